@@ -1,0 +1,64 @@
+"""Linear models of free-floating robots: URDF in, checked A and B out."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+# Public name -> module. Each is imported when it is first asked for, so that a command which
+# needs no dynamics does not pay for them.
+_PUBLIC = {
+    "ChartError": "errors",
+    "Check": "verification",
+    "FflinError": "errors",
+    "FileError": "errors",
+    "InputError": "errors",
+    "LinearModel": "linear_model",
+    "Linearizer": "linearization",
+    "MissingPackageError": "errors",
+    "ModelError": "errors",
+    "Robot": "model",
+    "SingularInertiaError": "errors",
+    "StateMap": "state",
+    "UnknownNameError": "errors",
+    "UrdfError": "errors",
+    "check": "verification",
+    "configuration": "model",
+    "from_model": "model",
+    "linearize": "linearization",
+    "list_robots": "robots",
+    "load": "model",
+}
+
+__all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
+
+if TYPE_CHECKING:
+    from fflin.errors import (
+        ChartError,
+        FflinError,
+        FileError,
+        InputError,
+        MissingPackageError,
+        ModelError,
+        SingularInertiaError,
+        UnknownNameError,
+        UrdfError,
+    )
+    from fflin.linear_model import LinearModel
+    from fflin.linearization import Linearizer, linearize
+    from fflin.model import Robot, configuration, from_model, load
+    from fflin.robots import list_robots
+    from fflin.state import StateMap
+    from fflin.verification import Check, check
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'fflin' has no attribute '{name}'")
+    value = getattr(import_module(f"fflin.{_PUBLIC[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_PUBLIC})

@@ -1,0 +1,180 @@
+"""A second route to A and B, by Pinocchio's ABA derivatives, and how far two routes differ."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.linear_model import Certificate, LinearModel
+from fflin.model import Robot
+from fflin.rotation import skew
+from fflin.state import ANGULAR, LINEAR, Chart, StateMap
+from fflin.validation import Array
+
+
+class Block(NamedTuple):
+    """Difference of two routes to one block of A or B.
+
+    Attributes
+    ----------
+    matrix : str
+        "A" or "B".
+    row, column : str
+        Groups of the state or input, such as "omega_b" and "q_m".
+    error : float
+        Largest difference relative to the block.
+    """
+
+    matrix: str
+    row: str
+    column: str
+    error: float
+
+
+INPUT_GROUPS = {"tau_b": slice(0, 3), "F_b": slice(3, 6), "tau_m": slice(6, None)}
+
+
+def certify(robot: Robot, lin: LinearModel) -> Certificate:
+    """Compute the figures that prove a continuous-time model of this robot."""
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    blocks = compare(state, lin, *aba_route(state, lin.q, lin.v, lin.u0))
+    return Certificate(
+        condition=scaled_condition(lin.M),
+        inertia_residual=inertia_residual(lin),
+        route_A=max(block.error for block in blocks if block.matrix == "A"),
+        route_B=max(block.error for block in blocks if block.matrix == "B"),
+        f0=float(np.abs(lin.f0).max()),
+    )
+
+
+def scaled_condition(M: Array) -> float:
+    """Condition number of M scaled to a unit diagonal."""
+    scale = 1.0 / np.sqrt(M.diagonal())
+    return float(np.linalg.cond(scale[:, None] * M * scale))
+
+
+def inertia_residual(lin: LinearModel) -> float:
+    """Largest entry of ``M M^-1 - E`` with M scaled to a unit diagonal."""
+    scale = np.sqrt(lin.M.diagonal())
+    residual = lin.M @ lin.B[-len(lin.M) :] - np.eye(len(lin.M))
+    return float(np.abs(residual * scale / scale[:, None]).max())
+
+
+def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+    r"""Build A and B from the derivatives of ABA.
+
+    They are built in base axes and carried to the frame by the change of coordinates
+    :math:`x_f = T x_l`: :math:`A_f = (T A_l + \dot T) T^{-1}`, :math:`B_f = T B_l`, to which the
+    turning of a force held in reference axes is added.
+
+    Returns
+    -------
+    A : ndarray (nx, nx)
+    B : ndarray (nx, 6 + n)
+    """
+    model = state.robot.model
+    data = state.robot.create_data()
+    chart, g, nv = state.chart(q), state.groups, model.nv
+    nu, force = v[state.order], u.copy()
+    state.to_base(chart, force)
+    tau = np.empty(nv)
+    tau[state.order] = force
+    by_q, by_v, inverse = pin.computeABADerivatives(model, data, q, v, tau)
+    by_q, by_v, inverse = (x[state.order][:, state.order] for x in (by_q, by_v, inverse))
+    acceleration = data.ddq[state.order]
+
+    J, R = chart.J, chart.R
+    A, B = np.zeros((state.nx, state.nx)), np.zeros((state.nx, nv))
+    w, linear = nu[ANGULAR], nu[LINEAR]
+    A[g.q_b, g.q_b] = -0.5 * (np.outer(w, chart.q_b) / chart.q0 + skew(w))
+    A[g.q_b, g.omega_b] = 0.5 * chart.Q
+    A[g.r_b, g.q_b] = -R @ skew(linear) @ J
+    A[g.r_b, g.v_b] = R
+    A[g.q_m, g.qdot_m] = np.eye(state.robot.n)
+    A[-nv:, g.q_b] = by_q[:, ANGULAR] @ J
+    A[-nv:, g.r_b] = by_q[:, LINEAR] @ R.T
+    A[-nv:, g.q_m] = by_q[:, 6:]
+    A[-nv:, -nv:] = by_v
+    B[-nv:] = inverse
+
+    T, T_rate = _change_of_coordinates(state, chart, nu, acceleration)
+    B = T @ B
+    A = np.linalg.solve(T.T, (T @ A + T_rate).T).T
+    for turned, columns in zip(state.axes, (ANGULAR, LINEAR), strict=True):
+        if turned:
+            A[:, g.q_b] += B[:, columns] @ skew(force[columns]) @ J
+            B[:, columns] = B[:, columns] @ R.T
+    return A, B
+
+
+def _change_of_coordinates(
+    state: StateMap, chart: Chart, nu: Array, acceleration: Array
+) -> tuple[Array, Array]:
+    """Return T (nx, nx) with x_frame = T x_local for deviations, and its time derivative."""
+    g = state.groups
+    T, T_rate = np.eye(state.nx), np.zeros((state.nx, state.nx))
+    J, R, w = chart.J, chart.R, nu[ANGULAR]
+    q_b_rate = 0.5 * chart.Q @ w
+    q0_rate = -0.5 * float(chart.q_b @ w)
+    J_rate = -0.5 * J @ (q0_rate * np.eye(3) + skew(q_b_rate)) @ J
+    for turned, rows, group in zip(state.axes, (ANGULAR, LINEAR), (g.omega_b, g.v_b), strict=True):
+        if turned:
+            s, s_rate = skew(nu[rows]), skew(acceleration[rows])
+            T[group, group] = R
+            T[group, g.q_b] = -R @ s @ J
+            T_rate[group, group] = R @ skew(w)
+            T_rate[group, g.q_b] = -R @ (skew(w) @ s + s_rate) @ J - R @ s @ J_rate
+    return T, T_rate
+
+
+def compare(state: StateMap, lin: LinearModel, A: Array, B: Array) -> list[Block]:
+    """Compare a model's A and B with those of another route, block by block.
+
+    A difference is relative to the largest entry of its block, rows of accelerations being
+    scaled by the mobility sqrt((M^-1)_ii), so that a light joint does not hide a heavy one.
+    Where a block vanishes because large terms cancel in it, it is relative to those terms.
+    An entry of M^-1 is relative to the mobilities of its row and column, which bound it.
+    """
+    nv = len(lin.M)
+    mobility = np.sqrt(np.abs(lin.B[-nv:].diagonal()))
+    row_scale = np.concatenate((np.ones(state.nx - nv), mobility))[:, None]
+    difference_A, scaled_A = np.abs(lin.A - A) / row_scale, np.abs(lin.A) / row_scale
+    column_scale = np.where(np.arange(state.nx)[:, None] < state.nx - nv, 1.0, mobility)
+    difference_B = np.abs(lin.B - B) / row_scale / column_scale
+
+    groups = state.groups._asdict()
+    blocks = []
+    for row, rows in groups.items():
+        for column, columns in groups.items():
+            cancelling = _cancelling_terms(state, lin, mobility, row, column)
+            scale = max(_largest(scaled_A[rows, columns]), cancelling) or 1.0
+            error = _largest(difference_A[rows, columns]) / scale
+            blocks.append(Block("A", row, column, error))
+        for column, columns in INPUT_GROUPS.items():
+            blocks.append(Block("B", row, column, _largest(difference_B[rows, columns])))
+    return blocks
+
+
+def _cancelling_terms(
+    state: StateMap, lin: LinearModel, mobility: Array, row: str, column: str
+) -> float:
+    """Size of the terms that may cancel in a block of A, in its scaled units."""
+    chart = state.chart(lin.q)
+    steepness = _largest(chart.J) if column == "q_b" else 1.0
+    speed = np.abs(lin.v[state.order])
+    rate = max(_largest(speed[ANGULAR]), _largest(speed[6:]))
+    moving = {"omega_b", "v_b", "qdot_m"}
+    if row not in moving:
+        return 0.0 if column in moving else _largest(speed[:6]) * steepness
+    if column in moving:
+        nu = state.groups._asdict()[column]
+        return rate * _largest(1.0 / mobility[nu.start - state.nx : nu.stop - state.nx or None])
+    accelerations = np.abs(lin.f0[-len(mobility) :]) / mobility
+    forces = np.abs(lin.u0) * mobility
+    return steepness * (
+        _largest(accelerations) + _largest(forces) + rate * _largest(speed / mobility)
+    )
+
+
+def _largest(x: Array) -> float:
+    return float(np.abs(x).max(initial=0.0))

@@ -1,0 +1,55 @@
+"""Errors that fflin raises; each message says what was given, what was expected, what to do."""
+
+from collections.abc import Iterable
+
+
+class FflinError(Exception):
+    """Base of every error that a public call of fflin raises on purpose."""
+
+
+class InputError(FflinError, ValueError):
+    """An argument has a wrong size, type or value."""
+
+
+class UnknownNameError(FflinError, LookupError):
+    """A robot, joint or frame of that name does not exist."""
+
+
+class FileError(FflinError, OSError):
+    """A file cannot be read or written."""
+
+
+class UrdfError(FflinError, ValueError):
+    """A robot description is malformed or describes what cannot exist."""
+
+
+class ModelError(FflinError, ValueError):
+    """A model is not one free-flying tree of one-degree-of-freedom joints."""
+
+
+class SingularInertiaError(FflinError, ArithmeticError):
+    """The joint-space inertia matrix cannot be inverted."""
+
+
+class ChartError(FflinError, ValueError):
+    """The base is turned by pi from the reference, where the attitude chart ends."""
+
+
+class MissingPackageError(FflinError, ImportError):
+    """An optional package is needed and not installed."""
+
+
+def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
+    """Build the error for a name that does not exist, with the names that are near."""
+    import difflib
+
+    names = list(known)
+    near = difflib.get_close_matches(name, names, n=5, cutoff=0.5)
+    if near:
+        hint = f"did you mean {', '.join(near)}?"
+    elif not names:
+        hint = "there are none"
+    else:
+        shown = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
+        hint = f"there are: {shown}"
+    return UnknownNameError(f"no {kind} named '{name}'; {hint}")

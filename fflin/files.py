@@ -1,0 +1,244 @@
+"""Linear models on disk: npz, mat, json and csv, exact to the last bit, whole or not at all."""
+
+import csv
+import io
+import json
+import os
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fflin.errors import FileError
+from fflin.linear_model import Certificate, LinearModel
+
+_MATRICES = ("A", "B", "C", "D", "M")
+_VECTORS = ("f0", "x0", "u0", "y0", "q", "v", "reference")
+_NAMES = (
+    *("state_names", "input_names", "output_names"),
+    *("state_units", "input_units", "output_units"),
+)
+_TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version")
+
+FORMATS = (".npz", ".mat", ".json", ".csv")
+
+
+def save_model(lin: LinearModel, path: Path) -> None:
+    """Write a model and its certificate; see `LinearModel.save`."""
+    check_format(path)
+    record: dict[str, Any] = {key: getattr(lin, key) for key in (*_MATRICES, *_VECTORS[:-1])}
+    record["reference"] = lin._reference
+    record |= {key: list(getattr(lin, key)) for key in _NAMES}
+    record |= {key: getattr(lin, key) for key in _TEXTS}
+    record["dt"] = float(lin.dt)
+    record["certificate"] = asdict(lin.certificate)
+    encode: Callable[[Path, dict[str, Any]], dict[Path, bytes]] = {
+        ".npz": _to_npz,
+        ".mat": _to_mat,
+        ".json": _to_json,
+        ".csv": _to_csv,
+    }[path.suffix]
+    write_whole(encode(path, record))
+
+
+def load_model(path: Path) -> LinearModel:
+    """Read a model that `save_model` wrote; see `LinearModel.load`."""
+    check_format(path)
+    decode = {".npz": _from_npz, ".mat": _from_mat, ".json": _from_json, ".csv": _from_csv}
+    try:
+        record = decode[path.suffix](path)
+        shapes: dict[str, Any] = {key: np.array(record[key], dtype=float) for key in _VECTORS}
+        sizes = {key: len(record[key]) for key in _NAMES[:3]}
+        nx, nu, ny = sizes.values()
+        for key, shape in zip("ABCD", ((nx, nx), (nx, nu), (ny, nx), (ny, nu)), strict=True):
+            shapes[key] = np.array(record[key], dtype=float).reshape(shape)
+        shapes["M"] = np.array(record["M"], dtype=float)
+        reference = shapes.pop("reference")
+        return LinearModel(
+            **shapes,
+            **{key: tuple(record[key]) for key in _NAMES},
+            **{key: str(record[key]) for key in _TEXTS},
+            dt=float(record["dt"]),
+            _reference=reference,
+            _certify=partial(_given, Certificate(**record["certificate"])),
+        )
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (KeyError, ValueError, TypeError, IndexError, EOFError) as error:
+        raise FileError(f"{path}: not a linear model saved by fflin ({error})") from None
+
+
+def _given(certificate: Certificate, _: LinearModel) -> Certificate:
+    return certificate
+
+
+def check_format(path: Path) -> None:
+    """Raise `FileError` where the ending of an output's name says no known format."""
+    if path.suffix not in FORMATS:
+        raise FileError(f"'{path}' ends in '{path.suffix}', expected one of {', '.join(FORMATS)}")
+
+
+def write_whole(contents: dict[Path, bytes]) -> None:
+    """Write files so that each is whole or, where anything fails, as it was before.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be written.
+    """
+    written: dict[Path, Path] = {}
+    target = Path()
+    try:
+        for target, content in contents.items():
+            if target.is_dir():
+                raise FileError(f"{target}: is a folder; give the name of a file")
+            temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+            with temporary.open("xb") as file:
+                written[temporary] = target
+                file.write(content)
+        for temporary, target in list(written.items()):
+            os.replace(temporary, target)
+            del written[temporary]
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(f"{target}: cannot be written: {error.strerror}") from None
+    finally:
+        for temporary in written:
+            temporary.unlink(missing_ok=True)
+
+
+def _to_npz(path: Path, record: dict[str, Any]) -> dict[Path, bytes]:
+    buffer = io.BytesIO()
+    np.savez(buffer, **{**record, "certificate": json.dumps(record["certificate"])})
+    return {path: buffer.getvalue()}
+
+
+def _from_npz(path: Path) -> dict[str, Any]:
+    from zipfile import BadZipFile
+
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            record = {key: file[key] for key in file.files}
+    except BadZipFile as error:
+        raise ValueError(str(error)) from None
+    for key in _NAMES:
+        record[key] = record[key].tolist()
+    return {**record, "certificate": json.loads(str(record["certificate"]))}
+
+
+def _to_mat(path: Path, record: dict[str, Any]) -> dict[Path, bytes]:
+    from scipy.io import savemat
+
+    buffer = io.BytesIO()
+    cells = {key: np.array(record[key], dtype=object) for key in _NAMES}
+    savemat(buffer, {**record, **cells}, oned_as="column")
+    return {path: buffer.getvalue()}
+
+
+def _from_mat(path: Path) -> dict[str, Any]:
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        raw = loadmat(path)
+    except (MatReadError, NotImplementedError) as error:
+        raise ValueError(str(error)) from None
+    record: dict[str, Any] = {key: raw[key] for key in _MATRICES}
+    record |= {key: raw[key].ravel() for key in _VECTORS}
+    record |= {key: [str(cell[0]) for cell in raw[key].ravel()] for key in _NAMES}
+    record |= {key: "".join(raw[key]) for key in _TEXTS}
+    record["dt"] = raw["dt"].item()
+    struct = raw["certificate"][0, 0]
+    record["certificate"] = {key: struct[key].item() for key in struct.dtype.names}
+    return record
+
+
+def _to_json(path: Path, record: dict[str, Any]) -> dict[Path, bytes]:
+    plain = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in record.items()}
+    lines = ",\n".join(
+        f"{json.dumps(k)}: {json.dumps(v, allow_nan=False)}" for k, v in plain.items()
+    )
+    return {path: f"{{\n{lines}\n}}\n".encode()}
+
+
+def _from_json(path: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return record
+
+
+# One table a matrix, named on its rows and columns; one for each of the signals, with units;
+# one for the point in Pinocchio's own order; and one of everything that is a single figure.
+
+
+def _to_csv(path: Path, record: dict[str, Any]) -> dict[Path, bytes]:
+    states, inputs, outputs = (record[key] for key in _NAMES[:3])
+    velocities = states[-len(record["M"]) :]
+    named = {
+        "A": (states, states),
+        "B": (states, inputs),
+        "C": (outputs, states),
+        "D": (outputs, inputs),
+        "M": (velocities, velocities),
+    }
+    tables: dict[str, list[list[Any]]] = {}
+    for key, (rows, columns) in named.items():
+        body = [[name, *row] for name, row in zip(rows, record[key].tolist(), strict=True)]
+        tables[key] = [["", *columns], *body]
+    for title, unit, vectors in (
+        ("state", "state_units", ("x0", "f0")),
+        ("input", "input_units", ("u0",)),
+        ("output", "output_units", ("y0",)),
+    ):
+        body = zip(record[f"{title}_names"], record[unit], *(record[k].tolist() for k in vectors))
+        tables[f"{title}s"] = [["name", "unit", *vectors], *map(list, body)]
+    point = [
+        [f"{key}[{i}]", x]
+        for key in ("q", "v", "reference")
+        for i, x in enumerate(record[key].tolist())
+    ]
+    tables["point"] = [["name", "value"], *point]
+    info = {**{key: record[key] for key in _TEXTS}, "dt": record["dt"]}
+    info |= {f"certificate.{key}": value for key, value in record["certificate"].items()}
+    tables["info"] = [["name", "value"], *map(list, info.items())]
+    return {_csv_path(path, key): _csv_text(rows) for key, rows in tables.items()}
+
+
+def _from_csv(path: Path) -> dict[str, Any]:
+    record: dict[str, Any] = {}
+    for key in _MATRICES:
+        _, *body = _csv_rows(path, key)
+        record[key] = [[float(x) for x in row[1:]] for row in body]
+    for title, vectors in (("state", ("x0", "f0")), ("input", ("u0",)), ("output", ("y0",))):
+        _, *body = _csv_rows(path, f"{title}s")
+        columns = list(zip(*body, strict=True))
+        record[f"{title}_names"], record[f"{title}_units"] = columns[:2]
+        for vector, column in zip(vectors, columns[2:], strict=True):
+            record[vector] = [float(x) for x in column]
+    _, *body = _csv_rows(path, "point")
+    for key in ("q", "v", "reference"):
+        record[key] = [float(x) for name, x in body if name.startswith(f"{key}[")]
+    info = dict(_csv_rows(path, "info")[1:])
+    prefix = "certificate."
+    record["certificate"] = {
+        key.removeprefix(prefix): float(x) for key, x in info.items() if key.startswith(prefix)
+    }
+    return {**record, **{key: info[key] for key in (*_TEXTS, "dt")}}
+
+
+def _csv_path(path: Path, key: str) -> Path:
+    return path.with_name(f"{path.stem}.{key}.csv")
+
+
+def _csv_text(rows: list[list[Any]]) -> bytes:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()
+
+
+def _csv_rows(path: Path, key: str) -> list[list[str]]:
+    with _csv_path(path, key).open(encoding="utf-8", newline="") as file:
+        return list(csv.reader(file))

@@ -1,0 +1,160 @@
+"""What the command line shows of robots, linear models and checks."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+from fflin.tables import grid, matrix, width
+
+if TYPE_CHECKING:
+    from fflin.linear_model import LinearModel
+    from fflin.model import Robot
+    from fflin.validation import Array
+    from fflin.verification import Check
+
+
+def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
+    """Show robots: (name, the robot or why it does not load, where from)."""
+    rows = [["name", "n", "mass [kg]", "from"]]
+    for name, robot, origin in entries:
+        if isinstance(robot, str):
+            rows.append([name, "-", "-", f"{origin}: {robot}"])
+        else:
+            rows.append([name, str(robot.n), f"{robot.mass:.6g}", origin])
+    return grid(rows, "lrrl")
+
+
+def robot_info(robot: Robot) -> str:
+    """Show a robot's tree, masses and limits."""
+    model = robot.model
+    source = str(robot.urdf) if robot.urdf else "a Pinocchio model"
+    head = (
+        f"{robot.name}: {robot.n} joints, {12 + 2 * robot.n} states, {6 + robot.n} inputs, "
+        f"mass {robot.mass:.6g} kg\nfrom {source}"
+    )
+    depth = {0: -1, 1: 0}
+    rows = [["joint", "type", "mass [kg]", "lower", "upper", "effort", "velocity"]]
+    rows.append(["(base)", "free", f"{model.inertias[1].mass:.6g}", ".", ".", ".", "."])
+    for joint in robot.joints:
+        index = model.getJointId(joint.name)
+        depth[index] = depth[model.parents[index]] + 1
+        kind = "prismatic" if joint.prismatic else "continuous" if joint.unbounded else "revolute"
+        limits = (
+            (".", ".")
+            if joint.unbounded
+            else (
+                _limit(model.lowerPositionLimit[joint.idx_q]),
+                _limit(model.upperPositionLimit[joint.idx_q]),
+            )
+        )
+        rows.append(
+            [
+                "  " * depth[index] + joint.name,
+                kind,
+                f"{model.inertias[index].mass:.6g}",
+                *limits,
+                _limit(model.effortLimit[joint.idx_v]),
+                _limit(model.velocityLimit[joint.idx_v]),
+            ]
+        )
+    frames = [f.name for f in model.frames if f.name != "universe"]
+    wrapped = textwrap.fill(
+        ", ".join(dict.fromkeys(frames)), width(), initial_indent="  ", subsequent_indent="  "
+    )
+    return f"{head}\n\n{grid(rows, 'll')}\n\nframes\n{wrapped}"
+
+
+def linear_model(lin: LinearModel) -> str:
+    """Show a linear model: its point, A, B, C, D and its certificate."""
+    nx, nu = lin.B.shape
+    point = "a fixed point" if lin.is_equilibrium() else "not a fixed point"
+    parts = [f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}, {point}"]
+    moved = [
+        _signal(title, values, names, units)
+        for title, values, names, units in (
+            ("x0", lin.x0, lin.state_names, lin.state_units),
+            ("u0", lin.u0, lin.input_names, lin.input_units),
+            ("f0", lin.f0, lin.state_names, [f"{unit}/s" for unit in lin.state_units]),
+        )
+        if values.any()
+    ]
+    if moved:
+        parts.append("\n".join(moved))
+    parts.append(_named_matrix("A", lin.A, lin.state_names, lin.state_names))
+    parts.append(_named_matrix("B", lin.B, lin.state_names, lin.input_names))
+    if lin.output_names == lin.state_names and not lin.D.any():
+        parts.append("C = E, D = 0: the output is the state")
+    else:
+        parts.append(_named_matrix("C", lin.C, lin.output_names, lin.state_names))
+        parts.append(_named_matrix("D", lin.D, lin.output_names, lin.input_names))
+    c = lin.certificate
+    parts.append(
+        f"A and B against ABA derivatives: {c.route_A:.1e} and {c.route_B:.1e}; M M^-1 - E: "
+        f"{c.inertia_residual:.1e};\ncond(M): {c.condition:.1e}; |f0|: {c.f0:.1e}"
+    )
+    return "\n\n".join(parts)
+
+
+def check_report(check: Check) -> str:
+    """Show what a check found: a table a route, the single figures, the verdict."""
+    states = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
+    inputs = ("tau_b", "F_b", "tau_m")
+    parts = [f"check of {check.title}"]
+    for test in ("ABA derivatives", "differences"):
+        rows = {row.block: row for row in check.rows if row.test == test}
+        body = [
+            [
+                state,
+                *(_error(rows[f"A[{state}, {column}]"]) for column in states),
+                *(_error(rows[f"B[{state}, {column}]"]) for column in inputs),
+            ]
+            for state in states
+        ]
+        tolerance = next(iter(rows.values())).tolerance
+        parts.append(
+            f"A and B against {test}: relative error of each block, at most {tolerance:.1e}"
+        )
+        parts.append(grid([["", *states, *inputs], *body]))
+    single = [r for r in check.rows if r.test not in ("ABA derivatives", "differences")]
+    rest = [[f"{r.test}: {r.block}", _error(r), f"at most {r.tolerance:.1e}"] for r in single]
+    parts.append(grid(rest, "lrl"))
+    if check.ok:
+        verdict = f"OK: {len(check.rows)} figures hold; the largest error is {check.max_error:.1e}"
+    else:
+        names = [f"{row.block} ({row.test})" for row in check.failures[:6]]
+        names += ["..."] * (len(check.failures) > 6)
+        verdict = f"FAILED: {len(check.failures)} of {len(check.rows)} figures: {', '.join(names)}"
+    parts.append(textwrap.fill(verdict, width()))
+    return "\n\n".join(parts)
+
+
+def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
+    size = f"{title} ({values.shape[0]} x {values.shape[1]})"
+    if not values.any():
+        return f"{size} is zero"
+    return f"{size}; rows and columns of zeros are not shown\n\n{matrix(values, rows, columns)}"
+
+
+def _signal(title: str, values: Array, names: Sequence[str], units: Sequence[str]) -> str:
+    entries = [
+        f"{name} = {value:.6g}" + (f" {unit}" if unit != "1" else "")
+        for name, value, unit in zip(names, values.tolist(), units, strict=True)
+        if value
+    ]
+    return textwrap.fill(
+        f"{title}: {', '.join(entries)}", width(), subsequent_indent=" " * (len(title) + 2)
+    )
+
+
+def _error(row: object) -> str:
+    error, ok = row.error, row.ok  # type: ignore[attr-defined]
+    text = "." if error == 0.0 else f"{error:.0e}"
+    return text if ok else f"{text}!"
+
+
+def _limit(value: float) -> str:
+    # Pinocchio marks what the URDF does not limit by the largest double or by infinity.
+    return "." if not math.isfinite(value) or abs(value) > 1e300 else f"{value:.5g}"

@@ -1,0 +1,118 @@
+"""Where robots are found: the bundled ones, those of example-robot-data, and any path."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from fflin.errors import FileError, UrdfError, unknown
+
+# example-robot-data's talos_legs is talos cut off at the torso, done in its loader's code.
+_PRUNED = {"talos_legs": ("torso_1_joint",)}
+
+
+@dataclass(frozen=True)
+class RobotFile:
+    """Where a robot's description lies.
+
+    Attributes
+    ----------
+    name : str
+        Name that `load` takes.
+    path : Path
+        The URDF.
+    origin : str
+        "fflin", "example-robot-data" or "file".
+    package_dirs : tuple of Path
+        Folders in which ``package://`` paths of meshes are looked up.
+    prune : tuple of str
+        Joints that are cut off with all that hangs on them.
+    """
+
+    name: str
+    path: Path
+    origin: str
+    package_dirs: tuple[Path, ...] = ()
+    prune: tuple[str, ...] = ()
+
+
+@cache
+def bundled_directory() -> Path:
+    """Folder of the bundled URDFs: inside an installed package, beside a source checkout's."""
+    package = Path(__file__).resolve().parent
+    installed = package / "bundled"
+    return installed if installed.is_dir() else package.parent / "robots"
+
+
+@cache
+def _bundled() -> dict[str, RobotFile]:
+    paths = sorted(bundled_directory().glob("*.urdf"))
+    return {path.stem: RobotFile(path.stem, path, "fflin") for path in paths}
+
+
+@cache
+def _example_robot_data() -> dict[str, RobotFile]:
+    # Only class attributes are read: making a loader would load its meshes.
+    from example_robot_data.robots_loader import ROBOTS, getModelPath
+
+    found = {}
+    for name, loader in ROBOTS.items():
+        if not loader.urdf_filename:
+            continue
+        inner = Path(loader.path, loader.urdf_subpath, loader.urdf_filename)
+        root = Path(getModelPath(str(inner))).resolve()
+        found[name] = RobotFile(
+            name,
+            root / inner,
+            "example-robot-data",
+            (root.parents[1], root.parent),
+            _PRUNED.get(name, ()),
+        )
+    return found
+
+
+def list_robots() -> tuple[str, ...]:
+    """Every robot name that `load` takes: the bundled ones first, then example-robot-data's.
+
+    Returns
+    -------
+    tuple of str
+    """
+    return tuple({**_bundled(), **_example_robot_data()})
+
+
+def find_robot(robot: str | Path) -> RobotFile:
+    """Find the description of a robot by its name or by the path of its URDF.
+
+    A bundled name comes first, then a path that exists, then a name of example-robot-data.
+
+    Parameters
+    ----------
+    robot : str or Path
+        Name or path.
+
+    Returns
+    -------
+    RobotFile
+
+    Raises
+    ------
+    UnknownNameError
+        If it is neither a known name nor looks like a path.
+    FileError
+        If it looks like a path and nothing is there.
+    UrdfError
+        If the robot is known but has no URDF.
+    """
+    if isinstance(robot, str) and robot in _bundled():
+        return _bundled()[robot]
+    path = Path(robot)
+    text = str(robot)
+    if path.exists() and not (path.is_dir() and text in _example_robot_data()):
+        return RobotFile(path.stem, path, "file", (path.resolve().parent,))
+    if isinstance(robot, Path) or path.suffix or len(path.parts) != 1:
+        raise FileError(f"no file at '{robot}'; give a URDF's path or a name of `fflin robots`")
+    if text == "cassie":
+        raise UrdfError("'cassie' comes as SDF only, which Pinocchio's wheels cannot read")
+    if text not in _example_robot_data():
+        raise unknown("robot", text, list_robots())
+    return _example_robot_data()[text]

@@ -1,0 +1,43 @@
+"""Rotations: cross-product matrices and Hamilton quaternions stored x, y, z, w."""
+
+import math
+
+import numpy as np
+
+from fflin.validation import Array
+
+
+def skew(a: Array) -> Array:
+    """Return [a]x (3, 3), with ``[a]x b = a x b``."""
+    x, y, z = a.tolist()
+    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+
+
+def quaternion_product(a: Array, b: Array) -> Array:
+    """Return the Hamilton product a b, (4,) in x, y, z, w, scaled to unit length."""
+    ax, ay, az, aw = a.tolist()
+    bx, by, bz, bw = b.tolist()
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by - ax * bz + ay * bw + az * bx
+    z = aw * bz + ax * by - ay * bx + az * bw
+    w = aw * bw - ax * bx - ay * by - az * bz
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    return np.array((x / norm, y / norm, z / norm, w / norm))
+
+
+def conjugate(a: Array) -> Array:
+    """Return the inverse of a unit quaternion."""
+    x, y, z, w = a.tolist()
+    return np.array((-x, -y, -z, w))
+
+
+def rotation_matrix(a: Array) -> Array:
+    """Return the rotation (3, 3) of a unit quaternion."""
+    x, y, z, w = a.tolist()
+    return np.array(
+        (
+            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+            (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+            (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+        )
+    )

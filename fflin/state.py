@@ -1,0 +1,305 @@
+"""The state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, names, frames and chart."""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.errors import ChartError, InputError
+from fflin.model import ROOT, Robot
+from fflin.rotation import conjugate, quaternion_product, rotation_matrix, skew
+from fflin.validation import Array, vector
+
+Frame = Literal["hybrid", "local", "world"]
+
+# Which base velocities (omega_b, v_b), and wrenches (tau_b, F_b) with them, stand in the axes
+# of the reference instead of the base's.
+_IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
+    "hybrid": (False, True),
+    "local": (False, False),
+    "world": (True, True),
+}
+
+# Where q0 is below the square root of the rounding unit, sqrt(1 - |q_b|^2) has no correct digit.
+_SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
+
+
+# Rows of the base's angular and linear part in any (6 + n) velocity or wrench of state order.
+ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
+
+
+class Groups(NamedTuple):
+    """Slices of the six groups of the state."""
+
+    q_b: slice
+    r_b: slice
+    q_m: slice
+    omega_b: slice
+    v_b: slice
+    qdot_m: slice
+
+
+@dataclass(frozen=True)
+class Chart:
+    """The attitude chart at one base attitude, relative to the reference.
+
+    Attributes
+    ----------
+    q_b : ndarray (3,)
+        Vector part of the quaternion of refMb.
+    q0 : float
+        Its scalar part, positive.
+    R : ndarray (3, 3)
+        refMb.rotation.
+    """
+
+    q_b: Array
+    q0: float
+    R: Array
+
+    @property
+    def Q(self) -> Array:
+        """Q (3, 3) with ``d q_b/dt = Q omega / 2``, omega in base axes."""
+        return self.q0 * np.eye(3) + skew(self.q_b)
+
+    @property
+    def J(self) -> Array:
+        """J = 2 Q^-1 (3, 3) with ``d theta = J d q_b``, d theta in base axes."""
+        outer = np.outer(self.q_b, self.q_b)
+        return 2.0 * (self.q0 * np.eye(3) - skew(self.q_b) + outer / self.q0)
+
+
+class StateMap:
+    r"""Map between Pinocchio's (q, v) and the state of the linear model.
+
+    The state is :math:`X = (q_b, r_b, q_m, \omega_b, v_b, \dot q_m)` of dimension 12 + 2n:
+    with :math:`{}^{ref}M_b = {}^oM_{ref}^{-1}\,{}^oM_b`, q_b is the vector part of its quaternion,
+    taken so that the scalar part is not negative, and r_b its translation.
+
+    Parameters
+    ----------
+    robot : Robot
+    reference : pin.SE3, optional
+        Placement oMref that the attitude and position are relative to; identity by default.
+    frame : {"hybrid", "local", "world"}
+        Axes of the velocities. hybrid: omega_b in base axes, v_b = d r_b/dt in reference axes.
+        local: both in base axes. world: both in reference axes. All at the base origin.
+
+    Attributes
+    ----------
+    nx : int
+        12 + 2n.
+    names, units : tuple of str
+        Of the nx states.
+    groups : Groups
+        Slices of q_b, r_b, q_m, omega_b, v_b, qdot_m in the state.
+    order : ndarray of int (6 + n,)
+        Index in Pinocchio's v of each velocity of the state.
+    axes : tuple of bool
+        Whether (omega_b, v_b) stand in reference axes.
+
+    Raises
+    ------
+    InputError
+        If the frame is unknown or the reference is not a pin.SE3.
+    """
+
+    def __init__(
+        self, robot: Robot, *, reference: pin.SE3 | None = None, frame: Frame = "hybrid"
+    ) -> None:
+        if frame not in _IN_REFERENCE_AXES:
+            raise InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
+        if reference is not None and not isinstance(reference, pin.SE3):
+            raise InputError(
+                f"reference is a {type(reference).__name__}, expected a pin.SE3 (placement oMref)"
+            )
+        n = robot.n
+        self.robot = robot
+        self.frame: Frame = frame
+        self.axes = _IN_REFERENCE_AXES[frame]
+        self.nx = 12 + 2 * n
+        self.groups = Groups(
+            slice(0, 3),
+            slice(3, 6),
+            slice(6, 6 + n),
+            slice(6 + n, 9 + n),
+            slice(9 + n, 12 + n),
+            slice(12 + n, 12 + 2 * n),
+        )
+        joints = robot.joints
+        length = ["m" if joint.prismatic else "rad" for joint in joints]
+        self.names = (
+            *_named("q_b", "xyz"),
+            *_named("r_b", "xyz"),
+            *_named("q_m", robot.joint_names),
+            *_named("omega_b", "xyz"),
+            *_named("v_b", "xyz"),
+            *_named("qdot_m", robot.joint_names),
+        )
+        self.units = (
+            *("1", "1", "1", "m", "m", "m"),
+            *length,
+            *("rad/s", "rad/s", "rad/s", "m/s", "m/s", "m/s"),
+            *(f"{unit}/s" for unit in length),
+        )
+        self.order = np.array([3, 4, 5, 0, 1, 2, *(joint.idx_v for joint in joints)], dtype=np.intp)
+        self._idx_q = np.array([joint.idx_q for joint in joints], dtype=np.intp)
+        self._unbounded = np.flatnonzero([joint.unbounded for joint in joints])
+        self._cos = self._idx_q[self._unbounded]
+        # The free-flyer joint may itself stand somewhere in the world.
+        oMref = pin.SE3(reference) if reference is not None else pin.SE3.Identity()
+        self._reference = oMref
+        # Composed as quaternions: their entries survive to the last digit near a turn of pi.
+        placement = pin.SE3ToXYZQUAT(oMref.actInv(robot.model.jointPlacements[ROOT]))
+        self._position, self._quaternion = placement[:3], placement[3:]
+        self._rotation = rotation_matrix(self._quaternion)
+
+    @property
+    def reference(self) -> pin.SE3:
+        """The placement oMref, a copy."""
+        return pin.SE3(self._reference)
+
+    def chart(self, q: Array) -> Chart:
+        """Return the attitude chart at a configuration.
+
+        Parameters
+        ----------
+        q : ndarray (nq,)
+            A valid configuration.
+
+        Raises
+        ------
+        ChartError
+            If the base is turned by pi from the reference.
+        """
+        quaternion = quaternion_product(self._quaternion, q[3:7])
+        if quaternion[3] < 0.0:
+            quaternion = -quaternion
+        q0 = float(quaternion[3])
+        if q0 < _SMALLEST_Q0:
+            raise ChartError(
+                "the base is turned by 180 deg from the reference, where the attitude chart "
+                "(quaternion vector part) is singular; give a reference nearer to the base"
+            )
+        return Chart(quaternion[:3], q0, rotation_matrix(quaternion))
+
+    def to_state(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
+        """Convert a Pinocchio configuration and velocity to a state.
+
+        Parameters
+        ----------
+        q : array_like (nq,)
+            Configuration.
+        v : array_like (nv,)
+            Velocity in Pinocchio's order: base linear and angular in base axes, then joints.
+        near : array_like (nx,), optional
+            A state; the angle of each continuous joint is taken on the turn nearest to it.
+            By default it lies in (-pi, pi].
+
+        Returns
+        -------
+        ndarray (nx,)
+
+        Raises
+        ------
+        ChartError
+            If the base is turned by pi from the reference.
+        InputError
+            If a size is wrong or an entry is not finite.
+        """
+        q = self.robot.checked_configuration(q)
+        v = vector("v", v, self.robot.model.nv, f"a velocity of '{self.robot.name}'")
+        chart = self.chart(q)
+        x = np.empty(self.nx)
+        g = self.groups
+        x[g.q_b] = chart.q_b
+        x[g.r_b] = self._position + self._rotation @ q[:3]
+        x[g.q_m] = self.joint_positions(q)
+        if near is not None:
+            self._unwrap(x, near)
+        velocity = v[self.order]
+        self.to_frame(chart, velocity)
+        x[6 + self.robot.n :] = velocity
+        return x
+
+    def to_pinocchio(self, x: Array) -> tuple[Array, Array]:
+        """Convert a state to a Pinocchio configuration and velocity.
+
+        Parameters
+        ----------
+        x : array_like (nx,)
+
+        Returns
+        -------
+        q : ndarray (nq,)
+        v : ndarray (nv,)
+
+        Raises
+        ------
+        ChartError
+            If q_b is as long as 1 or longer: a turn of pi and no attitude beyond it.
+        InputError
+            If the size is wrong or an entry is not finite.
+        """
+        x = vector("x", x, self.nx, f"a state of '{self.robot.name}'")
+        g = self.groups
+        q_b = x[g.q_b]
+        square = 1.0 - float(q_b @ q_b)
+        if square < _SMALLEST_Q0**2:
+            raise ChartError(
+                f"|q_b| is {np.sqrt(1.0 - square):.9g}, expected less than 1: at 1 the base is "
+                "turned by 180 deg from the reference, where the attitude chart is singular"
+            )
+        relative = np.array((*q_b, np.sqrt(square)))
+        q = np.empty(self.robot.model.nq)
+        q[:3] = self._rotation.T @ (x[g.r_b] - self._position)
+        q[3:7] = quaternion_product(conjugate(self._quaternion), relative)
+        angles = x[g.q_m]
+        q[self._idx_q] = angles
+        q[self._cos] = np.cos(angles[self._unbounded])
+        q[self._cos + 1] = np.sin(angles[self._unbounded])
+        velocity = x[6 + self.robot.n :].copy()
+        self.to_base(Chart(q_b, float(relative[3]), rotation_matrix(relative)), velocity)
+        v = np.empty(self.robot.model.nv)
+        v[self.order] = velocity
+        return q, v
+
+    def to_frame(self, chart: Chart, vectors: Array) -> None:
+        """Turn velocities or wrenches (6 + n, ...) in place from base axes to the frame's."""
+        for rows, turned in zip((ANGULAR, LINEAR), self.axes, strict=True):
+            if turned:
+                vectors[rows] = chart.R @ vectors[rows]
+
+    def to_base(self, chart: Chart, vectors: Array) -> None:
+        """Turn velocities or wrenches (6 + n, ...) in place from the frame's axes to the base's."""
+        for rows, turned in zip((ANGULAR, LINEAR), self.axes, strict=True):
+            if turned:
+                vectors[rows] = chart.R.T @ vectors[rows]
+
+    def joint_positions(self, q: Array) -> Array:
+        """Return q_m (n,), one angle or length a joint, of a valid configuration."""
+        angles = q[self._idx_q]
+        if self._cos.size:
+            angles[self._unbounded] = np.arctan2(q[self._cos + 1], q[self._cos])
+        return angles
+
+    def _unwrap(self, x: Array, near: Array) -> None:
+        near = vector("near", near, self.nx, f"a state of '{self.robot.name}'")
+        index = 6 + self._unbounded
+        x[index] += 2.0 * np.pi * np.round((near[index] - x[index]) / (2.0 * np.pi))
+
+
+def wrench_names(robot: Robot) -> tuple[str, ...]:
+    """Names of the default input u = (tau_b, F_b, tau_m)."""
+    return (*_named("tau_b", "xyz"), *_named("F_b", "xyz"), *_named("tau_m", robot.joint_names))
+
+
+def wrench_units(robot: Robot) -> tuple[str, ...]:
+    """Units of the default input."""
+    joints = ("N" if joint.prismatic else "N m" for joint in robot.joints)
+    return (*("N m", "N m", "N m", "N", "N", "N"), *joints)
+
+
+def _named(group: str, members: str | tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(f"{group}.{member}" for member in members)

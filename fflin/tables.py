@@ -1,0 +1,79 @@
+"""Text tables: aligned, folded to the terminal's width, plain where it is not a terminal."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fflin.validation import Array
+
+_GAP = "  "
+
+
+def width() -> int:
+    """Columns to fill: the terminal's, or 80 where the output goes elsewhere."""
+    return shutil.get_terminal_size((80, 24)).columns if sys.stdout.isatty() else 80
+
+
+def dim(text: str) -> str:
+    """Text that stands back on a terminal that shows colours."""
+    if sys.stdout.isatty() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb":
+        return f"\x1b[2m{text}\x1b[0m"
+    return text
+
+
+def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
+    """Align cells in columns.
+
+    Parameters
+    ----------
+    rows : sequence of sequence of str
+        Of equal length; a cell "." is dimmed.
+    align : str
+        "l" or "r" for each column; those beyond its end are aligned to the right.
+    """
+    sizes = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    align = align.ljust(len(sizes), "r")
+    lines = []
+    for row in rows:
+        cells = [
+            cell.ljust(size) if side == "l" else cell.rjust(size)
+            for cell, size, side in zip(row, sizes, align, strict=True)
+        ]
+        cells[-1] = cells[-1].rstrip()
+        lines.append(_GAP.join(dim(c) if c.strip() == "." else c for c in cells).rstrip())
+    return "\n".join(lines)
+
+
+def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
+    """Show a matrix with its names; zeros are dots, rows and columns of zeros are left out.
+
+    What is too wide is folded: the next columns follow below, under the rows that they need.
+    """
+    text = [[_number(x) for x in row] for row in values.tolist()]
+    label = max(map(len, rows))
+    folds: list[list[int]] = []
+    used = 0
+    for j, name in enumerate(columns):
+        if not values[:, j].any():
+            continue
+        size = len(_GAP) + max(len(name), *(len(row[j]) for row in text))
+        if not folds or used + size > width():
+            folds.append([])
+            used = label
+        folds[-1].append(j)
+        used += size
+    blocks = []
+    for fold in folds:
+        shown = [i for i in range(len(rows)) if values[i, fold].any()]
+        body = [[rows[i], *(text[i][j] for j in fold)] for i in shown]
+        blocks.append(grid([["", *(columns[j] for j in fold)], *body]))
+    return "\n\n".join(blocks)
+
+
+def _number(x: float) -> str:
+    return "." if x == 0.0 else f"{x:.5g}"

@@ -1,0 +1,245 @@
+"""Whether A and B hold: against ABA derivatives and against differences of the nonlinear model."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.certificate import aba_route, compare, inertia_residual, scaled_condition
+from fflin.errors import InputError
+from fflin.linear_model import LinearModel
+from fflin.model import Robot
+from fflin.reports import check_report
+from fflin.state import StateMap
+from fflin.validation import Array
+
+_EPS = float(np.finfo(float).eps)
+
+# Relative to its block an analytic route agrees to round-off times the conditioning of M, with
+# room for the longer chain of operations; for a well-conditioned M, to this.
+_ROUTE_TOLERANCE, _ROUTE_ROUNDING = 1e-9, 1e2 * _EPS
+# Differences of sixth order lose about four digits more to their step.
+_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING = 1e-8, 1e4 * _EPS
+
+# Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. Its error is
+# h^6 f^(7) / 140.
+_WEIGHTS = (45.0 / 60.0, -9.0 / 60.0, 1.0 / 60.0)
+
+
+class Row(NamedTuple):
+    """One figure of a check.
+
+    Attributes
+    ----------
+    test : str
+        What was compared.
+    block : str
+        The block of A or B, or what else was compared.
+    error : float
+        Relative error.
+    tolerance : float
+        What it must not exceed.
+    """
+
+    test: str
+    block: str
+    error: float
+    tolerance: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether the error, which must be a number, is within the tolerance."""
+        return self.error <= self.tolerance
+
+
+@dataclass(frozen=True)
+class Check:
+    """What a check of a linear model found; prints as tables.
+
+    Attributes
+    ----------
+    rows : tuple of Row
+        Every figure.
+    title : str
+        What was checked.
+    """
+
+    rows: tuple[Row, ...]
+    title: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether every figure is within its tolerance."""
+        return all(row.ok for row in self.rows)
+
+    @property
+    def max_error(self) -> float:
+        """The largest relative error."""
+        return float(np.max([row.error for row in self.rows]))
+
+    @property
+    def failures(self) -> tuple[Row, ...]:
+        """The figures that are not within their tolerance."""
+        return tuple(row for row in self.rows if not row.ok)
+
+    def __str__(self) -> str:
+        return check_report(self)
+
+
+def check(robot: Robot, lin: LinearModel) -> Check:
+    r"""Check a linear model by routes other than the one that made it.
+
+    A and B are compared, block by block, with Pinocchio's ABA derivatives mapped into the chart
+    (1e-9 relative), and with sixth-order central differences of the nonlinear model
+    :math:`\dot x = f(x, u)` in the same chart (1e-8), f itself being held against the flow
+    that it must generate. A tolerance grows with the conditioning of M, as round-off does.
+
+    Parameters
+    ----------
+    robot : Robot
+        The robot that the model claims to describe.
+    lin : LinearModel
+        In continuous time; fresh, loaded from a file, or of another make.
+
+    Returns
+    -------
+    Check
+        ``ok``, ``max_error``, ``rows``; printable.
+
+    Raises
+    ------
+    InputError
+        If the model is sampled or has other states and inputs than this robot's.
+    """
+    if lin.dt:
+        raise InputError(f"the model is sampled at dt = {lin.dt:g} s; check the continuous one")
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)  # type: ignore[arg-type]
+    if lin.state_names != state.names:
+        raise InputError(
+            f"the model has {len(lin.state_names)} states of '{lin.robot}', which are not the "
+            f"{state.nx} states of '{robot.name}'; check it against its own robot"
+        )
+    q, v = robot.checked_configuration(lin.q), lin.v
+    condition = scaled_condition(lin.M)
+    route = max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition)
+    difference = max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition)
+    model = _Nonlinear(state)
+    rows = [
+        Row("ABA derivatives", f"{b.matrix}[{b.row}, {b.column}]", b.error, route)
+        for b in compare(state, lin, *aba_route(state, q, v, lin.u0))
+    ]
+    rows += [
+        Row("differences", f"{b.matrix}[{b.row}, {b.column}]", b.error, difference)
+        for b in compare(state, lin, *_differences(model, lin))
+    ]
+    rows.append(Row("flow", "f", _flow_error(model, lin), difference))
+    rows.append(Row("point", "x0", _relative(lin.x0, state.to_state(q, v, near=lin.x0)), route))
+    rows.append(Row("point", "f0", _relative(lin.f0, model(lin.x0, lin.u0)), route))
+    rows.append(Row("inertia", "M M^-1 = E", inertia_residual(lin), route))
+    rows += [Row("inertia", name, error, 1e-12) for name, error in _positive_definite(lin)]
+    return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, cond(M) {condition:.1e}")
+
+
+class _Nonlinear:
+    """The nonlinear model in the chart, by ABA: ``xdot = f(x, u)``."""
+
+    def __init__(self, state: StateMap) -> None:
+        self.state = state
+        self.data = state.robot.create_data()
+
+    def acceleration(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Return (q, v, a) in Pinocchio's order."""
+        state, model = self.state, self.state.robot.model
+        q, v = state.to_pinocchio(x)
+        force = u.copy()
+        state.to_base(state.chart(q), force)
+        tau = np.empty(model.nv)
+        tau[state.order] = force
+        return q, v, pin.aba(model, self.data, q, v, tau)
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        state = self.state
+        q, v, a = self.acceleration(x, u)
+        chart = state.chart(q)
+        linear, angular = v[:3], v[3:6]
+        rate = a[state.order]
+        if state.axes[1]:
+            rate[3:6] += np.cross(angular, linear)  # of the velocity's reference-axis components
+        state.to_frame(chart, rate)
+        return np.concatenate(
+            (
+                0.5 * (chart.q0 * angular + np.cross(chart.q_b, angular)),
+                chart.R @ linear,
+                v[state.order[6:]],
+                rate,
+            )
+        )
+
+
+def _differences(model: _Nonlinear, lin: LinearModel) -> tuple[Array, Array]:
+    """A and B by central differences of the nonlinear model."""
+    groups = model.state.groups
+    nv = len(lin.M)
+    # The step keeps well inside the chart, whose edge |q_b| = 1 the model feels long before.
+    step = np.full(model.state.nx, 3e-3)
+    step[groups.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[groups.q_b]))
+    # f is quadratic in the velocities and linear in the input: no truncation at any step.
+    step[-nv:] = 0.1
+    mobility = np.sqrt(np.abs(lin.B[-nv:].diagonal()))
+    push = max(1.0, float(np.abs(lin.f0[-nv:] / mobility).max())) / mobility
+    A = _jacobian(lambda x: model(x, lin.u0), lin.x0, step)
+    B = _jacobian(lambda u: model(lin.x0, u), lin.u0, push)
+    return A, B
+
+
+def _jacobian(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:
+    columns = []
+    for index, step in enumerate(steps):
+        along = np.zeros(len(point))
+        along[index] = step
+        columns.append(_derivative(lambda t, d=along: f(point + t * d)) / step)
+    return np.column_stack(columns)
+
+
+def _derivative(f: Callable[[float], Array]) -> Array:
+    """df/dt at 0 by differences at t = -3 ... 3."""
+    return sum(w * (f(k) - f(-k)) for k, w in enumerate(_WEIGHTS, 1))  # type: ignore[return-value]
+
+
+def _flow_error(model: _Nonlinear, lin: LinearModel) -> float:
+    """How far f is from the rate of the state along motions of the robot.
+
+    The motions pass the point with its own velocity and with a unit of each base velocity added.
+    """
+    state, pinmodel = model.state, model.state.robot.model
+    worst = 0.0
+    for unit in (None, *range(6)):
+        x = lin.x0.copy()
+        if unit is not None:
+            x[6 + state.robot.n + unit] += 1.0
+        q, v, a = model.acceleration(x, lin.u0)
+        speed = 1.0 + float(np.abs(v).max())
+        h = 1e-2 * (1.0 - np.linalg.norm(x[state.groups.q_b])) / speed
+
+        def along(t: float, q: Array = q, v: Array = v, a: Array = a, h: float = h) -> Array:
+            moved = pin.integrate(pinmodel, q, t * h * v)
+            return state.to_state(moved, v + t * h * a, near=lin.x0)
+
+        worst = max(worst, _relative(model(x, lin.u0), _derivative(along) / h, floor=speed))
+    return worst
+
+
+def _relative(given: Array, expected: Array, floor: float = 1.0) -> float:
+    return float(np.abs(given - expected).max() / max(floor, float(np.abs(expected).max())))
+
+
+def _positive_definite(lin: LinearModel) -> list[tuple[str, float]]:
+    """Asymmetry of B's lower block, and how far its least eigenvalue is below zero."""
+    inverse = lin.B[-len(lin.M) :]
+    scale = 1.0 / np.sqrt(np.abs(inverse.diagonal()))
+    scaled = scale[:, None] * inverse * scale
+    asymmetry = float(np.abs(scaled - scaled.T).max())
+    least = float(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0])
+    return [("M^-1 symmetric", asymmetry), ("M^-1 positive", max(0.0, -least))]
