@@ -74,17 +74,17 @@ def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Arr
     """
     model = state.robot.model
     data = state.robot.create_data()
-    chart, g, nv = state.chart(q), state.groups, model.nv
-    nu, force = v[state.order], u.copy()
+    chart, g, nv = state.chart(q), state.groups, 6 + state.robot.n
+    nu, force = state.velocities(v), u.copy()
     state.to_base(chart, force)
-    tau = np.empty(nv)
-    tau[state.order] = force
+    tau = state.spread(force)
     by_q, by_v, inverse = pin.computeABADerivatives(model, data, q, v, tau)
-    by_q, by_v, inverse = (x[state.order][:, state.order] for x in (by_q, by_v, inverse))
-    acceleration = data.ddq[state.order]
+    by_q, by_v, inverse = (state.project(x) for x in (by_q, by_v, inverse))
+    acceleration = state.velocities(data.ddq)
 
     J, R = chart.J, chart.R
-    A, B = np.zeros((state.nx, state.nx)), np.zeros((state.nx, nv))
+    A: Array = np.zeros((state.nx, state.nx))
+    B: Array = np.zeros((state.nx, nv))
     w, linear = nu[ANGULAR], nu[LINEAR]
     A[g.q_b, g.q_b] = -0.5 * (np.outer(w, chart.q_b) / chart.q0 + skew(w))
     A[g.q_b, g.omega_b] = 0.5 * chart.Q
@@ -99,7 +99,7 @@ def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Arr
 
     T, T_rate = _change_of_coordinates(state, chart, nu, acceleration)
     B = T @ B
-    A = np.linalg.solve(T.T, (T @ A + T_rate).T).T
+    A = (T @ A + T_rate) @ np.linalg.inv(T)
     for turned, columns in zip(state.axes, (ANGULAR, LINEAR), strict=True):
         if turned:
             A[:, g.q_b] += B[:, columns] @ skew(force[columns]) @ J
@@ -161,7 +161,7 @@ def _cancelling_terms(
     """Size of the terms that may cancel in a block of A, in its scaled units."""
     chart = state.chart(lin.q)
     steepness = _largest(chart.J) if column == "q_b" else 1.0
-    speed = np.abs(lin.v[state.order])
+    speed = np.abs(state.velocities(lin.v))
     rate = max(_largest(speed[ANGULAR]), _largest(speed[6:]))
     moving = {"omega_b", "v_b", "qdot_m"}
     if row not in moving:

@@ -50,17 +50,17 @@ def load_model(path: Path) -> LinearModel:
     decode = {".npz": _from_npz, ".mat": _from_mat, ".json": _from_json, ".csv": _from_csv}
     try:
         record = decode[path.suffix](path)
-        shapes: dict[str, Any] = {key: np.array(record[key], dtype=float) for key in _VECTORS}
+        arrays = {key: np.array(record[key], dtype=float) for key in _VECTORS}
         sizes = {key: len(record[key]) for key in _NAMES[:3]}
         nx, nu, ny = sizes.values()
         for key, shape in zip("ABCD", ((nx, nx), (nx, nu), (ny, nx), (ny, nu)), strict=True):
-            shapes[key] = np.array(record[key], dtype=float).reshape(shape)
-        shapes["M"] = np.array(record["M"], dtype=float)
-        reference = shapes.pop("reference")
+            arrays[key] = np.array(record[key], dtype=float).reshape(shape)
+        arrays["M"] = np.array(record["M"], dtype=float)
+        reference = arrays.pop("reference")
+        named: dict[str, Any] = {key: tuple(record[key]) for key in _NAMES}
+        named |= {key: str(record[key]) for key in _TEXTS} | arrays
         return LinearModel(
-            **shapes,
-            **{key: tuple(record[key]) for key in _NAMES},
-            **{key: str(record[key]) for key in _TEXTS},
+            **named,
             dt=float(record["dt"]),
             _reference=reference,
             _certify=partial(_given, Certificate(**record["certificate"])),
@@ -185,16 +185,17 @@ def _to_csv(path: Path, record: dict[str, Any]) -> dict[Path, bytes]:
         "M": (velocities, velocities),
     }
     tables: dict[str, list[list[Any]]] = {}
-    for key, (rows, columns) in named.items():
-        body = [[name, *row] for name, row in zip(rows, record[key].tolist(), strict=True)]
-        tables[key] = [["", *columns], *body]
+    for key, (left, top) in named.items():
+        body = [[name, *row] for name, row in zip(left, record[key].tolist(), strict=True)]
+        tables[key] = [["", *top], *body]
     for title, unit, vectors in (
         ("state", "state_units", ("x0", "f0")),
         ("input", "input_units", ("u0",)),
         ("output", "output_units", ("y0",)),
     ):
-        body = zip(record[f"{title}_names"], record[unit], *(record[k].tolist() for k in vectors))
-        tables[f"{title}s"] = [["name", "unit", *vectors], *map(list, body)]
+        columns = [record[f"{title}_names"], record[unit], *(record[k].tolist() for k in vectors)]
+        rows = map(list, zip(*columns, strict=True))
+        tables[f"{title}s"] = [["name", "unit", *vectors], *rows]
     point = [
         [f"{key}[{i}]", x]
         for key in ("q", "v", "reference")

@@ -16,6 +16,8 @@ from fflin.validation import Array, number
 if TYPE_CHECKING:
     import pinocchio as pin
 
+    from fflin.state import Frame
+
 
 @dataclass(frozen=True)
 class Certificate:
@@ -94,7 +96,7 @@ class LinearModel:
     state_units: tuple[str, ...]
     input_units: tuple[str, ...]
     output_units: tuple[str, ...]
-    frame: str
+    frame: Frame
     q: Array
     v: Array
     robot: str
@@ -113,11 +115,12 @@ class LinearModel:
                 object.__setattr__(self, item.name, value)
 
     @classmethod
-    def _assemble(cls, common: dict[str, Any], **point: Any) -> LinearModel:
+    def _assemble(cls, common: dict[str, Any], point: dict[str, Any]) -> LinearModel:
         # The generated __init__ sets two dozen frozen fields one by one, which costs as much
         # as the dynamics of a small robot. The caller passes read-only arrays of its own.
         lin = object.__new__(cls)
-        lin.__dict__.update(common, **point)
+        lin.__dict__.update(common)
+        lin.__dict__.update(point)
         return lin
 
     def __repr__(self) -> str:
@@ -144,7 +147,8 @@ class LinearModel:
     def discretize(self, dt: float) -> LinearModel:
         r"""Sample the model with its input held constant between samples.
 
-        .. math:: A_d = e^{A h},\quad B_d = \int_0^h e^{A s}\,ds\,B,\quad f_d = \int_0^h e^{A s}\,ds\,f_0
+        .. math::
+            A_d = e^{A h}, \quad [B_d, f_d] = \int_0^h e^{A s}\,ds\,[B, f_0]
 
         At rest A^2 = 0, and the series ends: :math:`A_d = E + A h`, :math:`B_d = B h + A B h^2/2`.
 

@@ -8,17 +8,12 @@ import pinocchio as pin
 
 from fflin import __version__
 from fflin.certificate import certify
-from fflin.errors import SingularInertiaError
+from fflin.inertia import Inertia
 from fflin.linear_model import LinearModel
 from fflin.model import ROOT, Robot
 from fflin.rotation import skew
 from fflin.state import ANGULAR, LINEAR, Chart, Frame, StateMap, wrench_names, wrench_units
 from fflin.validation import Array, vector
-
-# M_ii (M^-1)_ii is 1 for a decoupled coordinate and grows as it loses inertia of its own; times
-# the rounding unit it is the relative error of (M^-1)_ii. Where the sum over the coordinates
-# passes this, less than two digits of M^-1 are left.
-_LARGEST_COUPLING = 1e-2 / np.finfo(float).eps
 
 _STANDING = Chart(np.zeros(3), 1.0, np.eye(3))
 
@@ -34,6 +29,8 @@ class Linearizer:
 
     Elsewhere :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is differentiated in base axes as
     :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)` and carried to the chart and frame.
+    The dynamics do not depend on the base's linear velocity (Galilei), so they are evaluated
+    without it: an orbital speed costs no digits.
 
     Parameters
     ----------
@@ -64,17 +61,20 @@ class Linearizer:
         self._map = StateMap(robot, reference=reference, frame=frame)
         self._own_reference = reference is None
         self._data = robot.create_data()
-        # A view into Data, which Pinocchio overwrites in place; transposed, it is C-contiguous.
-        self._M = self._data.M.T
-        self._diagonal = self._M.diagonal()
-        nv, nx = robot.model.nv, self._map.nx
-        self._zero_v, self._zero_u, self._zero_x = (_frozen(np.zeros(k)) for k in (nv, nv, nx))
-        order = self._map.order
-        self._state_order = order[:, None] * nv + order  # flat indices into an (nv, nv) array
-        self._A_rest = np.zeros((nx, nx))
-        self._set_kinematics(self._A_rest, _STANDING, self._zero_v)
-        self._A_rest.setflags(write=False)
+        self._inertia = Inertia(self._map, self._data)
+        nv, nx = 6 + robot.n, self._map.nx
+        self._nv = nv
+        self._zero_v, self._zero_u, self._zero_x = (
+            _frozen(np.zeros(size)) for size in (robot.nv, nv, nx)
+        )
+        self._rates = np.array([0.5] * 3 + [1.0] * (nv - 3))  # the diagonal of N
+        self._A_rest = _frozen(
+            np.block([[np.zeros((nv, nv)), np.diag(self._rates)], [np.zeros((nv, nx))]])
+        )
+        self._shape_B = (nx, nv)
+        self._q_m = self._map.groups.q_m
         self._root_at_origin = robot.model.jointPlacements[ROOT].isIdentity(0.0)
+        self._reference = _frozen(pin.SE3ToXYZQUAT(self._map.reference))
         self._common = self._common_fields()
 
     def __call__(
@@ -105,166 +105,140 @@ class Linearizer:
             If a joint moves no mass.
         """
         robot = self.robot
-        q = _frozen(
-            pin.neutral(robot.model) if q is None else robot.checked_configuration(q).copy()
-        )
+        q = pin.neutral(robot.model) if q is None else robot.checked_configuration(q).copy()
+        q.setflags(write=False)
         if v is None and u is None and self._own_reference:
             return self._at_rest(q)
-        v = (
-            self._zero_v
-            if v is None
-            else vector("v", v, robot.model.nv, f"a velocity of '{robot.name}'")
-        )
-        if u is None:
-            u = self._zero_u
-        else:
-            u = vector("u", u, robot.model.nv, "(tau_b, F_b, tau_m)")
-        return self._anywhere(q, _frozen(v.copy()), _frozen(u.copy()))
+        if v is not None:
+            v = _frozen(vector("v", v, robot.nv, "a velocity in Pinocchio's order").copy())
+        if u is not None:
+            u = _frozen(vector("u", u, self._nv, "an input (tau_b, F_b, tau_m)").copy())
+        return self._anywhere(q, self._zero_v if v is None else v, self._zero_u if u is None else u)
 
     def _at_rest(self, q: Array) -> LinearModel:
-        B = np.zeros(self._common["D"].shape)
-        B[-self.robot.model.nv :] = self._inverse_inertia(q)
-        x0 = self._zero_x.copy()
-        x0[self._map.groups.q_m] = self._map.joint_positions(q)
-        return LinearModel._assemble(
-            self._common,
-            A=self._A_rest,
-            B=_frozen(B),
-            M=_frozen(self._M.take(self._state_order)),
-            f0=self._zero_x,
-            x0=_frozen(x0),
-            y0=x0,
-            u0=self._zero_u,
-            q=q,
-            v=self._zero_v,
-            _reference=self._reference_of(q),
-        )
-
-    def _inverse_inertia(self, q: Array) -> Array:
-        """Return M^-1 in state order and base axes; leave M in Data."""
-        model, data = self.robot.model, self._data
-        pin.crba(model, data, q)
-        # The sparse Cholesky factor along the tree. Scaling M by its diagonal beforehand would
-        # not change its accuracy: the rounding of Cholesky is invariant under it.
-        pin.cholesky.decompose(model, data)
-        inverse: Array = pin.cholesky.computeMinv(model, data)
-        # Written so that NaN, from a pivot that is zero or negative, fails too.
-        if not self._diagonal.dot(inverse.diagonal()) < _LARGEST_COUPLING:
-            raise _singular(self.robot, self._M)
-        return inverse.take(self._state_order)
+        B = np.zeros(self._shape_B)
+        self._inertia.invert(q, B[-self._nv :])
+        M = self._inertia.matrix()
+        x0 = np.zeros(self._map.nx)
+        x0[self._q_m] = self._map.joint_positions(q)
+        for array in (B, M, x0):
+            array.setflags(write=False)
+        point = {
+            "A": self._A_rest,
+            "B": B,
+            "M": M,
+            "f0": self._zero_x,
+            "x0": x0,
+            "y0": x0,
+            "u0": self._zero_u,
+            "q": q,
+            "v": self._zero_v,
+            "_reference": self._reference_of(q),
+        }
+        return LinearModel._assemble(self._common, point)
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
-        model, data, nv = self.robot.model, self._data, self.robot.model.nv
-        order, groups = self._map.order, self._map.groups
-        chart = _STANDING if self._own_reference else self._map.chart(q)
+        state, nv, groups = self._map, self._nv, self._map.groups
+        model, data = self.robot.model, self._data
+        chart = _STANDING if self._own_reference else state.chart(q)
 
-        # Everything in base axes first; the bias by RNEA, its slope by RNEA's derivatives.
-        nu, force = v[order], u.copy()
-        self._map.to_base(chart, force)
-        inverse = self._inverse_inertia(q)
-        M = self._M.take(self._state_order)
-        acceleration = inverse @ (force - pin.nonLinearEffects(model, data, q, v)[order])
-        a = np.empty(nv)
-        a[order] = acceleration
-        by_q, by_v, _ = pin.computeRNEADerivatives(model, data, q, v, a)
+        # In base axes, and without the base's linear velocity, on which nothing below depends.
+        nu, force = state.velocities(v), u
+        if chart is not _STANDING:
+            force = u.copy()
+            state.to_base(chart, force)
+        v_still = v.copy()
+        v_still[:3] = 0.0
+        B = np.zeros(self._shape_B)
+        inverse = B[-nv:]
+        self._inertia.invert(q, inverse)
+        M = self._inertia.matrix()
+        bias = state.forces(pin.nonLinearEffects(model, data, q, v_still))
+        c = inverse.dot(force - bias)
+        by_q, by_v, _ = pin.computeRNEADerivatives(model, data, q, v_still, state.spread(c))
 
-        A = np.zeros((self._map.nx, self._map.nx))
+        A = self._A_rest.copy()
         self._set_kinematics(A, chart, nu)
         lower = A[-nv:]
-        # Without gravity the base's pose has no influence in base axes.
-        lower[:, groups.q_m] = -inverse @ by_q[order, 6:]
-        lower[:, -nv:] = -inverse @ by_v.take(self._state_order)
-        rate = self._set_base_columns(A, chart, nu, force, acceleration, inverse)
-
-        f0 = np.concatenate((self._kinematic_rate(chart, nu), rate))
-        B = np.zeros(self._common["D"].shape)
-        B[-nv:] = inverse
-        if chart is not _STANDING:
-            self._map.to_frame(chart, lower)
-            self._map.to_frame(chart, lower[:, -nv:].T)
-            self._map.to_frame(chart, f0[-nv:])
-            for symmetric in (B[-nv:], M):
-                self._map.to_frame(chart, symmetric)
-                self._map.to_frame(chart, symmetric.T)
-            x0 = self._map.to_state(q, v)
+        lower[:, groups.q_m] = inverse.dot(state.project(by_q)[:, 6:])
+        lower[:, -nv:] = inverse.dot(state.project(by_v))
+        np.negative(lower, out=lower)
+        lower[:, groups.v_b] = 0.0
+        self._set_turning(lower, chart, nu, force, c, inverse)
+        f0, x0 = np.empty(state.nx), np.zeros(state.nx)
+        np.multiply(nu, self._rates, out=f0[:nv])
+        f0[nv:] = c
+        if chart is _STANDING:
+            x0[groups.q_m] = state.joint_positions(q)
+            x0[nv:] = nu
         else:
-            x0 = np.concatenate((np.zeros(6), self._map.joint_positions(q), nu))
-        return LinearModel._assemble(
-            self._common,
-            A=_frozen(A),
-            B=_frozen(B),
-            M=_frozen(M),
-            f0=_frozen(f0),
-            x0=_frozen(x0),
-            y0=x0,
-            u0=u,
-            q=q,
-            v=v,
-            _reference=self._reference_of(q),
-        )
+            x0 = state.to_state(q, v)
+            f0[groups.q_b] = chart.Q @ f0[groups.q_b]
+            f0[groups.r_b] = chart.R @ f0[groups.r_b]
+            for rows in (f0[nv:], lower, lower[:, -nv:].T, inverse, inverse.T, M, M.T):
+                state.to_frame(chart, rows)
+        for array in (A, B, M, f0, x0):
+            array.setflags(write=False)
+        point = {
+            "A": A,
+            "B": B,
+            "M": M,
+            "f0": f0,
+            "x0": x0,
+            "y0": x0,
+            "u0": u,
+            "q": q,
+            "v": v,
+            "_reference": self._reference_of(q),
+        }
+        return LinearModel._assemble(self._common, point)
 
-    def _set_base_columns(
-        self,
-        A: Array,
-        chart: Chart,
-        nu: Array,
-        force: Array,
-        acceleration: Array,
-        inverse: Array,
-    ) -> Array:
-        r"""Complete the velocity rows for vectors held in reference axes.
+    def _set_turning(
+        self, lower: Array, chart: Chart, nu: Array, force: Array, c: Array, inverse: Array
+    ) -> None:
+        r"""Complete the velocity rows (6 + n, nx) for what is held in which axes.
 
-        With S the rotation of the turned vectors, the frame's velocity obeys
-        :math:`\dot\nu_f = S c`, where c is the acceleration, for a turned v_b plus
-        :math:`\omega \times v`. A turn :math:`\delta\theta` of the base under a vector s held in
-        reference axes changes its base components by :math:`[s]_\times \delta\theta`.
-
-        Returns c (6 + n,), in base axes like the rows that are set.
+        `c` (6 + n,) is the acceleration of the base origin and the joints in base axes. A turn
+        :math:`\delta\theta` of the base under a vector s held in reference axes changes its base
+        components by :math:`[s]_\times \delta\theta`: so the velocities and forces that the
+        frame holds in reference axes change, and the accelerations turn back. A v_b in base
+        axes has the rate :math:`c - \omega \times v_b` instead, which is left in `c`.
         """
-        nv, groups = len(nu), self._map.groups
-        lower = A[-nv:]
+        groups = self._map.groups
         turned_angular, turned_linear = self._map.axes
-        c = acceleration.copy()
+        w, v = nu[ANGULAR], nu[LINEAR]
         if turned_linear:
-            w, v = nu[ANGULAR], nu[LINEAR]
-            c[LINEAR] += np.cross(w, v)
-            lower[LINEAR, groups.omega_b] -= skew(v)
-            lower[LINEAR, groups.v_b] += skew(w)
-        turn = np.zeros((nv, 3))
-        for turned, rows, columns in (
-            (turned_angular, ANGULAR, groups.omega_b),
-            (turned_linear, LINEAR, groups.v_b),
-        ):
-            if turned:
-                turn += lower[:, columns] @ skew(nu[rows]) + inverse[:, rows] @ skew(force[rows])
-                turn[rows] -= skew(c[rows])
-        lower[:, groups.q_b] = turn @ chart.J
-        return c
+            turn = inverse[:, LINEAR].dot(skew(force[LINEAR]))
+            turn[LINEAR] -= skew(c[LINEAR])
+            if turned_angular:
+                turn += lower[:, groups.omega_b].dot(skew(w))
+                turn += inverse[:, ANGULAR].dot(skew(force[ANGULAR]))
+                turn[ANGULAR] -= skew(c[ANGULAR])
+            lower[:, groups.q_b] = turn.dot(chart.J)
+        else:
+            lower[LINEAR, groups.omega_b] += skew(v)
+            turning = skew(w)
+            lower[LINEAR, groups.v_b] -= turning
+            c[LINEAR] -= turning.dot(v)
 
     def _set_kinematics(self, A: Array, chart: Chart, nu: Array) -> None:
-        """Set the rows of q_b, r_b and q_m; `nu` (6 + n,) in base axes."""
+        """Set what the motion changes in the rows of q_b and r_b; `nu` (6 + n,) in base axes."""
         g, (turned_angular, turned_linear) = self._map.groups, self._map.axes
         w, Q, J, R = nu[ANGULAR], chart.Q, chart.J, chart.R
-        A[g.q_b, g.q_b] = -0.5 * (np.outer(w, chart.q_b) / chart.q0 + skew(w))
-        A[g.q_b, g.omega_b] = 0.5 * Q
+        slope = -0.5 * skew(w)
+        if chart is not _STANDING:
+            slope -= np.outer(0.5 * w, chart.q_b / chart.q0)
+            A[g.q_b, g.omega_b] = 0.5 * Q @ R.T if turned_angular else 0.5 * Q
         if turned_angular:
-            A[g.q_b, g.q_b] += 0.5 * Q @ skew(w) @ J
-            A[g.q_b, g.omega_b] = 0.5 * Q @ R.T
-        if turned_linear:
-            A[g.r_b, g.v_b] = np.eye(3)
-        else:
+            slope += 0.5 * Q.dot(skew(w)).dot(J)
+        A[g.q_b, g.q_b] = slope
+        if not turned_linear:
             A[g.r_b, g.v_b] = R
-            A[g.r_b, g.q_b] = -R @ skew(nu[LINEAR]) @ J
-        A[g.q_m, g.qdot_m] = np.eye(self.robot.n)
-
-    @staticmethod
-    def _kinematic_rate(chart: Chart, nu: Array) -> Array:
-        """Return d(q_b, r_b, q_m)/dt (6 + n,)."""
-        return np.concatenate((0.5 * chart.Q @ nu[ANGULAR], chart.R @ nu[LINEAR], nu[6:]))
+            A[g.r_b, g.q_b] = -R.dot(skew(nu[LINEAR])).dot(J)
 
     def _reference_of(self, q: Array) -> Array:
         if not self._own_reference:
-            return self._common["_reference"]
+            return self._reference
         if self._root_at_origin:
             return q[:7]
         root = self.robot.model.jointPlacements[ROOT]
@@ -288,7 +262,6 @@ class Linearizer:
             "urdf_sha256": robot.urdf_sha256,
             "fflin_version": __version__,
             "pinocchio_version": pin.__version__,
-            "_reference": _frozen(pin.SE3ToXYZQUAT(state.reference)),
             "_certify": partial(certify, robot),
         }
 
@@ -343,29 +316,3 @@ def linearize(
 def _frozen(array: Array) -> Array:
     array.setflags(write=False)
     return array
-
-
-def _singular(robot: Robot, M: Array) -> SingularInertiaError:
-    names = ["the base"] * 6 + ["?"] * robot.n
-    for joint in robot.joints:
-        names[joint.idx_v] = f"joint '{joint.name}'"
-    diagonal = M.diagonal()
-    massless = sorted({names[i] for i in np.flatnonzero(~(diagonal > 0.0))})
-    if massless:
-        return SingularInertiaError(
-            f"{_enumerate(massless)} of '{robot.name}' moves no mass, so M cannot be inverted; "
-            "give the links beyond it an inertia, or lock it"
-        )
-    scale = 1.0 / np.sqrt(diagonal)
-    mode = np.linalg.eigh(scale[:, None] * M * scale)[1][:, 0]
-    involved = [names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1]
-    return SingularInertiaError(
-        f"M of '{robot.name}' is singular at this configuration: "
-        f"{_enumerate(list(dict.fromkeys(involved)))} move no mass against each other; "
-        "choose another configuration, give the links an inertia, or lock one of them"
-    )
-
-
-def _enumerate(names: list[str]) -> str:
-    shown = names[:6]
-    return ", ".join(shown) + (f" and {len(names) - 6} more" if len(names) > 6 else "")

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +13,9 @@ from fflin.errors import InputError, ModelError, unknown
 from fflin.reader import read_urdf
 from fflin.robots import find_robot
 from fflin.validation import NORM_TOLERANCE, Array, number, vector
+
+# What renormalising a unit quaternion leaves: two ulp of unity.
+_ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
@@ -83,6 +87,20 @@ class Robot:
         """Number of independent joints."""
         return len(self.joints)
 
+    @cached_property
+    def nq(self) -> int:
+        """Size of Pinocchio's configuration."""
+        return int(self.model.nq)
+
+    @cached_property
+    def nv(self) -> int:
+        """Size of Pinocchio's velocity, 6 + n."""
+        return int(self.model.nv)
+
+    @cached_property
+    def _unbounded(self) -> tuple[tuple[int, str], ...]:
+        return tuple((joint.idx_q, joint.name) for joint in self.joints if joint.unbounded)
+
     @property
     def mass(self) -> float:
         """Total mass in kg."""
@@ -117,28 +135,25 @@ class Robot:
         InputError
             If the size is wrong, an entry is not finite, or a part is not of unit length.
         """
-        q = vector("q", q, self.model.nq, f"a configuration of '{self.name}'")
-        _, _, _, x, y, z, w, *joints = q.tolist()
-        excess = x * x + y * y + z * z + w * w - 1.0
-        worst = abs(excess)
+        q = vector("q", q, self.nq, "a configuration in Pinocchio's order")
+        entries = q.tolist()
+        x, y, z, w = entries[3:7]
+        worst = abs(x * x + y * y + z * z + w * w - 1.0)
         if worst > NORM_TOLERANCE:
             raise InputError(
-                f"the base quaternion q[3:7] has length {np.sqrt(excess + 1.0):.9g}, expected 1; "
+                f"the base quaternion q[3:7] has length {np.linalg.norm(q[3:7]):.9g}, expected 1; "
                 "normalise it (x, y, z, w)"
             )
-        for joint in self.joints:
-            if joint.unbounded:
-                c, s = joints[joint.idx_q - 7 : joint.idx_q - 5]
-                excess = c * c + s * s - 1.0
-                if abs(excess) > NORM_TOLERANCE:
-                    raise InputError(
-                        f"(cos, sin) of continuous joint '{joint.name}', "
-                        f"q[{joint.idx_q}:{joint.idx_q + 2}], has length "
-                        f"{np.sqrt(excess + 1.0):.9g}, expected 1"
-                    )
-                worst = max(worst, abs(excess))
-        # Two ulp of unity: below it there is nothing to renormalise.
-        return q if worst <= 2 * np.finfo(float).eps else pin.normalize(self.model, q)
+        for index, name in self._unbounded:
+            c, s = entries[index], entries[index + 1]
+            excess = abs(c * c + s * s - 1.0)
+            if excess > NORM_TOLERANCE:
+                raise InputError(
+                    f"(cos, sin) of continuous joint '{name}', q[{index}:{index + 2}], has length "
+                    f"{np.hypot(c, s):.9g}, expected 1"
+                )
+            worst = max(worst, excess)
+        return q if worst <= _ROUND_OFF else pin.normalize(self.model, q)
 
     def create_data(self) -> pin.Data:
         """Make Pinocchio's work space for this robot.

@@ -1,6 +1,7 @@
 """The state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, names, frames and chart."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -58,12 +59,12 @@ class Chart:
     q0: float
     R: Array
 
-    @property
+    @cached_property
     def Q(self) -> Array:
         """Q (3, 3) with ``d q_b/dt = Q omega / 2``, omega in base axes."""
         return self.q0 * np.eye(3) + skew(self.q_b)
 
-    @property
+    @cached_property
     def J(self) -> Array:
         """J = 2 Q^-1 (3, 3) with ``d theta = J d q_b``, d theta in base axes."""
         outer = np.outer(self.q_b, self.q_b)
@@ -94,8 +95,6 @@ class StateMap:
         Of the nx states.
     groups : Groups
         Slices of q_b, r_b, q_m, omega_b, v_b, qdot_m in the state.
-    order : ndarray of int (6 + n,)
-        Index in Pinocchio's v of each velocity of the state.
     axes : tuple of bool
         Whether (omega_b, v_b) stand in reference axes.
 
@@ -108,7 +107,7 @@ class StateMap:
     def __init__(
         self, robot: Robot, *, reference: pin.SE3 | None = None, frame: Frame = "hybrid"
     ) -> None:
-        if frame not in _IN_REFERENCE_AXES:
+        if frame not in get_args(Frame):
             raise InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
         if reference is not None and not isinstance(reference, pin.SE3):
             raise InputError(
@@ -143,7 +142,10 @@ class StateMap:
             *("rad/s", "rad/s", "rad/s", "m/s", "m/s", "m/s"),
             *(f"{unit}/s" for unit in length),
         )
-        self.order = np.array([3, 4, 5, 0, 1, 2, *(joint.idx_v for joint in joints)], dtype=np.intp)
+        # Index in Pinocchio's v of each velocity of the state, and in a flat (nv, nv) array.
+        self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
+        self._flat = self._order[:, None] * robot.nv + self._order
+        self._flat_transposed = np.ascontiguousarray(self._flat.T)
         self._idx_q = np.array([joint.idx_q for joint in joints], dtype=np.intp)
         self._unbounded = np.flatnonzero([joint.unbounded for joint in joints])
         self._cos = self._idx_q[self._unbounded]
@@ -209,7 +211,7 @@ class StateMap:
             If a size is wrong or an entry is not finite.
         """
         q = self.robot.checked_configuration(q)
-        v = vector("v", v, self.robot.model.nv, f"a velocity of '{self.robot.name}'")
+        v = vector("v", v, self.robot.nv, "a velocity in Pinocchio's order")
         chart = self.chart(q)
         x = np.empty(self.nx)
         g = self.groups
@@ -218,9 +220,9 @@ class StateMap:
         x[g.q_m] = self.joint_positions(q)
         if near is not None:
             self._unwrap(x, near)
-        velocity = v[self.order]
-        self.to_frame(chart, velocity)
-        x[6 + self.robot.n :] = velocity
+        nu = self.velocities(v)
+        self.to_frame(chart, nu)
+        x[6 + self.robot.n :] = nu
         return x
 
     def to_pinocchio(self, x: Array) -> tuple[Array, Array]:
@@ -242,7 +244,7 @@ class StateMap:
         InputError
             If the size is wrong or an entry is not finite.
         """
-        x = vector("x", x, self.nx, f"a state of '{self.robot.name}'")
+        x = vector("x", x, self.nx, "a state (12 + 2n)")
         g = self.groups
         q_b = x[g.q_b]
         square = 1.0 - float(q_b @ q_b)
@@ -252,18 +254,37 @@ class StateMap:
                 "turned by 180 deg from the reference, where the attitude chart is singular"
             )
         relative = np.array((*q_b, np.sqrt(square)))
-        q = np.empty(self.robot.model.nq)
+        q = np.empty(self.robot.nq)
         q[:3] = self._rotation.T @ (x[g.r_b] - self._position)
         q[3:7] = quaternion_product(conjugate(self._quaternion), relative)
         angles = x[g.q_m]
         q[self._idx_q] = angles
         q[self._cos] = np.cos(angles[self._unbounded])
         q[self._cos + 1] = np.sin(angles[self._unbounded])
-        velocity = x[6 + self.robot.n :].copy()
-        self.to_base(Chart(q_b, float(relative[3]), rotation_matrix(relative)), velocity)
-        v = np.empty(self.robot.model.nv)
-        v[self.order] = velocity
-        return q, v
+        nu = x[6 + self.robot.n :].copy()
+        self.to_base(Chart(q_b, float(relative[3]), rotation_matrix(relative)), nu)
+        return q, self.spread(nu)
+
+    def velocities(self, v: Array) -> Array:
+        """Return (omega_b, v_b, qdot_m) (6 + n,) in base axes of Pinocchio's v (nv,)."""
+        return v.take(self._order)
+
+    def spread(self, nu: Array) -> Array:
+        """Return Pinocchio's v (nv,) of (omega_b, v_b, qdot_m) in base axes."""
+        v = np.empty(self.robot.nv)
+        v[self._order] = nu
+        return v
+
+    def forces(self, tau: Array) -> Array:
+        """Return the generalised forces (6 + n,) in base axes of Pinocchio's tau (nv,)."""
+        return tau.take(self._order)
+
+    def project(self, matrix: Array, out: Array | None = None) -> Array:
+        """Take a matrix (nv, nv) over Pinocchio's v to state order."""
+        # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
+        if matrix.flags.c_contiguous:
+            return matrix.take(self._flat, out=out, mode="clip")
+        return matrix.T.take(self._flat_transposed, out=out, mode="clip")
 
     def to_frame(self, chart: Chart, vectors: Array) -> None:
         """Turn velocities or wrenches (6 + n, ...) in place from base axes to the frame's."""
@@ -285,7 +306,7 @@ class StateMap:
         return angles
 
     def _unwrap(self, x: Array, near: Array) -> None:
-        near = vector("near", near, self.nx, f"a state of '{self.robot.name}'")
+        near = vector("near", near, self.nx, "a state (12 + 2n)")
         index = 6 + self._unbounded
         x[index] += 2.0 * np.pi * np.round((near[index] - x[index]) / (2.0 * np.pi))
 

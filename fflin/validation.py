@@ -14,6 +14,9 @@ Array = NDArray[np.float64]
 # farther off it is taken for a mistake.
 NORM_TOLERANCE = 1e-6
 
+# Native double precision; NumPy makes one such object, so that identity tells it.
+_DOUBLE = np.dtype(np.float64)
+
 
 def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
     """Return a float vector of the given size.
@@ -39,9 +42,9 @@ def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
     InputError
         If the shape is another, an entry is masked, complex or not finite.
     """
-    array = value if type(value) is np.ndarray else _as_array(name, value)
-    if array.dtype != np.float64 or not array.dtype.isnative or not array.flags.c_contiguous:
-        array = _as_float(name, array)
+    array: NDArray[Any] = value if type(value) is np.ndarray else _as_array(name, value)
+    if array.dtype is not _DOUBLE or not array.flags.c_contiguous:
+        array = _as_double(name, array)
     if array.shape != (size,):
         raise InputError(f"{name} has shape {array.shape}, expected ({size},): {of_what}")
     if not math.isfinite(array.dot(array)) and not np.isfinite(array).all():
@@ -70,7 +73,7 @@ def _as_array(name: str, value: ArrayLike) -> NDArray[Any]:
         raise InputError(f"{name} is not an array: its rows differ in length") from None
 
 
-def _as_float(name: str, array: NDArray[Any]) -> Array:
+def _as_double(name: str, array: NDArray[Any]) -> Array:
     if array.dtype.kind not in "fiu":
         raise InputError(f"{name} holds {array.dtype} values, expected real numbers")
     return np.ascontiguousarray(array, dtype=np.float64)

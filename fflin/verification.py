@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -115,7 +116,7 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     """
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; check the continuous one")
-    state = StateMap(robot, reference=lin.reference, frame=lin.frame)  # type: ignore[arg-type]
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
         raise InputError(
             f"the model has {len(lin.state_names)} states of '{lin.robot}', which are not the "
@@ -155,16 +156,14 @@ class _Nonlinear:
         q, v = state.to_pinocchio(x)
         force = u.copy()
         state.to_base(state.chart(q), force)
-        tau = np.empty(model.nv)
-        tau[state.order] = force
-        return q, v, pin.aba(model, self.data, q, v, tau)
+        return q, v, pin.aba(model, self.data, q, v, state.spread(force))
 
     def __call__(self, x: Array, u: Array) -> Array:
         state = self.state
         q, v, a = self.acceleration(x, u)
         chart = state.chart(q)
         linear, angular = v[:3], v[3:6]
-        rate = a[state.order]
+        rate = state.velocities(a)
         if state.axes[1]:
             rate[3:6] += np.cross(angular, linear)  # of the velocity's reference-axis components
         state.to_frame(chart, rate)
@@ -172,14 +171,14 @@ class _Nonlinear:
             (
                 0.5 * (chart.q0 * angular + np.cross(chart.q_b, angular)),
                 chart.R @ linear,
-                v[state.order[6:]],
+                state.velocities(v)[6:],
                 rate,
             )
         )
 
 
 def _differences(model: _Nonlinear, lin: LinearModel) -> tuple[Array, Array]:
-    """A and B by central differences of the nonlinear model."""
+    """Return A and B by central differences of the nonlinear model."""
     groups = model.state.groups
     nv = len(lin.M)
     # The step keeps well inside the chart, whose edge |q_b| = 1 the model feels long before.
@@ -196,16 +195,19 @@ def _differences(model: _Nonlinear, lin: LinearModel) -> tuple[Array, Array]:
 
 def _jacobian(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:
     columns = []
-    for index, step in enumerate(steps):
-        along = np.zeros(len(point))
-        along[index] = step
-        columns.append(_derivative(lambda t, d=along: f(point + t * d)) / step)
+    for along, step in zip(np.diag(steps), steps, strict=True):
+        columns.append(_derivative(partial(_along, f, point, along)) / step)
     return np.column_stack(columns)
 
 
+def _along(f: Callable[[Array], Array], point: Array, along: Array, t: float) -> Array:
+    return f(point + t * along)
+
+
 def _derivative(f: Callable[[float], Array]) -> Array:
-    """df/dt at 0 by differences at t = -3 ... 3."""
-    return sum(w * (f(k) - f(-k)) for k, w in enumerate(_WEIGHTS, 1))  # type: ignore[return-value]
+    """Return df/dt at 0 by differences at t = -3 ... 3."""
+    differences = [f(k) - f(-k) for k in range(1, 1 + len(_WEIGHTS))]
+    return np.tensordot(_WEIGHTS, differences, axes=1)
 
 
 def _flow_error(model: _Nonlinear, lin: LinearModel) -> float:
@@ -213,7 +215,7 @@ def _flow_error(model: _Nonlinear, lin: LinearModel) -> float:
 
     The motions pass the point with its own velocity and with a unit of each base velocity added.
     """
-    state, pinmodel = model.state, model.state.robot.model
+    state = model.state
     worst = 0.0
     for unit in (None, *range(6)):
         x = lin.x0.copy()
@@ -221,14 +223,15 @@ def _flow_error(model: _Nonlinear, lin: LinearModel) -> float:
             x[6 + state.robot.n + unit] += 1.0
         q, v, a = model.acceleration(x, lin.u0)
         speed = 1.0 + float(np.abs(v).max())
-        h = 1e-2 * (1.0 - np.linalg.norm(x[state.groups.q_b])) / speed
+        h = 1e-2 * (1.0 - float(np.linalg.norm(x[state.groups.q_b]))) / speed
 
-        def along(t: float, q: Array = q, v: Array = v, a: Array = a, h: float = h) -> Array:
-            moved = pin.integrate(pinmodel, q, t * h * v)
-            return state.to_state(moved, v + t * h * a, near=lin.x0)
-
-        worst = max(worst, _relative(model(x, lin.u0), _derivative(along) / h, floor=speed))
+        rate = _derivative(partial(_moved, state, q, h * v, v, h * a)) / h
+        worst = max(worst, _relative(model(x, lin.u0), rate, floor=speed))
     return worst
+
+
+def _moved(state: StateMap, q: Array, dq: Array, v: Array, dv: Array, t: float) -> Array:
+    return state.to_state(pin.integrate(state.robot.model, q, t * dq), v + t * dv)
 
 
 def _relative(given: Array, expected: Array, floor: float = 1.0) -> float:
