@@ -78,7 +78,11 @@ def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Arr
     nu, force = state.velocities(v), u.copy()
     state.to_base(chart, force)
     tau = state.spread(force)
-    by_q, by_v, inverse = pin.computeABADerivatives(model, data, q, v, tau)
+    # Pinocchio differentiates in world axes at the world's origin, where a distant base costs
+    # digits; nothing depends on where the base is.
+    at_origin = q.copy()
+    at_origin[:3] = 0.0
+    by_q, by_v, inverse = pin.computeABADerivatives(model, data, at_origin, v, tau)
     by_q, by_v, inverse = (state.project(x) for x in (by_q, by_v, inverse))
     acceleration = state.velocities(data.ddq)
 
@@ -167,8 +171,10 @@ def _cancelling_terms(
     if row not in moving:
         return 0.0 if column in moving else _largest(speed[:6]) * steepness
     if column in moving:
+        # A unit of this velocity under the motion, and, where it turns, of the base's speed.
         nu = state.groups._asdict()[column]
-        return rate * _largest(1.0 / mobility[nu.start - state.nx : nu.stop - state.nx or None])
+        turning = rate * _largest(1.0 / mobility[nu.start - state.nx : nu.stop - state.nx or None])
+        return max(turning, _largest(speed[LINEAR] / mobility[LINEAR]) * (column != "v_b"))
     accelerations = np.abs(lin.f0[-len(mobility) :]) / mobility
     forces = np.abs(lin.u0) * mobility
     return steepness * (

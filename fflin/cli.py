@@ -257,7 +257,3 @@ def _add_point(command: argparse.ArgumentParser) -> None:
         help="axes of velocities and wrenches: angular in base axes and linear in reference axes "
         "(hybrid, default), both in base axes (local), both in reference axes (world)",
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -121,7 +121,7 @@ def _from_npz(path: Path) -> dict[str, Any]:
     from zipfile import BadZipFile
 
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             record = {key: file[key] for key in file.files}
     except BadZipFile as error:
         raise ValueError(str(error)) from None
@@ -144,7 +144,7 @@ def _from_mat(path: Path) -> dict[str, Any]:
     from scipy.io.matlab import MatReadError
 
     try:
-        raw = loadmat(path)
+        raw = loadmat(io.BytesIO(path.read_bytes()))
     except (MatReadError, NotImplementedError) as error:
         raise ValueError(str(error)) from None
     record: dict[str, Any] = {key: raw[key] for key in _MATRICES}

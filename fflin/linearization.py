@@ -29,8 +29,8 @@ class Linearizer:
 
     Elsewhere :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is differentiated in base axes as
     :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)` and carried to the chart and frame.
-    The dynamics do not depend on the base's linear velocity (Galilei), so they are evaluated
-    without it: an orbital speed costs no digits.
+    The dynamics do not depend on the base's position and linear velocity (Galilei), so they are
+    evaluated without them: an orbit costs no digits.
 
     Parameters
     ----------
@@ -142,20 +142,21 @@ class Linearizer:
         model, data = self.robot.model, self._data
         chart = _STANDING if self._own_reference else state.chart(q)
 
-        # In base axes, and without the base's linear velocity, on which nothing below depends.
+        # In base axes, and without the base's position and linear velocity: nothing below
+        # depends on them, and Pinocchio's derivatives lose digits to both.
         nu, force = state.velocities(v), u
         if chart is not _STANDING:
             force = u.copy()
             state.to_base(chart, force)
-        v_still = v.copy()
-        v_still[:3] = 0.0
+        q_still, v_still = q.copy(), v.copy()
+        q_still[:3] = v_still[:3] = 0.0
         B = np.zeros(self._shape_B)
         inverse = B[-nv:]
-        self._inertia.invert(q, inverse)
+        self._inertia.invert(q_still, inverse)
         M = self._inertia.matrix()
-        bias = state.forces(pin.nonLinearEffects(model, data, q, v_still))
+        bias = state.forces(pin.nonLinearEffects(model, data, q_still, v_still))
         c = inverse.dot(force - bias)
-        by_q, by_v, _ = pin.computeRNEADerivatives(model, data, q, v_still, state.spread(c))
+        by_q, by_v, _ = pin.computeRNEADerivatives(model, data, q_still, v_still, state.spread(c))
 
         A = self._A_rest.copy()
         self._set_kinematics(A, chart, nu)

@@ -316,7 +316,12 @@ def _lock(model: pin.Model, lock: Mapping[str, float | None] | Iterable[str]) ->
         value = values.get(name)
         if value is not None:
             _joint(model, model.getJointId(name)).place(q, number(f"lock '{name}'", value))
-    return pin.buildReducedModel(model, [model.getJointId(name) for name in names], q)
+    indices = [model.getJointId(name) for name in names]
+    for index in indices:
+        # Without a frame for the joint, which models built in code may lack, Pinocchio crashes.
+        if not model.existFrame(model.names[index], pin.FrameType.JOINT):
+            model.addJointFrame(index)
+    return pin.buildReducedModel(model, indices, q)
 
 
 def _joint(model: pin.Model, index: int) -> Joint:

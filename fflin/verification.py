@@ -13,7 +13,7 @@ from fflin.errors import InputError
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
 from fflin.reports import check_report
-from fflin.state import StateMap
+from fflin.state import ANGULAR, LINEAR, StateMap
 from fflin.validation import Array
 
 _EPS = float(np.finfo(float).eps)
@@ -181,11 +181,14 @@ def _differences(model: _Nonlinear, lin: LinearModel) -> tuple[Array, Array]:
     """Return A and B by central differences of the nonlinear model."""
     groups = model.state.groups
     nv = len(lin.M)
-    # The step keeps well inside the chart, whose edge |q_b| = 1 the model feels long before.
-    step = np.full(model.state.nx, 3e-3)
+    # Small against the angles over which accelerations change where light links line up.
+    step = np.full(model.state.nx, 2e-4)
+    # Well inside the chart, whose edge |q_b| = 1 the model feels long before.
     step[groups.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[groups.q_b]))
     # f is quadratic in the velocities and linear in the input: no truncation at any step.
-    step[-nv:] = 0.1
+    speed = np.abs(lin.x0[-nv:])
+    step[-nv:] = 0.1 * max(1.0, float(speed[ANGULAR].max()), float(speed[6:].max(initial=0.0)))
+    step[groups.v_b] = 0.1 * max(1.0, float(speed[LINEAR].max()))
     mobility = np.sqrt(np.abs(lin.B[-nv:].diagonal()))
     push = max(1.0, float(np.abs(lin.f0[-nv:] / mobility).max())) / mobility
     A = _jacobian(lambda x: model(x, lin.u0), lin.x0, step)
@@ -214,11 +217,13 @@ def _flow_error(model: _Nonlinear, lin: LinearModel) -> float:
     """How far f is from the rate of the state along motions of the robot.
 
     The motions pass the point with its own velocity and with a unit of each base velocity added.
+    They pass it at the reference's place: the step would drown in the digits of a distant one.
     """
     state = model.state
     worst = 0.0
     for unit in (None, *range(6)):
         x = lin.x0.copy()
+        x[state.groups.r_b] = 0.0
         if unit is not None:
             x[6 + state.robot.n + unit] += 1.0
         q, v, a = model.acceleration(x, lin.u0)

@@ -1,0 +1,191 @@
+"""The command line as a user runs it: in a process of its own."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import BUNDLED
+
+import fflin
+
+
+def run(*arguments, cwd=None, **environment):
+    """Run fflin; return exit code, stdout, stderr."""
+    done = subprocess.run(
+        [sys.executable, "-m", "fflin", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        env={**os.environ, **environment},
+        timeout=60,
+        check=False,
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+def refused(*arguments, cwd=None):
+    """Run what must be refused: exit 2, nothing on stdout, one line on stderr, which it returns."""
+    code, out, err = run(*arguments, cwd=cwd)
+    assert code == 2 and not out
+    assert err.startswith("fflin: error: ") and err.count("\n") == 1 and err.endswith("\n")
+    return err
+
+
+def test_robots_lists_all_with_n_mass_and_origin():
+    code, out, err = run("robots")
+    assert code == 0 and not err
+    rows = {line.split()[0]: line.split() for line in out.splitlines()}
+    assert set(fflin.list_robots()) <= set(rows)
+    assert rows["ets_vii"][1:4] == ["6", "2690.4", "fflin"]
+    assert rows["talos"][1] == "32" and rows["talos"][3] == "example-robot-data"
+
+
+def test_info_shows_tree_masses_and_limits():
+    code, out, err = run("info", "dual_arm")
+    assert code == 0 and not err
+    assert "8 joints, 28 states, 14 inputs" in out
+    lines = out.splitlines()
+    left, deeper = (next(x for x in lines if x.strip().startswith(n)) for n in ("left_1", "left_2"))
+    assert len(deeper) - len(deeper.lstrip()) == len(left) - len(left.lstrip()) + 2
+    assert "revolute" in left and "tool_left" in out
+    assert max(map(len, lines)) <= 80
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_check_exits_0_on_every_bundled_robot(name):
+    code, out, err = run("check", name, "--frame", "world", "--rpy", 20, -30, 160)
+    assert code == 0 and not err
+    assert "OK: 114 figures hold" in out
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_linearize_prints_readable_tables():
+    code, out, err = run("linearize", "ets_vii", "--joint", "joint_2=0.5")
+    assert code == 0 and not err
+    assert max(map(len, out.splitlines())) <= 80
+    assert "24 states, 12 inputs, frame hybrid, a fixed point" in out
+    assert "x0: q_m.joint_2 = 0.5 rad" in out
+    assert "\x1b" not in out  # plain where it is not a terminal
+    robot = fflin.load("ets_vii")
+    lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.5}))
+    row = next(x for x in out.splitlines() if x.startswith("omega_b.x") and "e-" in x)
+    assert f"{lin.B[12, 0]:.5g}" in row.split()
+
+
+def test_terminal_dims_zeros():
+    # `script` gives the command a terminal.
+    done = subprocess.run(
+        ["script", "-qec", f"{sys.executable} -m fflin linearize cubesat", "/dev/null"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "TERM": "xterm", "COLUMNS": "80"},
+        check=True,
+        stdin=subprocess.DEVNULL,
+    )
+    assert "\x1b[2m" in done.stdout
+
+
+@pytest.mark.parametrize("ending", [".npz", ".mat", ".json", ".csv"])
+def test_linearize_saves_what_python_gives(ending, tmp_path):
+    path = tmp_path / f"m{ending}"
+    options = (
+        "--joint",
+        "left_2=0.3",
+        "--frame",
+        "local",
+        "--lock",
+        "right_1=0.2",
+        "--lock",
+        "right_4",
+    )
+    code, out, err = run("linearize", "dual_arm", *options, "-o", path)
+    assert code == 0 and not err and "24 states, 12 inputs" in out
+    saved = fflin.LinearModel.load(path)
+    robot = fflin.load("dual_arm", lock={"right_1": 0.2, "right_4": None})
+    lin = fflin.linearize(robot, fflin.configuration(robot, {"left_2": 0.3}), frame="local")
+    assert (saved.B == lin.B).all() and saved.state_names == lin.state_names
+    assert saved.frame == "local" and saved.certificate == lin.certificate
+
+
+def test_reference_world_keeps_the_attitude_in_the_state(tmp_path):
+    path = tmp_path / "m.json"
+    options = ("--rpy", 90, 0, 0, "--position", 1, 2, 3)
+    run("linearize", "cubesat", *options, "--reference", "world", "-o", path)
+    x0 = json.loads(path.read_text())["x0"]
+    assert x0[:6] == pytest.approx([0.5**0.5, 0, 0, 1, 2, 3])
+    run("linearize", "cubesat", *options, "-o", path)
+    assert json.loads(path.read_text())["x0"][:6] == [0.0] * 6
+
+
+def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
+    output = tmp_path / "m.npz"
+    bad = tmp_path / "bad.urdf"
+    bad.write_text("<robot name='r'><link")
+    cases = {
+        ("linearize", "ets_vi", "-o", output): "no robot named 'ets_vi'; did you mean ets_vii",
+        ("linearize", bad, "-o", output): "bad.urdf:1: not well-formed",
+        ("linearize", tmp_path / "no.urdf", "-o", output): "no file at",
+        ("linearize", tmp_path, "-o", output): "a folder",
+        ("linearize", "ets_vii", "--joint", "joint_9=1", "-o", output): "no joint named 'joint_9'",
+        ("linearize", "ets_vii", "--joint", "joint_1=x", "-o", output): "'x' is not a number",
+        ("linearize", "ets_vii", "--joint", "joint_1", "-o", output): "'joint_1' is not NAME=VALUE",
+        ("linearize", "ets_vii", "--joint", "joint_1=nan", "-o", output): "not a finite number",
+        ("linearize", "ets_vii", "--frame", "body", "-o", output): "invalid choice: 'body'",
+        ("linearize", "ets_vii", "--lock", "tail", "-o", output): "no joint to lock named 'tail'",
+        ("linearize", "ets_vii", "-o", tmp_path / "m.xls"): "ends in '.xls'",
+        ("linearize", "ets_vii", "-o", tmp_path / "none" / "m.npz"): "cannot be written",
+        ("check", "romeo"): "cannot be inverted: joint 'LFinger",
+        ("check", "cubesat", "--rpy", 180, 0, 0, "--reference", "world"): "turned by 180 deg",
+        ("check",): "the following arguments are required: ROBOT",
+        ("dance",): "invalid choice: 'dance'",
+        (): "required",
+    }
+    for arguments, words in cases.items():
+        assert words in refused(*arguments)
+    assert sorted(tmp_path.iterdir()) == [bad]
+
+
+def test_existing_output_survives_a_failure(tmp_path):
+    output = tmp_path / "m.npz"
+    output.write_text("precious")
+    refused("linearize", "romeo", "-o", output)
+    assert output.read_text() == "precious"
+
+
+def test_check_exits_1_where_it_falls_short(monkeypatch, capsys):
+    """The exit code of a model that does not hold, by planting a wrong one."""
+    from dataclasses import replace
+
+    from fflin import cli, linearization
+
+    right = linearization.linearize
+    monkeypatch.setattr(
+        linearization, "linearize", lambda *a, **k: replace(lin := right(*a, **k), B=lin.B * 1.001)
+    )
+    assert cli.main(["check", "ets_vii"]) == 1
+    assert "FAILED" in capsys.readouterr().out
+
+
+def test_help_has_an_example_in_every_command():
+    code, out, _ = run("--help")
+    assert code == 0
+    for command in ("robots", "info", "linearize", "check"):
+        assert command in out
+        code, text, _ = run(command, "--help")
+        assert code == 0 and f"example: fflin {command}" in " ".join(text.split())
+    assert run("--version")[1] == f"fflin {fflin.__version__}\n"
+
+
+def test_closed_pipe_is_no_error():
+    command = f"{sys.executable} -m fflin linearize talos | head -n 1"
+    done = subprocess.run(
+        ["bash", "-c", command],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(__file__).parent,
+    )
+    assert done.stdout.startswith("talos") and not done.stderr

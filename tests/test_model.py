@@ -1,0 +1,172 @@
+"""Loading, locking and configuring robots, and what is refused."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from conftest import BUNDLED
+
+import fflin
+from fflin.robots import bundled_directory
+
+
+def free_flyer(*joints):
+    """A model of a free-flyer and one joint after the other."""
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
+    model.appendBodyToJoint(1, pin.Inertia.Random(), pin.SE3.Identity())
+    for index, joint in enumerate(joints):
+        parent = model.addJoint(index + 1, joint, pin.SE3.Random(), f"joint_{index}")
+        model.appendBodyToJoint(parent, pin.Inertia.Random(), pin.SE3.Random())
+    return model
+
+
+def test_bundled_names_come_first():
+    assert set(BUNDLED) == {
+        *("astrobee_arm", "canadarm2", "cubesat", "dual_arm"),
+        *("ets_vii", "planar_detumble", "servicer_7dof"),
+    }
+    assert fflin.list_robots()[: len(BUNDLED)] == BUNDLED
+    assert "talos" in fflin.list_robots()
+
+
+def test_name_and_path_give_the_same_robot():
+    by_name = fflin.load("ets_vii")
+    path = bundled_directory() / "ets_vii.urdf"
+    for by_path in (fflin.load(path), fflin.load(str(path))):
+        assert by_path.model == by_name.model
+        assert by_path.urdf_sha256 == by_name.urdf_sha256
+    assert by_name.n == 6 and by_name.joint_names == tuple(f"joint_{i}" for i in range(1, 7))
+    assert by_name.urdf == path
+    assert not by_name.model.gravity.linear.any()
+    assert by_name.mass == pytest.approx(2690.4)
+    assert repr(by_name) == "Robot('ets_vii', n=6, mass=2690.4 kg)"
+
+
+def test_example_robots_load_without_their_loaders_meshes():
+    robot = fflin.load("panda")
+    assert robot.model.joints[1].shortname() == "JointModelFreeFlyer"
+    assert robot.urdf.name == "panda.urdf"
+
+
+def test_configuration_places_joints_and_base():
+    robot = fflin.load("ets_vii")
+    base = pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.array([1.0, 2, 3]))
+    q = fflin.configuration(robot, {"joint_2": 4.0}, base)
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, q)
+    assert data.oMi[1].isApprox(base)
+    joint = robot.joint("joint_2")
+    assert q[joint.idx_q : joint.idx_q + 2] == pytest.approx([np.cos(4.0), np.sin(4.0)])
+    assert (fflin.configuration(robot) == pin.neutral(robot.model)).all()
+
+
+def test_locked_joints_are_welded():
+    robot = fflin.load("ets_vii")
+    locked = fflin.load("ets_vii", lock={"joint_2": 0.7, "joint_5": None})
+    assert locked.joint_names == ("joint_1", "joint_3", "joint_4", "joint_6")
+    assert locked.mass == pytest.approx(robot.mass)
+    full = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.7})).M
+    keep = [0, 1, 2, 3, 4, 5, 6, 8, 9, 11]
+    assert fflin.linearize(locked).M == pytest.approx(full[np.ix_(keep, keep)], rel=1e-12, abs=1e-9)
+    assert fflin.load("ets_vii", lock=["joint_1"]).n == 5
+    assert fflin.load("ets_vii", lock="joint_1").n == 5
+
+
+@pytest.mark.parametrize(
+    ("joint", "kind"),
+    [
+        (pin.JointModelSpherical(), "Spherical of 3"),
+        (pin.JointModelSphericalZYX(), "SphericalZYX of 3"),
+        (pin.JointModelPlanar(), "Planar of 3"),
+        (pin.JointModelFreeFlyer(), "FreeFlyer of 6"),
+        (pin.JointModelTranslation(), "Translation of 3"),
+    ],
+)
+def test_joints_of_more_freedom_are_refused_unless_locked(joint, kind):
+    model = free_flyer(pin.JointModelRX(), joint)
+    with pytest.raises(fflin.ModelError, match=f"joint 'joint_1' is a {kind}.*lock it"):
+        fflin.from_model(model)
+    robot = fflin.from_model(model, lock=["joint_1"])
+    assert robot.joint_names == ("joint_0",)
+    assert fflin.check(robot, fflin.linearize(robot)).ok
+
+
+def test_from_model_takes_a_copy():
+    model = free_flyer(pin.JointModelRX())
+    model.gravity.linear = np.array([0, 0, -9.81])
+    before = model.copy()
+    robot = fflin.from_model(model, name="mine")
+    assert robot.name == "mine" and robot.urdf is None
+    assert not robot.model.gravity.linear.any()
+    assert model == before
+
+
+def test_model_without_a_free_flyer_is_refused():
+    fixed = pin.Model()
+    fixed.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "joint")
+    with pytest.raises(fflin.ModelError, match="root joint is JointModelRX, expected"):
+        fflin.from_model(fixed)
+    with pytest.raises(fflin.ModelError, match="root joint is none"):
+        fflin.from_model(pin.Model())
+    two = free_flyer()
+    two.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "stray")
+    with pytest.raises(fflin.ModelError, match="'stray' hangs on the world"):
+        fflin.from_model(two)
+
+
+def test_joints_out_of_depth_first_order_are_refused():
+    model = free_flyer(pin.JointModelRX())
+    for parent, name in ((1, "other"), (2, "late")):
+        index = model.addJoint(parent, pin.JointModelRX(), pin.SE3.Random(), name)
+        model.appendBodyToJoint(index, pin.Inertia.Random(), pin.SE3.Random())
+    with pytest.raises(fflin.ModelError, match="depth-first"):
+        fflin.from_model(model)
+
+
+def test_too_large_a_robot_is_refused():
+    model = free_flyer(*[pin.JointModelRX() for _ in range(320)])
+    with pytest.raises(fflin.ModelError, match=r"320 joints.*1\.0 GiB.*lock"):
+        fflin.from_model(model)
+
+
+def test_unknown_names_list_the_near_ones():
+    with pytest.raises(
+        fflin.UnknownNameError, match="no robot named 'etsvii'; did you mean ets_vii"
+    ):
+        fflin.load("etsvii")
+    robot = fflin.load("ets_vii")
+    with pytest.raises(fflin.UnknownNameError, match=r"no joint named 'joint_7'.*joint_6"):
+        fflin.configuration(robot, {"joint_7": 1.0})
+    with pytest.raises(fflin.UnknownNameError, match="no joint to lock named 'panel'; there are"):
+        fflin.load("ets_vii", lock=["panel"])
+    with pytest.raises(fflin.InputError, match="joint 'joint_1' is nan"):
+        fflin.configuration(robot, {"joint_1": float("nan")})
+
+
+def test_unreadable_and_malformed_files(tmp_path: Path):
+    with pytest.raises(fflin.FileError, match="no file at"):
+        fflin.load(tmp_path / "none.urdf")
+    with pytest.raises(fflin.FileError, match="a folder"):
+        fflin.load(tmp_path)
+    for text, message in {
+        "": "no element found",
+        "<robot>": "not well-formed|no element found|unclosed",
+        "<model/>": "root element is <model>",
+        "<robot name='r'><link name='a'/><link name='b'/></robot>": "bad.urdf.*(root|link)",
+    }.items():
+        path = tmp_path / "bad.urdf"
+        path.write_text(text)
+        with pytest.raises(fflin.UrdfError, match=message):
+            fflin.load(path)
+
+
+def test_robot_is_picklable_for_workers():
+    robot = fflin.load("dual_arm")
+    again = pickle.loads(pickle.dumps(robot))
+    assert again.joint_names == robot.joint_names
+    assert (fflin.linearize(again).B == fflin.linearize(robot).B).all()
+    lin = pickle.loads(pickle.dumps(fflin.linearize(robot)))
+    assert lin.certificate.route_B < 1e-10

@@ -1,0 +1,38 @@
+"""The list of public names, and what an import pays for."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import fflin
+
+
+def imported_by(code: str) -> set[str]:
+    """Top-level modules that a new interpreter holds after running the code."""
+    code += "\nimport sys; print('\\n'.join(m for m in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return {name.split(".")[0] for name in done.stdout.split()}
+
+
+def test_every_public_name_resolves_and_is_documented():
+    for name in fflin.__all__:
+        assert getattr(fflin, name).__doc__, name
+    assert set(fflin.__all__) <= set(dir(fflin))
+    assert not hasattr(fflin, "nothing")
+
+
+def test_type_checkers_see_the_same_names():
+    tree = ast.parse(Path(fflin.__file__).read_text())
+    guarded = next(node for node in tree.body if isinstance(node, ast.If))
+    names = {alias.name for node in guarded.body for alias in node.names}
+    assert names == set(fflin.__all__)
+
+
+def test_import_pays_for_nothing_heavy():
+    heavy = {"scipy", "meshcat", "matplotlib", "control", "example_robot_data"}
+    assert not imported_by("import fflin") & (heavy | {"numpy", "pinocchio"})
+    main_job = "import fflin; fflin.check(r := fflin.load('ets_vii'), fflin.linearize(r))"
+    assert not imported_by(main_job) & heavy
+    help_text = "from fflin.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass"
+    assert not imported_by(help_text) & (heavy | {"numpy", "pinocchio"})
