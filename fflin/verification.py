@@ -135,7 +135,7 @@ def check(robot: Robot, lin: LinearModel) -> Check:
         Row("differences", f"{b.matrix}[{b.row}, {b.column}]", b.error, difference)
         for b in compare(state, lin, *_differences(model, lin))
     ]
-    rows.append(Row("flow", "f", _flow_error(model, lin), difference))
+    rows.append(Row("flow", "f", _flow_error(robot, lin), difference))
     rows.append(Row("point", "x0", _relative(lin.x0, state.to_state(q, v, near=lin.x0)), route))
     rows.append(Row("point", "f0", _relative(lin.f0, model(lin.x0, lin.u0)), route))
     rows.append(Row("inertia", "M M^-1 = E", inertia_residual(lin), route))
@@ -213,25 +213,27 @@ def _derivative(f: Callable[[float], Array]) -> Array:
     return np.tensordot(_WEIGHTS, differences, axes=1)
 
 
-def _flow_error(model: _Nonlinear, lin: LinearModel) -> float:
+def _flow_error(robot: Robot, lin: LinearModel) -> float:
     """How far f is from the rate of the state along motions of the robot.
 
     The motions pass the point with its own velocity and with a unit of each base velocity added.
-    They pass it at the reference's place: the step would drown in the digits of a distant one.
+    They pass it at the origin, since a step would drown in the digits of a distant place.
     """
-    state = model.state
+    turned = pin.SE3(lin.reference.rotation, np.zeros(3))
+    state = StateMap(robot, reference=turned, frame=lin.frame)
+    model = _Nonlinear(state)
     worst = 0.0
     for unit in (None, *range(6)):
         x = lin.x0.copy()
         x[state.groups.r_b] = 0.0
         if unit is not None:
-            x[6 + state.robot.n + unit] += 1.0
+            x[6 + robot.n + unit] += 1.0
         q, v, a = model.acceleration(x, lin.u0)
-        speed = 1.0 + float(np.abs(v).max())
-        h = 1e-2 * (1.0 - float(np.linalg.norm(x[state.groups.q_b]))) / speed
-
+        margin = 1.0 - float(np.linalg.norm(x[state.groups.q_b]))
+        h = 1e-2 * margin / (1.0 + float(np.abs(v[3:]).max()))
         rate = _derivative(partial(_moved, state, q, h * v, v, h * a)) / h
-        worst = max(worst, _relative(model(x, lin.u0), rate, floor=speed))
+        floor = 1.0 + float(np.abs(v).max())
+        worst = max(worst, _relative(model(x, lin.u0), rate, floor=floor))
     return worst
 
 
