@@ -55,7 +55,8 @@ def load_model(path: Path) -> LinearModel:
         nx, nu, ny = sizes.values()
         for key, shape in zip("ABCD", ((nx, nx), (nx, nu), (ny, nx), (ny, nu)), strict=True):
             arrays[key] = np.array(record[key], dtype=float).reshape(shape)
-        arrays["M"] = np.array(record["M"], dtype=float)
+        M = np.array(record["M"], dtype=float)
+        M.setflags(write=False)
         reference = arrays.pop("reference")
         named: dict[str, Any] = {key: tuple(record[key]) for key in _NAMES}
         named |= {key: str(record[key]) for key in _TEXTS} | arrays
@@ -63,6 +64,7 @@ def load_model(path: Path) -> LinearModel:
             **named,
             dt=float(record["dt"]),
             _reference=reference,
+            _inertia=partial(_given, M),
             _certify=partial(_given, Certificate(**record["certificate"])),
         )
     except OSError as error:
@@ -71,8 +73,8 @@ def load_model(path: Path) -> LinearModel:
         raise FileError(f"{path}: not a linear model saved by fflin ({error})") from None
 
 
-def _given(certificate: Certificate, _: LinearModel) -> Certificate:
-    return certificate
+def _given(value: Any, _: LinearModel) -> Any:
+    return value
 
 
 def check_format(path: Path) -> None:

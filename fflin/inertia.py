@@ -4,6 +4,8 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.errors import SingularInertiaError
+from fflin.linear_model import LinearModel
+from fflin.model import Robot
 from fflin.state import StateMap
 from fflin.validation import Array
 
@@ -11,6 +13,13 @@ from fflin.validation import Array
 # the rounding unit it is the relative error of (M^-1)_ii. Where the sum over the coordinates
 # passes this, less than two digits of M^-1 are left.
 _LARGEST_COUPLING = 1e-2 / float(np.finfo(float).eps)
+
+# Bound once: the look-up of a name in a module costs as much as a small matrix.
+_crba, _decompose, _compute_inverse = (
+    pin.crba,
+    pin.cholesky.decompose,
+    pin.cholesky.computeMinv,
+)
 
 
 class Inertia:
@@ -35,10 +44,6 @@ class Inertia:
         self._M = data.M.T
         self._diagonal = self._M.diagonal()
 
-    def matrix(self) -> Array:
-        """Return M (6 + n, 6 + n) at the configuration that was last inverted."""
-        return self._state.project(self._M)
-
     def invert(self, q: Array, out: Array) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array.
 
@@ -48,13 +53,24 @@ class Inertia:
             If a joint moves no mass, named.
         """
         model, data = self._model, self._data
-        pin.crba(model, data, q)
-        pin.cholesky.decompose(model, data)
-        inverse = pin.cholesky.computeMinv(model, data)
+        _crba(model, data, q)
+        _decompose(model, data)
+        inverse = _compute_inverse(model, data)
         # Written so that NaN, from a pivot that is zero or negative, fails too.
         if not self._diagonal.dot(inverse.diagonal()) < _LARGEST_COUPLING:
-            raise _singular(self._state, self.matrix())
+            raise _singular(self._state, self._state.project(self._M))
         self._state.project(inverse, out)
+
+
+def inertia_matrix(robot: Robot, lin: LinearModel) -> Array:
+    """Return M (6 + n, 6 + n) of a linear model, in state order and in the frame's axes."""
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    M = state.project(pin.crba(robot.model, robot.create_data(), lin.q))
+    chart = state.chart(lin.q)
+    state.to_frame(chart, M)
+    state.to_frame(chart, M.T)
+    M.setflags(write=False)
+    return M
 
 
 def _singular(state: StateMap, M: Array) -> SingularInertiaError:

@@ -60,8 +60,6 @@ class LinearModel:
         Nonlinear right-hand side at the point; zero exactly at a fixed point.
     x0, u0, y0 : ndarray
         State, input and output at the point.
-    M : ndarray (6 + n, 6 + n)
-        Joint-space inertia in state order (angular, linear, joints) and the frame's axes.
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
@@ -88,7 +86,6 @@ class LinearModel:
     x0: Array
     u0: Array
     y0: Array
-    M: Array
     dt: float
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
@@ -104,6 +101,7 @@ class LinearModel:
     fflin_version: str
     pinocchio_version: str
     _reference: Array = field()
+    _inertia: Callable[[LinearModel], Array] = field()
     _certify: Callable[[LinearModel], Certificate] = field()
 
     def __post_init__(self) -> None:
@@ -115,12 +113,11 @@ class LinearModel:
                 object.__setattr__(self, item.name, value)
 
     @classmethod
-    def _assemble(cls, common: dict[str, Any], point: dict[str, Any]) -> LinearModel:
+    def _from_fields(cls, values: dict[str, Any]) -> LinearModel:
         # The generated __init__ sets two dozen frozen fields one by one, which costs as much
         # as the dynamics of a small robot. The caller passes read-only arrays of its own.
         lin = object.__new__(cls)
-        lin.__dict__.update(common)
-        lin.__dict__.update(point)
+        object.__setattr__(lin, "__dict__", values)
         return lin
 
     def __repr__(self) -> str:
@@ -134,6 +131,11 @@ class LinearModel:
         import pinocchio as pin
 
         return pin.XYZQUATToSE3(self._reference)
+
+    @cached_property
+    def M(self) -> Array:
+        """Joint-space inertia (6 + n, 6 + n) in state order, angular first, and frame's axes."""
+        return self._inertia(self)
 
     @cached_property
     def certificate(self) -> Certificate:
@@ -186,7 +188,13 @@ class LinearModel:
             exponential = expm(block * dt)
             Ad, held = exponential[:nx, :nx], exponential[:nx, nx:]
         return replace(
-            self, A=Ad, B=held[:, :nu], f0=held[:, nu], dt=dt, _certify=partial(_same, self)
+            self,
+            A=Ad,
+            B=held[:, :nu],
+            f0=held[:, nu],
+            dt=dt,
+            _inertia=partial(_same, "M", self),
+            _certify=partial(_same, "certificate", self),
         )
 
     def to_scipy(self) -> Any:
@@ -249,5 +257,5 @@ class LinearModel:
         return load_model(Path(path))
 
 
-def _same(continuous: LinearModel, _: LinearModel) -> Certificate:
-    return continuous.certificate
+def _same(name: str, continuous: LinearModel, _: LinearModel) -> Any:
+    return getattr(continuous, name)

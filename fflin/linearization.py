@@ -8,7 +8,7 @@ import pinocchio as pin
 
 from fflin import __version__
 from fflin.certificate import certify
-from fflin.inertia import Inertia
+from fflin.inertia import Inertia, inertia_matrix
 from fflin.linear_model import LinearModel
 from fflin.model import ROOT, Robot
 from fflin.rotation import skew
@@ -71,11 +71,19 @@ class Linearizer:
         self._A_rest = _frozen(
             np.block([[np.zeros((nv, nv)), np.diag(self._rates)], [np.zeros((nv, nx))]])
         )
-        self._shape_B = (nx, nv)
-        self._q_m = self._map.groups.q_m
+        self._shape_B, self._lower = (nx, nv), slice(nv, nx)
+        self._q_m = self._map.groups.q_m if robot.n else None
         self._root_at_origin = robot.model.jointPlacements[ROOT].isIdentity(0.0)
         self._reference = _frozen(pin.SE3ToXYZQUAT(self._map.reference))
         self._common = self._common_fields()
+        self._at_rest_fields = self._common | {
+            "A": self._A_rest,
+            "f0": self._zero_x,
+            "x0": self._zero_x,
+            "y0": self._zero_x,
+            "u0": self._zero_u,
+            "v": self._zero_v,
+        }
 
     def __call__(
         self, q: Array | None = None, v: Array | None = None, u: Array | None = None
@@ -117,25 +125,18 @@ class Linearizer:
 
     def _at_rest(self, q: Array) -> LinearModel:
         B = np.zeros(self._shape_B)
-        self._inertia.invert(q, B[-self._nv :])
-        M = self._inertia.matrix()
-        x0 = np.zeros(self._map.nx)
-        x0[self._q_m] = self._map.joint_positions(q)
-        for array in (B, M, x0):
-            array.setflags(write=False)
-        point = {
-            "A": self._A_rest,
-            "B": B,
-            "M": M,
-            "f0": self._zero_x,
-            "x0": x0,
-            "y0": x0,
-            "u0": self._zero_u,
-            "q": q,
-            "v": self._zero_v,
-            "_reference": self._reference_of(q),
-        }
-        return LinearModel._assemble(self._common, point)
+        self._inertia.invert(q, B[self._lower])
+        B.setflags(write=False)
+        values = self._at_rest_fields.copy()
+        values["B"] = B
+        values["q"] = q
+        if self._q_m is not None:
+            x0 = np.zeros(self._map.nx)
+            x0[self._q_m] = self._map.joint_positions(q)
+            x0.setflags(write=False)
+            values["x0"] = values["y0"] = x0
+        values["_reference"] = q[:7] if self._root_at_origin else self._reference_of(q)
+        return LinearModel._from_fields(values)
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
         state, nv, groups = self._map, self._nv, self._map.groups
@@ -153,7 +154,6 @@ class Linearizer:
         B = np.zeros(self._shape_B)
         inverse = B[-nv:]
         self._inertia.invert(q_still, inverse)
-        M = self._inertia.matrix()
         bias = state.forces(pin.nonLinearEffects(model, data, q_still, v_still))
         c = inverse.dot(force - bias)
         by_q, by_v, _ = pin.computeRNEADerivatives(model, data, q_still, v_still, state.spread(c))
@@ -176,23 +176,13 @@ class Linearizer:
             x0 = state.to_state(q, v)
             f0[groups.q_b] = chart.Q @ f0[groups.q_b]
             f0[groups.r_b] = chart.R @ f0[groups.r_b]
-            for rows in (f0[nv:], lower, lower[:, -nv:].T, inverse, inverse.T, M, M.T):
+            for rows in (f0[nv:], lower, lower[:, -nv:].T, inverse, inverse.T):
                 state.to_frame(chart, rows)
-        for array in (A, B, M, f0, x0):
+        for array in (A, B, f0, x0):
             array.setflags(write=False)
-        point = {
-            "A": A,
-            "B": B,
-            "M": M,
-            "f0": f0,
-            "x0": x0,
-            "y0": x0,
-            "u0": u,
-            "q": q,
-            "v": v,
-            "_reference": self._reference_of(q),
-        }
-        return LinearModel._assemble(self._common, point)
+        point = {"A": A, "B": B, "f0": f0, "x0": x0, "y0": x0, "u0": u, "q": q, "v": v}
+        point["_reference"] = self._reference_of(q)
+        return LinearModel._from_fields(self._common | point)
 
     def _set_turning(
         self, lower: Array, chart: Chart, nu: Array, force: Array, c: Array, inverse: Array
@@ -263,6 +253,7 @@ class Linearizer:
             "urdf_sha256": robot.urdf_sha256,
             "fflin_version": __version__,
             "pinocchio_version": pin.__version__,
+            "_inertia": partial(inertia_matrix, robot),
             "_certify": partial(certify, robot),
         }
 

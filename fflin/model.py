@@ -98,8 +98,8 @@ class Robot:
         return int(self.model.nv)
 
     @cached_property
-    def _unbounded(self) -> tuple[tuple[int, str], ...]:
-        return tuple((joint.idx_q, joint.name) for joint in self.joints if joint.unbounded)
+    def _unbounded(self) -> tuple[int, ...]:
+        return tuple(joint.idx_q for joint in self.joints if joint.unbounded)
 
     @property
     def mass(self) -> float:
@@ -137,17 +137,18 @@ class Robot:
         """
         q = vector("q", q, self.nq, "a configuration in Pinocchio's order")
         entries = q.tolist()
-        x, y, z, w = entries[3:7]
+        _, _, _, x, y, z, w, *_ = entries
         worst = abs(x * x + y * y + z * z + w * w - 1.0)
         if worst > NORM_TOLERANCE:
             raise InputError(
                 f"the base quaternion q[3:7] has length {np.linalg.norm(q[3:7]):.9g}, expected 1; "
                 "normalise it (x, y, z, w)"
             )
-        for index, name in self._unbounded:
+        for index in self._unbounded:
             c, s = entries[index], entries[index + 1]
             excess = abs(c * c + s * s - 1.0)
             if excess > NORM_TOLERANCE:
+                name = next(joint.name for joint in self.joints if joint.idx_q == index)
                 raise InputError(
                     f"(cos, sin) of continuous joint '{name}', q[{index}:{index + 2}], has length "
                     f"{np.hypot(c, s):.9g}, expected 1"

@@ -6,11 +6,15 @@ import numpy as np
 
 from fflin.validation import Array
 
+# Row 3 i + j holds the entry (i, j) of [a]x as a linear function of a.
+_CROSS = np.zeros((9, 3))
+_CROSS[[7, 2, 3], [0, 1, 2]] = 1.0
+_CROSS[[5, 6, 1], [0, 1, 2]] = -1.0
+
 
 def skew(a: Array) -> Array:
     """Return [a]x (3, 3), with ``[a]x b = a x b``."""
-    x, y, z = a.tolist()
-    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+    return _CROSS.dot(a).reshape(3, 3)
 
 
 def quaternion_product(a: Array, b: Array) -> Array:

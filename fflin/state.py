@@ -145,10 +145,10 @@ class StateMap:
         # Index in Pinocchio's v of each velocity of the state, and in a flat (nv, nv) array.
         self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
         self._flat = self._order[:, None] * robot.nv + self._order
-        self._flat_transposed = np.ascontiguousarray(self._flat.T)
         self._idx_q = np.array([joint.idx_q for joint in joints], dtype=np.intp)
         self._unbounded = np.flatnonzero([joint.unbounded for joint in joints])
         self._cos = self._idx_q[self._unbounded]
+        self._sin = self._cos + 1
         # The free-flyer joint may itself stand somewhere in the world.
         oMref = pin.SE3(reference) if reference is not None else pin.SE3.Identity()
         self._reference = oMref
@@ -260,7 +260,7 @@ class StateMap:
         angles = x[g.q_m]
         q[self._idx_q] = angles
         q[self._cos] = np.cos(angles[self._unbounded])
-        q[self._cos + 1] = np.sin(angles[self._unbounded])
+        q[self._sin] = np.sin(angles[self._unbounded])
         nu = x[6 + self.robot.n :].copy()
         self.to_base(Chart(q_b, float(relative[3]), rotation_matrix(relative)), nu)
         return q, self.spread(nu)
@@ -282,9 +282,7 @@ class StateMap:
     def project(self, matrix: Array, out: Array | None = None) -> Array:
         """Take a matrix (nv, nv) over Pinocchio's v to state order."""
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
-        if matrix.flags.c_contiguous:
-            return matrix.take(self._flat, out=out, mode="clip")
-        return matrix.T.take(self._flat_transposed, out=out, mode="clip")
+        return matrix.take(self._flat, out=out, mode="clip")
 
     def to_frame(self, chart: Chart, vectors: Array) -> None:
         """Turn velocities or wrenches (6 + n, ...) in place from base axes to the frame's."""
@@ -300,9 +298,9 @@ class StateMap:
 
     def joint_positions(self, q: Array) -> Array:
         """Return q_m (n,), one angle or length a joint, of a valid configuration."""
-        angles = q[self._idx_q]
+        angles = q.take(self._idx_q)
         if self._cos.size:
-            angles[self._unbounded] = np.arctan2(q[self._cos + 1], q[self._cos])
+            angles[self._unbounded] = np.arctan2(q.take(self._sin), q.take(self._cos))
         return angles
 
     def _unwrap(self, x: Array, near: Array) -> None:

@@ -35,18 +35,20 @@ def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
     Returns
     -------
     ndarray (size,)
-        The caller's own array where it already is a native contiguous float vector.
+        The caller's own array where it already is a native float vector.
 
     Raises
     ------
     InputError
         If the shape is another, an entry is masked, complex or not finite.
     """
-    array: NDArray[Any] = value if type(value) is np.ndarray else _as_array(name, value)
-    if array.dtype is not _DOUBLE or not array.flags.c_contiguous:
-        array = _as_double(name, array)
+    if type(value) is np.ndarray and value.dtype is _DOUBLE:
+        array: Array = value
+    else:
+        array = _as_double(name, value)
     if array.shape != (size,):
         raise InputError(f"{name} has shape {array.shape}, expected ({size},): {of_what}")
+    # The square is finite where every entry is, but for numbers beyond 1e154.
     if not math.isfinite(array.dot(array)) and not np.isfinite(array).all():
         index = int(np.flatnonzero(~np.isfinite(array))[0])
         raise InputError(f"{name}[{index}] is {array[index]}; every entry must be finite")
@@ -64,16 +66,13 @@ def number(name: str, value: Any) -> float:
     return result
 
 
-def _as_array(name: str, value: ArrayLike) -> NDArray[Any]:
+def _as_double(name: str, value: ArrayLike) -> Array:
     if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
         raise InputError(f"{name} has masked entries; fill them first")
     try:
-        return np.asarray(value)
+        array = np.asarray(value)
     except ValueError:
         raise InputError(f"{name} is not an array: its rows differ in length") from None
-
-
-def _as_double(name: str, array: NDArray[Any]) -> Array:
     if array.dtype.kind not in "fiu":
         raise InputError(f"{name} holds {array.dtype} values, expected real numbers")
-    return np.ascontiguousarray(array, dtype=np.float64)
+    return array.astype(np.float64)
