@@ -11,6 +11,7 @@ _PUBLIC = {
     "ChartError": "errors",
     "Check": "verification",
     "FflinError": "errors",
+    "FflinWarning": "errors",
     "FileError": "errors",
     "InputError": "errors",
     "LinearModel": "linear_model",
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from fflin.errors import (
         ChartError,
         FflinError,
+        FflinWarning,
         FileError,
         InputError,
         MissingPackageError,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from fflin import __version__
-from fflin.errors import FflinError
+from fflin.errors import FflinError, FflinWarning
 
 if TYPE_CHECKING:
     from fflin.linear_model import LinearModel
@@ -63,7 +63,10 @@ def _robots(_: argparse.Namespace) -> int:
     entries: list[tuple[str, Robot | str, str]] = []
     for name in list_robots():
         try:
-            entries.append((name, load(name), find_robot(name).origin))
+            with warnings.catch_warnings():
+                # `fflin info` shows them, robot by robot.
+                warnings.simplefilter("ignore", FflinWarning)
+                entries.append((name, load(name), find_robot(name).origin))
         except FflinError as error:
             entries.append((name, str(error), find_robot(name).origin))
     print(robot_list(entries))

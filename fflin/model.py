@@ -1,16 +1,18 @@
 """The robot that every other call speaks of: a free-flyer root and n one-degree joints."""
 
+import warnings
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import InputError, ModelError, unknown
+from fflin.errors import FflinWarning, InputError, ModelError, unknown
 from fflin.reader import read_urdf
 from fflin.robots import find_robot
+from fflin.urdf_joints import Mimic
 from fflin.validation import NORM_TOLERANCE, Array, number, vector
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
@@ -65,6 +67,10 @@ class Robot:
         Hash of that file; empty where there is none.
     joints : tuple of Joint
         The n independent joints in state order, which is Pinocchio's.
+    notes : tuple of str
+        What was warned of when it was read.
+    mimics : mapping
+        {joint: Mimic} of the joints that follow another.
     """
 
     model: pin.Model
@@ -72,6 +78,8 @@ class Robot:
     urdf: Path | None
     urdf_sha256: str
     joints: tuple[Joint, ...]
+    notes: tuple[str, ...] = ()
+    mimics: Mapping[str, Mimic] = field(default_factory=dict)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -181,12 +189,22 @@ def load(
         If there is no such robot or joint to lock.
     FileError, UrdfError
         If the file cannot be read or is malformed.
+    MissingPackageError
+        If it is a xacro and the package that expands it is not installed.
     ModelError
         If a joint has more than one degree of freedom.
+
+    Warns
+    -----
+    FflinWarning
+        Of what the file holds and the model does not, and of what cannot be quite right in it.
     """
     found = find_robot(robot)
-    model, sha256 = read_urdf(found.path, found.prune)
-    return _robot(model, found.name, found.path, sha256, lock)
+    description = read_urdf(found.path, found.prune)
+    loaded = _robot(description.model, found.name, found.path, description.sha256, lock)
+    for note in description.notes:
+        warnings.warn(note, FflinWarning, stacklevel=2)
+    return replace(loaded, notes=description.notes, mimics=description.mimics)
 
 
 def from_model(
