@@ -11,7 +11,10 @@ from fflin.urdf_links import Link, read_link, refuse_near_miss
 from fflin.xml_tree import Element, enumerated, quoted
 
 # urdfdom and Pinocchio's parser recurse along the tree, about 2.5 kB of stack for each link.
-DEPTH_LIMIT = 1_000
+_DEPTH_LIMIT = 1_000
+
+# Pinocchio's time grows with the square of their number; these take some seconds.
+_LINK_LIMIT = 10_000
 
 # These hold <link> and <joint> elements of their own, which are not the robot's.
 _FOREIGN = frozenset({"gazebo", "transmission", "ros2_control", "group"})
@@ -65,6 +68,8 @@ def read_description(root: Element, prune: Collection[str] = ()) -> Urdf:
         link = read_link(element)
         _check_new("link", element, link.name, links.get(link.name))
         links[link.name] = link
+    if len(links) > _LINK_LIMIT:
+        raise root.error(f"<robot> has {len(links)} links; at most {_LINK_LIMIT} are read")
     if not links:
         raise root.error("<robot> has no <link>; add one")
     joints: dict[str, JointElement] = {}
@@ -168,9 +173,9 @@ def _check_tree(
             "nothing; correct a parent or child in it"
         )
     deepest = max(depths, key=depths.__getitem__)
-    if depths[deepest] > DEPTH_LIMIT:
+    if depths[deepest] > _DEPTH_LIMIT:
         raise root.error(
-            f"link {quoted(deepest)} stands {depths[deepest]} links deep; at most {DEPTH_LIMIT} "
+            f"link {quoted(deepest)} stands {depths[deepest]} links deep; at most {_DEPTH_LIMIT} "
             "are read; join links that are fixed to each other"
         )
     return depths
