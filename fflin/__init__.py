@@ -11,6 +11,7 @@ _PUBLIC = {
     "ChartError": "errors",
     "Check": "verification",
     "FflinError": "errors",
+    "FflinWarning": "errors",
     "FileError": "errors",
     "InputError": "errors",
     "LinearModel": "linear_model",
@@ -24,10 +25,10 @@ _PUBLIC = {
     "UrdfError": "errors",
     "check": "verification",
     "configuration": "model",
-    "from_model": "model",
+    "from_model": "loading",
     "linearize": "linearization",
     "list_robots": "robots",
-    "load": "model",
+    "load": "loading",
 }
 
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from fflin.errors import (
         ChartError,
         FflinError,
+        FflinWarning,
         FileError,
         InputError,
         MissingPackageError,
@@ -46,7 +48,8 @@ if TYPE_CHECKING:
     )
     from fflin.linear_model import LinearModel
     from fflin.linearization import Linearizer, linearize
-    from fflin.model import Robot, configuration, from_model, load
+    from fflin.loading import from_model, load
+    from fflin.model import Robot, configuration
     from fflin.robots import list_robots
     from fflin.state import StateMap
     from fflin.verification import Check, check

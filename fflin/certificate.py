@@ -77,14 +77,11 @@ def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Arr
     chart, g, nv = state.chart(q), state.groups, 6 + state.robot.n
     nu, force = state.velocities(v), u.copy()
     state.to_base(chart, force)
-    tau = state.spread(force)
     # Pinocchio differentiates in world axes at the world's origin, where a distant base costs
     # digits; nothing depends on where the base is.
     at_origin = q.copy()
     at_origin[:3] = 0.0
-    by_q, by_v, inverse = pin.computeABADerivatives(model, data, at_origin, v, tau)
-    by_q, by_v, inverse = (state.project(x) for x in (by_q, by_v, inverse))
-    acceleration = state.velocities(data.ddq)
+    by_q, by_v, inverse, acceleration = _aba_derivatives(state, data, at_origin, v, force)
 
     J, R = chart.J, chart.R
     A: Array = np.zeros((state.nx, state.nx))
@@ -109,6 +106,33 @@ def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Arr
             A[:, g.q_b] += B[:, columns] @ skew(force[columns]) @ J
             B[:, columns] = B[:, columns] @ R.T
     return A, B
+
+
+def _aba_derivatives(
+    state: StateMap, data: pin.Data, q: Array, v: Array, force: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return d(nudot)/d(q, nu, force) and nudot in state order and base axes."""
+    model = state.robot.model
+    tau = state.lift(force)
+    if state.S is None:
+        derivatives = pin.computeABADerivatives(model, data, q, v, tau)
+        by_q, by_v, inverse = (state.project(x) for x in derivatives)
+        return by_q, by_v, inverse, state.velocities(data.ddq)
+    # The forces that keep mimic joints in step do no work: S^T takes them out of M a = tau - b.
+    # They are added to tau, and M is what ABA's own inverse implies.
+    S: Array = state.S
+    M = np.linalg.inv(_symmetric(pin.computeMinverse(model, data, q)))
+    to_independent = np.linalg.solve(S.T @ M @ S, S.T @ M)
+    free = pin.aba(model, data, q, v, tau)
+    acceleration = to_independent @ free
+    in_step = tau + M @ (S @ acceleration - free)
+    by_q, by_v, _ = pin.computeABADerivatives(model, data, q, v, in_step)
+    inverse = np.linalg.inv(S.T @ M @ S)
+    return to_independent @ by_q @ S, to_independent @ by_v @ S, inverse, acceleration
+
+
+def _symmetric(upper: Array) -> Array:
+    return np.triu(upper) + np.triu(upper, 1).T
 
 
 def _change_of_coordinates(

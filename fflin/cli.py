@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from fflin import __version__
-from fflin.errors import FflinError
+from fflin.errors import FflinError, FflinWarning
 
 if TYPE_CHECKING:
     from fflin.linear_model import LinearModel
@@ -56,14 +56,17 @@ def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
 
 
 def _robots(_: argparse.Namespace) -> int:
-    from fflin.model import load
+    from fflin.loading import load
     from fflin.reports import robot_list
     from fflin.robots import find_robot, list_robots
 
     entries: list[tuple[str, Robot | str, str]] = []
     for name in list_robots():
         try:
-            entries.append((name, load(name), find_robot(name).origin))
+            with warnings.catch_warnings():
+                # `fflin info` shows them, robot by robot.
+                warnings.simplefilter("ignore", FflinWarning)
+                entries.append((name, load(name), find_robot(name).origin))
         except FflinError as error:
             entries.append((name, str(error), find_robot(name).origin))
     print(robot_list(entries))
@@ -103,7 +106,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _load(arguments: argparse.Namespace) -> Robot:
-    from fflin.model import load
+    from fflin.loading import load
 
     return load(arguments.robot, lock=dict(arguments.lock))
 

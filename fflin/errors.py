@@ -39,6 +39,10 @@ class MissingPackageError(FflinError, ImportError):
     """An optional package is needed and not installed."""
 
 
+class FflinWarning(UserWarning):
+    """Something about a robot that its user should know and that is no error."""
+
+
 def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     """Build the error for a name that does not exist, with the names that are near."""
     import difflib

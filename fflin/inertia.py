@@ -43,6 +43,7 @@ class Inertia:
         # A view, since Pinocchio overwrites M in place; transposed, it is C-contiguous.
         self._M = data.M.T
         self._diagonal = self._M.diagonal()
+        self._constrained = bool(state.robot.followers)
 
     def invert(self, q: Array, out: Array) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array.
@@ -54,6 +55,9 @@ class Inertia:
         """
         model, data = self._model, self._data
         _crba(model, data, q)
+        if self._constrained:
+            self._invert_projected(out)
+            return
         _decompose(model, data)
         inverse = _compute_inverse(model, data)
         # Written so that NaN, from a pivot that is zero or negative, fails too.
@@ -61,11 +65,22 @@ class Inertia:
             raise _singular(self._state, self._state.project(self._M))
         self._state.project(inverse, out)
 
+    def _invert_projected(self, out: Array) -> None:
+        """Invert S^T M S, which is dense, where joints mimic others."""
+        from scipy.linalg.lapack import dpotrf, dpotri
+
+        M = self._state.project(self._M)
+        factor, failed = dpotrf(M)
+        upper = np.full_like(M, np.nan) if failed else dpotri(factor)[0]
+        np.copyto(out, np.triu(upper) + np.triu(upper, 1).T)
+        if not M.diagonal().dot(out.diagonal()) < _LARGEST_COUPLING:
+            raise _singular(self._state, M)
+
 
 def inertia_matrix(robot: Robot, lin: LinearModel) -> Array:
     """Return M (6 + n, 6 + n) of a linear model, in state order and in the frame's axes."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    M = state.project(pin.crba(robot.model, robot.create_data(), lin.q))
+    M = state.project(pin.crba(robot.model, robot.create_data(), lin.q).T)
     chart = state.chart(lin.q)
     state.to_frame(chart, M)
     state.to_frame(chart, M.T)

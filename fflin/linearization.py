@@ -113,12 +113,12 @@ class Linearizer:
             If a joint moves no mass.
         """
         robot = self.robot
-        q = pin.neutral(robot.model) if q is None else robot.checked_configuration(q).copy()
+        q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
         q.setflags(write=False)
         if v is None and u is None and self._own_reference:
             return self._at_rest(q)
         if v is not None:
-            v = _frozen(vector("v", v, robot.nv, "a velocity in Pinocchio's order").copy())
+            v = _frozen(robot.checked_velocity(v).copy())
         if u is not None:
             u = _frozen(vector("u", u, self._nv, "an input (tau_b, F_b, tau_m)").copy())
         return self._anywhere(q, self._zero_v if v is None else v, self._zero_u if u is None else u)

@@ -1,6 +1,6 @@
 """The robot that every other call speaks of: a free-flyer root and n one-degree joints."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,14 +10,12 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.errors import InputError, ModelError, unknown
-from fflin.reader import read_urdf
-from fflin.robots import find_robot
 from fflin.validation import NORM_TOLERANCE, Array, number, vector
+
+ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
 # What renormalising a unit quaternion leaves: two ulp of unity.
 _ROUND_OFF = 2.0 * float(np.finfo(float).eps)
-
-ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
 # Data holds a third-order tensor of nv^3 entries among others: about 32 nv^3 bytes in all.
 _DATA_BYTES_PER_NV3 = 32
@@ -25,7 +23,7 @@ _DATA_LIMIT = 2**30
 
 
 class Joint(NamedTuple):
-    """One independent joint of one degree of freedom.
+    """One joint of one degree of freedom.
 
     Attributes
     ----------
@@ -52,6 +50,21 @@ class Joint(NamedTuple):
         else:
             q[self.idx_q] = value
 
+    def value(self, q: Array) -> float:
+        """Return this joint's angle [rad], of a continuous joint in (-pi, pi], or length [m]."""
+        if self.unbounded:
+            return float(np.arctan2(q[self.idx_q + 1], q[self.idx_q]))
+        return float(q[self.idx_q])
+
+
+class Follower(NamedTuple):
+    """A joint that mimics an independent one: value = multiplier * leader's value + offset."""
+
+    joint: Joint
+    leader: Joint
+    multiplier: float
+    offset: float
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Robot:
@@ -60,7 +73,7 @@ class Robot:
     Attributes
     ----------
     model : pin.Model
-        Free-flyer root joint, zero gravity.
+        Free-flyer root joint, zero gravity; its mimic joints are joints like the others.
     name : str
         Name or file stem it was loaded by.
     urdf : Path or None
@@ -69,6 +82,10 @@ class Robot:
         Hash of that file; empty where there is none.
     joints : tuple of Joint
         The n independent joints in state order, which is Pinocchio's.
+    followers : tuple of Follower
+        The mimic joints, each with the independent joint that it follows.
+    notes : tuple of str
+        What was warned of when it was read.
     """
 
     model: pin.Model
@@ -76,6 +93,8 @@ class Robot:
     urdf: Path | None
     urdf_sha256: str
     joints: tuple[Joint, ...]
+    followers: tuple[Follower, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -94,12 +113,8 @@ class Robot:
 
     @cached_property
     def nv(self) -> int:
-        """Size of Pinocchio's velocity, 6 + n."""
+        """Size of Pinocchio's velocity: 6 + n, and one for each mimic joint."""
         return int(self.model.nv)
-
-    @cached_property
-    def _unbounded(self) -> tuple[int, ...]:
-        return tuple(joint.idx_q for joint in self.joints if joint.unbounded)
 
     @property
     def mass(self) -> float:
@@ -110,11 +125,33 @@ class Robot:
         return f"Robot('{self.name}', n={self.n}, mass={self.mass:.6g} kg)"
 
     def joint(self, name: str) -> Joint:
-        """Return the joint of that name, or raise `UnknownNameError` with the near names."""
+        """Return the independent joint of that name.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is none; the message has the near names, or the leader of a mimic joint.
+        """
         for joint in self.joints:
             if joint.name == name:
                 return joint
+        for follower in self.followers:
+            if follower.joint.name == name:
+                raise InputError(
+                    f"joint '{name}' mimics '{follower.leader.name}'; place that one instead"
+                )
         raise unknown("joint", name, self.joint_names)
+
+    def neutral(self) -> Array:
+        """Return the neutral configuration (nq,): mimic joints where their leaders put them."""
+        q = pin.neutral(self.model)
+        self.follow(q)
+        return q
+
+    def follow(self, q: Array) -> None:
+        """Put the mimic joints of a configuration where their leaders say."""
+        for joint, leader, multiplier, offset in self.followers:
+            joint.place(q, multiplier * leader.value(q) + offset)
 
     def checked_configuration(self, q: Array) -> Array:
         """Return `q` as a valid configuration of this robot.
@@ -122,8 +159,8 @@ class Robot:
         Parameters
         ----------
         q : array_like (nq,)
-            Configuration in Pinocchio's order. Its quaternion, and the (cos, sin) of every
-            continuous joint, are renormalised where they are within 1e-6 of unit length.
+            Configuration in Pinocchio's order. Its quaternion, the (cos, sin) of every continuous
+            joint and the mimic joints are put right where they are within 1e-6.
 
         Returns
         -------
@@ -133,11 +170,12 @@ class Robot:
         Raises
         ------
         InputError
-            If the size is wrong, an entry is not finite, or a part is not of unit length.
+            If the size is wrong, an entry is not finite, a part is not of unit length, or a mimic
+            joint is not where its leader puts it.
         """
         q = vector("q", q, self.nq, "a configuration in Pinocchio's order")
         entries = q.tolist()
-        _, _, _, x, y, z, w, *_ = entries
+        x, y, z, w = entries[3:7]
         worst = abs(x * x + y * y + z * z + w * w - 1.0)
         if worst > NORM_TOLERANCE:
             raise InputError(
@@ -148,13 +186,33 @@ class Robot:
             c, s = entries[index], entries[index + 1]
             excess = abs(c * c + s * s - 1.0)
             if excess > NORM_TOLERANCE:
-                name = next(joint.name for joint in self.joints if joint.idx_q == index)
                 raise InputError(
-                    f"(cos, sin) of continuous joint '{name}', q[{index}:{index + 2}], has length "
-                    f"{np.hypot(c, s):.9g}, expected 1"
+                    f"(cos, sin) of continuous joint '{self._unbounded[index]}', "
+                    f"q[{index}:{index + 2}], has length {np.hypot(c, s):.9g}, expected 1"
                 )
             worst = max(worst, excess)
-        return q if worst <= _ROUND_OFF else pin.normalize(self.model, q)
+        if worst > _ROUND_OFF:
+            q = pin.normalize(self.model, q)
+        return self._followed(q) if self.followers else q
+
+    def checked_velocity(self, v: Array) -> Array:
+        """Return `v` as a valid velocity (nv,), never modified.
+
+        Raises
+        ------
+        InputError
+            If the size is wrong, an entry is not finite, or a mimic joint does not move as its
+            leader makes it.
+        """
+        v = vector("v", v, self.nv, "a velocity in Pinocchio's order")
+        for joint, leader, multiplier, _ in self.followers:
+            expected = multiplier * v[leader.idx_v]
+            if abs(v[joint.idx_v] - expected) > NORM_TOLERANCE * max(1.0, abs(expected)):
+                raise InputError(
+                    f"v[{joint.idx_v}] of joint '{joint.name}' is {v[joint.idx_v]:.9g}, but it "
+                    f"mimics '{leader.name}', which makes it {expected:.9g}"
+                )
+        return v
 
     def create_data(self) -> pin.Data:
         """Make Pinocchio's work space for this robot.
@@ -164,7 +222,7 @@ class Robot:
         ModelError
             If it would take more than 1 GiB.
         """
-        size = _DATA_BYTES_PER_NV3 * self.model.nv**3
+        size = _DATA_BYTES_PER_NV3 * self.nv**3
         if size > _DATA_LIMIT:
             raise ModelError(
                 f"'{self.name}' has {self.n} joints, for which Pinocchio's Data takes about "
@@ -172,69 +230,24 @@ class Robot:
             )
         return self.model.createData()
 
+    @cached_property
+    def _unbounded(self) -> dict[int, str]:
+        joints = (*self.joints, *(follower.joint for follower in self.followers))
+        return {joint.idx_q: joint.name for joint in joints if joint.unbounded}
 
-def load(
-    robot: str | Path,
-    *,
-    lock: Mapping[str, float | None] | Iterable[str] | None = None,
-) -> Robot:
-    """Load a robot as a free flyer in zero gravity.
-
-    Parameters
-    ----------
-    robot : str or Path
-        Bundled name, example-robot-data name, or path to a URDF. No mesh is loaded.
-    lock : mapping or iterable of str, optional
-        {joint: value [rad|m]} welded at that value (None: at neutral), or names.
-
-    Returns
-    -------
-    Robot
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such robot or joint to lock.
-    FileError, UrdfError
-        If the file cannot be read or is malformed.
-    ModelError
-        If a joint has more than one degree of freedom.
-    """
-    found = find_robot(robot)
-    model, sha256 = read_urdf(found.path, found.prune)
-    return _robot(model, found.name, found.path, sha256, lock)
-
-
-def from_model(
-    model: pin.Model,
-    *,
-    name: str | None = None,
-    lock: Mapping[str, float | None] | Iterable[str] | None = None,
-) -> Robot:
-    """Take a Pinocchio model built by other means (MJCF, SDF, code).
-
-    Parameters
-    ----------
-    model : pin.Model
-        Model whose one root joint is a free-flyer. It is copied; gravity of the copy is zero.
-    name : str, optional
-        Name of the robot; the model's own by default.
-    lock : mapping or iterable of str, optional
-        As in `load`.
-
-    Returns
-    -------
-    Robot
-
-    Raises
-    ------
-    ModelError
-        If the root is not one free-flyer, a joint has more than one degree of freedom, or the
-        joints are not in depth-first order, in which CRBA would be silently wrong.
-    """
-    copy = model.copy()
-    copy.gravity.setZero()
-    return _robot(copy, name or model.name or "model", None, "", lock)
+    def _followed(self, q: Array) -> Array:
+        followed = q.copy()
+        self.follow(followed)
+        for joint, leader, *_ in self.followers:
+            part = slice(joint.idx_q, joint.idx_q + 1 + joint.unbounded)
+            error = np.abs(followed[part] - q[part]).max()
+            if error > NORM_TOLERANCE * max(1.0, np.abs(followed[part]).max()):
+                raise InputError(
+                    f"joint '{joint.name}' is at {joint.value(q):.9g}, but it mimics "
+                    f"'{leader.name}', which puts it at {joint.value(followed):.9g}; "
+                    "`configuration` places mimic joints"
+                )
+        return followed
 
 
 def configuration(
@@ -248,7 +261,7 @@ def configuration(
     ----------
     robot : Robot
     joints : mapping, optional
-        {joint: value [rad|m]}; the others stay at neutral.
+        {joint: value [rad|m]} of independent joints; the others stay at neutral.
     base : pin.SE3, optional
         Placement of the base in the world; the identity by default.
 
@@ -261,77 +274,14 @@ def configuration(
     UnknownNameError
         If there is no such joint.
     InputError
-        If a value is not a finite number.
+        If a value is not a finite number, or a joint mimics another.
     """
     q = pin.neutral(robot.model)
     if base is not None:
+        if not isinstance(base, pin.SE3):
+            raise InputError(f"base is a {type(base).__name__}, expected a pin.SE3")
         q[:7] = pin.SE3ToXYZQUAT(robot.model.jointPlacements[ROOT].actInv(base))
     for name, value in (joints or {}).items():
         robot.joint(name).place(q, number(f"joint '{name}'", value))
+    robot.follow(q)
     return robot.checked_configuration(q)
-
-
-def _robot(
-    model: pin.Model,
-    name: str,
-    urdf: Path | None,
-    sha256: str,
-    lock: Mapping[str, float | None] | Iterable[str] | None,
-) -> Robot:
-    _check_root(model, name)
-    if lock:
-        model = _lock(model, lock)
-    joints = tuple(_joint(model, index) for index in range(ROOT + 1, model.njoints))
-    robot = Robot(model, name, urdf, sha256, joints)
-    if not model.check(robot.create_data()):
-        raise ModelError(
-            f"'{name}': the joints are not in depth-first order, in which Pinocchio's CRBA is "
-            "wrong; add the joints of one branch before those of the next"
-        )
-    return robot
-
-
-def _check_root(model: pin.Model, name: str) -> None:
-    root = model.joints[ROOT].shortname() if model.njoints > ROOT else "none"
-    if root != "JointModelFreeFlyer":
-        raise ModelError(
-            f"'{name}': the root joint is {root}, expected JointModelFreeFlyer; build the model "
-            "with pin.JointModelFreeFlyer() as its root joint"
-        )
-    fixed = [model.names[i] for i in range(ROOT + 1, model.njoints) if model.parents[i] == 0]
-    if fixed:
-        raise ModelError(
-            f"'{name}': joint '{fixed[0]}' hangs on the world beside the free-flyer; "
-            "everything that moves must hang on one base"
-        )
-
-
-def _lock(model: pin.Model, lock: Mapping[str, float | None] | Iterable[str]) -> pin.Model:
-    names = [lock] if isinstance(lock, str) else list(lock)
-    values = lock if isinstance(lock, Mapping) else {}
-    movable = list(model.names)[ROOT + 1 :]
-    q = pin.neutral(model)
-    for name in names:
-        if name not in movable:
-            raise unknown("joint to lock", name, movable)
-        value = values.get(name)
-        if value is not None:
-            _joint(model, model.getJointId(name)).place(q, number(f"lock '{name}'", value))
-    indices = [model.getJointId(name) for name in names]
-    for index in indices:
-        # Without a frame for the joint, which models built in code may lack, Pinocchio crashes.
-        if not model.existFrame(model.names[index], pin.FrameType.JOINT):
-            model.addJointFrame(index)
-    return pin.buildReducedModel(model, indices, q)
-
-
-def _joint(model: pin.Model, index: int) -> Joint:
-    joint = model.joints[index]
-    kind = joint.shortname()
-    if joint.nv != 1 or joint.nq not in (1, 2):
-        raise ModelError(
-            f"joint '{model.names[index]}' is a {kind.removeprefix('JointModel')} of {joint.nv} "
-            f"degrees of freedom, expected one; lock it (lock=['{model.names[index]}'])"
-        )
-    prismatic = kind.startswith("JointModelP")
-    return Joint(model.names[index], joint.idx_q, joint.idx_v, joint.nq == 2, prismatic)

@@ -64,7 +64,14 @@ def robot_info(robot: Robot) -> str:
     wrapped = textwrap.fill(
         ", ".join(dict.fromkeys(frames)), width(), initial_indent="  ", subsequent_indent="  "
     )
-    return f"{head}\n\n{grid(rows, 'll')}\n\nframes\n{wrapped}"
+    parts = [head, grid(rows, "ll"), f"frames\n{wrapped}"]
+    if robot.notes:
+        notes = (
+            textwrap.fill(note, width(), initial_indent="  ", subsequent_indent="    ")
+            for note in robot.notes
+        )
+        parts.append("\n".join(("warnings", *notes)))
+    return "\n\n".join(parts)
 
 
 def linear_model(lin: LinearModel) -> str:

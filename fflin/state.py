@@ -97,6 +97,8 @@ class StateMap:
         Slices of q_b, r_b, q_m, omega_b, v_b, qdot_m in the state.
     axes : tuple of bool
         Whether (omega_b, v_b) stand in reference axes.
+    S : ndarray (nv, 6 + n) or None
+        With v = S nu, where joints mimic others; None where v is nu in another order.
 
     Raises
     ------
@@ -145,6 +147,10 @@ class StateMap:
         # Index in Pinocchio's v of each velocity of the state, and in a flat (nv, nv) array.
         self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
         self._flat = self._order[:, None] * robot.nv + self._order
+        # v = S nu; where no joint mimics another S is the permutation above.
+        self.S: Array | None = None
+        if robot.followers:
+            self.S = np.column_stack([self.spread(e) for e in np.eye(6 + n)])
         self._idx_q = np.array([joint.idx_q for joint in joints], dtype=np.intp)
         self._unbounded = np.flatnonzero([joint.unbounded for joint in joints])
         self._cos = self._idx_q[self._unbounded]
@@ -211,7 +217,7 @@ class StateMap:
             If a size is wrong or an entry is not finite.
         """
         q = self.robot.checked_configuration(q)
-        v = vector("v", v, self.robot.nv, "a velocity in Pinocchio's order")
+        v = self.robot.checked_velocity(v)
         chart = self.chart(q)
         x = np.empty(self.nx)
         g = self.groups
@@ -261,6 +267,7 @@ class StateMap:
         q[self._idx_q] = angles
         q[self._cos] = np.cos(angles[self._unbounded])
         q[self._sin] = np.sin(angles[self._unbounded])
+        self.robot.follow(q)
         nu = x[6 + self.robot.n :].copy()
         self.to_base(Chart(q_b, float(relative[3]), rotation_matrix(relative)), nu)
         return q, self.spread(nu)
@@ -270,17 +277,27 @@ class StateMap:
         return v.take(self._order)
 
     def spread(self, nu: Array) -> Array:
-        """Return Pinocchio's v (nv,) of (omega_b, v_b, qdot_m) in base axes."""
+        """Return Pinocchio's v (nv,) of (omega_b, v_b, qdot_m) in base axes: v = S nu."""
         v = np.empty(self.robot.nv)
         v[self._order] = nu
+        for joint, leader, multiplier, _ in self.robot.followers:
+            v[joint.idx_v] = multiplier * v[leader.idx_v]
         return v
 
+    def lift(self, forces: Array) -> Array:
+        """Return a tau (nv,) whose generalised forces (6 + n,) in base axes are the given ones."""
+        tau = np.zeros(self.robot.nv)
+        tau[self._order] = forces
+        return tau
+
     def forces(self, tau: Array) -> Array:
-        """Return the generalised forces (6 + n,) in base axes of Pinocchio's tau (nv,)."""
-        return tau.take(self._order)
+        """Return the generalised forces (6 + n,) in base axes of Pinocchio's tau: S^T tau."""
+        return tau.take(self._order) if self.S is None else self.S.T @ tau
 
     def project(self, matrix: Array, out: Array | None = None) -> Array:
-        """Take a matrix (nv, nv) over Pinocchio's v to state order."""
+        """Take a matrix (nv, nv) over Pinocchio's v to state order: S^T matrix S."""
+        if self.S is not None:
+            return np.matmul(self.S.T @ matrix, self.S, out=out)
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
         return matrix.take(self._flat, out=out, mode="clip")
 

@@ -156,7 +156,12 @@ class _Nonlinear:
         q, v = state.to_pinocchio(x)
         force = u.copy()
         state.to_base(state.chart(q), force)
-        return q, v, pin.aba(model, self.data, q, v, state.spread(force))
+        a = pin.aba(model, self.data, q, v, state.lift(force))
+        if state.S is not None:
+            # What keeps mimic joints in step drops out of S^T M a = S^T (tau - b).
+            M = pin.crba(model, self.data, q)
+            a = state.S @ np.linalg.solve(state.project(M.T), state.forces(M @ a))
+        return q, v, a
 
     def __call__(self, x: Array, u: Array) -> Array:
         state = self.state

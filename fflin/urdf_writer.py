@@ -1,0 +1,84 @@
+"""From a checked description to the URDF that Pinocchio is given: what it needs and no more."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from xml.sax.saxutils import quoteattr
+
+from fflin.urdf import Urdf
+from fflin.urdf_joints import JointElement
+from fflin.urdf_links import Link, Pose
+
+# What a joint without a <limit>, or with half of one, is limited to: nothing.
+_UNLIMITED = sys.float_info.max
+
+
+def write_urdf(urdf: Urdf, name: str) -> str:
+    """Write a description without visuals, collisions and extensions.
+
+    Parameters
+    ----------
+    urdf : Urdf
+    name : str
+        Of the robot.
+
+    Returns
+    -------
+    str
+        Every number is the double that was read.
+    """
+    # urdfdom reads quat_xyzw from version 1.1 on; 1.2 would require limits.
+    lines = [f'<robot name={quoteattr(name)} version="1.1">']
+    for link in urdf.links.values():
+        lines.extend(_link(link))
+    for joint in urdf.joints.values():
+        lines.extend(_joint(joint))
+    lines.append("</robot>")
+    return "\n".join(lines)
+
+
+def _link(link: Link) -> Iterator[str]:
+    yield f"<link name={quoteattr(link.name)}>"
+    if link.mass is not None:
+        entries = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        inertia = " ".join(
+            f'{name}="{value!r}"' for name, value in zip(entries, link.inertia, strict=True)
+        )
+        yield f'<inertial>{_origin(link.com)}<mass value="{link.mass!r}"/>'
+        yield f"<inertia {inertia}/></inertial>"
+    yield "</link>"
+
+
+def _joint(joint: JointElement) -> Iterator[str]:
+    yield f'<joint name={quoteattr(joint.name)} type="{joint.type}">'
+    yield f"<parent link={quoteattr(joint.parent)}/><child link={quoteattr(joint.child)}/>"
+    yield _origin(joint.origin)
+    if joint.freedom == 1:
+        yield f'<axis xyz="{_numbers(joint.axis)}"/>'
+        if joint.damping or joint.friction:
+            yield f'<dynamics damping="{joint.damping!r}" friction="{joint.friction!r}"/>'
+    if joint.type in ("revolute", "prismatic") or joint.limits:
+        yield _limit(joint)
+    yield "</joint>"
+
+
+def _limit(joint: JointElement) -> str:
+    limits = {"effort": _UNLIMITED, "velocity": _UNLIMITED}
+    if joint.limits is None:
+        limits |= {"lower": -_UNLIMITED, "upper": _UNLIMITED}
+    limits |= joint.limits or {}
+    entries = " ".join(f'{name}="{value!r}"' for name, value in limits.items())
+    return f"<limit {entries}/>"
+
+
+def _origin(pose: Pose) -> str:
+    if pose.quaternion is not None:
+        attitude = f'quat_xyzw="{_numbers(pose.quaternion)}"'
+    else:
+        attitude = f'rpy="{_numbers(pose.rpy)}"'
+    return f'<origin xyz="{_numbers(pose.xyz)}" {attitude}/>'
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return " ".join(repr(value) for value in values)
