@@ -72,7 +72,6 @@ def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Arr
     A : ndarray (nx, nx)
     B : ndarray (nx, 6 + n)
     """
-    model = state.robot.model
     data = state.robot.create_data()
     chart, g, nv = state.chart(q), state.groups, 6 + state.robot.n
     nu, force = state.velocities(v), u.copy()
@@ -100,7 +99,7 @@ def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Arr
 
     T, T_rate = _change_of_coordinates(state, chart, nu, acceleration)
     B = T @ B
-    A = (T @ A + T_rate) @ np.linalg.inv(T)
+    A[:] = (T @ A + T_rate) @ np.linalg.inv(T)
     for turned, columns in zip(state.axes, (ANGULAR, LINEAR), strict=True):
         if turned:
             A[:, g.q_b] += B[:, columns] @ skew(force[columns]) @ J

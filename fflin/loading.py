@@ -53,9 +53,7 @@ def load(robot: str | Path, *, lock: Lock | None = None) -> Robot:
     loaded = _robot(description.model, found.name, lock, description.mimics)
     for note in description.notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
-    return replace(
-        loaded, urdf=found.path, urdf_sha256=description.sha256, notes=description.notes
-    )
+    return replace(loaded, urdf=found.path, urdf_sha256=description.sha256, notes=description.notes)
 
 
 def from_model(model: pin.Model, *, name: str | None = None, lock: Lock | None = None) -> Robot:
@@ -87,9 +85,7 @@ def from_model(model: pin.Model, *, name: str | None = None, lock: Lock | None =
     return _robot(copy, name or model.name or "model", lock, {})
 
 
-def _robot(
-    model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, Mimic]
-) -> Robot:
+def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, Mimic]) -> Robot:
     _check_root(model, name)
     if lock:
         model, mimics = _locked(model, lock, mimics)

@@ -31,7 +31,8 @@ def random_point(robot, rng, *, degrees=None, speed=1.0):
     q = fflin.configuration(robot, joints, random_pose(rng, angle))
     # Inputs that accelerate what they act on alone by about 1.
     inertia = np.abs(fflin.linearize(robot, q).M.diagonal())
-    return q, speed * rng.normal(size=robot.nv), speed * inertia * rng.normal(size=6 + robot.n)
+    v = fflin.StateMap(robot).spread(speed * rng.normal(size=6 + robot.n))
+    return q, v, speed * inertia * rng.normal(size=6 + robot.n)
 
 
 def random_tree(rng, n, *, prismatic=True):

@@ -152,7 +152,7 @@ def test_unreadable_and_malformed_files(tmp_path: Path):
     with pytest.raises(fflin.FileError, match="a folder"):
         fflin.load(tmp_path)
     for text, message in {
-        "": "no element found",
+        "": "is empty; expected a URDF",
         "<robot>": "not well-formed|no element found|unclosed",
         "<model/>": "root element is <model>",
         "<robot name='r'><link name='a'/><link name='b'/></robot>": "bad.urdf.*(root|link)",
