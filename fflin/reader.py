@@ -152,7 +152,7 @@ def _build(urdf: Urdf, path: Path, root: Element) -> pin.Model:
     root_joint = "root_joint"
     while root_joint in urdf.joints or root_joint in urdf.links:
         root_joint += "_"
-    document = write_urdf(urdf, urdf.name or path.stem)
+    document = write_urdf(urdf)
     try:
         model = _with_stack(
             urdf.depth,
@@ -166,6 +166,8 @@ def _build(urdf: Urdf, path: Path, root: Element) -> pin.Model:
     if set(model.names) != {"universe", root_joint, *moving} or model.nv != nv:
         raise UrdfError(f"{path}: Pinocchio built other joints than the file describes")
     model.gravity.setZero()
+    # The name of a file need not be text.
+    model.name = urdf.name or path.stem.encode(errors="backslashreplace").decode()
     return model
 
 

@@ -1,5 +1,6 @@
 """Where robots are found: the bundled ones, those of example-robot-data, and any path."""
 
+import os
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -107,8 +108,11 @@ def find_robot(robot: str | Path) -> RobotFile:
         return _bundled()[robot]
     path = Path(robot)
     text = str(robot)
-    if path.exists() and not (path.is_dir() and text in _example_robot_data()):
-        return RobotFile(path.stem, path, "file", (path.resolve().parent,))
+    # Unlike Path.exists, this takes a name that is too long for one that does not exist.
+    if os.path.exists(robot) and not (path.is_dir() and text in _example_robot_data()):
+        # The name of a file need not be text.
+        name = path.stem.encode(errors="backslashreplace").decode()
+        return RobotFile(name, path, "file", (path.resolve().parent,))
     if isinstance(robot, Path) or path.suffix or len(path.parts) != 1:
         raise FileError(f"no file at '{robot}'; give a URDF's path or a name of `fflin robots`")
     if text == "cassie":

@@ -168,9 +168,13 @@ def _check_tree(
             stack.append(child)
     if len(depths) < len(links):
         lost = next(name for name in links if name not in depths)
-        raise above[lost].element.error(
-            f"joint {quoted(above[lost].name)} belongs to a closed loop of joints that hangs on "
-            "nothing; correct a parent or child in it"
+        way = [lost]
+        while (parent := above[way[-1]].parent) not in way:
+            way.append(parent)
+        loop = [above[name].name for name in way[way.index(parent) :]]
+        raise above[parent].element.error(
+            f"joint {enumerated(loop)} form a closed loop that hangs on nothing; correct a parent "
+            "or child in it"
         )
     deepest = max(depths, key=depths.__getitem__)
     if depths[deepest] > _DEPTH_LIMIT:

@@ -56,7 +56,7 @@ class JointElement:
     origin : Pose
         Of the child's frame in the parent's.
     axis : tuple of float
-        In the child's frame, of unit length where it is not along a coordinate.
+        In the child's frame; Pinocchio scales it to unit length.
     limits : dict
         Those of lower, upper, effort and velocity that the file gives; None without <limit>.
     damping, friction : float
@@ -135,10 +135,7 @@ def _axis(element: Element, of: str, kind: str) -> tuple[float, ...]:
             raise found.error(
                 f"<axis> of {of} has length {length:g}; expected a direction, such as 0 0 1"
             )
-    along = [entry != 0.0 for entry in axis]
-    if sum(along) == 1:
-        axis = tuple(math.copysign(1.0, entry) if entry else 0.0 for entry in axis)
-    if kind == "planar" and axis != (0.0, 0.0, 1.0):
+    if kind == "planar" and (axis[0] or axis[1] or axis[2] < 0.0):
         raise element.error(
             f"{of} is planar about an axis other than z; turn its <origin> so that "
             '<axis xyz="0 0 1"/> is the normal of the plane'

@@ -14,14 +14,12 @@ from fflin.urdf_links import Link, Pose
 _UNLIMITED = sys.float_info.max
 
 
-def write_urdf(urdf: Urdf, name: str) -> str:
+def write_urdf(urdf: Urdf) -> str:
     """Write a description without visuals, collisions and extensions.
 
     Parameters
     ----------
     urdf : Urdf
-    name : str
-        Of the robot.
 
     Returns
     -------
@@ -29,7 +27,7 @@ def write_urdf(urdf: Urdf, name: str) -> str:
         Every number is the double that was read.
     """
     # urdfdom reads quat_xyzw from version 1.1 on; 1.2 would require limits.
-    lines = [f'<robot name={quoteattr(name)} version="1.1">']
+    lines = [f'<robot name={quoteattr(urdf.name)} version="1.1">']
     for link in urdf.links.values():
         lines.extend(_link(link))
     for joint in urdf.joints.values():

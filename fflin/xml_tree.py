@@ -101,22 +101,24 @@ class Element:
         """Return an attribute that is `size` finite decimal numbers."""
         text = self.text(name, of)
         entries = re.split(rf"[{_SPACE}]+", text.strip(_SPACE))
-        if len(entries) != size and "," not in text:
+        if "," in text:
             raise self.error(
-                f"{name} of {of} has {len(entries)} entries, {quoted(text)}; expected {size}, "
-                "separated by spaces"
+                f"{name} of {of} is {quoted(text)}; expected {size} numbers separated by spaces, "
+                "no commas"
             )
         if len(entries) != size:
             raise self.error(
-                f"{name} of {of} is {quoted(text)}; expected {size} numbers separated by spaces, "
-                "with decimal points, no commas"
+                f"{name} of {of} has {len(entries)} entries, {quoted(text)}; expected {size}, "
+                "separated by spaces"
             )
         return tuple(self._decimal(entry, f"{name} of {of}") for entry in entries)
 
     def _decimal(self, text: str, what: str) -> float:
         value = float(text) if _DECIMAL.fullmatch(text) else math.nan
         if not math.isfinite(value):
-            raise self.error(f"{what} is {quoted(text)}; expected a plain finite number")
+            raise self.error(
+                f"{what} is {quoted(text)}; expected a plain finite number, such as 0.5"
+            )
         return value
 
 

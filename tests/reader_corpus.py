@@ -119,7 +119,7 @@ for title, text, words in (
     ("two entries", "1 2", "has 2 entries"),
     ("four entries", "1 2 3 4", "has 4 entries"),
     ("commas", "1,2,3", "no commas"),
-    ("commas and spaces", "1, 2, 3", "'1,'"),
+    ("commas and spaces", "1, 2, 3", "no commas"),
     ("nan", "0 nan 0", "'nan'"),
     ("empty", "", "empty"),
     ("words", "left of it", "'left'"),
@@ -552,6 +552,12 @@ refuse("xacro: not well-formed", "<robot><xacro:", "not well-formed", suffix=".x
 # --- What is no file -----------------------------------------------------------------------------
 
 
+def _no_text(path):
+    path = path.with_name(os.fsdecode(b"\xff.urdf"))
+    path.write_text(arm(attributes=""))
+    return path
+
+
 def _fifo(path):
     os.mkfifo(path)
     return path
@@ -584,6 +590,9 @@ def _looping(path):
     return path
 
 
+refuse("a name that is too long", lambda path: path.with_name("x" * 5000 + ".urdf"), "no file")
+if sys.platform == "linux":
+    accept("a file name that is no text", _no_text)
 refuse("a missing file", lambda path: path, "no file")
 refuse("a folder", _folder, "is a folder")
 refuse("a dangling link", _dangling, "no file")
