@@ -126,8 +126,8 @@ def _aba_derivatives(
     acceleration = to_independent @ free
     in_step = tau + M @ (S @ acceleration - free)
     by_q, by_v, _ = pin.computeABADerivatives(model, data, q, v, in_step)
-    inverse = np.linalg.inv(S.T @ M @ S)
-    return to_independent @ by_q @ S, to_independent @ by_v @ S, inverse, acceleration
+    reduced: Array = np.linalg.inv(S.T @ M @ S)
+    return to_independent @ by_q @ S, to_independent @ by_v @ S, reduced, acceleration
 
 
 def _symmetric(upper: Array) -> Array:

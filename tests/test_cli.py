@@ -68,7 +68,10 @@ def test_check_exits_0_on_every_bundled_robot(name):
 
 def test_warnings_are_one_line_each_on_stderr_and_in_info():
     done = subprocess.run(
-        [sys.executable, "-m", "fflin", "info", "planar_detumble"], capture_output=True, text=True
+        [sys.executable, "-m", "fflin", "info", "planar_detumble"],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     words = "the damping of joint 'joint_1', 'joint_2', 'joint_3' is not in the linear model"
     assert done.returncode == 0
@@ -79,6 +82,7 @@ def test_warnings_are_one_line_each_on_stderr_and_in_info():
         [sys.executable, "-W", "ignore", "-m", "fflin", "info", "planar_detumble"],
         capture_output=True,
         text=True,
+        check=False,
     )
     assert silent.returncode == 0 and not silent.stderr
 
@@ -158,7 +162,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
         ("linearize", "ets_vii", "--lock", "tail", "-o", output): "no joint to lock named 'tail'",
         ("linearize", "ets_vii", "-o", tmp_path / "m.xls"): "ends in '.xls'",
         ("linearize", "ets_vii", "-o", tmp_path / "none" / "m.npz"): "cannot be written",
-        ("check", "romeo"): "cannot be inverted: joint 'LFinger",
+        ("check", "romeo"): "cannot be inverted: joint 'LHand'",
         ("check", "cubesat", "--rpy", 180, 0, 0, "--reference", "world"): "turned by 180 deg",
         ("check",): "the following arguments are required: ROBOT",
         ("dance",): "invalid choice: 'dance'",

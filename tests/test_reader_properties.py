@@ -130,7 +130,8 @@ def test_mutated(path, mutations, tmp_path, capfd):
     else:
         # Nothing was passed over: all joints that move are there, and all mass.
         moving = [j.get("name") for j in root.findall("joint") if j.get("type") != "fixed"]
-        assert sorted({*robot.joint_names, *followers}) == sorted(moving)
+        followers = [follower.joint.name for follower in robot.followers]
+        assert sorted([*robot.joint_names, *followers]) == sorted(moving)
         assert math.isclose(robot.mass, _mass(root), rel_tol=1e-12)
         try:
             found = fflin.check(robot, fflin.linearize(robot))
