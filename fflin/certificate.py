@@ -115,19 +115,27 @@ def _aba_derivatives(
     tau = state.lift(force)
     if state.S is None:
         derivatives = pin.computeABADerivatives(model, data, q, v, tau)
-        by_q, by_v, inverse = (state.project(x) for x in derivatives)
-        return by_q, by_v, inverse, state.velocities(data.ddq)
-    # The forces that keep mimic joints in step do no work: S^T takes them out of M a = tau - b.
-    # They are added to tau, and M is what ABA's own inverse implies.
+        by_q, by_v, by_tau = (state.project(x) for x in derivatives)
+        return by_q, by_v, by_tau, state.velocities(data.ddq)
+    # Mimic joints: S^T M a = S^T (tau - b), in which the forces that keep them in step drop out.
+    # ABA wants M regular, which it need not be where one of them carries no mass: they get a
+    # rotor's inertia as large as the inertia that they share, in M' = M + rotor, whose part in
+    # S^T M' S is taken out again.
     S: Array = state.S
-    M = np.linalg.inv(_symmetric(pin.computeMinverse(model, data, q)))
-    to_independent = np.linalg.solve(S.T @ M @ S, S.T @ M)
+    shared = S @ state.project(pin.crba(model, data, q)).diagonal()
+    model = model.copy()
+    rotor = np.zeros(model.nv)
+    for joint, leader, *_ in state.robot.followers:
+        rotor[[joint.idx_v, leader.idx_v]] = shared[leader.idx_v]
+    model.armature = model.armature + rotor
+    with_rotor = np.linalg.inv(_symmetric(pin.computeMinverse(model, data, q)))
+    inverse: Array = np.linalg.inv(S.T @ with_rotor @ S - (S.T * rotor) @ S)
+    to_independent = inverse @ S.T @ with_rotor
     free = pin.aba(model, data, q, v, tau)
     acceleration = to_independent @ free
-    in_step = tau + M @ (S @ acceleration - free)
+    in_step = tau + with_rotor @ (S @ acceleration - free)
     by_q, by_v, _ = pin.computeABADerivatives(model, data, q, v, in_step)
-    reduced: Array = np.linalg.inv(S.T @ M @ S)
-    return to_independent @ by_q @ S, to_independent @ by_v @ S, reduced, acceleration
+    return to_independent @ by_q @ S, to_independent @ by_v @ S, inverse, acceleration
 
 
 def _symmetric(upper: Array) -> Array:

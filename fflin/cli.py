@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from fflin import __version__
-from fflin.errors import FflinError, FflinWarning
+from fflin.errors import FflinError, FflinWarning, FileError
 
 if TYPE_CHECKING:
     from fflin.linear_model import LinearModel
@@ -91,8 +91,10 @@ def _linearize(arguments: argparse.Namespace) -> int:
         from fflin.files import check_format
 
         check_format(arguments.output)
-    _, lin = _point(arguments)
+    robot, lin = _point(arguments)
     if arguments.output:
+        if robot.urdf and arguments.output.resolve() == robot.urdf.resolve():
+            raise FileError(f"{arguments.output} is the robot's own file; name another to write")
         lin.save(arguments.output)
         print(f"wrote {arguments.output}: {lin.B.shape[0]} states, {lin.B.shape[1]} inputs")
     else:

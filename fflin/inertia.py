@@ -1,18 +1,22 @@
 """The joint-space inertia M in state order, and its inverse."""
 
+import warnings
+
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import SingularInertiaError
+from fflin.errors import FflinWarning, SingularInertiaError
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
 from fflin.state import StateMap
 from fflin.validation import Array
 
-# M_ii (M^-1)_ii is 1 for a decoupled coordinate and grows as it loses inertia of its own; times
-# the rounding unit it is the relative error of (M^-1)_ii. Where the sum over the coordinates
-# passes this, less than two digits of M^-1 are left.
-_LARGEST_COUPLING = 1e-2 / float(np.finfo(float).eps)
+# M_ii (M^-1)_ii is 1 for a decoupled coordinate, more for any other, and grows as a coordinate
+# loses inertia of its own; times the rounding unit it is the relative error of (M^-1)_ii. Of the
+# sum over the coordinates: beyond the second figure less than two digits of M^-1 are left, beyond
+# the first less than nine, and a sum below their number comes of pivots that are round-off.
+_EPS = float(np.finfo(float).eps)
+_WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
 # Bound once: the look-up of a name in a module costs as much as a small matrix.
 _crba, _decompose, _compute_inverse = (
@@ -44,6 +48,7 @@ class Inertia:
         self._M = data.M.T
         self._diagonal = self._M.diagonal()
         self._constrained = bool(state.robot.followers)
+        self._least_coupling = 0.999 * (6 + state.robot.n)
 
     def invert(self, q: Array, out: Array) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array.
@@ -60,10 +65,10 @@ class Inertia:
             return
         _decompose(model, data)
         inverse = _compute_inverse(model, data)
-        # Written so that NaN, from a pivot that is zero or negative, fails too.
-        if not self._diagonal.dot(inverse.diagonal()) < _LARGEST_COUPLING:
-            raise _singular(self._state, self._state.project(self._M))
         self._state.project(inverse, out)
+        coupling = self._diagonal.dot(inverse.diagonal())
+        if not self._least_coupling < coupling < _WARNING_COUPLING:
+            self._judge(coupling, self._state.project(self._M))
 
     def _invert_projected(self, out: Array) -> None:
         """Invert S^T M S, which is dense, where joints mimic others."""
@@ -73,8 +78,20 @@ class Inertia:
         factor, failed = dpotrf(M)
         upper = np.full_like(M, np.nan) if failed else dpotri(factor)[0]
         np.copyto(out, np.triu(upper) + np.triu(upper, 1).T)
-        if not M.diagonal().dot(out.diagonal()) < _LARGEST_COUPLING:
+        self._judge(M.diagonal().dot(out.diagonal()), M)
+
+    def _judge(self, coupling: float, M: Array) -> None:
+        # Written so that NaN, from a pivot that is zero, fails too.
+        if not self._least_coupling < coupling < _LARGEST_COUPLING:
             raise _singular(self._state, M)
+        if coupling > _WARNING_COUPLING:
+            warnings.warn(
+                f"M of '{self._state.robot.name}' is ill-conditioned: A and B have a relative "
+                f"error of about {coupling * _EPS:.0e}; {_involved(self._state, M)} hardly move "
+                "mass against each other",
+                FflinWarning,
+                stacklevel=5,
+            )
 
 
 def inertia_matrix(robot: Robot, lin: LinearModel) -> Array:
@@ -90,23 +107,31 @@ def inertia_matrix(robot: Robot, lin: LinearModel) -> Array:
 
 def _singular(state: StateMap, M: Array) -> SingularInertiaError:
     robot = state.robot
-    names = ["the base"] * 6 + [f"joint '{name}'" for name in robot.joint_names]
     diagonal = M.diagonal()
-    massless = [names[i] for i in np.flatnonzero(~(diagonal > 0.0))]
+    massless = [_names(state)[i] for i in np.flatnonzero(~(diagonal > 0.0))]
     if massless:
         verb = "moves" if len(set(massless)) == 1 else "move"
         return SingularInertiaError(
             f"M of '{robot.name}' cannot be inverted: {_enumerate(massless)} {verb} no mass; "
             "give the links beyond an inertia, or lock what needs none"
         )
-    scale = 1.0 / np.sqrt(diagonal)
-    mode = np.linalg.eigh(scale[:, None] * M * scale)[1][:, 0]
-    involved = [names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1]
     return SingularInertiaError(
-        f"M of '{robot.name}' is singular at this configuration: {_enumerate(involved)} can move "
+        f"M of '{robot.name}' is singular at this configuration: {_involved(state, M)} can move "
         "together without moving mass; choose another configuration, give the links an inertia, "
         "or lock one of them"
     )
+
+
+def _involved(state: StateMap, M: Array) -> str:
+    """Name the coordinates of the motion with the least inertia."""
+    scale = 1.0 / np.sqrt(M.diagonal())
+    mode = np.linalg.eigh(scale[:, None] * M * scale)[1][:, 0]
+    names = _names(state)
+    return _enumerate([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
+
+
+def _names(state: StateMap) -> list[str]:
+    return ["the base"] * 6 + [f"joint '{name}'" for name in state.robot.joint_names]
 
 
 def _enumerate(names: list[str]) -> str:

@@ -166,7 +166,8 @@ class Linearizer:
         np.negative(lower, out=lower)
         lower[:, groups.v_b] = 0.0
         self._set_turning(lower, chart, nu, force, c, inverse)
-        f0, x0 = np.empty(state.nx), np.zeros(state.nx)
+        f0: Array = np.empty(state.nx)
+        x0: Array = np.zeros(state.nx)
         np.multiply(nu, self._rates, out=f0[:nv])
         f0[nv:] = c
         if chart is _STANDING:

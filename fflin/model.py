@@ -276,6 +276,8 @@ def configuration(
     InputError
         If a value is not a finite number, or a joint mimics another.
     """
+    if not isinstance(robot, Robot):
+        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
     q = pin.neutral(robot.model)
     if base is not None:
         if not isinstance(base, pin.SE3):

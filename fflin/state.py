@@ -109,6 +109,10 @@ class StateMap:
     def __init__(
         self, robot: Robot, *, reference: pin.SE3 | None = None, frame: Frame = "hybrid"
     ) -> None:
+        if not isinstance(robot, Robot):
+            raise InputError(
+                f"robot is a {type(robot).__name__}, expected a fflin.Robot; fflin.load makes one"
+            )
         if frame not in get_args(Frame):
             raise InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
         if reference is not None and not isinstance(reference, pin.SE3):

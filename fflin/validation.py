@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fflin.errors import InputError
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
 # A quaternion or a (cos, sin) pair this far from unit length is renormalised without a word;
 # farther off it is taken for a mistake.

@@ -114,6 +114,8 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     InputError
         If the model is sampled or has other states and inputs than this robot's.
     """
+    if not isinstance(lin, LinearModel):
+        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; check the continuous one")
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
@@ -156,12 +158,12 @@ class _Nonlinear:
         q, v = state.to_pinocchio(x)
         force = u.copy()
         state.to_base(state.chart(q), force)
-        a = pin.aba(model, self.data, q, v, state.lift(force))
-        if state.S is not None:
-            # What keeps mimic joints in step drops out of S^T M a = S^T (tau - b).
-            M = pin.crba(model, self.data, q)
-            a = state.S @ np.linalg.solve(state.project(M.T), state.forces(M @ a))
-        return q, v, a
+        if state.S is None:
+            return q, v, pin.aba(model, self.data, q, v, state.lift(force))
+        # Mimic joints: S^T M S nudot = S^T (tau - b), with M from CRBA.
+        M = state.project(pin.crba(model, self.data, q))
+        bias = state.forces(pin.rnea(model, self.data, q, v, np.zeros(model.nv)))
+        return q, v, state.spread(np.linalg.solve(M, force - bias))
 
     def __call__(self, x: Array, u: Array) -> Array:
         state = self.state

@@ -180,6 +180,14 @@ def test_existing_output_survives_a_failure(tmp_path):
     assert output.read_text() == "precious"
 
 
+def test_robots_own_file_is_never_the_output(tmp_path):
+    robot = tmp_path / "robot.json"
+    robot.write_bytes((Path(__file__).parents[1] / "robots" / "cubesat.urdf").read_bytes())
+    before = robot.read_bytes()
+    assert "is the robot's own file" in refused("linearize", robot, "-o", robot)
+    assert robot.read_bytes() == before
+
+
 def test_check_exits_1_where_it_falls_short(monkeypatch, capsys):
     """The exit code of a model that does not hold, by planting a wrong one."""
     from dataclasses import replace

@@ -104,6 +104,44 @@ def test_from_model_takes_a_copy():
     assert model == before
 
 
+def test_mjcf_is_taken_as_a_model(tmp_path):
+    document = """<mujoco><worldbody><body name="base"><freejoint/>
+      <inertial pos="0 0 0" mass="3" diaginertia="1 1 1"/>
+      <body name="arm" pos="0 0 1"><joint name="hinge" type="hinge" axis="0 1 0"/>
+        <inertial pos="0 0 .5" mass="2" diaginertia=".1 .1 .1"/></body>
+    </body></worldbody></mujoco>"""
+    (tmp_path / "r.xml").write_text(document)
+    robot = fflin.from_model(pin.buildModelFromMJCF(str(tmp_path / "r.xml")))
+    assert robot.joint_names == ("hinge",) and robot.mass == 5.0
+    assert fflin.check(robot, fflin.linearize(robot)).ok
+
+
+def test_pinocchios_own_mimic_joints_are_refused_with_the_way_out():
+    urdf = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
+      <joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint>
+      <joint name="k" type="continuous"><parent link="a"/><child link="c"/>
+      <mimic joint="j"/></joint></robot>"""
+    model = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer(), True)
+    with pytest.raises(fflin.ModelError, match=r"joint 'k' is a JointModelMimic.*fflin\.load"):
+        fflin.from_model(model)
+
+
+def test_what_is_no_robot_is_refused():
+    lin = fflin.linearize(fflin.load("cubesat"))
+    for call in (
+        lambda: fflin.linearize("cubesat"),
+        lambda: fflin.configuration("cubesat"),
+        lambda: fflin.StateMap(None),
+        lambda: fflin.check("cubesat", lin),
+        lambda: fflin.check(fflin.load("cubesat"), lin.A),
+        lambda: fflin.configuration(fflin.load("cubesat"), base=np.eye(4)),
+    ):
+        with pytest.raises(fflin.InputError, match=r"is a .*, expected a"):
+            call()
+    with pytest.raises(fflin.ModelError, match="is a str, expected a pin"):
+        fflin.from_model("cubesat")
+
+
 def test_model_without_a_free_flyer_is_refused():
     fixed = pin.Model()
     fixed.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "joint")
