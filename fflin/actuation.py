@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
 from fflin.errors import unknown
+from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
 from fflin.model import ROOT, Robot
 from fflin.state import ANGULAR, LINEAR, Chart, StateMap
 from fflin.validation import Array

@@ -56,7 +56,7 @@ class Thruster:
 
     def __post_init__(self) -> None:
         for key in ("position", "direction"):
-            object.__setattr__(self, key, _three_numbers(f"thruster {key}", getattr(self, key)))
+            object.__setattr__(self, key, three_numbers(f"thruster {key}", getattr(self, key)))
         length = math.hypot(*self.direction)
         if length == 0.0:
             raise InputError("thruster direction is zero; give where it pushes")
@@ -66,7 +66,8 @@ class Thruster:
 Input: TypeAlias = BaseTorque | BaseForce | JointTorque | Thruster
 
 
-def _three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
+def three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
+    """Return three finite floats, or raise `InputError` that says what was given."""
     try:
         x, y, z = (float(entry) for entry in value)
     except (TypeError, ValueError):
@@ -74,3 +75,8 @@ def _three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
     if not math.isfinite(x + y + z):
         raise InputError(f"{what} is {value!r}, expected finite numbers")
     return x, y, z
+
+
+def default_inputs(joint_names: Sequence[str]) -> tuple[Input, ...]:
+    """Return one force for each degree of freedom: tau_b, F_b and every joint's."""
+    return (BaseTorque(), BaseForce(), *(JointTorque(name) for name in joint_names))

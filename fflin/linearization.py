@@ -7,12 +7,13 @@ import numpy as np
 import pinocchio as pin
 
 from fflin import __version__
+from fflin.actuation import Actuation
 from fflin.certificate import certify
 from fflin.inertia import Inertia, inertia_matrix
 from fflin.linear_model import LinearModel
 from fflin.model import ROOT, Robot
-from fflin.rotation import skew
-from fflin.state import ANGULAR, LINEAR, Chart, Frame, StateMap, wrench_names, wrench_units
+from fflin.rotation import rotation_matrix, skew
+from fflin.state import ANGULAR, LINEAR, Chart, Frame, StateMap
 from fflin.validation import Array, vector
 
 _STANDING = Chart(np.zeros(3), 1.0, np.eye(3))
@@ -62,16 +63,25 @@ class Linearizer:
         self._own_reference = reference is None
         self._data = robot.create_data()
         self._inertia = Inertia(self._map, self._data)
+        self._actuation = Actuation(self._map)
+        self._gravity = np.array(robot.gravity)
+        # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
+        self._plain = (
+            self._actuation.default
+            and not self._gravity.any()
+            and not any(values.any() for values in robot.passive)
+        )
         nv, nx = 6 + robot.n, self._map.nx
         self._nv = nv
         self._zero_v, self._zero_u, self._zero_x = (
-            _frozen(np.zeros(size)) for size in (robot.nv, nv, nx)
+            _frozen(np.zeros(size)) for size in (robot.nv, len(self._actuation.names), nx)
         )
         self._rates = np.array([0.5] * 3 + [1.0] * (nv - 3))  # the diagonal of N
         self._A_rest = _frozen(
             np.block([[np.zeros((nv, nv)), np.diag(self._rates)], [np.zeros((nv, nx))]])
         )
-        self._shape_B, self._lower = (nx, nv), slice(nv, nx)
+        self._nu = len(self._actuation.names)
+        self._shape_B, self._lower = (nx, self._nu), slice(nv, nx)
         self._q_m = self._map.groups.q_m if robot.n else None
         self._root_at_origin = robot.model.jointPlacements[ROOT].isIdentity(0.0)
         self._reference = _frozen(pin.SE3ToXYZQUAT(self._map.reference))
@@ -96,8 +106,8 @@ class Linearizer:
             Configuration in Pinocchio's order; neutral by default.
         v : array_like (nv,), optional
             Velocity in Pinocchio's order; at rest by default.
-        u : array_like (6 + n,), optional
-            Input (tau_b [N m], F_b [N], tau_m [N m|N]) in the frame's axes; zero by default.
+        u : array_like (nu,), optional
+            Over the robot's inputs, those on the base in the frame's axes; zero by default.
 
         Returns
         -------
@@ -115,12 +125,12 @@ class Linearizer:
         robot = self.robot
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
         q.setflags(write=False)
-        if v is None and u is None and self._own_reference:
+        if v is None and u is None and self._own_reference and self._plain:
             return self._at_rest(q)
         if v is not None:
             v = _frozen(robot.checked_velocity(v).copy())
         if u is not None:
-            u = _frozen(vector("u", u, self._nv, "an input (tau_b, F_b, tau_m)").copy())
+            u = _frozen(vector("u", u, self._nu, "the robot's inputs").copy())
         return self._anywhere(q, self._zero_v if v is None else v, self._zero_u if u is None else u)
 
     def _at_rest(self, q: Array) -> LinearModel:
@@ -144,74 +154,117 @@ class Linearizer:
         chart = _STANDING if self._own_reference else state.chart(q)
 
         # In base axes, and without the base's position and linear velocity: nothing below
-        # depends on them, and Pinocchio's derivatives lose digits to both.
-        nu, force = state.velocities(v), u
-        if chart is not _STANDING:
-            force = u.copy()
-            state.to_base(chart, force)
+        # depends on them, and Pinocchio's derivatives lose digits to both. Nor does it depend on
+        # gravity, which accelerates the base origin and nothing against it (equivalence).
+        nu = state.velocities(v)
         q_still, v_still = q.copy(), v.copy()
         q_still[:3] = v_still[:3] = 0.0
-        B = np.zeros(self._shape_B)
-        inverse = B[-nv:]
+        inverse = np.empty((nv, nv))
         self._inertia.invert(q_still, inverse)
-        bias = state.forces(pin.nonLinearEffects(model, data, q_still, v_still))
-        c = inverse.dot(force - bias)
-        by_q, by_v, _ = pin.computeRNEADerivatives(model, data, q_still, v_still, state.spread(c))
+        columns = self._actuation.columns(data, q_still)
+        u_base = self._actuation.in_base_axes(chart, u)
+        force = columns.dot(u_base) - state.forces(
+            pin.nonLinearEffects(model, data, q_still, v_still)
+        )
+        q_m = state.joint_positions(q)
+        stiffness, damping, rest = self.robot.passive
+        force[6:] -= stiffness * (q_m - rest) + damping * nu[6:]
+        c = inverse.dot(force)
+        by_q, by_v = self._bias_slopes(q_still, v_still, c, u_base)
 
         A = self._A_rest.copy()
         self._set_kinematics(A, chart, nu)
         lower = A[-nv:]
-        lower[:, groups.q_m] = inverse.dot(state.project(by_q)[:, 6:])
-        lower[:, -nv:] = inverse.dot(state.project(by_v))
+        lower[:, groups.q_m] = inverse.dot(by_q)
+        lower[:, -nv:] = inverse.dot(by_v)
         np.negative(lower, out=lower)
         lower[:, groups.v_b] = 0.0
-        self._set_turning(lower, chart, nu, force, c, inverse)
+        B = np.zeros(self._shape_B)
+        B[self._lower] = inverse if self._actuation.default else inverse.dot(columns)
+        gravity = self._gravity_in_base_axes(q)
+        self._set_turning(lower, B[self._lower], chart, nu, u_base, c, gravity)
         f0: Array = np.empty(state.nx)
         x0: Array = np.zeros(state.nx)
         np.multiply(nu, self._rates, out=f0[:nv])
         f0[nv:] = c
         if chart is _STANDING:
-            x0[groups.q_m] = state.joint_positions(q)
+            x0[groups.q_m] = q_m
             x0[nv:] = nu
         else:
             x0 = state.to_state(q, v)
             f0[groups.q_b] = chart.Q @ f0[groups.q_b]
             f0[groups.r_b] = chart.R @ f0[groups.r_b]
-            for rows in (f0[nv:], lower, lower[:, -nv:].T, inverse, inverse.T):
+            for rows in (f0[nv:], lower, lower[:, -nv:].T, B[self._lower]):
                 state.to_frame(chart, rows)
+            for columns_held, _ in self._actuation.held:
+                B[:, columns_held] = B[:, columns_held] @ chart.R.T
         for array in (A, B, f0, x0):
             array.setflags(write=False)
         point = {"A": A, "B": B, "f0": f0, "x0": x0, "y0": x0, "u0": u, "q": q, "v": v}
         point["_reference"] = self._reference_of(q)
         return LinearModel._from_fields(self._common | point)
 
+    def _bias_slopes(self, q: Array, v: Array, c: Array, u: Array) -> tuple[Array, Array]:
+        """Return the slopes of M a + b - B u + passive forces over q_m (.., n) and nu, a held.
+
+        The wrenches of thrusters are constant in the frames of their links, so that RNEA's
+        derivatives with them hold -d(B u)/dq.
+        """
+        model, data, state = self.robot.model, self._data, self._map
+        wrenches = self._actuation.wrenches(u)
+        external = () if wrenches is None else (wrenches,)
+        full_q, full_v, _ = pin.computeRNEADerivatives(
+            model, data, q, v, state.spread(c), *external
+        )
+        by_q, by_v = state.project(full_q)[:, 6:], state.project(full_v)
+        if not self._plain:
+            joints = np.arange(6, self._nv)
+            by_q[joints, joints - 6] += self.robot.passive.stiffness
+            by_v[joints, joints] += self.robot.passive.damping
+        return by_q, by_v
+
+    def _gravity_in_base_axes(self, q: Array) -> Array:
+        root = self.robot.model.jointPlacements[ROOT].rotation
+        return rotation_matrix(q[3:7]).T @ (root.T @ self._gravity)
+
     def _set_turning(
-        self, lower: Array, chart: Chart, nu: Array, force: Array, c: Array, inverse: Array
+        self,
+        lower: Array,
+        B: Array,
+        chart: Chart,
+        nu: Array,
+        u: Array,
+        c: Array,
+        gravity: Array,
     ) -> None:
         r"""Complete the velocity rows (6 + n, nx) for what is held in which axes.
 
-        `c` (6 + n,) is the acceleration of the base origin and the joints in base axes. A turn
-        :math:`\delta\theta` of the base under a vector s held in reference axes changes its base
-        components by :math:`[s]_\times \delta\theta`: so the velocities and forces that the
-        frame holds in reference axes change, and the accelerations turn back. A v_b in base
-        axes has the rate :math:`c - \omega \times v_b` instead, which is left in `c`.
+        `c` (6 + n,) is the acceleration of the base origin and the joints in base axes, without
+        gravity. A turn :math:`\delta\theta` of the base under a vector s held in reference axes
+        changes its base components by :math:`[s]_\times \delta\theta`: so the velocities,
+        inputs and gravity that are held in reference axes change, and the accelerations turn
+        back. A v_b in base axes has the rate :math:`c + g - \omega \times v_b`. The rate in the
+        frame is left in `c`.
         """
         groups = self._map.groups
         turned_angular, turned_linear = self._map.axes
         w, v = nu[ANGULAR], nu[LINEAR]
+        turn = np.zeros((self._nv, 3))
+        for columns, _ in self._actuation.held:
+            turn += B[:, columns].dot(skew(u[columns]))
+        if turned_angular:
+            turn += lower[:, groups.omega_b].dot(skew(w))
+            turn[ANGULAR] -= skew(c[ANGULAR])
         if turned_linear:
-            turn = inverse[:, LINEAR].dot(skew(force[LINEAR]))
             turn[LINEAR] -= skew(c[LINEAR])
-            if turned_angular:
-                turn += lower[:, groups.omega_b].dot(skew(w))
-                turn += inverse[:, ANGULAR].dot(skew(force[ANGULAR]))
-                turn[ANGULAR] -= skew(c[ANGULAR])
-            lower[:, groups.q_b] = turn.dot(chart.J)
         else:
-            lower[LINEAR, groups.omega_b] += skew(v)
             turning = skew(w)
+            lower[LINEAR, groups.omega_b] += skew(v)
             lower[LINEAR, groups.v_b] -= turning
+            turn[LINEAR] += skew(gravity)
             c[LINEAR] -= turning.dot(v)
+        c[LINEAR] += gravity
+        lower[:, groups.q_b] = turn.dot(chart.J)
 
     def _set_kinematics(self, A: Array, chart: Chart, nu: Array) -> None:
         """Set what the motion changes in the rows of q_b and r_b; `nu` (6 + n,) in base axes."""
@@ -238,7 +291,7 @@ class Linearizer:
 
     def _common_fields(self) -> dict[str, Any]:
         robot, state = self.robot, self._map
-        names, units = wrench_names(robot), wrench_units(robot)
+        names, units = self._actuation.names, self._actuation.units
         return {
             "C": _frozen(np.eye(state.nx)),
             "D": _frozen(np.zeros((state.nx, len(names)))),
@@ -277,8 +330,8 @@ def linearize(
         Configuration in Pinocchio's order, see `configuration`; neutral by default.
     v : array_like (nv,), optional
         Velocity in Pinocchio's order; at rest by default.
-    u : array_like (6 + n,), optional
-        Input (tau_b [N m], F_b [N], tau_m [N m|N]) in the frame's axes; zero by default.
+    u : array_like (nu,), optional
+        Over the robot's inputs, those on the base in the frame's axes; zero by default.
     frame : {"hybrid", "local", "world"}
         Axes of the base's velocities and wrenches, see `StateMap`.
     reference : pin.SE3, optional

@@ -4,11 +4,13 @@ import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pinocchio as pin
 
 from fflin.errors import FflinWarning, ModelError, unknown
-from fflin.model import ROOT, Follower, Joint, Robot
+from fflin.joints import Follower, Joint
+from fflin.model import ROOT, Robot
 from fflin.reader import read_urdf
 from fflin.robots import find_robot
 from fflin.urdf_joints import Mimic
@@ -17,8 +19,8 @@ from fflin.validation import number
 Lock = Mapping[str, float | None] | Iterable[str]
 
 
-def load(robot: str | Path, *, lock: Lock | None = None) -> Robot:
-    """Load a robot as a free flyer in zero gravity.
+def load(robot: str | Path, *, lock: Lock | None = None, **fields: Any) -> Robot:
+    """Load a robot as a free flyer, by default in zero gravity.
 
     Parameters
     ----------
@@ -27,6 +29,8 @@ def load(robot: str | Path, *, lock: Lock | None = None) -> Robot:
     lock : mapping or iterable of str, optional
         {joint: value [rad|m]} welded at that value (None: at neutral), or names. What mimics a
         locked joint is welded with it.
+    **fields
+        inputs, stiffness, damping, rest, gravity: see `Robot.replace`.
 
     Returns
     -------
@@ -35,7 +39,9 @@ def load(robot: str | Path, *, lock: Lock | None = None) -> Robot:
     Raises
     ------
     UnknownNameError
-        If there is no such robot or joint to lock.
+        If there is no such robot, joint, frame or field.
+    InputError
+        If a field has a wrong value.
     FileError, UrdfError
         If the file cannot be read or is malformed.
     MissingPackageError
@@ -53,10 +59,19 @@ def load(robot: str | Path, *, lock: Lock | None = None) -> Robot:
     loaded = _robot(description.model, found.name, lock, description.mimics)
     for note in description.notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
-    return replace(loaded, urdf=found.path, urdf_sha256=description.sha256, notes=description.notes)
+    loaded = replace(
+        loaded,
+        urdf=found.path,
+        urdf_sha256=description.sha256,
+        notes=description.notes,
+        urdf_damping=_independent_damping(loaded, description.damping),
+    )
+    return loaded.replace(**fields) if fields else loaded
 
 
-def from_model(model: pin.Model, *, name: str | None = None, lock: Lock | None = None) -> Robot:
+def from_model(
+    model: pin.Model, *, name: str | None = None, lock: Lock | None = None, **fields: Any
+) -> Robot:
     """Take a Pinocchio model built by other means (MJCF, SDF, code).
 
     Parameters
@@ -67,6 +82,8 @@ def from_model(model: pin.Model, *, name: str | None = None, lock: Lock | None =
         Name of the robot; the model's own by default.
     lock : mapping or iterable of str, optional
         As in `load`.
+    **fields
+        As in `load`. Of damping="urdf" the model's own ``damping`` is taken.
 
     Returns
     -------
@@ -82,7 +99,10 @@ def from_model(model: pin.Model, *, name: str | None = None, lock: Lock | None =
         raise ModelError(f"the model is a {type(model).__name__}, expected a pin.Model")
     copy = model.copy()
     copy.gravity.setZero()
-    return _robot(copy, name or model.name or "model", lock, {})
+    robot = _robot(copy, name or model.name or "model", lock, {})
+    own = {joint.name: float(robot.model.damping[joint.idx_v]) for joint in robot.joints}
+    robot = replace(robot, urdf_damping=own)
+    return robot.replace(**fields) if fields else robot
 
 
 def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, Mimic]) -> Robot:
@@ -108,6 +128,14 @@ def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, 
             "wrong; add the joints of one branch before those of the next"
         )
     return robot
+
+
+def _independent_damping(robot: Robot, damping: Mapping[str, float]) -> dict[str, float]:
+    """Count the damping of mimic joints with that of their leaders: the power is the same."""
+    result = {name: damping.get(name, 0.0) for name in robot.joint_names}
+    for joint, leader, multiplier, _ in robot.followers:
+        result[leader.name] += multiplier**2 * damping.get(joint.name, 0.0)
+    return result
 
 
 def _check_root(model: pin.Model, name: str) -> None:

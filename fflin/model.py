@@ -1,15 +1,20 @@
 """The robot that every other call speaks of: a free-flyer root and n one-degree joints."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.errors import InputError, ModelError, unknown
+from fflin.fields import validated_fields
+from fflin.inputs import Input, default_inputs
+from fflin.joints import Follower, Joint
 from fflin.validation import NORM_TOLERANCE, Array, number, vector
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
@@ -22,48 +27,12 @@ _DATA_BYTES_PER_NV3 = 32
 _DATA_LIMIT = 2**30
 
 
-class Joint(NamedTuple):
-    """One joint of one degree of freedom.
+class Passive(NamedTuple):
+    """What passive joints do: -stiffness (q_m - rest) - damping qdot_m, each (n,)."""
 
-    Attributes
-    ----------
-    name : str
-        Its name in the model.
-    idx_q, idx_v : int
-        Where it begins in Pinocchio's q and v.
-    unbounded : bool
-        Stored as (cos, sin), two entries of q; one angle in the state.
-    prismatic : bool
-        A length in metres; otherwise an angle in radians.
-    """
-
-    name: str
-    idx_q: int
-    idx_v: int
-    unbounded: bool
-    prismatic: bool
-
-    def place(self, q: Array, value: float) -> None:
-        """Write this joint's angle [rad] or length [m] into a configuration."""
-        if self.unbounded:
-            q[self.idx_q : self.idx_q + 2] = np.cos(value), np.sin(value)
-        else:
-            q[self.idx_q] = value
-
-    def value(self, q: Array) -> float:
-        """Return this joint's angle [rad], of a continuous joint in (-pi, pi], or length [m]."""
-        if self.unbounded:
-            return float(np.arctan2(q[self.idx_q + 1], q[self.idx_q]))
-        return float(q[self.idx_q])
-
-
-class Follower(NamedTuple):
-    """A joint that mimics an independent one: value = multiplier * leader's value + offset."""
-
-    joint: Joint
-    leader: Joint
-    multiplier: float
-    offset: float
+    stiffness: Array
+    damping: Array
+    rest: Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,6 +55,17 @@ class Robot:
         The mimic joints, each with the independent joint that it follows.
     notes : tuple of str
         What was warned of when it was read.
+    urdf_damping : mapping
+        {joint: viscous damping [N m s/rad | N s/m]} as its file says, what follows a joint
+        counted with it; part of the model only if `damping` is "urdf".
+    inputs : tuple of Input
+        What acts on it; the base's torque and force and every joint's by default.
+    stiffness, damping : mapping
+        {joint: value [N m/rad | N/m], [N m s/rad | N s/m]} of passive joints.
+    rest : mapping
+        {joint: position [rad|m]} where a spring is relaxed; 0 where not named.
+    gravity : tuple of float (3,)
+        Uniform acceleration [m/s^2] in Pinocchio's world axes. `model` itself has none.
     """
 
     model: pin.Model
@@ -95,6 +75,57 @@ class Robot:
     joints: tuple[Joint, ...]
     followers: tuple[Follower, ...] = ()
     notes: tuple[str, ...] = ()
+    urdf_damping: Mapping[str, float] = field(default_factory=dict)
+    inputs: tuple[Input, ...] = ()
+    stiffness: Mapping[str, float] = field(default_factory=dict)
+    damping: Mapping[str, float] = field(default_factory=dict)
+    rest: Mapping[str, float] = field(default_factory=dict)
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not self.inputs:
+            object.__setattr__(self, "inputs", default_inputs(self.joint_names))
+
+    def replace(self, **fields: Any) -> Robot:
+        """Return the same robot with other inputs, passive joints or gravity.
+
+        Parameters
+        ----------
+        inputs : sequence of Input
+            What acts on it, in the order of u.
+        stiffness : mapping or float
+            {joint: K [N m/rad | N/m]}, or one for all joints.
+        damping : mapping, float or "urdf"
+            {joint: D [N m s/rad | N s/m]}, one for all joints, or what the URDF says.
+        rest : mapping
+            {joint: position [rad|m]} where its spring is relaxed.
+        gravity : sequence of float (3,)
+            Uniform acceleration [m/s^2] in Pinocchio's world axes.
+
+        Returns
+        -------
+        Robot
+
+        Raises
+        ------
+        InputError
+            If a value is negative or not a number, or a field is not one of these.
+        UnknownNameError
+            If there is no such joint.
+        ModelError
+            If dry friction is asked for, which is not differentiable at rest.
+        """
+        return replace(self, **validated_fields(fields, self.joint, self.joints, self.urdf_damping))
+
+    @cached_property
+    def passive(self) -> Passive:
+        """Stiffness, damping and rest positions (n,) in state order."""
+        return Passive(
+            *(
+                np.array([values.get(name, 0.0) for name in self.joint_names])
+                for values in (self.stiffness, self.damping, self.rest)
+            )
+        )
 
     @property
     def joint_names(self) -> tuple[str, ...]:

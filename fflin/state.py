@@ -330,16 +330,5 @@ class StateMap:
         x[index] += 2.0 * np.pi * np.round((near[index] - x[index]) / (2.0 * np.pi))
 
 
-def wrench_names(robot: Robot) -> tuple[str, ...]:
-    """Names of the default input u = (tau_b, F_b, tau_m)."""
-    return (*_named("tau_b", "xyz"), *_named("F_b", "xyz"), *_named("tau_m", robot.joint_names))
-
-
-def wrench_units(robot: Robot) -> tuple[str, ...]:
-    """Units of the default input."""
-    joints = ("N" if joint.prismatic else "N m" for joint in robot.joints)
-    return (*("N m", "N m", "N m", "N", "N", "N"), *joints)
-
-
 def _named(group: str, members: str | tuple[str, ...]) -> tuple[str, ...]:
     return tuple(f"{group}.{member}" for member in members)
