@@ -3,8 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-import pinocchio as pin
 
+from fflin.aba import Aba
+from fflin.actuation import Actuation
+from fflin.inertia import inverse_inertia
 from fflin.linear_model import Certificate, LinearModel
 from fflin.model import Robot
 from fflin.rotation import skew
@@ -31,16 +33,13 @@ class Block(NamedTuple):
     error: float
 
 
-INPUT_GROUPS = {"tau_b": slice(0, 3), "F_b": slice(3, 6), "tau_m": slice(6, None)}
-
-
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
     """Compute the figures that prove a continuous-time model of this robot."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     blocks = compare(state, lin, *aba_route(state, lin.q, lin.v, lin.u0))
     return Certificate(
         condition=scaled_condition(lin.M),
-        inertia_residual=inertia_residual(lin),
+        inertia_residual=inertia_residual(lin.M, inverse_inertia(state, lin)),
         route_A=max(block.error for block in blocks if block.matrix == "A"),
         route_B=max(block.error for block in blocks if block.matrix == "B"),
         f0=float(np.abs(lin.f0).max()),
@@ -53,10 +52,10 @@ def scaled_condition(M: Array) -> float:
     return float(np.linalg.cond(scale[:, None] * M * scale))
 
 
-def inertia_residual(lin: LinearModel) -> float:
+def inertia_residual(M: Array, inverse: Array) -> float:
     """Largest entry of ``M M^-1 - E`` with M scaled to a unit diagonal."""
-    scale = np.sqrt(lin.M.diagonal())
-    residual = lin.M @ lin.B[-len(lin.M) :] - np.eye(len(lin.M))
+    scale = np.sqrt(M.diagonal())
+    residual = M @ inverse - np.eye(len(M))
     return float(np.abs(residual * scale / scale[:, None]).max())
 
 
@@ -70,21 +69,21 @@ def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Arr
     Returns
     -------
     A : ndarray (nx, nx)
-    B : ndarray (nx, 6 + n)
+    B : ndarray (nx, nu)
     """
-    data = state.robot.create_data()
+    aba = Aba(state)
     chart, g, nv = state.chart(q), state.groups, 6 + state.robot.n
-    nu, force = state.velocities(v), u.copy()
-    state.to_base(chart, force)
+    nu, u = state.velocities(v), aba.actuation.in_base_axes(chart, u)
     # Pinocchio differentiates in world axes at the world's origin, where a distant base costs
     # digits; nothing depends on where the base is.
     at_origin = q.copy()
     at_origin[:3] = 0.0
-    by_q, by_v, inverse, acceleration = _aba_derivatives(state, data, at_origin, v, force)
+    by_q, by_v, by_u = aba.slopes(at_origin, v, u)
+    acceleration = state.velocities(aba.acceleration(at_origin, v, u))
 
     J, R = chart.J, chart.R
     A: Array = np.zeros((state.nx, state.nx))
-    B: Array = np.zeros((state.nx, nv))
+    B: Array = np.zeros((state.nx, len(u)))
     w, linear = nu[ANGULAR], nu[LINEAR]
     A[g.q_b, g.q_b] = -0.5 * (np.outer(w, chart.q_b) / chart.q0 + skew(w))
     A[g.q_b, g.omega_b] = 0.5 * chart.Q
@@ -95,51 +94,15 @@ def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Arr
     A[-nv:, g.r_b] = by_q[:, LINEAR] @ R.T
     A[-nv:, g.q_m] = by_q[:, 6:]
     A[-nv:, -nv:] = by_v
-    B[-nv:] = inverse
+    B[-nv:] = by_u
 
     T, T_rate = _change_of_coordinates(state, chart, nu, acceleration)
     B = T @ B
     A[:] = (T @ A + T_rate) @ np.linalg.inv(T)
-    for turned, columns in zip(state.axes, (ANGULAR, LINEAR), strict=True):
-        if turned:
-            A[:, g.q_b] += B[:, columns] @ skew(force[columns]) @ J
-            B[:, columns] = B[:, columns] @ R.T
+    for columns, _ in aba.actuation.held:
+        A[:, g.q_b] += B[:, columns] @ skew(u[columns]) @ J
+        B[:, columns] = B[:, columns] @ R.T
     return A, B
-
-
-def _aba_derivatives(
-    state: StateMap, data: pin.Data, q: Array, v: Array, force: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return d(nudot)/d(q, nu, force) and nudot in state order and base axes."""
-    model = state.robot.model
-    tau = state.lift(force)
-    if state.S is None:
-        derivatives = pin.computeABADerivatives(model, data, q, v, tau)
-        by_q, by_v, by_tau = (state.project(x) for x in derivatives)
-        return by_q, by_v, by_tau, state.velocities(data.ddq)
-    # Mimic joints: S^T M a = S^T (tau - b), in which the forces that keep them in step drop out.
-    # ABA wants M regular, which it need not be where one of them carries no mass: they get a
-    # rotor's inertia as large as the inertia that they share, in M' = M + rotor, whose part in
-    # S^T M' S is taken out again.
-    S: Array = state.S
-    shared = S @ state.project(pin.crba(model, data, q)).diagonal()
-    model = model.copy()
-    rotor = np.zeros(model.nv)
-    for joint, leader, *_ in state.robot.followers:
-        rotor[[joint.idx_v, leader.idx_v]] = shared[leader.idx_v]
-    model.armature = model.armature + rotor
-    with_rotor = np.linalg.inv(_symmetric(pin.computeMinverse(model, data, q)))
-    inverse: Array = np.linalg.inv(S.T @ with_rotor @ S - (S.T * rotor) @ S)
-    to_independent = inverse @ S.T @ with_rotor
-    free = pin.aba(model, data, q, v, tau)
-    acceleration = to_independent @ free
-    in_step = tau + with_rotor @ (S @ acceleration - free)
-    by_q, by_v, _ = pin.computeABADerivatives(model, data, q, v, in_step)
-    return to_independent @ by_q @ S, to_independent @ by_v @ S, inverse, acceleration
-
-
-def _symmetric(upper: Array) -> Array:
-    return np.triu(upper) + np.triu(upper, 1).T
 
 
 def _change_of_coordinates(
@@ -168,32 +131,40 @@ def compare(state: StateMap, lin: LinearModel, A: Array, B: Array) -> list[Block
     A difference is relative to the largest entry of its block, rows of accelerations being
     scaled by the mobility sqrt((M^-1)_ii), so that a light joint does not hide a heavy one.
     Where a block vanishes because large terms cancel in it, it is relative to those terms.
-    An entry of M^-1 is relative to the mobilities of its row and column, which bound it.
+    An entry of B is relative to the mobilities of its row and of its input, which bound it.
     """
     nv = len(lin.M)
-    mobility = np.sqrt(np.abs(lin.B[-nv:].diagonal()))
+    mobility, input_mobility = mobilities(lin)
     row_scale = np.concatenate((np.ones(state.nx - nv), mobility))[:, None]
     difference_A, scaled_A = np.abs(lin.A - A) / row_scale, np.abs(lin.A) / row_scale
-    column_scale = np.where(np.arange(state.nx)[:, None] < state.nx - nv, 1.0, mobility)
+    column_scale = np.where(np.arange(state.nx)[:, None] < state.nx - nv, 1.0, input_mobility)
     difference_B = np.abs(lin.B - B) / row_scale / column_scale
+    inputs = Actuation(state).groups
 
     groups = state.groups._asdict()
     blocks = []
     for row, rows in groups.items():
         for column, columns in groups.items():
-            cancelling = _cancelling_terms(state, lin, mobility, row, column)
+            cancelling = _cancelling_terms(state, lin, row, column)
             scale = max(_largest(scaled_A[rows, columns]), cancelling) or 1.0
             error = _largest(difference_A[rows, columns]) / scale
             blocks.append(Block("A", row, column, error))
-        for column, columns in INPUT_GROUPS.items():
+        for column, columns in inputs.items():
             blocks.append(Block("B", row, column, _largest(difference_B[rows, columns])))
     return blocks
 
 
-def _cancelling_terms(
-    state: StateMap, lin: LinearModel, mobility: Array, row: str, column: str
-) -> float:
+def mobilities(lin: LinearModel) -> tuple[Array, Array]:
+    """Return sqrt((M^-1)_ii) (6 + n,) and sqrt(b^T M^-1 b) (nu,) of every input's column b."""
+    own = np.sqrt(np.linalg.inv(lin.M).diagonal())
+    lower = lin.B[-len(lin.M) :]
+    inputs = np.sqrt(np.einsum("ik,ij,jk->k", lower, lin.M, lower))
+    return own, np.where(inputs > 0.0, inputs, 1.0)
+
+
+def _cancelling_terms(state: StateMap, lin: LinearModel, row: str, column: str) -> float:
     """Size of the terms that may cancel in a block of A, in its scaled units."""
+    mobility, input_mobility = mobilities(lin)
     chart = state.chart(lin.q)
     steepness = _largest(chart.J) if column == "q_b" else 1.0
     speed = np.abs(state.velocities(lin.v))
@@ -207,7 +178,7 @@ def _cancelling_terms(
         turning = rate * _largest(1.0 / mobility[nu.start - state.nx : nu.stop - state.nx or None])
         return max(turning, _largest(speed[LINEAR] / mobility[LINEAR]) * (column != "v_b"))
     accelerations = np.abs(lin.f0[-len(mobility) :]) / mobility
-    forces = np.abs(lin.u0) * mobility
+    forces = np.abs(lin.u0) * input_mobility
     return steepness * (
         _largest(accelerations) + _largest(forces) + rate * _largest(speed / mobility)
     )

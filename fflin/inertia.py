@@ -105,6 +105,17 @@ def inertia_matrix(robot: Robot, lin: LinearModel) -> Array:
     return M
 
 
+def inverse_inertia(state: StateMap, lin: LinearModel) -> Array:
+    """Return M^-1 (6 + n, 6 + n) as it stands in B of a linear model, in the frame's axes."""
+    nv = 6 + state.robot.n
+    inverse: Array = np.empty((nv, nv))
+    Inertia(state, state.robot.create_data()).invert(lin.q, inverse)
+    chart = state.chart(lin.q)
+    state.to_frame(chart, inverse)
+    state.to_frame(chart, inverse.T)
+    return inverse
+
+
 def _singular(state: StateMap, M: Array) -> SingularInertiaError:
     robot = state.robot
     diagonal = M.diagonal()

@@ -108,7 +108,8 @@ def linear_model(lin: LinearModel) -> str:
 def check_report(check: Check) -> str:
     """Show what a check found: a table a route, the single figures, the verdict."""
     states = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
-    inputs = ("tau_b", "F_b", "tau_m")
+    blocks = [row.block for row in check.rows]
+    inputs = dict.fromkeys(b[:-1].split(", ")[1] for b in blocks if b.startswith("B["))
     parts = [f"check of {check.title}"]
     for test in ("ABA derivatives", "differences"):
         rows = {row.block: row for row in check.rows if row.test == test}

@@ -8,8 +8,17 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.certificate import aba_route, compare, inertia_residual, scaled_condition
+from fflin.aba import Aba
+from fflin.actuation import Actuation
+from fflin.certificate import (
+    aba_route,
+    compare,
+    inertia_residual,
+    mobilities,
+    scaled_condition,
+)
 from fflin.errors import InputError
+from fflin.inertia import inverse_inertia
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
 from fflin.reports import check_report
@@ -119,6 +128,11 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; check the continuous one")
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    if lin.input_names != Actuation(state).names:
+        raise InputError(
+            f"the model has {len(lin.input_names)} inputs, which are not the inputs of "
+            f"'{robot.name}'; give the robot the same (Robot.replace)"
+        )
     if lin.state_names != state.names:
         raise InputError(
             f"the model has {len(lin.state_names)} states of '{lin.robot}', which are not the "
@@ -140,8 +154,11 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     rows.append(Row("flow", "f", _flow_error(robot, lin), difference))
     rows.append(Row("point", "x0", _relative(lin.x0, state.to_state(q, v, near=lin.x0)), route))
     rows.append(Row("point", "f0", _relative(lin.f0, model(lin.x0, lin.u0)), route))
-    rows.append(Row("inertia", "M M^-1 = E", inertia_residual(lin), route))
-    rows += [Row("inertia", name, error, 1e-12) for name, error in _positive_definite(lin)]
+    inverse = inverse_inertia(state, lin)
+    if model.aba.actuation.default:
+        inverse = lin.B[-len(lin.M) :]  # which is all of it
+    rows.append(Row("inertia", "M M^-1 = E", inertia_residual(lin.M, inverse), route))
+    rows += [Row("inertia", name, error, 1e-12) for name, error in _positive_definite(inverse)]
     return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, cond(M) {condition:.1e}")
 
 
@@ -150,20 +167,13 @@ class _Nonlinear:
 
     def __init__(self, state: StateMap) -> None:
         self.state = state
-        self.data = state.robot.create_data()
+        self.aba = Aba(state)
 
     def acceleration(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return (q, v, a) in Pinocchio's order."""
-        state, model = self.state, self.state.robot.model
-        q, v = state.to_pinocchio(x)
-        force = u.copy()
-        state.to_base(state.chart(q), force)
-        if state.S is None:
-            return q, v, pin.aba(model, self.data, q, v, state.lift(force))
-        # Mimic joints: S^T M S nudot = S^T (tau - b), with M from CRBA.
-        M = state.project(pin.crba(model, self.data, q))
-        bias = state.forces(pin.rnea(model, self.data, q, v, np.zeros(model.nv)))
-        return q, v, state.spread(np.linalg.solve(M, force - bias))
+        q, v = self.state.to_pinocchio(x)
+        u = self.aba.actuation.in_base_axes(self.state.chart(q), u)
+        return q, v, self.aba.acceleration(q, v, u)
 
     def __call__(self, x: Array, u: Array) -> Array:
         state = self.state
@@ -196,8 +206,8 @@ def _differences(model: _Nonlinear, lin: LinearModel) -> tuple[Array, Array]:
     speed = np.abs(lin.x0[-nv:])
     step[-nv:] = 0.1 * max(1.0, float(speed[ANGULAR].max()), float(speed[6:].max(initial=0.0)))
     step[groups.v_b] = 0.1 * max(1.0, float(speed[LINEAR].max()))
-    mobility = np.sqrt(np.abs(lin.B[-nv:].diagonal()))
-    push = max(1.0, float(np.abs(lin.f0[-nv:] / mobility).max())) / mobility
+    mobility, input_mobility = mobilities(lin)
+    push = max(1.0, float(np.abs(lin.f0[-nv:] / mobility).max())) / input_mobility
     A = _jacobian(lambda x: model(x, lin.u0), lin.x0, step)
     B = _jacobian(lambda u: model(lin.x0, u), lin.u0, push)
     return A, B
@@ -252,9 +262,8 @@ def _relative(given: Array, expected: Array, floor: float = 1.0) -> float:
     return float(np.abs(given - expected).max() / max(floor, float(np.abs(expected).max())))
 
 
-def _positive_definite(lin: LinearModel) -> list[tuple[str, float]]:
-    """Asymmetry of B's lower block, and how far its least eigenvalue is below zero."""
-    inverse = lin.B[-len(lin.M) :]
+def _positive_definite(inverse: Array) -> list[tuple[str, float]]:
+    """Asymmetry of M^-1, and how far its least eigenvalue is below zero."""
     scale = 1.0 / np.sqrt(np.abs(inverse.diagonal()))
     scaled = scale[:, None] * inverse * scale
     asymmetry = float(np.abs(scaled - scaled.T).max())
