@@ -8,12 +8,16 @@ __version__ = "0.1.0"
 # Public name -> module. Each is imported when it is first asked for, so that a command which
 # needs no dynamics does not pay for them.
 _PUBLIC = {
+    "BaseForce": "inputs",
+    "BaseTorque": "inputs",
+    "Certificate": "linear_model",
     "ChartError": "errors",
     "Check": "verification",
     "FflinError": "errors",
     "FflinWarning": "errors",
     "FileError": "errors",
     "InputError": "errors",
+    "JointTorque": "inputs",
     "LinearModel": "linear_model",
     "Linearizer": "linearization",
     "MissingPackageError": "errors",
@@ -21,14 +25,17 @@ _PUBLIC = {
     "Robot": "model",
     "SingularInertiaError": "errors",
     "StateMap": "state",
+    "Thruster": "inputs",
     "UnknownNameError": "errors",
     "UrdfError": "errors",
     "check": "verification",
     "configuration": "model",
+    "effort": "points",
     "from_model": "loading",
     "linearize": "linearization",
     "list_robots": "robots",
     "load": "loading",
+    "velocity": "points",
 }
 
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
@@ -46,10 +53,12 @@ if TYPE_CHECKING:
         UnknownNameError,
         UrdfError,
     )
-    from fflin.linear_model import LinearModel
+    from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
+    from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load
     from fflin.model import Robot, configuration
+    from fflin.points import effort, velocity
     from fflin.robots import list_robots
     from fflin.state import StateMap
     from fflin.verification import Check, check

@@ -13,6 +13,9 @@ from fflin.rotation import skew
 from fflin.state import ANGULAR, LINEAR, Chart, StateMap
 from fflin.validation import Array
 
+# Of terms that drop out exactly: their rounding, 1e-16 of them, is to be far below the tolerance.
+_ROUNDING_SHARE = 1e-3
+
 
 class Block(NamedTuple):
     """Difference of two routes to one block of A or B.
@@ -36,7 +39,7 @@ class Block(NamedTuple):
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
     """Compute the figures that prove a continuous-time model of this robot."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    blocks = compare(state, lin, *aba_route(state, lin.q, lin.v, lin.u0))
+    blocks = compare(state, lin, lin.M, *aba_route(state, lin.q, lin.v, lin.u0))
     return Certificate(
         condition=scaled_condition(lin.M),
         inertia_residual=inertia_residual(lin.M, inverse_inertia(state, lin)),
@@ -125,16 +128,18 @@ def _change_of_coordinates(
     return T, T_rate
 
 
-def compare(state: StateMap, lin: LinearModel, A: Array, B: Array) -> list[Block]:
+def compare(state: StateMap, lin: LinearModel, M: Array, A: Array, B: Array) -> list[Block]:
     """Compare a model's A and B with those of another route, block by block.
+
+    `M` is the robot's, for the scales.
 
     A difference is relative to the largest entry of its block, rows of accelerations being
     scaled by the mobility sqrt((M^-1)_ii), so that a light joint does not hide a heavy one.
     Where a block vanishes because large terms cancel in it, it is relative to those terms.
     An entry of B is relative to the mobilities of its row and of its input, which bound it.
     """
-    nv = len(lin.M)
-    mobility, input_mobility = mobilities(lin)
+    nv = len(M)
+    mobility, input_mobility = mobilities(M, B)
     row_scale = np.concatenate((np.ones(state.nx - nv), mobility))[:, None]
     difference_A, scaled_A = np.abs(lin.A - A) / row_scale, np.abs(lin.A) / row_scale
     column_scale = np.where(np.arange(state.nx)[:, None] < state.nx - nv, 1.0, input_mobility)
@@ -145,7 +150,7 @@ def compare(state: StateMap, lin: LinearModel, A: Array, B: Array) -> list[Block
     blocks = []
     for row, rows in groups.items():
         for column, columns in groups.items():
-            cancelling = _cancelling_terms(state, lin, row, column)
+            cancelling = _cancelling_terms(state, lin, (mobility, input_mobility), row, column)
             scale = max(_largest(scaled_A[rows, columns]), cancelling) or 1.0
             error = _largest(difference_A[rows, columns]) / scale
             blocks.append(Block("A", row, column, error))
@@ -154,21 +159,29 @@ def compare(state: StateMap, lin: LinearModel, A: Array, B: Array) -> list[Block
     return blocks
 
 
-def mobilities(lin: LinearModel) -> tuple[Array, Array]:
+def mobilities(M: Array, B: Array) -> tuple[Array, Array]:
     """Return sqrt((M^-1)_ii) (6 + n,) and sqrt(b^T M^-1 b) (nu,) of every input's column b."""
-    own = np.sqrt(np.linalg.inv(lin.M).diagonal())
-    lower = lin.B[-len(lin.M) :]
-    inputs = np.sqrt(np.einsum("ik,ij,jk->k", lower, lin.M, lower))
+    own = np.sqrt(np.linalg.inv(M).diagonal())
+    lower = B[-len(M) :]
+    inputs = np.sqrt(np.einsum("ik,ij,jk->k", lower, M, lower))
     return own, np.where(inputs > 0.0, inputs, 1.0)
 
 
-def _cancelling_terms(state: StateMap, lin: LinearModel, row: str, column: str) -> float:
-    """Size of the terms that may cancel in a block of A, in its scaled units."""
-    mobility, input_mobility = mobilities(lin)
+def _cancelling_terms(
+    state: StateMap, lin: LinearModel, scales: tuple[Array, Array], row: str, column: str
+) -> float:
+    """Size of the terms that may cancel in a block of A, in its scaled units.
+
+    The base's own velocity has no influence but in its own axes, and counts for what its
+    rounding can do to Pinocchio's derivatives only.
+    """
+    mobility, input_mobility = scales
     chart = state.chart(lin.q)
     steepness = _largest(chart.J) if column == "q_b" else 1.0
     speed = np.abs(state.velocities(lin.v))
     rate = max(_largest(speed[ANGULAR]), _largest(speed[6:]))
+    still = speed.copy()
+    still[LINEAR] *= _ROUNDING_SHARE
     moving = {"omega_b", "v_b", "qdot_m"}
     if row not in moving:
         return 0.0 if column in moving else _largest(speed[:6]) * steepness
@@ -176,11 +189,11 @@ def _cancelling_terms(state: StateMap, lin: LinearModel, row: str, column: str) 
         # A unit of this velocity under the motion, and, where it turns, of the base's speed.
         nu = state.groups._asdict()[column]
         turning = rate * _largest(1.0 / mobility[nu.start - state.nx : nu.stop - state.nx or None])
-        return max(turning, _largest(speed[LINEAR] / mobility[LINEAR]) * (column != "v_b"))
+        return max(turning, _largest(still[LINEAR] / mobility[LINEAR]) * (column != "v_b"))
     accelerations = np.abs(lin.f0[-len(mobility) :]) / mobility
     forces = np.abs(lin.u0) * input_mobility
     return steepness * (
-        _largest(accelerations) + _largest(forces) + rate * _largest(speed / mobility)
+        _largest(accelerations) + _largest(forces) + rate * _largest(still / mobility)
     )
 
 

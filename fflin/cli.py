@@ -6,14 +6,15 @@ import argparse
 import io
 import math
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from fflin import __version__
-from fflin.errors import FflinError, FflinWarning, FileError
+from fflin.errors import FflinError, FflinWarning, FileError, InputError
 
 if TYPE_CHECKING:
     from fflin.linear_model import LinearModel
@@ -23,6 +24,11 @@ _DONE, _FELL_SHORT, _BAD_INPUT, _INTERRUPTED = 0, 1, 2, 130
 
 
 class _Parser(argparse.ArgumentParser):
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        # What is a negative number and no option; by default -1e-3 is taken for one.
+        self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+
     def error(self, message: str) -> NoReturn:
         self.exit(_BAD_INPUT, f"fflin: error: {message} (see {self.prog} --help)\n")
 
@@ -42,7 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     try:
         code: int = arguments.run(arguments)
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
         return code
     except FflinError as error:
         print(f"fflin: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -51,6 +58,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader, such as head, has what it wanted; the interpreter must not complain either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _DONE
+    except OSError as error:
+        print(f"fflin: error: the output cannot be written: {error.strerror}", file=sys.stderr)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _BAD_INPUT
     except KeyboardInterrupt:
         return _INTERRUPTED
 
@@ -114,7 +125,25 @@ def _check(arguments: argparse.Namespace) -> int:
 def _load(arguments: argparse.Namespace) -> Robot:
     from fflin.loading import load
 
-    return load(arguments.robot, lock=dict(arguments.lock))
+    robot = load(arguments.robot, lock=_once("--lock", arguments.lock))
+    fields: dict[str, Any] = {}
+    for name in ("stiffness", "damping"):
+        values = getattr(arguments, name, [])
+        for_all = [value for joint, value in values if joint is None]
+        if for_all and len(values) > 1:
+            raise InputError(f"--{name} is given for all joints and once more; give either")
+        if values:
+            fields[name] = for_all[0] if for_all else _once(f"--{name}", values)
+    if getattr(arguments, "gravity", None):
+        fields["gravity"] = arguments.gravity
+    return robot.replace(**fields) if fields else robot
+
+
+def _once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        raise InputError(f"{option} names a joint twice; give one value for each")
+    return values
 
 
 def _point(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
@@ -122,13 +151,18 @@ def _point(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
 
     from fflin.linearization import linearize
     from fflin.model import configuration
+    from fflin.points import effort, velocity
 
     robot = _load(arguments)
     rotation = pin.rpy.rpyToMatrix(*(math.radians(angle) for angle in arguments.rpy))
     base = pin.SE3(rotation, pin.SE3.Identity().translation + arguments.position)
-    q = configuration(robot, dict(arguments.joint), base)
+    q = configuration(robot, _once("--joint", arguments.joint), base)
     reference = pin.SE3.Identity() if arguments.reference == "world" else None
-    return robot, linearize(robot, q, frame=arguments.frame, reference=reference)
+    v = velocity(robot, _once("--velocity", arguments.velocity)) if arguments.velocity else None
+    u = None
+    if arguments.effort:
+        u = effort(robot, _once("--effort", arguments.effort))
+    return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
 
 
 def _number(text: str) -> float:
@@ -146,6 +180,12 @@ def _assignment(text: str) -> tuple[str, float]:
     if not separator or not name:
         raise argparse.ArgumentTypeError(f"'{text}' is not NAME=VALUE")
     return name, _number(value)
+
+
+def _passive(text: str) -> tuple[str | None, float | str]:
+    if "=" in text:
+        return _assignment(text)
+    return None, text if text == "urdf" else _number(text)
 
 
 def _lock(text: str) -> tuple[str, float | None]:
@@ -251,6 +291,40 @@ def _add_point(command: argparse.ArgumentParser) -> None:
         default=(0.0, 0.0, 0.0),
         metavar=("X", "Y", "Z"),
         help="base position [m]",
+    )
+    for name, unit in (("stiffness", "N m/rad|N/m"), ("damping", "N m s/rad|N s/m")):
+        command.add_argument(
+            f"--{name}",
+            metavar="[NAME=]VALUE",
+            type=_passive,
+            action="append",
+            default=[],
+            help=f"{name} of a joint [{unit}] (repeatable), or one value for all joints"
+            + ("; `urdf`: what the URDF says" if name == "damping" else ""),
+        )
+    command.add_argument(
+        "--gravity",
+        nargs=3,
+        type=_number,
+        metavar=("X", "Y", "Z"),
+        help="uniform gravity in world axes [m/s^2]; none by default",
+    )
+    command.add_argument(
+        "--velocity",
+        metavar="NAME=VALUE",
+        type=_assignment,
+        action="append",
+        default=[],
+        help="a velocity at the point (repeatable): a joint's rate [rad/s|m/s], or omega_b.x ... "
+        "v_b.z of the base in base axes",
+    )
+    command.add_argument(
+        "--effort",
+        metavar="NAME=VALUE",
+        type=_assignment,
+        action="append",
+        default=[],
+        help="an input at the point (repeatable), by its name in u, such as tau_m.joint_1",
     )
     command.add_argument(
         "--reference",

@@ -48,7 +48,7 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     import difflib
 
     names = list(known)
-    near = difflib.get_close_matches(name, names, n=5, cutoff=0.5)
+    near = difflib.get_close_matches(str(name), names, n=5, cutoff=0.5)
     if near:
         hint = f"did you mean {', '.join(near)}?"
     elif not names:

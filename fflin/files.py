@@ -4,15 +4,16 @@ import csv
 import io
 import json
 import os
+import zlib
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fflin.errors import FileError
+from fflin.errors import FileError, InputError
 from fflin.linear_model import Certificate, LinearModel
 
 _MATRICES = ("A", "B", "C", "D", "M")
@@ -21,6 +22,7 @@ _NAMES = (
     *("state_names", "input_names", "output_names"),
     *("state_units", "input_units", "output_units"),
 )
+_LISTS = (*_NAMES, "locked")
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version")
 
 FORMATS = (".npz", ".mat", ".json", ".csv")
@@ -29,9 +31,11 @@ FORMATS = (".npz", ".mat", ".json", ".csv")
 def save_model(lin: LinearModel, path: Path) -> None:
     """Write a model and its certificate; see `LinearModel.save`."""
     check_format(path)
+    if not all(np.isfinite(getattr(lin, key)).all() for key in (*_MATRICES, *_VECTORS[:-1])):
+        raise InputError("the model has entries that are not finite; it is not saved")
     record: dict[str, Any] = {key: getattr(lin, key) for key in (*_MATRICES, *_VECTORS[:-1])}
     record["reference"] = lin._reference
-    record |= {key: list(getattr(lin, key)) for key in _NAMES}
+    record |= {key: list(getattr(lin, key)) for key in _LISTS}
     record |= {key: getattr(lin, key) for key in _TEXTS}
     record["dt"] = float(lin.dt)
     record["certificate"] = asdict(lin.certificate)
@@ -58,23 +62,65 @@ def load_model(path: Path) -> LinearModel:
         M = np.array(record["M"], dtype=float)
         M.setflags(write=False)
         reference = arrays.pop("reference")
-        named: dict[str, Any] = {key: tuple(record[key]) for key in _NAMES}
+        named: dict[str, Any] = {key: tuple(map(str, record[key])) for key in _LISTS}
         named |= {key: str(record[key]) for key in _TEXTS} | arrays
-        return LinearModel(
+        _check_sizes(arrays, M, reference, named)
+        lin = LinearModel(
             **named,
             dt=float(record["dt"]),
             _reference=reference,
             _inertia=partial(_given, M),
-            _certify=partial(_given, Certificate(**record["certificate"])),
+            _certify=partial(_given, None),
         )
+        certificate = Certificate(**{k: float(x) for k, x in record["certificate"].items()})
+        return replace(lin, _certify=partial(_certified, certificate, lin.fingerprint))
+    except FileNotFoundError:
+        hint = "; a csv model is named NAME.csv, without the matrix" * (path.suffix == ".csv")
+        raise FileError(f"{path}: cannot be read: No such file or directory{hint}") from None
     except OSError as error:
         raise FileError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except (KeyError, ValueError, TypeError, IndexError, EOFError) as error:
+    except _UNREADABLE as error:
         raise FileError(f"{path}: not a linear model saved by fflin ({error})") from None
+
+
+# What decoders raise at files that are not theirs, or are damaged.
+_UNREADABLE = (
+    *(KeyError, ValueError, TypeError, IndexError, AttributeError, EOFError, OverflowError),
+    *(NotImplementedError, RecursionError, zlib.error),
+)
+
+
+def _check_sizes(arrays: dict[str, Any], M: Any, reference: Any, named: dict[str, Any]) -> None:
+    nx, nu, ny = (len(named[key]) for key in _NAMES[:3])
+    expected = {"f0": nx, "x0": nx, "u0": nu, "y0": ny}
+    for key, size in expected.items():
+        if arrays[key].shape != (size,):
+            raise ValueError(f"{key} has shape {arrays[key].shape}, expected ({size},)")
+    for key, size in zip(_NAMES[3:], (nx, nu, ny), strict=True):
+        if len(named[key]) != size:
+            raise ValueError(f"{key} has {len(named[key])} entries, expected {size}")
+    if M.shape != (nx // 2, nx // 2) or reference.shape != (7,):
+        raise ValueError("M or the reference has a wrong shape")
+    if named["frame"] not in ("hybrid", "local", "world"):
+        raise ValueError(f"unknown frame '{named['frame']}'")
+    if not all(np.isfinite(array).all() for array in (*arrays.values(), M, reference)):
+        raise ValueError("an entry is not finite")
 
 
 def _given(value: Any, _: LinearModel) -> Any:
     return value
+
+
+def _certified(certificate: Certificate, fingerprint: str, lin: LinearModel) -> Certificate:
+    lin.require(fingerprint)
+    return certificate
+
+
+def as_path(path: Any) -> Path:
+    """Return a path, or raise `InputError` where it is none."""
+    if not isinstance(path, str | os.PathLike) or "\0" in str(path):
+        raise InputError(f"{path!r} is not a path")
+    return Path(path)
 
 
 def check_format(path: Path) -> None:
@@ -97,9 +143,10 @@ def write_whole(contents: dict[Path, bytes]) -> None:
         for target, content in contents.items():
             if target.is_dir():
                 raise FileError(f"{target}: is a folder; give the name of a file")
-            temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+            real = target.resolve()  # so that a link stays one
+            temporary = real.with_name(f".{real.name}.{os.getpid()}.tmp")
             with temporary.open("xb") as file:
-                written[temporary] = target
+                written[temporary] = real
                 file.write(content)
         for temporary, target in list(written.items()):
             os.replace(temporary, target)
@@ -127,7 +174,7 @@ def _from_npz(path: Path) -> dict[str, Any]:
             record = {key: file[key] for key in file.files}
     except BadZipFile as error:
         raise ValueError(str(error)) from None
-    for key in _NAMES:
+    for key in _LISTS:
         record[key] = record[key].tolist()
     return {**record, "certificate": json.loads(str(record["certificate"]))}
 
@@ -136,7 +183,7 @@ def _to_mat(path: Path, record: dict[str, Any]) -> dict[Path, bytes]:
     from scipy.io import savemat
 
     buffer = io.BytesIO()
-    cells = {key: np.array(record[key], dtype=object) for key in _NAMES}
+    cells = {key: np.array(record[key], dtype=object) for key in _LISTS}
     savemat(buffer, {**record, **cells}, oned_as="column")
     return {path: buffer.getvalue()}
 
@@ -151,7 +198,7 @@ def _from_mat(path: Path) -> dict[str, Any]:
         raise ValueError(str(error)) from None
     record: dict[str, Any] = {key: raw[key] for key in _MATRICES}
     record |= {key: raw[key].ravel() for key in _VECTORS}
-    record |= {key: [str(cell[0]) for cell in raw[key].ravel()] for key in _NAMES}
+    record |= {key: [str(cell[0]) for cell in raw[key].ravel()] for key in _LISTS}
     record |= {key: "".join(raw[key]) for key in _TEXTS}
     record["dt"] = raw["dt"].item()
     struct = raw["certificate"][0, 0]
@@ -205,6 +252,7 @@ def _to_csv(path: Path, record: dict[str, Any]) -> dict[Path, bytes]:
     ]
     tables["point"] = [["name", "value"], *point]
     info = {**{key: record[key] for key in _TEXTS}, "dt": record["dt"]}
+    info["locked"] = ";".join(record["locked"])
     info |= {f"certificate.{key}": value for key, value in record["certificate"].items()}
     tables["info"] = [["name", "value"], *map(list, info.items())]
     return {_csv_path(path, key): _csv_text(rows) for key, rows in tables.items()}
@@ -229,6 +277,7 @@ def _from_csv(path: Path) -> dict[str, Any]:
     record["certificate"] = {
         key.removeprefix(prefix): float(x) for key, x in info.items() if key.startswith(prefix)
     }
+    record["locked"] = [entry for entry in info["locked"].split(";") if entry]
     return {**record, **{key: info[key] for key in (*_TEXTS, "dt")}}
 
 

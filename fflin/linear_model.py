@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,6 +75,8 @@ class LinearModel:
         Name of the robot.
     urdf_sha256 : str
         Hash of the URDF as it was read; empty where there was none.
+    locked : tuple of str
+        "joint=value" [rad|m] of the joints that are welded in it.
     fflin_version, pinocchio_version : str
         What made the model.
     """
@@ -98,6 +101,7 @@ class LinearModel:
     v: Array
     robot: str
     urdf_sha256: str
+    locked: tuple[str, ...]
     fflin_version: str
     pinocchio_version: str
     _reference: Array = field()
@@ -137,6 +141,22 @@ class LinearModel:
         """Joint-space inertia (6 + n, 6 + n) in state order, angular first, and frame's axes."""
         return self._inertia(self)
 
+    @property
+    def fingerprint(self) -> str:
+        """Hash of A, B and f0, which a certificate is about."""
+        digest = sha256()
+        for array in (self.A, self.B, self.f0):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+    def require(self, fingerprint: str) -> None:
+        """Raise `InputError` where the matrices are not those that were certified."""
+        if self.fingerprint != fingerprint:
+            raise InputError(
+                "A, B or f0 were changed after they were certified; hold them against the robot "
+                "with fflin.check"
+            )
+
     @cached_property
     def certificate(self) -> Certificate:
         """The figures that prove the model, computed when first asked for."""
@@ -144,7 +164,7 @@ class LinearModel:
 
     def is_equilibrium(self, tol: float = 1e-9) -> bool:
         """Whether the point is a fixed point: no entry of f0 exceeds `tol`."""
-        return bool(np.abs(self.f0).max() <= tol)
+        return bool(np.abs(self.f0).max() <= number("tol", tol))
 
     def discretize(self, dt: float) -> LinearModel:
         r"""Sample the model with its input held constant between samples.
@@ -187,15 +207,13 @@ class LinearModel:
             block[:nx, nx:] = driven
             exponential = expm(block * dt)
             Ad, held = exponential[:nx, :nx], exponential[:nx, nx:]
-        return replace(
-            self,
-            A=Ad,
-            B=held[:, :nu],
-            f0=held[:, nu],
-            dt=dt,
-            _inertia=partial(_same, "M", self),
-            _certify=partial(_same, "certificate", self),
+        if not (np.isfinite(Ad).all() and np.isfinite(held).all()):
+            raise InputError(f"dt is {dt:g} s, over which the model grows beyond all numbers")
+        sampled = replace(
+            self, A=Ad, B=held[:, :nu], f0=held[:, nu], dt=dt, _inertia=partial(_same_M, self)
         )
+        certify = partial(_same_certificate, self, sampled.fingerprint)
+        return replace(sampled, _certify=certify)
 
     def to_scipy(self) -> Any:
         """Return a `scipy.signal.StateSpace` of the deviations; names and f0 are lost."""
@@ -239,9 +257,9 @@ class LinearModel:
         FileError
             If the ending is another or the file cannot be written.
         """
-        from fflin.files import save_model
+        from fflin.files import as_path, save_model
 
-        save_model(self, Path(path))
+        save_model(self, as_path(path))
 
     @staticmethod
     def load(path: str | Path) -> LinearModel:
@@ -252,10 +270,17 @@ class LinearModel:
         FileError
             If the file cannot be read or is not such a model.
         """
-        from fflin.files import load_model
+        from fflin.files import as_path, load_model
 
-        return load_model(Path(path))
+        return load_model(as_path(path))
 
 
-def _same(name: str, continuous: LinearModel, _: LinearModel) -> Any:
-    return getattr(continuous, name)
+def _same_M(continuous: LinearModel, _: LinearModel) -> Array:
+    return continuous.M
+
+
+def _same_certificate(
+    continuous: LinearModel, fingerprint: str, sampled: LinearModel
+) -> Certificate:
+    sampled.require(fingerprint)
+    return continuous.certificate

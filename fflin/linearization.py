@@ -1,6 +1,7 @@
 """The equations: A and B about any point, from CRBA's M and the derivatives of RNEA."""
 
 from functools import partial
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pinocchio as pin
 from fflin import __version__
 from fflin.actuation import Actuation
 from fflin.certificate import certify
+from fflin.errors import InputError
 from fflin.inertia import Inertia, inertia_matrix
 from fflin.linear_model import LinearModel
 from fflin.model import ROOT, Robot
@@ -21,6 +23,8 @@ _STANDING = Chart(np.zeros(3), 1.0, np.eye(3))
 
 class Linearizer:
     r"""Linearise one robot many times; what does not change is prepared once.
+
+    Threads may share one, taking turns; copied or pickled, it has a work space of its own.
 
     At rest, with N = blkdiag(E3/2, E3, En) and M the joint-space inertia in state order,
 
@@ -62,6 +66,7 @@ class Linearizer:
         self._map = StateMap(robot, reference=reference, frame=frame)
         self._own_reference = reference is None
         self._data = robot.create_data()
+        self._lock = Lock()  # of the work space
         self._inertia = Inertia(self._map, self._data)
         self._actuation = Actuation(self._map)
         self._gravity = np.array(robot.gravity)
@@ -126,12 +131,21 @@ class Linearizer:
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
         q.setflags(write=False)
         if v is None and u is None and self._own_reference and self._plain:
-            return self._at_rest(q)
+            with self._lock:
+                return self._at_rest(q)
         if v is not None:
             v = _frozen(robot.checked_velocity(v).copy())
         if u is not None:
             u = _frozen(vector("u", u, self._nu, "the robot's inputs").copy())
-        return self._anywhere(q, self._zero_v if v is None else v, self._zero_u if u is None else u)
+        v = self._zero_v if v is None else v
+        u = self._zero_u if u is None else u
+        with self._lock:
+            return self._anywhere(q, v, u)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A copy, in this process or another, needs a work space of its own.
+        reference = None if self._own_reference else self._map.reference
+        return _rebuilt, (self.robot, self._map.frame, reference)
 
     def _at_rest(self, q: Array) -> LinearModel:
         B = np.zeros(self._shape_B)
@@ -199,6 +213,8 @@ class Linearizer:
             for columns_held, _ in self._actuation.held:
                 B[:, columns_held] = B[:, columns_held] @ chart.R.T
         for array in (A, B, f0, x0):
+            if not np.isfinite(array).all():
+                raise InputError("q, v or u is so large that the model is not finite")
             array.setflags(write=False)
         point = {"A": A, "B": B, "f0": f0, "x0": x0, "y0": x0, "u0": u, "q": q, "v": v}
         point["_reference"] = self._reference_of(q)
@@ -305,6 +321,7 @@ class Linearizer:
             "frame": state.frame,
             "robot": robot.name,
             "urdf_sha256": robot.urdf_sha256,
+            "locked": robot.locked,
             "fflin_version": __version__,
             "pinocchio_version": pin.__version__,
             "_inertia": partial(inertia_matrix, robot),
@@ -357,6 +374,10 @@ def linearize(
     Linearizer : the same, prepared once for many points; the equations stand there.
     """
     return Linearizer(robot, frame=frame, reference=reference)(q, v, u)
+
+
+def _rebuilt(robot: Robot, frame: Frame, reference: pin.SE3 | None) -> Linearizer:
+    return Linearizer(robot, frame=frame, reference=reference)
 
 
 def _frozen(array: Array) -> Array:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pinocchio as pin
 
-from fflin.errors import FflinWarning, ModelError, unknown
+from fflin.errors import FflinWarning, InputError, ModelError, unknown
 from fflin.joints import Follower, Joint
 from fflin.model import ROOT, Robot
 from fflin.reader import read_urdf
@@ -107,8 +107,9 @@ def from_model(
 
 def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, Mimic]) -> Robot:
     _check_root(model, name)
-    if lock:
-        model, mimics = _locked(model, lock, mimics)
+    locked: tuple[str, ...] = ()
+    if lock is not None:
+        model, mimics, locked = _locked(model, lock, mimics)
     all_joints = [_joint(model, index) for index in range(ROOT + 1, model.njoints)]
     by_name = {joint.name: joint for joint in all_joints}
     robot = Robot(
@@ -121,6 +122,7 @@ def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, 
             Follower(by_name[joint], by_name[mimic.leader], mimic.multiplier, mimic.offset)
             for joint, mimic in mimics.items()
         ),
+        locked=locked,
     )
     if not model.check(robot.create_data()):
         raise ModelError(
@@ -155,8 +157,13 @@ def _check_root(model: pin.Model, name: str) -> None:
 
 def _locked(
     model: pin.Model, lock: Lock, mimics: Mapping[str, Mimic]
-) -> tuple[pin.Model, dict[str, Mimic]]:
-    """Weld joints, and what mimics them; return the smaller model and the mimics that are left."""
+) -> tuple[pin.Model, dict[str, Mimic], tuple[str, ...]]:
+    """Weld joints, and what mimics them.
+
+    Returns the smaller model, the mimics that are left, and "joint=value" of what was welded.
+    """
+    if not isinstance(lock, Iterable):
+        raise InputError(f"lock is {lock!r}, expected {{joint: value}} or names of joints")
     names = [lock] if isinstance(lock, str) else list(lock)
     given = lock if isinstance(lock, Mapping) else {}
     movable = list(model.names)[ROOT + 1 :]
@@ -174,17 +181,18 @@ def _locked(
             values.setdefault(name, None)
             if values[name] is None:
                 values[name] = mimic.multiplier * leader_value + mimic.offset
-    indices = []
+    indices, locked = [], []
     for name, value in values.items():
         index = model.getJointId(name)
         indices.append(index)
+        locked.append(f"{name}={0.0 if value is None else value!r}")
         if value is not None:
             _joint(model, index).place(q, value)
         # Without a frame for the joint, which models built in code may lack, Pinocchio crashes.
         if not model.existFrame(name, pin.FrameType.JOINT):
             model.addJointFrame(index)
     left = {name: mimic for name, mimic in mimics.items() if name not in values}
-    return pin.buildReducedModel(model, indices, q), left
+    return pin.buildReducedModel(model, indices, q), left, tuple(locked)
 
 
 def _joint(model: pin.Model, index: int) -> Joint:

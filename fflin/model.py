@@ -15,7 +15,7 @@ from fflin.errors import InputError, ModelError, unknown
 from fflin.fields import validated_fields
 from fflin.inputs import Input, default_inputs
 from fflin.joints import Follower, Joint
-from fflin.validation import NORM_TOLERANCE, Array, number, vector
+from fflin.validation import NORM_TOLERANCE, Array, number, placement, vector
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
@@ -42,7 +42,8 @@ class Robot:
     Attributes
     ----------
     model : pin.Model
-        Free-flyer root joint, zero gravity; its mimic joints are joints like the others.
+        Free-flyer root joint, zero gravity; its mimic joints are joints like the others. To be
+        read; what is changed in it after loading is not seen everywhere.
     name : str
         Name or file stem it was loaded by.
     urdf : Path or None
@@ -55,6 +56,8 @@ class Robot:
         The mimic joints, each with the independent joint that it follows.
     notes : tuple of str
         What was warned of when it was read.
+    locked : tuple of str
+        "joint=value" [rad|m] of the joints that were welded.
     urdf_damping : mapping
         {joint: viscous damping [N m s/rad | N s/m]} as its file says, what follows a joint
         counted with it; part of the model only if `damping` is "urdf".
@@ -75,6 +78,7 @@ class Robot:
     joints: tuple[Joint, ...]
     followers: tuple[Follower, ...] = ()
     notes: tuple[str, ...] = ()
+    locked: tuple[str, ...] = ()
     urdf_damping: Mapping[str, float] = field(default_factory=dict)
     inputs: tuple[Input, ...] = ()
     stiffness: Mapping[str, float] = field(default_factory=dict)
@@ -171,6 +175,8 @@ class Robot:
                 raise InputError(
                     f"joint '{name}' mimics '{follower.leader.name}'; place that one instead"
                 )
+        if any(locked.rpartition("=")[0] == name for locked in self.locked):
+            raise InputError(f"joint '{name}' is locked; lock it at another value instead")
         raise unknown("joint", name, self.joint_names)
 
     def neutral(self) -> Array:
@@ -311,9 +317,10 @@ def configuration(
         raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
     q = pin.neutral(robot.model)
     if base is not None:
-        if not isinstance(base, pin.SE3):
-            raise InputError(f"base is a {type(base).__name__}, expected a pin.SE3")
-        q[:7] = pin.SE3ToXYZQUAT(robot.model.jointPlacements[ROOT].actInv(base))
+        root = robot.model.jointPlacements[ROOT]
+        q[:7] = pin.SE3ToXYZQUAT(root.actInv(placement("base", base)))
+    if joints is not None and not isinstance(joints, Mapping):
+        raise InputError(f"joints is a {type(joints).__name__}, expected {{joint: value}}")
     for name, value in (joints or {}).items():
         robot.joint(name).place(q, number(f"joint '{name}'", value))
     robot.follow(q)

@@ -18,13 +18,14 @@ if TYPE_CHECKING:
 
 def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
     """Show robots: (name, the robot or why it does not load, where from)."""
-    rows = [["name", "n", "mass [kg]", "from"]]
+    rows, refused = [["name", "n", "mass [kg]", "from"]], []
     for name, robot, origin in entries:
         if isinstance(robot, str):
-            rows.append([name, "-", "-", f"{origin}: {robot}"])
+            refused.append(f"{name} does not load: {robot}")
         else:
             rows.append([name, str(robot.n), f"{robot.mass:.6g}", origin])
-    return grid(rows, "lrrl")
+    notes = [textwrap.fill(line, width(), subsequent_indent="  ") for line in refused]
+    return "\n\n".join((grid(rows, "lrrl"), *notes))
 
 
 def robot_info(robot: Robot) -> str:
@@ -79,6 +80,10 @@ def linear_model(lin: LinearModel) -> str:
     nx, nu = lin.B.shape
     point = "a fixed point" if lin.is_equilibrium() else "not a fixed point"
     parts = [f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}, {point}"]
+    growing = _growing_poles(lin)
+    if growing:
+        shown = ", ".join(f"{pole:.5g}" for pole in growing)
+        parts.append(textwrap.fill(f"unstable: poles with a positive real part {shown}", width()))
     moved = [
         _signal(title, values, names, units)
         for title, values, names, units in (
@@ -137,6 +142,16 @@ def check_report(check: Check) -> str:
         verdict = f"FAILED: {len(check.failures)} of {len(check.rows)} figures: {', '.join(names)}"
     parts.append(textwrap.fill(verdict, width()))
     return "\n\n".join(parts)
+
+
+def _growing_poles(lin: LinearModel) -> list[complex]:
+    """Poles that grow by more than the rounding of the repeated poles at zero can explain."""
+    import numpy as np
+
+    poles = np.linalg.eigvals(lin.A)
+    size = float(np.abs(poles).max())
+    # A Jordan block of four, two coupled free motions, moves by the fourth root of round-off.
+    return [complex(pole) for pole in poles if pole.real > 1e-3 * size] if size > 1e-3 else []
 
 
 def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:

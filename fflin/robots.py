@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from fflin.errors import FileError, UrdfError, unknown
+from fflin.errors import FileError, InputError, UrdfError, unknown
 
 # example-robot-data's talos_legs is talos cut off at the torso, done in its loader's code.
 _PRUNED = {"talos_legs": ("torso_1_joint",)}
@@ -104,6 +104,8 @@ def find_robot(robot: str | Path) -> RobotFile:
     UrdfError
         If the robot is known but has no URDF.
     """
+    if not isinstance(robot, str | os.PathLike):
+        raise InputError(f"robot is a {type(robot).__name__}, expected a name or a path")
     if isinstance(robot, str) and robot in _bundled():
         return _bundled()[robot]
     path = Path(robot)

@@ -10,7 +10,7 @@ import pinocchio as pin
 from fflin.errors import ChartError, InputError
 from fflin.model import ROOT, Robot
 from fflin.rotation import conjugate, quaternion_product, rotation_matrix, skew
-from fflin.validation import Array, vector
+from fflin.validation import Array, placement, vector
 
 Frame = Literal["hybrid", "local", "world"]
 
@@ -113,12 +113,8 @@ class StateMap:
             raise InputError(
                 f"robot is a {type(robot).__name__}, expected a fflin.Robot; fflin.load makes one"
             )
-        if frame not in get_args(Frame):
+        if not isinstance(frame, str) or frame not in get_args(Frame):
             raise InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
-        if reference is not None and not isinstance(reference, pin.SE3):
-            raise InputError(
-                f"reference is a {type(reference).__name__}, expected a pin.SE3 (placement oMref)"
-            )
         n = robot.n
         self.robot = robot
         self.frame: Frame = frame
@@ -160,11 +156,11 @@ class StateMap:
         self._cos = self._idx_q[self._unbounded]
         self._sin = self._cos + 1
         # The free-flyer joint may itself stand somewhere in the world.
-        oMref = pin.SE3(reference) if reference is not None else pin.SE3.Identity()
+        oMref = pin.SE3.Identity() if reference is None else placement("reference", reference)
         self._reference = oMref
         # Composed as quaternions: their entries survive to the last digit near a turn of pi.
-        placement = pin.SE3ToXYZQUAT(oMref.actInv(robot.model.jointPlacements[ROOT]))
-        self._position, self._quaternion = placement[:3], placement[3:]
+        offset = pin.SE3ToXYZQUAT(oMref.actInv(robot.model.jointPlacements[ROOT]))
+        self._position, self._quaternion = offset[:3], offset[3:]
         self._rotation = rotation_matrix(self._quaternion)
 
     @property
@@ -295,8 +291,8 @@ class StateMap:
         return tau
 
     def forces(self, tau: Array) -> Array:
-        """Return the generalised forces (6 + n,) in base axes of Pinocchio's tau: S^T tau."""
-        return tau.take(self._order) if self.S is None else self.S.T @ tau
+        """Return the generalised forces (6 + n, ...) in base axes of Pinocchio's tau (nv, ...): S^T tau."""
+        return tau.take(self._order, axis=0) if self.S is None else self.S.T @ tau
 
     def project(self, matrix: Array, out: Array | None = None) -> Array:
         """Take a matrix (nv, nv) over Pinocchio's v to state order: S^T matrix S."""

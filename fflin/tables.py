@@ -16,14 +16,18 @@ _GAP = "  "
 
 def width() -> int:
     """Columns to fill: the terminal's, or 80 where the output goes elsewhere."""
-    return shutil.get_terminal_size((80, 24)).columns if sys.stdout.isatty() else 80
+    return shutil.get_terminal_size((80, 24)).columns if _on_terminal() else 80
 
 
 def dim(text: str) -> str:
     """Text that stands back on a terminal that shows colours."""
-    if sys.stdout.isatty() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb":
+    if _on_terminal() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb":
         return f"\x1b[2m{text}\x1b[0m"
     return text
+
+
+def _on_terminal() -> bool:
+    return sys.stdout is not None and sys.stdout.isatty()
 
 
 def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:

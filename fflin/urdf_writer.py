@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from xml.sax.saxutils import quoteattr
 
 from fflin.urdf import Urdf
 from fflin.urdf_joints import JointElement
@@ -27,7 +26,7 @@ def write_urdf(urdf: Urdf) -> str:
         Every number is the double that was read.
     """
     # urdfdom reads quat_xyzw from version 1.1 on; 1.2 would require limits.
-    lines = [f'<robot name={quoteattr(urdf.name)} version="1.1">']
+    lines = [f'<robot name={_quoted(urdf.name)} version="1.1">']
     for link in urdf.links.values():
         lines.extend(_link(link))
     for joint in urdf.joints.values():
@@ -37,7 +36,7 @@ def write_urdf(urdf: Urdf) -> str:
 
 
 def _link(link: Link) -> Iterator[str]:
-    yield f"<link name={quoteattr(link.name)}>"
+    yield f"<link name={_quoted(link.name)}>"
     if link.mass is not None:
         entries = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         inertia = " ".join(
@@ -49,8 +48,8 @@ def _link(link: Link) -> Iterator[str]:
 
 
 def _joint(joint: JointElement) -> Iterator[str]:
-    yield f'<joint name={quoteattr(joint.name)} type="{joint.type}">'
-    yield f"<parent link={quoteattr(joint.parent)}/><child link={quoteattr(joint.child)}/>"
+    yield f'<joint name={_quoted(joint.name)} type="{joint.type}">'
+    yield f"<parent link={_quoted(joint.parent)}/><child link={_quoted(joint.child)}/>"
     yield _origin(joint.origin)
     if joint.freedom == 1:
         yield f'<axis xyz="{_numbers(joint.axis)}"/>'
@@ -80,3 +79,12 @@ def _origin(pose: Pose) -> str:
 
 def _numbers(values: tuple[float, ...]) -> str:
     return " ".join(repr(value) for value in values)
+
+
+def _quoted(text: str) -> str:
+    """Write an attribute's value. The standard library's writer loads its network client."""
+    for character, entity in (("&", "&amp;"), ("<", "&lt;"), (">", "&gt;"), ('"', "&quot;")):
+        text = text.replace(character, entity)
+    for character in "\t\n\r":
+        text = text.replace(character, f"&#{ord(character)};")
+    return f'"{text}"'

@@ -1,12 +1,17 @@
 """Checks of what callers pass in, made once at the public door."""
 
+from __future__ import annotations
+
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fflin.errors import InputError
+
+if TYPE_CHECKING:
+    import pinocchio as pin
 
 Array = NDArray[np.floating[Any]]
 
@@ -48,8 +53,8 @@ def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
         array = _as_double(name, value)
     if array.shape != (size,):
         raise InputError(f"{name} has shape {array.shape}, expected ({size},): {of_what}")
-    # The square is finite where every entry is, but for numbers beyond 1e154.
-    if not math.isfinite(array.dot(array)) and not np.isfinite(array).all():
+    # Python's sum is quicker than NumPy's here, and overflows without a warning.
+    if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
         index = int(np.flatnonzero(~np.isfinite(array))[0])
         raise InputError(f"{name}[{index}] is {array[index]}; every entry must be finite")
     return array
@@ -59,11 +64,29 @@ def number(name: str, value: Any) -> float:
     """Return a finite float, or raise `InputError` that says what was given."""
     try:
         result = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name} is {value!r}, expected a number") from None
     if not math.isfinite(result):
         raise InputError(f"{name} is {result}, expected a finite number")
     return result
+
+
+def placement(name: str, value: Any) -> pin.SE3:
+    """Return a copy of a rigid placement, or raise `InputError`.
+
+    Its rotation is renormalised where it is one within 1e-6.
+    """
+    import pinocchio as pin
+
+    if not isinstance(value, pin.SE3):
+        raise InputError(f"{name} is a {type(value).__name__}, expected a pin.SE3 (placement)")
+    if not np.isfinite(value.homogeneous).all():
+        raise InputError(f"{name} has entries that are not finite")
+    rotation = value.rotation
+    skewed = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if skewed > NORM_TOLERANCE or np.linalg.det(rotation) < 0.0:
+        raise InputError(f"the rotation of {name} is not one: R^T R and det R must be 1")
+    return pin.SE3(pin.Quaternion(rotation).normalized().matrix(), value.translation)
 
 
 def _as_double(name: str, value: ArrayLike) -> Array:

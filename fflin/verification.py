@@ -18,10 +18,11 @@ from fflin.certificate import (
     scaled_condition,
 )
 from fflin.errors import InputError
-from fflin.inertia import inverse_inertia
+from fflin.inertia import inertia_matrix, inverse_inertia
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
 from fflin.reports import check_report
+from fflin.rotation import rotation_matrix
 from fflin.state import ANGULAR, LINEAR, StateMap
 from fflin.validation import Array
 
@@ -32,6 +33,12 @@ _EPS = float(np.finfo(float).eps)
 _ROUTE_TOLERANCE, _ROUTE_ROUNDING = 1e-9, 1e2 * _EPS
 # Differences of sixth order lose about four digits more to their step.
 _DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING = 1e-8, 1e4 * _EPS
+
+# Beyond two digits nothing is confirmed, however badly M is conditioned.
+_LOOSEST = 1e-2
+
+# Where the base flies faster than this [m/s], the digits of its speed would drown the rest.
+_FAST = 100.0
 
 # Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. Its error is
 # h^6 f^(7) / 140.
@@ -128,52 +135,64 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; check the continuous one")
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    if lin.input_names != Actuation(state).names:
-        raise InputError(
-            f"the model has {len(lin.input_names)} inputs, which are not the inputs of "
-            f"'{robot.name}'; give the robot the same (Robot.replace)"
-        )
     if lin.state_names != state.names:
         raise InputError(
             f"the model has {len(lin.state_names)} states of '{lin.robot}', which are not the "
             f"{state.nx} states of '{robot.name}'; check it against its own robot"
         )
-    q, v = robot.checked_configuration(lin.q), lin.v
-    condition = scaled_condition(lin.M)
-    route = max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition)
-    difference = max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition)
-    model = _Nonlinear(state)
+    actuation = Actuation(state)
+    if (lin.input_names, lin.input_units) != (actuation.names, actuation.units):
+        raise InputError(
+            f"the model has {len(lin.input_names)} inputs, which are not the "
+            f"{len(actuation.names)} of '{robot.name}'; give the robot the same (Robot.replace)"
+        )
+    q, v = robot.checked_configuration(lin.q), robot.checked_velocity(lin.v)
+    M = inertia_matrix(robot, lin)
+    condition = scaled_condition(M)
+    route = min(max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition), _LOOSEST)
+    difference = min(max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition), _LOOSEST)
+    model = _Nonlinear(state, q, v)
     rows = [
         Row("ABA derivatives", f"{b.matrix}[{b.row}, {b.column}]", b.error, route)
-        for b in compare(state, lin, *aba_route(state, q, v, lin.u0))
+        for b in compare(state, lin, M, *aba_route(state, q, v, lin.u0))
     ]
     rows += [
         Row("differences", f"{b.matrix}[{b.row}, {b.column}]", b.error, difference)
-        for b in compare(state, lin, *_differences(model, lin))
+        for b in compare(state, lin, M, *_differences(model, lin, M))
     ]
     rows.append(Row("flow", "f", _flow_error(robot, lin), difference))
-    rows.append(Row("point", "x0", _relative(lin.x0, state.to_state(q, v, near=lin.x0)), route))
-    rows.append(Row("point", "f0", _relative(lin.f0, model(lin.x0, lin.u0)), route))
+    rows += [Row("point", name, error, route) for name, error in _point_errors(model, lin, M, q, v)]
+    rows.append(Row("inertia", "M", _relative(lin.M, M, floor=0.0), route))
     inverse = inverse_inertia(state, lin)
     if model.aba.actuation.default:
-        inverse = lin.B[-len(lin.M) :]  # which is all of it
-    rows.append(Row("inertia", "M M^-1 = E", inertia_residual(lin.M, inverse), route))
+        inverse = lin.B[-len(M) :]  # which is all of it
+    rows.append(Row("inertia", "M M^-1 = E", inertia_residual(M, inverse), route))
     rows += [Row("inertia", name, error, 1e-12) for name, error in _positive_definite(inverse)]
     return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, cond(M) {condition:.1e}")
 
 
 class _Nonlinear:
-    """The nonlinear model in the chart, by ABA: ``xdot = f(x, u)``."""
+    """The nonlinear model in the chart, by ABA: ``xdot = f(x, u)``.
 
-    def __init__(self, state: StateMap) -> None:
+    Where the base is fast, accelerations are taken by an observer who flies with the point at
+    constant velocity: they are the same, v_b's rate but for the turning of the base's axes.
+    """
+
+    def __init__(self, state: StateMap, q: Array, v: Array) -> None:
         self.state = state
         self.aba = Aba(state)
+        observer = rotation_matrix(q[3:7]) @ v[:3]
+        self._observer = observer if np.linalg.norm(observer) > _FAST else np.zeros(3)
 
     def acceleration(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return (q, v, a) in Pinocchio's order."""
         q, v = self.state.to_pinocchio(x)
         u = self.aba.actuation.in_base_axes(self.state.chart(q), u)
-        return q, v, self.aba.acceleration(q, v, u)
+        seen, observer = v.copy(), rotation_matrix(q[3:7]).T @ self._observer
+        seen[:3] -= observer
+        a = self.aba.acceleration(q, seen, u).copy()
+        a[:3] -= np.cross(v[3:6], observer)
+        return q, v, a
 
     def __call__(self, x: Array, u: Array) -> Array:
         state = self.state
@@ -194,10 +213,29 @@ class _Nonlinear:
         )
 
 
-def _differences(model: _Nonlinear, lin: LinearModel) -> tuple[Array, Array]:
+def _point_errors(
+    model: _Nonlinear, lin: LinearModel, M: Array, q: Array, v: Array
+) -> list[tuple[str, float]]:
+    """Errors of x0 and f0, and of f0's groups relative to the terms that may cancel in them."""
+    state = model.state
+    mobility, input_mobility = mobilities(M, lin.B)
+    rate = model(lin.x0, lin.u0)
+    speed = np.abs(state.velocities(v))
+    spinning = max(float(speed[ANGULAR].max()), float(speed[6:].max(initial=0.0)))
+    push = float((np.abs(lin.u0) * input_mobility).max(initial=0.0))
+    push += spinning**2 * float((1.0 / mobility).max())
+    natural = np.concatenate((np.ones(len(M)), mobility * push))
+    errors = [("x0", _relative(lin.x0, state.to_state(q, v, near=lin.x0)))]
+    for name, rows in state.groups._asdict().items():
+        floor = float(natural[rows].max(initial=0.0)) or float(np.abs(rate[rows]).max(initial=1.0))
+        errors.append((f"f0[{name}]", _relative(lin.f0[rows], rate[rows], floor=floor or 1.0)))
+    return errors
+
+
+def _differences(model: _Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
     """Return A and B by central differences of the nonlinear model."""
     groups = model.state.groups
-    nv = len(lin.M)
+    nv = len(M)
     # Small against the angles over which accelerations change where light links line up.
     step = np.full(model.state.nx, 2e-4)
     # Well inside the chart, whose edge |q_b| = 1 the model feels long before.
@@ -206,7 +244,7 @@ def _differences(model: _Nonlinear, lin: LinearModel) -> tuple[Array, Array]:
     speed = np.abs(lin.x0[-nv:])
     step[-nv:] = 0.1 * max(1.0, float(speed[ANGULAR].max()), float(speed[6:].max(initial=0.0)))
     step[groups.v_b] = 0.1 * max(1.0, float(speed[LINEAR].max()))
-    mobility, input_mobility = mobilities(lin)
+    mobility, input_mobility = mobilities(M, lin.B)
     push = max(1.0, float(np.abs(lin.f0[-nv:] / mobility).max())) / input_mobility
     A = _jacobian(lambda x: model(x, lin.u0), lin.x0, step)
     B = _jacobian(lambda u: model(lin.x0, u), lin.u0, push)
@@ -238,7 +276,7 @@ def _flow_error(robot: Robot, lin: LinearModel) -> float:
     """
     turned = pin.SE3(lin.reference.rotation, np.zeros(3))
     state = StateMap(robot, reference=turned, frame=lin.frame)
-    model = _Nonlinear(state)
+    model = _Nonlinear(state, lin.q, lin.v)
     worst = 0.0
     for unit in (None, *range(6)):
         x = lin.x0.copy()
@@ -246,8 +284,7 @@ def _flow_error(robot: Robot, lin: LinearModel) -> float:
         if unit is not None:
             x[6 + robot.n + unit] += 1.0
         q, v, a = model.acceleration(x, lin.u0)
-        margin = 1.0 - float(np.linalg.norm(x[state.groups.q_b]))
-        h = 1e-2 * margin / (1.0 + float(np.abs(v[3:]).max()))
+        h = 1e-2 * state.chart(q).q0 / (1.0 + float(np.abs(v[3:]).max()))
         rate = _derivative(partial(_moved, state, q, h * v, v, h * a)) / h
         floor = 1.0 + float(np.abs(v).max())
         worst = max(worst, _relative(model(x, lin.u0), rate, floor=floor))
@@ -259,6 +296,8 @@ def _moved(state: StateMap, q: Array, dq: Array, v: Array, dv: Array, t: float) 
 
 
 def _relative(given: Array, expected: Array, floor: float = 1.0) -> float:
+    if not given.size:
+        return 0.0
     return float(np.abs(given - expected).max() / max(floor, float(np.abs(expected).max())))
 
 
