@@ -69,8 +69,8 @@ class Carried(NamedTuple):
 def center_of_mass(at: Point, to: Sensed) -> None:
     """Position in reference axes."""
     jacobian = pin.jacobianCenterOfMass(at.model, at.data, at.q, False)
-    to.y[:] = at.r_b + at.R @ at.data.com[0]
-    to.by_q[:] = at.R @ jacobian
+    to.y[:] = at.r_b + at.R.dot(at.data.com[0])
+    to.by_q[:] = at.R.dot(jacobian)
 
 
 def momentum(at: Point, to: Sensed) -> None:
@@ -78,20 +78,20 @@ def momentum(at: Point, to: Sensed) -> None:
     # Its rate, which this differentiates too, is of no interest: any acceleration will do.
     by_q, _, _, by_v = pin.computeCentroidalDynamicsDerivatives(at.model, at.data, at.q, at.v, at.v)
     mass, still = pin.computeTotalMass(at.model), at.data.hg
-    to.y[:3] = at.R @ still.angular
-    to.y[3:] = at.R @ (still.linear + mass * at.v_b)
+    to.y[:3] = at.R.dot(still.angular)
+    to.y[3:] = at.R.dot(still.linear + mass * at.v_b)
     for part, rows in (slice(0, 3), ANGULAR), (slice(3, 6), LINEAR):
-        to.by_q[part] = at.R @ by_q[rows]
-        to.by_v[part] = at.R @ by_v[rows]
-    to.by_q[3:, ANGULAR] -= mass * at.R @ skew(at.v_b)
+        to.by_q[part] = at.R.dot(by_q[rows])
+        to.by_v[part] = at.R.dot(by_v[rows])
+    to.by_q[3:, ANGULAR] -= at.R.dot(skew(mass * at.v_b))
 
 
 def frame_pose(at: Point, frame: Carried, to: Sensed) -> None:
     """Position in reference axes, and the rotation vector from where it is."""
     placement = at.data.oMi[frame.joint] * frame.placement
     _, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
-    to.y[:3] = at.r_b + at.R @ placement.translation
-    to.by_q[:3] = at.R @ placement.rotation @ jacobian[LINEAR]
+    to.y[:3] = at.r_b + at.R.dot(placement.translation)
+    to.by_q[:3] = at.R.dot(placement.rotation).dot(jacobian[LINEAR])
     to.by_q[3:] = jacobian[ANGULAR]
 
 
@@ -99,15 +99,15 @@ def frame_velocity(at: Point, frame: Carried, to: Sensed) -> None:
     """Angular in the frame's axes, and of its origin in reference axes."""
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     velocity = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL)
-    R = at.R @ (at.data.oMi[frame.joint] * frame.placement).rotation
+    R = at.R.dot((at.data.oMi[frame.joint] * frame.placement).rotation)
     to.y[:3] = velocity.angular
     to.by_q[:3] = by_q[ANGULAR]
     to.by_v[:3] = jacobian[ANGULAR]
     # A velocity held in axes that turn turns with them: the frame's, and the base's.
-    to.y[3:] = R @ velocity.linear + at.R @ at.v_b
-    to.by_q[3:] = R @ (by_q[LINEAR] - skew(velocity.linear) @ jacobian[ANGULAR])
-    to.by_q[3:, ANGULAR] -= at.R @ skew(at.v_b)
-    to.by_v[3:] = R @ jacobian[LINEAR]
+    to.y[3:] = R.dot(velocity.linear) + at.R.dot(at.v_b)
+    to.by_q[3:] = R.dot(by_q[LINEAR] - skew(velocity.linear).dot(jacobian[ANGULAR]))
+    to.by_q[3:, ANGULAR] -= at.R.dot(skew(at.v_b))
+    to.by_v[3:] = R.dot(jacobian[LINEAR])
 
 
 def gyroscope(at: Point, frame: Carried, to: Sensed) -> None:
@@ -130,5 +130,5 @@ def accelerometer(at: Point, frame: Carried, to: Sensed) -> None:
     to.by_q[:], to.by_v[:], to.by_a[:] = by_q, by_v, by_a
     # The terms of that sum; gravity turns against the base.
     of_base = by_a[:, LINEAR]
-    to.by_q[:, ANGULAR] -= of_base @ skew(at.g)
-    to.by_v[:, ANGULAR] -= of_base @ skew(at.v_b)
+    to.by_q[:, ANGULAR] -= of_base.dot(skew(at.g))
+    to.by_v[:, ANGULAR] -= of_base.dot(skew(at.v_b))

@@ -33,7 +33,7 @@ from fflin.outputs import (
     Momentum,
     Output,
 )
-from fflin.rotation import quaternion_product, rotation_matrix
+from fflin.rotation import quaternion_product, rotation_matrix, skew
 from fflin.state import StateMap
 from fflin.validation import Array
 
@@ -99,6 +99,7 @@ class Sensing:
         robot = state.robot
         self._model, self._nv = robot.model, robot.nv
         self._gravity: Array = np.zeros(3) if gravity is None else np.array(gravity, dtype=float)
+        self._weighed = bool(self._gravity.any())
         self._own_reference = own_reference
         # The free-flyer joint may itself stand somewhere in the world.
         root = robot.model.jointPlacements[ROOT]
@@ -162,7 +163,7 @@ class Sensing:
             of_robot(at, Sensed(*(part[rows] for part in sensed)))
         if self.needs_acceleration:
             felt = a.copy()
-            felt[LINEAR] += np.cross(v[ANGULAR], at.v_b) - at.g
+            felt[LINEAR] += skew(v[ANGULAR]).dot(at.v_b) - at.g
             pin.computeForwardKinematicsDerivatives(self._model, data, at.q, at.v, felt)
         elif self._of_frames:
             pin.computeForwardKinematicsDerivatives(self._model, data, at.q, at.v)
@@ -178,7 +179,9 @@ class Sensing:
         if not self._own_reference:
             R = rotation_matrix(quaternion_product(self._quaternion, q[3:7]))
             r_b = self._position + self._rotation @ q[:3]
-        gravity = (self._root_rotation @ rotation_matrix(q[3:7])).T @ self._gravity
+        gravity = self._gravity
+        if self._weighed:
+            gravity = rotation_matrix(q[3:7]).T @ (self._root_rotation.T @ gravity)
         return Point(self._model, data, still_q, still_v, R, r_b, v[LINEAR], gravity)
 
 
