@@ -8,20 +8,30 @@ __version__ = "0.1.0"
 # Public name -> module. Each is imported when it is first asked for, so that a command which
 # needs no dynamics does not pay for them.
 _PUBLIC = {
+    "Accelerometer": "outputs",
     "BaseForce": "inputs",
+    "BasePose": "outputs",
     "BaseTorque": "inputs",
+    "CenterOfMass": "outputs",
     "Certificate": "linear_model",
     "ChartError": "errors",
     "Check": "verification",
     "FflinError": "errors",
     "FflinWarning": "errors",
     "FileError": "errors",
+    "FramePose": "outputs",
+    "FrameVelocity": "outputs",
+    "FullState": "outputs",
+    "Gyroscope": "outputs",
     "InputError": "errors",
+    "JointPositions": "outputs",
     "JointTorque": "inputs",
+    "JointVelocities": "outputs",
     "LinearModel": "linear_model",
     "Linearizer": "linearization",
     "MissingPackageError": "errors",
     "ModelError": "errors",
+    "Momentum": "outputs",
     "Robot": "model",
     "SingularInertiaError": "errors",
     "StateMap": "state",
@@ -58,6 +68,18 @@ if TYPE_CHECKING:
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load
     from fflin.model import Robot, configuration
+    from fflin.outputs import (
+        Accelerometer,
+        BasePose,
+        CenterOfMass,
+        FramePose,
+        FrameVelocity,
+        FullState,
+        Gyroscope,
+        JointPositions,
+        JointVelocities,
+        Momentum,
+    )
     from fflin.points import effort, velocity
     from fflin.robots import list_robots
     from fflin.state import StateMap

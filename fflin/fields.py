@@ -6,9 +6,10 @@ from typing import Any
 from fflin.errors import InputError, ModelError, unknown
 from fflin.inputs import BaseForce, BaseTorque, Input, JointTorque, Thruster, three_numbers
 from fflin.joints import Joint
+from fflin.outputs import Output
 from fflin.validation import number
 
-FIELDS = ("inputs", "stiffness", "damping", "rest", "gravity")
+FIELDS = ("inputs", "outputs", "stiffness", "damping", "rest", "gravity")
 
 
 def validated_fields(
@@ -45,6 +46,8 @@ def validated_fields(
             raise unknown("field of a robot", name, FIELDS)
         if name == "inputs":
             checked[name] = _inputs(value, find)
+        elif name == "outputs":
+            checked[name] = _outputs(value)
         elif name == "gravity":
             checked[name] = three_numbers("gravity", value)
         elif name == "damping" and isinstance(value, str):
@@ -73,6 +76,15 @@ def _inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, ...]:
     twice = [str(x) for x in (*names, *plain) if (*names, *plain).count(x) > 1]
     if twice:
         raise InputError(f"input {twice[0]} stands there twice")
+    return tuple(value)
+
+
+def _outputs(value: Any) -> tuple[Output, ...]:
+    if isinstance(value, str) or not isinstance(value, Sequence) or not value:
+        raise InputError(f"outputs is {value!r}, expected a sequence of at least one output")
+    for item in value:
+        if not isinstance(item, Output):
+            raise InputError(f"{item!r} is not an output, as FramePose('tool') would be")
     return tuple(value)
 
 

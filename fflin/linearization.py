@@ -14,7 +14,10 @@ from fflin.errors import InputError
 from fflin.inertia import Inertia, inertia_matrix
 from fflin.linear_model import LinearModel
 from fflin.model import ROOT, Robot
+from fflin.output_equations import Rates, output_equations
+from fflin.outputs import FullState
 from fflin.rotation import rotation_matrix, skew
+from fflin.sensing import Sensing
 from fflin.state import ANGULAR, LINEAR, Chart, Frame, StateMap
 from fflin.validation import Array, vector
 
@@ -70,9 +73,18 @@ class Linearizer:
         self._inertia = Inertia(self._map, self._data)
         self._actuation = Actuation(self._map)
         self._gravity = np.array(robot.gravity)
+        self._sensing: Sensing | None = None
+        if robot.outputs != (FullState(),):
+            self._sensing = Sensing(
+                self._map,
+                robot.outputs,
+                gravity=self._gravity,
+                own_reference=self._own_reference,
+            )
         # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
         self._plain = (
             self._actuation.default
+            and self._sensing is None
             and not self._gravity.any()
             and not any(values.any() for values in robot.passive)
         )
@@ -164,39 +176,19 @@ class Linearizer:
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
         state, nv, groups = self._map, self._nv, self._map.groups
-        model, data = self.robot.model, self._data
         chart = _STANDING if self._own_reference else state.chart(q)
-
-        # In base axes, and without the base's position and linear velocity: nothing below
-        # depends on them, and Pinocchio's derivatives lose digits to both. Nor does it depend on
-        # gravity, which accelerates the base origin and nothing against it (equivalence).
-        nu = state.velocities(v)
-        q_still, v_still = q.copy(), v.copy()
-        q_still[:3] = v_still[:3] = 0.0
-        inverse = np.empty((nv, nv))
-        self._inertia.invert(q_still, inverse)
-        columns = self._actuation.columns(data, q_still)
+        nu, q_m = state.velocities(v), state.joint_positions(q)
         u_base = self._actuation.in_base_axes(chart, u)
-        force = columns.dot(u_base) - state.forces(
-            pin.nonLinearEffects(model, data, q_still, v_still)
-        )
-        q_m = state.joint_positions(q)
-        stiffness, damping, rest = self.robot.passive
-        force[6:] -= stiffness * (q_m - rest) + damping * nu[6:]
-        c = inverse.dot(force)
-        by_q, by_v = self._bias_slopes(q_still, v_still, c, u_base)
-
+        rates = self._rates_in_base_axes(q, v, nu, q_m, u_base)
         A = self._A_rest.copy()
         self._set_kinematics(A, chart, nu)
         lower = A[-nv:]
-        lower[:, groups.q_m] = inverse.dot(by_q)
-        lower[:, -nv:] = inverse.dot(by_v)
-        np.negative(lower, out=lower)
-        lower[:, groups.v_b] = 0.0
+        lower[:, groups.q_m] = rates.by_q_m
+        lower[:, -nv:] = rates.by_nu
         B = np.zeros(self._shape_B)
-        B[self._lower] = inverse if self._actuation.default else inverse.dot(columns)
-        gravity = self._gravity_in_base_axes(q)
-        self._set_turning(lower, B[self._lower], chart, nu, u_base, c, gravity)
+        B[self._lower] = rates.by_u
+        c = rates.c.copy()
+        self._set_turning(lower, chart, nu, u_base, c, rates)
         f0: Array = np.empty(state.nx)
         x0: Array = np.zeros(state.nx)
         np.multiply(nu, self._rates, out=f0[:nv])
@@ -212,13 +204,56 @@ class Linearizer:
                 state.to_frame(chart, rows)
             for columns_held, _ in self._actuation.held:
                 B[:, columns_held] = B[:, columns_held] @ chart.R.T
-        for array in (A, B, f0, x0):
+        C, D, y0 = self._seen(chart, rates, q, v, u_base, x0)
+        for array in (A, B, C, D, f0, x0, y0):
             if not np.isfinite(array).all():
                 raise InputError("q, v or u is so large that the model is not finite")
             array.setflags(write=False)
-        point = {"A": A, "B": B, "f0": f0, "x0": x0, "y0": x0, "u0": u, "q": q, "v": v}
+        point = {"A": A, "B": B, "C": C, "D": D, "f0": f0}
+        point |= {"x0": x0, "y0": y0, "u0": u, "q": q, "v": v}
         point["_reference"] = self._reference_of(q)
         return LinearModel._from_fields(self._common | point)
+
+    def _rates_in_base_axes(self, q: Array, v: Array, nu: Array, q_m: Array, u: Array) -> Rates:
+        """Return the accelerations and their slopes; `u` (nu,) in base axes."""
+        model, data, state, nv = self.robot.model, self._data, self._map, self._nv
+        # Without the base's position and linear velocity: nothing here depends on them, and
+        # Pinocchio's derivatives lose digits to both. Nor does it depend on gravity, which
+        # accelerates the base origin and nothing against it (equivalence).
+        q_still, v_still = q.copy(), v.copy()
+        q_still[:3] = v_still[:3] = 0.0
+        inverse = np.empty((nv, nv))
+        self._inertia.invert(q_still, inverse)
+        columns = self._actuation.columns(data, q_still)
+        bias = pin.nonLinearEffects(model, data, q_still, v_still)
+        force = columns.dot(u) - state.forces(bias)
+        stiffness, damping, rest = self.robot.passive
+        force[6:] -= stiffness * (q_m - rest) + damping * nu[6:]
+        c = inverse.dot(force)
+        by_q, by_v = self._bias_slopes(q_still, v_still, c, u)
+        by_nu = inverse.dot(-by_v)
+        by_nu[:, LINEAR] = 0.0
+        by_u = inverse if self._actuation.default else inverse.dot(columns)
+        root = model.jointPlacements[ROOT].rotation
+        gravity = rotation_matrix(q[3:7]).T @ (root.T @ self._gravity)
+        return Rates(c, inverse.dot(-by_q), by_nu, by_u, gravity)
+
+    def _seen(
+        self, chart: Chart, rates: Rates, q: Array, v: Array, u: Array, x0: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return C, D and y0; `u` (nu,) in base axes."""
+        sensing, state = self._sensing, self._map
+        if sensing is None:
+            return self._common["C"], self._common["D"], x0
+        nu = state.velocities(v)
+        a = rates.c.copy()
+        a[LINEAR] += rates.gravity - skew(nu[ANGULAR]).dot(nu[LINEAR])
+        sensed = sensing.evaluate(self._data, q, v, state.spread(a))
+        C, D = output_equations(state, self._actuation, chart, sensed, rates, nu, u)
+        for row, index in sensing.states:
+            C[row, index] = 1.0
+            sensed.y[row] = x0[index]
+        return C, D, sensed.y
 
     def _bias_slopes(self, q: Array, v: Array, c: Array, u: Array) -> tuple[Array, Array]:
         """Return the slopes of M a + b - B u + passive forces over q_m (.., n) and nu, a held.
@@ -239,19 +274,14 @@ class Linearizer:
             by_v[joints, joints] += self.robot.passive.damping
         return by_q, by_v
 
-    def _gravity_in_base_axes(self, q: Array) -> Array:
-        root = self.robot.model.jointPlacements[ROOT].rotation
-        return rotation_matrix(q[3:7]).T @ (root.T @ self._gravity)
-
     def _set_turning(
         self,
         lower: Array,
-        B: Array,
         chart: Chart,
         nu: Array,
         u: Array,
         c: Array,
-        gravity: Array,
+        rates: Rates,
     ) -> None:
         r"""Complete the velocity rows (6 + n, nx) for what is held in which axes.
 
@@ -267,7 +297,7 @@ class Linearizer:
         w, v = nu[ANGULAR], nu[LINEAR]
         turn = np.zeros((self._nv, 3))
         for columns, _ in self._actuation.held:
-            turn += B[:, columns].dot(skew(u[columns]))
+            turn += rates.by_u[:, columns].dot(skew(u[columns]))
         if turned_angular:
             turn += lower[:, groups.omega_b].dot(skew(w))
             turn[ANGULAR] -= skew(c[ANGULAR])
@@ -277,9 +307,9 @@ class Linearizer:
             turning = skew(w)
             lower[LINEAR, groups.omega_b] += skew(v)
             lower[LINEAR, groups.v_b] -= turning
-            turn[LINEAR] += skew(gravity)
+            turn[LINEAR] += skew(rates.gravity)
             c[LINEAR] -= turning.dot(v)
-        c[LINEAR] += gravity
+        c[LINEAR] += rates.gravity
         lower[:, groups.q_b] = turn.dot(chart.J)
 
     def _set_kinematics(self, A: Array, chart: Chart, nu: Array) -> None:
@@ -308,16 +338,17 @@ class Linearizer:
     def _common_fields(self) -> dict[str, Any]:
         robot, state = self.robot, self._map
         names, units = self._actuation.names, self._actuation.units
+        seen = self._sensing or state
         return {
             "C": _frozen(np.eye(state.nx)),
             "D": _frozen(np.zeros((state.nx, len(names)))),
             "dt": 0.0,
             "state_names": state.names,
             "input_names": names,
-            "output_names": state.names,
+            "output_names": seen.names,
             "state_units": state.units,
             "input_units": units,
-            "output_units": state.units,
+            "output_units": seen.units,
             "frame": state.frame,
             "robot": robot.name,
             "urdf_sha256": robot.urdf_sha256,

@@ -15,6 +15,7 @@ from fflin.errors import InputError, ModelError, unknown
 from fflin.fields import validated_fields
 from fflin.inputs import Input, default_inputs
 from fflin.joints import Follower, Joint
+from fflin.outputs import FullState, Output
 from fflin.validation import NORM_TOLERANCE, Array, number, placement, vector
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
@@ -63,6 +64,8 @@ class Robot:
         counted with it; part of the model only if `damping` is "urdf".
     inputs : tuple of Input
         What acts on it; the base's torque and force and every joint's by default.
+    outputs : tuple of Output
+        What is watched of it; the full state by default.
     stiffness, damping : mapping
         {joint: value [N m/rad | N/m], [N m s/rad | N s/m]} of passive joints.
     rest : mapping
@@ -81,6 +84,7 @@ class Robot:
     locked: tuple[str, ...] = ()
     urdf_damping: Mapping[str, float] = field(default_factory=dict)
     inputs: tuple[Input, ...] = ()
+    outputs: tuple[Output, ...] = (FullState(),)
     stiffness: Mapping[str, float] = field(default_factory=dict)
     damping: Mapping[str, float] = field(default_factory=dict)
     rest: Mapping[str, float] = field(default_factory=dict)
@@ -97,6 +101,8 @@ class Robot:
         ----------
         inputs : sequence of Input
             What acts on it, in the order of u.
+        outputs : sequence of Output
+            What is watched of it, in the order of y.
         stiffness : mapping or float
             {joint: K [N m/rad | N/m]}, or one for all joints.
         damping : mapping, float or "urdf"

@@ -121,11 +121,11 @@ class Sensing:
                 self._of_robot.append((slice(at, len(signals)), of_robot))
             elif isinstance(output, FramePose | FrameVelocity | Gyroscope | Accelerometer):
                 of_frame, vectors = _OF_FRAME[type(output)]
-                name, frame = output.frame, _carried(robot, output.frame)
+                name, frame = output.frame, carried(robot, output.frame)
                 signals += _components([(f"{name}.{vector}", unit) for vector, unit in vectors])
                 self._of_frames.append((slice(at, len(signals)), of_frame, frame))
             else:
-                indices = _states(state, output)
+                indices = states_of(state, output)
                 self.states += enumerate(indices, start=at)
                 signals += [(state.names[index], state.units[index]) for index in indices]
         self.names = tuple(name for name, _ in signals)
@@ -185,7 +185,7 @@ class Sensing:
         return Point(self._model, data, still_q, still_v, R, r_b, v[LINEAR], gravity)
 
 
-def _states(state: StateMap, output: Output) -> list[int]:
+def states_of(state: StateMap, output: Output) -> list[int]:
     """Return the indices of the states that an output is made of."""
     robot, groups = state.robot, state.groups
     if isinstance(output, FullState):
@@ -199,7 +199,7 @@ def _states(state: StateMap, output: Output) -> list[int]:
     return [group.start + robot.joints.index(robot.joint(name)) for name in names]
 
 
-def _carried(robot: Robot, name: str) -> Carried:
+def carried(robot: Robot, name: str) -> Carried:
     """Return where a frame is; a link's before a joint's of the same name."""
     frames = [frame for frame in robot.model.frames.tolist() if frame.parentJoint >= ROOT]
     found = [frame for frame in frames if frame.name == name]

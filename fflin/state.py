@@ -291,8 +291,12 @@ class StateMap:
         return tau
 
     def forces(self, tau: Array) -> Array:
-        """Return the generalised forces (6 + n, ...) in base axes of Pinocchio's tau (nv, ...): S^T tau."""
+        """Return the generalised forces (6 + n, ...) in base axes of tau (nv, ...): S^T tau."""
         return tau.take(self._order, axis=0) if self.S is None else self.S.T @ tau
+
+    def columns(self, matrix: Array) -> Array:
+        """Take the columns (..., nv) over Pinocchio's v to state order: matrix S."""
+        return matrix.take(self._order, axis=1) if self.S is None else matrix @ self.S
 
     def project(self, matrix: Array, out: Array | None = None) -> Array:
         """Take a matrix (nv, nv) over Pinocchio's v to state order: S^T matrix S."""

@@ -20,9 +20,12 @@ from fflin.certificate import (
 from fflin.errors import InputError
 from fflin.inertia import inertia_matrix, inverse_inertia
 from fflin.linear_model import LinearModel
+from fflin.measuring import Measuring
 from fflin.model import Robot
+from fflin.outputs import FullState
 from fflin.reports import check_report
 from fflin.rotation import rotation_matrix
+from fflin.sensing import Sensing
 from fflin.state import ANGULAR, LINEAR, StateMap
 from fflin.validation import Array
 
@@ -160,6 +163,7 @@ def check(robot: Robot, lin: LinearModel) -> Check:
         Row("differences", f"{b.matrix}[{b.row}, {b.column}]", b.error, difference)
         for b in compare(state, lin, M, *_differences(model, lin, M))
     ]
+    rows += _output_rows(model, lin, M, difference)
     rows.append(Row("flow", "f", _flow_error(robot, lin), difference))
     rows += [Row("point", name, error, route) for name, error in _point_errors(model, lin, M, q, v)]
     rows.append(Row("inertia", "M", _relative(lin.M, M, floor=0.0), route))
@@ -234,6 +238,14 @@ def _point_errors(
 
 def _differences(model: _Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
     """Return A and B by central differences of the nonlinear model."""
+    step, push = _steps(model, lin, M)
+    A = _jacobian(lambda x: model(x, lin.u0), lin.x0, step)
+    B = _jacobian(lambda u: model(lin.x0, u), lin.u0, push)
+    return A, B
+
+
+def _steps(model: _Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
+    """Return the steps of differences in x and u."""
     groups = model.state.groups
     nv = len(M)
     # Small against the angles over which accelerations change where light links line up.
@@ -246,9 +258,40 @@ def _differences(model: _Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, 
     step[groups.v_b] = 0.1 * max(1.0, float(speed[LINEAR].max()))
     mobility, input_mobility = mobilities(M, lin.B)
     push = max(1.0, float(np.abs(lin.f0[-nv:] / mobility).max())) / input_mobility
-    A = _jacobian(lambda x: model(x, lin.u0), lin.x0, step)
-    B = _jacobian(lambda u: model(lin.x0, u), lin.u0, push)
-    return A, B
+    return step, push
+
+
+def _output_rows(model: _Nonlinear, lin: LinearModel, M: Array, tolerance: float) -> list[Row]:
+    """Rows of C, D and y0 against differences of what the nonlinear model measures."""
+    state = model.state
+    names, units = state.names, state.units
+    if state.robot.outputs != (FullState(),):
+        sensing = Sensing(state, state.robot.outputs)
+        names, units = sensing.names, sensing.units
+    if (lin.output_names, lin.output_units) != (names, units):
+        raise InputError(
+            f"the model has {len(lin.output_names)} outputs, which are not the {len(names)} of "
+            f"'{state.robot.name}'; give the robot the same (Robot.replace)"
+        )
+    measuring = Measuring(state, lin.q)
+
+    def y(x: Array, u: Array) -> Array:
+        return measuring(x, *model.acceleration(x, u))
+
+    step_x, step_u = _steps(model, lin, M)
+    here = y(lin.x0, lin.u0)
+    C = _jacobian(lambda x: y(x, lin.u0), lin.x0, step_x)
+    D = _jacobian(lambda u: y(lin.x0, u), lin.u0, step_u)
+    # What cannot be told from the rounding of y in its step is not compared any closer.
+    scale = np.maximum(1.0, np.abs(here))[:, None]
+    rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]
+    for name, given, expected, step in (("C", lin.C, C, step_x), ("D", lin.D, D, step_u)):
+        size = np.maximum(
+            np.abs(expected).max(axis=1, initial=0.0)[:, None], _EPS * scale / step / tolerance
+        )
+        error = float((np.abs(given - expected) / size).max(initial=0.0))
+        rows.append(Row("outputs", name, error, tolerance))
+    return rows
 
 
 def _jacobian(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:

@@ -1,0 +1,76 @@
+"""C and D: the derivatives of the outputs carried into the chart, the frame and the inputs."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fflin.actuation import Actuation
+from fflin.measurements import Sensed
+from fflin.rotation import skew
+from fflin.state import ANGULAR, LINEAR, Chart, StateMap
+from fflin.validation import Array
+
+
+class Rates(NamedTuple):
+    r"""The acceleration of the base origin and the joints, in base axes, and what it depends on.
+
+    Attributes
+    ----------
+    c : ndarray (6 + n,)
+        Without gravity and :math:`\omega \times v_b`.
+    by_q_m : ndarray (6 + n, n)
+    by_nu : ndarray (6 + n, 6 + n)
+        Without the base's linear velocity, on which it does not depend.
+    by_u : ndarray (6 + n, nu)
+        `u` held in base axes.
+    gravity : ndarray (3,)
+        In base axes.
+    """
+
+    c: Array
+    by_q_m: Array
+    by_nu: Array
+    by_u: Array
+    gravity: Array
+
+
+def output_equations(
+    state: StateMap,
+    actuation: Actuation,
+    chart: Chart,
+    sensed: Sensed,
+    rates: Rates,
+    nu: Array,
+    u: Array,
+) -> tuple[Array, Array]:
+    r"""Return C (ny, nx) and D (ny, nu) of the outputs that are not states.
+
+    What is measured is a function of pose, velocity and the rate of the LOCAL velocity, whose
+    linear part is :math:`c + g - \omega \times v_b`. `nu` (6 + n,) and `u` (nu,) are in base axes.
+    A turn :math:`\delta\theta` of the base under a vector s held in reference axes changes its
+    base components by :math:`[s]_\times \delta\theta`.
+    """
+    g = state.groups
+    w, v = nu[ANGULAR], nu[LINEAR]
+    by_q, by_nu, by_rate = (state.columns(part) for part in sensed[1:])
+    rate_by_nu = rates.by_nu.copy()
+    rate_by_nu[LINEAR, ANGULAR] += skew(v)
+    rate_by_nu[LINEAR, LINEAR] -= skew(w)
+    by_nu = by_nu + by_rate @ rate_by_nu
+    by_u = by_rate @ rates.by_u
+
+    turn = by_q[:, ANGULAR] + by_rate[:, LINEAR] @ skew(rates.gravity)
+    for turned, part in zip(state.axes, (ANGULAR, LINEAR), strict=True):
+        if turned:
+            turn = turn + by_nu[:, part] @ skew(nu[part])
+    for columns, _ in actuation.held:
+        turn = turn + by_u[:, columns] @ skew(u[columns])
+        by_u[:, columns] = by_u[:, columns] @ chart.R.T
+
+    C = np.zeros((len(by_q), state.nx))
+    C[:, g.q_b] = turn @ chart.J
+    C[:, g.r_b] = by_q[:, LINEAR] @ chart.R.T
+    C[:, g.q_m] = by_q[:, 6:] + by_rate @ rates.by_q_m
+    C[:, -len(nu) :] = by_nu
+    state.to_frame(chart, C[:, -len(nu) :].T)
+    return C, by_u
