@@ -17,6 +17,11 @@ class Aba:
     Parameters
     ----------
     state : StateMap
+
+    Attributes
+    ----------
+    inverse : ndarray (6 + n, 6 + n)
+        M^-1 in base axes as ABA has it, of the last slopes.
     """
 
     def __init__(self, state: StateMap) -> None:
@@ -27,6 +32,7 @@ class Aba:
         self._weightless = robot.model
         self._model = robot.model.copy()
         self._model.gravity.linear = np.array(robot.gravity)
+        self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 
     def acceleration(self, q: Array, v: Array, u: Array) -> Array:
@@ -50,6 +56,7 @@ class Aba:
             by_q, by_v, by_force = (state.project(slope) for slope in slopes)
         else:
             by_q, by_v, by_force = self._constrained_slopes(q, v, u, tau, state.S)
+        self.inverse = by_force
         by_q[:, 6:] -= by_force[:, 6:] * stiffness
         by_v[:, 6:] -= by_force[:, 6:] * damping
         at_rest = np.zeros_like(v)

@@ -39,7 +39,8 @@ class Block(NamedTuple):
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
     """Compute the figures that prove a continuous-time model of this robot."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    blocks = compare(state, lin, lin.M, *aba_route(state, lin.q, lin.v, lin.u0))
+    A, B, _ = aba_route(state, lin.q, lin.v, lin.u0)
+    blocks = compare(state, lin, lin.M, A, B)
     return Certificate(
         condition=scaled_condition(lin.M),
         inertia_residual=inertia_residual(lin.M, inverse_inertia(state, lin)),
@@ -62,7 +63,7 @@ def inertia_residual(M: Array, inverse: Array) -> float:
     return float(np.abs(residual * scale / scale[:, None]).max())
 
 
-def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
     r"""Build A and B from the derivatives of ABA.
 
     They are built in base axes and carried to the frame by the change of coordinates
@@ -73,6 +74,8 @@ def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Arr
     -------
     A : ndarray (nx, nx)
     B : ndarray (nx, nu)
+    inverse : ndarray (6 + n, 6 + n)
+        M^-1 in base axes as ABA has it, which tells how much its route is worth.
     """
     aba = Aba(state)
     chart, g, nv = state.chart(q), state.groups, 6 + state.robot.n
@@ -105,7 +108,7 @@ def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Arr
     for columns, _ in aba.actuation.held:
         A[:, g.q_b] += B[:, columns] @ skew(u[columns]) @ J
         B[:, columns] = B[:, columns] @ R.T
-    return A, B
+    return A, B, aba.inverse
 
 
 def _change_of_coordinates(

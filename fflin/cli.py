@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from fflin import __version__
-from fflin.errors import FflinError, FflinWarning, FileError, InputError
+from fflin.errors import FflinError, FflinWarning, InputError
 
 if TYPE_CHECKING:
     from fflin.linear_model import LinearModel
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if sys.stdout is not None:
             sys.stdout.flush()
         return code
-    except FflinError as error:
+    except (FflinError, FflinWarning) as error:  # a warning where Python is told to raise them
         print(f"fflin: error: {' '.join(str(error).split())}", file=sys.stderr)
         return _BAD_INPUT
     except BrokenPipeError:
@@ -66,8 +66,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _INTERRUPTED
 
 
-def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    print(f"fflin: warning: {' '.join(str(message).split())}", file=sys.stderr)
+def _show_warning(
+    message: Warning | str, category: type[Warning], *_: object, **__: object
+) -> None:
+    name = "warning" if issubclass(category, FflinWarning) else category.__name__
+    print(f"fflin: {name}: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 def _robots(_: argparse.Namespace) -> int:
@@ -96,17 +99,14 @@ def _info(arguments: argparse.Namespace) -> int:
 
 
 def _linearize(arguments: argparse.Namespace) -> int:
+    from fflin.files import check_format, save_model
     from fflin.reports import linear_model
 
     if arguments.output:
-        from fflin.files import check_format
-
         check_format(arguments.output)
     robot, lin = _point(arguments)
     if arguments.output:
-        if robot.urdf and arguments.output.resolve() == robot.urdf.resolve():
-            raise FileError(f"{arguments.output} is the robot's own file; name another to write")
-        lin.save(arguments.output)
+        save_model(lin, arguments.output, spare=robot.urdf)
         print(f"wrote {arguments.output}: {lin.B.shape[0]} states, {lin.B.shape[1]} inputs")
     else:
         print(linear_model(lin))

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import os
+import tempfile
 import zlib
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -28,8 +29,11 @@ _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version")
 FORMATS = (".npz", ".mat", ".json", ".csv")
 
 
-def save_model(lin: LinearModel, path: Path) -> None:
-    """Write a model and its certificate; see `LinearModel.save`."""
+def save_model(lin: LinearModel, path: Path, spare: Path | None = None) -> None:
+    """Write a model and its certificate; see `LinearModel.save`.
+
+    `spare` is a file that must not be overwritten, such as the robot's own.
+    """
     check_format(path)
     if not all(np.isfinite(getattr(lin, key)).all() for key in (*_MATRICES, *_VECTORS[:-1])):
         raise InputError("the model has entries that are not finite; it is not saved")
@@ -45,7 +49,11 @@ def save_model(lin: LinearModel, path: Path) -> None:
         ".json": _to_json,
         ".csv": _to_csv,
     }[path.suffix]
-    write_whole(encode(path, record))
+    contents = encode(path, record)
+    for target in contents:
+        if spare and os.path.exists(spare) and os.path.realpath(target) == os.path.realpath(spare):
+            raise FileError(f"{target} is the robot's own file; name another to write")
+    write_whole(contents)
 
 
 def load_model(path: Path) -> LinearModel:
@@ -141,13 +149,16 @@ def write_whole(contents: dict[Path, bytes]) -> None:
     target = Path()
     try:
         for target, content in contents.items():
-            if target.is_dir():
-                raise FileError(f"{target}: is a folder; give the name of a file")
-            real = target.resolve()  # so that a link stays one
-            temporary = real.with_name(f".{real.name}.{os.getpid()}.tmp")
-            with temporary.open("xb") as file:
-                written[temporary] = real
+            real = Path(os.path.realpath(target))  # so that a link stays one
+            if real.exists() and not real.is_file():
+                kind = "a folder" if real.is_dir() else "not a regular file"
+                raise FileError(f"{target}: is {kind}; give the name of a file")
+            handle, name = tempfile.mkstemp(prefix=".fflin-", dir=real.parent)
+            temporary = Path(name)
+            written[temporary] = real
+            with os.fdopen(handle, "wb") as file:
                 file.write(content)
+            os.chmod(temporary, real.stat().st_mode & 0o777 if real.exists() else 0o666 & ~_umask())
         for temporary, target in list(written.items()):
             os.replace(temporary, target)
             del written[temporary]
@@ -158,6 +169,13 @@ def write_whole(contents: dict[Path, bytes]) -> None:
     finally:
         for temporary in written:
             temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    # It can be read only by setting it.
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
 
 
 def _to_npz(path: Path, record: dict[str, Any]) -> dict[Path, bytes]:

@@ -37,6 +37,9 @@ _ROUTE_TOLERANCE, _ROUTE_ROUNDING = 1e-9, 1e2 * _EPS
 # Differences of sixth order lose about four digits more to their step.
 _DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING = 1e-8, 1e4 * _EPS
 
+# From the residual of an inverse to the error of what it multiplies.
+_ROUTE_SAFETY = 10.0
+
 # Beyond two digits nothing is confirmed, however badly M is conditioned.
 _LOOSEST = 1e-2
 
@@ -155,9 +158,13 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     route = min(max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition), _LOOSEST)
     difference = min(max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition), _LOOSEST)
     model = _Nonlinear(state, q, v)
+    A, B, inverse = aba_route(state, q, v, lin.u0)
+    # Links far apart cost ABA digits that M keeps; what its inverse of M lacks, its route lacks.
+    own_error = inertia_residual(_in_base_axes(state, M, q), inverse)
+    by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
     rows = [
-        Row("ABA derivatives", f"{b.matrix}[{b.row}, {b.column}]", b.error, route)
-        for b in compare(state, lin, M, *aba_route(state, q, v, lin.u0))
+        Row("ABA derivatives", f"{b.matrix}[{b.row}, {b.column}]", b.error, by_aba)
+        for b in compare(state, lin, M, A, B)
     ]
     rows += [
         Row("differences", f"{b.matrix}[{b.row}, {b.column}]", b.error, difference)
@@ -215,6 +222,13 @@ class _Nonlinear:
                 rate,
             )
         )
+
+
+def _in_base_axes(state: StateMap, M: Array, q: Array) -> Array:
+    chart, M = state.chart(q), M.copy()
+    state.to_base(chart, M)
+    state.to_base(chart, M.T)
+    return M
 
 
 def _point_errors(

@@ -193,6 +193,10 @@ def test_robots_own_file_is_never_the_output(tmp_path):
     before = robot.read_bytes()
     assert "is the robot's own file" in refused("linearize", robot, "-o", robot)
     assert robot.read_bytes() == before
+    sibling = tmp_path / "arm.A.csv"
+    sibling.write_bytes(before)
+    assert "is the robot's own file" in refused("linearize", sibling, "-o", tmp_path / "arm.csv")
+    assert sibling.read_bytes() == before
 
 
 def test_unwritable_stdout_is_one_line():

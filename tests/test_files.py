@@ -3,7 +3,7 @@
 import csv
 import json
 import os
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +124,52 @@ def test_truncated_file_is_refused(lin, tmp_path):
             path.write_bytes(whole[: int(share * len(whole))])
             with pytest.raises(fflin.FileError):
                 fflin.LinearModel.load(path)
+
+
+def test_a_link_stays_a_link_and_other_kinds_are_refused(lin, tmp_path):
+    target, link = tmp_path / "real.json", tmp_path / "link.json"
+    target.write_text("old")
+    target.chmod(0o600)
+    link.symlink_to(target)
+    lin.save(link)
+    assert link.is_symlink() and fflin.LinearModel.load(target).robot == lin.robot
+    assert target.stat().st_mode & 0o777 == 0o600
+    os.mkfifo(tmp_path / "pipe.json")
+    with pytest.raises(fflin.FileError, match="not a regular file"):
+        lin.save(tmp_path / "pipe.json")
+    assert not list(tmp_path.glob(".fflin*"))
+    for path in (3, None, b"m.npz", "a\0b.npz"):
+        for call in (lin.save, fflin.LinearModel.load):
+            with pytest.raises(fflin.InputError, match="is not a path"):
+                call(path)
+
+
+def test_damaged_figures_are_refused(lin, tmp_path):
+    path = tmp_path / "m.json"
+    lin.save(path)
+    record = json.loads(path.read_text())
+    for key, value in {
+        "reference": [1, 2],
+        "x0": [0.0],
+        "M": [],
+        "state_units": [],
+        "frame": "body",
+        "A": [[float("nan")] * len(lin.x0)] * len(lin.x0),
+    }.items():
+        path.write_text(json.dumps({**record, key: value}))
+        with pytest.raises(fflin.FileError, match="not a linear model saved by fflin"):
+            fflin.LinearModel.load(path)
+    path.write_text("[" * 100_000)
+    with pytest.raises(fflin.FileError):
+        fflin.LinearModel.load(path)
+
+
+def test_certificate_is_bound_to_its_matrices(lin, tmp_path):
+    lin.save(tmp_path / "m.npz")
+    for good in (fflin.LinearModel.load(tmp_path / "m.npz"), lin.discretize(0.1)):
+        assert good.certificate == lin.certificate
+        with pytest.raises(fflin.InputError, match="changed after they were certified"):
+            _ = replace(good, B=3 * good.B).certificate
 
 
 def test_path_may_be_a_string(lin, tmp_path):

@@ -9,7 +9,6 @@ import pytest
 from conftest import random_tree
 
 import fflin
-from fflin.inertia import Inertia
 
 
 def chain(*inertias):
@@ -52,15 +51,19 @@ def test_inverse_is_as_right_as_the_conditioning_allows(n):
     assert error.max() < 8 * (6 + n) * np.finfo(float).eps * lin.certificate.condition
 
 
-def test_scaling_m_beforehand_changes_nothing():
-    """Units of the joints by powers of two: the same digits come out."""
-    robot = fflin.load("canadarm2")
-    lin = fflin.linearize(robot)
-    data, out = robot.create_data(), np.zeros((13, 13))
-    Inertia(fflin.StateMap(robot), data).invert(lin.q, out)
-    scale = 2.0 ** -np.round(np.log2(np.sqrt(lin.M.diagonal())))
-    scaled = np.linalg.cholesky(scale[:, None] * lin.M * scale)
-    assert (scaled == scale[:, None] * np.linalg.cholesky(lin.M)).all()
+def test_scaling_m_beforehand_would_gain_nothing():
+    """The inverse by way of a scaled M is no nearer to the exact one."""
+    lin = fflin.linearize(fflin.load("canadarm2"))
+    exact = exact_inverse(lin.M)
+    mobility = np.sqrt(exact.diagonal())
+    scale = 1.0 / np.sqrt(lin.M.diagonal())
+    factor = np.linalg.inv(np.linalg.cholesky(scale[:, None] * lin.M * scale))
+    scaled = scale[:, None] * (factor.T @ factor) * scale
+    errors = [
+        np.abs((inverse - exact) / np.outer(mobility, mobility)).max()
+        for inverse in (lin.B[13:], scaled)
+    ]
+    assert errors[0] < 4 * errors[1]
 
 
 def far_joint(distance):
@@ -168,6 +171,11 @@ def test_what_does_not_follow_its_leader_is_refused():
         fflin.linearize(robot, None, v)
     with pytest.raises(fflin.InputError, match="mimics 'panda_finger_joint1'; place that one"):
         fflin.configuration(robot, {"panda_finger_joint2": 0.01})
+
+
+def test_singular_m_of_mimic_joints_is_refused():
+    with pytest.raises(fflin.SingularInertiaError, match="joint 'LHand', joint 'RHand'"):
+        fflin.linearize(fflin.load("romeo"))
 
 
 def test_locking_a_leader_locks_its_followers():

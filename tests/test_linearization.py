@@ -1,5 +1,10 @@
 """A and B: closed forms and laws first, then every robot by the routes of `check`."""
 
+import pickle
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from copy import deepcopy
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -219,6 +224,47 @@ def test_prepared_linearizer_gives_the_same_and_keeps_earlier_results():
     for array, copy in zip((first.B, first.M, moving.A, moving.B), kept, strict=True):
         assert (array == copy).all()
     assert (fflin.linearize(robot, q1, v1, u1).A == moving.A).all()
+
+
+def test_input_alone_is_not_dropped():
+    robot = fflin.load("ets_vii")
+    u = np.arange(12.0)
+    assert (fflin.linearize(robot, None, None, u).u0 == u).all()
+    assert fflin.linearize(robot, None, None, u).f0.any()
+
+
+def test_linearizer_is_shared_copied_and_pickled():
+    robot = fflin.load("dual_arm")
+    linearizer = fflin.Linearizer(robot, frame="world", reference=pin.SE3.Identity())
+    rng = np.random.default_rng(15)
+    points = [random_point(robot, rng) for _ in range(40)]
+    expected = [linearizer(*point) for point in points]
+    for twin in (deepcopy(linearizer), pickle.loads(pickle.dumps(linearizer))):
+        assert (twin(*points[0]).A == expected[0].A).all()
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            found = list(pool.map(lambda point: linearizer(*point), points * 5))
+    finally:
+        sys.setswitchinterval(interval)
+    for lin, right in zip(found, expected * 5, strict=True):
+        assert (lin.A == right.A).all() and (lin.B == right.B).all()
+
+
+def test_what_is_beyond_all_numbers_is_refused():
+    robot = fflin.load("ets_vii")
+    q = fflin.configuration(robot)
+    for v, u in ((np.full(12, 1e200), None), (None, np.full(12, 1e308))):
+        with np.errstate(all="ignore"), pytest.raises(fflin.InputError, match="not finite"):
+            fflin.linearize(robot, q, v, u)
+    with np.errstate(all="ignore"), pytest.raises(fflin.InputError, match="beyond all numbers"):
+        fflin.linearize(robot).discretize(1e300)
+    for bad in (np.diag([2.0, 1, 1]), np.diag([1.0, 1, -1]), np.full((3, 3), np.nan)):
+        with pytest.raises(fflin.InputError, match="reference"):
+            fflin.linearize(robot, reference=pin.SE3(bad, np.zeros(3)))
+        with pytest.raises(fflin.InputError, match="base"):
+            fflin.configuration(robot, base=pin.SE3(bad, np.zeros(3)))
 
 
 def test_nothing_of_the_callers_is_changed_or_shared():

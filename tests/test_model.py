@@ -142,6 +142,36 @@ def test_what_is_no_robot_is_refused():
         fflin.from_model("cubesat")
 
 
+def test_arguments_of_the_wrong_kind_are_told():
+    robot = fflin.load("ets_vii")
+    for call in (
+        lambda: fflin.load(None),
+        lambda: fflin.load(3),
+        lambda: fflin.load(b"ets_vii"),
+        lambda: fflin.load("ets_vii", lock=3),
+        lambda: fflin.load("ets_vii", lock=[3]),
+        lambda: fflin.load("ets_vii", lock=""),
+        lambda: fflin.configuration(robot, [0.1] * 6),
+        lambda: fflin.configuration(robot, {3: 1.0}),
+        lambda: fflin.configuration(robot, {"joint_1": 10**400}),
+        lambda: fflin.linearize(robot, frame=np.array("hybrid")),
+        lambda: fflin.linearize(robot).is_equilibrium("a"),
+    ):
+        with pytest.raises(fflin.FflinError):
+            call()
+
+
+def test_locked_joints_are_on_record(tmp_path):
+    robot = fflin.load("ets_vii", lock={"joint_1": 0.7, "joint_4": None})
+    assert robot.locked == ("joint_1=0.7", "joint_4=0.0")
+    lin = fflin.linearize(robot)
+    for ending in (".npz", ".mat", ".json", ".csv"):
+        lin.save(tmp_path / f"m{ending}")
+        assert fflin.LinearModel.load(tmp_path / f"m{ending}").locked == robot.locked
+    with pytest.raises(fflin.InputError, match="'joint_1' is locked"):
+        fflin.configuration(robot, {"joint_1": 0.1})
+
+
 def test_model_without_a_free_flyer_is_refused():
     fixed = pin.Model()
     fixed.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "joint")

@@ -86,6 +86,38 @@ def test_model_of_another_inertia_is_found():
     assert not fflin.check(heavier, fflin.linearize(robot)).ok
 
 
+def test_own_m_of_a_model_does_not_loosen_the_check():
+    robot = fflin.load("servicer_7dof")
+    lin = fflin.linearize(robot)
+    noise = np.random.default_rng(3).normal(size=(15, 15))
+    nearly_singular = np.ones((15, 15)) + 1e-15 * noise @ noise.T
+    wrong = replace(lin, A=1.5 * lin.A, B=1.3 * lin.B, _inertia=lambda _: nearly_singular)
+    found = fflin.check(robot, wrong)
+    assert {"M", "B[omega_b, tau_b]", "A[q_b, omega_b]"} <= {row.block for row in found.failures}
+    assert max(row.tolerance for row in found.rows) < 1e-7
+
+
+def test_check_keeps_its_edge_at_orbital_speed():
+    robot = fflin.load("servicer_7dof")
+    q, v, u = random_point(robot, np.random.default_rng(4))
+    v[:3] = 7.6e3, -200.0, 30.0
+    for frame in ("hybrid", "local", "world"):
+        lin = fflin.linearize(robot, q, v, 0.05 * u, frame=frame, reference=pin.SE3.Identity())
+        assert fflin.check(robot, lin).ok
+        groups = fflin.StateMap(robot).groups
+        A = lin.A.copy()
+        A[groups.omega_b, groups.q_m] *= 1.0 + 1e-4
+        found = fflin.check(robot, replace(lin, A=A))
+        assert "A[omega_b, q_m]" in {row.block for row in found.failures}
+
+
+def test_far_joints_are_confirmed_as_far_as_m_is():
+    model = fflin.load("dual_arm").model.copy()
+    model.jointPlacements[4] = pin.SE3(np.eye(3), np.array([3e3, 0.0, 0.0]))
+    robot = fflin.from_model(model)
+    assert fflin.check(robot, fflin.linearize(robot)).ok
+
+
 def test_not_a_number_is_not_ok():
     robot = fflin.load("cubesat")
     lin = fflin.linearize(robot)
