@@ -39,7 +39,7 @@ class Block(NamedTuple):
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
     """Compute the figures that prove a continuous-time model of this robot."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    A, B, _ = aba_route(state, lin.q, lin.v, lin.u0)
+    A, B, _ = aba_route(state, lin.q, lin.v, lin.u0, moving=lin.moving)
     blocks = compare(state, lin, lin.M, A, B)
     return Certificate(
         condition=scaled_condition(lin.M),
@@ -63,7 +63,9 @@ def inertia_residual(M: Array, inverse: Array) -> float:
     return float(np.abs(residual * scale / scale[:, None]).max())
 
 
-def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
+def aba_route(
+    state: StateMap, q: Array, v: Array, u: Array, *, moving: bool = False
+) -> tuple[Array, Array, Array]:
     r"""Build A and B from the derivatives of ABA.
 
     They are built in base axes and carried to the frame by the change of coordinates
@@ -96,6 +98,10 @@ def aba_route(state: StateMap, q: Array, v: Array, u: Array) -> tuple[Array, Arr
     A[g.r_b, g.q_b] = -R @ skew(linear) @ J
     A[g.r_b, g.v_b] = R
     A[g.q_m, g.qdot_m] = np.eye(state.robot.n)
+    if moving:
+        # The reference, turning with w, carries the axes of the error with it.
+        A[g.q_b, g.q_b] -= 0.5 * skew(w)
+        A[g.r_b, g.r_b] -= skew(w)
     A[-nv:, g.q_b] = by_q[:, ANGULAR] @ J
     A[-nv:, g.r_b] = by_q[:, LINEAR] @ R.T
     A[-nv:, g.q_m] = by_q[:, 6:]

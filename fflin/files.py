@@ -41,7 +41,7 @@ def save_model(lin: LinearModel, path: Path, spare: Path | None = None) -> None:
     record["reference"] = lin._reference
     record |= {key: list(getattr(lin, key)) for key in _LISTS}
     record |= {key: getattr(lin, key) for key in _TEXTS}
-    record["dt"] = float(lin.dt)
+    record["dt"], record["moving"] = float(lin.dt), float(lin.moving)
     record["certificate"] = asdict(lin.certificate)
     encode: Callable[[Path, dict[str, Any]], dict[Path, bytes]] = {
         ".npz": _to_npz,
@@ -76,6 +76,7 @@ def load_model(path: Path) -> LinearModel:
         lin = LinearModel(
             **named,
             dt=float(record["dt"]),
+            moving=bool(float(record["moving"])),
             _reference=reference,
             _inertia=partial(_given, M),
             _certify=partial(_given, None),
@@ -218,7 +219,7 @@ def _from_mat(path: Path) -> dict[str, Any]:
     record |= {key: raw[key].ravel() for key in _VECTORS}
     record |= {key: [str(cell[0]) for cell in raw[key].ravel()] for key in _LISTS}
     record |= {key: "".join(raw[key]) for key in _TEXTS}
-    record["dt"] = raw["dt"].item()
+    record["dt"], record["moving"] = raw["dt"].item(), raw["moving"].item()
     struct = raw["certificate"][0, 0]
     record["certificate"] = {key: struct[key].item() for key in struct.dtype.names}
     return record
@@ -269,7 +270,7 @@ def _to_csv(path: Path, record: dict[str, Any]) -> dict[Path, bytes]:
         for i, x in enumerate(record[key].tolist())
     ]
     tables["point"] = [["name", "value"], *point]
-    info = {**{key: record[key] for key in _TEXTS}, "dt": record["dt"]}
+    info = {key: record[key] for key in (*_TEXTS, "dt", "moving")}
     info["locked"] = ";".join(record["locked"])
     info |= {f"certificate.{key}": value for key, value in record["certificate"].items()}
     tables["info"] = [["name", "value"], *map(list, info.items())]
@@ -296,7 +297,7 @@ def _from_csv(path: Path) -> dict[str, Any]:
         key.removeprefix(prefix): float(x) for key, x in info.items() if key.startswith(prefix)
     }
     record["locked"] = [entry for entry in info["locked"].split(";") if entry]
-    return {**record, **{key: info[key] for key in (*_TEXTS, "dt")}}
+    return {**record, **{key: info[key] for key in (*_TEXTS, "dt", "moving")}}
 
 
 def _csv_path(path: Path, key: str) -> Path:

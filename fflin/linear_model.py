@@ -67,6 +67,8 @@ class LinearModel:
     state_units, input_units, output_units : tuple of str
     frame : str
         "hybrid", "local" or "world": axes of velocities and wrenches.
+    moving : bool
+        Whether the state is the error from a reference that moves through the point.
     q : ndarray (nq,)
         Configuration of the point in Pinocchio's order.
     v : ndarray (nv,)
@@ -97,6 +99,7 @@ class LinearModel:
     input_units: tuple[str, ...]
     output_units: tuple[str, ...]
     frame: Frame
+    moving: bool
     q: Array
     v: Array
     robot: str

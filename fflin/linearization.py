@@ -43,16 +43,21 @@ class Linearizer:
     Parameters
     ----------
     robot : Robot
-    frame : {"hybrid", "local", "world"}
-        Axes of the base's velocities and wrenches, see `StateMap`.
+    frame : {"hybrid", "local", "world"}, optional
+        Axes of the base's velocities and wrenches, see `StateMap`; "hybrid" by default.
     reference : pin.SE3, optional
         Placement that attitude and position are relative to; by default the base's own at each
         point, so that the model is taken about the pose where the robot stands.
+    moving : bool
+        The error dynamics about a reference that moves through the point with the robot's own
+        dynamics: the error is q_b = vec(q*^-1 q), r_b = R*^T (p - p*), the frame is "local", and
+        f0 is zero. For a trajectory, and for relative equilibria such as a steady spin.
 
     Raises
     ------
     InputError
-        If the frame is unknown or the reference is not a pin.SE3.
+        If the frame is unknown, the reference is not a pin.SE3, or `moving` is asked for with a
+        reference or with a frame other than "local".
     ModelError
         If Pinocchio's Data for the robot would pass 1 GiB.
 
@@ -63,9 +68,21 @@ class Linearizer:
     """
 
     def __init__(
-        self, robot: Robot, *, frame: Frame = "hybrid", reference: pin.SE3 | None = None
+        self,
+        robot: Robot,
+        *,
+        frame: Frame | None = None,
+        reference: pin.SE3 | None = None,
+        moving: bool = False,
     ) -> None:
         self.robot = robot
+        if moving and (reference is not None or frame not in (None, "local")):
+            raise InputError(
+                "moving=True takes the error in the moving base's own axes: leave out the "
+                "reference, and the frame or make it 'local'"
+            )
+        frame = frame or ("local" if moving else "hybrid")
+        self._moving = bool(moving)
         self._map = StateMap(robot, reference=reference, frame=frame)
         self._own_reference = reference is None
         self._data = robot.create_data()
@@ -85,6 +102,7 @@ class Linearizer:
         self._plain = (
             self._actuation.default
             and self._sensing is None
+            and not self._moving
             and not self._gravity.any()
             and not any(values.any() for values in robot.passive)
         )
@@ -157,7 +175,7 @@ class Linearizer:
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy, in this process or another, needs a work space of its own.
         reference = None if self._own_reference else self._map.reference
-        return _rebuilt, (self.robot, self._map.frame, reference)
+        return _rebuilt, (self.robot, self._map.frame, reference, self._moving)
 
     def _at_rest(self, q: Array) -> LinearModel:
         B = np.zeros(self._shape_B)
@@ -204,6 +222,11 @@ class Linearizer:
                 state.to_frame(chart, rows)
             for columns_held, _ in self._actuation.held:
                 B[:, columns_held] = B[:, columns_held] @ chart.R.T
+        if self._moving:
+            # The reference turns and flies with the point, so that the error does not.
+            turning = skew(nu[ANGULAR])
+            A[groups.q_b, groups.q_b] = A[groups.r_b, groups.r_b] = -turning
+            f0[:] = 0.0
         C, D, y0 = self._seen(chart, rates, q, v, u_base, x0)
         for array in (A, B, C, D, f0, x0, y0):
             if not np.isfinite(array).all():
@@ -350,6 +373,7 @@ class Linearizer:
             "input_units": units,
             "output_units": seen.units,
             "frame": state.frame,
+            "moving": self._moving,
             "robot": robot.name,
             "urdf_sha256": robot.urdf_sha256,
             "locked": robot.locked,
@@ -366,8 +390,9 @@ def linearize(
     v: Array | None = None,
     u: Array | None = None,
     *,
-    frame: Frame = "hybrid",
+    frame: Frame | None = None,
     reference: pin.SE3 | None = None,
+    moving: bool = False,
 ) -> LinearModel:
     """Linearise a robot about a point; at rest with neutral joints by default.
 
@@ -380,10 +405,12 @@ def linearize(
         Velocity in Pinocchio's order; at rest by default.
     u : array_like (nu,), optional
         Over the robot's inputs, those on the base in the frame's axes; zero by default.
-    frame : {"hybrid", "local", "world"}
-        Axes of the base's velocities and wrenches, see `StateMap`.
+    frame : {"hybrid", "local", "world"}, optional
+        Axes of the base's velocities and wrenches, see `StateMap`; "hybrid" by default.
     reference : pin.SE3, optional
         Placement that attitude and position are relative to; the base's own by default.
+    moving : bool
+        The error dynamics about a reference that moves through the point, see `Linearizer`.
 
     Returns
     -------
@@ -404,11 +431,11 @@ def linearize(
     --------
     Linearizer : the same, prepared once for many points; the equations stand there.
     """
-    return Linearizer(robot, frame=frame, reference=reference)(q, v, u)
+    return Linearizer(robot, frame=frame, reference=reference, moving=moving)(q, v, u)
 
 
-def _rebuilt(robot: Robot, frame: Frame, reference: pin.SE3 | None) -> Linearizer:
-    return Linearizer(robot, frame=frame, reference=reference)
+def _rebuilt(robot: Robot, frame: Frame, reference: pin.SE3 | None, moving: bool) -> Linearizer:
+    return Linearizer(robot, frame=frame, reference=reference, moving=moving)
 
 
 def _frozen(array: Array) -> Array:

@@ -157,8 +157,8 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     condition = scaled_condition(M)
     route = min(max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition), _LOOSEST)
     difference = min(max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition), _LOOSEST)
-    model = _Nonlinear(state, q, v)
-    A, B, inverse = aba_route(state, q, v, lin.u0)
+    model = (_Error if lin.moving else _Nonlinear)(state, lin)
+    A, B, inverse = aba_route(state, q, v, lin.u0, moving=lin.moving)
     # Links far apart cost ABA digits that M keeps; what its inverse of M lacks, its route lacks.
     own_error = inertia_residual(_in_base_axes(state, M, q), inverse)
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
@@ -189,10 +189,10 @@ class _Nonlinear:
     constant velocity: they are the same, v_b's rate but for the turning of the base's axes.
     """
 
-    def __init__(self, state: StateMap, q: Array, v: Array) -> None:
+    def __init__(self, state: StateMap, lin: LinearModel) -> None:
         self.state = state
         self.aba = Aba(state)
-        observer = rotation_matrix(q[3:7]) @ v[:3]
+        observer = rotation_matrix(lin.q[3:7]) @ lin.v[:3]
         self._observer = observer if np.linalg.norm(observer) > _FAST else np.zeros(3)
 
     def acceleration(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
@@ -229,6 +229,29 @@ def _in_base_axes(state: StateMap, M: Array, q: Array) -> Array:
     state.to_base(chart, M)
     state.to_base(chart, M.T)
     return M
+
+
+class _Error(_Nonlinear):
+    """The dynamics of the error from a reference that moves through the point: ``f(x0, u0) = 0``.
+
+    With the error quaternion (e, e0) = q*^-1 q: edot = (e0 (w - w*) + e x (w + w*)) / 2, and
+    with r = R*^T (p - p*): rdot = R_e v - v* - w* x r.
+    """
+
+    def __init__(self, state: StateMap, lin: LinearModel) -> None:
+        super().__init__(state, lin)
+        self._v = lin.v
+        self._a = state.velocities(self.acceleration(lin.x0, lin.u0)[2])
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        state, g = self.state, self.state.groups
+        q, v, a = self.acceleration(x, u)
+        chart = state.chart(q)
+        (linear, angular), (at_linear, at_angular) = (w[:6].reshape(2, 3) for w in (v, self._v))
+        turning = chart.q0 * (angular - at_angular) + np.cross(chart.q_b, angular + at_angular)
+        flying = chart.R @ linear - at_linear - np.cross(at_angular, x[g.r_b])
+        rates = state.velocities(v)[6:] - state.velocities(self._v)[6:]
+        return np.concatenate((0.5 * turning, flying, rates, state.velocities(a) - self._a))
 
 
 def _point_errors(
@@ -333,7 +356,7 @@ def _flow_error(robot: Robot, lin: LinearModel) -> float:
     """
     turned = pin.SE3(lin.reference.rotation, np.zeros(3))
     state = StateMap(robot, reference=turned, frame=lin.frame)
-    model = _Nonlinear(state, lin.q, lin.v)
+    model = (_Error if lin.moving else _Nonlinear)(state, lin)
     worst = 0.0
     for unit in (None, *range(6)):
         x = lin.x0.copy()
@@ -343,6 +366,12 @@ def _flow_error(robot: Robot, lin: LinearModel) -> float:
         q, v, a = model.acceleration(x, lin.u0)
         h = 1e-2 * state.chart(q).q0 / (1.0 + float(np.abs(v[3:]).max()))
         rate = _derivative(partial(_moved, state, q, h * v, v, h * a)) / h
+        if lin.moving:
+            q_star = lin.q.copy()
+            q_star[:3] = 0.0
+            back = partial(_moved_error, robot, q_star, h * lin.v, q, h * v)
+            rate[:6] = _derivative(back) / h
+            rate[6:] -= _motion_of_reference(model, lin)
         floor = 1.0 + float(np.abs(v).max())
         worst = max(worst, _relative(model(x, lin.u0), rate, floor=floor))
     return worst
@@ -350,6 +379,22 @@ def _flow_error(robot: Robot, lin: LinearModel) -> float:
 
 def _moved(state: StateMap, q: Array, dq: Array, v: Array, dv: Array, t: float) -> Array:
     return state.to_state(pin.integrate(state.robot.model, q, t * dq), v + t * dv)
+
+
+def _moved_error(robot: Robot, q: Array, dq: Array, q1: Array, dq1: Array, t: float) -> Array:
+    """Return (q_b, r_b) of the error when reference and robot have both moved on."""
+    reference = pin.integrate(robot.model, q, t * dq)
+    root = robot.model.jointPlacements[1]
+    moved = StateMap(robot, reference=root * pin.XYZQUATToSE3(reference[:7]), frame="local")
+    now = pin.integrate(robot.model, q1, t * dq1)
+    return moved.to_state(now, np.zeros(robot.nv))[:6]
+
+
+def _motion_of_reference(model: _Nonlinear, lin: LinearModel) -> Array:
+    """Return d(q_m, omega_b, v_b, qdot_m)/dt of the reference itself."""
+    state = model.state
+    _, v, a = model.acceleration(lin.x0, lin.u0)
+    return np.concatenate((state.velocities(v)[6:], state.velocities(a)))
 
 
 def _relative(given: Array, expected: Array, floor: float = 1.0) -> float:
