@@ -28,6 +28,7 @@ _PUBLIC = {
     "JointTorque": "inputs",
     "JointVelocities": "outputs",
     "LinearModel": "linear_model",
+    "LinearTrajectory": "trajectory",
     "Linearizer": "linearization",
     "MissingPackageError": "errors",
     "ModelError": "errors",
@@ -43,6 +44,7 @@ _PUBLIC = {
     "effort": "points",
     "from_model": "loading",
     "linearize": "linearization",
+    "linearize_trajectory": "trajectory",
     "list_robots": "robots",
     "load": "loading",
     "velocity": "points",
@@ -83,6 +85,7 @@ if TYPE_CHECKING:
     from fflin.points import effort, velocity
     from fflin.robots import list_robots
     from fflin.state import StateMap
+    from fflin.trajectory import LinearTrajectory, linearize_trajectory
     from fflin.verification import Check, check
 
 
