@@ -99,16 +99,17 @@ def _info(arguments: argparse.Namespace) -> int:
 
 
 def _linearize(arguments: argparse.Namespace) -> int:
-    from fflin.files import check_format, save_model
-    from fflin.reports import linear_model
-
     if arguments.output:
+        from fflin.files import check_format, save_model
+
         check_format(arguments.output)
     robot, lin = _point(arguments)
     if arguments.output:
         save_model(lin, arguments.output, spare=robot.urdf)
         print(f"wrote {arguments.output}: {lin.B.shape[0]} states, {lin.B.shape[1]} inputs")
     else:
+        from fflin.reports import linear_model
+
         print(linear_model(lin))
     return _DONE
 
