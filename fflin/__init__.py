@@ -45,6 +45,7 @@ _PUBLIC = {
     "linearize": "linearization",
     "list_robots": "robots",
     "load": "loading",
+    "load_inputs": "input_files",
     "velocity": "points",
 }
 
@@ -63,6 +64,7 @@ if TYPE_CHECKING:
         UnknownNameError,
         UrdfError,
     )
+    from fflin.input_files import load_inputs
     from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
     from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize
