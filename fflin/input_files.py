@@ -94,15 +94,15 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     """
     document = _Document(find_inputs(path))
     inputs: list[Input] = []
+    seen: dict[Input | str | None, int] = {}
     for index, table in enumerate(document.tables):
         item = _input(document, index, table)
-        name = getattr(item, "name", None)
-        for other, earlier in enumerate(inputs):
-            if item == earlier if name is None else name == getattr(earlier, "name", None):
-                what = f"name '{name}'" if name else table["type"]
-                raise document.error(
-                    index, "name", f"{what} stands in line {document.line(other)} already"
-                )
+        what = item.name if isinstance(item, Thruster) else item
+        if what is not None and what in seen:
+            shown = f"the name '{what}'" if isinstance(what, str) else what
+            message = f"{shown} stands in line {document.line(seen[what])} already; take one out"
+            raise document.error(index, "name", message)
+        seen[what] = index
         inputs.append(item)
     return tuple(inputs)
 
@@ -175,7 +175,8 @@ def _input(document: _Document, index: int, table: dict[str, Any]) -> Input:
             index, None, f"has no key 'type'{hint}; give one of {', '.join(_TYPES)}"
         )
     if not isinstance(kind, str) or kind not in _TYPES:
-        raise document.unknown(index, "type", unknown("type of input", kind, _TYPES))
+        shown = kind if isinstance(kind, str) else reprlib.repr(kind)
+        raise document.unknown(index, "type", unknown("type of input", shown, _TYPES))
     known = {field.name: field for field in fields(_TYPES[kind])}
     values = {key: value for key, value in table.items() if key != "type"}
     for key, value in values.items():
