@@ -28,6 +28,9 @@ _VECTORS = ("position", "direction")
 # Some 1,000 inputs.
 _SIZE_LIMIT = 2**17
 
+# The time for a dotted key grows with the square of its parts.
+_DOTS_LIMIT = 1_000
+
 # What may hold a line that looks like a key: strings of several lines. Those of one line and
 # comments are found too, for they may hold the quotes of the former.
 _TEXTS = re.compile(
@@ -118,6 +121,9 @@ class _Document:
         except UnicodeDecodeError as error:
             line = content.count(b"\n", 0, error.start) + 1
             raise InputError(f"{path}:{line}: is not UTF-8 text; save it as UTF-8") from None
+        for number, line in enumerate(text.split("\n"), start=1):
+            if line.count(".") > _DOTS_LIMIT:
+                raise InputError(f"{path}:{number}: has more than {_DOTS_LIMIT} dots; shorten it")
         try:
             record = tomllib.loads(text)
         except RecursionError:

@@ -61,7 +61,7 @@ def parse_output(text: str) -> tuple[Output, ...]:
             raise InputError(f"output '{text}' is of no frame; write {kind}:NAME")
         return tuple(build(frame) for build in _OF_FRAME[kind])
     if kind not in _OF_ROBOT:
-        raise unknown("output", text, (*_OF_ROBOT, *(f"{name}:NAME" for name in _OF_FRAME)))
+        raise unknown("output", kind, (*_OF_ROBOT, *_OF_FRAME))
     if colon:
         raise InputError(f"output '{text}' is of the whole robot; write {kind}")
     return (_OF_ROBOT[kind],)

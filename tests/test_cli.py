@@ -175,7 +175,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
         ("linearize", "cubesat", "--inputs", typo, "-o", output): "bad.toml:2: no type of input",
         ("check", "cubesat", "--inputs", "none.toml"): "none.toml: cannot be read: No such file",
         ("check", "cubesat", "--inputs", "servicer_7dof"): "no joint named 'joint_1'",
-        ("check", "ets_vii", "--output", "pos:tool"): "no output named 'pos:tool'; did you mean",
+        ("check", "ets_vii", "--output", "pos:tool"): "no output named 'pos'; did you mean pose",
         ("check", "ets_vii", "--output", "pose"): "output 'pose' is of no frame; write pose:NAME",
         ("check", "ets_vii", "--output", "com:tool"): "is of the whole robot; write com",
         ("check", "ets_vii", "--output", "pose:tol"): "no frame named 'tol'; did you mean tool",
