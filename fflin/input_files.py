@@ -121,8 +121,8 @@ class _Document:
         except UnicodeDecodeError as error:
             line = content.count(b"\n", 0, error.start) + 1
             raise InputError(f"{path}:{line}: is not UTF-8 text; save it as UTF-8") from None
-        for number, line in enumerate(text.split("\n"), start=1):
-            if line.count(".") > _DOTS_LIMIT:
+        for number, written in enumerate(text.split("\n"), start=1):
+            if written.count(".") > _DOTS_LIMIT:
                 raise InputError(f"{path}:{number}: has more than {_DOTS_LIMIT} dots; shorten it")
         try:
             record = tomllib.loads(text)
