@@ -47,6 +47,7 @@ _PUBLIC = {
     "linearize_trajectory": "trajectory",
     "list_robots": "robots",
     "load": "loading",
+    "load_inputs": "input_files",
     "velocity": "points",
 }
 
@@ -65,6 +66,7 @@ if TYPE_CHECKING:
         UnknownNameError,
         UrdfError,
     )
+    from fflin.input_files import load_inputs
     from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
     from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import unknown
+from fflin.errors import InputError, unknown
 from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
 from fflin.model import ROOT, Robot
 from fflin.state import ANGULAR, LINEAR, Chart, StateMap
@@ -72,6 +72,9 @@ class Actuation:
                 units.append("N")
                 kinds.append("thrust")
                 columns.append(np.zeros(nv))
+        twice = [name for index, name in enumerate(names) if name in names[:index]]
+        if twice:
+            raise InputError(f"two inputs are named '{twice[0]}'; give one of them another name")
         self.names, self.units = tuple(names), tuple(units)
         self.groups = {
             kind: np.flatnonzero([kind == other for other in kinds])

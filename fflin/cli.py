@@ -99,14 +99,14 @@ def _info(arguments: argparse.Namespace) -> int:
 
 
 def _linearize(arguments: argparse.Namespace) -> int:
-    if arguments.output:
+    if arguments.output_file:
         from fflin.files import check_format, save_model
 
-        check_format(arguments.output)
+        check_format(arguments.output_file)
     robot, lin = _point(arguments)
-    if arguments.output:
-        save_model(lin, arguments.output, spare=robot.urdf)
-        print(f"wrote {arguments.output}: {lin.B.shape[0]} states, {lin.B.shape[1]} inputs")
+    if arguments.output_file:
+        save_model(lin, arguments.output_file, spare=robot.urdf)
+        print(f"wrote {arguments.output_file}: {lin.B.shape[0]} states, {lin.B.shape[1]} inputs")
     else:
         from fflin.reports import linear_model
 
@@ -137,6 +137,14 @@ def _load(arguments: argparse.Namespace) -> Robot:
             fields[name] = for_all[0] if for_all else _once(f"--{name}", values)
     if getattr(arguments, "gravity", None):
         fields["gravity"] = arguments.gravity
+    if getattr(arguments, "inputs", None):
+        from fflin.input_files import load_inputs
+
+        fields["inputs"] = load_inputs(arguments.inputs)
+    if getattr(arguments, "output", []):
+        from fflin.output_specs import parse_output
+
+        fields["outputs"] = [output for text in arguments.output for output in parse_output(text)]
     return robot.replace(**fields) if fields else robot
 
 
@@ -219,7 +227,7 @@ def _parser() -> argparse.ArgumentParser:
         "-o",
         "--output-file",
         metavar="FILE",
-        dest="output",
+        dest="output_file",
         type=Path,
         help="save to FILE: .npz, .mat, .json, or .csv (one file a matrix: NAME.A.csv, ...)",
     )
@@ -326,6 +334,21 @@ def _add_point(command: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         help="an input at the point (repeatable), by its name in u, such as tau_m.joint_1",
+    )
+    command.add_argument(
+        "--inputs",
+        metavar="FILE.toml",
+        help="what acts on the robot, as fflin.load_inputs reads it: a file, or the name of a "
+        "bundled one; by default torque and force on the base and every joint's",
+    )
+    command.add_argument(
+        "--output",
+        metavar="SPEC",
+        action="append",
+        default=[],
+        help="what is watched (repeatable): state (default), base, joints, rates, com, momentum, "
+        "frame:NAME (pose and velocity), pose:NAME, velocity:NAME, gyroscope:NAME or "
+        "accelerometer:NAME",
     )
     command.add_argument(
         "--reference",

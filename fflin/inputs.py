@@ -70,7 +70,7 @@ def three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
     """Return three finite floats, or raise `InputError` that says what was given."""
     try:
         x, y, z = (float(entry) for entry in value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{what} is {value!r}, expected three numbers") from None
     if not math.isfinite(x + y + z):
         raise InputError(f"{what} is {value!r}, expected finite numbers")

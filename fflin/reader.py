@@ -116,24 +116,25 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     )
 
 
-def read_file(path: Path) -> bytes:
-    """Return what a regular file of at most 64 MiB holds, or raise `FileError`."""
+def read_file(path: Path, kind: str = "URDF", limit: int = _SIZE_LIMIT) -> bytes:
+    """Return what a regular file of at most `limit` bytes holds, or raise `FileError`."""
     try:
         # Without O_NONBLOCK, opening a pipe would wait for somebody to write into it.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
         if path.is_dir():
-            raise FileError(f"{path}: is a folder; give the path of a URDF file")
+            raise FileError(f"{path}: is a folder; give the path of a {kind} file")
         with open(os.open(path, flags | getattr(os, "O_CLOEXEC", 0)), "rb") as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise FileError(f"{path}: is not a regular file; give the path of a URDF file")
-            document = file.read(_SIZE_LIMIT + 1)
+                raise FileError(f"{path}: is not a regular file; give the path of a {kind} file")
+            document = file.read(limit + 1)
     except FileError:
         raise
     except (OSError, ValueError) as error:
         what = error.strerror if isinstance(error, OSError) else str(error)
         raise FileError(f"{path}: cannot be read: {what}") from None
-    if len(document) > _SIZE_LIMIT:
-        raise FileError(f"{path}: is larger than {_SIZE_LIMIT >> 20} MiB, too large for a URDF")
+    if len(document) > limit:
+        size = f"{limit >> 20} MiB" if limit >> 20 else f"{limit >> 10} KiB"
+        raise FileError(f"{path}: is larger than {size}, too large for a {kind} file")
     return document
 
 

@@ -122,3 +122,26 @@ def find_robot(robot: str | Path) -> RobotFile:
     if text not in _example_robot_data():
         raise unknown("robot", text, list_robots())
     return _example_robot_data()[text]
+
+
+def find_inputs(inputs: str | Path) -> Path:
+    """Find a file of inputs by its path, or the bundled one by its robot's name.
+
+    Parameters
+    ----------
+    inputs : str or Path
+        Name or path; a bundled name comes first.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError
+        If it is neither.
+    """
+    if not isinstance(inputs, str | os.PathLike) or "\0" in str(inputs):
+        raise InputError(f"{inputs!r} is not the path of a file of inputs")
+    bundled = {path.stem: path for path in bundled_directory().glob("*.toml")}
+    return bundled.get(str(inputs), Path(inputs))

@@ -1,5 +1,7 @@
 """What acts on a robot: inputs, springs, dampers, gravity; laws and closed forms, then `check`."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -267,6 +269,9 @@ def test_bad_fields_are_told():
         "no joint named 'joint_8'": {"inputs": [fflin.JointTorque("joint_8")]},
         "inputs is empty": {"inputs": []},
         "is not an input": {"inputs": ["thruster"]},
+        "two inputs are named 'thruster_2'": {
+            "inputs": [replace(THRUSTERS[0], name="thruster_2"), THRUSTERS[0]]
+        },
         "stands there twice": {"inputs": [fflin.BaseForce(), fflin.BaseForce()]},
         "stiffness of joint 'panel_left' is -1": {"stiffness": {"panel_left": -1}},
         "no joint named 'panel'": {"damping": {"panel": 1}},

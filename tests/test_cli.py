@@ -10,6 +10,7 @@ import pytest
 from conftest import BUNDLED
 
 import fflin
+from fflin.robots import bundled_directory
 
 
 def run(*arguments, cwd=None, **environment):
@@ -152,6 +153,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
     output = tmp_path / "m.npz"
     bad = tmp_path / "bad.urdf"
     bad.write_text("<robot name='r'><link")
+    typo = tmp_path / "bad.toml"
+    typo.write_text('[[input]]\ntype = "truster"\n')
     cases = {
         ("linearize", "ets_vi", "-o", output): "no robot named 'ets_vi'; did you mean ets_vii",
         ("linearize", bad, "-o", output): "bad.urdf:1: not well-formed",
@@ -169,6 +172,15 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
         ("linearize", "ets_vii", "--lock", "joint_1", "--joint", "joint_1=2"): "is locked",
         ("linearize", "ets_vii", "--stiffness", "joint_1=-1"): "is -1, expected 0 or more",
         ("linearize", "ets_vii", "--damping", "viscous"): "'viscous' is not",
+        ("linearize", "cubesat", "--inputs", typo, "-o", output): "bad.toml:2: no type of input",
+        ("check", "cubesat", "--inputs", "none.toml"): "none.toml: cannot be read: No such file",
+        ("check", "cubesat", "--inputs", "servicer_7dof"): "no joint named 'joint_1'",
+        ("check", "ets_vii", "--output", "pos:tool"): "no output named 'pos'; did you mean pose",
+        ("check", "ets_vii", "--output", "pose"): "output 'pose' is of no frame; write pose:NAME",
+        ("check", "ets_vii", "--output", "com:tool"): "is of the whole robot; write com",
+        ("check", "ets_vii", "--output", "pose:tol"): "no frame named 'tol'; did you mean tool",
+        ("check", "ets_vii", "--output", "base", "--output", "state"): "is asked for twice",
+        ("linearize", "ets_vii", "--out", "m.mat"): "ambiguous option: --out could match",
         ("check", "romeo"): "cannot be inverted: joint 'LHand'",
         ("check", "cubesat", "--rpy", 180, 0, 0, "--reference", "world"): "turned by 180 deg",
         ("check",): "the following arguments are required: ROBOT",
@@ -177,7 +189,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
     }
     for arguments, words in cases.items():
         assert words in refused(*arguments)
-    assert sorted(tmp_path.iterdir()) == [bad]
+    assert sorted(tmp_path.iterdir()) == [typo, bad]
 
 
 def test_existing_output_survives_a_failure(tmp_path):
@@ -232,6 +244,37 @@ def test_passive_joints_and_gravity(tmp_path):
     options = ("--damping", "urdf", "--velocity", "joint_2=0.3", "--effort", "tau_m.joint_1=2")
     code, out, _ = run("check", "planar_detumble", *options)
     assert code == 0 and "OK" in out
+
+
+def test_inputs_and_outputs_are_those_of_python(tmp_path):
+    path = tmp_path / "m.mat"
+    springs = ("--stiffness", "panel_left=100", "--stiffness", "panel_right=100")
+    inputs = fflin.load_inputs("servicer_7dof")
+    options = ("--inputs", bundled_directory() / "servicer_7dof.toml", *springs)
+    code, out, err = run(
+        "linearize", "servicer_7dof", *options, "--output", "frame:tool", "-o", path
+    )
+    assert code == 0 and not err and "30 states, 17 inputs" in out
+    robot = fflin.load(
+        "servicer_7dof",
+        inputs=inputs,
+        outputs=[fflin.FramePose("tool"), fflin.FrameVelocity("tool")],
+        stiffness={"panel_left": 100.0, "panel_right": 100.0},
+    )
+    lin, saved = fflin.linearize(robot), fflin.LinearModel.load(path)
+    for key in "ABCD":
+        assert (getattr(saved, key) == getattr(lin, key)).all()
+    assert saved.input_names == lin.input_names and saved.output_names == lin.output_names
+    code, out, _ = run("check", "servicer_7dof", *options)
+    assert code == 0 and "figures hold" in out
+
+
+def test_output_and_output_file_are_told_apart(tmp_path):
+    for option in (("--output-file",), ("--output-f",), ("-o",)):
+        path = tmp_path / f"m{len(option[0])}.json"
+        code, _, err = run("linearize", "ets_vii", "--output=com", *option, path)
+        assert code == 0 and not err
+        assert fflin.LinearModel.load(path).output_names == ("com.x", "com.y", "com.z")
 
 
 def test_check_exits_1_where_it_falls_short(monkeypatch, capsys):
