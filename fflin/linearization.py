@@ -1,5 +1,6 @@
 """The equations: A and B about any point, from CRBA's M and the derivatives of RNEA."""
 
+import math
 from functools import partial
 from threading import Lock
 from typing import Any
@@ -229,7 +230,7 @@ class Linearizer:
             f0[:] = 0.0
         C, D, y0 = self._seen(chart, rates, q, v, u_base, x0)
         for array in (A, B, C, D, f0, x0, y0):
-            if not np.isfinite(array).all():
+            if not _is_finite(array):
                 raise InputError("q, v or u is so large that the model is not finite")
             array.setflags(write=False)
         point = {"A": A, "B": B, "C": C, "D": D, "f0": f0}
@@ -436,6 +437,12 @@ def linearize(
 
 def _rebuilt(robot: Robot, frame: Frame, reference: pin.SE3 | None, moving: bool) -> Linearizer:
     return Linearizer(robot, frame=frame, reference=reference, moving=moving)
+
+
+def _is_finite(array: Array) -> bool:
+    flat = array.ravel()
+    # The square tells at once, but for entries beyond 1e154.
+    return math.isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())
 
 
 def _frozen(array: Array) -> Array:
