@@ -57,6 +57,31 @@ def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
     return {name: resolved[name] for name in written}
 
 
+def counted_leaders(joints: dict[str, JointElement], mimics: dict[str, Mimic]) -> set[str]:
+    """Return the continuous leaders whose whole turns matter.
+
+    A turn of the leader more leaves a follower where it is only if that is continuous too and
+    makes a whole number of turns itself.
+
+    Parameters
+    ----------
+    joints : dict
+        All joints of the robot by name.
+    mimics : dict
+        Of `resolve_mimics`.
+
+    Returns
+    -------
+    set of str
+    """
+    return {
+        mimic.leader
+        for name, mimic in mimics.items()
+        if joints[mimic.leader].type == "continuous"
+        and not (joints[name].type == "continuous" and mimic.multiplier.is_integer())
+    }
+
+
 def _check(joint: JointElement, mimic: Mimic, joints: dict[str, JointElement]) -> None:
     if joint.freedom != 1:
         raise joint.element.error(

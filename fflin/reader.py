@@ -6,7 +6,7 @@ import hashlib
 import os
 import stat
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,7 @@ import pinocchio as pin
 from fflin.errors import FileError, UrdfError
 from fflin.expansion import expand, uses_xacro
 from fflin.inertia_checks import inertia_notes
-from fflin.mimics import resolve_mimics
+from fflin.mimics import counted_leaders, resolve_mimics
 from fflin.urdf import Urdf, read_description
 from fflin.urdf_joints import Mimic
 from fflin.urdf_writer import write_urdf
@@ -94,7 +94,8 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
         root = parse(expanded, f"{path} as expanded by xacro")
         _check_expanded(root)
     urdf = read_description(root, prune)
-    model = _build(urdf, path, root)
+    mimics = resolve_mimics(urdf.joints)
+    model = _build(urdf, path, root, counted_leaders(urdf.joints, mimics))
     notes += inertia_notes(urdf.links.values(), model, path.name)
 
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
@@ -109,7 +110,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     return Description(
         model,
         hashlib.sha256(document).hexdigest(),
-        resolve_mimics(urdf.joints),
+        mimics,
         damping,
         friction,
         tuple(notes),
@@ -142,7 +143,7 @@ def _check_expanded(root: Element) -> None:
         raise UrdfError(f"{root.origin}: xacro is left in it; is a macro missing?")
 
 
-def _build(urdf: Urdf, path: Path, root: Element) -> pin.Model:
+def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> pin.Model:
     nv = 6 + sum(joint.freedom for joint in urdf.joints.values())
     if nv > _LARGEST_NV:
         raise root.error(
@@ -152,7 +153,7 @@ def _build(urdf: Urdf, path: Path, root: Element) -> pin.Model:
     root_joint = "root_joint"
     while root_joint in urdf.joints or root_joint in urdf.links:
         root_joint += "_"
-    document = write_urdf(urdf)
+    document = write_urdf(urdf, counted)
     try:
         model = _with_stack(
             urdf.depth,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from dataclasses import replace
 
 from fflin.urdf import Urdf
 from fflin.urdf_joints import JointElement
@@ -13,12 +14,15 @@ from fflin.urdf_links import Link, Pose
 _UNLIMITED = sys.float_info.max
 
 
-def write_urdf(urdf: Urdf) -> str:
+def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:
     """Write a description without visuals, collisions and extensions.
 
     Parameters
     ----------
     urdf : Urdf
+    counted : collection of str
+        Continuous joints whose whole turns count: written as revolute joints without bounds,
+        for Pinocchio stores a continuous one as (cos, sin).
 
     Returns
     -------
@@ -30,7 +34,7 @@ def write_urdf(urdf: Urdf) -> str:
     for link in urdf.links.values():
         lines.extend(_link(link))
     for joint in urdf.joints.values():
-        lines.extend(_joint(joint))
+        lines.extend(_joint(_counting(joint) if joint.name in counted else joint))
     lines.append("</robot>")
     return "\n".join(lines)
 
@@ -45,6 +49,12 @@ def _link(link: Link) -> Iterator[str]:
         yield f'<inertial>{_origin(link.com)}<mass value="{link.mass!r}"/>'
         yield f"<inertia {inertia}/></inertial>"
     yield "</link>"
+
+
+def _counting(joint: JointElement) -> JointElement:
+    """Return a continuous joint as a revolute one without bounds."""
+    unbounded = {"lower": -_UNLIMITED, "upper": _UNLIMITED}
+    return replace(joint, type="revolute", limits=(joint.limits or {}) | unbounded)
 
 
 def _joint(joint: JointElement) -> Iterator[str]:
