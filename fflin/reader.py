@@ -19,7 +19,7 @@ from fflin.mimics import counted_leaders, resolve_mimics
 from fflin.urdf import Urdf, read_description
 from fflin.urdf_joints import Mimic
 from fflin.urdf_writer import write_urdf
-from fflin.xml_tree import Element, enumerated, parse
+from fflin.xml_tree import Element, enumerated, parse, told
 
 _SIZE_LIMIT = 64 * 2**20
 
@@ -96,6 +96,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     urdf = read_description(root, prune)
     mimics = resolve_mimics(urdf.joints)
     model = _build(urdf, path, root, counted_leaders(urdf.joints, mimics))
+    notes += told(root)
     notes += inertia_notes(urdf.links.values(), model, path.name)
 
     moving = [joint for joint in urdf.joints.values() if joint.freedom]

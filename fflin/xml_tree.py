@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -33,6 +34,8 @@ class Element:
     origin : str
         What errors call the document: the path of the file.
     children : list of Element
+    notes : dict
+        {what is to be told: lines}, shared by all elements of the document.
     """
 
     tag: str
@@ -40,10 +43,15 @@ class Element:
     line: int
     origin: str
     children: list[Element] = field(default_factory=list)
+    notes: dict[str, list[int]] = field(default_factory=dict)
 
     def error(self, message: str) -> UrdfError:
         """Build an error that says where this element stands."""
         return UrdfError(f"{self.origin}:{self.line}: {message}")
+
+    def note(self, message: str) -> None:
+        """Leave a warning about this element; the same one is told once for all its lines."""
+        self.notes.setdefault(message, []).append(self.line)
 
     def find_all(self, tag: str) -> list[Element]:
         """Return the children of that tag."""
@@ -133,6 +141,18 @@ def enumerated(names: list[str]) -> str:
     return shown + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
+def told(root: Element) -> list[str]:
+    """Return the notes left on a document, one line each."""
+    # Notes are kept with the robot, where the folder does not matter.
+    origin = root.origin.rpartition(os.sep)[2]
+    return [
+        f"{origin}:{lines[0]}: {message}"
+        + (f" (and in {len(lines) - 1} more places)" if len(lines) > 2 else "")
+        + (f" (and in line {lines[1]})" if len(lines) == 2 else "")
+        for message, lines in root.notes.items()
+    ]
+
+
 def parse(document: bytes, origin: str) -> Element:
     """Parse an XML document without namespaces, document types and entities.
 
@@ -205,7 +225,9 @@ class _Builder:
         parser.Parse(b"", True)
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
-        element = Element(tag, attributes, self.parser.CurrentLineNumber, self.root.origin)
+        element = Element(
+            tag, attributes, self.parser.CurrentLineNumber, self.root.origin, [], self.root.notes
+        )
         self._count += 1
         if self._count > _ELEMENT_LIMIT:
             raise element.error(

@@ -392,6 +392,25 @@ refuse("1,000 joints", chain(999, "continuous"), "998 degrees of freedom", "GiB"
 refuse("20,000 links", robot(*(link(f"l{k}", "") for k in range(20_000))), "20000 links")
 refuse("317 joints", chain(318, "continuous"), "317 degrees of freedom")
 accept("a chain of 900 links", chain(900, "fixed"))
+warn(
+    "a world that the base floats in",
+    robot(link("world", ""), link("a"), link("b"), joint("j", "a", "b")).replace(
+        "</robot>", joint("free", "world", "a", "floating", "") + "</robot>"
+    ),
+    "'world'",
+    "'free'",
+    "left out",
+)
+refuse(
+    "a world that two bases float in",
+    robot(
+        link("world", ""),
+        *(link(name) + joint(f"{name}_", "world", name, "floating") for name in "ab"),
+    ),
+    "'a_'",
+    "lock",
+)
+refuse("a floating joint below a link of mass", arm(kind="floating", inside=""), "'hinge'")
 accept("a joint before its links", robot(joint("j", "a", "b"), link("b"), link("a")))
 accept(
     "branches",
@@ -487,10 +506,23 @@ accept(
     arm(child=link("arm", INERTIAL + "<collision><origin xyz='?'/></collision>")),
 )
 accept("gazebo", arm(more='<gazebo reference="arm"><mu1>0.2</mu1></gazebo>'))
-accept(
-    "gazebo with links",
-    arm(more=f"<gazebo><model>{link('x')}{joint('y', 'x', 'z')}</model></gazebo>"),
-)
+accept("gazebo with names", arm(more=f"<gazebo>{link('x', '')}<joint name='y'/></gazebo>"))
+for wrapper in ("gazebo", "group", "transmission", "ros2_control", "drake:group"):
+    both = link("tip") + joint("k", "arm", "tip")
+    refuse(
+        f"{wrapper} around a link and its joint",
+        arm(more=f"<{wrapper}>{both}</{wrapper}>"),
+        ":5:",
+        "'tip'",
+        f"<{wrapper}>",
+        "directly into <robot>",
+    )
+    refuse(
+        f"{wrapper} around a joint",
+        arm(more=f"<{wrapper}>{joint('k', 'arm', 'tip')}</{wrapper}>"),
+        ":5:",
+        "'k'",
+    )
 accept("transmission", arm(more='<transmission name="t"><joint name="hinge"/></transmission>'))
 accept(
     "ros2_control",
