@@ -187,9 +187,10 @@ def _drop_world(links: dict[str, Link], joints: dict[str, JointElement]) -> None
     """Drop a root that stands for the world: without mass, its one joint floating."""
     children = {joint.child for joint in joints.values()}
     root = next(link for name, link in links.items() if name not in children)
-    (first, *others) = [j for j in joints.values() if j.parent == root.name] or [None]
-    if first is None or others or first.type != "floating" or root.mass:
+    hanging = [joint for joint in joints.values() if joint.parent == root.name]
+    if len(hanging) != 1 or hanging[0].type != "floating" or root.mass:
         return
+    first = hanging[0]
     first.element.note(
         f"joint {quoted(first.name)} is floating and link {quoted(root.name)} has no mass; both "
         f"are left out, for the base, link {quoted(first.child)}, floats free by itself"

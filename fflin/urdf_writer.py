@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 
 from fflin.urdf import Urdf
-from fflin.urdf_joints import JointElement
+from fflin.urdf_joints import UNLIMITED, JointElement
 from fflin.urdf_links import Link, Pose
-
-# What a joint without a <limit>, or with half of one, is limited to: nothing.
-_UNLIMITED = sys.float_info.max
 
 
 def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:
@@ -53,7 +49,7 @@ def _link(link: Link) -> Iterator[str]:
 
 def _counting(joint: JointElement) -> JointElement:
     """Return a continuous joint as a revolute one without bounds."""
-    unbounded = {"lower": -_UNLIMITED, "upper": _UNLIMITED}
+    unbounded = {"lower": -UNLIMITED, "upper": UNLIMITED}
     return replace(joint, type="revolute", limits=(joint.limits or {}) | unbounded)
 
 
@@ -71,9 +67,9 @@ def _joint(joint: JointElement) -> Iterator[str]:
 
 
 def _limit(joint: JointElement) -> str:
-    limits = {"effort": _UNLIMITED, "velocity": _UNLIMITED}
+    limits = {"effort": UNLIMITED, "velocity": UNLIMITED}
     if joint.limits is None:
-        limits |= {"lower": -_UNLIMITED, "upper": _UNLIMITED}
+        limits |= {"lower": -UNLIMITED, "upper": UNLIMITED}
     limits |= joint.limits or {}
     entries = " ".join(f'{name}="{value!r}"' for name, value in limits.items())
     return f"<limit {entries}/>"

@@ -16,6 +16,9 @@ _DEPTH_LIMIT = 100
 _ELEMENT_LIMIT = 500_000
 _TAG_LIMIT = 2**20  # bytes
 
+# Between xzy and xyz, quat and quat_xyzw; unit and value are farther apart.
+_NEAR = 0.6
+
 _SPACE = " \t\r\n"
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
@@ -82,13 +85,18 @@ class Element:
             stack.extend(element.children[::-1])
 
     def allow_only(self, *names: str, of: str) -> None:
-        """Refuse other attributes: a misspelt one would be a default taken in silence."""
+        """Refuse a misspelt attribute, a default taken in silence; note others it does not know."""
+        import difflib
+
         for name in self.attributes:
-            if name not in names and ":" not in name:
+            if name in names or ":" in name:
+                continue
+            if difflib.get_close_matches(name.lower(), names, n=1, cutoff=_NEAR):
                 raise self.error(
                     f"<{self.tag}> of {of} has an unknown attribute {quoted(name)}; known: "
                     f"{', '.join(names)}; correct it or take it out"
                 )
+            self.note(f"the attribute {quoted(name)} of <{self.tag}> is not in the model")
 
     def text(self, name: str, of: str) -> str:
         """Return an attribute that must be there and hold something."""
@@ -122,12 +130,17 @@ class Element:
         return tuple(self._decimal(entry, f"{name} of {of}") for entry in entries)
 
     def _decimal(self, text: str, what: str) -> float:
-        value = float(text) if _DECIMAL.fullmatch(text) else math.nan
+        value = decimal(text)
         if not math.isfinite(value):
             raise self.error(
                 f"{what} is {quoted(text)}; expected a plain finite number, such as 0.5"
             )
         return value
+
+
+def decimal(text: str) -> float:
+    """Return a decimal number, infinite where it overflows; NaN of anything else."""
+    return float(text) if _DECIMAL.fullmatch(text) else math.nan
 
 
 def quoted(text: str) -> str:

@@ -105,16 +105,31 @@ for title, text in BAD_NUMBERS.items():
     refuse(f"mass: {title}", arm(child=inertial(text)), ":3:", f"'{text}'", "link 'arm'", "finite")
 for entry in ("ixx", "ixy", "izz"):
     refuse(f"{entry} nan", arm(child=inertial("1", moments(**{entry: "nan"}))), ":3:", entry)
-for attribute, place in {
-    "lower": "limit",
-    "upper": "limit",
-    "effort": "limit",
-    "velocity": "limit",
-    "damping": "dynamics",
-    "friction": "dynamics",
-}.items():
-    inside = AXIS + f'<{place} {attribute}="1,5"/>'
+for attribute in ("damping", "friction"):
+    inside = AXIS + f'<dynamics {attribute}="1,5"/>'
     refuse(f"{attribute} with comma", arm(inside=inside), ":4:", attribute, "'hinge'", "'1,5'")
+    inside = AXIS + f'<dynamics {attribute}=""/>'
+    warn(f"{attribute} empty", arm(inside=inside), ":4:", attribute, "'hinge'", "as 0")
+for attribute, texts in {
+    "lower": ("1,5", "", "nan", "inf", "1e999"),
+    "upper": ("1,5", "", "nan", "-inf"),
+    "effort": ("1,5", "", "nan", "-inf", "-1"),
+    "velocity": ("1,5", "", "nan", "-inf", "-1"),
+}.items():
+    for text in texts:
+        inside = AXIS + f'<limit {attribute}="{text}"/>'
+        warn(f"{attribute} of '{text}'", arm(inside=inside), ":4:", attribute, "'hinge'", "no lim")
+accept(
+    "infinite limits",
+    arm(inside=AXIS + '<limit lower="-inf" upper="INF" effort="+inf" velocity="Infinity"/>'),
+)
+warn(
+    "limits in the wrong order",
+    arm(inside=AXIS + '<limit lower="1" upper="-1"/>'),
+    ":4:",
+    "'hinge'",
+    "more than upper",
+)
 for title, text, words in (
     ("two entries", "1 2", "has 2 entries"),
     ("four entries", "1 2 3 4", "has 4 entries"),
@@ -128,7 +143,9 @@ for title, text, words in (
     refuse(f"rpy: {title}", arm(inside=f'{AXIS}<origin rpy="{text}"/>'), ":4:", words, "rpy")
     refuse(f"axis: {title}", arm(inside=f'<axis xyz="{text}"/>'), ":4:", words, "<axis>")
 refuse("com of two entries", arm(child=inertial(origin='<origin xyz="0 0"/>')), ":3:", "'arm'")
-refuse("xyz beyond anything", arm(inside=f'{AXIS}<origin xyz="1e40 0 0"/>'), "beyond anything")
+refuse("rpy beyond anything", arm(inside=f'{AXIS}<origin rpy="1e40 0 0"/>'), "beyond anything")
+refuse("xyz of 1e29", arm(inside=f'{AXIS}<origin xyz="0 -1e29 0"/>'), ":4:", "'hinge'", "1e+12 m")
+refuse("com of 1e29", arm(child=inertial(origin='<origin xyz="1e29 0 0"/>')), ":3:", "'arm'", "m;")
 refuse("mass beyond anything", arm(child=inertial("1e40")), "beyond anything")
 accept("numbers in every form", arm(child=inertial("+1.", moments(".5", "-0", "0e5", "5E-1"))))
 accept("spaces around numbers", arm(inside='<axis xyz="  0\t0\n1 "/>', child=inertial(" 1 ")))
@@ -188,7 +205,8 @@ refuse(
 refuse(
     "intertial", arm(child=link("arm", INERTIAL.replace("inertial", "intertial"))), "did you mean"
 )
-refuse("unknown attribute of mass", arm(child=inertial('1" unit="g')), "'unit'", "<mass>")
+warn("unit of a mass", arm(child=inertial('1" unit="kg')), ":3:", "'unit'", "<mass>", "not in")
+refuse("mass misspelt", arm(child=inertial('1" vaule="2')), ":3:", "'vaule'", "<mass>")
 warn("triangle inequality", arm(child=inertial("1", moments(izz=3))), "'arm'", "rigid body")
 warn("inertia without mass", arm(child=inertial("0")), "'arm'", "no mass")
 warn(
@@ -432,7 +450,9 @@ refuse("axis zero", arm(inside='<axis xyz="0 0 0"/>'), ":4:", "length 0", "'hing
 refuse("axis 1e-200", arm(inside='<axis xyz="0 0 1e-200"/>'), "length 1e-200")
 refuse("axis 1e200", arm(inside='<axis xyz="0 1e200 0"/>'), "length 1e+200")
 refuse("axis without xyz", arm(inside="<axis/>"), "'xyz'")
-refuse("axis by rpy", arm(inside='<axis rpy="0 0 1"/>'), "'rpy'", "xyz")
+refuse("axis by rpy", arm(inside='<axis rpy="0 0 1"/>'), "no 'xyz'")
+accept("axis with an rpy of zeros", arm(inside='<axis xyz="0 0 1" rpy="0 0.0 -0"/>'))
+warn("axis with an rpy", arm(inside='<axis xyz="0 0 1" rpy="0 0 1"/>'), ":4:", "'rpy'", "<axis>")
 refuse("two axes", arm(inside=AXIS * 2), "second <axis>", "'hinge'")
 refuse("two origins", arm(inside=AXIS + "<origin/>" * 2), "second <origin>")
 refuse("two limits", arm(inside=AXIS + LIMIT * 2), "second <limit>")
@@ -450,6 +470,21 @@ refuse("negative damping", arm(inside=AXIS + '<dynamics damping="-1"/>'), "dampi
 refuse("negative friction", arm(inside=AXIS + '<dynamics friction="-1"/>'), "friction", "negative")
 warn("damping", arm(inside=AXIS + '<dynamics damping="0.1"/>'), "damping", "'hinge'", "asked for")
 warn("friction", arm(inside=AXIS + '<dynamics friction="0.1"/>'), "friction", "'hinge'")
+warn(
+    "stiffness of a spring",
+    arm(inside=AXIS + '<dynamics spring_stiffness="1"/>'),
+    ":4:",
+    "'spring_stiffness'",
+    "not in the model",
+)
+warn(
+    "rotor inertia",
+    arm(inside=AXIS + '<drake:rotor_inertia value="1"/>'),
+    ":4:",
+    "<drake:rotor_inertia>",
+    "'hinge'",
+    "not in the model",
+)
 accept("damping of zero", arm(inside=AXIS + '<dynamics damping="0" friction="0.0"/>'))
 accept("damping of a fixed joint", arm(kind="fixed", inside='<dynamics damping="1"/>'))
 for kind in ("revolute", "prismatic", "continuous", "fixed"):
@@ -469,6 +504,7 @@ accept("empty origin", arm(inside=AXIS + "<origin/>"))
 
 refuse("mimic of nothing", three("<mimic/>"), ":6:", "'joint'", "'j1'")
 refuse("mimic of an unknown joint", three('<mimic joint="j9"/>'), ":6:", "'j1'", "'j9'")
+refuse("mimic of Drake", three("", '<drake:mimic joint="j1"/>'), ":7:", "'j2'", "as <mimic>")
 refuse("mimic of itself", three('<mimic joint="j1"/>'), ":6:", "itself", "'j1'")
 refuse(
     "mimics of each other", three('<mimic joint="j2"/>', '<mimic joint="j1"/>'), "circle", "'j2'"

@@ -305,6 +305,21 @@ def test_the_stack_size_of_threads_is_left_as_it_was():
     assert threading.stack_size() == before
 
 
+def test_wrong_and_infinite_limits_are_none():
+    for limit in ('lower="-inf" upper="inf" effort="inf"', 'lower="" upper="-" effort="-1"'):
+        model = read(arm(inside=f"{AXIS}<limit {limit}/>")).model
+        assert model.lowerPositionLimit[7] < -1e300 and model.upperPositionLimit[7] > 1e300
+        assert model.effortLimit[6] > 1e300
+
+
+def test_a_note_is_told_once_for_all_its_lines():
+    document = robot(*(link(name) for name in "abc"), joint("j", "a", "b"), joint("k", "a", "c"))
+    (note,) = read(document.replace('<mass value="1"', '<mass unit="kg" value="1"')).notes
+    assert note == (
+        "robot.urdf:2: the attribute 'unit' of <mass> is not in the model (and in 2 more places)"
+    )
+
+
 def test_limit_given_is_the_limit():
     model = read(arm(inside=AXIS + LIMIT)).model
     assert (model.lowerPositionLimit[7], model.upperPositionLimit[7]) == (-1.0, 1.0)
