@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fflin.errors import unknown
 from fflin.urdf_joints import JointElement, Mimic
-from fflin.urdf_links import bounded
+from fflin.urdf_links import bounded, bounded_length
 from fflin.xml_tree import enumerated, quoted
 
 
@@ -49,10 +49,11 @@ def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
             own = written[follower]
             above = resolved.get(own.leader, Mimic(own.leader, 1.0, 0.0))
             element, of = joints[follower].element, f"joint {quoted(follower)}"
+            limit = bounded_length if joints[follower].type == "prismatic" else bounded
             resolved[follower] = Mimic(
                 above.leader,
                 bounded(element, "multiplier", of, own.multiplier * above.multiplier),
-                bounded(element, "offset", of, own.multiplier * above.offset + own.offset),
+                limit(element, "offset", of, own.multiplier * above.offset + own.offset),
             )
     return {name: resolved[name] for name in written}
 

@@ -13,13 +13,13 @@ from pathlib import Path
 import pinocchio as pin
 
 from fflin.errors import FileError, UrdfError
-from fflin.expansion import expand, uses_xacro
+from fflin.expansion import expand, first_xacro
 from fflin.inertia_checks import inertia_notes
 from fflin.mimics import counted_leaders, resolve_mimics
 from fflin.urdf import Urdf, read_description
 from fflin.urdf_joints import Mimic
 from fflin.urdf_writer import write_urdf
-from fflin.xml_tree import Element, enumerated, parse, told
+from fflin.xml_tree import Element, named, parse, told
 
 _SIZE_LIMIT = 64 * 2**20
 
@@ -89,8 +89,9 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     """Do what `read_urdf` does with the bytes of a file; `path` names it in errors."""
     root = parse(document, str(path))
     notes: list[str] = []
-    if path.suffix == ".xacro" or uses_xacro(root):
-        expanded, notes = expand(path, document)
+    first = first_xacro(root)
+    if path.suffix == ".xacro" or first:
+        expanded, notes = expand(path, document, first)
         root = parse(expanded, f"{path} as expanded by xacro")
         _check_expanded(root)
     urdf = read_description(root, prune)
@@ -105,7 +106,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     for what, values in (("damping", damping), ("Coulomb friction", friction)):
         if values:
             notes.append(
-                f"{path.name}: the {what} of joint {enumerated(list(values))} is not in the linear "
+                f"{path.name}: the {what} of {named('joint', list(values))} is not in the linear "
                 "model unless it is asked for"
             )
     return Description(
@@ -140,8 +141,9 @@ def read_file(path: Path) -> bytes:
 
 
 def _check_expanded(root: Element) -> None:
-    if uses_xacro(root):
-        raise UrdfError(f"{root.origin}: xacro is left in it; is a macro missing?")
+    left = first_xacro(root)
+    if left:
+        raise left.error(f"xacro is left in <{left.tag}>; is a macro missing?")
 
 
 def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> pin.Model:

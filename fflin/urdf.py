@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from fflin.errors import unknown
 from fflin.urdf_joints import JointElement, read_joint
 from fflin.urdf_links import Link, read_link, refuse_near_miss
-from fflin.xml_tree import Element, enumerated, quoted
+from fflin.xml_tree import Element, enumerated, named, quoted
 
 # urdfdom and Pinocchio's parser recurse along the tree, about 2.5 kB of stack for each link.
 _DEPTH_LIMIT = 1_000
@@ -171,7 +171,7 @@ def _check_tree(
             way.append(parent)
         loop = [above[name].name for name in way[way.index(parent) :]]
         raise above[parent].element.error(
-            f"joint {enumerated(loop)} form a closed loop that hangs on nothing; correct a parent "
+            f"{named('joint', loop)} form a closed loop that hangs on nothing; correct a parent "
             "or child in it"
         )
     deepest = max(depths, key=depths.__getitem__)

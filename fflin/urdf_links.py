@@ -12,8 +12,9 @@ from fflin.xml_tree import Element, quoted
 # Beyond it nothing is physical, and products of two such numbers stay far from overflow.
 _ABSURD = 1e30
 
-# Its square, as it enters inertias, still lets those of a robot's joints be inverted.
-_FARTHEST = 1e12  # [m]
+# From 1e8 m on, in double precision the square of the length swallows that of a metre, and with
+# it what the links weigh about their own joints: ABA then divides zero by zero.
+_FARTHEST = 1e7  # [m]
 
 # Quaternions are written with four digits often, seldom with fewer.
 _QUATERNION_SLACK = 1e-3
@@ -127,7 +128,7 @@ def bounded(element: Element, what: str, of: str, value: float) -> float:
 
 
 def bounded_length(element: Element, what: str, of: str, value: float) -> float:
-    """Return a length that leaves digits to those of a robot."""
+    """Return a length [m] that is not too large for inertias about both of its ends."""
     if abs(value) > _FARTHEST:
         raise element.error(
             f"{what} of {of} is {value:g} m, expected at most {_FARTHEST:g} m; correct it"

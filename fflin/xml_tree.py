@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from xml.parsers import expat
 
-from fflin.errors import UrdfError
+from fflin.errors import UrdfError, listed
 
 # URDFs nest some 10 elements and hold some 10,000; these only keep hostile input off.
 _DEPTH_LIMIT = 100
@@ -20,6 +20,7 @@ _TAG_LIMIT = 2**20  # bytes
 _NEAR = 0.6
 
 _SPACE = " \t\r\n"
+_ENTITY = re.compile(rb"&(?!(amp|lt|gt|quot|apos);|#)")
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
@@ -149,9 +150,13 @@ def quoted(text: str) -> str:
 
 
 def enumerated(names: list[str]) -> str:
-    """Show names in a sentence: the first six, and how many more there are."""
-    shown = ", ".join(quoted(name) for name in names[:6])
-    return shown + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+    """Show names of a file in a sentence: the first six, and how many more there are."""
+    return listed(map(quoted, names))
+
+
+def named(kind: str, names: list[str]) -> str:
+    """Show names after what they are names of: joint 'a', joints 'a', 'b'."""
+    return f"{kind}{'s' if len(names) > 1 else ''} {enumerated(names)}"
 
 
 def told(root: Element) -> list[str]:
@@ -167,7 +172,7 @@ def told(root: Element) -> list[str]:
 
 
 def parse(document: bytes, origin: str) -> Element:
-    """Parse an XML document without namespaces, document types and entities.
+    """Parse an XML document without namespaces and entities.
 
     Parameters
     ----------
@@ -184,7 +189,7 @@ def parse(document: bytes, origin: str) -> Element:
     Raises
     ------
     UrdfError
-        If it is not well-formed, declares a document type or entities, or is nested too deeply
+        If it is not well-formed, declares or uses entities of its own, or is nested too deeply
         or too large for a robot description.
     """
     if not document.strip():
@@ -223,9 +228,22 @@ class _Builder:
         self.parser = expat.ParserCreate()
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end
-        self.parser.StartDoctypeDeclHandler = self._refuse_doctype
+        # A document type may be named; one that is declared elsewhere is not read.
+        self.parser.EntityDeclHandler = self._refuse_entities
+        self.parser.NotStandaloneHandler = self._meet_unread_declarations
+        self._unread = False
 
     def parse(self, document: bytes) -> None:
+        self._parse(document)
+        # Where declarations are not read, expat drops entities that it does not know from
+        # attributes in silence. Without its zeros, UTF-16 is ASCII where it matters.
+        if self._unread and _ENTITY.search(document.replace(b"\0", b"")):
+            raise UrdfError(
+                f"{self.root.origin}: uses an entity that it does not declare itself; write what "
+                "it stands for in its place"
+            )
+
+    def _parse(self, document: bytes) -> None:
         # In pieces, for expat's time for one tag grows faster than its length.
         parser, step = self.parser, _TAG_LIMIT // 4
         for begin in range(0, len(document), step):
@@ -256,8 +274,12 @@ class _Builder:
     def _end(self, _: str) -> None:
         self._open.pop()
 
-    def _refuse_doctype(self, *_: object) -> None:
+    def _meet_unread_declarations(self) -> int:
+        self._unread = True
+        return 1
+
+    def _refuse_entities(self, *_: object) -> None:
         raise UrdfError(
-            f"{self.root.origin}:{self.parser.CurrentLineNumber}: a document type or entities "
-            "(<!DOCTYPE>) are not read; take the declaration out"
+            f"{self.root.origin}:{self.parser.CurrentLineNumber}: entities (<!ENTITY>) are not "
+            "read; take the declaration out and write what each stands for"
         )

@@ -144,7 +144,18 @@ for title, text, words in (
     refuse(f"axis: {title}", arm(inside=f'<axis xyz="{text}"/>'), ":4:", words, "<axis>")
 refuse("com of two entries", arm(child=inertial(origin='<origin xyz="0 0"/>')), ":3:", "'arm'")
 refuse("rpy beyond anything", arm(inside=f'{AXIS}<origin rpy="1e40 0 0"/>'), "beyond anything")
-refuse("xyz of 1e29", arm(inside=f'{AXIS}<origin xyz="0 -1e29 0"/>'), ":4:", "'hinge'", "1e+12 m")
+refuse("xyz of 1e29", arm(inside=f'{AXIS}<origin xyz="0 -1e29 0"/>'), ":4:", "'hinge'", "1e+07 m")
+refuse("xyz of 1e8", arm(inside=f'{AXIS}<origin xyz="1e8 0 0"/>'), ":4:", "'hinge'", "1e+08 m")
+accept("xyz of 1e7", arm(inside=f'{AXIS}<origin xyz="1e7 0 0"/>'))
+refuse(
+    "mimic offset of 1e29",
+    arm(
+        more=link("tip")
+        + joint("k", "arm", "tip", "prismatic", AXIS + '<mimic joint="hinge" offset="1e29"/>')
+    ),
+    "offset of joint 'k'",
+    "1e+07 m",
+)
 refuse("com of 1e29", arm(child=inertial(origin='<origin xyz="1e29 0 0"/>')), ":3:", "'arm'", "m;")
 refuse("mass beyond anything", arm(child=inertial("1e40")), "beyond anything")
 accept("numbers in every form", arm(child=inertial("+1.", moments(".5", "-0", "0e5", "5E-1"))))
@@ -276,12 +287,20 @@ refuse("another root", "<model name='r'><link name='a'/></model>", "<model>", "<
 refuse("SDF", '<sdf version="1.9"><model name="r"><link name="a"/></model></sdf>', "<sdf>")
 refuse("MJCF", "<mujoco><worldbody/></mujoco>", "<mujoco>")
 refuse("version 2", robot(link("base"), attributes='name="r" version="2.0"'), "'2.0'")
-refuse("entity", '<!DOCTYPE r [<!ENTITY m "1">]>' + arm(child=inertial("&m;")), "<!DOCTYPE>")
+refuse("entity", '<!DOCTYPE r [<!ENTITY m "1">]>' + arm(child=inertial("&m;")), "<!ENTITY>")
 BOMB = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 12))
-refuse("entity bomb", f'<!DOCTYPE r [<!ENTITY a0 "x">{BOMB}]><robot name="&a11;"/>', "<!DOCTYPE>")
+refuse("entity bomb", f'<!DOCTYPE r [<!ENTITY a0 "x">{BOMB}]><robot name="&a11;"/>', "<!ENTITY>")
 refuse(
-    "external entity", '<!DOCTYPE r [<!ENTITY x SYSTEM "/etc/passwd">]><robot name="&x;"/>', "DOCT"
+    "external entity", '<!DOCTYPE r [<!ENTITY x SYSTEM "/etc/passwd">]><robot name="&x;"/>', "ENTI"
 )
+refuse(
+    "entity of an external subset",
+    '<!DOCTYPE robot SYSTEM "gone.dtd">' + arm(child=inertial("1&m;")),
+    "entit",
+)
+refuse("entity of a parameter", "<!DOCTYPE robot [%p;]>" + arm(child=inertial("1&m;")), "entit")
+accept("document type", "<!DOCTYPE robot>" + arm())
+accept("document type elsewhere", '<!DOCTYPE robot SYSTEM "gone.dtd">' + arm(more="<!--&amp;-->"))
 refuse("undefined entity", arm(child=inertial("&m;")), "undefined entity")
 refuse("unknown encoding", '<?xml version="1.0" encoding="klingon"?>' + arm(), "encoding", "UTF-8")
 refuse(
@@ -582,6 +601,10 @@ accept(
     "xacro merely declared", arm(attributes='name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"')
 )
 accept("dollar in a mesh", arm(child=link("arm", INERTIAL + VISUAL.replace("no", "${no}"))))
+for place in ("material", "plugin", "sensor", "gazebo"):
+    accept(f"dollar in a {place}", arm(more=f'<{place} name="${{x}}"><a b="$(find y)"/></{place}>'))
+for place in ("safety_controller", "calibration"):
+    accept(f"dollar in a {place}", arm(inside=AXIS + f'<{place} a="${{x}}"/>'))
 accept("dollar in a comment", arm(more="<!-- ${mass} <xacro:if/> -->"))
 
 # --- Xacro ---------------------------------------------------------------------------------------
@@ -595,6 +618,7 @@ accept("xacro file", arm(child=MACRO, attributes=XACRO), ".xacro")
 accept("xacro file of plain URDF", arm(), ".urdf.xacro")
 accept("property without declaration", arm(child=inertial("${2 + 3}")))
 refuse("xacro: unknown property", arm(child=inertial("${m}"), attributes=XACRO), "xacro", "'m'")
+refuse("xacro: its first use", arm(child=inertial("${m}")), "<mass>", "line 3")
 refuse("xacro: unknown macro", arm(child="<xacro:take/>", attributes=XACRO), "xacro:take")
 refuse(
     "xacro: missing include",

@@ -228,7 +228,12 @@ def test_notes_name_six_joints_and_count_the_rest():
     damped = AXIS + '<dynamics damping="1"/>'
     joints = [joint(f"j{k}", "l0", f"l{k}", inside=damped) for k in range(1, 9)]
     (note,) = read(robot(*links, *joints)).notes
-    assert "'j1', 'j2', 'j3', 'j4', 'j5', 'j6' and 2 more" in note
+    assert "the damping of joints 'j1', 'j2', 'j3', 'j4', 'j5', 'j6' and 2 more" in note
+
+
+def test_blanks_at_the_end_of_a_name_are_seen():
+    with pytest.raises(fflin.UrdfError, match=r"did you mean base2, 'base '\?"):
+        read(robot(link("base "), link("base2"), joint("j", "base", "base2")))
 
 
 def test_hash_is_of_the_file(tmp_path):
