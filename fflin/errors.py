@@ -43,6 +43,17 @@ class FflinWarning(UserWarning):
     """Something about a robot that its user should know and that is no error."""
 
 
+def listed(names: Iterable[str]) -> str:
+    """Show names in a sentence: the first six, each once, and how many more there are."""
+    names = list(dict.fromkeys(names))
+    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+
+
+def _visible(name: str) -> str:
+    """Quote a name whose blanks at an end would not be seen."""
+    return name if name == name.strip() else repr(name)
+
+
 def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     """Build the error for a name that does not exist, with the names that are near."""
     import difflib
@@ -50,10 +61,12 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     names = list(known)
     near = difflib.get_close_matches(str(name), names, n=5, cutoff=0.5)
     if near:
-        hint = f"did you mean {', '.join(near)}?"
+        hint = f"did you mean {', '.join(map(_visible, near))}?"
     elif not names:
         hint = "there are none"
     else:
-        shown = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
+        shown = ", ".join(map(_visible, names[:12])) + (
+            f", ... ({len(names)} in all)" if len(names) > 12 else ""
+        )
         hint = f"there are: {shown}"
     return UnknownNameError(f"no {kind} named '{name}'; {hint}")

@@ -11,23 +11,28 @@ from fflin.errors import MissingPackageError, UrdfError
 from fflin.xml_tree import Element
 
 # What lies below these does not reach the model, so a "${" there is no reason to expand.
-_IGNORED = frozenset({"visual", "collision", "gazebo", "transmission", "ros2_control", "sensor"})
+_IGNORED = frozenset(
+    {
+        *("visual", "collision", "material", "gazebo", "transmission", "ros2_control"),
+        *("sensor", "plugin", "safety_controller", "calibration"),
+    }
+)
 
 
-def uses_xacro(root: Element) -> bool:
-    """Tell whether a document makes use of xacro; merely declaring its prefix does not count."""
+def first_xacro(root: Element) -> Element | None:
+    """Return the first element that makes use of xacro; declaring its prefix does not count."""
     stack = [root]
     while stack:
         element = stack.pop()
         if element.tag.startswith("xacro:"):
-            return True
+            return element
         if any("${" in value or "$(" in value for value in element.attributes.values()):
-            return True
-        stack.extend(child for child in element.children if child.tag not in _IGNORED)
-    return False
+            return element
+        stack.extend(child for child in element.children[::-1] if child.tag not in _IGNORED)
+    return None
 
 
-def expand(path: Path, document: bytes) -> tuple[bytes, list[str]]:
+def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, list[str]]:
     """Expand a xacro document.
 
     Parameters
@@ -36,6 +41,8 @@ def expand(path: Path, document: bytes) -> tuple[bytes, list[str]]:
         Where it lies; files that it includes are looked up from there.
     document : bytes
         What the file holds.
+    first : Element or None
+        Of `first_xacro`, for errors.
 
     Returns
     -------
@@ -51,6 +58,7 @@ def expand(path: Path, document: bytes) -> tuple[bytes, list[str]]:
     UrdfError
         If xacro cannot expand it.
     """
+    use = f", first used by <{first.tag}> in line {first.line}" if first else ""
     said = io.StringIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the packages themselves, on import
@@ -59,7 +67,7 @@ def expand(path: Path, document: bytes) -> tuple[bytes, list[str]]:
             from xacrodoc import XacroDoc, packages
         except ImportError:
             raise MissingPackageError(
-                f"{path}: is written in xacro; pip install 'fflin[xacro]' to have it expanded"
+                f"{path}: is written in xacro{use}; pip install 'fflin[xacro]' to have it expanded"
             ) from None
         try:
             with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
@@ -71,7 +79,7 @@ def expand(path: Path, document: bytes) -> tuple[bytes, list[str]]:
                 ).to_urdf_string()
         except Exception as error:  # xacro evaluates Python expressions, which may raise anything
             text = " ".join(str(error).split()) or type(error).__name__
-            raise UrdfError(f"{path}: xacro cannot expand it: {text[:300]}") from None
+            raise UrdfError(f"{path}: cannot be expanded by xacro{use}: {text[:300]}") from None
         finally:
             xacro.init_stacks(None)
     return urdf.encode(), [f"{path.name}: {line}" for line in said.getvalue().splitlines() if line]

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import FflinWarning, SingularInertiaError
+from fflin.errors import FflinWarning, SingularInertiaError, listed
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
 from fflin.state import StateMap
@@ -123,7 +123,7 @@ def _singular(state: StateMap, M: Array) -> SingularInertiaError:
     if massless:
         verb = "moves" if len(set(massless)) == 1 else "move"
         return SingularInertiaError(
-            f"M of '{robot.name}' cannot be inverted: {_enumerate(massless)} {verb} no mass; "
+            f"M of '{robot.name}' cannot be inverted: {listed(massless)} {verb} no mass; "
             "give the links beyond an inertia, or lock what needs none"
         )
     return SingularInertiaError(
@@ -138,13 +138,8 @@ def _involved(state: StateMap, M: Array) -> str:
     scale = 1.0 / np.sqrt(M.diagonal())
     mode = np.linalg.eigh(scale[:, None] * M * scale)[1][:, 0]
     names = _names(state)
-    return _enumerate([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
+    return listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
 
 
 def _names(state: StateMap) -> list[str]:
     return ["the base"] * 6 + [f"joint '{name}'" for name in state.robot.joint_names]
-
-
-def _enumerate(names: list[str]) -> str:
-    names = list(dict.fromkeys(names))
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.urdf_links import Link
-from fflin.xml_tree import enumerated, quoted
+from fflin.xml_tree import named, quoted
 
 # Rounding of the six numbers leaves a singular inertia with eigenvalues of about -1e-16 of the
 # largest when they are written in full; CAD programs write fewer digits.
@@ -24,6 +24,12 @@ _LOST_IN_BODY = 1e-6
 
 # Published figures have three digits or more, and a flat plate's lie on the bound.
 _TRIANGLE_SLACK = 1e-3
+
+
+def is_impossible(mass: float, moments: Sequence[float]) -> bool:
+    """Tell whether the principal moments, ascending [kg m^2], are negative beyond rounding."""
+    # A body within the radius r of its centre has moments of at most mass r^2.
+    return moments[0] < -max(_NEGATIVE_SLACK * moments[-1], mass * _POINT**2)
 
 
 def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[str]:
@@ -56,8 +62,7 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
         if link.mass is None:
             continue
         least, middle, largest = link.principal_inertias().tolist()
-        # A body within the radius r of its centre has moments of at most mass r^2.
-        if least < -max(_NEGATIVE_SLACK * largest, link.mass * _POINT**2):
+        if is_impossible(link.mass, (least, middle, largest)):
             if abs(least) > _LOST_IN_BODY * _least_moment_of_body(link, model):
                 raise link.element.error(
                     f"the inertia of link {quoted(link.name)} has principal moments {least:.3g}, "
@@ -71,16 +76,16 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
     notes = []
     if negligible:
         notes.append(
-            f"{origin}: the inertia of link {enumerated(negligible)} has a negative principal "
+            f"{origin}: the inertia of {named('link', negligible)} has a negative principal "
             "moment, of no account beside the links it is fixed to"
         )
     if unequal:
         notes.append(
-            f"{origin}: the inertia of link {enumerated(unequal)} is not that of a rigid body: "
+            f"{origin}: the inertia of {named('link', unequal)} is not that of a rigid body: "
             "one principal moment is more than the sum of the others"
         )
     if weightless:
-        notes.append(f"{origin}: link {enumerated(weightless)} has an inertia and no mass")
+        notes.append(f"{origin}: an inertia and no mass: {named('link', weightless)}")
     return notes
 
 

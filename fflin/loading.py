@@ -11,6 +11,7 @@ import pinocchio as pin
 from fflin.errors import FflinWarning, InputError, ModelError, unknown
 from fflin.joints import Follower, Joint
 from fflin.model import ROOT, Robot
+from fflin.model_checks import check_model
 from fflin.reader import read_urdf
 from fflin.robots import find_robot
 from fflin.urdf_joints import Mimic
@@ -92,14 +93,17 @@ def from_model(
     Raises
     ------
     ModelError
-        If the root is not one free-flyer, a joint has more than one degree of freedom, or the
-        joints are not in depth-first order, in which CRBA would be silently wrong.
+        If the root is not one free-flyer, a joint has more than one degree of freedom, the
+        joints are not in depth-first order, in which CRBA would be silently wrong, or a
+        placement, a body or an armature is not physical.
     """
     if not isinstance(model, pin.Model):
         raise ModelError(f"the model is a {type(model).__name__}, expected a pin.Model")
     copy = model.copy()
     copy.gravity.setZero()
-    robot = _robot(copy, name or model.name or "model", lock, {})
+    name = name or model.name or "model"
+    check_model(copy, name)
+    robot = _robot(copy, name, lock, {})
     own = {joint.name: float(robot.model.damping[joint.idx_v]) for joint in robot.joints}
     robot = replace(robot, urdf_damping=own)
     return robot.replace(**fields) if fields else robot

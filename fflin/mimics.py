@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fflin.errors import unknown
 from fflin.urdf_joints import JointElement, Mimic
-from fflin.urdf_links import bounded
+from fflin.urdf_links import bounded, bounded_length
 from fflin.xml_tree import enumerated, quoted
 
 
@@ -49,12 +49,38 @@ def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
             own = written[follower]
             above = resolved.get(own.leader, Mimic(own.leader, 1.0, 0.0))
             element, of = joints[follower].element, f"joint {quoted(follower)}"
+            limit = bounded_length if joints[follower].type == "prismatic" else bounded
             resolved[follower] = Mimic(
                 above.leader,
                 bounded(element, "multiplier", of, own.multiplier * above.multiplier),
-                bounded(element, "offset", of, own.multiplier * above.offset + own.offset),
+                limit(element, "offset", of, own.multiplier * above.offset + own.offset),
             )
     return {name: resolved[name] for name in written}
+
+
+def counted_leaders(joints: dict[str, JointElement], mimics: dict[str, Mimic]) -> set[str]:
+    """Return the continuous leaders whose whole turns matter.
+
+    A turn of the leader more leaves a follower where it is only if that is continuous too and
+    makes a whole number of turns itself.
+
+    Parameters
+    ----------
+    joints : dict
+        All joints of the robot by name.
+    mimics : dict
+        Of `resolve_mimics`.
+
+    Returns
+    -------
+    set of str
+    """
+    return {
+        mimic.leader
+        for name, mimic in mimics.items()
+        if joints[mimic.leader].type == "continuous"
+        and not (joints[name].type == "continuous" and mimic.multiplier.is_integer())
+    }
 
 
 def _check(joint: JointElement, mimic: Mimic, joints: dict[str, JointElement]) -> None:

@@ -6,20 +6,20 @@ import hashlib
 import os
 import stat
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pinocchio as pin
 
 from fflin.errors import FileError, UrdfError
-from fflin.expansion import expand, uses_xacro
+from fflin.expansion import expand, first_xacro
 from fflin.inertia_checks import inertia_notes
-from fflin.mimics import resolve_mimics
+from fflin.mimics import counted_leaders, resolve_mimics
 from fflin.urdf import Urdf, read_description
 from fflin.urdf_joints import Mimic
 from fflin.urdf_writer import write_urdf
-from fflin.xml_tree import Element, enumerated, parse
+from fflin.xml_tree import Element, named, parse, told
 
 _SIZE_LIMIT = 64 * 2**20
 
@@ -89,12 +89,15 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     """Do what `read_urdf` does with the bytes of a file; `path` names it in errors."""
     root = parse(document, str(path))
     notes: list[str] = []
-    if path.suffix == ".xacro" or uses_xacro(root):
-        expanded, notes = expand(path, document)
+    first = first_xacro(root)
+    if path.suffix == ".xacro" or first:
+        expanded, notes = expand(path, document, first)
         root = parse(expanded, f"{path} as expanded by xacro")
         _check_expanded(root)
     urdf = read_description(root, prune)
-    model = _build(urdf, path, root)
+    mimics = resolve_mimics(urdf.joints)
+    model = _build(urdf, path, root, counted_leaders(urdf.joints, mimics))
+    notes += told(root)
     notes += inertia_notes(urdf.links.values(), model, path.name)
 
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
@@ -103,13 +106,13 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     for what, values in (("damping", damping), ("Coulomb friction", friction)):
         if values:
             notes.append(
-                f"{path.name}: the {what} of joint {enumerated(list(values))} is not in the linear "
+                f"{path.name}: the {what} of {named('joint', list(values))} is not in the linear "
                 "model unless it is asked for"
             )
     return Description(
         model,
         hashlib.sha256(document).hexdigest(),
-        resolve_mimics(urdf.joints),
+        mimics,
         damping,
         friction,
         tuple(notes),
@@ -139,11 +142,12 @@ def read_file(path: Path, kind: str = "URDF", limit: int = _SIZE_LIMIT) -> bytes
 
 
 def _check_expanded(root: Element) -> None:
-    if uses_xacro(root):
-        raise UrdfError(f"{root.origin}: xacro is left in it; is a macro missing?")
+    left = first_xacro(root)
+    if left:
+        raise left.error(f"xacro is left in <{left.tag}>; is a macro missing?")
 
 
-def _build(urdf: Urdf, path: Path, root: Element) -> pin.Model:
+def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> pin.Model:
     nv = 6 + sum(joint.freedom for joint in urdf.joints.values())
     if nv > _LARGEST_NV:
         raise root.error(
@@ -153,7 +157,7 @@ def _build(urdf: Urdf, path: Path, root: Element) -> pin.Model:
     root_joint = "root_joint"
     while root_joint in urdf.joints or root_joint in urdf.links:
         root_joint += "_"
-    document = write_urdf(urdf)
+    document = write_urdf(urdf, counted)
     try:
         model = _with_stack(
             urdf.depth,

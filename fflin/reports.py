@@ -39,10 +39,16 @@ def robot_info(robot: Robot) -> str:
     depth = {0: -1, 1: 0}
     rows = [["joint", "type", "mass [kg]", "lower", "upper", "effort", "velocity"]]
     rows.append(["(base)", "free", f"{model.inertias[1].mass:.6g}", ".", ".", ".", "."])
-    for joint in robot.joints:
+    kinds = {
+        joint: "prismatic" if joint.prismatic else "continuous" if joint.unbounded else "revolute"
+        for joint in robot.joints
+    }
+    for joint, leader, multiplier, offset in robot.followers:
+        kinds[joint] = f"mimics {leader.name} * {multiplier:g}"
+        kinds[joint] += f" {'-' if offset < 0 else '+'} {abs(offset):g}" if offset else ""
+    for joint in sorted(kinds, key=lambda joint: joint.idx_v):
         index = model.getJointId(joint.name)
         depth[index] = depth[model.parents[index]] + 1
-        kind = "prismatic" if joint.prismatic else "continuous" if joint.unbounded else "revolute"
         limits = (
             (".", ".")
             if joint.unbounded
@@ -54,7 +60,7 @@ def robot_info(robot: Robot) -> str:
         rows.append(
             [
                 "  " * depth[index] + joint.name,
-                kind,
+                kinds[joint],
                 f"{model.inertias[index].mass:.6g}",
                 *limits,
                 _limit(model.effortLimit[joint.idx_v]),

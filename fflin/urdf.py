@@ -8,16 +8,13 @@ from dataclasses import dataclass
 from fflin.errors import unknown
 from fflin.urdf_joints import JointElement, read_joint
 from fflin.urdf_links import Link, read_link, refuse_near_miss
-from fflin.xml_tree import Element, enumerated, quoted
+from fflin.xml_tree import Element, enumerated, named, quoted
 
 # urdfdom and Pinocchio's parser recurse along the tree, about 2.5 kB of stack for each link.
 _DEPTH_LIMIT = 1_000
 
 # Pinocchio's time grows with the square of their number; these take some seconds.
 _LINK_LIMIT = 10_000
-
-# These hold <link> and <joint> elements of their own, which are not the robot's.
-_FOREIGN = frozenset({"gazebo", "transmission", "ros2_control", "group"})
 
 
 @dataclass(frozen=True)
@@ -82,6 +79,7 @@ def read_description(root: Element, prune: Collection[str] = ()) -> Urdf:
         dropped = _hanging_on(prune, joints)
         joints = {n: joint for n, joint in joints.items() if joint.child not in dropped}
         links = {n: link for n, link in links.items() if n not in dropped}
+    _drop_world(links, joints)
     depth = max(depths[name] for name in links)
     return Urdf(root.attributes.get("name", "").strip(), links, joints, depth)
 
@@ -98,7 +96,7 @@ def _check_root(root: Element) -> None:
             raise child.error(
                 "a <robot> inside <robot>; keep one <robot> with all links and joints"
             )
-        if child.tag in ("link", "joint") or child.tag in _FOREIGN or ":" in child.tag:
+        if child.tag in ("link", "joint"):
             continue
         for inner in child.iterate():
             tags = {part.tag for part in inner.children}
@@ -173,7 +171,7 @@ def _check_tree(
             way.append(parent)
         loop = [above[name].name for name in way[way.index(parent) :]]
         raise above[parent].element.error(
-            f"joint {enumerated(loop)} form a closed loop that hangs on nothing; correct a parent "
+            f"{named('joint', loop)} form a closed loop that hangs on nothing; correct a parent "
             "or child in it"
         )
     deepest = max(depths, key=depths.__getitem__)
@@ -183,6 +181,21 @@ def _check_tree(
             "are read; join links that are fixed to each other"
         )
     return depths
+
+
+def _drop_world(links: dict[str, Link], joints: dict[str, JointElement]) -> None:
+    """Drop a root that stands for the world: without mass, its one joint floating."""
+    children = {joint.child for joint in joints.values()}
+    root = next(link for name, link in links.items() if name not in children)
+    hanging = [joint for joint in joints.values() if joint.parent == root.name]
+    if len(hanging) != 1 or hanging[0].type != "floating" or root.mass:
+        return
+    first = hanging[0]
+    first.element.note(
+        f"joint {quoted(first.name)} is floating and link {quoted(root.name)} has no mass; both "
+        f"are left out, for the base, link {quoted(first.child)}, floats free by itself"
+    )
+    del links[root.name], joints[first.name]
 
 
 def _hanging_on(prune: Collection[str], joints: dict[str, JointElement]) -> set[str]:

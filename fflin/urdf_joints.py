@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
+import sys
 from dataclasses import dataclass
 
 from fflin.urdf_links import Pose, bounded, read_pose, refuse_near_miss
-from fflin.xml_tree import Element, quoted
+from fflin.xml_tree import Element, decimal, quoted
 
 # Degrees of freedom of the types of joint.
 FREEDOM = {
@@ -18,6 +20,9 @@ FREEDOM = {
     "floating": 6,
 }
 _AXIAL = ("revolute", "continuous", "prismatic", "planar")
+
+# What a joint without a limit is limited to.
+UNLIMITED = sys.float_info.max
 
 # An axis this short or long is no direction that somebody meant to write.
 _SHORTEST_AXIS, _LONGEST_AXIS = 1e-6, 1e6
@@ -100,6 +105,12 @@ def read_joint(element: Element) -> JointElement:
         of,
         ("parent", "child", "origin", "axis", "limit", "dynamics", "mimic"),
     )
+    for child in element.children:
+        prefix, _, local = child.tag.rpartition(":")
+        if prefix and local == "mimic":
+            raise child.error(f"<{child.tag}> in {of} is not read; write it as <mimic>")
+        if prefix and local == "rotor_inertia":
+            child.note(f"<{child.tag}> of {of} is not in the model")
     ends = []
     for end in ("parent", "child"):
         found = element.require(end, of)
@@ -128,7 +139,9 @@ def _axis(element: Element, of: str, kind: str) -> tuple[float, ...]:
         return (1.0, 0.0, 0.0)
     axis: tuple[float, ...] = (1.0, 0.0, 0.0)
     if found is not None:
-        found.allow_only("xyz", of=of)
+        # Exporters write an rpy of zeros here, which turns nothing.
+        turned = any(decimal(entry) != 0.0 for entry in found.attributes.get("rpy", "").split())
+        found.allow_only("xyz", *(() if turned else ("rpy",)), of=of)
         axis = found.vector("xyz", f"<axis> of {of}", 3)
         length = math.hypot(*axis)
         if not _SHORTEST_AXIS <= length <= _LONGEST_AXIS:
@@ -148,9 +161,26 @@ def _limits(element: Element, of: str, kind: str) -> dict[str, float] | None:
     if found is None or FREEDOM[kind] != 1:
         return None
     names = ("lower", "upper", "effort", "velocity")
-    return {
-        name: found.number(name, f"<limit> of {of}") for name in names if name in found.attributes
-    }
+    limits = {name: _limit(found, name, of) for name in names if name in found.attributes}
+    lower, upper = limits.get("lower", 0.0), limits.get("upper", 0.0)
+    if lower > upper:
+        found.note(f"lower of {of} is {lower:g}, more than upper, {upper:g}; taken as no limits")
+        limits |= {"lower": -UNLIMITED, "upper": UNLIMITED}
+    return limits
+
+
+def _limit(found: Element, name: str, of: str) -> float:
+    """Return one limit. They do not enter the linear model, so a wrong one is no error."""
+    none = -UNLIMITED if name == "lower" else UNLIMITED
+    text = found.attributes[name].strip()
+    value = float(text) if re.fullmatch(r"[+-]?inf(inity)?", text.lower()) else decimal(text)
+    least = -math.inf if name in ("lower", "upper") else 0.0
+    # Written so that NaN, of what is no number, fails too.
+    if not value >= least or value == -math.copysign(math.inf, none):
+        expected = "a number" if least else "one that is not negative"
+        found.note(f"{name} of {of} is {quoted(text)}, expected {expected}; taken as no limit")
+        return none
+    return none if math.isinf(value) else value
 
 
 def _dynamics(element: Element, of: str, kind: str) -> tuple[float, float]:
@@ -158,7 +188,12 @@ def _dynamics(element: Element, of: str, kind: str) -> tuple[float, float]:
     if found is None or FREEDOM[kind] != 1:
         return 0.0, 0.0
     values = []
+    found.allow_only("damping", "friction", of=of)
     for name in ("damping", "friction"):
+        if not found.attributes.get(name, "0").strip():
+            found.note(f"{name} of {of} is empty; taken as 0")
+            values.append(0.0)
+            continue
         value = bounded(found, name, of, found.number(name, f"<dynamics> of {of}", 0.0))
         if value < 0.0:
             raise found.error(f"{name} of {of} is {value:g}; it cannot be negative")

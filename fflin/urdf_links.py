@@ -12,6 +12,10 @@ from fflin.xml_tree import Element, quoted
 # Beyond it nothing is physical, and products of two such numbers stay far from overflow.
 _ABSURD = 1e30
 
+# From 1e8 m on, in double precision the square of the length swallows that of a metre, and with
+# it what the links weigh about their own joints: ABA then divides zero by zero.
+_FARTHEST = 1e7  # [m]
+
 # Quaternions are written with four digits often, seldom with fewer.
 _QUATERNION_SLACK = 1e-3
 
@@ -101,8 +105,10 @@ def read_pose(element: Element, of: str) -> Pose:
         origin.vector(name, what, 3) if name in origin.attributes else (0.0, 0.0, 0.0)
         for name in ("xyz", "rpy")
     )
-    for entry in (*xyz, *rpy):
-        bounded(origin, "origin", of, entry)
+    for entry in xyz:
+        bounded_length(origin, "xyz", of, entry)
+    for entry in rpy:
+        bounded(origin, "rpy", of, entry)
     if "quat_xyzw" not in origin.attributes:
         return Pose(xyz, rpy)
     if "rpy" in origin.attributes:
@@ -118,6 +124,15 @@ def bounded(element: Element, what: str, of: str, value: float) -> float:
     """Return a number that is not absurdly large."""
     if abs(value) > _ABSURD:
         raise element.error(f"{what} of {of} is {value:g}, beyond anything physical; correct it")
+    return value
+
+
+def bounded_length(element: Element, what: str, of: str, value: float) -> float:
+    """Return a length [m] that is not too large for inertias about both of its ends."""
+    if abs(value) > _FARTHEST:
+        raise element.error(
+            f"{what} of {of} is {value:g} m, expected at most {_FARTHEST:g} m; correct it"
+        )
     return value
 
 

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from dataclasses import replace
 
 from fflin.urdf import Urdf
-from fflin.urdf_joints import JointElement
+from fflin.urdf_joints import UNLIMITED, JointElement
 from fflin.urdf_links import Link, Pose
 
-# What a joint without a <limit>, or with half of one, is limited to: nothing.
-_UNLIMITED = sys.float_info.max
 
-
-def write_urdf(urdf: Urdf) -> str:
+def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:
     """Write a description without visuals, collisions and extensions.
 
     Parameters
     ----------
     urdf : Urdf
+    counted : collection of str
+        Continuous joints whose whole turns count: written as revolute joints without bounds,
+        for Pinocchio stores a continuous one as (cos, sin).
 
     Returns
     -------
@@ -30,7 +30,7 @@ def write_urdf(urdf: Urdf) -> str:
     for link in urdf.links.values():
         lines.extend(_link(link))
     for joint in urdf.joints.values():
-        lines.extend(_joint(joint))
+        lines.extend(_joint(_counting(joint) if joint.name in counted else joint))
     lines.append("</robot>")
     return "\n".join(lines)
 
@@ -47,6 +47,12 @@ def _link(link: Link) -> Iterator[str]:
     yield "</link>"
 
 
+def _counting(joint: JointElement) -> JointElement:
+    """Return a continuous joint as a revolute one without bounds."""
+    unbounded = {"lower": -UNLIMITED, "upper": UNLIMITED}
+    return replace(joint, type="revolute", limits=(joint.limits or {}) | unbounded)
+
+
 def _joint(joint: JointElement) -> Iterator[str]:
     yield f'<joint name={_quoted(joint.name)} type="{joint.type}">'
     yield f"<parent link={_quoted(joint.parent)}/><child link={_quoted(joint.child)}/>"
@@ -61,9 +67,9 @@ def _joint(joint: JointElement) -> Iterator[str]:
 
 
 def _limit(joint: JointElement) -> str:
-    limits = {"effort": _UNLIMITED, "velocity": _UNLIMITED}
+    limits = {"effort": UNLIMITED, "velocity": UNLIMITED}
     if joint.limits is None:
-        limits |= {"lower": -_UNLIMITED, "upper": _UNLIMITED}
+        limits |= {"lower": -UNLIMITED, "upper": UNLIMITED}
     limits |= joint.limits or {}
     entries = " ".join(f'{name}="{value!r}"' for name, value in limits.items())
     return f"<limit {entries}/>"

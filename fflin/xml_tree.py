@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from xml.parsers import expat
 
-from fflin.errors import UrdfError
+from fflin.errors import UrdfError, listed
 
 # URDFs nest some 10 elements and hold some 10,000; these only keep hostile input off.
 _DEPTH_LIMIT = 100
 _ELEMENT_LIMIT = 500_000
 _TAG_LIMIT = 2**20  # bytes
 
+# Between xzy and xyz, quat and quat_xyzw; unit and value are farther apart.
+_NEAR = 0.6
+
 _SPACE = " \t\r\n"
+_ENTITY = re.compile(rb"&(?!(amp|lt|gt|quot|apos);|#)")
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
@@ -33,6 +38,8 @@ class Element:
     origin : str
         What errors call the document: the path of the file.
     children : list of Element
+    notes : dict
+        {what is to be told: lines}, shared by all elements of the document.
     """
 
     tag: str
@@ -40,10 +47,15 @@ class Element:
     line: int
     origin: str
     children: list[Element] = field(default_factory=list)
+    notes: dict[str, list[int]] = field(default_factory=dict)
 
     def error(self, message: str) -> UrdfError:
         """Build an error that says where this element stands."""
         return UrdfError(f"{self.origin}:{self.line}: {message}")
+
+    def note(self, message: str) -> None:
+        """Leave a warning about this element; the same one is told once for all its lines."""
+        self.notes.setdefault(message, []).append(self.line)
 
     def find_all(self, tag: str) -> list[Element]:
         """Return the children of that tag."""
@@ -74,13 +86,18 @@ class Element:
             stack.extend(element.children[::-1])
 
     def allow_only(self, *names: str, of: str) -> None:
-        """Refuse other attributes: a misspelt one would be a default taken in silence."""
+        """Refuse a misspelt attribute, a default taken in silence; note others it does not know."""
+        import difflib
+
         for name in self.attributes:
-            if name not in names and ":" not in name:
+            if name in names or ":" in name:
+                continue
+            if difflib.get_close_matches(name.lower(), names, n=1, cutoff=_NEAR):
                 raise self.error(
                     f"<{self.tag}> of {of} has an unknown attribute {quoted(name)}; known: "
                     f"{', '.join(names)}; correct it or take it out"
                 )
+            self.note(f"the attribute {quoted(name)} of <{self.tag}> is not in the model")
 
     def text(self, name: str, of: str) -> str:
         """Return an attribute that must be there and hold something."""
@@ -114,12 +131,17 @@ class Element:
         return tuple(self._decimal(entry, f"{name} of {of}") for entry in entries)
 
     def _decimal(self, text: str, what: str) -> float:
-        value = float(text) if _DECIMAL.fullmatch(text) else math.nan
+        value = decimal(text)
         if not math.isfinite(value):
             raise self.error(
                 f"{what} is {quoted(text)}; expected a plain finite number, such as 0.5"
             )
         return value
+
+
+def decimal(text: str) -> float:
+    """Return a decimal number, infinite where it overflows; NaN of anything else."""
+    return float(text) if _DECIMAL.fullmatch(text) else math.nan
 
 
 def quoted(text: str) -> str:
@@ -128,13 +150,29 @@ def quoted(text: str) -> str:
 
 
 def enumerated(names: list[str]) -> str:
-    """Show names in a sentence: the first six, and how many more there are."""
-    shown = ", ".join(quoted(name) for name in names[:6])
-    return shown + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+    """Show names of a file in a sentence: the first six, and how many more there are."""
+    return listed(map(quoted, names))
+
+
+def named(kind: str, names: list[str]) -> str:
+    """Show names after what they are names of: joint 'a', joints 'a', 'b'."""
+    return f"{kind}{'s' if len(names) > 1 else ''} {enumerated(names)}"
+
+
+def told(root: Element) -> list[str]:
+    """Return the notes left on a document, one line each."""
+    # Notes are kept with the robot, where the folder does not matter.
+    origin = root.origin.rpartition(os.sep)[2]
+    return [
+        f"{origin}:{lines[0]}: {message}"
+        + (f" (and in {len(lines) - 1} more places)" if len(lines) > 2 else "")
+        + (f" (and in line {lines[1]})" if len(lines) == 2 else "")
+        for message, lines in root.notes.items()
+    ]
 
 
 def parse(document: bytes, origin: str) -> Element:
-    """Parse an XML document without namespaces, document types and entities.
+    """Parse an XML document without namespaces and entities.
 
     Parameters
     ----------
@@ -151,7 +189,7 @@ def parse(document: bytes, origin: str) -> Element:
     Raises
     ------
     UrdfError
-        If it is not well-formed, declares a document type or entities, or is nested too deeply
+        If it is not well-formed, declares or uses entities of its own, or is nested too deeply
         or too large for a robot description.
     """
     if not document.strip():
@@ -190,9 +228,22 @@ class _Builder:
         self.parser = expat.ParserCreate()
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end
-        self.parser.StartDoctypeDeclHandler = self._refuse_doctype
+        # A document type may be named; one that is declared elsewhere is not read.
+        self.parser.EntityDeclHandler = self._refuse_entities
+        self.parser.NotStandaloneHandler = self._meet_unread_declarations
+        self._unread = False
 
     def parse(self, document: bytes) -> None:
+        self._parse(document)
+        # Where declarations are not read, expat drops entities that it does not know from
+        # attributes in silence. Without its zeros, UTF-16 is ASCII where it matters.
+        if self._unread and _ENTITY.search(document.replace(b"\0", b"")):
+            raise UrdfError(
+                f"{self.root.origin}: uses an entity that it does not declare itself; write what "
+                "it stands for in its place"
+            )
+
+    def _parse(self, document: bytes) -> None:
         # In pieces, for expat's time for one tag grows faster than its length.
         parser, step = self.parser, _TAG_LIMIT // 4
         for begin in range(0, len(document), step):
@@ -205,7 +256,9 @@ class _Builder:
         parser.Parse(b"", True)
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
-        element = Element(tag, attributes, self.parser.CurrentLineNumber, self.root.origin)
+        element = Element(
+            tag, attributes, self.parser.CurrentLineNumber, self.root.origin, [], self.root.notes
+        )
         self._count += 1
         if self._count > _ELEMENT_LIMIT:
             raise element.error(
@@ -221,8 +274,12 @@ class _Builder:
     def _end(self, _: str) -> None:
         self._open.pop()
 
-    def _refuse_doctype(self, *_: object) -> None:
+    def _meet_unread_declarations(self) -> int:
+        self._unread = True
+        return 1
+
+    def _refuse_entities(self, *_: object) -> None:
         raise UrdfError(
-            f"{self.root.origin}:{self.parser.CurrentLineNumber}: a document type or entities "
-            "(<!DOCTYPE>) are not read; take the declaration out"
+            f"{self.root.origin}:{self.parser.CurrentLineNumber}: entities (<!ENTITY>) are not "
+            "read; take the declaration out and write what each stands for"
         )

@@ -105,16 +105,31 @@ for title, text in BAD_NUMBERS.items():
     refuse(f"mass: {title}", arm(child=inertial(text)), ":3:", f"'{text}'", "link 'arm'", "finite")
 for entry in ("ixx", "ixy", "izz"):
     refuse(f"{entry} nan", arm(child=inertial("1", moments(**{entry: "nan"}))), ":3:", entry)
-for attribute, place in {
-    "lower": "limit",
-    "upper": "limit",
-    "effort": "limit",
-    "velocity": "limit",
-    "damping": "dynamics",
-    "friction": "dynamics",
-}.items():
-    inside = AXIS + f'<{place} {attribute}="1,5"/>'
+for attribute in ("damping", "friction"):
+    inside = AXIS + f'<dynamics {attribute}="1,5"/>'
     refuse(f"{attribute} with comma", arm(inside=inside), ":4:", attribute, "'hinge'", "'1,5'")
+    inside = AXIS + f'<dynamics {attribute}=""/>'
+    warn(f"{attribute} empty", arm(inside=inside), ":4:", attribute, "'hinge'", "as 0")
+for attribute, texts in {
+    "lower": ("1,5", "", "nan", "inf", "1e999"),
+    "upper": ("1,5", "", "nan", "-inf"),
+    "effort": ("1,5", "", "nan", "-inf", "-1"),
+    "velocity": ("1,5", "", "nan", "-inf", "-1"),
+}.items():
+    for text in texts:
+        inside = AXIS + f'<limit {attribute}="{text}"/>'
+        warn(f"{attribute} of '{text}'", arm(inside=inside), ":4:", attribute, "'hinge'", "no lim")
+accept(
+    "infinite limits",
+    arm(inside=AXIS + '<limit lower="-inf" upper="INF" effort="+inf" velocity="Infinity"/>'),
+)
+warn(
+    "limits in the wrong order",
+    arm(inside=AXIS + '<limit lower="1" upper="-1"/>'),
+    ":4:",
+    "'hinge'",
+    "more than upper",
+)
 for title, text, words in (
     ("two entries", "1 2", "has 2 entries"),
     ("four entries", "1 2 3 4", "has 4 entries"),
@@ -128,7 +143,20 @@ for title, text, words in (
     refuse(f"rpy: {title}", arm(inside=f'{AXIS}<origin rpy="{text}"/>'), ":4:", words, "rpy")
     refuse(f"axis: {title}", arm(inside=f'<axis xyz="{text}"/>'), ":4:", words, "<axis>")
 refuse("com of two entries", arm(child=inertial(origin='<origin xyz="0 0"/>')), ":3:", "'arm'")
-refuse("xyz beyond anything", arm(inside=f'{AXIS}<origin xyz="1e40 0 0"/>'), "beyond anything")
+refuse("rpy beyond anything", arm(inside=f'{AXIS}<origin rpy="1e40 0 0"/>'), "beyond anything")
+refuse("xyz of 1e29", arm(inside=f'{AXIS}<origin xyz="0 -1e29 0"/>'), ":4:", "'hinge'", "1e+07 m")
+refuse("xyz of 1e8", arm(inside=f'{AXIS}<origin xyz="1e8 0 0"/>'), ":4:", "'hinge'", "1e+08 m")
+accept("xyz of 1e7", arm(inside=f'{AXIS}<origin xyz="1e7 0 0"/>'))
+refuse(
+    "mimic offset of 1e29",
+    arm(
+        more=link("tip")
+        + joint("k", "arm", "tip", "prismatic", AXIS + '<mimic joint="hinge" offset="1e29"/>')
+    ),
+    "offset of joint 'k'",
+    "1e+07 m",
+)
+refuse("com of 1e29", arm(child=inertial(origin='<origin xyz="1e29 0 0"/>')), ":3:", "'arm'", "m;")
 refuse("mass beyond anything", arm(child=inertial("1e40")), "beyond anything")
 accept("numbers in every form", arm(child=inertial("+1.", moments(".5", "-0", "0e5", "5E-1"))))
 accept("spaces around numbers", arm(inside='<axis xyz="  0\t0\n1 "/>', child=inertial(" 1 ")))
@@ -188,7 +216,8 @@ refuse(
 refuse(
     "intertial", arm(child=link("arm", INERTIAL.replace("inertial", "intertial"))), "did you mean"
 )
-refuse("unknown attribute of mass", arm(child=inertial('1" unit="g')), "'unit'", "<mass>")
+warn("unit of a mass", arm(child=inertial('1" unit="kg')), ":3:", "'unit'", "<mass>", "not in")
+refuse("mass misspelt", arm(child=inertial('1" vaule="2')), ":3:", "'vaule'", "<mass>")
 warn("triangle inequality", arm(child=inertial("1", moments(izz=3))), "'arm'", "rigid body")
 warn("inertia without mass", arm(child=inertial("0")), "'arm'", "no mass")
 warn(
@@ -258,12 +287,20 @@ refuse("another root", "<model name='r'><link name='a'/></model>", "<model>", "<
 refuse("SDF", '<sdf version="1.9"><model name="r"><link name="a"/></model></sdf>', "<sdf>")
 refuse("MJCF", "<mujoco><worldbody/></mujoco>", "<mujoco>")
 refuse("version 2", robot(link("base"), attributes='name="r" version="2.0"'), "'2.0'")
-refuse("entity", '<!DOCTYPE r [<!ENTITY m "1">]>' + arm(child=inertial("&m;")), "<!DOCTYPE>")
+refuse("entity", '<!DOCTYPE r [<!ENTITY m "1">]>' + arm(child=inertial("&m;")), "<!ENTITY>")
 BOMB = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10}">' for k in range(1, 12))
-refuse("entity bomb", f'<!DOCTYPE r [<!ENTITY a0 "x">{BOMB}]><robot name="&a11;"/>', "<!DOCTYPE>")
+refuse("entity bomb", f'<!DOCTYPE r [<!ENTITY a0 "x">{BOMB}]><robot name="&a11;"/>', "<!ENTITY>")
 refuse(
-    "external entity", '<!DOCTYPE r [<!ENTITY x SYSTEM "/etc/passwd">]><robot name="&x;"/>', "DOCT"
+    "external entity", '<!DOCTYPE r [<!ENTITY x SYSTEM "/etc/passwd">]><robot name="&x;"/>', "ENTI"
 )
+refuse(
+    "entity of an external subset",
+    '<!DOCTYPE robot SYSTEM "gone.dtd">' + arm(child=inertial("1&m;")),
+    "entit",
+)
+refuse("entity of a parameter", "<!DOCTYPE robot [%p;]>" + arm(child=inertial("1&m;")), "entit")
+accept("document type", "<!DOCTYPE robot>" + arm())
+accept("document type elsewhere", '<!DOCTYPE robot SYSTEM "gone.dtd">' + arm(more="<!--&amp;-->"))
 refuse("undefined entity", arm(child=inertial("&m;")), "undefined entity")
 refuse("unknown encoding", '<?xml version="1.0" encoding="klingon"?>' + arm(), "encoding", "UTF-8")
 refuse(
@@ -392,6 +429,25 @@ refuse("1,000 joints", chain(999, "continuous"), "998 degrees of freedom", "GiB"
 refuse("20,000 links", robot(*(link(f"l{k}", "") for k in range(20_000))), "20000 links")
 refuse("317 joints", chain(318, "continuous"), "317 degrees of freedom")
 accept("a chain of 900 links", chain(900, "fixed"))
+warn(
+    "a world that the base floats in",
+    robot(link("world", ""), link("a"), link("b"), joint("j", "a", "b")).replace(
+        "</robot>", joint("free", "world", "a", "floating", "") + "</robot>"
+    ),
+    "'world'",
+    "'free'",
+    "left out",
+)
+refuse(
+    "a world that two bases float in",
+    robot(
+        link("world", ""),
+        *(link(name) + joint(f"{name}_", "world", name, "floating") for name in "ab"),
+    ),
+    "'a_'",
+    "lock",
+)
+refuse("a floating joint below a link of mass", arm(kind="floating", inside=""), "'hinge'")
 accept("a joint before its links", robot(joint("j", "a", "b"), link("b"), link("a")))
 accept(
     "branches",
@@ -413,7 +469,9 @@ refuse("axis zero", arm(inside='<axis xyz="0 0 0"/>'), ":4:", "length 0", "'hing
 refuse("axis 1e-200", arm(inside='<axis xyz="0 0 1e-200"/>'), "length 1e-200")
 refuse("axis 1e200", arm(inside='<axis xyz="0 1e200 0"/>'), "length 1e+200")
 refuse("axis without xyz", arm(inside="<axis/>"), "'xyz'")
-refuse("axis by rpy", arm(inside='<axis rpy="0 0 1"/>'), "'rpy'", "xyz")
+refuse("axis by rpy", arm(inside='<axis rpy="0 0 1"/>'), "no 'xyz'")
+accept("axis with an rpy of zeros", arm(inside='<axis xyz="0 0 1" rpy="0 0.0 -0"/>'))
+warn("axis with an rpy", arm(inside='<axis xyz="0 0 1" rpy="0 0 1"/>'), ":4:", "'rpy'", "<axis>")
 refuse("two axes", arm(inside=AXIS * 2), "second <axis>", "'hinge'")
 refuse("two origins", arm(inside=AXIS + "<origin/>" * 2), "second <origin>")
 refuse("two limits", arm(inside=AXIS + LIMIT * 2), "second <limit>")
@@ -431,6 +489,21 @@ refuse("negative damping", arm(inside=AXIS + '<dynamics damping="-1"/>'), "dampi
 refuse("negative friction", arm(inside=AXIS + '<dynamics friction="-1"/>'), "friction", "negative")
 warn("damping", arm(inside=AXIS + '<dynamics damping="0.1"/>'), "damping", "'hinge'", "asked for")
 warn("friction", arm(inside=AXIS + '<dynamics friction="0.1"/>'), "friction", "'hinge'")
+warn(
+    "stiffness of a spring",
+    arm(inside=AXIS + '<dynamics spring_stiffness="1"/>'),
+    ":4:",
+    "'spring_stiffness'",
+    "not in the model",
+)
+warn(
+    "rotor inertia",
+    arm(inside=AXIS + '<drake:rotor_inertia value="1"/>'),
+    ":4:",
+    "<drake:rotor_inertia>",
+    "'hinge'",
+    "not in the model",
+)
 accept("damping of zero", arm(inside=AXIS + '<dynamics damping="0" friction="0.0"/>'))
 accept("damping of a fixed joint", arm(kind="fixed", inside='<dynamics damping="1"/>'))
 for kind in ("revolute", "prismatic", "continuous", "fixed"):
@@ -450,6 +523,7 @@ accept("empty origin", arm(inside=AXIS + "<origin/>"))
 
 refuse("mimic of nothing", three("<mimic/>"), ":6:", "'joint'", "'j1'")
 refuse("mimic of an unknown joint", three('<mimic joint="j9"/>'), ":6:", "'j1'", "'j9'")
+refuse("mimic of Drake", three("", '<drake:mimic joint="j1"/>'), ":7:", "'j2'", "as <mimic>")
 refuse("mimic of itself", three('<mimic joint="j1"/>'), ":6:", "itself", "'j1'")
 refuse(
     "mimics of each other", three('<mimic joint="j2"/>', '<mimic joint="j1"/>'), "circle", "'j2'"
@@ -487,10 +561,23 @@ accept(
     arm(child=link("arm", INERTIAL + "<collision><origin xyz='?'/></collision>")),
 )
 accept("gazebo", arm(more='<gazebo reference="arm"><mu1>0.2</mu1></gazebo>'))
-accept(
-    "gazebo with links",
-    arm(more=f"<gazebo><model>{link('x')}{joint('y', 'x', 'z')}</model></gazebo>"),
-)
+accept("gazebo with names", arm(more=f"<gazebo>{link('x', '')}<joint name='y'/></gazebo>"))
+for wrapper in ("gazebo", "group", "transmission", "ros2_control", "drake:group"):
+    both = link("tip") + joint("k", "arm", "tip")
+    refuse(
+        f"{wrapper} around a link and its joint",
+        arm(more=f"<{wrapper}>{both}</{wrapper}>"),
+        ":5:",
+        "'tip'",
+        f"<{wrapper}>",
+        "directly into <robot>",
+    )
+    refuse(
+        f"{wrapper} around a joint",
+        arm(more=f"<{wrapper}>{joint('k', 'arm', 'tip')}</{wrapper}>"),
+        ":5:",
+        "'k'",
+    )
 accept("transmission", arm(more='<transmission name="t"><joint name="hinge"/></transmission>'))
 accept(
     "ros2_control",
@@ -514,6 +601,10 @@ accept(
     "xacro merely declared", arm(attributes='name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"')
 )
 accept("dollar in a mesh", arm(child=link("arm", INERTIAL + VISUAL.replace("no", "${no}"))))
+for place in ("material", "plugin", "sensor", "gazebo"):
+    accept(f"dollar in a {place}", arm(more=f'<{place} name="${{x}}"><a b="$(find y)"/></{place}>'))
+for place in ("safety_controller", "calibration"):
+    accept(f"dollar in a {place}", arm(inside=AXIS + f'<{place} a="${{x}}"/>'))
 accept("dollar in a comment", arm(more="<!-- ${mass} <xacro:if/> -->"))
 
 # --- Xacro ---------------------------------------------------------------------------------------
@@ -527,6 +618,7 @@ accept("xacro file", arm(child=MACRO, attributes=XACRO), ".xacro")
 accept("xacro file of plain URDF", arm(), ".urdf.xacro")
 accept("property without declaration", arm(child=inertial("${2 + 3}")))
 refuse("xacro: unknown property", arm(child=inertial("${m}"), attributes=XACRO), "xacro", "'m'")
+refuse("xacro: its first use", arm(child=inertial("${m}")), "<mass>", "line 3")
 refuse("xacro: unknown macro", arm(child="<xacro:take/>", attributes=XACRO), "xacro:take")
 refuse(
     "xacro: missing include",

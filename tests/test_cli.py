@@ -77,7 +77,7 @@ def test_warnings_are_one_line_each_on_stderr_and_in_info():
         text=True,
         check=False,
     )
-    words = "the damping of joint 'joint_1', 'joint_2', 'joint_3' is not in the linear model"
+    words = "the damping of joints 'joint_1', 'joint_2', 'joint_3' is not in the linear model"
     assert done.returncode == 0
     assert done.stderr.startswith("fflin: warning: ") and done.stderr.count("\n") == 1
     assert words in done.stderr

@@ -1,6 +1,7 @@
 """Loading, locking and configuring robots, and what is refused."""
 
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -192,6 +193,67 @@ def test_joints_out_of_depth_first_order_are_refused():
         model.appendBodyToJoint(index, pin.Inertia.Random(), pin.SE3.Random())
     with pytest.raises(fflin.ModelError, match="depth-first"):
         fflin.from_model(model)
+
+
+def _set_parent(model):
+    model.parents[3] = 5
+
+
+def _set_mass(model):
+    model.inertias[3] = pin.Inertia(-1.0, np.zeros(3), np.eye(3))
+
+
+def _set_nan_mass(model):
+    model.inertias[3] = pin.Inertia(np.nan, np.zeros(3), np.eye(3))
+
+
+def _set_lever(model):
+    model.inertias[3] = pin.Inertia(1.0, np.array([0.0, np.inf, 0.0]), np.eye(3))
+
+
+def _set_inertia(model):
+    moments = np.array((1.0, 0, 0, 0, 1.0, 0, 1.0, 0, 0, -0.5))
+    model.inertias[3] = pin.Inertia.FromDynamicParameters(moments)
+
+
+def _set_armature(model):
+    armature = model.armature.copy()
+    armature[model.joints[3].idx_v] = -1.0
+    model.armature = armature
+
+
+def _set_translation(model):
+    model.jointPlacements[3] = pin.SE3(np.eye(3), np.array([np.nan, 0.0, 0.0]))
+
+
+def _set_rotation(model):
+    model.jointPlacements[3] = pin.SE3(np.diag((1.0, 1.0, -1.0)), np.zeros(3))
+
+
+def _set_scaled_rotation(model):
+    model.jointPlacements[3] = pin.SE3(1.01 * np.eye(3), np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (_set_parent, "parent 5"),
+        (_set_mass, "mass of -1 kg"),
+        (_set_nan_mass, "mass of nan kg"),
+        (_set_lever, "not finite"),
+        (_set_inertia, "-0.5, 1, 1"),
+        (_set_armature, "armature of -1"),
+        (_set_translation, "not finite"),
+        (_set_rotation, "det R"),
+        (_set_scaled_rotation, "R^T R"),
+    ],
+)
+def test_what_no_robot_has_is_refused_by_name(robots, spoil, words):
+    model = robots["dual_arm"].model.copy()
+    spoil(model)
+    with pytest.raises(fflin.ModelError, match=re.escape(words)) as caught:
+        fflin.from_model(model)
+    assert f"joint '{model.names[3]}'" in str(caught.value)
 
 
 def test_too_large_a_robot_is_refused():

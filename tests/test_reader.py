@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from reader_corpus import AXIS, INERTIA, LIMIT, arm, inertial, joint, link, robot, three
+from reader_corpus import AXIS, INERTIA, INERTIAL, LIMIT, arm, inertial, joint, link, robot, three
 
 import fflin
 from fflin.reader import describe, read_urdf
@@ -101,6 +101,14 @@ def test_without_a_limit_there_is_none(kind):
     assert model.effortLimit[6] > 1e300 and model.velocityLimit[6] > 1e300
 
 
+def test_a_massless_root_with_one_floating_joint_is_the_world():
+    ends = (joint("free", "world", "a", "floating", '<origin xyz="1 0 0"/>'), joint("j", "a", "b"))
+    found = read(robot(link("world", ""), link("a"), link("b"), *ends))
+    assert list(found.model.names) == ["universe", "root_joint", "j"]
+    np.testing.assert_array_equal(found.model.inertias[1].lever, 0.0)
+    assert not found.model.existFrame("world")
+
+
 def test_half_a_limit_is_kept():
     model = read(arm(inside=AXIS + '<limit lower="-2" upper="3" effort="4"/>')).model
     assert (model.lowerPositionLimit[7], model.upperPositionLimit[7]) == (-2.0, 3.0)
@@ -142,6 +150,59 @@ def test_mimics_in_the_other_order_resolve_alike():
     assert read(document).mimics == {"j2": Mimic("j1", 1.0, 1.0), "j3": Mimic("j1", 4.0, 4.0)}
 
 
+@pytest.mark.parametrize(
+    ("kind", "multiplier", "counted"),
+    [
+        ("continuous", 0.5, True),
+        ("continuous", 2.0, False),
+        ("continuous", -1.0, False),
+        ("revolute", 2.0, True),
+        ("prismatic", 0.125, True),
+    ],
+)
+def test_turns_of_a_continuous_leader_count(tmp_path, kind, multiplier, counted):
+    follow = AXIS + f'<mimic joint="j" multiplier="{multiplier}" offset="0.25"/>'
+    off_axis = '<inertial><origin xyz="0.5 0.25 0"/>' + INERTIAL.partition("<inertial>")[2]
+    path = tmp_path / "r.urdf"
+    path.write_text(
+        robot(
+            link("a"),
+            link("b", off_axis),
+            link("c", off_axis),
+            joint("j", "a", "b", inside=AXIS + LIMIT),
+            joint("k", "b", "c", kind, '<origin xyz="1 0 0"/>' + follow),
+        )
+    )
+    loaded = fflin.load(path)
+    (leader,) = loaded.joints
+    (follower,) = loaded.followers
+    assert leader.unbounded is not counted
+    assert loaded.model.effortLimit[leader.idx_v] == 1.0
+    if counted:
+        assert loaded.model.upperPositionLimit[leader.idx_q] > 1e300
+
+    state = fflin.StateMap(loaded)
+    q = fflin.configuration(loaded, {"j": 4.0})
+    x = np.zeros(state.nx)
+    x[6], x[-1] = 4.0, 1.0
+    np.testing.assert_allclose(state.to_pinocchio(x)[0], q, atol=1e-15)
+    free = pin.neutral(loaded.model)
+    leader.place(free, 4.0)
+    follower.joint.place(free, 4.0 * multiplier + 0.25)
+    np.testing.assert_allclose(q, free, atol=1e-12)
+    dense = pin.crba(loaded.model, loaded.create_data(), free)
+    dense = np.triu(dense) + np.triu(dense, 1).T
+    np.testing.assert_allclose(
+        fflin.linearize(loaded, q).M, state.S.T @ dense @ state.S, rtol=0, atol=1e-12
+    )
+
+    # Across pi, where the stored angle of a continuous joint jumps.
+    x[6] = 3.0
+    q, v = state.to_pinocchio(x)
+    q = loaded.checked_configuration(pin.integrate(loaded.model, q, 0.5 * v))
+    np.testing.assert_allclose(q, fflin.configuration(loaded, {"j": 3.5}), atol=1e-12)
+
+
 def test_a_pruned_mimic_is_gone_and_a_pruned_leader_is_missed():
     document = three("", "", '<mimic joint="j1"/>').encode()
     assert describe(document, Path("r.urdf"), ["j3"]).mimics == {}
@@ -167,7 +228,12 @@ def test_notes_name_six_joints_and_count_the_rest():
     damped = AXIS + '<dynamics damping="1"/>'
     joints = [joint(f"j{k}", "l0", f"l{k}", inside=damped) for k in range(1, 9)]
     (note,) = read(robot(*links, *joints)).notes
-    assert "'j1', 'j2', 'j3', 'j4', 'j5', 'j6' and 2 more" in note
+    assert "the damping of joints 'j1', 'j2', 'j3', 'j4', 'j5', 'j6' and 2 more" in note
+
+
+def test_blanks_at_the_end_of_a_name_are_seen():
+    with pytest.raises(fflin.UrdfError, match=r"did you mean base2, 'base '\?"):
+        read(robot(link("base "), link("base2"), joint("j", "base", "base2")))
 
 
 def test_hash_is_of_the_file(tmp_path):
@@ -196,6 +262,18 @@ def test_info_lists_the_warnings(tmp_path):
     with pytest.warns(fflin.FflinWarning):
         text = robot_info(fflin.load(path))
     assert "\nwarnings\n  r.urdf: the damping of joint 'hinge'" in text
+
+
+def test_info_lists_mimic_joints_and_what_hangs_on_them(tmp_path):
+    from fflin.reports import robot_info
+
+    path = tmp_path / "r.urdf"
+    path.write_text(three("", '<mimic joint="j1" multiplier="0.5" offset="-2"/>'))
+    lines = robot_info(fflin.load(path)).splitlines()
+    rows = [line for line in lines if line.lstrip().startswith("j")][-3:]
+    assert [len(row) - len(row.lstrip()) for row in rows] == [2, 4, 6]
+    assert "mimics j1 * 0.5 - 2" in rows[1]
+    assert "continuous" in rows[2]
 
 
 def test_without_xacrodoc_one_line_says_how(monkeypatch):
@@ -230,6 +308,21 @@ def test_the_stack_size_of_threads_is_left_as_it_was():
     joints = [joint(f"j{k}", f"l{k}", f"l{k + 1}", "fixed") for k in range(199)]
     assert read(robot(*links, *joints)).model.inertias[1].mass == 200.0
     assert threading.stack_size() == before
+
+
+def test_wrong_and_infinite_limits_are_none():
+    for limit in ('lower="-inf" upper="inf" effort="inf"', 'lower="" upper="-" effort="-1"'):
+        model = read(arm(inside=f"{AXIS}<limit {limit}/>")).model
+        assert model.lowerPositionLimit[7] < -1e300 and model.upperPositionLimit[7] > 1e300
+        assert model.effortLimit[6] > 1e300
+
+
+def test_a_note_is_told_once_for_all_its_lines():
+    document = robot(*(link(name) for name in "abc"), joint("j", "a", "b"), joint("k", "a", "c"))
+    (note,) = read(document.replace('<mass value="1"', '<mass unit="kg" value="1"')).notes
+    assert note == (
+        "robot.urdf:2: the attribute 'unit' of <mass> is not in the model (and in 2 more places)"
+    )
 
 
 def test_limit_given_is_the_limit():
