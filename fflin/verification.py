@@ -1,14 +1,10 @@
 """Whether A and B hold: against ABA derivatives and against differences of the nonlinear model."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import pinocchio as pin
 
-from fflin.aba import Aba
 from fflin.actuation import Actuation
 from fflin.certificate import (
     aba_route,
@@ -22,9 +18,9 @@ from fflin.inertia import inertia_matrix, inverse_inertia
 from fflin.linear_model import LinearModel
 from fflin.measuring import Measuring
 from fflin.model import Robot
+from fflin.nonlinear import ErrorDynamics, Nonlinear, flow_error, jacobian
 from fflin.outputs import FullState
 from fflin.reports import check_report
-from fflin.rotation import rotation_matrix
 from fflin.sensing import Sensing
 from fflin.state import ANGULAR, LINEAR, StateMap
 from fflin.validation import Array
@@ -42,13 +38,6 @@ _ROUTE_SAFETY = 10.0
 
 # Beyond two digits nothing is confirmed, however badly M is conditioned.
 _LOOSEST = 1e-2
-
-# Where the base flies faster than this [m/s], the digits of its speed would drown the rest.
-_FAST = 100.0
-
-# Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. Its error is
-# h^6 f^(7) / 140.
-_WEIGHTS = (45.0 / 60.0, -9.0 / 60.0, 1.0 / 60.0)
 
 
 class Row(NamedTuple):
@@ -157,7 +146,7 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     condition = scaled_condition(M)
     route = min(max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition), _LOOSEST)
     difference = min(max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition), _LOOSEST)
-    model = (_Error if lin.moving else _Nonlinear)(state, lin)
+    model = (ErrorDynamics if lin.moving else Nonlinear)(state, lin)
     A, B, inverse = aba_route(state, q, v, lin.u0, moving=lin.moving)
     # Links far apart cost ABA digits that M keeps; what its inverse of M lacks, its route lacks.
     own_error = inertia_residual(_in_base_axes(state, M, q), inverse)
@@ -171,7 +160,7 @@ def check(robot: Robot, lin: LinearModel) -> Check:
         for b in compare(state, lin, M, *_differences(model, lin, M))
     ]
     rows += _output_rows(model, lin, M, difference)
-    rows.append(Row("flow", "f", _flow_error(robot, lin), difference))
+    rows.append(Row("flow", "f", flow_error(robot, lin), difference))
     rows += [Row("point", name, error, route) for name, error in _point_errors(model, lin, M, q, v)]
     rows.append(Row("inertia", "M", _relative(lin.M, M, floor=0.0), route))
     inverse = inverse_inertia(state, lin)
@@ -182,48 +171,6 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, cond(M) {condition:.1e}")
 
 
-class _Nonlinear:
-    """The nonlinear model in the chart, by ABA: ``xdot = f(x, u)``.
-
-    Where the base is fast, accelerations are taken by an observer who flies with the point at
-    constant velocity: they are the same, v_b's rate but for the turning of the base's axes.
-    """
-
-    def __init__(self, state: StateMap, lin: LinearModel) -> None:
-        self.state = state
-        self.aba = Aba(state)
-        observer = rotation_matrix(lin.q[3:7]) @ lin.v[:3]
-        self._observer = observer if np.linalg.norm(observer) > _FAST else np.zeros(3)
-
-    def acceleration(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return (q, v, a) in Pinocchio's order."""
-        q, v = self.state.to_pinocchio(x)
-        u = self.aba.actuation.in_base_axes(self.state.chart(q), u)
-        seen, observer = v.copy(), rotation_matrix(q[3:7]).T @ self._observer
-        seen[:3] -= observer
-        a = self.aba.acceleration(q, seen, u).copy()
-        a[:3] -= np.cross(v[3:6], observer)
-        return q, v, a
-
-    def __call__(self, x: Array, u: Array) -> Array:
-        state = self.state
-        q, v, a = self.acceleration(x, u)
-        chart = state.chart(q)
-        linear, angular = v[:3], v[3:6]
-        rate = state.velocities(a)
-        if state.axes[1]:
-            rate[3:6] += np.cross(angular, linear)  # of the velocity's reference-axis components
-        state.to_frame(chart, rate)
-        return np.concatenate(
-            (
-                0.5 * (chart.q0 * angular + np.cross(chart.q_b, angular)),
-                chart.R @ linear,
-                state.velocities(v)[6:],
-                rate,
-            )
-        )
-
-
 def _in_base_axes(state: StateMap, M: Array, q: Array) -> Array:
     chart, M = state.chart(q), M.copy()
     state.to_base(chart, M)
@@ -231,31 +178,8 @@ def _in_base_axes(state: StateMap, M: Array, q: Array) -> Array:
     return M
 
 
-class _Error(_Nonlinear):
-    """The dynamics of the error from a reference that moves through the point: ``f(x0, u0) = 0``.
-
-    With the error quaternion (e, e0) = q*^-1 q: edot = (e0 (w - w*) + e x (w + w*)) / 2, and
-    with r = R*^T (p - p*): rdot = R_e v - v* - w* x r.
-    """
-
-    def __init__(self, state: StateMap, lin: LinearModel) -> None:
-        super().__init__(state, lin)
-        self._v = lin.v
-        self._a = state.velocities(self.acceleration(lin.x0, lin.u0)[2])
-
-    def __call__(self, x: Array, u: Array) -> Array:
-        state, g = self.state, self.state.groups
-        q, v, a = self.acceleration(x, u)
-        chart = state.chart(q)
-        (linear, angular), (at_linear, at_angular) = (w[:6].reshape(2, 3) for w in (v, self._v))
-        turning = chart.q0 * (angular - at_angular) + np.cross(chart.q_b, angular + at_angular)
-        flying = chart.R @ linear - at_linear - np.cross(at_angular, x[g.r_b])
-        rates = state.velocities(v)[6:] - state.velocities(self._v)[6:]
-        return np.concatenate((0.5 * turning, flying, rates, state.velocities(a) - self._a))
-
-
 def _point_errors(
-    model: _Nonlinear, lin: LinearModel, M: Array, q: Array, v: Array
+    model: Nonlinear, lin: LinearModel, M: Array, q: Array, v: Array
 ) -> list[tuple[str, float]]:
     """Errors of x0 and f0, and of f0's groups relative to the terms that may cancel in them."""
     state = model.state
@@ -273,15 +197,15 @@ def _point_errors(
     return errors
 
 
-def _differences(model: _Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
+def _differences(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
     """Return A and B by central differences of the nonlinear model."""
     step, push = _steps(model, lin, M)
-    A = _jacobian(lambda x: model(x, lin.u0), lin.x0, step)
-    B = _jacobian(lambda u: model(lin.x0, u), lin.u0, push)
+    A = jacobian(lambda x: model(x, lin.u0), lin.x0, step)
+    B = jacobian(lambda u: model(lin.x0, u), lin.u0, push)
     return A, B
 
 
-def _steps(model: _Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
+def _steps(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
     """Return the steps of differences in x and u."""
     groups = model.state.groups
     nv = len(M)
@@ -298,7 +222,7 @@ def _steps(model: _Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]
     return step, push
 
 
-def _output_rows(model: _Nonlinear, lin: LinearModel, M: Array, tolerance: float) -> list[Row]:
+def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float) -> list[Row]:
     """Rows of C, D and y0 against differences of what the nonlinear model measures."""
     state = model.state
     names, units = state.names, state.units
@@ -317,8 +241,8 @@ def _output_rows(model: _Nonlinear, lin: LinearModel, M: Array, tolerance: float
 
     step_x, step_u = _steps(model, lin, M)
     here = y(lin.x0, lin.u0)
-    C = _jacobian(lambda x: y(x, lin.u0), lin.x0, step_x)
-    D = _jacobian(lambda u: y(lin.x0, u), lin.u0, step_u)
+    C = jacobian(lambda x: y(x, lin.u0), lin.x0, step_x)
+    D = jacobian(lambda u: y(lin.x0, u), lin.u0, step_u)
     # What cannot be told from the rounding of y in its step is not compared any closer.
     scale = np.maximum(1.0, np.abs(here))[:, None]
     rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]
@@ -329,72 +253,6 @@ def _output_rows(model: _Nonlinear, lin: LinearModel, M: Array, tolerance: float
         error = float((np.abs(given - expected) / size).max(initial=0.0))
         rows.append(Row("outputs", name, error, tolerance))
     return rows
-
-
-def _jacobian(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:
-    columns = []
-    for along, step in zip(np.diag(steps), steps, strict=True):
-        columns.append(_derivative(partial(_along, f, point, along)) / step)
-    return np.column_stack(columns)
-
-
-def _along(f: Callable[[Array], Array], point: Array, along: Array, t: float) -> Array:
-    return f(point + t * along)
-
-
-def _derivative(f: Callable[[float], Array]) -> Array:
-    """Return df/dt at 0 by differences at t = -3 ... 3."""
-    differences = [f(k) - f(-k) for k in range(1, 1 + len(_WEIGHTS))]
-    return np.tensordot(_WEIGHTS, differences, axes=1)
-
-
-def _flow_error(robot: Robot, lin: LinearModel) -> float:
-    """How far f is from the rate of the state along motions of the robot.
-
-    The motions pass the point with its own velocity and with a unit of each base velocity added.
-    They pass it at the origin, since a step would drown in the digits of a distant place.
-    """
-    turned = pin.SE3(lin.reference.rotation, np.zeros(3))
-    state = StateMap(robot, reference=turned, frame=lin.frame)
-    model = (_Error if lin.moving else _Nonlinear)(state, lin)
-    worst = 0.0
-    for unit in (None, *range(6)):
-        x = lin.x0.copy()
-        x[state.groups.r_b] = 0.0
-        if unit is not None:
-            x[6 + robot.n + unit] += 1.0
-        q, v, a = model.acceleration(x, lin.u0)
-        h = 1e-2 * state.chart(q).q0 / (1.0 + float(np.abs(v[3:]).max()))
-        rate = _derivative(partial(_moved, state, q, h * v, v, h * a)) / h
-        if lin.moving:
-            q_star = lin.q.copy()
-            q_star[:3] = 0.0
-            back = partial(_moved_error, robot, q_star, h * lin.v, q, h * v)
-            rate[:6] = _derivative(back) / h
-            rate[6:] -= _motion_of_reference(model, lin)
-        floor = 1.0 + float(np.abs(v).max())
-        worst = max(worst, _relative(model(x, lin.u0), rate, floor=floor))
-    return worst
-
-
-def _moved(state: StateMap, q: Array, dq: Array, v: Array, dv: Array, t: float) -> Array:
-    return state.to_state(pin.integrate(state.robot.model, q, t * dq), v + t * dv)
-
-
-def _moved_error(robot: Robot, q: Array, dq: Array, q1: Array, dq1: Array, t: float) -> Array:
-    """Return (q_b, r_b) of the error when reference and robot have both moved on."""
-    reference = pin.integrate(robot.model, q, t * dq)
-    root = robot.model.jointPlacements[1]
-    moved = StateMap(robot, reference=root * pin.XYZQUATToSE3(reference[:7]), frame="local")
-    now = pin.integrate(robot.model, q1, t * dq1)
-    return moved.to_state(now, np.zeros(robot.nv))[:6]
-
-
-def _motion_of_reference(model: _Nonlinear, lin: LinearModel) -> Array:
-    """Return d(q_m, omega_b, v_b, qdot_m)/dt of the reference itself."""
-    state = model.state
-    _, v, a = model.acceleration(lin.x0, lin.u0)
-    return np.concatenate((state.velocities(v)[6:], state.velocities(a)))
 
 
 def _relative(given: Array, expected: Array, floor: float = 1.0) -> float:

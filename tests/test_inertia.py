@@ -178,6 +178,26 @@ def test_singular_m_of_mimic_joints_is_refused():
         fflin.linearize(fflin.load("romeo"))
 
 
+def test_what_mimics_a_locked_joint_is_welded_where_it_follows(tmp_path):
+    document = MIMIC.format(
+        links=LINKS,
+        a="revolute",
+        b="revolute",
+        parent="base",
+        mimic='<mimic joint="b" multiplier="-2" offset="0.3"/>',
+    )
+    (tmp_path / "r.urdf").write_text(document)
+    free = fflin.load(tmp_path / "r.urdf")
+    for lock, at in (({"b": 0.4}, 0.4), ({"b": None}, 0.0)):
+        robot = fflin.load(tmp_path / "r.urdf", lock=lock)
+        assert robot.n == 0 and not robot.followers
+        M = fflin.linearize(free, fflin.configuration(free, {"b": at})).M[:6, :6]
+        assert fflin.linearize(robot).M == pytest.approx(M, rel=1e-13, abs=1e-13)
+    # A follower that is locked alone stays at its offset.
+    robot = fflin.load(tmp_path / "r.urdf", lock=["a"])
+    assert robot.joint_names == ("b",) and robot.locked == ("a=0.3",)
+
+
 def test_locking_a_leader_locks_its_followers():
     robot = fflin.load("panda", lock={"panda_finger_joint1": 0.02})
     assert not robot.followers and robot.n == 7

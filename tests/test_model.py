@@ -152,6 +152,8 @@ def test_arguments_of_the_wrong_kind_are_told():
         lambda: fflin.load("ets_vii", lock=3),
         lambda: fflin.load("ets_vii", lock=[3]),
         lambda: fflin.load("ets_vii", lock=""),
+        lambda: fflin.load("ets_vii", lock=["universe"]),
+        lambda: fflin.load("ets_vii", lock=["root_joint"]),
         lambda: fflin.configuration(robot, [0.1] * 6),
         lambda: fflin.configuration(robot, {3: 1.0}),
         lambda: fflin.configuration(robot, {"joint_1": 10**400}),

@@ -86,6 +86,8 @@ def test_interpolation_is_on_the_manifold():
     assert robot.checked_configuration(q) is not None
     assert np.linalg.norm(q[3:7]) == pytest.approx(1.0, abs=1e-14)
     assert v == pytest.approx(0.5 * (along.v[3] + along.v[4]))
+    half = pin.difference(robot.model, along.q[3], along.q[4]) / 2
+    assert pin.difference(robot.model, along.q[3], q) == pytest.approx(half, abs=1e-14)
     assert (along.matrices(along.t[5])[0] == along.A[5]).all()
     assert (along.matrices(along.t[-1])[1] == along.B[-1]).all()
     with pytest.raises(fflin.InputError, match=r"t is 9 s, expected 0 to 0\.4 s"):
