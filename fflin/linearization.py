@@ -1,9 +1,11 @@
 """The equations: A and B about any point, from CRBA's M and the derivatives of RNEA."""
 
+from __future__ import annotations
+
 import math
 from functools import partial
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -18,9 +20,11 @@ from fflin.model import ROOT, Robot
 from fflin.output_equations import Rates, output_equations
 from fflin.outputs import FullState
 from fflin.rotation import rotation_matrix, skew
-from fflin.sensing import Sensing
 from fflin.state import ANGULAR, LINEAR, Chart, Frame, StateMap
 from fflin.validation import Array, vector
+
+if TYPE_CHECKING:
+    from fflin.sensing import Sensing
 
 _STANDING = Chart(np.zeros(3), 1.0, np.eye(3))
 
@@ -93,6 +97,8 @@ class Linearizer:
         self._gravity = np.array(robot.gravity)
         self._sensing: Sensing | None = None
         if robot.outputs != (FullState(),):
+            from fflin.sensing import Sensing
+
             self._sensing = Sensing(
                 self._map,
                 robot.outputs,

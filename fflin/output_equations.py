@@ -1,14 +1,18 @@
 """C and D: the derivatives of the outputs carried into the chart, the frame and the inputs."""
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from fflin.actuation import Actuation
-from fflin.measurements import Sensed
 from fflin.rotation import skew
 from fflin.state import ANGULAR, LINEAR, Chart, StateMap
 from fflin.validation import Array
+
+if TYPE_CHECKING:
+    from fflin.measurements import Sensed
 
 
 class Rates(NamedTuple):

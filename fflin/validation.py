@@ -6,14 +6,16 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from fflin.errors import InputError
 
 if TYPE_CHECKING:
     import pinocchio as pin
+    from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.floating[Any]]
+    Array = NDArray[np.floating[Any]]
+else:
+    Array = np.ndarray  # numpy.typing takes a tenth of the command line's start
 
 # A quaternion or a (cos, sin) pair this far from unit length is renormalised without a word;
 # farther off it is taken for a mistake.
