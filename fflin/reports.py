@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from fflin.linear_model import LinearModel
     from fflin.model import Robot
     from fflin.validation import Array
-    from fflin.verification import Check
+    from fflin.verification import Check, Row
 
 
 def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
@@ -178,10 +178,9 @@ def _signal(title: str, values: Array, names: Sequence[str], units: Sequence[str
     )
 
 
-def _error(row: object) -> str:
-    error, ok = row.error, row.ok  # type: ignore[attr-defined]
-    text = "." if error == 0.0 else f"{error:.0e}"
-    return text if ok else f"{text}!"
+def _error(row: Row) -> str:
+    text = "." if row.error == 0.0 else f"{row.error:.0e}"
+    return text if row.ok else f"{text}!"
 
 
 def _limit(value: float) -> str:
