@@ -137,16 +137,28 @@ def solve(
     D. L. Kleinman, IEEE Trans. Automatic Control 13(1), 1968.
     """
     equation = Riccati(A, B, Q, R, N, dt)
-    start = None
-    with suppress(np.linalg.LinAlgError):
-        start = _half_size(equation)
+    start = _attempt(equation)
     if start is not None and start.residual <= _SOUND:
         return start
     general = _finished(equation, *_refined(equation, _general(equation), None), "general")
     found = [solution for solution in (start, general) if solution is not None]
     if not found:
-        raise np.linalg.LinAlgError("no stabilising solution was found")
+        raise np.linalg.LinAlgError("it has none that is stable")
     return min(found, key=lambda solution: solution.residual)
+
+
+def half_size(
+    A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
+) -> Solution | None:
+    """Solve as `solve` does by the half-size method; None where it falls short."""
+    solution = _attempt(Riccati(A, B, Q, R, N, dt))
+    return solution if solution is not None and solution.residual <= _SOUND else None
+
+
+def _attempt(equation: Riccati) -> Solution | None:
+    with suppress(np.linalg.LinAlgError):
+        return _half_size(equation)
+    return None
 
 
 def _half_size(equation: Riccati) -> Solution | None:
