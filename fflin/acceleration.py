@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -136,7 +136,7 @@ def _integrators(lin: LinearModel) -> tuple[Array, Array]:
 
 
 def _diagonal(what: str, value: Weight, names: Sequence[str], *, definite: bool) -> Array:
-    if np.ndim(value) == 2:
+    if not isinstance(value, Mapping) and np.ndim(value) == 2:
         raise InputError(f"{what} is a matrix; the closed form needs its diagonal alone, use lqr")
     return weight(what, value, names, definite=definite).diagonal()
 

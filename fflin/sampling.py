@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -92,7 +93,7 @@ def held_cost(F: Array, W: Array, h: float) -> Array:
     from scipy.linalg import expm
 
     n = len(F)
-    doublings = max(0, int(np.ceil(np.log2(max(2.0 * h * np.linalg.norm(F, 1), 1.0)))))
+    doublings = math.ceil(math.log2(max(2.0 * h * float(np.linalg.norm(F, 1)), 1.0)))
     block = np.zeros((2 * n, 2 * n))
     block[:n, :n], block[:n, n:], block[n:, n:] = -F.T, W, F
     with np.errstate(over="ignore", invalid="ignore"):

@@ -46,6 +46,17 @@ def require_detectable(lin: LinearModel) -> None:
         )
 
 
+def require_disturbed(lin: LinearModel, W: Array) -> None:
+    """Raise `InputError` that names the modes on the boundary that no disturbance reaches."""
+    hidden = hidden_modes(lin.A, W, bool(lin.dt), margin=True)
+    if hidden:
+        words = _dominant(np.vstack([vectors for _, vectors in hidden]), lin.state_names)
+        raise InputError(
+            f"W does not disturb {words}, which do not settle by themselves: a steady filter "
+            "would not correct them; give them an intensity"
+        )
+
+
 def hidden_modes(
     A: Array, B: Array, discrete: bool, *, margin: bool
 ) -> list[tuple[complex, Array]]:
@@ -129,7 +140,6 @@ _MOMENTA = {"base attitude": "angular", "base position": "linear"}
 
 def _dominant(vectors: Array, names: Sequence[str]) -> str:
     """Name the states that vectors (k, nx) stand on most, one each at least."""
-    chosen: list[str] = []
-    for row in np.abs(vectors):
-        chosen += [name for name, x in zip(names, row, strict=True) if x >= 0.3 * row.max()]
-    return listed(chosen)
+    sizes = np.abs(vectors)
+    large = (sizes >= 0.3 * sizes.max(axis=1, keepdims=True)).any(axis=0)
+    return listed(name for name, chosen in zip(names, large, strict=True) if chosen)

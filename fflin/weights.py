@@ -109,9 +109,9 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
     size = len(names)
     if isinstance(value, Mapping):
         diagonal = _diagonal(what, value, names, complete=definite)
-    elif np.ndim(value) == 0:
+    elif (dimension := _dimension(what, value)) == 0:
         diagonal = np.full(size, number(what, value))
-    elif np.ndim(value) == 1:
+    elif dimension == 1:
         diagonal = vector(what, value, size, f"its diagonal, {names[0]} to {names[-1]}")
     else:
         return _checked_matrix(what, value, names, definite)
@@ -122,8 +122,8 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
 
 
 def cross_weight(what: str, value: ArrayLike, rows: int, columns: int) -> Array:
-    """Return a cross weight (rows, columns)."""
-    if np.shape(value) != (rows, columns):
+    """Return a matrix (rows, columns)."""
+    if _dimension(what, value) != 2 or np.shape(value) != (rows, columns):
         raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, {columns})")
     return vector(what, np.ravel(value), rows * columns, "its entries").reshape(rows, columns)
 
@@ -159,23 +159,52 @@ def _checked_matrix(what: str, value: Any, names: Sequence[str], definite: bool)
     return matrix
 
 
-def _diagonal(
-    what: str, values: Mapping[str, float], names: Sequence[str], *, complete: bool
+def default_weights(lin: LinearModel) -> tuple[Array, Array]:
+    """Return diagonals that suit a robot of any size: 1 on every state, and on each input.
+
+    An input costs the squares of the accelerations that a unit of it gives the coordinates, each
+    taken alone with its inertia on the diagonal of M.
+    """
+    nx, nu = lin.B.shape
+    if lin.M.shape != (nx - nx // 2,) * 2:
+        return np.ones(nx), np.ones(nu)
+    forces = lin.M @ lin.B[nx // 2 :] / (lin.dt or 1.0)
+    return np.ones(nx), ((forces / lin.M.diagonal()[:, None]) ** 2).sum(axis=0)
+
+
+def named_weights(
+    what: str, values: Mapping[str, float], names: Sequence[str], others: Array
 ) -> Array:
+    """Return a diagonal (k,) of {name of an entry or of a group: value} and of the `others`."""
     groups: dict[str, list[int]] = {}
     for index, name in enumerate(names):
         groups.setdefault(_group(name), []).append(index)
-    diagonal = np.full(len(names), np.nan if complete else 0.0)
+    diagonal = others.astype(float)
     # A single name goes before its group's, whichever stands first.
     for name, value in sorted(values.items(), key=lambda item: item[0] in names):
         if name not in names and name not in groups:
-            raise unknown(f"entry of {what}", name, (*groups, *names))
+            raise unknown(what, name, (*groups, *names))
         entries = [names.index(name)] if name in names else groups[name]
-        diagonal[entries] = number(f"{what} of '{name}'", value)
+        diagonal[entries] = number(f"weight of '{name}'", value)
+    return diagonal
+
+
+def _diagonal(
+    what: str, values: Mapping[str, float], names: Sequence[str], *, complete: bool
+) -> Array:
+    others = np.full(len(names), np.nan if complete else 0.0)
+    diagonal = named_weights(f"entry of {what}", values, names, others)
     missing = np.flatnonzero(np.isnan(diagonal))
     if missing.size:
         raise InputError(f"{what} has no value for {names[missing[0]]}; every input needs one")
     return diagonal
+
+
+def _dimension(what: str, value: Any) -> int:
+    try:
+        return np.ndim(value)
+    except ValueError:
+        raise InputError(f"{what} is not an array: its rows differ in length") from None
 
 
 def _group(name: str) -> str:
