@@ -22,7 +22,7 @@ Kind = TypeVar("Kind", bound=Design)
 
 _UNREADABLE = (
     *(KeyError, ValueError, TypeError, IndexError, AttributeError, EOFError, OverflowError),
-    *(NotImplementedError, RecursionError, zlib.error, zipfile.BadZipFile),
+    *(NotImplementedError, RecursionError, OSError, zlib.error, zipfile.BadZipFile),
 )
 
 
@@ -66,12 +66,14 @@ def load_design(cls: type[Kind], path: str | Path) -> Kind:
     reader = {".npz": _from_npz, ".mat": _from_mat, ".json": _from_json}[source.suffix]
     name = cls.__name__
     try:
-        record = reader(source)
+        content = source.read_bytes()
+    except OSError as error:
+        raise FileError(f"{source}: cannot be read: {error.strerror or error}") from None
+    try:
+        record = reader(content)
         if _text(record["kind"]) != name:
             raise ValueError(f"it is a {_text(record['kind'])}")
         return cls(**{field.name: _value(cls, field, record) for field in fields(cls)})
-    except OSError as error:
-        raise FileError(f"{source}: cannot be read: {error.strerror or error}") from None
     except _UNREADABLE as error:
         raise FileError(f"{source}: not a {name} saved by fflin ({error})") from None
 
@@ -105,8 +107,8 @@ def _npz(record: dict[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def _from_npz(path: Path) -> dict[str, Any]:
-    with np.load(path, allow_pickle=False) as file:
+def _from_npz(content: bytes) -> dict[str, Any]:
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
         return {key: file[key] for key in file.files}
 
 
@@ -119,13 +121,12 @@ def _mat(record: dict[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def _from_mat(path: Path) -> dict[str, Any]:
+def _from_mat(content: bytes) -> dict[str, Any]:
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
-    content = io.BytesIO(path.read_bytes())
     try:
-        raw = loadmat(content)
+        raw = loadmat(io.BytesIO(content))
     except (MatReadError, NotImplementedError) as error:
         raise ValueError(str(error)) from None
     return {
@@ -147,6 +148,6 @@ def _json(record: dict[str, Any]) -> bytes:
     return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
 
 
-def _from_json(path: Path) -> dict[str, Any]:
-    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+def _from_json(content: bytes) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads(content)
     return record

@@ -23,8 +23,9 @@ def gain_report(gain: Gain) -> str:
     """Show a gain, its poles, and the figures that prove it."""
     nu, nx = gain.K.shape
     time = f"sampled at {gain.dt:g} s" if gain.dt else "continuous"
-    head = (
-        f"{gain.robot}: u = u0 - K (x - x0), {nx} states, {nu} inputs, frame {gain.frame}, {time}"
+    head = textwrap.fill(
+        f"{gain.robot}: u = u0 - K (x - x0), {nx} states, {nu} inputs, frame {gain.frame}, {time}",
+        width(),
     )
     if gain.K.size <= _LARGE:
         body = f"K ({nu} x {nx})\n\n{matrix(gain.K, gain.input_names, gain.state_names)}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dgeev, dpotrf, dtrtrs
@@ -56,7 +56,11 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> Loop | N
     if nx != 2 * m or B[:m].any():
         return None
     white = _lower(R_factor, B[m:].T)
-    Ls, singular = dpotrf(white.T @ white, lower=1)
+    # Of the inverse weight on forces, S = Ls Ls'; squaring it would square its condition.
+    triangle: Any = np.linalg.qr(white, mode="r")
+    Ls: Array = triangle.T
+    sizes = np.abs(Ls.diagonal())
+    singular = len(white) < m or sizes.min() <= 1e-14 * sizes.max()
     A11, A12 = A[:m, :m], A[:m, m:]
     inverse = _inverse(A12)
     if singular or inverse is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from fflin.design import Design
-from fflin.errors import EquilibriumError, InputError, StabilizabilityError
+from fflin.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.linear_model import LinearModel
 from fflin.validation import Array
 from fflin.weights import Weight, cross_weight, require_semidefinite, weight
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     from fflin.margins import Margins
 
 _SHOWN_RESIDUALS = 6
+
+# A relative residual that a user should know of.
+_COARSE = 1e-8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -112,8 +116,9 @@ def lqr(lin: LinearModel, Q: Weight, R: Weight, N: ArrayLike | None = None) -> G
     for a sampled one the same sum over its samples; `sampled_cost` takes the weights of the
     integral to those of the sum. The Riccati equation of a fully actuated model is solved by
     half its usual size, any other by SciPy's solver; either is refined by Newton's method, and
-    the residual in the model's own variables comes with the result. Weights that are M' R_a M as
-    numbers lose what M's condition takes: `acceleration_lqr` puts them on accelerations.
+    the residual in the model's own variables comes with the result. A weight that is formed with
+    the inertia, such as M^-1 R_a M^-1 on accelerations, has lost what the inertia's condition
+    takes before any solver sees it: `acceleration_lqr` does without.
 
     Parameters
     ----------
@@ -142,6 +147,11 @@ def lqr(lin: LinearModel, Q: Weight, R: Weight, N: ArrayLike | None = None) -> G
         not settle by itself.
     UnknownNameError
         If a name does not exist.
+
+    Warns
+    -----
+    FflinWarning
+        If the weights are so badly scaled that the equation is solved to less than 1e-8.
 
     References
     ----------
@@ -224,9 +234,17 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
         free, A = Q - N @ toward, A - lin.B @ toward
     require_weighed(lin, A, free)
     try:
-        return solve(*arguments)
+        solution = solve(*arguments)
     except np.linalg.LinAlgError as error:
         raise StabilizabilityError(
-            f"no stabilising solution of the Riccati equation was found ({error}); scale the "
-            "weights, or weigh every state"
+            f"no stabilising solution of the Riccati equation was found: {error}; scale the "
+            "weights, with bryson, or use acceleration_lqr"
         ) from None
+    if solution.residual > _COARSE:
+        warnings.warn(
+            f"the Riccati equation is solved to {solution.residual:.0e} only: the weights are "
+            "badly scaled; scale them, with bryson",
+            FflinWarning,
+            stacklevel=3,
+        )
+    return solution

@@ -19,6 +19,9 @@ _EPS = float(np.finfo(float).eps)
 _SOUND = 1e-11
 _STEPS = 25
 
+# Of a residual below which Newton's method lowers it at every step.
+_NEAR = 1e-3
+
 
 class Solution(NamedTuple):
     """P and K, the poles of A - B K, the relative residual, and what found them."""
@@ -140,10 +143,13 @@ def solve(
     start = _attempt(equation)
     if start is not None and start.residual <= _SOUND:
         return start
-    general = _finished(equation, *_refined(equation, _general(equation), None), "general")
+    general = None
+    # SciPy raises either where a pencil cannot be reordered.
+    with suppress(np.linalg.LinAlgError, ValueError):
+        general = _finished(equation, *_refined(equation, _general(equation), None), "general")
     found = [solution for solution in (start, general) if solution is not None]
     if not found:
-        raise np.linalg.LinAlgError("it has none that is stable")
+        raise np.linalg.LinAlgError("the weights or the model are too badly scaled")
     return min(found, key=lambda solution: solution.residual)
 
 
@@ -211,23 +217,26 @@ def _finished(
 def _refined(equation: Riccati, P: Array, modes: Modes | None) -> tuple[_Trial, Modes | None]:
     """Apply Newton steps; `modes` are those of a closed loop near that of P, where known."""
     enough = 0.5 * _EPS * len(P) ** 0.5
-    trial = equation.trial(P)
+    trial = best = equation.trial(P)
     fresh = False
     for _ in range(_STEPS):
-        if trial.residual <= enough:
+        if best.residual <= enough:
             break
         if modes is None:
             modes, fresh = Modes.of(equation.closed_loop(trial.P), equation.discrete), True
         better = equation.trial(trial.P + modes.lyapunov(trial.defect))
         gain = trial.residual / max(better.residual, 1e-300)
-        if gain > 1.0:
+        # From afar the first steps may raise the residual; what they do to P is for the better.
+        if gain > 1.0 or (fresh and trial.residual > _NEAR):
             trial = better
+        if trial.residual < best.residual:
+            best = trial
         if gain < 10.0:
             # What is left is rounding, or these modes are those of another loop.
-            if trial.residual < 100.0 * enough or (fresh and gain <= 1.0):
+            if trial.residual < 100.0 * enough or (fresh and gain <= 1.0 and trial is not better):
                 break
             modes = None
-    return trial, modes
+    return best, modes
 
 
 def _general(equation: Riccati) -> Array:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 # Between two knots P is a cubic; knots are put in until it holds to this, relative to P.
 _ACCURACY = 1e-7
 _KNOTS_LIMIT = 100_000
+_TOO_FAST = "P changes too fast at {}; give smaller weights or a larger R"
 _NODES = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
 
 
@@ -151,7 +152,10 @@ def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSched
     names = traj.state_names
     Q, Qf = weight("Q", Q, names), weight("Qf", Qf, names)
     R = weight("R", R, traj.input_names, definite=True)
-    t, P = _solve(traj, Q, R, Qf)
+    try:
+        t, P = _solve(traj, Q, R, Qf)
+    except np.linalg.LinAlgError:
+        raise InputError(_TOO_FAST.format("some time")) from None
     A, B = map(np.array, zip(*(traj.matrices(float(x)) for x in t), strict=True))
     K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
     schedule = GainSchedule(
@@ -206,9 +210,7 @@ def _solve(traj: LinearTrajectory, Q: Array, R: Array, Qf: Array) -> tuple[Array
                 times += [middle, start]
                 values += [half, double]
             elif len(times) > _KNOTS_LIMIT or h < 1e-12 * abs(traj.t[-1] - traj.t[0]):
-                raise InputError(
-                    f"P changes too fast at t = {end:g} s; give smaller weights or a larger R"
-                )
+                raise InputError(_TOO_FAST.format(f"t = {end:g} s"))
             else:
                 pending += [(start, middle, None), (middle, end, half)]
     return np.array(times[::-1]), np.array(values[::-1])
