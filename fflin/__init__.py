@@ -16,12 +16,14 @@ _PUBLIC = {
     "Certificate": "linear_model",
     "ChartError": "errors",
     "Check": "verification",
+    "Controllability": "structure",
     "FflinError": "errors",
     "FflinWarning": "errors",
     "FileError": "errors",
     "FramePose": "outputs",
     "FrameVelocity": "outputs",
     "FullState": "outputs",
+    "Gramians": "gramian",
     "Gyroscope": "outputs",
     "InputError": "errors",
     "JointPositions": "outputs",
@@ -33,6 +35,8 @@ _PUBLIC = {
     "MissingPackageError": "errors",
     "ModelError": "errors",
     "Momentum": "outputs",
+    "Observability": "observation",
+    "ReducedModel": "momentum",
     "Robot": "model",
     "SingularInertiaError": "errors",
     "StateMap": "state",
@@ -41,13 +45,19 @@ _PUBLIC = {
     "UrdfError": "errors",
     "check": "verification",
     "configuration": "model",
+    "controllability": "structure",
     "effort": "points",
     "from_model": "loading",
+    "generalized_inertia": "momentum",
+    "generalized_jacobian": "momentum",
+    "gramians": "gramian",
     "linearize": "linearization",
     "linearize_trajectory": "trajectory",
     "list_robots": "robots",
     "load": "loading",
     "load_inputs": "input_files",
+    "momentum_reduction": "momentum",
+    "observability": "observation",
     "velocity": "points",
 }
 
@@ -66,12 +76,20 @@ if TYPE_CHECKING:
         UnknownNameError,
         UrdfError,
     )
+    from fflin.gramian import Gramians, gramians
     from fflin.input_files import load_inputs
     from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
     from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load
     from fflin.model import Robot, configuration
+    from fflin.momentum import (
+        ReducedModel,
+        generalized_inertia,
+        generalized_jacobian,
+        momentum_reduction,
+    )
+    from fflin.observation import Observability, observability
     from fflin.outputs import (
         Accelerometer,
         BasePose,
@@ -87,6 +105,7 @@ if TYPE_CHECKING:
     from fflin.points import effort, velocity
     from fflin.robots import list_robots
     from fflin.state import StateMap
+    from fflin.structure import Controllability, controllability
     from fflin.trajectory import LinearTrajectory, linearize_trajectory
     from fflin.verification import Check, check
 
