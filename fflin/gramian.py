@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,7 +76,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     pairs = ((lin.A, lin.B), (lin.A.T, lin.C.T))
     if duration is None:
         _require_decay(lin)
-        return Gramians(*(_symmetric(_endless(A, B @ B.T, lin.dt)) for A, B in pairs), np.inf)
+        reach, show = (_symmetric(_endless(A, B @ B.T, lin.dt)) for A, B in pairs)
+        return Gramians(reach, show, np.inf)
     duration = number("duration", duration)
     if duration <= 0.0:
         raise InputError(f"duration is {duration:g} s, expected a positive horizon")
@@ -83,7 +85,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
         found = [_finite(A, B @ B.T, lin.dt, duration) for A, B in pairs]
     if not all(np.isfinite(W).all() for W in found):
         raise InputError(f"duration is {duration:g} s, over which the model grows beyond numbers")
-    return Gramians(*(_symmetric(W) for W in found), duration)
+    reach, show = map(_symmetric, found)
+    return Gramians(reach, show, duration)
 
 
 def _require_decay(lin: LinearModel) -> None:
@@ -115,7 +118,8 @@ def _finite(A: Array, Q: Array, dt: float, duration: float) -> Array:
 
     size = len(A)
     # Halved until the exponential of -A cannot grow.
-    halvings = max(0, int(np.ceil(np.log2(max(1e-300, np.linalg.norm(A, 1) * duration)))) + 1)
+    growth = float(np.linalg.norm(A, 1)) * duration
+    halvings = max(0, math.ceil(math.log2(growth)) + 1) if growth > 0.0 else 0
     block = np.block([[-A, Q], [np.zeros_like(A), A.T]]) * (duration / 2.0**halvings)
     exponential = expm(block)
     step: Array = exponential[size:, size:].T

@@ -107,9 +107,7 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
         "state_units": tuple(lin.state_units[i] for i in z),
         "_inertia": partial(_given, M),
     }
-    reduced = ReducedModel(
-        **values, T=T, S=S, momenta=held.momenta, coordinates=held.coordinates
-    )
+    reduced = ReducedModel(**values, T=T, S=S, momenta=held.momenta, coordinates=held.coordinates)
     certify = partial(_same_certificate, lin, reduced.fingerprint)
     return replace(reduced, _certify=certify)
 

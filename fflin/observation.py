@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from fflin.linear_model import LinearModel
 from fflin.mechanics import checked, scaled, slopes
-from fflin.ranks import EPS, Margin, combination, echelon, reached_by, split, unit_columns
+from fflin.naming import combination
+from fflin.ranks import EPS, Margin, echelon, reached_by, split, unit_columns
 from fflin.tables import width
 from fflin.validation import Array
 
@@ -45,7 +47,7 @@ class Observability:
     unobservable: tuple[str, ...]
     basis: Array
     rows: Array
-    fixed_poles: Array
+    fixed_poles: Any
     detectable: bool
     method: str
     margin: Margin
@@ -70,7 +72,8 @@ def observability(lin: LinearModel) -> Observability:
 
     About rest without springs and dampers :math:`A^2 = 0`, and the unobservable subspace is the
     kernel of :math:`[C; C A]`, which is one decision. Elsewhere it is the orthogonal complement
-    of what the dual pair :math:`(A^T, C^T)` reaches, found by eigenvalue by eigenvalue in units of energy, as in `controllability`.
+    of what the dual pair :math:`(A^T, C^T)` reaches, found eigenvalue by eigenvalue in units of
+    energy, as in `controllability`.
 
     Parameters
     ----------

@@ -163,9 +163,7 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
     return found, margin
 
 
-def _at_pole(
-    A: Array, B: Array, pole: complex, tolerance: float
-) -> tuple[Array, complex, Margin]:
+def _at_pole(A: Array, B: Array, pole: complex, tolerance: float) -> tuple[Array, complex, Margin]:
     """Return the left vectors (m, k) at a pole, the pole itself, and the margin."""
     size = len(A)
     for _ in range(_REFINEMENTS):
@@ -180,20 +178,3 @@ def _at_pole(
     kept = float(values[rank - 1]) if rank else np.inf
     dropped = float(values[rank]) if rank < size else 0.0
     return U[:, rank:], complex(shift), Margin(kept / tolerance, dropped / tolerance)
-
-
-def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int = 3) -> str:
-    """Show a linear combination by its largest terms; `sizes` makes the weights comparable."""
-    order = [i for i in np.argsort(-np.abs(weights) * sizes) if weights[i]]
-    largest = abs(weights[order[0]]) * sizes[order[0]]
-    shown = [i for i in order if abs(weights[i]) * sizes[i] > 1e-6 * largest]
-    terms = [_term(float(weights[i]), names[i], first=i == shown[0]) for i in shown[:most]]
-    if len(shown) > most:
-        terms.append("+ ...")
-    return " ".join(terms)
-
-
-def _term(weight: float, name: str, *, first: bool) -> str:
-    sign = ("-" if weight < 0.0 else "") if first else ("- " if weight < 0.0 else "+ ")
-    size = f"{abs(weight):.3g}"
-    return sign + (name if size == "1" else f"{size} {name}")

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from fflin.linear_model import LinearModel
 from fflin.mechanics import Conserved, Scaled, checked, conserved, scaled, slopes
-from fflin.modes_of_motion import undamped_modes, vibration_rows
-from fflin.ranks import Margin, combination, echelon, reached_by, split, unit_columns
+from fflin.naming import combination, grouped, momentum_names
+from fflin.ranks import Margin, echelon, reached_by, split, unit_columns
 from fflin.tables import width
 from fflin.validation import Array
+from fflin.vibrations import undamped_modes, vibration_rows
 
 # A defective pair of poles at zero moves by the square root of round-off.
 _DECAY = 1e-7
@@ -60,7 +62,7 @@ class Controllability:
     uncontrollable: tuple[str, ...]
     rows: Array
     basis: Array
-    fixed_poles: Array
+    fixed_poles: Any
     stabilizable: bool
     reach: dict[str, int]
     method: str
@@ -122,7 +124,8 @@ def controllability(lin: LinearModel) -> Controllability:
     -----
     Inputs act in both directions: that a thruster only pushes is not considered. At a nonzero
     angular velocity the answer is that of the frozen model, which certifies nothing about the
-    motion.
+    motion. Where the fastest pole is more than about 1e8 times the slowest that is not zero, as
+    with a heavy damper on a light link, the slow ones are taken for rounding, as `margin` shows.
 
     References
     ----------
@@ -135,7 +138,7 @@ def controllability(lin: LinearModel) -> Controllability:
     A, M = X[z] @ held.T, held.T[len(lin.M) :, len(held.kept) :]
     part = _split_kept(lin, A, B, M.T @ lin.M @ M, held)
     rows = np.vstack((held.momenta, held.coordinates, part.rows @ _selector(z, len(X))))
-    names = (*_momentum_names(lin, held), *part.names)
+    names = (*momentum_names(lin, held), *part.names)
     size = _state_sizes(lin)
     spanned = held.T @ part.reached
     basis, pivots = echelon(spanned, size, _driven_states(lin))
@@ -164,7 +167,7 @@ class _Part:
     reached: Array
     rows: Array
     names: tuple[str, ...]
-    poles: Array
+    poles: Any
     decays: bool
     method: str
     margin: Margin
@@ -183,7 +186,9 @@ def _split_kept(lin: LinearModel, A: Array, B: Array, M: Array, held: Conserved)
     modes = None if lin.dt else undamped_modes(A, M)
     if modes is not None:
         found = modes.split(B[r:])
-        rows, names, poles = vibration_rows(found, modes, tuple(np.array(lin.state_names)[held.selected]))
+        rows, names, poles = vibration_rows(
+            found, modes, tuple(np.array(lin.state_names)[held.selected])
+        )
         return _Part(found.reached, rows, names, poles, not len(rows), "modes", found.margin)
     return _by_eigenvalues(lin, scaled(A, M, lin.dt), B, held)
 
@@ -227,50 +232,10 @@ def _state_sizes(lin: LinearModel) -> Array:
 def _driven_states(lin: LinearModel) -> Array:
     """Return the states of coordinates that an input pushes on directly."""
     force = np.abs(lin.M @ lin.B[len(lin.M) :])
-    rounding = 1e3 * len(lin.M) * np.finfo(float).eps * (np.abs(lin.M) @ np.abs(lin.B[len(lin.M) :]))
+    rounding = (
+        1e3 * len(lin.M) * np.finfo(float).eps * (np.abs(lin.M) @ np.abs(lin.B[len(lin.M) :]))
+    )
     return np.tile((force > rounding).any(axis=1), 2)
-
-
-_MOMENTUM = {"omega_b": "angular momentum {}", "v_b": "linear momentum {}"}
-_COORDINATE = {"omega_b": "base attitude {}", "v_b": "base position {}"}
-
-
-def _momentum_names(lin: LinearModel, held: Conserved) -> tuple[str, ...]:
-    nv = len(lin.M)
-    size = 1.0 / np.sqrt(lin.M.diagonal())
-    rates = [name.split(".", 1) for name in lin.state_names[nv:]]
-    momenta = tuple(
-        _MOMENTUM.get(group, "momentum of {}").format(member) for group, member in rates
-    )
-    driven = tuple(
-        _COORDINATE.get(group, "position of {}").format(member) for group, member in rates
-    )
-    # What the coordinates are counted from: without it every one of them can be moved.
-    only_joints = all(rates[i][0] == "qdot_m" for i in held.kept)
-    of_base = all(not row[i] for row in held.weights for i in range(nv) if rates[i][0] == "qdot_m")
-    rest = "joints" if only_joints and of_base else "the rest"
-    return (
-        *(combination(row, momenta, 1.0 / size) for row in held.weights),
-        *(f"{combination(row, driven, 1.0 / size)} for given {rest}" for row in held.weights),
-    )
-
-
-def grouped(names: tuple[str, ...]) -> list[str]:
-    """Join names that differ in their axis alone: "angular momentum x, y, z" is one."""
-    groups: dict[tuple[str, str], list[str]] = {}
-    for name in names:
-        words = name.split(" ")
-        axes = [i for i, word in enumerate(words) if word in ("x", "y", "z")]
-        if len(axes) == 1:
-            i = axes[0]
-            key = (" ".join(words[:i]), " ".join(words[i + 1 :]))
-            groups.setdefault(key, []).append(words[i])
-        else:
-            groups[name, ""] = []
-    return [
-        " ".join(part for part in (head, "/".join(axes), tail) if part)
-        for (head, tail), axes in groups.items()
-    ]
 
 
 def _reach(lin: LinearModel, weighted: Array) -> dict[str, int]:
@@ -287,7 +252,8 @@ def _reach(lin: LinearModel, weighted: Array) -> dict[str, int]:
 
 def _notes(lin: LinearModel, held: Conserved, part: _Part) -> tuple[str, ...]:
     notes = []
-    if any(name.startswith("angular momentum") for name in _momentum_names(lin, held)):
+    turned = any("angular momentum" in name for name in momentum_names(lin, held))
+    if turned and any(lin.state_names[i].startswith("q_m.") for i in held.kept):
         notes.append(_LOOPS)
     if len(held.weights):
         notes.append("conserved momenta are split off by fflin.momentum_reduction")

@@ -61,15 +61,21 @@ def test_springs_and_dampers_against_exact_arithmetic(robots, name):
     nv = 6 + robot.n
     for _ in range(4):
         joints = list(robot.joint_names)
-        K, D = (
-            {j: float(rng.integers(1, 90)) for j in joints if rng.random() < 0.6} for _ in range(2)
+        # Each spring of 1 to 9 rad/s on what it moves with the base free, each damper of 0.1 to 1.
+        own = dict(
+            zip(joints, 1.0 / np.linalg.inv(fflin.linearize(robot).M).diagonal()[6:], strict=True)
         )
+        K = {j: own[j] * float(rng.uniform(1, 90)) for j in joints if rng.random() < 0.6}
+        D = {j: own[j] * float(rng.uniform(0.1, 1)) for j in joints if rng.random() < 0.6}
         seen = [j for j in joints if rng.random() < 0.5] or joints[:1]
         chosen = robot.replace(stiffness=K, damping=D, outputs=[JointPositions(tuple(seen))])
         lin = fflin.linearize(chosen)
         M, k, d = (
             exact.modular(x)
-            for x in (lin.M, *(np.diag([0.0] * 6 + [v.get(j, 0.0) for j in joints]) for v in (K, D)))
+            for x in (
+                lin.M,
+                *(np.diag([0.0] * 6 + [v.get(j, 0.0) for j in joints]) for v in (K, D)),
+            )
         )
         slopes = exact.solve(M, np.hstack((-k, -d)) % exact.PRIME)
         A = np.zeros((2 * nv, 2 * nv), dtype=np.int64)
@@ -85,7 +91,9 @@ def test_springs_and_dampers_against_exact_arithmetic(robots, name):
 def damped(robots):
     robot = robots["ets_vii"]
     robot = robot.replace(
-        inputs=[JointTorque(j) for j in robot.joint_names], stiffness=50.0, damping=20.0,
+        inputs=[JointTorque(j) for j in robot.joint_names],
+        stiffness=50.0,
+        damping=20.0,
         outputs=[JointPositions()],
     )
     return fflin.momentum_reduction(fflin.linearize(robot))
@@ -100,7 +108,9 @@ def test_endless_gramians_solve_lyapunov(robots):
     assert lin.A.T @ Wo + Wo @ lin.A == pytest.approx(-lin.C.T @ lin.C, abs=1e-9)
     sampled = lin.discretize(0.2)
     Wd = fflin.gramians(sampled).controllability
-    assert sampled.A @ Wd @ sampled.A.T + sampled.B @ sampled.B.T == pytest.approx(Wd, rel=1e-9, abs=1e-9)
+    assert sampled.A @ Wd @ sampled.A.T + sampled.B @ sampled.B.T == pytest.approx(
+        Wd, rel=1e-9, abs=1e-9
+    )
     assert fflin.gramians(lin, 1e4).controllability == pytest.approx(Wc, rel=1e-8, abs=1e-10)
 
 
@@ -120,17 +130,19 @@ def test_finite_gramians_are_the_integrals(robots):
     sampled = lin.discretize(0.5)
     powers = [np.linalg.matrix_power(sampled.A, k) @ sampled.B for k in range(7)]
     expected = sum(x @ x.T for x in powers)
-    assert fflin.gramians(sampled, 3.5).controllability == pytest.approx(expected, rel=1e-10, abs=1e-12)
+    assert fflin.gramians(sampled, 3.5).controllability == pytest.approx(
+        expected, rel=1e-10, abs=1e-12
+    )
 
 
 def test_gramians_that_do_not_exist(robots):
     lin = fflin.linearize(robots["ets_vii"])
     for model in (lin, lin.discretize(0.1)):
-        with pytest.raises(fflin.InputError, match="not asymptotically stable.*give a duration"):
+        with pytest.raises(fflin.InputError, match=r"not asymptotically stable.*give a duration"):
             fflin.gramians(model)
     with pytest.raises(fflin.InputError, match="positive horizon"):
         fflin.gramians(lin, -1.0)
     with pytest.raises(fflin.InputError, match="multiple of dt"):
         fflin.gramians(lin.discretize(0.1), 0.25)
-    with pytest.raises(fflin.InputError, match="expected a fflin.LinearModel"):
+    with pytest.raises(fflin.InputError, match=r"expected a fflin\.LinearModel"):
         fflin.observability(3)

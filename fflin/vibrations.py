@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
-from fflin.ranks import EPS, Margin, combination, split
+from fflin.naming import combination
+from fflin.ranks import EPS, Margin, split
 from fflin.validation import Array
 
 # Squares of frequencies that differ by less than this many roundings are taken as equal; a
@@ -37,7 +40,7 @@ class Split:
 
 @dataclass(frozen=True)
 class Modes:
-    """Modes of :math:`K \\phi = \\lambda M \\phi`, grouped by equal frequency.
+    r"""Modes of :math:`K \phi = \lambda M \phi`, grouped by equal frequency.
 
     Attributes
     ----------
@@ -105,13 +108,13 @@ def undamped_modes(A: Array, M: Array) -> Modes | None:
     noise = max(r * EPS * float(np.abs(squares).max()), asymmetry)
     edges = np.flatnonzero(np.diff(squares) > _EQUAL * noise) + 1
     bounds = [0, *edges.tolist(), r]
-    groups = tuple(slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True))
+    groups = tuple(slice(a, b) for a, b in pairwise(bounds))
     return Modes(squares, inverse.T @ turned, groups, noise, N, M)
 
 
 def vibration_rows(
     found: Split, modes: Modes, names: tuple[str, ...]
-) -> tuple[Array, tuple[str, ...], Array]:
+) -> tuple[Array, tuple[str, ...], Any]:
     """Return the rows (m, 2 r) that read the undriven modes, their names, and their poles."""
     r = len(modes.M)
     size = np.sqrt(modes.M.diagonal())
@@ -126,7 +129,9 @@ def vibration_rows(
         pole = np.sqrt(complex(0.0 if still else -square))
         kind = "drift" if still else "vibration" if square > 0.0 else "instability"
         speed = "" if still else f" at {abs(pole):.4g} rad/s"
-        shown = [combination(s / np.abs(s * size).max() * size, members, np.ones(r)) for s in shapes.T]
+        shown = [
+            combination(s / np.abs(s * size).max() * size, members, np.ones(r)) for s in shapes.T
+        ]
         for what in ("", "rate of "):
             labels += [f"{what}{kind}{speed} ({shape})" for shape in shown]
         poles += [pole, -pole] * len(shapes.T)
