@@ -16,6 +16,8 @@ _PUBLIC = {
     "Certificate": "linear_model",
     "ChartError": "errors",
     "Check": "verification",
+    "Equilibrium": "balance",
+    "EquilibriumError": "errors",
     "FflinError": "errors",
     "FflinWarning": "errors",
     "FileError": "errors",
@@ -42,6 +44,7 @@ _PUBLIC = {
     "check": "verification",
     "configuration": "model",
     "effort": "points",
+    "equilibrium": "balance",
     "from_model": "loading",
     "linearize": "linearization",
     "linearize_trajectory": "trajectory",
@@ -54,8 +57,10 @@ _PUBLIC = {
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
 
 if TYPE_CHECKING:
+    from fflin.balance import Equilibrium, equilibrium
     from fflin.errors import (
         ChartError,
+        EquilibriumError,
         FflinError,
         FflinWarning,
         FileError,
