@@ -34,6 +34,8 @@ _PUBLIC = {
     "Linearizer": "linearization",
     "MissingPackageError": "errors",
     "ModelError": "errors",
+    "Mode": "eigenmodes",
+    "Modes": "eigenmodes",
     "Momentum": "outputs",
     "Robot": "model",
     "SingularInertiaError": "errors",
@@ -51,6 +53,7 @@ _PUBLIC = {
     "list_robots": "robots",
     "load": "loading",
     "load_inputs": "input_files",
+    "modes": "eigenmodes",
     "velocity": "points",
 }
 
@@ -58,6 +61,7 @@ __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of 
 
 if TYPE_CHECKING:
     from fflin.balance import Equilibrium, equilibrium
+    from fflin.eigenmodes import Mode, Modes, modes
     from fflin.errors import (
         ChartError,
         EquilibriumError,

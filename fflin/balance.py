@@ -16,6 +16,8 @@ from fflin.state import Frame, StateMap
 from fflin.validation import Array
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from fflin.linear_model import LinearModel
 
 _EPS = float(np.finfo(float).eps)
@@ -146,11 +148,10 @@ def equilibrium(
 
 def _require_steady(lin: LinearModel, drift: Array) -> None:
     """Refuse a motion in which something moves that the forces depend on."""
-    positions = len(drift) // 2
     moving = [
         f"{name} at {rate:.3g} {unit}/s"
-        for name, unit, rate in zip(lin.state_names, lin.state_units, drift[:positions].tolist())
-        if rate and name not in lin.ignorable and not name.startswith("q_b.")
+        for name, unit, rate in zip(lin.state_names, lin.state_units, drift.tolist(), strict=True)
+        if rate and name.startswith("q_m.") and name not in lin.ignorable
     ]
     if moving:
         raise EquilibriumError(
@@ -175,7 +176,7 @@ def _rounding(robot: Robot, lin: LinearModel) -> Array:
     return _ROUNDING * terms
 
 
-def _least_norm(C: Array, d: Array, one_sided: Array) -> tuple[Array, Array]:
+def _least_norm(C: Array, d: Array, one_sided: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Return the least u with ``C u = d``, ``u[one_sided] >= 0``, and ``C u - d``.
 
     Where there is none, the u that leaves least.
@@ -205,7 +206,7 @@ def _pseudo_solve(C: Array, d: Array) -> Array:
     return u
 
 
-def _least_distance(C: Array, start: Array, one_sided: Array) -> Array:
+def _least_distance(C: Array, start: Array, one_sided: NDArray[np.bool_]) -> Array:
     """Return the least u = start + Z z with u[one_sided] >= 0, where C Z = 0.
 
     Least distance programming: min |z| subject to G z >= h is solved by the residual
@@ -227,7 +228,7 @@ def _least_distance(C: Array, start: Array, one_sided: Array) -> Array:
     return np.where(one_sided, np.maximum(u, 0.0), u)
 
 
-def _least_residual(C: Array, d: Array, one_sided: Array) -> Array:
+def _least_residual(C: Array, d: Array, one_sided: NDArray[np.bool_]) -> Array:
     """Return a u with u[one_sided] >= 0 that leaves the least ``|C u - d|``."""
     from scipy.optimize import nnls
 

@@ -80,9 +80,9 @@ def least_by_every_active_set(C, d, one_sided):
             u = np.zeros(C.shape[1])
             u[on] = np.linalg.pinv(C[:, on]) @ d
             feasible = np.linalg.norm(C @ u - d) < 1e-9 * np.linalg.norm(d)
-            if feasible and (u[sided] > -1e-12).all():
-                if best is None or np.linalg.norm(u) < np.linalg.norm(best):
-                    best = u
+            better = best is None or np.linalg.norm(u) < np.linalg.norm(best)
+            if feasible and better and (u[sided] > -1e-12).all():
+                best = u
     return best
 
 
@@ -184,7 +184,7 @@ def test_bad_input_is_told():
     robot = fflin.load("cubesat")
     with pytest.raises(fflin.InputError, match="q has shape"):
         fflin.equilibrium(robot, [0.0])
-    with pytest.raises(fflin.InputError, match="expected a fflin.Robot"):
+    with pytest.raises(fflin.InputError, match=r"expected a fflin\.Robot"):
         fflin.equilibrium("cubesat")
     with pytest.raises(fflin.InputError, match="expected one of hybrid"):
         fflin.equilibrium(robot, frame="body")
