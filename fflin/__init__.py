@@ -17,6 +17,8 @@ _PUBLIC = {
     "ChartError": "errors",
     "Check": "verification",
     "Controllability": "structure",
+    "Equilibrium": "balance",
+    "EquilibriumError": "errors",
     "FflinError": "errors",
     "FflinWarning": "errors",
     "FileError": "errors",
@@ -33,7 +35,9 @@ _PUBLIC = {
     "LinearTrajectory": "trajectory",
     "Linearizer": "linearization",
     "MissingPackageError": "errors",
+    "Mode": "eigenmodes",
     "ModelError": "errors",
+    "Modes": "eigenmodes",
     "Momentum": "outputs",
     "Observability": "observation",
     "ReducedModel": "momentum",
@@ -47,6 +51,7 @@ _PUBLIC = {
     "configuration": "model",
     "controllability": "structure",
     "effort": "points",
+    "equilibrium": "balance",
     "from_model": "loading",
     "generalized_inertia": "momentum",
     "generalized_jacobian": "momentum",
@@ -56,6 +61,7 @@ _PUBLIC = {
     "list_robots": "robots",
     "load": "loading",
     "load_inputs": "input_files",
+    "modes": "eigenmodes",
     "momentum_reduction": "momentum",
     "observability": "observation",
     "velocity": "points",
@@ -64,8 +70,11 @@ _PUBLIC = {
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
 
 if TYPE_CHECKING:
+    from fflin.balance import Equilibrium, equilibrium
+    from fflin.eigenmodes import Mode, Modes, modes
     from fflin.errors import (
         ChartError,
+        EquilibriumError,
         FflinError,
         FflinWarning,
         FileError,

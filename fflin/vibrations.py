@@ -39,7 +39,7 @@ class Split:
 
 
 @dataclass(frozen=True)
-class Modes:
+class Vibrations:
     r"""Modes of :math:`K \phi = \lambda M \phi`, grouped by equal frequency.
 
     Attributes
@@ -92,7 +92,7 @@ class Modes:
         return float(min(gaps))
 
 
-def undamped_modes(A: Array, M: Array) -> Modes | None:
+def undamped_modes(A: Array, M: Array) -> Vibrations | None:
     """Return the modes of a model about rest, or None where it is damped or not symmetric."""
     r = len(M)
     N = A[:r, r:]
@@ -109,11 +109,11 @@ def undamped_modes(A: Array, M: Array) -> Modes | None:
     edges = np.flatnonzero(np.diff(squares) > _EQUAL * noise) + 1
     bounds = [0, *edges.tolist(), r]
     groups = tuple(slice(a, b) for a, b in pairwise(bounds))
-    return Modes(squares, inverse.T @ turned, groups, noise, N, M)
+    return Vibrations(squares, inverse.T @ turned, groups, noise, N, M)
 
 
 def vibration_rows(
-    found: Split, modes: Modes, names: tuple[str, ...]
+    found: Split, modes: Vibrations, names: tuple[str, ...]
 ) -> tuple[Array, tuple[str, ...], Any]:
     """Return the rows (m, 2 r) that read the undriven modes, their names, and their poles."""
     r = len(modes.M)
