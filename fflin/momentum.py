@@ -20,7 +20,7 @@ from fflin.validation import Array
 _DRIFT = 1e-9
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ReducedModel(LinearModel):
     """A linear model in the coordinates that its inputs, springs and dampers act on.
 
@@ -85,7 +85,8 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
     lin = checked(lin)
     held = conserved(lin)
     z, T = held.selected, held.T
-    drift = float(np.abs(lin.f0 - T @ lin.f0[z]).max())
+    judged = [name not in lin.ignorable for name in lin.state_names]
+    drift = float(np.abs(lin.f0 - T @ lin.f0[z])[judged].max(initial=0.0))
     if drift > _DRIFT * float(np.abs(lin.f0).max()):
         raise InputError(
             f"the point is no fixed point: |f0| is {np.abs(lin.f0).max():.3g} and changes what "
@@ -105,6 +106,8 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
         "x0": lin.x0[z],
         "state_names": tuple(lin.state_names[i] for i in z),
         "state_units": tuple(lin.state_units[i] for i in z),
+        "ignorable": tuple(lin.state_names[i] for i in z if not judged[i]),
+        "_drift": None if lin._drift is None else lin._drift[z],
         "_inertia": partial(_given, M),
     }
     reduced = ReducedModel(**values, T=T, S=S, momenta=held.momenta, coordinates=held.coordinates)

@@ -26,10 +26,10 @@ def momentum_names(lin: LinearModel, held: Conserved) -> tuple[str, ...]:
     # What the coordinates are counted from: without it every one of them can be moved.
     only_joints = all(rates[i][0] == "qdot_m" for i in held.kept)
     of_base = all(not row[i] for row in held.weights for i in range(nv) if rates[i][0] == "qdot_m")
-    rest = "joints" if only_joints and of_base else "the rest"
+    rest = "the joints" if only_joints and of_base else "the rest"
     return (
         *(combination(row, momenta, 1.0 / size) for row in held.weights),
-        *(f"{combination(row, driven, 1.0 / size)} for given {rest}" for row in held.weights),
+        *(f"{combination(row, driven, 1.0 / size)} with {rest} held" for row in held.weights),
     )
 
 
@@ -49,6 +49,22 @@ def grouped(names: tuple[str, ...]) -> list[str]:
         " ".join(part for part in (head, "/".join(axes), tail) if part)
         for (head, tail), axes in groups.items()
     ]
+
+
+_RATES = {"q_b": "omega_b", "r_b": "v_b", "q_m": "qdot_m"}
+
+
+def with_rates(names: tuple[str, ...]) -> str:
+    """List names in a sentence; rates that come with their positions are said once."""
+    pairs = {}
+    for name in names:
+        group, _, member = name.partition(".")
+        if group in _RATES and f"{_RATES[group]}.{member}" in names:
+            pairs[name] = f"{_RATES[group]}.{member}"
+    if not pairs:
+        return ", ".join(names) or "none"
+    alone = [name for name in names if name not in pairs and name not in pairs.values()]
+    return "; ".join((", ".join(pairs) + " and their rates", *alone))
 
 
 def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int = 3) -> str:

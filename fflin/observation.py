@@ -10,7 +10,7 @@ import numpy as np
 
 from fflin.linear_model import LinearModel
 from fflin.mechanics import checked, scaled, slopes
-from fflin.naming import combination
+from fflin.naming import combination, with_rates
 from fflin.ranks import EPS, Margin, echelon, reached_by, split, unit_columns
 from fflin.tables import width
 from fflin.validation import Array
@@ -63,7 +63,7 @@ class Observability:
             f"({self.method}); {'' if self.detectable else 'not '}detectable"
         ]
         if self.unobservable:
-            lines.append(f"unobservable: {', '.join(self.unobservable)}")
+            lines.append(f"unobservable: {with_rates(self.unobservable)}")
         return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
 
 

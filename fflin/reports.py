@@ -205,7 +205,9 @@ def _moving_most(mode: Mode, names: Sequence[str], room: int) -> str:
             break
         amount = f"{value.real:.2g}"
         if abs(value.imag) > 1e-3 * abs(value):
-            amount = f"{abs(value):.2g} at {math.degrees(math.atan2(value.imag, value.real)):.0f}deg"
+            amount = (
+                f"{abs(value):.2g} at {math.degrees(math.atan2(value.imag, value.real)):.0f}deg"
+            )
         longer = f"{text}, {names[i]} {amount}" if text else f"{names[i]} {amount}"
         if text and len(longer) > room:
             break

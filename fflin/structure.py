@@ -10,7 +10,7 @@ import numpy as np
 
 from fflin.linear_model import LinearModel
 from fflin.mechanics import Conserved, Scaled, checked, conserved, scaled, slopes
-from fflin.naming import combination, grouped, momentum_names
+from fflin.naming import combination, grouped, momentum_names, with_rates
 from fflin.ranks import Margin, echelon, reached_by, split, unit_columns
 from fflin.tables import width
 from fflin.validation import Array
@@ -80,9 +80,8 @@ class Controllability:
             f"{self.robot}: {self.dimension} of {nx} states are controllable ({self.method}); "
             f"{'' if self.stabilizable else 'not '}stabilizable"
         ]
-        if self.controllable:
-            lines.append(f"controllable: {', '.join(self.controllable)}")
         if self.uncontrollable:
+            lines.append(f"controllable: {with_rates(self.controllable)}")
             lines.append(f"uncontrollable: {', '.join(grouped(self.uncontrollable))}")
             placed = [f"{what} in {count}" for what, count in self.reach.items()]
             lines.append(f"directions that the inputs move: {', '.join(placed)}")
