@@ -36,7 +36,15 @@ class ChartError(FflinError, ValueError):
 
 
 class EquilibriumError(FflinError, ValueError):
-    """No input balances what acts on the robot at the point."""
+    """A point is no fixed point where one is needed, or no input makes it one."""
+
+
+class StabilizabilityError(FflinError, ValueError):
+    """The inputs cannot hold what does not settle by itself."""
+
+
+class DetectabilityError(FflinError, ValueError):
+    """The outputs do not show what does not settle by itself."""
 
 
 class MissingPackageError(FflinError, ImportError):
