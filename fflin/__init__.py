@@ -17,7 +17,9 @@ _PUBLIC = {
     "ChartError": "errors",
     "Check": "verification",
     "Compensator": "estimation",
+    "Controllability": "structure",
     "DetectabilityError": "errors",
+    "Equilibrium": "balance",
     "EquilibriumError": "errors",
     "Estimator": "estimation",
     "FflinError": "errors",
@@ -28,6 +30,7 @@ _PUBLIC = {
     "FullState": "outputs",
     "Gain": "regulator",
     "GainSchedule": "schedules",
+    "Gramians": "gramian",
     "Gyroscope": "outputs",
     "InputError": "errors",
     "JointPositions": "outputs",
@@ -37,8 +40,12 @@ _PUBLIC = {
     "LinearTrajectory": "trajectory",
     "Linearizer": "linearization",
     "MissingPackageError": "errors",
+    "Mode": "eigenmodes",
     "ModelError": "errors",
+    "Modes": "eigenmodes",
     "Momentum": "outputs",
+    "Observability": "observation",
+    "ReducedModel": "momentum",
     "Robot": "model",
     "SingularInertiaError": "errors",
     "StabilizabilityError": "errors",
@@ -50,8 +57,13 @@ _PUBLIC = {
     "bryson": "weights",
     "check": "verification",
     "configuration": "model",
+    "controllability": "structure",
     "effort": "points",
+    "equilibrium": "balance",
     "from_model": "loading",
+    "generalized_inertia": "momentum",
+    "generalized_jacobian": "momentum",
+    "gramians": "gramian",
     "kalman": "estimation",
     "linearize": "linearization",
     "linearize_trajectory": "trajectory",
@@ -60,6 +72,9 @@ _PUBLIC = {
     "load_inputs": "input_files",
     "lqg": "estimation",
     "lqr": "regulator",
+    "modes": "eigenmodes",
+    "momentum_reduction": "momentum",
+    "observability": "observation",
     "sampled_cost": "sampling",
     "tvlqr": "schedules",
     "velocity": "points",
@@ -69,6 +84,8 @@ __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of 
 
 if TYPE_CHECKING:
     from fflin.acceleration import acceleration_lqr
+    from fflin.balance import Equilibrium, equilibrium
+    from fflin.eigenmodes import Mode, Modes, modes
     from fflin.errors import (
         ChartError,
         DetectabilityError,
@@ -85,12 +102,20 @@ if TYPE_CHECKING:
         UrdfError,
     )
     from fflin.estimation import Compensator, Estimator, kalman, lqg
+    from fflin.gramian import Gramians, gramians
     from fflin.input_files import load_inputs
     from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
     from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load
     from fflin.model import Robot, configuration
+    from fflin.momentum import (
+        ReducedModel,
+        generalized_inertia,
+        generalized_jacobian,
+        momentum_reduction,
+    )
+    from fflin.observation import Observability, observability
     from fflin.outputs import (
         Accelerometer,
         BasePose,
@@ -109,6 +134,7 @@ if TYPE_CHECKING:
     from fflin.sampling import sampled_cost
     from fflin.schedules import GainSchedule, tvlqr
     from fflin.state import StateMap
+    from fflin.structure import Controllability, controllability
     from fflin.trajectory import LinearTrajectory, linearize_trajectory
     from fflin.verification import Check, check
     from fflin.weights import bryson

@@ -36,7 +36,7 @@ class ChartError(FflinError, ValueError):
 
 
 class EquilibriumError(FflinError, ValueError):
-    """A point is not a fixed point, and what was asked for needs one."""
+    """A point is no fixed point where one is needed, or no input makes it one."""
 
 
 class StabilizabilityError(FflinError, ValueError):
