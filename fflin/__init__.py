@@ -55,6 +55,11 @@ _PUBLIC = {
     "UrdfError": "errors",
     "acceleration_lqr": "acceleration",
     "bryson": "weights",
+    "Allocation": "policies",
+    "Motion": "motion",
+    "StateFeedback": "policies",
+    "TrajectoryFeedback": "policies",
+    "simulate": "simulation",
     "check": "verification",
     "configuration": "model",
     "controllability": "structure",
@@ -115,6 +120,7 @@ if TYPE_CHECKING:
         generalized_jacobian,
         momentum_reduction,
     )
+    from fflin.motion import Motion
     from fflin.observation import Observability, observability
     from fflin.outputs import (
         Accelerometer,
@@ -129,10 +135,12 @@ if TYPE_CHECKING:
         Momentum,
     )
     from fflin.points import effort, velocity
+    from fflin.policies import Allocation, StateFeedback, TrajectoryFeedback
     from fflin.regulator import Gain, lqr
     from fflin.robots import list_robots
     from fflin.sampling import sampled_cost
     from fflin.schedules import GainSchedule, tvlqr
+    from fflin.simulation import simulate
     from fflin.state import StateMap
     from fflin.structure import Controllability, controllability
     from fflin.trajectory import LinearTrajectory, linearize_trajectory

@@ -35,9 +35,14 @@ class Aba:
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 
-    def acceleration(self, q: Array, v: Array, u: Array) -> Array:
-        """Return dv/dt (nv,) in Pinocchio's order; `u` (nu,) in base axes."""
+    def acceleration(self, q: Array, v: Array, u: Array, tau: Array | None = None) -> Array:
+        """Return dv/dt (nv,) in Pinocchio's order; `u` (nu,) in base axes.
+
+        `tau` (nv,), in Pinocchio's order, is a force besides.
+        """
         forces = self.actuation.torques(u) + self._passive_force(q, v)
+        if tau is not None:
+            forces += self.state.forces(tau)
         return self._accelerate(self._model, q, v, forces, self._wrenches(u))
 
     def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:

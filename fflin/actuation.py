@@ -88,6 +88,11 @@ class Actuation:
             for joint, items in carried.items()
         ]
 
+    @property
+    def carried(self) -> bool:
+        """Whether an input's column depends on the configuration."""
+        return bool(self._carried)
+
     def columns(self, data: pin.Data, q: Array) -> Array:
         """Return the generalised force (6 + n, nu), in base axes, of a unit of each input.
 
