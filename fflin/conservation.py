@@ -9,6 +9,7 @@ import pinocchio as pin
 from scipy.linalg.lapack import dposv
 
 from fflin.model import ROOT, Robot
+from fflin.rotation import skew
 from fflin.validation import Array
 
 
@@ -45,7 +46,7 @@ class Conserved:
         """Return the momentum (6,) about a fixed point (3,)."""
         pin.computeCentroidalMomentum(self._model, self._data, q, v)
         hg = self._data.hg.vector
-        angular = hg[3:] + np.cross(self._data.com[0] - point, hg[:3])
+        angular = hg[3:] + skew(self._data.com[0] - point).dot(hg[:3])
         return np.concatenate((angular, hg[:3]))
 
     def wrench(self, q: Array, force: Array, point: Array) -> Array:
@@ -57,11 +58,11 @@ class Conserved:
         placement = self._base(q)
         linear = placement.rotation @ force[3:]
         angular = placement.rotation @ force[:3]
-        angular += np.cross(placement.translation - point, linear)
+        angular += skew(placement.translation - point).dot(linear)
         if self._gravity.any():
             weight = self._mass * self._gravity
             com = pin.centerOfMass(self._model, self._data, q, False)
-            angular += np.cross(com - point, weight)
+            angular += skew(com - point).dot(weight)
             linear += weight
         return np.concatenate((angular, linear))
 
@@ -79,10 +80,7 @@ class Conserved:
         target = np.empty(6)
         target[:3] = linear = R.dot(momentum[3:])
         arm = R.dot(point - placement.translation)
-        target[3:] = R.dot(momentum[:3])
-        target[3] += arm[1] * linear[2] - arm[2] * linear[1]
-        target[4] += arm[2] * linear[0] - arm[0] * linear[2]
-        target[5] += arm[0] * linear[1] - arm[1] * linear[0]
+        target[3:] = R.dot(momentum[:3]) + skew(arm).dot(linear)
         v = v.copy()
         v[:6] += dposv(M[:, :6], target - M.dot(v))[1]
         return v

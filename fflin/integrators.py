@@ -1,4 +1,4 @@
-r"""Steps of fixed size of a motion on the manifold, by name.
+"""Steps of fixed size of a motion on the manifold, by name.
 
 Each takes the acceleration f(t, q, v), whose stages it calls in order, and returns q and v at the
 end. The weights say with which share of the step each stage counts, for what is summed along.
@@ -24,14 +24,14 @@ _integrate = pin.integrate
 
 
 class Integrator(NamedTuple):
-    """A step and the weights of its stages.
+    r"""A step and the weights of its stages.
 
     Attributes
     ----------
     step : callable
     weights : tuple of float
     reach : float
-        Largest \\|pole\\| dt with which it is stable on the negative real axis.
+        Largest |pole| dt with which it is stable on the negative real axis.
     """
 
     step: Step

@@ -66,7 +66,7 @@ def predict(
         if sample:
             e = held.A @ e + held.B @ (u - u0) + held.f0
             continue
-        stages = []
+        stages: list[Array] = []
         for share in (0.0, 0.5, 0.5, 1.0):
             at = e + share * dt * stages[-1] if stages else e
             stages.append(lin.A @ at + lin.B @ (channel.ask(at) - u0) + lin.f0)

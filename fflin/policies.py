@@ -164,9 +164,9 @@ class Allocation:
             )
         inner = bound(self.policy, self.design)
         lin = getattr(self.policy, "lin", None)
-        reference, frame = (lin.reference, lin.frame) if lin else (None, "hybrid")
         asked, given = (
-            StateMap(each, reference=reference, frame=frame) for each in (self.design, robot)
+            StateMap(each, reference=lin.reference, frame=lin.frame) if lin else StateMap(each)
+            for each in (self.design, robot)
         )
         asking, giving = Actuation(asked), Actuation(given)
         data = robot.create_data()

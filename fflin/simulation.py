@@ -31,6 +31,7 @@ Event = Callable[[float, Array, Array], float]
 
 # A turn within one step [rad] beyond which no integrator follows.
 _LARGEST_TURN = 1.0
+_STEP = 0.01  # [s]
 _ROWS_LIMIT = 10_000_000
 
 
@@ -42,7 +43,7 @@ def simulate(
     q0: ArrayLike | None = None,
     v0: ArrayLike | None = None,
     duration: float,
-    dt: float = 0.01,
+    dt: float | None = None,
     method: str = "cf4",
     project: bool = True,
     sample: float | None = None,
@@ -78,8 +79,8 @@ def simulate(
         rest by default.
     duration : float
         [s]
-    dt : float
-        Step [s].
+    dt : float, optional
+        Step [s]; by default 0.01, or less where the loop's fastest pole asks for it.
     method : {"cf4", "rkmk4", "semi_implicit_euler"}
     project : bool
         Whether the momentum is kept as above.
@@ -159,7 +160,7 @@ class _Run:
         self.conserved = Conserved(robot)
         self._law = None if policy is None else bound(policy, robot)
 
-    def begin(self, x0: ArrayLike | None, q0: ArrayLike | None, v0: ArrayLike | None) -> None:
+    def begin(self, x0: Any, q0: Any, v0: Any) -> None:
         """Set the initial point."""
         robot = self.robot
         if x0 is not None:
@@ -174,9 +175,16 @@ class _Run:
         self.x = self._read(self.q, self.v, np.zeros(self.state.nx) if near is None else near)
 
     def clock(
-        self, duration: float, dt: float, every: int, sample: float | None, delay: float
+        self, duration: float, dt: float | None, every: int, sample: float | None, delay: float
     ) -> None:
         """Set the times."""
+        if sample is None and self.lin is not None and self.lin.dt:
+            sample = self.lin.dt
+        self.fastest = 0.0 if sample else self._fastest_pole()
+        if dt is None:
+            dt = _STEP if sample is None else min(sample, sample / np.ceil(sample / _STEP))
+            if self.fastest * dt > 1.0:
+                dt = 0.5 ** np.ceil(np.log2(self.fastest))
         self.dt = _positive("dt", dt)
         duration = _positive("duration", duration)
         self.steps = max(1, round(duration / self.dt))
@@ -191,8 +199,6 @@ class _Run:
             raise InputError(
                 f"{duration:g} s in steps of {self.dt:g} s are {rows} rows; take a larger `every`"
             )
-        if sample is None and self.lin is not None and self.lin.dt:
-            sample = self.lin.dt
         delayed = number("delay", delay)
         if delayed < 0.0:
             raise InputError(f"delay is {delayed:g} s, expected 0 or more")
@@ -239,16 +245,18 @@ class _Run:
         """Set the integrator."""
         self.method = integrator(method)
         self.project = bool(project)
-        K = getattr(self.policy, "K", None)
-        if self.lin is None or K is None or self.sample:
-            return
-        poles = np.linalg.eigvals(self.lin.A - self.lin.B @ K) if not self.lin.dt else np.zeros(1)
-        fastest = float(np.abs(poles).max())
-        if fastest * self.dt > self.method.reach:
+        if self.fastest * self.dt > self.method.reach:
             raise InputError(
                 f"dt is {self.dt:g} s, too large for a loop whose fastest pole is at "
-                f"{fastest:.4g} 1/s; take at most {self.method.reach / fastest:.2g} s, or `sample`"
+                f"{self.fastest:.4g} 1/s; take at most "
+                f"{self.method.reach / self.fastest:.2g} s, or `sample`"
             )
+
+    def _fastest_pole(self) -> float:
+        K = getattr(self.policy, "K", None)
+        if self.lin is None or K is None or self.lin.dt:
+            return 0.0
+        return float(np.abs(np.linalg.eigvals(self.lin.A - self.lin.B @ K)).max())
 
     def guard(self, events: Sequence[Event], callback: Any) -> None:
         """Set what ends the run and what watches it."""
@@ -267,7 +275,7 @@ class _Run:
         self.missing = np.zeros((rows, 6))
         self.count = 0
         self.point = self.q[:3].copy()
-        self.expected = self.conserved.about(self.q, self.v, self.point)
+        self.expected: Array = self.conserved.about(self.q, self.v, self.point)
         bar = Progress(self.steps, progress)
         stopped, step = "", 0
         try:
@@ -313,7 +321,7 @@ class _Run:
         rate = plain if channel is None and not follow else f
         self.q, self.v = self.method.step(self.robot.model, rate, t, q, v, h)
         if follow:
-            self.expected = self.expected + h * (np.array(self.method.weights) @ np.array(pushes))
+            self.expected += h * np.array(self.method.weights) @ np.array(pushes)
         if self.project:
             self.v = self.conserved.impose(self.q, self.v, self.expected, self.point)
         return u

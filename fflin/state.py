@@ -335,6 +335,8 @@ class StateMap:
         return angles
 
     def _unwrap(self, x: Array, near: Array) -> None:
+        if not self._unbounded.size:
+            return
         index = 6 + self._unbounded
         x[index] += 2.0 * np.pi * np.round((near[index] - x[index]) / (2.0 * np.pi))
 
