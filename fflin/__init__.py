@@ -59,6 +59,9 @@ _PUBLIC = {
     "Motion": "motion",
     "StateFeedback": "policies",
     "TrajectoryFeedback": "policies",
+    "plot_matrices": "plots",
+    "plot_motion": "plots",
+    "plot_poles": "plots",
     "simulate": "simulation",
     "check": "verification",
     "configuration": "model",
@@ -134,6 +137,7 @@ if TYPE_CHECKING:
         JointVelocities,
         Momentum,
     )
+    from fflin.plots import plot_matrices, plot_motion, plot_poles
     from fflin.points import effort, velocity
     from fflin.policies import Allocation, StateFeedback, TrajectoryFeedback
     from fflin.regulator import Gain, lqr
