@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 FORMATS = (".png", ".pdf", ".svg")
 
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a6d3b")
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
@@ -37,6 +37,7 @@ _STYLE = {
     "figure.dpi": 150,
     "savefig.dpi": 150,
 }
+_DASHES = ("-", "--", ":", "-.")
 _GROUPS = {
     "q_b": "attitude q_b",
     "r_b": "position r_b",

@@ -321,7 +321,7 @@ class _Run:
         rate = plain if channel is None and not follow else f
         self.q, self.v = self.method.step(self.robot.model, rate, t, q, v, h)
         if follow:
-            self.expected += h * np.array(self.method.weights) @ np.array(pushes)
+            self.expected = self.expected + h * np.dot(self.method.weights, pushes)
         if self.project:
             self.v = self.conserved.impose(self.q, self.v, self.expected, self.point)
         return u
