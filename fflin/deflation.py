@@ -58,9 +58,9 @@ def nonzero_eigenpairs(
     for value, y, x in zip(values.tolist(), left.T, right.T, strict=True):
         error = 1e2 * _EPS * size / max(abs(np.vdot(y, x)), _EPS)
         for step in reversed(steps):
-            # A (V_0 a + V_1 x) = value (V_0 a + V_1 x), and A V_0 = 0.
-            x = step @ x / value  # noqa: PLW2901 - the same vector in a larger space
-        # What slow modes lost to the division, one inverse iteration brings back.
+            # value (V_0 a + V_1 x) = A (V_0 a + V_1 x), and A V_0 = 0; of any size.
+            x = step @ x  # noqa: PLW2901 - the same vector in a larger space
+        # What slow modes lost on the way, one inverse iteration brings back.
         near = whole - (value + _EPS * size) * np.eye(n)
         with suppress(np.linalg.LinAlgError):  # singular to the last bit
             x = np.linalg.solve(near, x / np.linalg.norm(x))  # noqa: PLW2901

@@ -209,7 +209,7 @@ def _free_free(lin: LinearModel, inertia: Array) -> _Found | None:
     rounding = 1e2 * _EPS * float(np.linalg.cond(unit))
     if not np.abs(K - K.T).max(initial=0.0) <= rounding * size:
         return None
-    felt = np.flatnonzero(np.abs(by_s).max(axis=0, initial=0.0) > _NO_STIFFNESS * size)
+    felt = np.flatnonzero(by_s.any(axis=0))
     if not felt.size:
         return [], nv, 2 * nv
     free = np.setdiff1d(np.arange(nv), felt)
@@ -221,8 +221,8 @@ def _free_free(lin: LinearModel, inertia: Array) -> _Found | None:
     for square, vector in zip(squares.tolist(), vectors.T, strict=True):
         if abs(square) <= _NO_STIFFNESS * len(felt) * float(np.abs(squares).max()):
             continue
-        # All that floats follows: -omega^2 s = (d nudot/ds) s.
-        s = by_s[:, felt] @ vector / -square / inertia
+        # All that floats follows: -omega^2 s = (d nudot/ds) s, of any size.
+        s = by_s[:, felt] @ vector / inertia
         root = abs(square) ** 0.5
         for pole in [1j * root] if square > 0.0 else [complex(root), complex(-root)]:
             shape = np.concatenate((N @ s, pole * s))

@@ -141,6 +141,15 @@ def test_poles_are_the_eigenvalues(name, damped):
         assert found.zero_eigenvalues == 12 + 2 * (robot.n - len(some))
         assert not found.unstable and found.equilibrium
         assert found.residual < 1e-13 + 1e-15 * lin.certificate.condition
+        if damped and some:
+            # The joints alone, the base and the free joints floating, have no zeros to disturb.
+            on = [6 + bare.joint_names.index(joint) for joint in some]
+            inverse = fflin.linearize(bare, q).B[6 + robot.n :][np.ix_(on, on)]
+            K, D = ([values[j] for j in some] for values in (robot.stiffness, robot.damping))
+            size = len(on)
+            alone = np.block([[np.zeros((size, size)), np.eye(size)], [-inverse * K, -inverse * D]])
+            expected = np.linalg.eigvals(alone)
+            assert matched(np.log(mine), np.log(expected)) < 3e-13
         if not damped and some:
             # The free-free pencil over all joints, M* by the Schur complement of the base.
             M = fflin.linearize(bare, q).M
@@ -201,6 +210,24 @@ def test_a_spinning_wheel_nutates():
     assert nutation.pole == pytest.approx(1j * 0.5 * 20.0 / 2.3, rel=1e-12)
     assert nutation.damping_ratio == 0.0 and not nutation.unstable
     assert found.zero_eigenvalues == 12
+
+
+@pytest.mark.parametrize("name, rotor", [("canadarm2", "joint_7"), ("ets_vii", "joint_6")])
+def test_what_loses_no_energy_neither_decays_nor_grows(name, rotor):
+    """Springs and a spinning rotor: gyroscopic, so that every pole is imaginary; exactly so."""
+    rng = np.random.default_rng(5)
+    bare = fflin.load(name)
+    q, _, _ = random_point(bare, rng)
+    own = dict(zip(bare.joint_names, fflin.linearize(bare, q).M.diagonal()[6:], strict=True))
+    springs = {joint: own[joint] * rng.uniform(1, 9) for joint in own if joint != rotor}
+    rest = {joint.name: joint.value(q) for joint in bare.joints}
+    robot = bare.replace(stiffness=springs, rest=rest)
+    lin = fflin.linearize(robot, q, fflin.velocity(robot, {rotor: 3.0}))
+    assert lin.is_equilibrium() and lin.A[-len(lin.M) :, -len(lin.M) :].any()
+    found = fflin.modes(lin)
+    assert len(found.vibrations) == len(found.modes) >= len(springs)
+    assert not found.damping_ratios.any() and not found.unstable
+    assert matched(found.poles, np.linalg.eigvals(lin.A)) < 1e-6 * found.frequencies[-1]
 
 
 def test_null_space_thrust_on_moving_links_is_seen_to_be_unstable(capsys):
