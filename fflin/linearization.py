@@ -395,7 +395,7 @@ class Linearizer:
             "pinocchio_version": pin.__version__,
             "_inertia": partial(inertia_matrix, robot),
             "_certify": partial(certify, robot),
-            "ignorable": ignorable_states(robot, moving=self._moving),
+            "_ignorable": partial(ignorable_states, robot),
         }
 
 

