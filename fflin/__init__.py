@@ -33,6 +33,7 @@ _PUBLIC = {
     "MissingPackageError": "errors",
     "ModelError": "errors",
     "Momentum": "outputs",
+    "ReactionWheel": "inputs",
     "Robot": "model",
     "SingularInertiaError": "errors",
     "StateMap": "state",
@@ -67,7 +68,7 @@ if TYPE_CHECKING:
         UrdfError,
     )
     from fflin.input_files import load_inputs
-    from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
+    from fflin.inputs import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
     from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load
