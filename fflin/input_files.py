@@ -191,7 +191,7 @@ def _input(document: _Document, index: int, table: dict[str, Any]) -> Input:
     for key, value in values.items():
         if key not in known:
             raise document.unknown(index, key, unknown(f"key of a {kind}", key, ("type", *known)))
-        right, expected = isinstance(value, str) and value, "a name in quotes"
+        right, expected = isinstance(value, str) and value != "", "a name in quotes"
         if key in _VECTORS:
             right, expected = _is_vector(value), "three finite numbers, [x, y, z]"
         elif key in _NUMBERS:
