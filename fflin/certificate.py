@@ -7,7 +7,6 @@ import numpy as np
 from fflin.aba import Aba
 from fflin.actuation import Actuation
 from fflin.inertia import inverse_inertia
-from fflin.inputs import named_wheels
 from fflin.linear_model import Certificate, LinearModel
 from fflin.model import Robot
 from fflin.rotation import skew
@@ -215,8 +214,7 @@ def motion(state: StateMap, v: Array) -> tuple[Array, float, float]:
     A wheel's speed matters as the momentum [N m s] that it carries, however fast it is.
     """
     speed, robot = np.abs(state.velocities(v)), state.robot
-    wheels = {name: wheel.inertia for name, wheel in named_wheels(robot.inputs)}
-    inertia = np.array([wheels.get(name) or 0.0 for name in robot.joint_names])
+    inertia = np.array([robot.wheels.get(name, 0.0) for name in robot.joint_names])
     momentum = float(inertia @ speed[6:])
     momentum += sum(float(np.linalg.norm(stored)) for _, stored in robot.stored_momentum)
     speed[6:][inertia > 0.0] = 0.0

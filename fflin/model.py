@@ -138,6 +138,12 @@ class Robot:
         return replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
 
     @cached_property
+    def wheels(self) -> dict[str, float]:
+        """{name: inertia [kg m^2]} of the wheels among its joints."""
+        wheels = named_wheels(self.inputs)
+        return {name: wheel.inertia for name, wheel in wheels if wheel.inertia}
+
+    @cached_property
     def stored_momentum(self) -> tuple[tuple[int, Array], ...]:
         """Of wheels without inertia: (Pinocchio joint, momentum (3,) [N m s] in its axes)."""
         return stored_momentum(self.model, self.inputs)
