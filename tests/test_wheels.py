@@ -355,6 +355,28 @@ def test_wheels_are_shown_and_named():
     assert np.flatnonzero(u).tolist() == [lin.input_names.index("wheel_2")]
 
 
+@pytest.mark.parametrize("fields", [{"inertia": 0.002}, {"momentum": 0.5}])
+def test_axis_is_fixed_in_its_frame(fields):
+    """In a frame that stands turned on its link, and in the link's own."""
+    model = fflin.load("servicer_7dof").model.copy()
+    tilt, axis = random_pose(np.random.default_rng(9), 70.0), unit((1.0, 2.0, -0.5))
+    link = model.frames[model.getFrameId("link_3")]
+    placement = link.placement * tilt
+    joint, kind = link.parentJoint, pin.FrameType.OP_FRAME
+    model.addFrame(pin.Frame("tilted", joint, placement, kind))
+    bare = fflin.from_model(model)
+    models = []
+    for turned, frame in ((axis, "tilted"), (tilt.rotation @ axis, "link_3")):
+        robot = bare.replace(inputs=[ReactionWheel(turned, frame, **fields)])
+        joints = dict.fromkeys(bare.joint_names, 0.4)
+        rates = dict.fromkeys(robot.joint_names, 0.5) | {"omega_b.x": 0.3}
+        point = fflin.configuration(robot, joints), fflin.velocity(robot, rates)
+        models.append(fflin.linearize(robot, *point, [0.3]))
+    for name in ("A", "B", "f0"):
+        given, expected = (getattr(lin, name) for lin in models)
+        assert given == pytest.approx(expected, abs=1e-12 * np.abs(expected).max())
+
+
 def test_bad_wheels_are_told_in_a_line():
     robot = fflin.load("servicer_7dof")
     none = ReactionWheel((0, 0, 1))
