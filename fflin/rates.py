@@ -79,6 +79,7 @@ class Dynamics:
         self._model, self._nv = robot.model, 6 + robot.n
         self._inertia = Inertia(state, data)
         self._passive = robot.passive
+        self._resists = any(values.any() for values in robot.passive)
         self._joints = np.arange(6, self._nv)
         self._gravity = np.array(robot.gravity)
         self._root = robot.model.jointPlacements[ROOT].rotation
@@ -114,8 +115,9 @@ class Dynamics:
         if gyroscopic:
             bias = bias - gyroscopic.force
         force = columns.dot(u) - state.forces(bias)
-        stiffness, damping, rest = self._passive
-        force[6:] -= stiffness * (q_m - rest) + damping * nu[6:]
+        if self._resists:
+            stiffness, damping, rest = self._passive
+            force[6:] -= stiffness * (q_m - rest) + damping * nu[6:]
         c = inverse.dot(force)
         by_q, by_v = self._bias_slopes(q_still, v_still, c, u, gyroscopic)
         by_nu = inverse.dot(-by_v)
@@ -141,8 +143,9 @@ class Dynamics:
         if gyroscopic:
             full_q, full_v = full_q - gyroscopic.by_q, full_v - gyroscopic.by_v
         by_q, by_v = state.project(full_q)[:, 6:], state.project(full_v)
-        by_q[self._joints, self._joints - 6] += self._passive.stiffness
-        by_v[self._joints, self._joints] += self._passive.damping
+        if self._resists:
+            by_q[self._joints, self._joints - 6] += self._passive.stiffness
+            by_v[self._joints, self._joints] += self._passive.damping
         return by_q, by_v
 
     def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:

@@ -143,7 +143,7 @@ def _rebuilt(
         index = new.addJoint(
             moved[parent],
             pin.JointModelRUBZ(),
-            pin.SE3(pin.Quaternion.FromTwoVectors(_Z, axis), np.zeros(3)),
+            pin.SE3(_turned_to(axis), np.zeros(3)),
             name,
         )
         spinning = pin.Inertia(0.0, np.zeros(3), inertia * np.outer(_Z, _Z))
@@ -157,6 +157,13 @@ def _rebuilt(
     for name in (name for wheels in carried.values() for name, *_ in wheels):
         new.addJointFrame(new.getJointId(name))
     return new
+
+
+def _turned_to(axis: Array) -> Array:
+    """Return a rotation (3, 3) that takes z to an axis, without rounding if it is x, y or z."""
+    beside = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
+    beside /= np.linalg.norm(beside)
+    return np.column_stack((beside, np.cross(axis, beside), axis))
 
 
 def _depth_first(

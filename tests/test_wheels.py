@@ -235,6 +235,29 @@ def test_stored_momentum_is_a_wheel_held_at_its_speed(name):
     assert lin.f0[6 + bare.n :] == pytest.approx(rates_held, abs=1e-11 * np.abs(rates_held).max())
 
 
+def test_stored_momentum_is_the_limit_of_small_fast_wheels():
+    """At the same momentum the difference in A, B and f0 goes with the inertia."""
+    bare = fflin.load("servicer_7dof")
+    rng = np.random.default_rng(10)
+    joints = {name: rng.uniform(-2.0, 2.0) for name in bare.joint_names}
+    rates = {name: rng.normal() for name in bare.joint_names} | {"omega_b.x": 0.4}
+    u = np.append(rng.normal(size=6 + bare.n), 0.5 + np.arange(4.0))
+    models = []
+    for J in (None, 1e-5, 1e-6):
+        momenta = [(axis, frame, J, 5.0 / (J or 1.0)) for axis, frame, *_ in FOUR]
+        robot, speeds = spinning(bare, momenta) if J else (bare, {})
+        if not J:
+            robot = storing(bare, [(axis, frame, 5.0, 1.0) for axis, frame, *_ in FOUR])
+        point = fflin.configuration(robot, joints), fflin.velocity(robot, rates | speeds)
+        lin = fflin.linearize(robot, *point, u)
+        kept = np.array([".wheel" not in name for name in lin.state_names])
+        models.append((lin.A[np.ix_(kept, kept)], lin.B[kept], lin.f0[kept]))
+    for limit, near, nearer in zip(*models, strict=True):
+        far, close = (np.abs(part - limit).max() for part in (near, nearer))
+        assert close < 1e-3 * np.abs(limit).max()
+        assert far / close == pytest.approx(10.0, rel=0.05)
+
+
 def test_motor_of_a_stored_wheel_turns_its_carrier_back():
     """Its power is minus the torque times the carrier's rate about the axis."""
     axis, frame = unit(FOUR[2][0]), FOUR[2][1]
