@@ -37,6 +37,7 @@ _PUBLIC = {
     "Mode": "eigenmodes",
     "Modes": "eigenmodes",
     "Momentum": "outputs",
+    "ReactionWheel": "inputs",
     "Robot": "model",
     "SingularInertiaError": "errors",
     "StateMap": "state",
@@ -76,7 +77,7 @@ if TYPE_CHECKING:
         UrdfError,
     )
     from fflin.input_files import load_inputs
-    from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
+    from fflin.inputs import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
     from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load

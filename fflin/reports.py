@@ -48,6 +48,7 @@ def robot_info(robot: Robot) -> str:
         joint: "prismatic" if joint.prismatic else "continuous" if joint.unbounded else "revolute"
         for joint in robot.joints
     }
+    kinds |= {joint: "wheel" for joint in robot.joints if joint.name in robot.wheels}
     for joint, leader, multiplier, offset in robot.followers:
         kinds[joint] = f"mimics {leader.name} * {multiplier:g}"
         kinds[joint] += f" {'-' if offset < 0 else '+'} {abs(offset):g}" if offset else ""

@@ -320,3 +320,22 @@ def test_closed_pipe_is_no_error():
         cwd=Path(__file__).parent,
     )
     assert done.stdout.startswith("talos") and not without_warnings(done.stderr)
+
+
+def test_wheels_from_a_file_at_speed(tmp_path):
+    options = ("cubesat", "--inputs", "cubesat", "--velocity", "wheel_z=500")
+    code, out, err = run("linearize", *options, "-o", "m.json", cwd=tmp_path)
+    assert code == 0 and not err
+    saved = json.loads((tmp_path / "m.json").read_text())
+    names = saved["state_names"]
+    row, column = names.index("omega_b.x"), names.index("omega_b.y")
+    # (I - J a a^T) d(omega)/dt = -omega x h, h = 3e-6 * 500 about z
+    expected = -3e-6 * 500.0 / (0.01520407970002 - 3e-6)
+    assert saved["A"][row][column] == pytest.approx(expected, rel=1e-12)
+    code, out, _ = run("check", *options)
+    assert code == 0 and max(map(len, out.splitlines())) <= 80
+    stored = tmp_path / "stored.toml"
+    stored.write_text('[[input]]\ntype = "reaction_wheel"\naxis = [0, 0, 1]\nmomentum = 0.1\n')
+    assert run("check", "cubesat", "--inputs", stored)[0] == 0
+    err = refused("check", "cubesat", "--inputs", stored, "--velocity", "wheel_1=100")
+    assert "wheel 'wheel_1' has no inertia" in err

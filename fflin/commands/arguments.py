@@ -127,8 +127,8 @@ def add_point(command: argparse.ArgumentParser) -> None:
         type=assignment,
         action="append",
         default=[],
-        help="a velocity at the point (repeatable): a joint's rate [rad/s|m/s], or omega_b.x ... "
-        "v_b.z of the base in base axes",
+        help="a velocity at the point (repeatable): the rate [rad/s|m/s] of a joint or "
+        "wheel, or omega_b.x ... v_b.z of the base in base axes",
     )
     command.add_argument(
         "--effort",
