@@ -16,6 +16,8 @@ _PUBLIC = {
     "Certificate": "linear_model",
     "ChartError": "errors",
     "Check": "verification",
+    "Equilibrium": "balance",
+    "EquilibriumError": "errors",
     "FflinError": "errors",
     "FflinWarning": "errors",
     "FileError": "errors",
@@ -32,6 +34,8 @@ _PUBLIC = {
     "Linearizer": "linearization",
     "MissingPackageError": "errors",
     "ModelError": "errors",
+    "Mode": "eigenmodes",
+    "Modes": "eigenmodes",
     "Momentum": "outputs",
     "ReactionWheel": "inputs",
     "Robot": "model",
@@ -43,20 +47,25 @@ _PUBLIC = {
     "check": "verification",
     "configuration": "model",
     "effort": "points",
+    "equilibrium": "balance",
     "from_model": "loading",
     "linearize": "linearization",
     "linearize_trajectory": "trajectory",
     "list_robots": "robots",
     "load": "loading",
     "load_inputs": "input_files",
+    "modes": "eigenmodes",
     "velocity": "points",
 }
 
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
 
 if TYPE_CHECKING:
+    from fflin.balance import Equilibrium, equilibrium
+    from fflin.eigenmodes import Mode, Modes, modes
     from fflin.errors import (
         ChartError,
+        EquilibriumError,
         FflinError,
         FflinWarning,
         FileError,

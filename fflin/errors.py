@@ -35,6 +35,10 @@ class ChartError(FflinError, ValueError):
     """The base is turned by pi from the reference, where the attitude chart ends."""
 
 
+class EquilibriumError(FflinError, ValueError):
+    """No input balances what acts on the robot at the point."""
+
+
 class MissingPackageError(FflinError, ImportError):
     """An optional package is needed and not installed."""
 

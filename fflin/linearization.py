@@ -24,6 +24,7 @@ from fflin.rates import Dynamics, Rates
 from fflin.rotation import skew
 from fflin.state import ANGULAR, LINEAR, Chart, Frame, StateMap
 from fflin.state_equations import STANDING, at_rest, state_equations
+from fflin.symmetry import ignorable_states
 from fflin.validation import Array, vector
 
 if TYPE_CHECKING:
@@ -212,6 +213,10 @@ class Linearizer:
             # The reference turns and flies with the point, so that the error does not.
             turning = skew(nu[ANGULAR])
             A[groups.q_b, groups.q_b] = A[groups.r_b, groups.r_b] = -turning
+            drift, weight = f0.copy(), float(rates.gravity.dot(rates.gravity))
+            if weight:
+                about = rates.gravity * (drift[groups.q_b].dot(rates.gravity) / weight)
+                drift[groups.q_b] -= about
             f0[:] = 0.0
         C, D, y0 = self._seen(chart, rates, q, v, u_base, x0)
         for array in (A, B, C, D, f0, x0, y0):
@@ -221,6 +226,8 @@ class Linearizer:
         point = {"A": A, "B": B, "C": C, "D": D, "f0": f0}
         point |= {"x0": x0, "y0": y0, "u0": u, "q": q, "v": v}
         point["_reference"] = self._reference_of(q)
+        if self._moving:
+            point["_drift"] = _frozen(drift)
         return LinearModel._from_fields(self._common | point)
 
     def _seen(
@@ -271,6 +278,7 @@ class Linearizer:
             "pinocchio_version": pin.__version__,
             "_inertia": partial(inertia_matrix, robot),
             "_certify": partial(certify, robot),
+            "_ignorable": partial(ignorable_states, robot),
         }
 
 

@@ -303,7 +303,7 @@ def test_check_exits_1_where_it_falls_short(monkeypatch, capsys):
 def test_help_has_an_example_in_every_command():
     code, out, _ = run("--help")
     assert code == 0
-    for command in ("robots", "info", "linearize", "check"):
+    for command in ("robots", "info", "linearize", "check", "modes"):
         assert command in out
         code, text, _ = run(command, "--help")
         assert code == 0 and f"example: fflin {command}" in " ".join(text.split())

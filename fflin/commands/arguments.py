@@ -139,6 +139,12 @@ def add_point(command: argparse.ArgumentParser) -> None:
         help="an input at the point (repeatable), by its name in u, such as tau_m.joint_1",
     )
     command.add_argument(
+        "--equilibrium",
+        action="store_true",
+        help="take the least inputs that balance springs, gravity and a steady motion at the "
+        "point; refused where there are none",
+    )
+    command.add_argument(
         "--inputs",
         metavar="FILE.toml",
         help="what acts on the robot, as fflin.load_inputs reads it: a file, or the name of a "
