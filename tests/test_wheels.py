@@ -89,8 +89,9 @@ def test_gyroscopic_block_has_its_closed_form(name, kind):
         expected = np.linalg.solve(lin.M, gyroscopic)
         size = np.abs(expected).max()
         assert lin.A[nv:, nv:] == pytest.approx(expected, abs=1e-11 * size)
-        # A relative equilibrium: nothing accelerates.
         assert np.abs(lin.f0[nv:]).max() < 1e-12
+        # A relative equilibrium: only the wheels' angles move, on which nothing depends.
+        assert lin.is_equilibrium(1e-10)
     if name == "cubesat":
         reduced = np.array(bare.model.inertias[1].inertia)
         if kind == "joints":
