@@ -46,6 +46,7 @@ _PUBLIC = {
     "Momentum": "outputs",
     "Observability": "observation",
     "ReducedModel": "momentum",
+    "ReactionWheel": "inputs",
     "Robot": "model",
     "SingularInertiaError": "errors",
     "StabilizabilityError": "errors",
@@ -112,7 +113,7 @@ if TYPE_CHECKING:
     from fflin.estimation import Compensator, Estimator, kalman, lqg
     from fflin.gramian import Gramians, gramians
     from fflin.input_files import load_inputs
-    from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
+    from fflin.inputs import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
     from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load

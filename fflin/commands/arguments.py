@@ -127,8 +127,8 @@ def add_point(command: argparse.ArgumentParser) -> None:
         type=assignment,
         action="append",
         default=[],
-        help="a velocity at the point (repeatable): a joint's rate [rad/s|m/s], or omega_b.x ... "
-        "v_b.z of the base in base axes",
+        help="a velocity at the point (repeatable): the rate [rad/s|m/s] of a joint or "
+        "wheel, or omega_b.x ... v_b.z of the base in base axes",
     )
     command.add_argument(
         "--effort",
@@ -137,6 +137,12 @@ def add_point(command: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         help="an input at the point (repeatable), by its name in u, such as tau_m.joint_1",
+    )
+    command.add_argument(
+        "--equilibrium",
+        action="store_true",
+        help="take the least inputs that balance springs, gravity and a steady motion at the "
+        "point; refused where there are none",
     )
     command.add_argument(
         "--inputs",

@@ -84,4 +84,12 @@ def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
     reference = pin.SE3.Identity() if arguments.reference == "world" else None
     v = velocity(robot, once("--velocity", arguments.velocity)) if arguments.velocity else None
     u = effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
+    if arguments.equilibrium:
+        if arguments.effort:
+            raise InputError(
+                "--effort and --equilibrium both say the inputs at the point; give either"
+            )
+        from fflin.balance import equilibrium
+
+        u = equilibrium(robot, q, v=v, frame=arguments.frame, reference=reference).u
     return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
