@@ -379,7 +379,7 @@ class _Run:
         drift = np.divide(sizes, scale, out=np.zeros_like(sizes), where=scale > 0.0)
         lin = self.lin if linear is None or linear is True else linear or None
         x = self.rows_x[rows]
-        prediction = np.zeros((0, self.state.nx))
+        prediction: Array = np.zeros((0, self.state.nx))
         K = getattr(self.policy, "K", None)
         if lin is not None and K is not None and lin.state_names == self.state.names:
             loop = (lin, K, self.limits, self.sample, self.delay)
