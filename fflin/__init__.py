@@ -53,6 +53,7 @@ _PUBLIC = {
     "Thruster": "inputs",
     "UnknownNameError": "errors",
     "UrdfError": "errors",
+    "Validity": "region",
     "acceleration_lqr": "acceleration",
     "bryson": "weights",
     "check": "verification",
@@ -77,6 +78,7 @@ _PUBLIC = {
     "observability": "observation",
     "sampled_cost": "sampling",
     "tvlqr": "schedules",
+    "validity": "region",
     "velocity": "points",
 }
 
@@ -129,6 +131,7 @@ if TYPE_CHECKING:
         Momentum,
     )
     from fflin.points import effort, velocity
+    from fflin.region import Validity, validity
     from fflin.regulator import Gain, lqr
     from fflin.robots import list_robots
     from fflin.sampling import sampled_cost
