@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
@@ -86,7 +87,7 @@ class Loop:
         """The slowest decay of the linear loop [1/s]; not positive where it is unstable."""
         poles = np.linalg.eigvals(self.rate)
         if self.lin.dt:
-            return -float(np.log(max(np.abs(poles).max(), 1e-300))) / self.lin.dt
+            return -math.log(max(float(np.abs(poles).max()), 1e-300)) / self.lin.dt
         return -float(poles.real.max())
 
     @cached_property
@@ -102,7 +103,7 @@ class Loop:
 
     def size(self, error: Array) -> float:
         """Return the norm of a deviation (nz,) of the model's states."""
-        return float(np.sqrt(max(error @ self.weight @ error, 0.0)))
+        return math.sqrt(max(float(error @ self.weight @ error), 0.0))
 
     def displaced(
         self, rng: np.random.Generator, attitude: float, position: float, joint: float

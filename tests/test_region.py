@@ -1,6 +1,7 @@
 """How far the linear model and its loop reach."""
 
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,12 +10,14 @@ from test_cli import refused, run
 
 import fflin
 from fflin.closed_loop import Loop
-from fflin.region import _clopper_pearson
+from fflin.region import _LEVELS, _clopper_pearson, _crossing, _slope
 from fflin.weights import default_weights
 
 
 def held(robot, dt=0.0, reduce=False):
-    lin = fflin.linearize(robot)
+    # Bent, since a straight arm has no terms of second order to show.
+    bent = {name: 0.4 + 0.2 * i for i, name in enumerate(robot.joint_names)}
+    lin = fflin.linearize(robot, fflin.configuration(robot, bent))
     lin = fflin.momentum_reduction(lin) if reduce else lin
     lin = lin.discretize(dt) if dt else lin
     return lin, fflin.lqr(lin, *default_weights(lin))
@@ -25,17 +28,26 @@ def arm(robots):
     return robots["planar_detumble"]
 
 
-def test_prediction_error_is_of_second_order(arm):
-    for dt in (0.0, 0.2):
-        lin, gain = held(arm, dt)
-        found = fflin.validity(arm, lin, gain, samples=2)
+def test_prediction_error_is_of_second_order(robots, arm):
+    for robot, dt in ((arm, 0.0), (robots["cubesat"], 0.2)):
+        lin, gain = held(robot, dt)
+        found = fflin.validity(robot, lin, gain, samples=2)
         assert found.slope == pytest.approx(2.0, abs=0.1)
         assert (np.diff(found.prediction_error[:5]) > 0.0).all()
-        assert 0.0 < found.trusted["attitude"] < 90.0
-        # A model that is wrong to first order shows it.
-    lin, gain = held(arm)
-    wrong = fflin.LinearModel(**{**vars(lin), "A": lin.A * 1.02})
-    assert fflin.validity(arm, wrong, gain, samples=1).slope < 1.5
+        assert found.trusted["attitude"] > 0.0
+    # A model that is wrong to first order shows it.
+    robot = robots["cubesat"]
+    lin, gain = held(robot)
+    wrong = replace(lin, B=lin.B * 1.05)
+    assert fflin.validity(robot, wrong, gain, samples=1).slope < 1.2
+
+
+def test_trust_ends_where_the_error_reaches_a_tenth():
+    errors = np.array([0.005, 0.01, 0.02, 0.05, 0.2, np.nan, np.nan])
+    assert 1 / 8 < _crossing(errors) < 1 / 4
+    assert _crossing(np.full(7, 0.05)) == 1.0
+    assert _crossing(np.full(7, 0.2)) == pytest.approx(1 / 128)
+    assert _slope(0.3 * _LEVELS) == pytest.approx(2.0)
 
 
 def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
@@ -71,31 +83,34 @@ def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
     assert motion[-1] == pytest.approx(last - lin.x0, abs=2e-4)
 
 
-def test_same_seed_same_result_whoever_runs_it(arm):
-    lin, gain = held(arm)
-    one = fflin.validity(arm, lin, gain, attitude=170.0, samples=12, seed=3)
+def test_same_seed_same_result_whoever_runs_it(robots):
+    robot = robots["cubesat"]
+    lin, gain = held(robot)
+    options = {"attitude": 170.0, "samples": 6}
+    one = fflin.validity(robot, lin, gain, seed=3, **options)
     for executor in (ProcessPoolExecutor(2), ThreadPoolExecutor(3)):
         with executor:
-            two = fflin.validity(
-                arm, lin, gain, attitude=170.0, samples=12, seed=3, executor=executor
-            )
+            two = fflin.validity(robot, lin, gain, seed=3, executor=executor, **options)
         assert two.outcomes == one.outcomes and two.slope == one.slope
         assert (two.prediction_error == one.prediction_error)[:5].all()
-    other = fflin.validity(arm, lin, gain, attitude=170.0, samples=12, seed=4)
+    other = fflin.validity(robot, lin, gain, seed=4, **options)
     assert (other.prediction_error != one.prediction_error).any()
 
 
-def test_what_the_counts_say(arm):
+def test_what_the_counts_say(robots):
     """A loop that is lost far out: the runs below the first failure, and both intervals."""
-    lin, gain = held(arm)
-    found = fflin.validity(arm, lin, gain, attitude=174.0, position=5.0, joint=3.0, samples=30)
+    robot = robots["ets_vii"]
+    lin, gain = held(robot)
+    found = fflin.validity(robot, lin, gain, attitude=174.0, samples=16)
     failed = [i for i, outcome in enumerate(found.outcomes) if outcome != "settled"]
     assert failed and found.inside == failed[0] > 0
-    assert found.settled == 30 - len(failed)
+    assert found.settled == 16 - len(failed)
     level = found.sampled[found.inside - 1]
-    assert found.holds == {"attitude": 174.0 * level, "position": 5.0 * level, "joint": 3.0 * level}
+    assert found.holds == {"attitude": 174.0 * level, "position": 0.5 * level, "joint": level}
     assert found.inside_rate == pytest.approx(0.05 ** (1.0 / found.inside))
     assert f"{found.inside} of {found.inside} runs" in " ".join(str(found).split())
+    near = fflin.validity(robot, lin, gain, attitude=30.0, position=0.5, joint=0.3, samples=8)
+    assert near.settled == 8
 
 
 def test_interval_is_clopper_and_pearsons():
