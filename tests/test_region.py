@@ -83,6 +83,20 @@ def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
     assert motion[-1] == pytest.approx(last - lin.x0, abs=2e-4)
 
 
+def test_displacements_are_as_large_as_they_say(robots):
+    import pinocchio as pin
+
+    robot = robots["ets_vii"]
+    lin, gain = held(robot)
+    loop = Loop(robot, lin, gain.K)
+    x = loop.displaced(np.random.default_rng(0), 100.0, 0.3, 0.7)
+    q, v = loop.state.to_pinocchio(x)
+    moved = pin.XYZQUATToSE3(lin.q[:7]).actInv(pin.XYZQUATToSE3(q[:7]))
+    assert np.rad2deg(np.linalg.norm(pin.log3(moved.rotation))) == pytest.approx(100.0)
+    assert np.linalg.norm(moved.translation) == pytest.approx(0.3)
+    assert np.abs((x - lin.x0)[6:12]).max() == pytest.approx(0.7) and not v.any()
+
+
 def test_same_seed_same_result_whoever_runs_it(robots):
     robot = robots["cubesat"]
     lin, gain = held(robot)

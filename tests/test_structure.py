@@ -366,3 +366,19 @@ def test_a_file_gives_the_same_answer(robots, tmp_path):
 def test_what_is_no_model_is_refused():
     with pytest.raises(fflin.InputError, match=r"expected a fflin\.LinearModel"):
         fflin.controllability(np.eye(3))
+
+
+LOST = pytest.param(
+    1.0,
+    28,
+    marks=pytest.mark.xfail(strict=True, reason="one of the two lost directions is found only"),
+)
+
+
+@pytest.mark.parametrize(("share", "dimension"), [(0.31, 30), LOST])
+def test_a_lost_vibration_is_lost_to_every_input(robots, share, dimension):
+    robot = robots["servicer_7dof"].replace(stiffness={"panel_left": 100.0})
+    lin = fflin.linearize(robot)
+    period = 2.0 * np.pi / fflin.modes(lin).frequencies[-1]
+    found = fflin.controllability(lin.discretize(share * period))
+    assert found.dimension == dimension and found.stabilizable == (dimension == 30)
