@@ -9,6 +9,7 @@ __version__ = "0.1.0"
 # needs no dynamics does not pay for them.
 _PUBLIC = {
     "Accelerometer": "outputs",
+    "Allocation": "policies",
     "BaseForce": "inputs",
     "BasePose": "outputs",
     "BaseTorque": "inputs",
@@ -44,26 +45,22 @@ _PUBLIC = {
     "ModelError": "errors",
     "Modes": "eigenmodes",
     "Momentum": "outputs",
+    "Motion": "motion",
     "Observability": "observation",
-    "ReducedModel": "momentum",
     "ReactionWheel": "inputs",
+    "ReducedModel": "momentum",
     "Robot": "model",
     "SingularInertiaError": "errors",
     "StabilizabilityError": "errors",
+    "StateFeedback": "policies",
     "StateMap": "state",
     "Thruster": "inputs",
+    "TrajectoryFeedback": "policies",
     "UnknownNameError": "errors",
     "UrdfError": "errors",
+    "Validity": "region",
     "acceleration_lqr": "acceleration",
     "bryson": "weights",
-    "Allocation": "policies",
-    "Motion": "motion",
-    "StateFeedback": "policies",
-    "TrajectoryFeedback": "policies",
-    "plot_matrices": "plots",
-    "plot_motion": "plots",
-    "plot_poles": "plots",
-    "simulate": "simulation",
     "check": "verification",
     "configuration": "model",
     "controllability": "structure",
@@ -84,8 +81,13 @@ _PUBLIC = {
     "modes": "eigenmodes",
     "momentum_reduction": "momentum",
     "observability": "observation",
+    "plot_matrices": "plots",
+    "plot_motion": "plots",
+    "plot_poles": "plots",
     "sampled_cost": "sampling",
+    "simulate": "simulation",
     "tvlqr": "schedules",
+    "validity": "region",
     "velocity": "points",
 }
 
@@ -141,6 +143,7 @@ if TYPE_CHECKING:
     from fflin.plots import plot_matrices, plot_motion, plot_poles
     from fflin.points import effort, velocity
     from fflin.policies import Allocation, StateFeedback, TrajectoryFeedback
+    from fflin.region import Validity, validity
     from fflin.regulator import Gain, lqr
     from fflin.robots import list_robots
     from fflin.sampling import sampled_cost
