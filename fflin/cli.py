@@ -20,6 +20,7 @@ from fflin.commands import (
     models,
     natural_modes,
     regulator,
+    simulation,
 )
 from fflin.errors import FflinError, FflinWarning
 
@@ -86,4 +87,5 @@ def _parser() -> argparse.ArgumentParser:
     analysis.add_commands(commands)
     regulator.add_commands(commands)
     natural_modes.add_commands(commands)
+    simulation.add_commands(commands)
     return parser

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -296,19 +297,24 @@ class _styled:
     """The style, for as long as a figure is drawn, and the class of figures without a window."""
 
     def __enter__(self) -> Any:
-        try:
-            import matplotlib
-            from matplotlib.figure import Figure
-        except ImportError:
-            raise MissingPackageError(
-                "figures need matplotlib; install it with: pip install 'fflin[plot]'"
-            ) from None
+        require_matplotlib()
+        import matplotlib
+        from matplotlib.figure import Figure
+
         self._context = matplotlib.rc_context(_STYLE)
         self._context.__enter__()
         return Figure
 
     def __exit__(self, *problem: object) -> None:
         self._context.__exit__(None, None, None)
+
+
+def require_matplotlib() -> None:
+    """Raise `MissingPackageError` where matplotlib is not installed."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise MissingPackageError(
+            "figures need matplotlib; install it with: pip install 'fflin[plot]'"
+        )
 
 
 def check_figure_format(path: Path) -> None:
