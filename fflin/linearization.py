@@ -20,7 +20,7 @@ from fflin.linear_model import LinearModel
 from fflin.model import Robot
 from fflin.output_equations import output_equations
 from fflin.outputs import FullState
-from fflin.rates import Dynamics, Rates
+from fflin.rates import Accelerations, Rates
 from fflin.rotation import skew
 from fflin.state import ANGULAR, LINEAR, Chart, Frame, StateMap
 from fflin.state_equations import STANDING, at_rest, state_equations
@@ -95,7 +95,7 @@ class Linearizer:
         self._data = robot.create_data()
         self._lock = Lock()  # of the work space
         self._actuation = Actuation(self._map)
-        self._dynamics = Dynamics(self._map, self._actuation, self._data)
+        self._accelerations = Accelerations(self._map, self._actuation, self._data)
         self._sensing: Sensing | None = None
         if robot.outputs != (FullState(),):
             from fflin.sensing import Sensing
@@ -183,7 +183,7 @@ class Linearizer:
 
     def _at_rest(self, q: Array) -> LinearModel:
         B = np.zeros(self._shape_B)
-        self._dynamics.invert(q, B[self._lower])
+        self._accelerations.invert(q, B[self._lower])
         B.setflags(write=False)
         values = self._at_rest_fields.copy()
         values["B"] = B
@@ -201,7 +201,7 @@ class Linearizer:
         chart = STANDING if self._own_reference else state.chart(q)
         nu, q_m = state.velocities(v), state.joint_positions(q)
         u_base = self._actuation.in_base_axes(chart, u)
-        rates = self._dynamics.rates(q, v, nu, q_m, u_base)
+        rates = self._accelerations.rates(q, v, nu, q_m, u_base)
         A, B, f0 = state_equations(self._A_rest, state, self._actuation, chart, rates, nu, u_base)
         x0: Array = np.zeros(state.nx)
         if chart is STANDING:

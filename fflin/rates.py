@@ -59,7 +59,7 @@ class Gyroscopic(NamedTuple):
     by_v: Array
 
 
-class Dynamics:
+class Accelerations:
     r"""``M nudot + b = B u`` of a robot, solved and differentiated in base axes.
 
     The slopes of :math:`\dot\nu = M^{-1}(B u - b(q, \nu))` are those of RNEA at the acceleration,

@@ -48,6 +48,8 @@ def stored_momentum(model: pin.Model, inputs: Sequence[Input]) -> tuple[tuple[in
         if wheel.momentum:
             joint, axis = carrier(model, wheel)
             stored[joint] = stored.get(joint, np.zeros(3)) + wheel.momentum * axis
+    for momentum in stored.values():
+        momentum.setflags(write=False)
     return tuple(stored.items())
 
 
