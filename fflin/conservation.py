@@ -39,15 +39,15 @@ class Conserved:
         self._root = robot.model.jointPlacements[ROOT]
         self._gravity = np.array(robot.gravity)
         self._mass = robot.mass
-        self._joints = np.array([joint.idx_v for joint in robot.joints], dtype=np.intp)
         self._anywhere = self._root.isIdentity(0.0)
+        self._stored = robot.stored_momentum
 
     def about(self, q: Array, v: Array, point: Array) -> Array:
         """Return the momentum (6,) about a fixed point (3,)."""
         pin.computeCentroidalMomentum(self._model, self._data, q, v)
         hg = self._data.hg.vector
         angular = hg[3:] + skew(self._data.com[0] - point).dot(hg[:3])
-        return np.concatenate((angular, hg[:3]))
+        return np.concatenate((angular + self._of_wheels(), hg[:3]))
 
     def wrench(self, q: Array, force: Array, point: Array) -> Array:
         """Return the wrench (6,) about a point, in world axes, of what pushes the robot.
@@ -80,7 +80,11 @@ class Conserved:
         target = np.empty(6)
         target[:3] = linear = R.dot(momentum[3:])
         arm = R.dot(point - placement.translation)
-        target[3:] = R.dot(momentum[:3]) + skew(arm).dot(linear)
+        angular = momentum[:3]
+        if self._stored:
+            pin.forwardKinematics(self._model, self._data, q)
+            angular = angular - self._of_wheels()
+        target[3:] = R.dot(angular) + skew(arm).dot(linear)
         v = v.copy()
         v[:6] += dposv(M[:, :6], target - M.dot(v))[1]
         return v
@@ -91,7 +95,7 @@ class Conserved:
         energy = pin.computeKineticEnergy(model, data, q, v)
         pin.computeCentroidalMomentum(model, data, q, v)
         hg = data.hg.vector
-        central = np.concatenate((hg[3:], hg[:3]))
+        central = np.concatenate((hg[3:] + self._of_wheels(), hg[:3]))
         energy -= self._mass * float(self._gravity @ data.com[0])
         stiffness, _, rest = self._robot.passive
         if stiffness.any():
@@ -102,7 +106,15 @@ class Conserved:
         scale = np.array(
             [np.linalg.norm(base[part]) + np.linalg.norm(joints[part]) for part in _PARTS]
         )
+        scale[0] += sum(float(np.linalg.norm(stored)) for _, stored in self._stored)
         return Momenta(float(energy), central, scale)
+
+    def _of_wheels(self) -> Array:
+        """Return the stored momentum (3,) where the links were put last."""
+        total: Array = np.zeros(3)
+        for joint, stored in self._stored:
+            total += self._data.oMi[joint].rotation @ stored
+        return total
 
     def _base(self, q: Array) -> pin.SE3:
         placement = pin.XYZQUATToSE3(q[:7])

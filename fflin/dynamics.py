@@ -46,6 +46,7 @@ class Dynamics:
         self._plain = (
             state.S is None
             and not self.actuation.carried
+            and not robot.stored_momentum
             and not any(values.any() for values in robot.passive)
             and not any(robot.gravity)
         )

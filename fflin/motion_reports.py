@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 # Of an error relative to its largest, where a motion is taken to have settled.
 _SETTLED = 0.02
 
+# Below which an error is rounding, in SI units.
+_NOTHING = 1e-14
+
 
 def motion_report(motion: Motion, *, controlled: bool = True) -> str:
     """Show where a motion began and ended, what it took, and the figures that prove it."""
@@ -54,9 +57,9 @@ def motion_report(motion: Motion, *, controlled: bool = True) -> str:
 def _course(error: np.ndarray, t: np.ndarray) -> list[str]:
     largest = float(error.max())
     outside = np.flatnonzero(error > _SETTLED * largest)
-    if not largest:
-        settled = "."
-    elif len(outside) and outside[-1] == len(error) - 1:
+    if largest < _NOTHING:
+        return [".", ".", ".", "."]
+    if len(outside) and outside[-1] == len(error) - 1:
         settled = "not yet"
     else:
         settled = f"{t[outside[-1] + 1]:.3g}"
