@@ -117,6 +117,10 @@ def test_what_is_no_fixed_point_is_refused_with_its_rows():
     for point in (fflin.linearize(robot, None, v), fflin.linearize(robot, None, v).discretize(0.1)):
         with pytest.raises(fflin.EquilibriumError, match=r"d q_m\.joint_1/dt = 0\.2.*and \d+ more"):
             fflin.lqr(point, 1, 1)
+    with pytest.raises(fflin.EquilibriumError, match=r"d qdot_m\.joint_2/dt"):
+        fflin.lqr(fflin.linearize(robot, None, v, moving=True), 1, 1)
+    # Flying along is steady.
+    v = fflin.velocity(robot, {"v_b.x": 0.1})
     steady = fflin.lqr(fflin.linearize(robot, None, v, moving=True), 1, 1)
     assert steady.residual < 1e-14 and steady.margin > 0.0
 
@@ -144,7 +148,9 @@ def test_springs_do_not_hide_that_momentum_is_conserved():
     robot = joints_only(fflin.load("servicer_7dof").replace(stiffness=20.0, damping=1.0))
     with pytest.raises(fflin.StabilizabilityError, match="base attitude and position"):
         fflin.lqr(fflin.linearize(robot), 1, 1)
-    # The base holds joints that springs hold.
+    # Without what is conserved it can be held, and so can all with the base's inputs.
+    reduced = fflin.lqr(fflin.momentum_reduction(fflin.linearize(robot)), 1, 1)
+    assert reduced.K.shape == (9, 18) and reduced.residual < 1e-14
     flexible = robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce()])
     gain = fflin.lqr(fflin.linearize(flexible), 1, 1e-4)
     assert gain.method == "general" and gain.residual < 1e-13 and gain.margin > 0.0
