@@ -9,6 +9,7 @@ from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
 import fflin
+from fflin.margins import _norm
 from fflin.sampling import held_cost
 
 
@@ -184,6 +185,21 @@ def test_margins_are_the_least_over_all_frequencies(lin, gain):
         factors = np.exp(rng.uniform(np.log(low), np.log(high), 12))
         loop = sampled.A - sampled.B @ (factors[:, None] * sampled.K)
         assert np.abs(np.linalg.eigvals(loop)).max() < 1.0
+
+
+def test_the_largest_gain_of_a_resonance_is_found_between_the_poles():
+    """w^2/(s^2 + 2 z w s + w^2) has its largest gain, 1/(2 z sqrt(1 - z^2)), below w."""
+    for z in (0.05, 0.3, 0.6):
+        A = np.array([[0.0, 1.0], [-9.0, -6.0 * z]])
+        B, C = np.array([[0.0], [9.0]]), np.array([[1.0, 0.0]])
+        exact = 1.0 / (2.0 * z * np.sqrt(1.0 - z**2))
+        assert _norm(A, B, C, np.zeros((1, 1))) == pytest.approx(exact, rel=2e-5)
+        # With a direct term, on a dense grid.
+        D = np.array([[0.7]])
+        response = D + [
+            C @ np.linalg.solve(1j * w * np.eye(2) - A, B) for w in np.linspace(0, 9, 9001)
+        ]
+        assert _norm(A, B, C, D) == pytest.approx(np.abs(response).max(), rel=3e-5)
 
 
 def test_sampled_cost_is_the_integral_under_held_inputs(lin):
