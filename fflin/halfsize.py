@@ -81,6 +81,8 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> Loop | N
         return None
     C = np.zeros((nx, nx), order="F")
     C[:m, m:], C[m:, :m], C[m:, m:] = G.T, -G, D
+    if not np.isfinite(C).all():
+        return None
     real, imag, _, W, failed = dgeev(C, compute_vl=0, overwrite_a=1)
     if failed or ((imag == 0.0) & (real <= 0.0)).any():
         return None

@@ -60,7 +60,7 @@ class Modes:
         factors, pivots, _ = dgetrf(V)
         inverse, failed = dgetri(factors, pivots, overwrite_lu=1)
         outer = poles[:, None] * poles - 1.0 if discrete else poles[:, None] + poles
-        if failed or not outer.all():
+        if failed or not (outer.all() and np.isfinite(inverse).all()):
             raise np.linalg.LinAlgError("the modes are not independent")
         self.V, self.inverse, self.spectrum = V, inverse, spectrum
         self._factors = -1.0 / outer
@@ -68,6 +68,8 @@ class Modes:
     @classmethod
     def of(cls, F: Array, discrete: bool) -> Modes:
         """Compute the modes of a matrix."""
+        if not np.isfinite(F).all():
+            raise np.linalg.LinAlgError("the matrix is not finite")
         real, imag, _, V, failed = dgeev(F, compute_vl=0)
         if failed:
             raise np.linalg.LinAlgError("the eigenvalues did not converge")
@@ -121,6 +123,8 @@ class Modes:
 
 def eigenvalues(F: Array) -> Any:
     """Return the eigenvalues of a real matrix."""
+    if not np.isfinite(F).all():
+        raise np.linalg.LinAlgError("the matrix is not finite")
     real, imag, _, _, failed = dgeev(F, compute_vl=0, compute_vr=0)
     if failed:
         raise np.linalg.LinAlgError("the eigenvalues did not converge")

@@ -112,6 +112,23 @@ def test_bad_weights_are_named(lin):
         fflin.lqr(fflin.load("ets_vii"), 1, 1)
 
 
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_weights_of_any_size_give_a_gain_or_one_clear_line(lin, dt):
+    model = lin.discretize(dt) if dt else lin
+    sizes = (1e-300, 1e-150, 1e-20, 1.0, 1e20, 1e150, 1e300)
+    solved = 0
+    for q in sizes:
+        for r in sizes:
+            try:
+                gain = fflin.lqr(model, q, r)
+            except fflin.StabilizabilityError as error:
+                assert "scale the weights" in str(error)
+            else:
+                assert np.isfinite(gain.K).all() and gain.margin > 0.0
+                solved += 1
+    assert solved >= 7
+
+
 def test_what_is_no_fixed_point_is_refused_with_its_rows():
     robot = fflin.load("ets_vii")
     v = fflin.velocity(robot, {"omega_b.z": 0.1, "joint_1": 0.2})
