@@ -103,7 +103,7 @@ class Modes:
     def poles(self, F: Array) -> Any:
         """Return the eigenvalues of a matrix near to that of these modes.
 
-        Where it is so near that they decouple to eight digits they are read off, else computed.
+        Where it is so near that they decouple to seven digits they are read off, else computed.
         """
         first, second = self.spectrum.first, self.spectrum.second
         M = self.inverse @ F @ self.V
@@ -116,7 +116,7 @@ class Modes:
         for block, sign in zip(blocks, (-1.0, 1.0), strict=True):
             block.flat[:: block.shape[1] + 1] += sign * pairs.imag
         # Those of a normal matrix times E + X move by the norm of X at most, relatively.
-        if np.linalg.norm(M / np.abs(values)) <= 1e-8:
+        if np.linalg.norm(M / np.abs(values)) <= 1e-7:
             return values
         return eigenvalues(F)
 

@@ -20,7 +20,9 @@ _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 _SOUND = 1e-11
 _STEPS = 25
 
-# Of a residual below which Newton's method lowers it at every step.
+# Of a residual: where what a step does not lower is rounding, and where Newton's method lowers it
+# at every step.
+_ROUNDED = 1e-12
 _NEAR = 1e-3
 
 
@@ -235,9 +237,12 @@ def _refined(equation: Riccati, P: Array, modes: Modes | None) -> tuple[_Trial, 
             trial = better
         if trial.residual < best.residual:
             best = trial
-        if gain < 10.0:
-            # What is left is rounding, or these modes are those of another loop.
-            if trial.residual < 100.0 * enough or (fresh and gain <= 1.0 and trial is not better):
+        if trial.residual < _ROUNDED:
+            if gain < 2.0:
+                break
+        elif gain < 10.0:
+            # These modes are those of another loop.
+            if fresh and trial is not better:
                 break
             modes = None
     return best, modes
