@@ -273,7 +273,7 @@ class _Run:
         self.rows_q, self.rows_v = np.empty((rows, self.robot.nq)), np.empty((rows, self.robot.nv))
         self.rows_x, self.rows_u = np.empty((rows, self.state.nx)), np.empty((rows, nu))
         self.missing = np.zeros((rows, 6))
-        self.count = 0
+        self.count, self.orbital = 0, 0.0
         self.point = self.q[:3].copy()
         self.expected: Array = self.conserved.about(self.q, self.v, self.point)
         bar = Progress(self.steps, progress)
@@ -300,7 +300,7 @@ class _Run:
         t, q, v, h = step * self.dt, self.q, self.v, self.dt
         channel, dynamics = self.channel, self.dynamics
         pushes: list[Array] = []
-        follow = self.project and not dynamics.isolated
+        follow = not dynamics.isolated
         if channel is None:
             u = self.initial
             plain = dynamics.free(q, v)
@@ -355,6 +355,8 @@ class _Run:
         self.rows_x[row] = self.x
         about = self.conserved.about(self.q, self.v, self.point)
         self.missing[row] = about - self.expected
+        arm = float(np.linalg.norm(self.q[:3] - self.point))
+        self.orbital = max(self.orbital, arm * float(np.linalg.norm(self.expected[3:])))
         self.count += 1
         if self.callback is not None:
             self.callback(t, self.q, self.v, u)
@@ -374,6 +376,8 @@ class _Run:
         q, v = self.rows_q[rows], self.rows_v[rows]
         momenta = [self.conserved.momenta(*point) for point in zip(q, v, strict=True)]
         scale = np.max([each.scale for each in momenta], axis=0)
+        # About a fixed point the flight of the whole counts too.
+        scale[0] += self.orbital
         parts = self.missing[rows].reshape(-1, 2, 3)
         sizes = np.linalg.norm(parts, axis=2)
         drift = np.divide(sizes, scale, out=np.zeros_like(sizes), where=scale > 0.0)
