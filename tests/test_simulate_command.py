@@ -26,15 +26,15 @@ def test_a_loop_settles_is_saved_and_drawn(tmp_path):
 
 def test_target_sampling_limits_and_delay(tmp_path):
     code, _, err = run(
-        *("simulate", "planar_detumble", "--target-joint", "joint_1=0.5", "--dt", 0.1),
-        *("--limit", "tau_m=0.05", "--delay", 0.1, "--duration", 20, "--step", 0.02),
+        *("simulate", "ets_vii", "--target-joint", "joint_1=0.5", "--dt", 0.1),
+        *("--limit", "tau_m=8", "--delay", 0.1, "--duration", 30, "--step", 0.02),
         *("-o", "m.json"),
         cwd=tmp_path,
     )
     assert (code, err) == (0, "")
     motion = fflin.Motion.load(tmp_path / "m.json")
     joints = [i for i, name in enumerate(motion.input_names) if name.startswith("tau_m")]
-    assert np.abs(motion.u[:, joints]).max() == 0.05
+    assert np.abs(motion.u[:, joints]).max() == 8.0
     assert not motion.u[:5].any()
     assert motion.x[-1, motion.state_names.index("q_m.joint_1")] == pytest.approx(0.5, abs=0.02)
 
