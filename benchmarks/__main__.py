@@ -1,14 +1,9 @@
 """The command: ``python -m benchmarks [CASE ...] [--readme]``."""
 
-import os
-
-# Before anything loads BLAS or OpenMP: one thread, for all alike.
-for _name in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
-    os.environ[f"{_name}_NUM_THREADS"] = "1"
-
 import argparse
 import importlib
 import logging
+import os
 import sys
 import time
 import warnings
@@ -29,6 +24,8 @@ def main() -> None:
     wrong = [case for case in arguments.cases if case not in ORDER]
     if wrong or (arguments.cases and arguments.readme):
         parser.error(f"CASE is one of {', '.join(ORDER)}; --readme takes none, it runs all")
+    # Before a case loads BLAS or OpenMP: one thread, for all alike.
+    os.environ |= {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
     warnings.simplefilter("ignore")  # of robots whose inertias are not rigid, told once is enough
     logging.getLogger("drake").setLevel(logging.ERROR)
     made = []

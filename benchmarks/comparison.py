@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable
 
-from benchmarks.peers import MODULES, methods
+from benchmarks.peers import methods
 from benchmarks.peers.pinocchio_peer import FLOOR
 from benchmarks.robots import Point
 from benchmarks.tables import Table, figure
@@ -33,18 +33,14 @@ def compare(
     fflin_call : callable
         Makes what is timed of fflin.
     too_slow : callable
-        The peers to leave out at a point.
+        Names of the methods to leave out at a point.
     """
     rows: list[dict[str, str]] = []
     notes: dict[str, None] = {}
     columns = ["robot", "n", f"{FFLIN} [us]"]
     for point in points:
-        slow = too_slow(point)
-        found, left_out = methods(what, point, skip=slow)
-        notes |= dict.fromkeys(left_out)
-        left_out = [name.removesuffix("_peer") for name in MODULES if name in slow]
-        if left_out:
-            notes[f"{', '.join(left_out)}: left out on {point.robot.name}, too slow"] = None
+        found, said = methods(what, point, too_slow(point))
+        notes |= dict.fromkeys(said)
         calls = {FFLIN: fflin_call(point)} | {method.name: method.call for method in found}
         times = interleaved(calls)
         own = times.pop(FFLIN)

@@ -42,7 +42,10 @@ class Table:
 
 
 def _cells(row: Sequence[str], widths: Sequence[int]) -> list[str]:
-    return [row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]
+    return [
+        row[0].ljust(widths[0]),
+        *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)),
+    ]
 
 
 def figure(value: float | None) -> str:
@@ -85,7 +88,9 @@ def insert_in_readme(tables: Sequence[Table], command: str) -> None:
     if not found:
         raise SystemExit(f"README.md has no '{BEGIN}' followed by '{END}'")
     shown = [table for table in tables if table.in_readme]
-    body = "\n".join(f"{table.title}. {table.about}\n\n" + "\n".join(table.grid()) + "\n" for table in shown)
+    body = "\n".join(
+        f"{table.title}. {table.about}\n\n" + "\n".join(table.grid()) + "\n" for table in shown
+    )
     README.write_text(
         f"{before}{BEGIN}\n{body}\n`{command}` made these on: {machine()}\n{END}{after}",
         encoding="utf-8",

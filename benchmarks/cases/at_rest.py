@@ -11,8 +11,8 @@ def run() -> Table:
         "at_rest",
         "One linearisation at rest",
         "fflin's time, its ratio to its floor (crba, dpotrf and dpotri called by hand), and the "
-        "peers' times as multiples of fflin's: above 1, fflin is faster. From a configuration to A "
-        "and B; MuJoCo by hand is kinematics, inertia, factor and solve, to M^-1 alone.",
+        "peers' times as multiples of fflin's: above 1, fflin is faster. MuJoCo by hand is "
+        "kinematics, inertia, factor, solve and B, without checks, names or units.",
         (random_point(load(name)) for name in NAMES),
         fflin_call,
         in_readme=True,

@@ -6,7 +6,7 @@ from benchmarks.robots import Point, generated, random_point
 from benchmarks.tables import Table
 
 SIZES = (10, 30, 100, 300)
-DRAKE_UP_TO, DIFFERENCES_UP_TO = 100, 100
+BEYOND_100 = ("MuJoCo mjd_transitionFD", "Drake FirstOrderTaylorApproximation")
 
 
 def run() -> Table:
@@ -22,4 +22,4 @@ def run() -> Table:
 
 
 def _too_slow(point: Point) -> tuple[str, ...]:
-    return ("mujoco_peer", "drake_peer") if point.robot.n > 100 else ()
+    return BEYOND_100 if point.robot.n > 100 else ()

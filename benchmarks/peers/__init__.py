@@ -43,7 +43,9 @@ class WrongResultError(Exception):
     """A peer's result is not fflin's: there is nothing to compare."""
 
 
-def methods(what: str, point: Point, skip: tuple[str, ...] = ()) -> tuple[list[Method], list[str]]:
+def methods(
+    what: str, point: Point, left_out: tuple[str, ...] = ()
+) -> tuple[list[Method], list[str]]:
     """Return every peer's checked methods for a case, and what was left out and why.
 
     Parameters
@@ -51,14 +53,12 @@ def methods(what: str, point: Point, skip: tuple[str, ...] = ()) -> tuple[list[M
     what : {"at_rest", "at_point"}
         Function of the peers' modules.
     point : Point
-    skip : tuple of str
-        Modules that are too slow for the case.
+    left_out : tuple of str
+        Names of methods that are too slow for the case.
     """
     found: list[Method] = []
     notes: list[str] = []
     for module_name in MODULES:
-        if module_name in skip:
-            continue
         name = module_name.removesuffix("_peer")
         try:
             module = importlib.import_module(f"benchmarks.peers.{module_name}")
@@ -72,6 +72,9 @@ def methods(what: str, point: Point, skip: tuple[str, ...] = ()) -> tuple[list[M
             notes.append(f"{name}: cannot load {point.robot.name}: {text[:120]}")
             continue
         for method in offered:
+            if method.name in left_out:
+                notes.append(f"{method.name}: left out on {point.robot.name}, too slow")
+                continue
             check(method, point, at_rest=what == "at_rest")
             found.append(method)
     return found, notes

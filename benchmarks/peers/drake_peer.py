@@ -3,8 +3,8 @@
 import numpy as np
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.primitives import FirstOrderTaylorApproximation
 from pydrake.systems.framework import OutputPortSelection
+from pydrake.systems.primitives import FirstOrderTaylorApproximation
 
 from benchmarks.peers import Method
 from benchmarks.robots import BASE, Array, Point, is_rigid, plain_urdf

@@ -59,7 +59,9 @@ def _motor(spec: "mujoco.MjSpec", joint: str, axis: int) -> None:
 def at_rest(point: Point) -> list[Method]:
     here = MujocoPoint(point)
     model, data, order, qpos = here.model, here.data, here.order, here.qpos
-    unit, inverse = np.eye(here.nv), np.zeros((here.nv, here.nv))
+    nv = here.nv
+    unit, inverse = np.eye(nv), np.zeros((nv, nv))
+    kept: dict[str, Array] = {}
     fill_inertia = getattr(mujoco, "mj_makeM", mujoco.mj_crb)
 
     def by_hand() -> None:
@@ -69,9 +71,11 @@ def at_rest(point: Point) -> list[Method]:
         fill_inertia(model, data)
         mujoco.mj_factorM(model, data)
         mujoco.mj_solveM(model, data, inverse, unit)
+        kept["B"] = B = np.zeros((2 * nv, nv))
+        B[nv:] = inverse
 
     def slopes() -> Array:
-        return inverse[np.ix_(order, order)]
+        return kept["B"][nv:][np.ix_(order, order)]
 
     here.qvel[:] = here.ctrl[:] = 0.0
     return [Method("MuJoCo by hand", by_hand, slopes), _transition(MujocoPoint(point), rest=True)]
