@@ -68,7 +68,7 @@ def generated(kind: str, n: int) -> fflin.Robot:
     """Return a chain or a tree of `n` revolute joints; in a tree two hang on every link."""
     model, rng = pin.Model(), np.random.default_rng(n)
     base = pin.Inertia(500.0, np.array([0.05, 0.0, 0.1]), np.diag([80.0, 90.0, 100.0]))
-    link = pin.Inertia(4.0, np.array([0.15, 0.01, 0.02]), np.diag([0.02, 0.06, 0.07]))
+    link = pin.Inertia(4.0, np.array([0.05, 0.01, 0.02]), np.diag([0.02, 0.06, 0.07]))
     root = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
     model.appendBodyToJoint(root, base, pin.SE3.Identity())
     kinds = (pin.JointModelRZ, pin.JointModelRY, pin.JointModelRX)
@@ -78,7 +78,7 @@ def generated(kind: str, n: int) -> fflin.Robot:
         parent, count = waiting.pop()
         if not count:
             continue
-        place = pin.SE3(pin.exp3(0.3 * rng.normal(size=3)), np.array([0.3, 0.0, 0.0]))
+        place = pin.SE3(pin.exp3(0.3 * rng.normal(size=3)), np.array([0.1, 0.0, 0.0]))
         index = model.njoints - 2
         joint = model.addJoint(parent, kinds[index % 3](), place, f"joint_{index}")
         model.appendBodyToJoint(joint, link, pin.SE3.Identity())
