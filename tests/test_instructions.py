@@ -5,6 +5,7 @@ import shutil
 import sys
 
 import pytest
+
 from benchmarks.instructions import BASELINE, TOLERANCE, ratios
 
 
