@@ -16,12 +16,18 @@ _PUBLIC = {
     "Certificate": "linear_model",
     "ChartError": "errors",
     "Check": "verification",
+    "Compensator": "estimation",
+    "DetectabilityError": "errors",
+    "EquilibriumError": "errors",
+    "Estimator": "estimation",
     "FflinError": "errors",
     "FflinWarning": "errors",
     "FileError": "errors",
     "FramePose": "outputs",
     "FrameVelocity": "outputs",
     "FullState": "outputs",
+    "Gain": "regulator",
+    "GainSchedule": "schedules",
     "Gyroscope": "outputs",
     "InputError": "errors",
     "JointPositions": "outputs",
@@ -35,27 +41,38 @@ _PUBLIC = {
     "Momentum": "outputs",
     "Robot": "model",
     "SingularInertiaError": "errors",
+    "StabilizabilityError": "errors",
     "StateMap": "state",
     "Thruster": "inputs",
     "UnknownNameError": "errors",
     "UrdfError": "errors",
+    "acceleration_lqr": "acceleration",
+    "bryson": "weights",
     "check": "verification",
     "configuration": "model",
     "effort": "points",
     "from_model": "loading",
+    "kalman": "estimation",
     "linearize": "linearization",
     "linearize_trajectory": "trajectory",
     "list_robots": "robots",
     "load": "loading",
     "load_inputs": "input_files",
+    "lqg": "estimation",
+    "lqr": "regulator",
+    "sampled_cost": "sampling",
+    "tvlqr": "schedules",
     "velocity": "points",
 }
 
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
 
 if TYPE_CHECKING:
+    from fflin.acceleration import acceleration_lqr
     from fflin.errors import (
         ChartError,
+        DetectabilityError,
+        EquilibriumError,
         FflinError,
         FflinWarning,
         FileError,
@@ -63,9 +80,11 @@ if TYPE_CHECKING:
         MissingPackageError,
         ModelError,
         SingularInertiaError,
+        StabilizabilityError,
         UnknownNameError,
         UrdfError,
     )
+    from fflin.estimation import Compensator, Estimator, kalman, lqg
     from fflin.input_files import load_inputs
     from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
     from fflin.linear_model import Certificate, LinearModel
@@ -85,10 +104,14 @@ if TYPE_CHECKING:
         Momentum,
     )
     from fflin.points import effort, velocity
+    from fflin.regulator import Gain, lqr
     from fflin.robots import list_robots
+    from fflin.sampling import sampled_cost
+    from fflin.schedules import GainSchedule, tvlqr
     from fflin.state import StateMap
     from fflin.trajectory import LinearTrajectory, linearize_trajectory
     from fflin.verification import Check, check
+    from fflin.weights import bryson
 
 
 def __getattr__(name: str) -> Any:
