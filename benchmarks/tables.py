@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import platform
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +10,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 RESULTS, README = ROOT / "benchmarks" / "results.md", ROOT / "README.md"
 BEGIN, END = "<!-- benchmarks: begin -->", "<!-- benchmarks: end -->"
-PACKAGES = (
-    *("fflin", "pin", "numpy", "scipy", "numba", "mujoco", "drake", "crocoddyl"),
-    *("adam-robotics", "casadi", "control"),
-)
+PACKAGES = ("pin", "numpy", "scipy", "numba", "mujoco", "drake", "crocoddyl", "control")
 MISSING = "–"
 
 
@@ -65,7 +63,9 @@ def machine() -> str:
             cpu = next(line.split(":")[1].strip() for line in file if "model name" in line)
     except (OSError, StopIteration):
         pass
-    versions = [f"Python {platform.python_version()}"]
+    from fflin import __version__
+
+    versions = [f"Python {platform.python_version()}", f"fflin {__version__}"]
     for name in PACKAGES:
         try:
             versions.append(f"{name} {importlib.metadata.version(name)}")
@@ -89,9 +89,14 @@ def insert_in_readme(tables: Sequence[Table], command: str) -> None:
         raise SystemExit(f"README.md has no '{BEGIN}' followed by '{END}'")
     shown = [table for table in tables if table.in_readme]
     body = "\n".join(
-        f"{table.title}. {table.about}\n\n" + "\n".join(table.grid()) + "\n" for table in shown
+        textwrap.fill(f"{table.title}. {table.about}", 100)
+        + "\n\n"
+        + "\n".join(table.grid())
+        + "\n"
+        for table in shown
     )
+    made = textwrap.fill(f"`{command}` made these on: {machine()}", 100)
     README.write_text(
-        f"{before}{BEGIN}\n{body}\n`{command}` made these on: {machine()}\n{END}{after}",
+        f"{before}{BEGIN}\n{body}\n{made}\n{END}{after}",
         encoding="utf-8",
     )

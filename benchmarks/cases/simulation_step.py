@@ -129,7 +129,10 @@ def _mujoco(point: Point) -> Simulation:
         here.data.qpos[:], here.data.qvel[:] = here.qpos, here.qvel
         mujoco.mj_step(here.model, here.data, STEPS)
 
-    return Simulation(call, lambda: here.data.qvel[here.order[6:]].copy())
+    def velocities() -> Array:
+        return here.data.qvel[here.order[6:]]
+
+    return Simulation(call, velocities)
 
 
 def _drake(point: Point) -> Simulation:
