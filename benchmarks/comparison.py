@@ -33,7 +33,7 @@ def compare(
     fflin_call : callable
         Makes what is timed of fflin.
     too_slow : callable
-        Names of the methods to leave out at a point.
+        Names of the methods or peers to leave out at a point.
     """
     rows: list[dict[str, str]] = []
     notes: dict[str, None] = {}

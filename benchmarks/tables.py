@@ -10,7 +10,18 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 RESULTS, README = ROOT / "benchmarks" / "results.md", ROOT / "README.md"
 BEGIN, END = "<!-- benchmarks: begin -->", "<!-- benchmarks: end -->"
-PACKAGES = ("pin", "numpy", "scipy", "numba", "mujoco", "drake", "crocoddyl", "control")
+PACKAGES = (
+    "pin",
+    "numpy",
+    "scipy",
+    "numba",
+    "mujoco",
+    "drake",
+    "crocoddyl",
+    "adam-robotics",
+    "casadi",
+    "control",
+)
 MISSING = "–"
 
 

@@ -1,7 +1,9 @@
 """The benchmarks compare what is the same, and the README claims what they found."""
 
 import builtins
+import itertools
 import re
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import fflin
 from benchmarks import peers, tables
 from benchmarks.peers import WrongResultError, check, methods, pinocchio_peer
 from benchmarks.robots import generated, is_rigid, load, plain_urdf, random_point
-from benchmarks.timing import Times
+from benchmarks.timing import Times, interleaved
 
 RESULTS = tables.RESULTS.read_text(encoding="utf-8")
 README = tables.README.read_text(encoding="utf-8")
@@ -68,7 +70,7 @@ def test_peer_in_another_frame_is_found_out():
 
 
 def test_peers_that_are_not_there_are_named(monkeypatch):
-    missing = ("mujoco", "crocoddyl", "pydrake")
+    missing = ("mujoco", "crocoddyl", "pydrake", "casadi")
     there = builtins.__import__
 
     def without(name, *rest):
@@ -81,7 +83,7 @@ def test_peers_that_are_not_there_are_named(monkeypatch):
         monkeypatch.delitem(peers.importlib.sys.modules, f"benchmarks.peers.{name}", raising=False)
     found, notes = methods("at_rest", random_point(load("cubesat")))
     assert [method.name for method in found] == [pinocchio_peer.FLOOR]
-    assert len(notes) == 3 and all("not installed" in note for note in notes)
+    assert len(notes) == 4 and all("not installed" in note for note in notes)
 
 
 @pytest.mark.parametrize("robot", ["servicer_7dof", "panda", "talos", "chain", "tree"])
@@ -106,6 +108,21 @@ def test_ratio_is_of_pairs():
     """Where the machine slows down for all alike, the ratio stays."""
     one, other = Times((1.0, 10.0, 100.0)), Times((2.0, 20.0, 200.0))
     assert other.ratio(one) == 2.0 and one.median == 10.0
+
+
+def test_rounds_in_which_the_machine_was_busy_are_left_out():
+    """Every third round is slow for one of the two alone, which are alike otherwise."""
+    rounds = itertools.count()
+
+    def steady():
+        time.sleep(2e-3)
+
+    def disturbed():
+        time.sleep(2e-3 if next(rounds) % 3 else 4e-2)
+
+    times = interleaved({"steady": steady, "disturbed": disturbed})
+    assert times["disturbed"].ratio(times["steady"]) == pytest.approx(1.0, abs=0.3)
+    assert max(times["disturbed"].samples) < 2e-2
 
 
 def test_table_lands_between_the_markers(monkeypatch, tmp_path):

@@ -6,7 +6,8 @@ from benchmarks.robots import Point, generated, random_point
 from benchmarks.tables import Table
 
 SIZES = (10, 30, 100, 300)
-BEYOND_100 = ("MuJoCo mjd_transitionFD", "Drake FirstOrderTaylorApproximation")
+BEYOND_30 = ("adam",)
+BEYOND_100 = (*BEYOND_30, "MuJoCo mjd_transitionFD", "Drake FirstOrderTaylorApproximation")
 
 
 def run() -> Table:
@@ -22,4 +23,6 @@ def run() -> Table:
 
 
 def _too_slow(point: Point) -> tuple[str, ...]:
-    return BEYOND_100 if point.robot.n > 100 else ()
+    if point.robot.n > 100:
+        return BEYOND_100
+    return BEYOND_30 if point.robot.n > 30 else ()

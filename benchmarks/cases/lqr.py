@@ -35,7 +35,7 @@ def run() -> Table:
             key: (lambda solve=solve, lin=lin, Q=Q, R=R: solve(lin, Q, R))
             for key, solve in solvers.items()
         }
-        times = interleaved(calls, repetitions=15)
+        times = interleaved(calls)
         own = times.pop(reference)
         rows.append(
             (

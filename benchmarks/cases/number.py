@@ -39,7 +39,7 @@ def run() -> Table:
         calls = {"each": each, "bare": bare}
         if count <= 1000:
             calls["afresh"] = afresh
-        times = interleaved(calls, repetitions=15)
+        times = interleaved(calls)
         own = times["each"]
         fresh = times["afresh"].ratio(own) if "afresh" in times else None
         rows.append(

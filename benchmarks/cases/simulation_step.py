@@ -40,7 +40,7 @@ def run() -> Table:
             if not error < 1e-6:
                 raise WrongResultError(f"{key} on {name}: velocities differ by {error:.1e}")
         calls = {key: each.run for key, each in simulations.items()}
-        times = interleaved(calls | {BARE: _bare(point)}, repetitions=9)
+        times = interleaved(calls | {BARE: _bare(point)})
         first = "fflin" if "fflin" in times else BARE
         own = times.pop(first)
         columns += [key for key in times if key not in columns]

@@ -10,7 +10,7 @@ import fflin
 from benchmarks.robots import Array, Point
 
 # In the order of the columns.
-MODULES = ("pinocchio_peer", "mujoco_peer", "crocoddyl_peer", "drake_peer")
+MODULES = ("pinocchio_peer", "mujoco_peer", "crocoddyl_peer", "drake_peer", "adam_peer")
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,15 @@ def methods(
         Function of the peers' modules.
     point : Point
     left_out : tuple of str
-        Names of methods that are too slow for the case.
+        Names of methods or of whole peers that are too slow for the case.
     """
     found: list[Method] = []
     notes: list[str] = []
     for module_name in MODULES:
         name = module_name.removesuffix("_peer")
+        if name in left_out:
+            notes.append(f"{name}: left out on {point.robot.name}, too slow")
+            continue
         try:
             module = importlib.import_module(f"benchmarks.peers.{module_name}")
         except ImportError as error:
@@ -69,7 +72,7 @@ def methods(
             offered = getattr(module, what)(point)
         except module.REFUSALS as error:
             text = " ".join(str(error).split())
-            notes.append(f"{name}: cannot load {point.robot.name}: {text[:120]}")
+            notes.append(f"{name}: cannot load {point.robot.name}: {text[:80]}")
             continue
         for method in offered:
             if method.name in left_out:
