@@ -39,6 +39,7 @@ _PUBLIC = {
     "MissingPackageError": "errors",
     "ModelError": "errors",
     "Momentum": "outputs",
+    "ReactionWheel": "inputs",
     "Robot": "model",
     "SingularInertiaError": "errors",
     "StabilizabilityError": "errors",
@@ -86,7 +87,7 @@ if TYPE_CHECKING:
     )
     from fflin.estimation import Compensator, Estimator, kalman, lqg
     from fflin.input_files import load_inputs
-    from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
+    from fflin.inputs import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
     from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load

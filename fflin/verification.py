@@ -11,6 +11,7 @@ from fflin.certificate import (
     compare,
     inertia_residual,
     mobilities,
+    motion,
     scaled_condition,
 )
 from fflin.errors import InputError
@@ -26,6 +27,8 @@ from fflin.state import ANGULAR, LINEAR, StateMap
 from fflin.validation import Array
 
 _EPS = float(np.finfo(float).eps)
+# Rounding of a difference of outputs: its weights add up to two ulp, each output brings a few.
+_ULPS = 8.0
 
 # Relative to its block an analytic route agrees to round-off times the conditioning of M, with
 # room for the longer chain of operations; for a well-conditioned M, to this.
@@ -185,10 +188,10 @@ def _point_errors(
     state = model.state
     mobility, input_mobility = mobilities(M, lin.B)
     rate = model(lin.x0, lin.u0)
-    speed = np.abs(state.velocities(v))
-    spinning = max(float(speed[ANGULAR].max()), float(speed[6:].max(initial=0.0)))
+    _, rate_of_turn, momentum = motion(state, v)
     push = float((np.abs(lin.u0) * input_mobility).max(initial=0.0))
-    push += spinning**2 * float((1.0 / mobility).max())
+    push += rate_of_turn**2 * float((1.0 / mobility).max())
+    push += rate_of_turn * momentum * float(mobility.max())
     natural = np.concatenate((np.ones(len(M)), mobility * push))
     errors = [("x0", _relative(lin.x0, state.to_state(q, v, near=lin.x0)))]
     for name, rows in state.groups._asdict().items():
@@ -244,7 +247,7 @@ def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float)
     C = jacobian(lambda x: y(x, lin.u0), lin.x0, step_x)
     D = jacobian(lambda u: y(lin.x0, u), lin.u0, step_u)
     # What cannot be told from the rounding of y in its step is not compared any closer.
-    scale = np.maximum(1.0, np.abs(here))[:, None]
+    scale = _ULPS * np.maximum(1.0, np.abs(here))[:, None]
     rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]
     for name, given, expected, step in (("C", lin.C, C, step_x), ("D", lin.D, D, step_u)):
         size = np.maximum(
