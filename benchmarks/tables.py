@@ -87,7 +87,10 @@ def machine() -> str:
 
 def document(tables: Sequence[Table], command: str) -> str:
     """Return the whole file of results."""
-    head = f"# Benchmarks\n\nMade by `{command}`. {machine()}\n\n"
+    head = (
+        f"# Benchmarks\n\nMade by `{command}`. {machine()} Each time is the least of many rounds, "
+        "in which the candidates take turns.\n\n"
+    )
     return head + "\n".join(table.markdown() for table in tables)
 
 

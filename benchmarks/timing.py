@@ -1,46 +1,41 @@
 """Times of several functions, measured side by side."""
 
-import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-SAMPLE_SECONDS, CASE_SECONDS = 2e-3, 3.0
-FEWEST_ROUNDS, MOST_ROUNDS = 7, 41
+SAMPLE_SECONDS, CASE_SECONDS = 1e-3, 3.0
+FEWEST_ROUNDS, MOST_ROUNDS = 9, 101
 
 
 @dataclass(frozen=True)
 class Times:
-    """Samples of one function [s], taken in turns with those of the others."""
+    """Samples of one function [s], taken in turns with those of the others.
+
+    The least is what the function costs; the others hold what else the machine did.
+    """
 
     samples: tuple[float, ...]
 
     @property
-    def median(self) -> float:
-        return statistics.median(self.samples)
+    def least(self) -> float:
+        return min(self.samples)
 
     def ratio(self, other: "Times") -> float:
-        """Median of this one's time over the other's, each pair taken one after the other."""
-        return statistics.median(
-            mine / theirs for mine, theirs in zip(self.samples, other.samples, strict=True)
-        )
+        return self.least / other.least
 
 
 def interleaved(functions: Mapping[str, Callable[[], object]]) -> dict[str, Times]:
-    """Time functions in turns, so that a machine that is busy for a while is so for all.
-
-    Of the rounds the quicker half is kept: in the others the machine was at something else.
-    """
+    """Time functions in turns, so that a machine that is busy for a while is so for all."""
     once = {name: _once(function) for name, function in functions.items()}
     loops = {name: max(1, min(2000, round(SAMPLE_SECONDS / each))) for name, each in once.items()}
     round_seconds = sum(loops[name] * once[name] for name in functions)
     rounds = max(FEWEST_ROUNDS, min(MOST_ROUNDS, round(CASE_SECONDS / round_seconds)))
-    taken = [
-        {name: _sample(functions[name], loops[name]) for name in functions} for _ in range(rounds)
-    ]
-    taken.sort(key=lambda samples: sum(samples[name] * loops[name] for name in functions))
-    kept = taken[: rounds // 2 + 1]
-    return {name: Times(tuple(samples[name] for samples in kept)) for name in functions}
+    samples: dict[str, list[float]] = {name: [] for name in functions}
+    for _ in range(rounds):
+        for name, function in functions.items():
+            samples[name].append(_sample(function, loops[name]))
+    return {name: Times(tuple(taken)) for name, taken in samples.items()}
 
 
 def _sample(function: Callable[[], object], loops: int) -> float:

@@ -3,6 +3,8 @@
 import builtins
 import itertools
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +15,6 @@ import fflin
 from benchmarks import peers, tables, timing
 from benchmarks.peers import WrongResultError, check, methods, pinocchio_peer
 from benchmarks.robots import generated, is_rigid, load, plain_urdf, random_point
-from benchmarks.timing import Times
 
 RESULTS = tables.RESULTS.read_text(encoding="utf-8")
 README = tables.README.read_text(encoding="utf-8")
@@ -103,26 +104,36 @@ def test_inertias_that_no_rigid_body_has_are_told():
     assert not is_rigid(load("ets_vii")) and is_rigid(load("servicer_7dof"))
 
 
-def test_ratio_is_of_pairs():
-    """Where the machine slows down for all alike, the ratio stays."""
-    one, other = Times((1.0, 10.0, 100.0)), Times((2.0, 20.0, 200.0))
-    assert other.ratio(one) == 2.0 and one.median == 10.0
-
-
-def test_rounds_in_which_the_machine_was_busy_are_left_out(monkeypatch):
-    """Every third round is slow for one of the two alone, which are alike otherwise."""
+def test_what_else_the_machine_does_is_not_counted(monkeypatch):
+    """Two functions that cost 2 and 3 ms, each disturbed in every third of its calls."""
     clock, calls = [0.0], itertools.count()
 
-    def steady():
-        clock[0] += 2e-3
+    def costs(seconds):
+        def call():
+            clock[0] += seconds if next(calls) % 3 else 20.0 * seconds
 
-    def disturbed():
-        clock[0] += 2e-3 if next(calls) % 3 else 4e-2
+        return call
 
     monkeypatch.setattr(timing.time, "perf_counter", lambda: clock[0])
-    times = timing.interleaved({"steady": steady, "disturbed": disturbed})
-    assert times["disturbed"].samples == pytest.approx(times["steady"].samples)
-    assert len(times["steady"].samples) == timing.MOST_ROUNDS // 2 + 1
+    times = timing.interleaved({"two": costs(2e-3), "three": costs(3e-3)})
+    assert times["two"].least == pytest.approx(2e-3)
+    assert times["three"].ratio(times["two"]) == pytest.approx(1.5)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_command_prints_a_case():
+    command = [sys.executable, "-m", "benchmarks"]
+    done = subprocess.run(
+        [*command, "memory"], cwd=tables.ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    row = next(line for line in done.stdout.splitlines() if line.startswith("| fflin "))
+    imported, first = (float(cell) for cell in row.split("|")[2:4])
+    assert 5.0 < imported < first
+    done = subprocess.run(
+        [*command, "speed"], cwd=tables.ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2 and "CASE is one of at_rest, " in done.stderr
 
 
 def test_table_lands_between_the_markers(monkeypatch, tmp_path):

@@ -41,7 +41,7 @@ def run() -> Table:
             (
                 name,
                 str(point.robot.n),
-                figure(own.median * 1e3),
+                figure(own.least * 1e3),
                 *(figure(each.ratio(own)) for each in times.values()),
             )
         )

@@ -45,7 +45,7 @@ def run() -> Table:
         rows.append(
             (
                 f"{count:,}",
-                figure(own.median / count * 1e6),
+                figure(own.least / count * 1e6),
                 figure(fresh),
                 figure(own.ratio(times["bare"])),
             )

@@ -45,7 +45,7 @@ def run() -> Table:
         own = times.pop(first)
         columns += [key for key in times if key not in columns]
         row = {key: figure(each.ratio(own)) for key, each in times.items()}
-        rows.append((name, point.robot.n, figure(own.median / STEPS * 1e6), row))
+        rows.append((name, point.robot.n, figure(own.least / STEPS * 1e6), row))
     return Table(
         "Simulation step",
         f"One of {STEPS} steps of {STEP * 1e3:g} ms at fourth order (Drake: third, its highest of "
