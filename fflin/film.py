@@ -17,7 +17,7 @@ from fflin.validation import Array
 
 # Where one looks from, and where the sun stands, in world axes.
 VIEW = (1.0, -0.62, 0.50)
-SUN = (0.35, -0.92, 0.62)
+SUN = (0.62, -0.78, 0.62)
 
 TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
 FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
@@ -88,7 +88,7 @@ def stage_info(
 def triads(robot: Robot, tool: str | None, size: float) -> list[dict[str, Any]]:
     """Return the axes drawn at the base and the tool."""
     paths = body_paths(robot)
-    found = [(paths[0], pin.SE3.Identity(), 0.22)]
+    found = [(paths[0], pin.SE3.Identity(), 0.3)]
     if tool:
         frame = robot.model.frames[robot.model.getFrameId(tool)]
         found.append((paths[frame.parentJoint - ROOT], frame.placement, 0.12))

@@ -40,6 +40,7 @@ def build_page(info: dict[str, Any], commands: Iterable[bytes] = (), connect: st
     fields = {
         "title": escape(info["title"]),
         "scene": info["scene"],
+        "mode": info["mode"],
         "connect": connect or "'none'",
         "style": _asset("style.css"),
         "meshcat": _meshcat(),

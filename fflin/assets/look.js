@@ -75,7 +75,7 @@ function cellTexture(colour) {
       context.fillRect(x + 2, y + 2, half - 4, half - 4);
       context.fillStyle = "rgba(190,205,235,0.30)";
       for (const f of [0.3, 0.7]) context.fillRect(x + f * half, y, 1, half);
-      context.strokeStyle = "rgba(205,215,235,0.75)";
+      context.strokeStyle = "rgba(200,210,235,0.55)";
       context.lineWidth = 2.5;
       context.strokeRect(x, y, half, half);
     }
@@ -97,7 +97,7 @@ function realMaterial(about) {
     });
     if (finish.foil) {
       material.bumpMap = once("foil", foilTexture);
-      material.bumpScale = 0.012;
+      material.bumpScale = 0.02; material.envMapIntensity = 1.5;
     }
     if (finish.cells) {
       material.color.set(0xffffff);

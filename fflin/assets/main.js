@@ -100,6 +100,10 @@ function main() {
   frame(info.points, info.direction);
   resize();
   window.addEventListener("resize", () => requestAnimationFrame(() => player.seek(player.state.time)));
-  window.fflin = { ...player, frame: (direction) => frame(info.points, direction), ready: true };
+  const plain = (on) => {
+    document.body.classList.toggle("plain", on);
+    frame(info.points, info.direction);
+  };
+  window.fflin = { ...player, plain, ready: true };
   if (!/[#&]pause\b/.test(location.hash)) player.play();
 }

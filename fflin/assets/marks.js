@@ -1,7 +1,7 @@
 // What is drawn about the robot: frames, trails, forces, torques and plumes of thrusters.
 
 function flat(colour) {
-  return new THREE.MeshBasicMaterial({ color: colour, toneMapped: false });
+  return new THREE.MeshBasicMaterial({ color: new THREE.Color(colour).convertSRGBToLinear(), toneMapped: false });
 }
 
 function arrow(colour, thickness, material = flat(colour)) {
@@ -62,7 +62,7 @@ function trail({ points, colour, radius }) {
   curve.getPointAt = (u) => curve.getPoint(u); // the points themselves, not equal lengths
   curve.getTangentAt = (u) => curve.getTangent(u);
   const tube = new THREE.TubeGeometry(curve, path.length - 1, radius, around);
-  const whole = new THREE.Mesh(tube, new THREE.MeshBasicMaterial({ color: colour, transparent: true, opacity: 0.16, depthWrite: false, toneMapped: false }));
+  const whole = new THREE.Mesh(tube, Object.assign(flat(colour), { transparent: true, opacity: 0.16, depthWrite: false }));
   const passed = new THREE.Mesh(tube.clone(), flat(colour));
   group.add(whole, passed);
   group.show = (i) => passed.geometry.setDrawRange(0, 6 * around * at[i]);

@@ -112,7 +112,7 @@ function makeSky(renderer, sun, space) {
   scene.add(new THREE.Mesh(new THREE.BoxGeometry(10, 10, 10), material));
   const render = (size) => {
     const target = new THREE.WebGLCubeRenderTarget(size, {
-      type: THREE.HalfFloatType, generateMipmaps: true, minFilter: THREE.LinearMipmapLinearFilter,
+      type: THREE.HalfFloatType, format: THREE.RGBAFormat, generateMipmaps: true, minFilter: THREE.LinearMipmapLinearFilter,
     });
     const encoding = renderer.outputEncoding, mapping = renderer.toneMapping;
     renderer.outputEncoding = THREE.LinearEncoding;
