@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from fflin.validation import Array
 
 _GAP = "  "
+_EPS = sys.float_info.epsilon
 
 
 def width() -> int:
@@ -56,9 +57,16 @@ def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
 def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
     """Show a matrix with its names; zeros are dots, rows and columns of zeros are left out.
 
+    What is below the rounding of both its row's and its column's largest entry is shown as "~0".
     What is too wide is folded: the next columns follow below, under the rows that they need.
     """
-    text = [[_number(x) for x in row] for row in values.tolist()]
+    sizes = abs(values)
+    rounding = _EPS * sizes.max(axis=1, initial=0.0)[:, None]
+    rounding = rounding.clip(max=_EPS * sizes.max(axis=0, initial=0.0))
+    text = [
+        [_number(x, below) for x, below in zip(row, limits, strict=True)]
+        for row, limits in zip(values.tolist(), rounding.tolist(), strict=True)
+    ]
     label = max(map(len, rows))
     folds: list[list[int]] = []
     used = 0
@@ -79,5 +87,5 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
     return "\n\n".join(blocks)
 
 
-def _number(x: float) -> str:
-    return "." if x == 0.0 else f"{x:.5g}"
+def _number(x: float, rounding: float) -> str:
+    return "." if x == 0.0 else "~0" if abs(x) < rounding else f"{x:.5g}"

@@ -6,11 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import BUNDLED
 
 import fflin
 from fflin.robots import bundled_directory
+from fflin.tables import matrix
 
 
 def run(*arguments, cwd=None, **environment):
@@ -89,6 +91,13 @@ def test_warnings_are_one_line_each_on_stderr_and_in_info():
         check=False,
     )
     assert silent.returncode == 0 and not silent.stderr
+
+
+def test_round_off_is_not_shown_as_figures():
+    values = np.array([[2.0, 1e-17, 1e-20], [3e-16, 1.0, 0.0]])
+    shown = [line.split() for line in matrix(values, ["a", "b"], ["x", "y", "z"]).splitlines()]
+    # 1e-20 stands alone in its column, and 3e-16 is just above the rounding of a one.
+    assert shown == [["x", "y", "z"], ["a", "2", "~0", "1e-20"], ["b", "3e-16", "1", "."]]
 
 
 def test_linearize_prints_readable_tables():

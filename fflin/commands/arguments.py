@@ -1,0 +1,176 @@
+"""What the commands take: the robot, the point, and how their values are read."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeAlias
+
+Commands: TypeAlias = "argparse._SubParsersAction[Any]"
+
+
+def number(text: str) -> float:
+    """Read a finite number."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number") from None
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a finite number")
+    return value
+
+
+def assignment(text: str) -> tuple[str, float]:
+    """Read NAME=VALUE."""
+    name, separator, value = text.rpartition("=")
+    if not separator or not name:
+        raise argparse.ArgumentTypeError(f"'{text}' is not NAME=VALUE")
+    return name, number(value)
+
+
+def passive(text: str) -> tuple[str | None, float | str]:
+    """Read NAME=VALUE, VALUE for all joints (name None), or urdf."""
+    if "=" in text:
+        return assignment(text)
+    return None, text if text == "urdf" else number(text)
+
+
+def lock(text: str) -> tuple[str, float | None]:
+    """Read NAME=VALUE, or NAME for neutral (value None)."""
+    return assignment(text) if "=" in text else (text, None)
+
+
+def command(
+    commands: Commands,
+    name: str,
+    run: Callable[[argparse.Namespace], int],
+    summary: str,
+    example: str,
+) -> argparse.ArgumentParser:
+    """Add a command; `example` stands at the end of its help."""
+    command: argparse.ArgumentParser = commands.add_parser(
+        name,
+        help=summary,
+        description=f"{summary[0].upper()}{summary[1:]}.",
+        epilog=f"example: {example}",
+    )
+    command.set_defaults(run=run)
+    return command
+
+
+def add_robot(command: argparse.ArgumentParser) -> None:
+    """Add ROBOT and --lock."""
+    command.add_argument(
+        "robot",
+        metavar="ROBOT",
+        help="a name of `fflin robots`, or the path of a URDF",
+    )
+    command.add_argument(
+        "--lock",
+        metavar="NAME[=VALUE]",
+        type=lock,
+        action="append",
+        default=[],
+        help="weld a joint, at VALUE [rad|m] or at neutral (repeatable)",
+    )
+
+
+def add_point(command: argparse.ArgumentParser) -> None:
+    """Add the robot and what says the point that it is linearised about."""
+    add_robot(command)
+    command.add_argument(
+        "--joint",
+        metavar="NAME=VALUE",
+        type=assignment,
+        action="append",
+        default=[],
+        help="put a joint at VALUE [rad|m] (repeatable); the others are at neutral",
+    )
+    command.add_argument(
+        "--rpy",
+        nargs=3,
+        type=number,
+        default=(0.0, 0.0, 0.0),
+        metavar=("R", "P", "Y"),
+        help="base attitude: roll, pitch, yaw [deg] about fixed axes",
+    )
+    command.add_argument(
+        "--position",
+        nargs=3,
+        type=number,
+        default=(0.0, 0.0, 0.0),
+        metavar=("X", "Y", "Z"),
+        help="base position [m]",
+    )
+    for name, unit in (("stiffness", "N m/rad|N/m"), ("damping", "N m s/rad|N s/m")):
+        command.add_argument(
+            f"--{name}",
+            metavar="[NAME=]VALUE",
+            type=passive,
+            action="append",
+            default=[],
+            help=f"{name} of a joint [{unit}] (repeatable), or one value for all joints"
+            + ("; `urdf`: what the URDF says" if name == "damping" else ""),
+        )
+    command.add_argument(
+        "--gravity",
+        nargs=3,
+        type=number,
+        metavar=("X", "Y", "Z"),
+        help="uniform gravity in world axes [m/s^2]; none by default",
+    )
+    command.add_argument(
+        "--velocity",
+        metavar="NAME=VALUE",
+        type=assignment,
+        action="append",
+        default=[],
+        help="a velocity at the point (repeatable): a joint's rate [rad/s|m/s], or omega_b.x ... "
+        "v_b.z of the base in base axes",
+    )
+    command.add_argument(
+        "--effort",
+        metavar="NAME=VALUE",
+        type=assignment,
+        action="append",
+        default=[],
+        help="an input at the point (repeatable), by its name in u, such as tau_m.joint_1",
+    )
+    command.add_argument(
+        "--inputs",
+        metavar="FILE.toml",
+        help="what acts on the robot, as fflin.load_inputs reads it: a file, or the name of a "
+        "bundled one; by default torque and force on the base and every joint's",
+    )
+    command.add_argument(
+        "--output",
+        metavar="SPEC",
+        action="append",
+        default=[],
+        help="what is watched (repeatable): state (default), base, joints, rates, com, momentum, "
+        "frame:NAME (pose and velocity), pose:NAME, velocity:NAME, gyroscope:NAME or "
+        "accelerometer:NAME",
+    )
+    command.add_argument(
+        "--reference",
+        choices=("base", "world"),
+        default="base",
+        help="what attitude and position are relative to: the base where it stands (default), "
+        "or the world",
+    )
+    command.add_argument(
+        "--frame",
+        choices=("hybrid", "local", "world"),
+        default="hybrid",
+        help="axes of velocities and wrenches: angular in base axes and linear in reference axes "
+        "(hybrid, default), both in base axes (local), both in reference axes (world)",
+    )
+
+
+def add_output_file(command: argparse.ArgumentParser, what: str) -> None:
+    """Add -o FILE; `what` says which endings there are."""
+    command.add_argument(
+        "-o", "--output-file", metavar="FILE", dest="output_file", type=Path, help=what
+    )

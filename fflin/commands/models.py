@@ -1,0 +1,93 @@
+"""The commands that show robots, and that make and check linear models."""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from typing import TYPE_CHECKING
+
+from fflin.commands import DONE, FELL_SHORT
+from fflin.commands.arguments import Commands, add_output_file, add_point, add_robot, command
+from fflin.commands.points import linear_model, load_robot
+from fflin.errors import FflinError, FflinWarning
+
+if TYPE_CHECKING:
+    from fflin.model import Robot
+
+
+def add_commands(commands: Commands) -> None:
+    """Add robots, info, linearize and check."""
+    command(commands, "robots", _robots, "list the robots that can be named", "fflin robots")
+    info = command(
+        commands, "info", _info, "show tree, joints, masses and limits", "fflin info servicer_7dof"
+    )
+    add_robot(info)
+    linearize = command(
+        commands,
+        "linearize",
+        _linearize,
+        "show or save A, B, C, D",
+        "fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat",
+    )
+    add_point(linearize)
+    add_output_file(
+        linearize, "save to FILE: .npz, .mat, .json, or .csv (one file a matrix: NAME.A.csv, ...)"
+    )
+    check = command(
+        commands,
+        "check",
+        _check,
+        "check A and B by two other routes; exit 1 where they do not hold",
+        "fflin check canadarm2 --rpy 20 0 0 --reference world --frame world",
+    )
+    add_point(check)
+
+
+def _robots(_: argparse.Namespace) -> int:
+    from fflin.loading import load
+    from fflin.reports import robot_list
+    from fflin.robots import find_robot, list_robots
+
+    entries: list[tuple[str, Robot | str, str]] = []
+    for name in list_robots():
+        try:
+            with warnings.catch_warnings():
+                # `fflin info` shows them, robot by robot.
+                warnings.simplefilter("ignore", FflinWarning)
+                entries.append((name, load(name), find_robot(name).origin))
+        except FflinError as error:
+            entries.append((name, str(error), find_robot(name).origin))
+    print(robot_list(entries))
+    return DONE
+
+
+def _info(arguments: argparse.Namespace) -> int:
+    from fflin.reports import robot_info
+
+    print(robot_info(load_robot(arguments)))
+    return DONE
+
+
+def _linearize(arguments: argparse.Namespace) -> int:
+    if arguments.output_file:
+        from fflin.files import check_format, save_model
+
+        check_format(arguments.output_file)
+    robot, lin = linear_model(arguments)
+    if arguments.output_file:
+        save_model(lin, arguments.output_file, spare=robot.urdf)
+        print(f"wrote {arguments.output_file}: {lin.B.shape[0]} states, {lin.B.shape[1]} inputs")
+    else:
+        from fflin import reports
+
+        print(reports.linear_model(lin))
+    return DONE
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from fflin.verification import check
+
+    robot, lin = linear_model(arguments)
+    found = check(robot, lin)
+    print(found)
+    return DONE if found.ok else FELL_SHORT
