@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from meshcat import Visualizer
 
 from fflin.model import ROOT, Robot
 from fflin.page import packed
 from fflin.playback import Playback, thrusters
-from fflin.scene import Animation, Drawing, body_paths
+from fflin.scene import Animation, Drawing, Visualizer, body_paths
 from fflin.validation import Array
 
 # Where one looks from, and where the sun stands, in world axes.

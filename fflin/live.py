@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from meshcat import Visualizer
 from tornado import httpserver, netutil, web, websocket
 
 from fflin.errors import FflinError, InputError
@@ -18,7 +17,7 @@ from fflin.model import Robot
 from fflin.page import build_page
 from fflin.playback import body_poses
 from fflin.recorder import Recorder
-from fflin.scene import Drawing, body_paths
+from fflin.scene import Drawing, Visualizer, body_paths
 from fflin.state import StateMap
 from fflin.validation import Array
 

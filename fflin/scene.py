@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from hashlib import sha1
 from typing import Any
@@ -10,15 +11,18 @@ from urllib.parse import quote
 import numpy as np
 import pinocchio as pin
 import umsgpack
-from meshcat import Visualizer
-from meshcat.commands import SetAnimation, SetTransform
-from meshcat.geometry import Mesh as MeshcatMesh
 
 from fflin.meshes import Mesh, load_mesh
 from fflin.model import ROOT, Robot
 from fflin.validation import Array
 from fflin.visuals import PLAIN, Shape, shapes
 from fflin.xml_tree import named
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", DeprecationWarning)  # of what meshcat imports, not of ours
+    from meshcat import Visualizer
+    from meshcat.commands import SetAnimation, SetTransform
+    from meshcat.geometry import Mesh as MeshcatMesh
 
 # three.js draws cylinders along y, URDF along z.
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
