@@ -49,6 +49,7 @@ _PUBLIC = {
     "load": "loading",
     "load_inputs": "input_files",
     "velocity": "points",
+    "visualize": "viewer",
 }
 
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
@@ -89,6 +90,7 @@ if TYPE_CHECKING:
     from fflin.state import StateMap
     from fflin.trajectory import LinearTrajectory, linearize_trajectory
     from fflin.verification import Check, check
+    from fflin.viewer import visualize
 
 
 def __getattr__(name: str) -> Any:

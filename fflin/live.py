@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+import socket
 import threading
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from tornado import httpserver, netutil, web, websocket
+from tornado import httpserver, web, websocket
 
 from fflin.errors import FflinError, InputError
 from fflin.film import corner_points, stage_info, triads
@@ -157,14 +159,8 @@ class Live:
         self.close()
 
     def _serve(self, page: str, port: int) -> None:
-        try:
-            sockets = netutil.bind_sockets(port, _HOST)
-        except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(
-                f"port {port} cannot be had: {reason}; name another, or none for one that is free"
-            ) from None
-        self.port = sockets[0].getsockname()[1]
+        listener = _listen(port)
+        self.port = listener.getsockname()[1]
         self.url = f"http://{_HOST}:{self.port}/"
         hosts = {f"{name}:{self.port}" for name in (_HOST, "localhost")}
         application = web.Application(
@@ -181,7 +177,7 @@ class Live:
             self._loop = asyncio.get_running_loop()
             self._stop = asyncio.Event()
             server = httpserver.HTTPServer(application)
-            server.add_sockets(sockets)
+            server.add_socket(listener)
             started.set()
             await self._stop.wait()
             server.stop()
@@ -292,6 +288,22 @@ class _Socket(_Guarded, websocket.WebSocketHandler):
                 self.update()
 
         sent.add_done_callback(done)
+
+
+def _listen(port: int) -> socket.socket:
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        if os.name == "posix":  # elsewhere it would let two listen on one port
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((_HOST, port))
+        listener.listen(128)
+    except OSError as error:
+        listener.close()
+        raise InputError(
+            f"port {port} cannot be had: {error.strerror}; name another, or none for a free one"
+        ) from None
+    listener.setblocking(False)
+    return listener
 
 
 def _subtitle(robot: Robot) -> str:
