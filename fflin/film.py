@@ -2,33 +2,93 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.model import ROOT, Robot
-from fflin.page import packed
-from fflin.playback import Playback, thrusters
+from fflin.page import build_page, packed
+from fflin.panel import panel
+from fflin.playback import Playback, body_poses, frame_indices, play_back, thrusters
+from fflin.recorder import Recorder
 from fflin.scene import Animation, Drawing, Visualizer, body_paths
+from fflin.state import StateMap
 from fflin.validation import Array
 
+if TYPE_CHECKING:
+    from fflin.motion import Motion
+
 # Where one looks from, and where the sun stands, in world axes.
-VIEW = (1.0, -0.62, 0.50)
+VIEWS = {"space": (1.0, -0.62, 0.50), "lab": (1.0, -0.62, 0.36)}
 SUN = (0.62, -0.78, 0.62)
 
 TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
 FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
 
 
-def animate(visualizer: Visualizer, robots: Sequence[tuple[Drawing, Array, Array]]) -> None:
-    """Move drawings (drawing, t (N,), poses (N, njoints - 1, 7)) by one animation."""
+def motion_page(
+    robot: Robot,
+    motion: Motion,
+    *,
+    scene: str,
+    fps: float,
+    speed: float,
+    follow: bool,
+    target: Array,
+    tool: str | None,
+) -> tuple[str, tuple[str, ...]]:
+    """Return the page of a motion, and what could not be drawn; see `visualize`."""
+    shown = frame_indices(motion.t, fps, speed)
+    t, q, u = motion.t[shown], motion.q[shown], motion.u[np.minimum(shown, len(motion.u) - 1)]
+    state = StateMap(robot, reference=motion.reference, frame=motion.frame)
+    film = play_back(robot, state, t, q, u, tool)
+
+    window, sent = Recorder(), set[str]()
+    scenery = Visualizer(window=window)
+    drawing = Drawing(robot, scenery["robot"], sent=sent)
+    moving = [(drawing, film.poses)]
+    data = robot.model.createData()
+    Drawing(robot, scenery["target"], "ghost", sent).place(body_poses(robot, data, target))
+    predicted = _predicted(state, motion, shown)
+    if predicted is not None:
+        poses = np.array([body_poses(robot, data, each) for each in predicted])
+        moving.append((Drawing(robot, scenery["linear"], "linear", sent), poses))
     clips = []
-    for drawing, t, poses in robots:
-        drawing.place(poses[0])
-        clips += drawing.tracks(t - t[0], poses)
-    visualizer.window.send(Animation(clips))
+    for each, poses in moving:
+        each.place(poses[0])
+        clips += each.tracks(t - t[0], poses)
+    window.send(Animation(clips))
+
+    info = stage_info(robot, drawing, film.poses[0], scene=scene, subtitle=_subtitle(robot, t))
+    info |= marks(robot, film, tool, info["size"])
+    info |= panel(robot, state, q, u, target, _drift(motion)[shown])
+    info |= {
+        "mode": "motion",
+        "t": packed(t),
+        "speed": speed,
+        "follow": follow,
+        "points": frame_points(drawing, film.poses, follow=follow).round(4).tolist(),
+        "legend": legend(info, linear=predicted is not None),
+    }
+    return build_page(info, window.commands()), drawing.notes
+
+
+def _predicted(state: StateMap, motion: Motion, shown: Array) -> Array | None:
+    """Return the configurations (N, nq) that the linear model predicts, where it was asked."""
+    if motion.linear is None:
+        return None
+    return np.array([state.to_pinocchio(x)[0] for x in motion.linear[shown]])
+
+
+def _drift(motion: Motion) -> Array:
+    """Return how far the momentum is off what the inputs make of it (N,), relative."""
+    return np.broadcast_to(np.asarray(motion.momentum_drift, dtype=float), motion.t.shape)
+
+
+def _subtitle(robot: Robot, t: Array) -> str:
+    joints = f"{robot.n} joint{'s' * (robot.n != 1)}"
+    return f"{joints}, {robot.mass:.4g} kg, {t[-1] - t[0]:.4g} s"
 
 
 def frame_points(drawing: Drawing, poses: Array, *, follow: bool, most: int = 12) -> Array:
@@ -79,7 +139,7 @@ def stage_info(
         "centre": centre.tolist(),
         "floor": [*centre[:2].tolist(), float(low[2])],
         "sun": SUN,
-        "direction": VIEW,
+        "direction": VIEWS[scene],
         "base": ["meshcat", "robot", body_paths(robot)[0]],
     }
 
@@ -140,9 +200,7 @@ def marks(robot: Robot, film: Playback, tool: str | None, size: float) -> dict[s
     }
 
 
-def legend(
-    shown: dict[str, Any], *, target: bool = False, linear: bool = False
-) -> list[dict[str, Any]]:
+def legend(shown: dict[str, Any], *, linear: bool) -> list[dict[str, Any]]:
     """Return the entries of the legend, each of which can be switched off."""
     entries = [
         {"label": f"path of the {each['name']}", "colour": each["colour"],
@@ -154,10 +212,9 @@ def legend(
          "paths": [["meshcat", "wrench", each["kind"]]]}
         for each in shown["arrows"]
     ]  # fmt: skip
-    if target:
-        entries.append({"label": "target", "colour": "#8fb4ff", "paths": [["meshcat", "target"]]})
+    entries.append({"label": "target", "colour": "#8fb4ff", "paths": [["meshcat", "target"]]})
     if linear:
         entries.append(
-            {"label": "linear model", "colour": "#ffb45e", "paths": [["meshcat", "linear"]]}
+            {"label": "linear model", "colour": "#ff7fc8", "paths": [["meshcat", "linear"]]}
         )
     return entries

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 import pinocchio as pin
 
@@ -92,25 +90,23 @@ def body_poses(robot: Robot, data: pin.Data, q: Array) -> Array:
 
 
 def play_back(
-    robot: Robot, t: Array, q: Array, u: Array, frame: Any, reference: pin.SE3, tool: str | None
+    robot: Robot, state: StateMap, t: Array, q: Array, u: Array, tool: str | None
 ) -> Playback:
     """Compute what is shown of a motion.
 
     Parameters
     ----------
     robot : Robot
+    state : StateMap
+        Its frame says the axes of the base's wrench.
     t : ndarray (N,)
     q : ndarray (N, nq)
     u : ndarray (N, nu)
-    frame : str
-        Velocity frame that the base wrench stands in.
-    reference : pin.SE3
     tool : str or None
         Frame of the model.
     """
     model, data = robot.model, robot.model.createData()
     tool_id = model.getFrameId(tool) if tool else None
-    state = StateMap(robot, reference=reference, frame=frame)
     actuation = Actuation(state)
     poses, com, tools, force, torque = [], [], [], [], []
     for q_k, u_k in zip(q, u, strict=True):
@@ -126,7 +122,7 @@ def play_back(
             ("F_b", state.axes[1], force),
         ):
             rows = actuation.groups.get(kind)
-            axes = reference.rotation if turned else base.rotation
+            axes = state.reference.rotation if turned else base.rotation
             found.append(_ORIGIN if rows is None else axes @ u_k[rows])
     thrust = actuation.groups.get("thrust", np.zeros(0, dtype=int))
     return Playback(
@@ -152,26 +148,3 @@ def thrusters(robot: Robot) -> list[tuple[int, Array, Array]]:
             )
     return found
 
-
-def errors(
-    robot: Robot, q: Array, target: Array
-) -> dict[str, Array]:
-    """Return the distance of each configuration (N, nq) from a target (nq,).
-
-    Returns
-    -------
-    dict
-        attitude [deg], position [m] of the base, joints: the largest error [rad|m]; each (N,).
-    """
-    state = StateMap(robot)
-    goal = pin.XYZQUATToSE3(target[:7])
-    difference = [goal.actInv(pin.XYZQUATToSE3(q_k[:7])) for q_k in q]
-    joints = np.array([state.joint_positions(q_k) for q_k in q]) - state.joint_positions(target)
-    for index, joint in enumerate(robot.joints):
-        if joint.unbounded:
-            joints[:, index] = np.angle(np.exp(1j * joints[:, index]))
-    return {
-        "attitude": np.degrees([np.linalg.norm(pin.log3(m.rotation)) for m in difference]),
-        "position": np.array([np.linalg.norm(m.translation) for m in difference]),
-        "joints": np.abs(joints).max(axis=1) if robot.n else np.zeros(len(q)),
-    }

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from warnings import warn
 
-import numpy as np
 import pinocchio as pin
 
+from fflin.actuation import Actuation
 from fflin.errors import FflinWarning, FileError, InputError, unknown
 from fflin.files import as_path, write_whole
 from fflin.model import ROOT, Robot
+from fflin.state import StateMap
 from fflin.validation import Array, number
 
 if TYPE_CHECKING:
@@ -128,8 +129,14 @@ def visualize(
         from fflin.capture import find_chromium
 
         find_chromium()
+    _check_motion(robot, motion)
     fps, speed = _rates(motion, fps, speed)
-    page, notes = _page(robot, motion, scene, fps, speed, follow, target, tool)
+    goal = _target(robot, motion) if target is None else robot.checked_configuration(target)
+    from fflin.film import motion_page
+
+    page, notes = motion_page(
+        robot, motion, scene=scene, fps=fps, speed=speed, follow=follow, target=goal, tool=tool
+    )
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)
     contents = _pictures(page, outputs, motion, speed, times)
@@ -201,3 +208,56 @@ def _rates(motion: Motion, fps: float, speed: float | None) -> tuple[float, floa
     if not speed > 0.0:
         raise InputError(f"speed is {speed:g}, expected more than 0")
     return fps, speed
+
+
+def _check_motion(robot: Robot, motion: Motion) -> None:
+    try:
+        sizes = motion.q.shape[1], motion.u.shape[1]
+    except (AttributeError, IndexError, TypeError):
+        raise InputError(
+            f"motion is a {type(motion).__name__}, expected a Motion of fflin.simulate"
+        ) from None
+    expected = robot.nq, len(Actuation(StateMap(robot)).names)
+    if sizes != expected or motion.urdf_sha256 != robot.urdf_sha256:
+        raise InputError(
+            f"the motion is one of '{motion.robot}', not of '{robot.name}' as it is given; give "
+            "the robot that it was simulated with"
+        )
+
+
+def _target(robot: Robot, motion: Motion) -> Array:
+    """Return the reference placement with the joints where the motion ends."""
+    goal = motion.q[-1].copy()
+    root = robot.model.jointPlacements[ROOT]
+    goal[:7] = pin.SE3ToXYZQUAT(root.actInv(motion.reference))
+    return goal
+
+
+def _pictures(
+    page: str,
+    outputs: dict[str, Path],
+    motion: Motion,
+    speed: float,
+    times: Sequence[float] | None,
+) -> dict[Path, bytes]:
+    if ".png" not in outputs and ".gif" not in outputs:
+        return {}
+    from fflin.capture import take_gif, take_png
+
+    start, end = float(motion.t[0]), float(motion.t[-1])
+    if times is None:
+        # What settles moves most at first.
+        times = [start + share * (end - start) for share in (0.0, 0.08, 0.25, 1.0)]
+    times = [number("a time", time) for time in times]
+    if not times or not all(start <= time <= end for time in times):
+        raise InputError(f"times are {times}, expected some from {start:g} to {end:g} s")
+    contents = {}
+    with tempfile.TemporaryDirectory(prefix="fflin-") as folder:
+        file = Path(folder, "page.html")
+        file.write_text(page, encoding="utf-8")
+        if ".png" in outputs:
+            size = _PICTURE if len(times) == 1 else _STRIP
+            contents[outputs[".png"]] = take_png(file, times, size)
+        if ".gif" in outputs:
+            contents[outputs[".gif"]] = take_gif(file, end - start, speed, _GIF)
+    return contents

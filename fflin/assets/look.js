@@ -12,7 +12,7 @@ const FINISHES = [
   [/^$/, { metalness: 0.15, roughness: 0.5 }],
 ];
 
-const GHOSTS = { ghost: [0x9fc4ff, 0.42], linear: [0xffb45e, 0.50] };
+const GHOSTS = { ghost: [0x9fc4ff, 0.42], linear: [0xff7fc8, 0.50] };
 
 const shared = new Map(); // geometries by name, materials and textures by what they are
 
