@@ -154,7 +154,9 @@ async def _shoot(
         nonlocal number
         number += 1
         command = {"id": number, "method": method, "params": parameters}
-        await socket.write_message(json.dumps(command | ({"sessionId": session} if session else {})))
+        await socket.write_message(
+            json.dumps(command | ({"sessionId": session} if session else {}))
+        )
         while True:
             message = await socket.read_message()
             if message is None:

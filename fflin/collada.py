@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, TypeAlias
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,7 +13,8 @@ import numpy as np
 from fflin.validation import Array
 from fflin.visuals import Color
 
-Part = tuple[Array, Array, Color | None]
+Indices: TypeAlias = "np.ndarray[Any, np.dtype[np.integer[Any]]]"
+Part: TypeAlias = "tuple[Array, Indices, Color | None]"
 
 _NAMESPACE = re.compile(r"\{[^}]*\}")
 _UP = {
@@ -57,9 +59,7 @@ def _parts(root: ElementTree.Element) -> Iterator[Part]:
         node, above = stack.pop()
         here = above @ _transform(node)
         stack += [(child, here) for child in node.findall("node")]
-        stack += [
-            (identified[e.get("url", "")[1:]], here) for e in node.findall("instance_node")
-        ]
+        stack += [(identified[e.get("url", "")[1:]], here) for e in node.findall("instance_node")]
         for instance in node.findall("instance_geometry"):
             bound = {
                 e.get("symbol"): identified[e.get("target", "")[1:]]
@@ -76,9 +76,9 @@ def _parts(root: ElementTree.Element) -> Iterator[Part]:
 
 
 def _transform(node: ElementTree.Element) -> Array:
-    total = np.eye(4)
+    total: Array = np.eye(4)
     for element in node:
-        step = np.eye(4)
+        step: Array = np.eye(4)
         if element.tag == "matrix":
             step = _floats(element).reshape(4, 4)
         elif element.tag == "translate":
@@ -99,7 +99,7 @@ def _transform(node: ElementTree.Element) -> Array:
 
 def _faces(
     primitive: ElementTree.Element, identified: dict[str | None, ElementTree.Element]
-) -> tuple[Array, Array]:
+) -> tuple[Array, Indices]:
     inputs = primitive.findall("input")
     stride = 1 + max(int(e.get("offset", 0)) for e in inputs)
     (corner,) = (e for e in inputs if e.get("semantic") == "VERTEX")

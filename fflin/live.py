@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
-import os
-import socket
 import threading
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from tornado import httpserver, web, websocket
 
-from fflin.errors import FflinError, InputError
 from fflin.film import corner_points, stage_info, triads
 from fflin.model import Robot
 from fflin.page import build_page
 from fflin.playback import body_poses
 from fflin.recorder import Recorder
 from fflin.scene import Drawing, Visualizer, body_paths
+from fflin.serving import Server
 from fflin.state import StateMap
 from fflin.validation import Array
-
-_HOST = "127.0.0.1"
 
 
 class Live:
@@ -49,6 +43,7 @@ class Live:
     Attributes
     ----------
     url : str
+    port : int
     q : ndarray (nq,)
         Where the robot stands; sliders move it.
     meshcat : meshcat.Visualizer
@@ -70,11 +65,8 @@ class Live:
         self.robot = robot
         self._data = robot.model.createData()
         self._state_map = StateMap(robot)
-        self._recorder = Recorder(self._forward)
-        self._clients: set[_Socket] = set()
         self._lock = threading.Lock()
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._pending = False
+        self._recorder = Recorder(self._forward)
         self.meshcat = Visualizer(window=self._recorder)
         drawing = Drawing(robot, self.meshcat["robot"])
         self.notes = drawing.notes
@@ -91,8 +83,10 @@ class Live:
             "triads": triads(robot, tool, info["size"]),
         }
         info["names"][:6] = [f"base {kind} {axis}" for kind in ("turn", "shift") for axis in "xyz"]
-        self._serve(build_page(info, connect="'self' ws:"), port)
-        self._recorder.web_url = self.url
+        page = build_page(info, connect="'self' ws:")
+        self._server = Server(page, self._recorder.commands, self._asked, port)
+        self.url = self._recorder.web_url = self._server.url
+        self.port = self._server.port
         self.show(q)
 
     def show(self, q: Array, t: float | None = None) -> None:
@@ -123,8 +117,7 @@ class Live:
                 "coupling": (inertia / np.outer(scale, scale)).round(4).ravel().tolist(),
             }
             self.q = q
-            self._message = json.dumps(state)
-        self._call(self._broadcast)
+        self._server.update(json.dumps(state))
 
     def __call__(self, t: float, q: Array, *_: Any) -> None:
         """Show a step of a running simulation."""
@@ -138,19 +131,11 @@ class Live:
 
     def wait(self) -> None:
         """Wait until it is closed, or until Ctrl-C."""
-        try:
-            # Without a timeout some platforms do not let Ctrl-C through.
-            while self._thread.is_alive():
-                self._thread.join(0.5)
-        except KeyboardInterrupt:
-            self.close()
+        self._server.wait()
 
     def close(self) -> None:
         """End it; the page says that the connection is lost."""
-        loop, self._loop = self._loop, None
-        if loop:
-            loop.call_soon_threadsafe(self._stop.set)
-            self._thread.join(5.0)
+        self._server.close()
 
     def __enter__(self) -> Live:
         return self
@@ -158,57 +143,13 @@ class Live:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _serve(self, page: str, port: int) -> None:
-        listener = _listen(port)
-        self.port = listener.getsockname()[1]
-        self.url = f"http://{_HOST}:{self.port}/"
-        hosts = {f"{name}:{self.port}" for name in (_HOST, "localhost")}
-        application = web.Application(
-            [
-                ("/", _Page, {"hosts": hosts, "page": page}),
-                ("/socket", _Socket, {"hosts": hosts, "live": self}),
-            ],
-            log_function=lambda _: None,
-            websocket_ping_interval=20,
-        )
-        started = threading.Event()
-
-        async def run() -> None:
-            self._loop = asyncio.get_running_loop()
-            self._stop = asyncio.Event()
-            server = httpserver.HTTPServer(application)
-            server.add_socket(listener)
-            started.set()
-            await self._stop.wait()
-            server.stop()
-            for client in list(self._clients):
-                client.close()
-            await server.close_all_connections()
-
-        self._thread = threading.Thread(target=lambda: asyncio.run(run()), daemon=True)
-        self._thread.start()
-        started.wait()
-
-    def _call(self, what: Any, *arguments: Any) -> None:
-        loop = self._loop
-        if loop:
-            loop.call_soon_threadsafe(what, *arguments)
-
     def _forward(self, command: bytes) -> None:
-        if self._loop:
-            self._call(lambda: [client.send(command) for client in list(self._clients)])
+        # What is drawn before there is a server waits in the recorder.
+        if hasattr(self, "_server"):
+            self._server.send(command)
 
-    def _broadcast(self) -> None:
-        for client in list(self._clients):
-            client.update()
-
-    def _opened(self, client: _Socket) -> None:
-        self._clients.add(client)
-        for command in self._recorder.commands():
-            client.send(command)
-        client.update()
-
-    def _asked(self, message: dict[str, Any]) -> None:
+    def _asked(self, message: Any) -> None:
+        """Do what a browser asks: {"joints": {name: value}}, {"neutral": _}, {"random": _}."""
         q = self.q.copy()
         if message.get("neutral"):
             q[7:] = self.robot.neutral()[7:]
@@ -223,89 +164,6 @@ class Live:
         self.show(q)
 
 
-class _Guarded(web.RequestHandler):
-    """Answers only to this machine's own names, so that no other site's page gets through."""
-
-    def initialize(self, hosts: set[str], **fields: Any) -> None:
-        self._hosts = hosts
-        self._fields = fields
-
-    def prepare(self) -> None:
-        if self.request.host not in self._hosts:
-            raise web.HTTPError(403)
-
-    def set_default_headers(self) -> None:
-        self.clear_header("Server")
-
-
-class _Page(_Guarded):
-    def get(self) -> None:
-        self.set_header("Cache-Control", "no-store")
-        self.write(self._fields["page"])
-
-
-class _Socket(_Guarded, websocket.WebSocketHandler):
-    """One browser. It is sent the newest state when it has taken the one before."""
-
-    _busy = False
-    _behind = False
-
-    def check_origin(self, origin: str) -> bool:
-        return origin.partition("://")[2] in self._hosts
-
-    def open(self, *_: str, **__: str) -> None:
-        self._fields["live"]._opened(self)
-
-    def on_close(self) -> None:
-        self._fields["live"]._clients.discard(self)
-
-    def on_message(self, message: str | bytes) -> None:
-        try:
-            asked = json.loads(message)
-            self._fields["live"]._asked(asked)
-        except (FflinError, ValueError, TypeError, AttributeError):
-            pass  # of no page of ours
-
-    def send(self, content: bytes | str) -> Any:
-        try:
-            return self.write_message(content, binary=isinstance(content, bytes))
-        except websocket.WebSocketClosedError:
-            return None
-
-    def update(self) -> None:
-        if self._busy:
-            self._behind = True
-            return
-        sent = self.send(self._fields["live"]._message)
-        if sent is None:
-            return
-        self._busy = True
-
-        def done(future: asyncio.Future[None]) -> None:
-            self._busy = False
-            if future.exception() is None and self._behind:
-                self._behind = False
-                self.update()
-
-        sent.add_done_callback(done)
-
-
-def _listen(port: int) -> socket.socket:
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    try:
-        if os.name == "posix":  # elsewhere it would let two listen on one port
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((_HOST, port))
-        listener.listen(128)
-    except OSError as error:
-        listener.close()
-        raise InputError(
-            f"port {port} cannot be had: {error.strerror}; name another, or none for a free one"
-        ) from None
-    listener.setblocking(False)
-    return listener
-
-
 def _subtitle(robot: Robot) -> str:
     return f"{robot.n} joint{'s' * (robot.n != 1)}, {robot.mass:.4g} kg"
 
@@ -317,8 +175,12 @@ def _joints(robot: Robot) -> list[dict[str, Any]]:
     for joint in robot.joints:
         low, high = -np.pi, np.pi
         if not joint.unbounded:
-            low = max(float(model.lowerPositionLimit[joint.idx_q]), -1.0 if joint.prismatic else -np.pi)
-            high = min(float(model.upperPositionLimit[joint.idx_q]), 1.0 if joint.prismatic else np.pi)
+            low = max(
+                float(model.lowerPositionLimit[joint.idx_q]), -1.0 if joint.prismatic else -np.pi
+            )
+            high = min(
+                float(model.upperPositionLimit[joint.idx_q]), 1.0 if joint.prismatic else np.pi
+            )
             if not low < high:
                 low, high = low - 1.0, low + 1.0
         found.append({"name": joint.name, "low": low, "high": high, "length": joint.prismatic})

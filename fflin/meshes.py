@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fflin.collada import read_collada
-from fflin.visuals import Color
+from fflin.collada import Indices, read_collada
 from fflin.validation import Array
+from fflin.visuals import Color
 
 # Details smaller than this part of a mesh's extent are not drawn; it halves most CAD exports.
 _RESOLUTION = 1.0 / 400.0
@@ -32,7 +32,7 @@ class Mesh:
     """
 
     vertices: Array
-    faces: Array
+    faces: Indices
     color: Color | None
 
 
@@ -72,7 +72,7 @@ def load_mesh(path: Path) -> tuple[Mesh, ...]:
         resolution *= 1.5
 
 
-def _triangles(path: Path) -> tuple[Array, Array]:
+def _triangles(path: Path) -> tuple[Array, Indices]:
     import coal
 
     try:
@@ -81,11 +81,11 @@ def _triangles(path: Path) -> tuple[Array, Array]:
         raise ValueError(f"{path}: cannot be read: {' '.join(str(error).split())}") from None
     vertices = np.array(mesh.vertices(), dtype=float).reshape(-1, 3)
     triangles = (mesh.tri_indices(index) for index in range(mesh.num_tris))
-    faces = np.array([(t[0], t[1], t[2]) for t in triangles], dtype=np.intp)
-    return vertices, faces.reshape(-1, 3)
+    faces = np.array([(t[0], t[1], t[2]) for t in triangles], dtype=np.intp).reshape(-1, 3)
+    return vertices, faces
 
 
-def _weld(vertices: Array, faces: Array, cell: float) -> tuple[Array, Array]:
+def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]:
     """Let vertices in one cell of a grid be one, where they first stand; drop what collapses."""
     if not cell:
         return vertices[:0].astype(np.float32), faces[:0].astype(np.uint32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+
 import numpy as np
 import pinocchio as pin
 
@@ -108,7 +109,11 @@ def play_back(
     model, data = robot.model, robot.model.createData()
     tool_id = model.getFrameId(tool) if tool else None
     actuation = Actuation(state)
-    poses, com, tools, force, torque = [], [], [], [], []
+    poses: list[Array] = []
+    com: list[Array] = []
+    tools: list[Array] = []
+    force: list[Array] = []
+    torque: list[Array] = []
     for q_k, u_k in zip(q, u, strict=True):
         poses.append(body_poses(robot, data, q_k))
         com.append(pin.centerOfMass(model, data, q_k).copy())
@@ -147,4 +152,3 @@ def thrusters(robot: Robot) -> list[tuple[int, Array, Array]]:
                 (frame.parentJoint, position, frame.placement.rotation @ np.array(item.direction))
             )
     return found
-

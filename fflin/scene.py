@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 import umsgpack
 
+from fflin.collada import Indices
 from fflin.meshes import Mesh, load_mesh
 from fflin.model import ROOT, Robot
 from fflin.validation import Array
@@ -111,13 +112,13 @@ class Drawing:
                 continue
             for part, (geometry, matrix, color, box) in enumerate(pieces):
                 about = {"finish": shape.finish, "color": color, "look": look}
+                shown = geometry
                 if geometry["type"] == "BufferGeometry":
                     about["mesh"] = geometry["uuid"]
-                    if geometry["uuid"] in sent:
-                        geometry = _ELSEWHERE
-                    sent.add(about["mesh"])
+                    shown = _ELSEWHERE if geometry["uuid"] in sent else geometry
+                    sent.add(geometry["uuid"])
                 placed = shape.placement.homogeneous @ matrix
-                node[f"{index}_{part}"].set_object(_Piece(geometry, placed, about))
+                node[f"{index}_{part}"].set_object(_Piece(shown, placed, about))
                 corners.setdefault(shape.joint, []).append(_box_corners(placed, box))
         if unreadable:
             notes += (f"{robot.name}: {named('mesh file', unreadable)} cannot be read; not drawn",)
@@ -160,7 +161,7 @@ class Animation(SetAnimation):
         return {"type": "set_animation", "animations": self._clips, "options": options, "path": ""}
 
 
-def typed(array: Array, kind: str = "<f4") -> Any:
+def typed(array: Array | Indices, kind: str = "<f4") -> Any:
     """Pack an array so that the page has it as a typed one."""
     return umsgpack.Ext(_TYPED[kind][0], np.ascontiguousarray(array, dtype=kind).tobytes())
 

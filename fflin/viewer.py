@@ -47,6 +47,7 @@ def visualize(
     follow: bool = False,
     target: Array | None = None,
     tool: str | None = None,
+    q: Array | None = None,
     port: int = 0,
 ) -> Live | Path | None:
     """Show a robot live, or a motion of it as one HTML file that needs no network.
@@ -84,6 +85,8 @@ def visualize(
         to, or where it ends.
     tool : str, optional
         Frame whose trail is drawn; "tool" or the last link of the longest chain by default.
+    q : array_like (nq,), optional
+        Where a live robot stands first; neutral by default.
     port : int
         Of the live page; a free one by default.
 
@@ -123,12 +126,11 @@ def visualize(
 
     tool = tool or default_tool(robot)
     if motion is None:
-        return _live(robot, open, (html, png, gif), scene, tool, follow, port)
-    outputs = _outputs(robot, {".html": html, ".png": png, ".gif": gif})
-    if ".png" in outputs or ".gif" in outputs:
-        from fflin.capture import find_chromium
-
-        find_chromium()
+        if any(file is not None for file in (html, png, gif)):
+            raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
+        start = robot.neutral() if q is None else robot.checked_configuration(q)
+        return _live(robot, start, open is None or open, scene, tool, follow, port)
+    outputs = check_outputs(robot, {".html": html, ".png": png, ".gif": gif})
     _check_motion(robot, motion)
     fps, speed = _rates(motion, fps, speed)
     goal = _target(robot, motion) if target is None else robot.checked_configuration(target)
@@ -158,29 +160,22 @@ def visualize(
 
 
 def _live(
-    robot: Robot,
-    open: bool | None,
-    files: tuple[Any, ...],
-    scene: str,
-    tool: str | None,
-    follow: bool,
-    port: int,
+    robot: Robot, q: Array, open: bool, scene: str, tool: str | None, follow: bool, port: int
 ) -> Live:
-    if any(file is not None for file in files):
-        raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port < 2**16:
         raise InputError(f"port is {port!r}, expected 0 to 65535 (0: one that is free)")
     from fflin.live import Live
 
-    live = Live(robot, robot.neutral(), scene=scene, tool=tool, follow=follow, port=port)
+    live = Live(robot, q, scene=scene, tool=tool, follow=follow, port=port)
     for note in live.notes:
         warn(note, FflinWarning, stacklevel=3)
-    if open is None or open:
+    if open:
         live.open()
     return live
 
 
-def _outputs(robot: Robot, files: dict[str, Any]) -> dict[str, Path]:
+def check_outputs(robot: Robot, files: dict[str, Any]) -> dict[str, Path]:
+    """Return {ending: path} of the files that are named, or raise where one cannot be written."""
     outputs = {}
     for ending, file in files.items():
         if file is None:
@@ -193,6 +188,10 @@ def _outputs(robot: Robot, files: dict[str, Any]) -> dict[str, Path]:
         if robot.urdf and path.resolve() == robot.urdf.resolve():
             raise FileError(f"{path} is the robot's own file; name another to write")
         outputs[ending] = path
+    if ".png" in outputs or ".gif" in outputs:
+        from fflin.capture import find_chromium
+
+        find_chromium()
     return outputs
 
 

@@ -117,8 +117,8 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
     if missing:
         where = ", ".join(str(folder) for folder in robot.package_dirs) or path.parent
         notes.append(
-            f"{robot.name}: {named('mesh file', missing)} not found below {where}; the rest is drawn "
-            "(package_dirs of fflin.load names other folders)"
+            f"{robot.name}: {named('mesh file', missing)} not found below {where}; the rest is "
+            "drawn (package_dirs of fflin.load names other folders)"
         )
     if odd:
         lines = ", ".join(map(str, odd[:6])) + ", ..." * (len(odd) > 6)
@@ -159,9 +159,7 @@ def _placement(visual: Element) -> pin.SE3:
     return pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
 
 
-def _material(
-    visual: Element, colors: Mapping[str, Color], kind: str
-) -> tuple[Color | None, str]:
+def _material(visual: Element, colors: Mapping[str, Color], kind: str) -> tuple[Color | None, str]:
     materials = visual.find_all("material")
     none = None if kind == "mesh" else PLAIN
     if not materials:

@@ -16,9 +16,9 @@ import urllib.request
 import numpy as np
 import pinocchio as pin
 import pytest
+from browser import Watched, chromium
 
 import fflin
-from browser import Watched, chromium
 from fflin.model import ROOT
 
 
@@ -95,9 +95,9 @@ def test_it_survives_a_thousand_reconnects(live):
     before = count()
     asyncio.run(reconnect())
     deadline = time.monotonic() + 5.0
-    while live._clients and time.monotonic() < deadline:
+    while live._server.clients and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert not live._clients
+    assert not live._server.clients
     assert count() <= before + 5
     assert urllib.request.urlopen(live.url).status == 200
 
@@ -143,18 +143,18 @@ def test_a_slow_browser_gets_the_newest_state_and_not_all(live, robots):
         lines += ["Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13"]
         lines += ["Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "", ""]
         slow.sendall("\r\n".join(lines).encode())
-        while not live._clients:
+        while not live._server.clients:
             time.sleep(0.01)
         last = 20_000
         for k in range(last + 1):
             live.show(q, k)
-        total = last * len(live._message)
+        total = last * len(live._server.state)
         slow.settimeout(1.0)
         received, tail = 0, b""
         with contextlib.suppress(TimeoutError):
             while chunk := slow.recv(2**20):
                 received += len(chunk)
-                tail = (tail + chunk)[-len(live._message) :]
+                tail = (tail + chunk)[-len(live._server.state) :]
     assert json.loads(tail)["time"] == last
     assert received < total / 2
 

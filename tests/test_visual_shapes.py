@@ -1,4 +1,6 @@
-"""What is drawn: shapes of URDFs against Pinocchio's reader, inertia boxes, meshes, the recorder."""
+"""Shapes of URDFs against Pinocchio's reader, inertia boxes, meshes, and the recorder."""
+
+import importlib
 
 import numpy as np
 import pinocchio as pin
@@ -177,7 +179,7 @@ def test_the_recorder_keeps_the_last_value_of_a_property_per_path():
     from fflin.recorder import Recorder
     from fflin.scene import Visualizer
 
-    import meshcat.geometry as g  # after fflin.scene, which quiets it
+    g = importlib.import_module("meshcat.geometry")  # after fflin.scene, which quiets it
 
     forwarded = []
     window = Recorder(forwarded.append)

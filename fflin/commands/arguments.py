@@ -77,8 +77,8 @@ def add_robot(command: argparse.ArgumentParser) -> None:
     )
 
 
-def add_point(command: argparse.ArgumentParser) -> None:
-    """Add the robot and what says the point that it is linearised about."""
+def add_pose(command: argparse.ArgumentParser) -> None:
+    """Add the robot and where it stands."""
     add_robot(command)
     command.add_argument(
         "--joint",
@@ -104,6 +104,11 @@ def add_point(command: argparse.ArgumentParser) -> None:
         metavar=("X", "Y", "Z"),
         help="base position [m]",
     )
+
+
+def add_point(command: argparse.ArgumentParser) -> None:
+    """Add the robot and what says the point that it is linearised about."""
+    add_pose(command)
     for name, unit in (("stiffness", "N m/rad|N/m"), ("damping", "N m s/rad|N s/m")):
         command.add_argument(
             f"--{name}",
