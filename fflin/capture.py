@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -66,7 +67,7 @@ def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes
     size : tuple of int
         Width and height of each picture [pixels].
     """
-    frames = asyncio.run(_film(page, times, size, plain=len(times) > 1))
+    frames = _film(page, times, size, plain=len(times) > 1)
     if len(frames) == 1:
         return frames[0]
     from PIL import Image
@@ -94,7 +95,7 @@ def take_gif(page: Path, duration: float, speed: float, size: tuple[int, int]) -
 
     count = max(2, min(_GIF_FRAMES, round(duration / speed * _GIF_FPS)))
     times = [duration * index / (count - 1) for index in range(count)]
-    frames = asyncio.run(_film(page, times, size, plain=True))
+    frames = _film(page, times, size, plain=True)
     images = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
     palette = images[0].quantize(160)
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
@@ -105,10 +106,16 @@ def take_gif(page: Path, duration: float, speed: float, size: tuple[int, int]) -
     return content.getvalue()
 
 
-async def _film(
-    page: Path, times: Sequence[float], size: tuple[int, int], *, plain: bool
-) -> list[bytes]:
+def _film(page: Path, times: Sequence[float], size: tuple[int, int], *, plain: bool) -> list[bytes]:
     """Return a PNG of the page at each time."""
+    # In a notebook this thread has an event loop already.
+    with ThreadPoolExecutor(1) as other:
+        return other.submit(lambda: asyncio.run(_browse(page, times, size, plain))).result()
+
+
+async def _browse(
+    page: Path, times: Sequence[float], size: tuple[int, int], plain: bool
+) -> list[bytes]:
     program = find_chromium()
     with tempfile.TemporaryDirectory(prefix="fflin-", ignore_cleanup_errors=True) as folder:
         root = ["--no-sandbox"] if getattr(os, "geteuid", lambda: 1)() == 0 else []
@@ -125,7 +132,7 @@ async def _film(
             )
         except (asyncio.TimeoutError, OSError, _BrowserError) as error:
             raise FileError(
-                f"{program} takes no picture of {page}: {error or 'it does not answer'}"
+                f"{program} takes no picture of {page}: {str(error) or 'it does not answer'}"
             ) from None
         finally:
             process.terminate()
@@ -148,56 +155,67 @@ async def _shoot(
         await asyncio.sleep(0.05)
     port, path = ready.read_text().split()
     socket = await websocket_connect(f"ws://127.0.0.1:{port}{path}", max_message_size=2**28)
-    number = 0
+    try:
+        return await _Tab(socket).shoot(page, times, size, plain)
+    finally:
+        socket.close()
+        while await asyncio.wait_for(socket.read_message(), 10.0) is not None:
+            pass
 
-    async def tell(method: str, session: str = "", **parameters: Any) -> dict[str, Any]:
-        nonlocal number
-        number += 1
-        command = {"id": number, "method": method, "params": parameters}
-        await socket.write_message(
-            json.dumps(command | ({"sessionId": session} if session else {}))
-        )
+
+class _Tab:
+    """One page of a browser, told what to do by the DevTools protocol."""
+
+    def __init__(self, socket: Any) -> None:
+        self._socket = socket
+        self._number = 0
+        self._session: dict[str, str] = {}
+
+    async def tell(self, method: str, **parameters: Any) -> dict[str, Any]:
+        self._number += 1
+        command = {"id": self._number, "method": method, "params": parameters, **self._session}
+        await self._socket.write_message(json.dumps(command))
         while True:
-            message = await socket.read_message()
+            message = await self._socket.read_message()
             if message is None:
                 raise _BrowserError("the connection is lost")
             answer = json.loads(message)
-            if answer.get("id") == number:
+            if answer.get("id") == self._number:
                 if "error" in answer:
                     raise _BrowserError(answer["error"].get("message"))
                 result: dict[str, Any] = answer["result"]
                 return result
 
-    target = (await tell("Target.createTarget", url="about:blank"))["targetId"]
-    session = (await tell("Target.attachToTarget", targetId=target, flatten=True))["sessionId"]
-    metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
-    await tell("Emulation.setDeviceMetricsOverride", session, **metrics)
-    await tell("Page.navigate", session, url=page.resolve().as_uri() + "#pause")
-
-    async def evaluate(expression: str) -> Any:
-        answer = await tell(
-            "Runtime.evaluate",
-            session,
-            expression=expression,
-            awaitPromise=True,
-            returnByValue=True,
+    async def evaluate(self, expression: str) -> Any:
+        answer = await self.tell(
+            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
         )
         if "exceptionDetails" in answer:
             raise _BrowserError(answer["exceptionDetails"].get("text"))
         return answer["result"].get("value")
 
-    while not await evaluate("Boolean(window.fflin && window.fflin.ready)"):
-        await asyncio.sleep(0.05)
-    if plain:
-        await evaluate("fflin.plain(true)")
-    pictures = []
-    for time in times:
-        # Two frames: one that draws, one after which it is on the screen.
-        await evaluate(
-            f"fflin.seek({float(time)!r}); new Promise(done => requestAnimationFrame(() => "
-            "requestAnimationFrame(() => done(1))))"
+    async def shoot(
+        self, page: Path, times: Sequence[float], size: tuple[int, int], plain: bool
+    ) -> list[bytes]:
+        target = await self.tell("Target.createTarget", url="about:blank")
+        attached = await self.tell(
+            "Target.attachToTarget", targetId=target["targetId"], flatten=True
         )
-        picture = await tell("Page.captureScreenshot", session, format="png")
-        pictures.append(base64.b64decode(picture["data"]))
-    await tell("Browser.close")
-    return pictures
+        self._session = {"sessionId": attached["sessionId"]}
+        metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
+        await self.tell("Emulation.setDeviceMetricsOverride", **metrics)
+        await self.tell("Page.navigate", url=page.resolve().as_uri() + "#pause")
+        while not await self.evaluate("Boolean(window.fflin && window.fflin.ready)"):
+            await asyncio.sleep(0.05)
+        if plain:
+            await self.evaluate("fflin.plain(true)")
+        pictures = []
+        for time in times:
+            # Two frames: one that draws, one after which it is on the screen.
+            await self.evaluate(
+                f"fflin.seek({float(time)!r}); new Promise(done => requestAnimationFrame(() => "
+                "requestAnimationFrame(() => done(1))))"
+            )
+            picture = await self.tell("Page.captureScreenshot", format="png")
+            pictures.append(base64.b64decode(picture["data"]))
+        return pictures

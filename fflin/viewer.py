@@ -128,12 +128,12 @@ def visualize(
     if motion is None:
         if any(file is not None for file in (html, png, gif)):
             raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
-        start = robot.neutral() if q is None else robot.checked_configuration(q)
+        start = robot.neutral() if q is None else _configuration(robot, "q", q)
         return _live(robot, start, open is None or open, scene, tool, follow, port)
     outputs = check_outputs(robot, {".html": html, ".png": png, ".gif": gif})
     _check_motion(robot, motion)
     fps, speed = _rates(motion, fps, speed)
-    goal = _target(robot, motion) if target is None else robot.checked_configuration(target)
+    goal = _target(robot, motion) if target is None else _configuration(robot, "target", target)
     from fflin.film import motion_page
 
     page, notes = motion_page(
@@ -222,6 +222,13 @@ def _check_motion(robot: Robot, motion: Motion) -> None:
             f"the motion is one of '{motion.robot}', not of '{robot.name}' as it is given; give "
             "the robot that it was simulated with"
         )
+
+
+def _configuration(robot: Robot, name: str, value: Array) -> Array:
+    try:
+        return robot.checked_configuration(value)
+    except InputError as error:
+        raise InputError(f"{name} is no configuration: {error}") from None
 
 
 def _target(robot: Robot, motion: Motion) -> Array:

@@ -112,7 +112,7 @@ function torqueArrow({ colour, values, most, size }) {
 }
 
 function plume({ position, direction, values, most, size }) {
-  const length = 0.42 * size, radius = 0.055 * size;
+  const length = 0.48 * size, radius = 0.07 * size;
   const cone = new THREE.ConeGeometry(radius, length, 28, 12, true);
   cone.translate(0, -length / 2, 0); // the nozzle at the origin, the gas along -y
   const material = new THREE.ShaderMaterial({
@@ -132,7 +132,7 @@ function plume({ position, direction, values, most, size }) {
         float core = pow(abs(dot(normalize(n), normalize(eye))), 1.4);
         float fade = pow(1.0 - along, 1.8);
         vec3 colour = mix(vec3(0.35, 0.55, 1.0), vec3(1.0, 0.93, 0.85), pow(1.0 - along, 5.0));
-        gl_FragColor = vec4(colour * core * fade * (0.35 + 0.65 * power), 1.0);
+        gl_FragColor = vec4(1.9 * colour * core * fade * (0.4 + 0.6 * power), 1.0);
       }`,
   });
   const group = new THREE.Group();
