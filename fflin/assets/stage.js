@@ -26,14 +26,14 @@ function makeStage(info) {
   scene.environment = sky.environment;
 
   const size = info.size;
-  const sun = new THREE.DirectionalLight(0xfff3e2, space ? 2.6 : 2.0);
+  const sun = new THREE.DirectionalLight(0xfff3e2, space ? 2.6 : 1.6);
   sun.castShadow = true;
   sun.shadow.mapSize.set(2048, 2048);
   sun.shadow.bias = -0.0004;
   sun.shadow.normalBias = 0.004 * size;
   const reach = 1.35 * size;
   Object.assign(sun.shadow.camera, { left: -reach, right: reach, top: reach, bottom: -reach, near: 0.1 * size, far: 9 * size });
-  const glow = new THREE.HemisphereLight(space ? 0x9db4d8 : 0xffffff, space ? 0x2f5fae : 0xb0b4ba, space ? 0.28 : 0.45);
+  const glow = new THREE.HemisphereLight(space ? 0x9db4d8 : 0xffffff, space ? 0x2f5fae : 0xb0b4ba, space ? 0.28 : 0.35);
   const lights = new THREE.Group();
   lights.rotation.x = Math.PI / 2; // undoes the turn of the scene
   lights.add(sun, sun.target, glow);
