@@ -17,11 +17,6 @@ Indices: TypeAlias = "np.ndarray[Any, np.dtype[np.integer[Any]]]"
 Part: TypeAlias = "tuple[Array, Indices, Color | None]"
 
 _NAMESPACE = re.compile(r"\{[^}]*\}")
-_UP = {
-    "X_UP": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-    "Y_UP": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-    "Z_UP": np.eye(3),
-}
 
 
 def read_collada(path: Path) -> list[Part] | None:
@@ -49,9 +44,9 @@ def read_collada(path: Path) -> list[Part] | None:
 
 def _parts(root: ElementTree.Element) -> Iterator[Part]:
     unit = root.find("asset/unit")
-    up = root.findtext("asset/up_axis", "Y_UP").strip()
-    top = np.eye(4)
-    top[:3, :3] = _UP[up] * float(unit.get("meter", 1.0) if unit is not None else 1.0)
+    top: Array = np.eye(4)
+    # As ROS and Pinocchio do, and unlike COLLADA, no heed is paid to the axis that is up.
+    top[:3, :3] *= float(unit.get("meter", 1.0) if unit is not None else 1.0)
     identified = {e.get("id"): e for e in root.iter() if e.get("id")}
     (scene,) = (identified[e.get("url", "")[1:]] for e in root.iter("instance_visual_scene"))
     stack = [(node, top) for node in scene.findall("node")]

@@ -40,7 +40,7 @@ def motion_page(
 ) -> tuple[str, tuple[str, ...]]:
     """Return the page of a motion, and what could not be drawn; see `visualize`."""
     shown = frame_indices(motion.t, fps, speed)
-    t, q, u = motion.t[shown], motion.q[shown], motion.u[np.minimum(shown, len(motion.u) - 1)]
+    t, q, u = motion.t[shown], motion.q[shown], motion.u[shown]
     state = StateMap(robot, reference=motion.reference, frame=motion.frame)
     film = play_back(robot, state, t, q, u, tool)
 
@@ -62,7 +62,7 @@ def motion_page(
 
     info = stage_info(robot, drawing, film.poses[0], scene=scene, subtitle=_subtitle(robot, t))
     info |= marks(robot, film, tool, info["size"])
-    info |= panel(robot, state, q, u, target, _drift(motion)[shown])
+    info |= panel(robot, state, q, u, target, motion.momentum_drift[shown])
     info |= {
         "mode": "motion",
         "t": packed(t),
@@ -79,11 +79,6 @@ def _predicted(state: StateMap, motion: Motion, shown: Array) -> Array | None:
     if motion.linear is None:
         return None
     return np.array([state.to_pinocchio(x)[0] for x in motion.linear[shown]])
-
-
-def _drift(motion: Motion) -> Array:
-    """Return how far the momentum is off what the inputs make of it (N,), relative."""
-    return np.broadcast_to(np.asarray(motion.momentum_drift, dtype=float), motion.t.shape)
 
 
 def _subtitle(robot: Robot, t: Array) -> str:

@@ -137,12 +137,9 @@ class Drawing:
         times = typed(t)
         clips = []
         for index, path in enumerate(self._paths):
-            quaternions = poses[:, index, 3:].copy()
-            turned = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0
-            quaternions[1:][np.cumsum(turned) % 2 == 1] *= -1.0
             tracks = [
                 {"name": ".position", "type": "vector3", "values": typed(poses[:, index, :3])},
-                {"name": ".quaternion", "type": "quaternion", "values": typed(quaternions)},
+                {"name": ".quaternion", "type": "quaternion", "values": typed(poses[:, index, 3:])},
             ]
             clip = {"fps": 1, "name": path, "tracks": [{**each, "times": times} for each in tracks]}
             clips.append({"path": self._visualizer[path].path.lower(), "clip": clip})

@@ -82,7 +82,7 @@ def visualize(
         Whether the camera follows the base.
     target : array_like (nq,), optional
         Configuration that errors are counted from; by default the one that the motion was steered
-        to, or where it ends.
+        to, or where it begins.
     tool : str, optional
         Frame whose trail is drawn; "tool" or the last link of the longest chain by default.
     q : array_like (nq,), optional
@@ -133,7 +133,10 @@ def visualize(
     outputs = check_outputs(robot, {".html": html, ".png": png, ".gif": gif})
     _check_motion(robot, motion)
     fps, speed = _rates(motion, fps, speed)
-    goal = _target(robot, motion) if target is None else _configuration(robot, "target", target)
+    if target is None:
+        state = StateMap(robot, reference=motion.reference, frame=motion.frame)
+        target = state.to_pinocchio(motion.target)[0]
+    goal = _configuration(robot, "target", target)
     from fflin.film import motion_page
 
     page, notes = motion_page(
@@ -210,12 +213,10 @@ def _rates(motion: Motion, fps: float, speed: float | None) -> tuple[float, floa
 
 
 def _check_motion(robot: Robot, motion: Motion) -> None:
-    try:
-        sizes = motion.q.shape[1], motion.u.shape[1]
-    except (AttributeError, IndexError, TypeError):
-        raise InputError(
-            f"motion is a {type(motion).__name__}, expected a Motion of fflin.simulate"
-        ) from None
+    from fflin.motion import require_motion
+
+    require_motion(motion)
+    sizes = motion.q.shape[1], motion.u.shape[1]
     expected = robot.nq, len(Actuation(StateMap(robot)).names)
     if sizes != expected or motion.urdf_sha256 != robot.urdf_sha256:
         raise InputError(
@@ -229,14 +230,6 @@ def _configuration(robot: Robot, name: str, value: Array) -> Array:
         return robot.checked_configuration(value)
     except InputError as error:
         raise InputError(f"{name} is no configuration: {error}") from None
-
-
-def _target(robot: Robot, motion: Motion) -> Array:
-    """Return the reference placement with the joints where the motion ends."""
-    goal = motion.q[-1].copy()
-    root = robot.model.jointPlacements[ROOT]
-    goal[:7] = pin.SE3ToXYZQUAT(root.actInv(motion.reference))
-    return goal
 
 
 def _pictures(

@@ -250,6 +250,26 @@ def test_a_lab_with_meshes_plumes_and_a_prediction(robots, browser, tmp_path):
     state = fflin.StateMap(robot, reference=motion.reference, frame=motion.frame)
     predicted = state.to_pinocchio(motion.linear[index])[0]
     assert largest_difference(watched, robot, predicted, "linear") < EXACT
+    # Their normals are of length 1 and look outwards: the light is right.
+    wrong = watched.do("""(() => {
+        const V = MeshCat.THREE.Vector3, a = new V(), b = new V(), c = new V(), n = new V();
+        let wrong = 0, all = 0;
+        viewer.scene_tree.find(['meshcat', 'robot']).object.traverse((o) => {
+            if (!o.isMesh || !o.userData.mesh) return;
+            const { position, normal } = o.geometry.attributes;
+            for (let i = 0; i < position.count; i += 3) {
+                [a, b, c].forEach((v, k) => v.fromBufferAttribute(position, i + k));
+                b.sub(a).cross(c.sub(a)).normalize();
+                for (let k = 0; k < 3; k++) {
+                    n.fromBufferAttribute(normal, i + k);
+                    all++;
+                    if (Math.abs(n.length() - 1) > 1e-3 || n.dot(b) < 0.6) wrong++;
+                }
+            }
+        });
+        return wrong / all;
+    })()""")
+    assert wrong < 1e-2
     # Meshes shared by the three robots are sent once, and drawn three times.
     drawn = watched.do("""(() => {
         const count = {};

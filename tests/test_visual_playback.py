@@ -93,13 +93,14 @@ def test_plumes_stand_where_thrusters_push(robots):
 def test_errors_are_those_of_the_pose(robots):
     rng = np.random.default_rng(2)
     robot = robots["ets_vii"]  # its joints are continuous
-    target = random_point(robot, rng)[0]
+    turns = dict(zip(robot.joint_names, (0.3, 3.0, -1.0, 0.0, 1.0, -3.0), strict=True))
+    target = fflin.configuration(robot, turns, random_pose(rng, 50.0))
     step = np.concatenate((rng.normal(size=3), np.radians(37.0) * np.array([0.6, 0, 0.8])))
-    v = np.concatenate((np.zeros(6), [0.1, -3.0, 0.2, 0, 0, 2 * np.pi + 0.1]))
+    v = np.concatenate((np.zeros(6), [0.1, 0.7, 0.2, 0, 0, -1.1]))
     q = pin.integrate(robot.model, target, v)
     base = pin.XYZQUATToSE3(target[:7]) * pin.SE3(pin.exp3(step[3:]), step[:3])
     q[:7] = pin.SE3ToXYZQUAT(base)
     found = errors(robot, np.array([target, q]), target)
     np.testing.assert_allclose(found["attitude"], [0, 37.0], atol=1e-6)
     np.testing.assert_allclose(found["position"], [0, np.linalg.norm(step[:3])], atol=1e-12)
-    np.testing.assert_allclose(found["joints"], [0, 3.0], atol=1e-9)
+    np.testing.assert_allclose(found["joints"], [0, 1.1], atol=1e-9)

@@ -99,6 +99,7 @@ def test_inertia_boxes_have_the_inertia_of_the_bodies():
         inertia = root.inertias[shape.joint]
         box = shape.placement.act(pin.Inertia.FromBox(inertia.mass, *shape.size))
         assert box.isApprox(inertia, 1e-9)
+        assert np.linalg.det(shape.placement.rotation) == pytest.approx(1.0)
 
 
 def test_a_material_gives_colour_and_opacity(tmp_path):
@@ -160,6 +161,37 @@ def test_collada_has_the_triangles_of_pinocchios_loader(robot):
             whole = area(*parts[0][:2])
             assert whole == pytest.approx(area(vertices, faces), rel=1e-5), path
     assert any(color for path in paths for _, _, color in read_collada(path))
+
+
+COLLADA = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="centimeter" meter="0.01"/><up_axis>Y_UP</up_axis></asset>
+<library_effects><effect id="e"><profile_COMMON><technique sid="t"><phong>
+<diffuse><color>1 0.5 0 1</color></diffuse></phong></technique></profile_COMMON></effect>
+</library_effects>
+<library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="12">0 0 0 1 0 0 0 2 0 0 0 3</float_array>
+<technique_common><accessor source="#a" count="4" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<polylist material="s" count="2"><input semantic="VERTEX" source="#v" offset="0"/>
+<vcount>3 4</vcount><p>0 2 1 0 1 2 3</p></polylist></mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="w"><node id="n1">
+<translate>1 2 3</translate><rotate>0 0 1 90</rotate><node id="n2"><rotate>1 0 0 30</rotate>
+<scale>1 2 3</scale><instance_geometry url="#g"><bind_material><technique_common>
+<instance_material symbol="s" target="#m"/></technique_common></bind_material>
+</instance_geometry></node></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#w"/></scene></COLLADA>"""
+
+
+def test_collada_composes_the_transforms_of_its_nodes(tmp_path):
+    path = tmp_path / "m.dae"
+    path.write_text(COLLADA)
+    ((vertices, faces, color),) = read_collada(path)
+    assert color == (1.0, 0.5, 0.0, 1.0) and len(faces) == 3
+    theirs = 0.01 * _triangles(path)[0]  # Pinocchio's loader pays no heed to the unit either
+    assert {tuple(x) for x in np.round(vertices, 6)} == {tuple(x) for x in np.round(theirs, 6)}
 
 
 def test_welding_keeps_a_mesh_within_its_grid():
