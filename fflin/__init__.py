@@ -16,12 +16,21 @@ _PUBLIC = {
     "Certificate": "linear_model",
     "ChartError": "errors",
     "Check": "verification",
+    "Compensator": "estimation",
+    "Controllability": "structure",
+    "DetectabilityError": "errors",
+    "Equilibrium": "balance",
+    "EquilibriumError": "errors",
+    "Estimator": "estimation",
     "FflinError": "errors",
     "FflinWarning": "errors",
     "FileError": "errors",
     "FramePose": "outputs",
     "FrameVelocity": "outputs",
     "FullState": "outputs",
+    "Gain": "regulator",
+    "GainSchedule": "schedules",
+    "Gramians": "gramian",
     "Gyroscope": "outputs",
     "InputError": "errors",
     "JointPositions": "outputs",
@@ -31,23 +40,43 @@ _PUBLIC = {
     "LinearTrajectory": "trajectory",
     "Linearizer": "linearization",
     "MissingPackageError": "errors",
+    "Mode": "eigenmodes",
     "ModelError": "errors",
+    "Modes": "eigenmodes",
     "Momentum": "outputs",
+    "Observability": "observation",
+    "ReducedModel": "momentum",
     "Robot": "model",
     "SingularInertiaError": "errors",
+    "StabilizabilityError": "errors",
     "StateMap": "state",
     "Thruster": "inputs",
     "UnknownNameError": "errors",
     "UrdfError": "errors",
+    "acceleration_lqr": "acceleration",
+    "bryson": "weights",
     "check": "verification",
     "configuration": "model",
+    "controllability": "structure",
     "effort": "points",
+    "equilibrium": "balance",
     "from_model": "loading",
+    "generalized_inertia": "momentum",
+    "generalized_jacobian": "momentum",
+    "gramians": "gramian",
+    "kalman": "estimation",
     "linearize": "linearization",
     "linearize_trajectory": "trajectory",
     "list_robots": "robots",
     "load": "loading",
     "load_inputs": "input_files",
+    "lqg": "estimation",
+    "lqr": "regulator",
+    "modes": "eigenmodes",
+    "momentum_reduction": "momentum",
+    "observability": "observation",
+    "sampled_cost": "sampling",
+    "tvlqr": "schedules",
     "velocity": "points",
     "visualize": "viewer",
 }
@@ -55,8 +84,13 @@ _PUBLIC = {
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
 
 if TYPE_CHECKING:
+    from fflin.acceleration import acceleration_lqr
+    from fflin.balance import Equilibrium, equilibrium
+    from fflin.eigenmodes import Mode, Modes, modes
     from fflin.errors import (
         ChartError,
+        DetectabilityError,
+        EquilibriumError,
         FflinError,
         FflinWarning,
         FileError,
@@ -64,15 +98,25 @@ if TYPE_CHECKING:
         MissingPackageError,
         ModelError,
         SingularInertiaError,
+        StabilizabilityError,
         UnknownNameError,
         UrdfError,
     )
+    from fflin.estimation import Compensator, Estimator, kalman, lqg
+    from fflin.gramian import Gramians, gramians
     from fflin.input_files import load_inputs
     from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
     from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load
     from fflin.model import Robot, configuration
+    from fflin.momentum import (
+        ReducedModel,
+        generalized_inertia,
+        generalized_jacobian,
+        momentum_reduction,
+    )
+    from fflin.observation import Observability, observability
     from fflin.outputs import (
         Accelerometer,
         BasePose,
@@ -86,11 +130,16 @@ if TYPE_CHECKING:
         Momentum,
     )
     from fflin.points import effort, velocity
+    from fflin.regulator import Gain, lqr
     from fflin.robots import list_robots
+    from fflin.sampling import sampled_cost
+    from fflin.schedules import GainSchedule, tvlqr
     from fflin.state import StateMap
+    from fflin.structure import Controllability, controllability
     from fflin.trajectory import LinearTrajectory, linearize_trajectory
     from fflin.verification import Check, check
     from fflin.viewer import visualize
+    from fflin.weights import bryson
 
 
 def __getattr__(name: str) -> Any:

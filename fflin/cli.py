@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from fflin import __version__
-from fflin.commands import BAD_INPUT, DONE, INTERRUPTED, models, visual
+from fflin.commands import BAD_INPUT, DONE, INTERRUPTED, analysis, models, regulator, visual
 from fflin.errors import FflinError, FflinWarning
 
 
@@ -75,5 +75,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"fflin {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     models.add_commands(commands)
+    analysis.add_commands(commands)
+    regulator.add_commands(commands)
     visual.add_commands(commands)
     return parser

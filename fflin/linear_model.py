@@ -81,6 +81,9 @@ class LinearModel:
         "joint=value" [rad|m] of the joints that are welded in it.
     fflin_version, pinocchio_version : str
         What made the model.
+    ignorable : tuple of str
+        The states that nothing in the model depends on: where the base is, and the angles of
+        rotors; with `moving` and without gravity, the attitude too.
     """
 
     A: Array
@@ -110,6 +113,10 @@ class LinearModel:
     _reference: Array = field()
     _inertia: Callable[[LinearModel], Array] = field()
     _certify: Callable[[LinearModel], Certificate] = field()
+    ignorable: tuple[str, ...] = ()
+    # Of a moving reference, whose f0 is zero by construction: its own rate (nx,), that of its
+    # attitude without turns about gravity. None otherwise.
+    _drift: Array | None = None
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -166,8 +173,21 @@ class LinearModel:
         return self._certify(self)
 
     def is_equilibrium(self, tol: float = 1e-9) -> bool:
-        """Whether the point is a fixed point: no entry of f0 exceeds `tol`."""
-        return bool(np.abs(self.f0).max() <= number("tol", tol))
+        """Whether the point is a fixed point or a relative equilibrium, so that A and B stay.
+
+        At a relative equilibrium only ignorable coordinates move, at constant rates: a rotor
+        spins, or the base flies along. With ``moving=True`` the motion of the reference is
+        judged, not f0: its velocities in base axes must be constant, its joints stand but for
+        rotors, and under gravity it may turn about the vertical only.
+
+        Parameters
+        ----------
+        tol : float
+            What no rate may exceed, in SI units; those of ignorable coordinates may.
+        """
+        rate = self.f0 if self._drift is None else self._drift
+        judged = [name not in self.ignorable for name in self.state_names]
+        return bool(np.abs(rate[judged]).max(initial=0.0) <= number("tol", tol))
 
     def discretize(self, dt: float) -> LinearModel:
         r"""Sample the model with its input held constant between samples.

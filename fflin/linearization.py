@@ -21,6 +21,7 @@ from fflin.output_equations import Rates, output_equations
 from fflin.outputs import FullState
 from fflin.rotation import rotation_matrix, skew
 from fflin.state import ANGULAR, LINEAR, Chart, Frame, StateMap
+from fflin.symmetry import ignorable_states
 from fflin.validation import Array, vector
 
 if TYPE_CHECKING:
@@ -233,6 +234,10 @@ class Linearizer:
             # The reference turns and flies with the point, so that the error does not.
             turning = skew(nu[ANGULAR])
             A[groups.q_b, groups.q_b] = A[groups.r_b, groups.r_b] = -turning
+            drift, weight = f0.copy(), float(rates.gravity.dot(rates.gravity))
+            if weight:
+                about = rates.gravity * (drift[groups.q_b].dot(rates.gravity) / weight)
+                drift[groups.q_b] -= about
             f0[:] = 0.0
         C, D, y0 = self._seen(chart, rates, q, v, u_base, x0)
         for array in (A, B, C, D, f0, x0, y0):
@@ -242,6 +247,8 @@ class Linearizer:
         point = {"A": A, "B": B, "C": C, "D": D, "f0": f0}
         point |= {"x0": x0, "y0": y0, "u0": u, "q": q, "v": v}
         point["_reference"] = self._reference_of(q)
+        if self._moving:
+            point["_drift"] = _frozen(drift)
         return LinearModel._from_fields(self._common | point)
 
     def _rates_in_base_axes(self, q: Array, v: Array, nu: Array, q_m: Array, u: Array) -> Rates:
@@ -388,6 +395,7 @@ class Linearizer:
             "pinocchio_version": pin.__version__,
             "_inertia": partial(inertia_matrix, robot),
             "_certify": partial(certify, robot),
+            "ignorable": ignorable_states(robot, moving=self._moving),
         }
 
 

@@ -26,6 +26,8 @@ from fflin.state import ANGULAR, LINEAR, StateMap
 from fflin.validation import Array
 
 _EPS = float(np.finfo(float).eps)
+# Rounding of a difference of outputs: its weights add up to two ulp, each output brings a few.
+_ULPS = 8.0
 
 # Relative to its block an analytic route agrees to round-off times the conditioning of M, with
 # room for the longer chain of operations; for a well-conditioned M, to this.
@@ -244,7 +246,7 @@ def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float)
     C = jacobian(lambda x: y(x, lin.u0), lin.x0, step_x)
     D = jacobian(lambda u: y(lin.x0, u), lin.u0, step_u)
     # What cannot be told from the rounding of y in its step is not compared any closer.
-    scale = np.maximum(1.0, np.abs(here))[:, None]
+    scale = _ULPS * np.maximum(1.0, np.abs(here))[:, None]
     rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]
     for name, given, expected, step in (("C", lin.C, C, step_x), ("D", lin.D, D, step_u)):
         size = np.maximum(

@@ -140,3 +140,13 @@ def test_report_fits_80_columns():
     text = str(fflin.check(robot, fflin.linearize(robot)))
     assert max(map(len, text.splitlines())) <= 80
     assert "OK: 123 figures hold" in text
+
+
+def test_rounding_of_a_large_acceleration_is_no_failure():
+    # Where an accelerometer sits at the pushed origin, its slopes vanish and only rounding is left.
+    robot = fflin.load("cubesat")
+    push = fflin.Thruster("base", (0.3, -1.1, 0.4), (1.0, 0.2, -0.5))
+    robot = robot.replace(inputs=[push], outputs=[fflin.Accelerometer("base")])
+    v = fflin.velocity(robot, {"omega_b.x": 1.3, "omega_b.y": -0.7, "v_b.z": 0.4})
+    for thrust in (1.0, 3.3, 7.1):
+        assert fflin.check(robot, fflin.linearize(robot, v=v, u=[thrust], moving=True)).ok

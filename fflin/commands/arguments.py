@@ -147,7 +147,8 @@ def add_point(command: argparse.ArgumentParser) -> None:
         "--inputs",
         metavar="FILE.toml",
         help="what acts on the robot, as fflin.load_inputs reads it: a file, or the name of a "
-        "bundled one; by default torque and force on the base and every joint's",
+        "bundled one; `joints` or `base`: those alone; by default torque and force on the base "
+        "and every joint's",
     )
     command.add_argument(
         "--output",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from fflin.errors import InputError
 
 if TYPE_CHECKING:
+    from fflin.inputs import Input
     from fflin.linear_model import LinearModel
     from fflin.model import Robot
     from fflin.validation import Array
@@ -30,14 +31,26 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
     if getattr(arguments, "gravity", None):
         fields["gravity"] = arguments.gravity
     if getattr(arguments, "inputs", None):
-        from fflin.input_files import load_inputs
-
-        fields["inputs"] = load_inputs(arguments.inputs)
+        fields["inputs"] = _inputs(robot, arguments.inputs)
     if getattr(arguments, "output", []):
         from fflin.output_specs import parse_output
 
         fields["outputs"] = [output for text in arguments.output for output in parse_output(text)]
     return robot.replace(**fields) if fields else robot
+
+
+def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:
+    from fflin.inputs import BaseForce, BaseTorque, JointTorque
+
+    if name == "joints":
+        if not robot.n:
+            raise InputError(f"--inputs joints: '{robot.name}' has no joints")
+        return tuple(JointTorque(joint) for joint in robot.joint_names)
+    if name == "base":
+        return BaseTorque(), BaseForce()
+    from fflin.input_files import load_inputs
+
+    return load_inputs(name)
 
 
 def once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
