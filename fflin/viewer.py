@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from warnings import warn
 
-import pinocchio as pin
-
 from fflin.actuation import Actuation
 from fflin.errors import FflinWarning, FileError, InputError, unknown
 from fflin.files import as_path, write_whole

@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from browser import Watched, chromium
-from motions import falling, settling
+from motions import HOME, settling
 
 import fflin
 from fflin.model import ROOT
@@ -86,9 +86,9 @@ def test_pieces_stand_where_the_urdf_puts_them(settled, watched):
 
 
 def test_the_target_is_the_reference(settled, watched):
-    robot, motion, _ = settled
-    goal = motion.q[-1].copy()
-    goal[:7] = pin.SE3ToXYZQUAT(pin.SE3.Identity())
+    robot, _, _ = settled
+    goal = robot.neutral()
+    goal[:7] = pin.SE3ToXYZQUAT(HOME)
     assert largest_difference(watched, robot, goal, "target") < EXACT
 
 
@@ -127,7 +127,7 @@ def test_the_panel_says_what_the_motion_says(settled, watched):
     for t in (0.0, 4.0):
         watched.do(f"fflin.seek({t})")
         q = motion.q[np.argmin(np.abs(motion.t - t))]
-        base = pin.XYZQUATToSE3(q[:7])
+        base = HOME.actInv(pin.XYZQUATToSE3(q[:7]))
         values = watched.page.locator(".readouts b").all_text_contents()
         angle = np.degrees(np.linalg.norm(pin.log3(base.rotation)))
         assert float(values[0].split()[0]) == pytest.approx(angle, rel=6e-3)
@@ -179,27 +179,30 @@ def test_all_of_the_motion_is_within_the_view(settled, watched):
 
 def test_forces_trails_and_the_legend(settled, watched):
     _, motion, _ = settled
-    node = "viewer.scene_tree.find(['meshcat', 'wrench', 'torque']).object"
-    lengths = []
-    for t in (0.0, 1.0):
-        watched.do(f"fflin.seek({t})")
-        # The axis' tip: its cone's middle lies half its height below the arrow's end.
-        tip = watched.do(f"""(() => {{
-            viewer.scene.updateMatrixWorld(true);
-            const mark = {node}.children[0], head = mark.children[0].children[1];
-            const world = new MeshCat.THREE.Vector3(0, 0.5 * head.geometry.parameters.height, 0);
-            head.localToWorld(world);
-            return [world.x, -world.z, world.y];
-        }})()""")
-        index = np.argmin(np.abs(motion.t - t))
-        base = pin.XYZQUATToSE3(motion.q[index, :7])
-        torque = base.rotation @ motion.u[index, :3]
-        arrow = np.array(tip) - base.translation
-        np.testing.assert_allclose(
-            arrow / np.linalg.norm(arrow), torque / np.linalg.norm(torque), atol=1e-4
-        )
-        lengths.append(np.linalg.norm(arrow) / np.linalg.norm(torque))
-    assert lengths[0] == pytest.approx(lengths[1], rel=1e-4)
+    for kind, part in (("torque", ".children[0]"), ("force", "")):
+        node = f"viewer.scene_tree.find(['meshcat', 'wrench', '{kind}']).object.children[0]{part}"
+        lengths = []
+        for t in (0.0, 1.0):
+            watched.do(f"fflin.seek({t})")
+            # The tip of the arrow: of its cone, whose middle lies half its height below.
+            tip = watched.do(f"""(() => {{
+                viewer.scene.updateMatrixWorld(true);
+                const head = {node}.children[1];
+                const tip = new MeshCat.THREE.Vector3(0, 0.5 * head.geometry.parameters.height, 0);
+                head.localToWorld(tip);
+                return [tip.x, -tip.z, tip.y];
+            }})()""")
+            index = np.argmin(np.abs(motion.t - t))
+            base = pin.XYZQUATToSE3(motion.q[index, :7])
+            # In the hybrid frame torques stand in the base's axes, forces in the reference's.
+            if kind == "torque":
+                pushed = base.rotation @ motion.u[index, :3]
+            else:
+                pushed = HOME.rotation @ motion.u[index, 3:6]
+            arrow = np.array(tip) - base.translation
+            lengths.append(np.linalg.norm(arrow) / np.linalg.norm(pushed))
+            np.testing.assert_allclose(arrow / lengths[-1], pushed, rtol=1e-4, atol=1e-3)
+        assert lengths[0] == pytest.approx(lengths[1], rel=1e-4)
     box = watched.page.get_by_label("path of the tool")
     trail = "viewer.scene_tree.find(['meshcat', 'trails', 'tool']).object.visible"
     assert watched.do(trail)
@@ -240,7 +243,7 @@ def test_a_lab_with_meshes_plumes_and_a_prediction(robots, browser, tmp_path):
     robot = robot.replace(
         inputs=[*robot.inputs, fflin.Thruster("panda_link0", (0.1, 0, 0), (0, 0, 1), "up")],
     )
-    motion = falling(robot, duration=2.0)
+    motion = settling(robot, duration=2.0, predicted=True)
     path = tmp_path / "panda.html"
     fflin.visualize(robot, motion, html=path, scene="lab", tool="panda_hand_tcp")
     watched = Watched(browser, path.as_uri() + "#pause")
@@ -299,5 +302,5 @@ def test_a_lab_with_meshes_plumes_and_a_prediction(robots, browser, tmp_path):
 def test_the_files_are_small(name, limit, tmp_path):
     robot = fflin.load(name)
     path = tmp_path / "motion.html"
-    fflin.visualize(robot, falling(robot, duration=20.0), html=path, fps=30)
+    fflin.visualize(robot, settling(robot, duration=20.0, predicted=True), html=path, fps=30)
     assert os.path.getsize(path) < limit
