@@ -9,6 +9,7 @@ __version__ = "0.1.0"
 # needs no dynamics does not pay for them.
 _PUBLIC = {
     "Accelerometer": "outputs",
+    "Allocation": "policies",
     "BaseForce": "inputs",
     "BasePose": "outputs",
     "BaseTorque": "inputs",
@@ -44,15 +45,20 @@ _PUBLIC = {
     "ModelError": "errors",
     "Modes": "eigenmodes",
     "Momentum": "outputs",
+    "Motion": "motion",
     "Observability": "observation",
+    "ReactionWheel": "inputs",
     "ReducedModel": "momentum",
     "Robot": "model",
     "SingularInertiaError": "errors",
     "StabilizabilityError": "errors",
+    "StateFeedback": "policies",
     "StateMap": "state",
     "Thruster": "inputs",
+    "TrajectoryFeedback": "policies",
     "UnknownNameError": "errors",
     "UrdfError": "errors",
+    "Validity": "region",
     "acceleration_lqr": "acceleration",
     "bryson": "weights",
     "check": "verification",
@@ -75,8 +81,13 @@ _PUBLIC = {
     "modes": "eigenmodes",
     "momentum_reduction": "momentum",
     "observability": "observation",
+    "plot_matrices": "plots",
+    "plot_motion": "plots",
+    "plot_poles": "plots",
     "sampled_cost": "sampling",
+    "simulate": "simulation",
     "tvlqr": "schedules",
+    "validity": "region",
     "velocity": "points",
     "visualize": "viewer",
 }
@@ -105,7 +116,7 @@ if TYPE_CHECKING:
     from fflin.estimation import Compensator, Estimator, kalman, lqg
     from fflin.gramian import Gramians, gramians
     from fflin.input_files import load_inputs
-    from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
+    from fflin.inputs import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
     from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load
@@ -116,6 +127,7 @@ if TYPE_CHECKING:
         generalized_jacobian,
         momentum_reduction,
     )
+    from fflin.motion import Motion
     from fflin.observation import Observability, observability
     from fflin.outputs import (
         Accelerometer,
@@ -129,11 +141,15 @@ if TYPE_CHECKING:
         JointVelocities,
         Momentum,
     )
+    from fflin.plots import plot_matrices, plot_motion, plot_poles
     from fflin.points import effort, velocity
+    from fflin.policies import Allocation, StateFeedback, TrajectoryFeedback
+    from fflin.region import Validity, validity
     from fflin.regulator import Gain, lqr
     from fflin.robots import list_robots
     from fflin.sampling import sampled_cost
     from fflin.schedules import GainSchedule, tvlqr
+    from fflin.simulation import simulate
     from fflin.state import StateMap
     from fflin.structure import Controllability, controllability
     from fflin.trajectory import LinearTrajectory, linearize_trajectory

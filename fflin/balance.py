@@ -186,7 +186,7 @@ def _least_norm(C: Array, d: Array, one_sided: NDArray[np.bool_]) -> tuple[Array
         u = _least_distance(C, u, one_sided)
         # Exactly the least on the face that was found: those that do not push stay out.
         pushing = ~one_sided | (u > _TOLERANCE * float(np.abs(u).max(initial=0.0)))
-        polished = np.zeros(len(u))
+        polished: Array = np.zeros(len(u))
         polished[pushing] = _pseudo_solve(C[:, pushing], d)
         left = C @ polished - d
         if (polished[one_sided] < 0.0).any() or np.linalg.norm(left) > _TOLERANCE * np.linalg.norm(

@@ -12,7 +12,17 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from fflin import __version__
-from fflin.commands import BAD_INPUT, DONE, INTERRUPTED, analysis, models, regulator, visual
+from fflin.commands import (
+    BAD_INPUT,
+    DONE,
+    INTERRUPTED,
+    analysis,
+    models,
+    natural_modes,
+    regulator,
+    simulation,
+    visual,
+)
 from fflin.errors import FflinError, FflinWarning
 
 
@@ -77,5 +87,7 @@ def _parser() -> argparse.ArgumentParser:
     models.add_commands(commands)
     analysis.add_commands(commands)
     regulator.add_commands(commands)
+    natural_modes.add_commands(commands)
+    simulation.add_commands(commands)
     visual.add_commands(commands)
     return parser

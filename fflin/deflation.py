@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,8 +19,8 @@ _EPS = float(np.finfo(float).eps)
 
 def nonzero_eigenpairs(
     A: Array, tolerance: float
-) -> tuple[list[tuple[complex, Vector, float]], list[int]]:
-    r"""Return the eigenpairs of A that are not zero, and how its zero eigenvalues are chained.
+) -> tuple[list[tuple[complex, Vector, float]], int]:
+    r"""Return the eigenpairs of A that are not zero, and the dimension of its null space.
 
     A Jordan block of k zeros turns round-off into eigenvalues of :math:`\epsilon^{1/k}`. So, with
     :math:`V_0, V_1` a basis of the null space and of its complement, A is replaced by
@@ -36,32 +37,43 @@ def nonzero_eigenpairs(
     -------
     pairs : list of (eigenvalue, eigenvector (n,), error)
         `error` bounds what rounding does to the eigenvalue: by its condition number.
-    dimensions : list of int
-        How many Jordan blocks at zero have size 1 or more, 2 or more, ...
+    nullity : int
     """
     from scipy.linalg import eig
 
-    n = len(A)
+    n, whole = len(A), A
     size = float(np.linalg.norm(A))
+    nullity = n - int(np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance))
     steps: list[Array] = []
-    dimensions: list[int] = []
     while len(A):
-        _, singular, transposed = np.linalg.svd(A)
-        rank = int(np.count_nonzero(singular > n * tolerance))
-        if rank == len(A):
+        complement = _complement(A, n * tolerance)
+        if complement is None:
             break
-        dimensions.append(len(A) - rank)
-        complement = transposed[:rank].T
         steps.append(A @ complement)
         A = complement.T @ steps[-1]
     if not len(A):
-        return [], dimensions
+        return [], nullity
     values, left, right = eig(A, left=True, right=True)
     pairs = []
     for value, y, x in zip(values.tolist(), left.T, right.T, strict=True):
         error = 1e2 * _EPS * size / max(abs(np.vdot(y, x)), _EPS)
         for step in reversed(steps):
-            # A (V_0 a + V_1 x) = value (V_0 a + V_1 x), and A V_0 = 0.
-            x = step @ x / value  # noqa: PLW2901 - the same vector in a larger space
-        pairs.append((complex(value), x, error))
-    return pairs, dimensions
+            # value (V_0 a + V_1 x) = A (V_0 a + V_1 x), and A V_0 = 0; of any size.
+            x = step @ x  # noqa: PLW2901 - the same vector in a larger space
+        # What slow modes lost on the way, one inverse iteration brings back.
+        near = whole - (value + _EPS * size) * np.eye(n)
+        with suppress(np.linalg.LinAlgError):  # singular to the last bit
+            x = np.linalg.solve(near, x / np.linalg.norm(x))  # noqa: PLW2901
+        pairs.append((complex(value), x / np.linalg.norm(x), error))
+    return pairs, nullity
+
+
+def _complement(A: Array, tolerance: float) -> Array | None:
+    """Return a basis of what is orthogonal to the null space of A; None where that is empty."""
+    used = A.any(axis=0)
+    if not used.all():
+        # Of columns that are zero exactly: without the rounding of any rotation.
+        return np.eye(len(A))[:, used]
+    _, singular, transposed = np.linalg.svd(A)
+    rank = int(np.count_nonzero(singular > tolerance))
+    return None if rank == len(A) else np.asarray(transposed[:rank].T)

@@ -77,7 +77,8 @@ class Modes:
     zero_eigenvalues : int
         How many eigenvalues are zero; a rigid-body mode without friction has two.
     residual : float
-        Largest ``|A x - pole x|``, relative, in states scaled to unit inertias.
+        Largest ``|A x - pole x|`` relative to ``|A| |x|``, in states scaled to unit inertias and to
+        the time of the fastest motion.
     equilibrium : bool
         Whether the point is a fixed point or a relative equilibrium; elsewhere the eigenvalues
         are those of a frozen model and say nothing about stability.
@@ -167,22 +168,21 @@ def modes(lin: LinearModel) -> Modes:
     if nx != 2 * nv:
         raise InputError(f"the model has {nx} states, expected {nv} positions and their velocities")
     inertia = np.sqrt(lin.M.diagonal())
+    weight, fastest = _scales(lin, inertia)
     found = _free_free(lin, inertia)
     if found is None:
-        found = _general(lin, inertia)
+        found = _general(lin, weight, fastest)
     triples, rigid_body, zeros = found
     triples.sort(key=lambda triple: (abs(triple[0]), triple[0].real))
     residual = 0.0
-    weight = np.tile(inertia, 2)
-    size = float(np.linalg.norm(weight[:, None] * lin.A / weight)) or 1.0
     for pole, shape, _ in triples:
-        left = weight * (lin.A @ shape - pole * shape)
+        left = weight * (lin.A @ shape - pole * shape) / fastest
         residual = max(residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape)))
     return Modes(
         tuple(Mode(pole, _normalised(shape), grows) for pole, shape, grows in triples),
         rigid_body,
         zeros,
-        residual / size,
+        residual,
         lin.is_equilibrium(),
         lin.state_names,
         lin.robot,
@@ -190,7 +190,7 @@ def modes(lin: LinearModel) -> Modes:
 
 
 # A pole, its shape, and whether it grows.
-_Found = tuple[list[tuple[complex, Array, bool]], int, int]
+_Found = tuple[list[tuple[complex, Any, bool]], int, int]
 
 
 def _free_free(lin: LinearModel, inertia: Array) -> _Found | None:
@@ -209,19 +209,20 @@ def _free_free(lin: LinearModel, inertia: Array) -> _Found | None:
     rounding = 1e2 * _EPS * float(np.linalg.cond(unit))
     if not np.abs(K - K.T).max(initial=0.0) <= rounding * size:
         return None
-    felt = np.flatnonzero(np.abs(by_s).max(axis=0, initial=0.0) > _NO_STIFFNESS * size)
+    felt = np.flatnonzero(by_s.any(axis=0))
     if not felt.size:
         return [], nv, 2 * nv
-    inverse = np.linalg.inv(unit)[np.ix_(felt, felt)]
-    M_star = np.linalg.inv((inverse + inverse.T) / 2.0)
+    free = np.setdiff1d(np.arange(nv), felt)
+    across = unit[np.ix_(free, felt)]
+    M_star = unit[np.ix_(felt, felt)] - across.T @ np.linalg.solve(unit[np.ix_(free, free)], across)
     K = -M_star @ by_s[np.ix_(felt, felt)]
     squares, vectors = eigh((K + K.T) / 2.0, (M_star + M_star.T) / 2.0)
-    found: list[tuple[complex, Array, bool]] = []
+    found: list[tuple[complex, Any, bool]] = []
     for square, vector in zip(squares.tolist(), vectors.T, strict=True):
         if abs(square) <= _NO_STIFFNESS * len(felt) * float(np.abs(squares).max()):
             continue
-        # All that floats follows: -omega^2 s = (d nudot/ds) s.
-        s = by_s[:, felt] @ vector / -square / inertia
+        # All that floats follows: -omega^2 s = (d nudot/ds) s, of any size.
+        s = by_s[:, felt] @ vector / inertia
         root = abs(square) ** 0.5
         for pole in [1j * root] if square > 0.0 else [complex(root), complex(-root)]:
             shape = np.concatenate((N @ s, pole * s))
@@ -230,27 +231,30 @@ def _free_free(lin: LinearModel, inertia: Array) -> _Found | None:
     return found, nv - counted // 2, 2 * nv - counted
 
 
-def _general(lin: LinearModel, inertia: Array) -> _Found:
+def _scales(lin: LinearModel, inertia: Array) -> tuple[Array, float]:
+    """Return weights of the states and a rate, over which the entries of A are of order 1.
+
+    Velocities are weighed by sqrt(M_ii), and positions by the rate as well.
+    """
+    nv = len(inertia)
+    rates = np.abs(np.tile(inertia, 2)[:, None] * lin.A / np.tile(inertia, 2))
+    turning = max(float(rates[nv:, nv:].max()), float(rates[:nv, :nv].max()))
+    fastest = max(float(rates[nv:, :nv].max()) ** 0.5, turning) or 1.0
+    return np.concatenate((fastest * inertia, inertia)), fastest
+
+
+def _general(lin: LinearModel, weight: Array, fastest: float) -> _Found:
     """Return the modes of any model, by the eigenvalues of A."""
-    nv = len(lin.M)
-    weight = np.tile(inertia, 2)
-    rates = weight[:, None] * lin.A / weight
-    # One time scale makes positions and velocities comparable.
-    stiffest = float(np.abs(rates[nv:, :nv]).max()) ** 0.5
-    turning = max(float(np.abs(rates[nv:, nv:]).max()), float(np.abs(rates[:nv, :nv]).max()))
-    fastest = max(stiffest, turning) or 1.0
-    rates[:nv, nv:] *= fastest
-    rates[nv:, :nv] /= fastest
-    scale = np.concatenate((1.0 / fastest / inertia, 1.0 / inertia))
-    found, dimensions = nonzero_eigenpairs(rates / fastest, _NO_STIFFNESS)
-    listed: list[tuple[complex, Array, bool]] = []
+    scaled = weight[:, None] * lin.A / weight / fastest
+    found, nullity = nonzero_eigenpairs(scaled, _NO_STIFFNESS)
+    listed: list[tuple[complex, Any, bool]] = []
     for pole, vector, error in found:
         if pole.imag < 0.0:
             continue
         real = 0.0 if abs(pole.real) <= error and pole.imag else pole.real
         value = complex(real, pole.imag) * fastest
-        listed.append((value, scale * vector, pole.real > error))
-    return listed, dimensions[0] if dimensions else 0, sum(dimensions)
+        listed.append((value, vector / weight, pole.real > error))
+    return listed, nullity, len(weight) - len(found)
 
 
 def _normalised(shape: Array) -> NDArray[np.complexfloating[Any]]:

@@ -23,7 +23,8 @@ _NAMES = (
     *("state_names", "input_names", "output_names"),
     *("state_units", "input_units", "output_units"),
 )
-_LISTS = (*_NAMES, "locked", "ignorable")
+_FIELDS = (*_NAMES, "locked")
+_LISTS = (*_FIELDS, "ignorable")
 _LATER: dict[str, Any] = {"ignorable": (), "drift": ()}  # which files once had not
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version")
 
@@ -73,7 +74,8 @@ def load_model(path: Path) -> LinearModel:
         M.setflags(write=False)
         reference = arrays.pop("reference")
         drift = np.array(record["drift"], dtype=float)
-        named: dict[str, Any] = {key: tuple(map(str, record[key])) for key in _LISTS}
+        ignorable = tuple(map(str, record["ignorable"]))
+        named: dict[str, Any] = {key: tuple(map(str, record[key])) for key in _FIELDS}
         named |= {key: str(record[key]) for key in _TEXTS} | arrays
         _check_sizes(arrays, M, reference, drift, named)
         lin = LinearModel(
@@ -83,6 +85,7 @@ def load_model(path: Path) -> LinearModel:
             _reference=reference,
             _inertia=partial(_given, M),
             _certify=partial(_given, None),
+            _ignorable=partial(_given, ignorable),
             _drift=drift if drift.size else None,
         )
         certificate = Certificate(**{k: float(x) for k, x in record["certificate"].items()})

@@ -81,9 +81,6 @@ class LinearModel:
         "joint=value" [rad|m] of the joints that are welded in it.
     fflin_version, pinocchio_version : str
         What made the model.
-    ignorable : tuple of str
-        The states that nothing in the model depends on: where the base is, and the angles of
-        rotors; with `moving` and without gravity, the attitude too.
     """
 
     A: Array
@@ -113,7 +110,7 @@ class LinearModel:
     _reference: Array = field()
     _inertia: Callable[[LinearModel], Array] = field()
     _certify: Callable[[LinearModel], Certificate] = field()
-    ignorable: tuple[str, ...] = ()
+    _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
     # Of a moving reference, whose f0 is zero by construction: its own rate (nx,), that of its
     # attitude without turns about gravity. None otherwise.
     _drift: Array | None = None
@@ -171,6 +168,15 @@ class LinearModel:
     def certificate(self) -> Certificate:
         """The figures that prove the model, computed when first asked for."""
         return self._certify(self)
+
+    @cached_property
+    def ignorable(self) -> tuple[str, ...]:
+        """The states that nothing in the model depends on, found on the robot.
+
+        Where the base is, and the angles of rotors; with `moving`, without gravity, the attitude
+        too. A rotor is symmetric about its axis and has nothing fixed on it.
+        """
+        return () if self._ignorable is None else self._ignorable(self)
 
     def is_equilibrium(self, tol: float = 1e-9) -> bool:
         """Whether the point is a fixed point or a relative equilibrium, so that A and B stay.

@@ -167,6 +167,9 @@ def scaled(X: Array, M: Array, dt: float = 0.0) -> Scaled:
     rate = max(sizes[0], sizes[3], np.sqrt(sizes[2]))
     # Where nothing but inertia acts, any unit will do.
     unit = 1.0 / rate if rate > 0.0 else 1.0
+    if dt:
+        # Sampled at a period of its only vibration, all but inertia is rounding.
+        unit = min(unit, 100.0 * dt)
     # Positions change by 1/unit where velocities change by 1.
     stretch = np.repeat((unit, 1.0), nv)
     to_x, back = to_x * stretch, back / stretch[:, None]

@@ -106,7 +106,7 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
         "x0": lin.x0[z],
         "state_names": tuple(lin.state_names[i] for i in z),
         "state_units": tuple(lin.state_units[i] for i in z),
-        "ignorable": tuple(lin.state_names[i] for i in z if not judged[i]),
+        "_ignorable": partial(_given, tuple(lin.state_names[i] for i in z if not judged[i])),
         "_drift": None if lin._drift is None else lin._drift[z],
         "_inertia": partial(_given, M),
     }

@@ -61,9 +61,10 @@ def split(matrix: Array, tolerance: float) -> tuple[Array, Array, Margin]:
 
 
 def unit_columns(matrix: Array) -> Array:
-    """Scale columns to unit length; those that vanish are left out."""
+    """Scale columns to unit length; those that are rounding of the others are left out."""
     sizes = np.linalg.norm(matrix, axis=0)
-    return matrix[:, sizes > 0.0] / sizes[sizes > 0.0]
+    real = sizes > 1e2 * EPS * sizes.max(initial=0.0)
+    return matrix[:, real] / sizes[real]
 
 
 def echelon(columns: Array, weights: Array, preferred: Array | None = None) -> tuple[Array, Array]:

@@ -48,6 +48,7 @@ def robot_info(robot: Robot) -> str:
         joint: "prismatic" if joint.prismatic else "continuous" if joint.unbounded else "revolute"
         for joint in robot.joints
     }
+    kinds |= {joint: "wheel" for joint in robot.joints if joint.name in robot.wheels}
     for joint, leader, multiplier, offset in robot.followers:
         kinds[joint] = f"mimics {leader.name} * {multiplier:g}"
         kinds[joint] += f" {'-' if offset < 0 else '+'} {abs(offset):g}" if offset else ""
@@ -204,10 +205,9 @@ def _moving_most(mode: Mode, names: Sequence[str], room: int) -> str:
         if abs(value) < 0.1:
             break
         amount = f"{value.real:.2g}"
-        if abs(value.imag) > 1e-3 * abs(value):
-            amount = (
-                f"{abs(value):.2g} at {math.degrees(math.atan2(value.imag, value.real)):.0f}deg"
-            )
+        if abs(value.imag) > 0.02 * abs(value):  # an angle of more than a degree
+            angle = math.degrees(math.atan2(value.imag, value.real))
+            amount = f"{abs(value):.2g} at {angle:.0f} deg"
         longer = f"{text}, {names[i]} {amount}" if text else f"{names[i]} {amount}"
         if text and len(longer) > room:
             break

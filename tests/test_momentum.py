@@ -151,6 +151,20 @@ def test_it_can_be_controlled(robots):
     assert np.sum(np.abs(poles) < 1e-6) == 12
 
 
+def test_what_drifts_is_carried_over(robots):
+    """The base may fly on, since nothing depends on where it is; what is kept keeps its f0."""
+    robot = robots["ets_vii"]
+    v = fflin.velocity(robot, {"v_b.x": 0.3})
+    lin = fflin.linearize(robot.replace(inputs=motors(robot)), v=v)
+    reduced = fflin.momentum_reduction(lin)
+    assert len(reduced.A) == 12 and np.abs(lin.f0).max() == 0.3
+    assert not reduced.f0.any() and reduced.is_equilibrium()
+    assert "q_m.joint_1" not in reduced.ignorable
+    assert fflin.momentum_reduction(fflin.linearize(robot, v=v)).ignorable == lin.ignorable
+    falling = fflin.linearize(robot.replace(gravity=(0.0, 0.0, -9.81)))
+    assert (fflin.momentum_reduction(falling).f0 == falling.f0).all() and falling.f0.any()
+
+
 def test_drifting_points_are_refused(robots):
     robot = robots["ets_vii"].replace(gravity=(0.0, 0.0, -9.81), inputs=motors(robots["ets_vii"]))
     with pytest.raises(fflin.InputError, match=r"no fixed point"):

@@ -112,12 +112,26 @@ def test_rotors_of_other_kinds():
         inputs=[fflin.Thruster("link", (0, 0, 0), (0, 1, 0)), fflin.JointTorque("wheel")],
     )
     assert fflin.linearize(robot).ignorable == (*HOME, "q_m.wheel")
-    # A disc that carries a disc turns it; a leader turns its followers.
+    # What it carries turns with it.
     assert fflin.linearize(wheeled(tip=True)).ignorable == HOME
-    panda = fflin.load("panda")
-    assert not {f"q_m.{f.leader.name}" for f in panda.followers} & set(
-        fflin.linearize(panda).ignorable
-    )
+
+
+MIMIC = """<robot name="r"><link name="base"><inertial><mass value="9"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+{joints}</robot>"""
+JOINT = """<link name="l{k}"><inertial><mass value="1"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.2" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="j{k}" type="revolute"><parent link="base"/><child link="l{k}"/>
+<origin xyz="{k} 0 0"/><axis xyz="0 0 1"/>
+<limit lower="-3" upper="3" effort="1" velocity="1"/>{mimic}</joint>"""
+
+
+def test_a_leader_turns_its_followers(tmp_path):
+    for mimic, names in (('<mimic joint="j1"/>', HOME), ("", (*HOME, "q_m.j1", "q_m.j2"))):
+        joints = JOINT.format(k=1, mimic="") + JOINT.format(k=2, mimic=mimic)
+        (tmp_path / "r.urdf").write_text(MIMIC.format(joints=joints))
+        robot = fflin.load(tmp_path / "r.urdf")
+        assert fflin.linearize(robot).ignorable == names
 
 
 def test_a_base_that_flies_along_stays_what_it_is_and_one_that_turns_does_not():

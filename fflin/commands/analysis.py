@@ -1,14 +1,16 @@
-"""The command that says what inputs move, what is conserved, how it vibrates, what is seen."""
+"""The commands that say what a linear model is worth: its structure, and how far it reaches."""
 
 from __future__ import annotations
 
 import argparse
 import textwrap
+from functools import partial
 from typing import TYPE_CHECKING
 
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, add_point, command
+from fflin.commands.arguments import Commands, add_point, command, number
 from fflin.commands.points import linear_model
+from fflin.commands.regulator import add_weights, gain_of
 from fflin.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: Commands) -> None:
-    """Add analyze."""
+    """Add analyze and validity."""
     analyze = command(
         commands,
         "analyze",
@@ -25,6 +27,44 @@ def add_commands(commands: Commands) -> None:
         "fflin analyze servicer_7dof --stiffness panel_left=100 --output joints",
     )
     add_point(analyze)
+    validity = command(
+        commands,
+        "validity",
+        _validity,
+        "measure how far from the point the linear model can be trusted and its regulator holds",
+        "fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
+    )
+    add_point(validity)
+    add_weights(validity)
+    validity.add_argument(
+        "--reduce",
+        action="store_true",
+        help="judge the part that the inputs can hold where momentum is conserved",
+    )
+    for name, default, what in (
+        ("attitude", 90.0, "largest turn of the base [deg]"),
+        ("offset", 0.5, "largest displacement of the base [m]"),
+        ("spread", 1.0, "largest displacement of a joint [rad|m]"),
+    ):
+        validity.add_argument(
+            f"--{name}",
+            metavar="X",
+            type=number,
+            default=default,
+            help=f"{what}; {default:g} by default",
+        )
+    for name, default, what in (
+        ("samples", 100, "random runs"),
+        ("seed", 0, "seed of the random runs"),
+        ("jobs", 1, "processes"),
+    ):
+        validity.add_argument(
+            f"--{name}",
+            metavar="N",
+            type=int,
+            default=default,
+            help=f"{what}; {default} by default",
+        )
 
 
 def _analyze(arguments: argparse.Namespace) -> int:
@@ -62,3 +102,34 @@ def _momentum(lin: LinearModel) -> str:
         elif not lin.is_equilibrium():
             text = "none can be split off: the model is one of a point that moves on"
     return textwrap.fill(text, width())
+
+
+def _validity(arguments: argparse.Namespace) -> int:
+    from concurrent.futures import ProcessPoolExecutor
+
+    from fflin.momentum import momentum_reduction
+    from fflin.region import validity
+
+    if arguments.jobs < 1:
+        raise InputError(f"--jobs is {arguments.jobs}, expected at least 1")
+    robot, lin = linear_model(arguments)
+    lin = momentum_reduction(lin) if arguments.reduce else lin
+    gain = gain_of(lin, arguments)
+    judged = lin.discretize(arguments.dt) if arguments.dt else lin
+    measure = partial(
+        validity,
+        robot,
+        judged,
+        gain,
+        attitude=arguments.attitude,
+        position=arguments.offset,
+        joint=arguments.spread,
+        samples=arguments.samples,
+        seed=arguments.seed,
+    )
+    if arguments.jobs == 1:
+        print(measure())
+        return DONE
+    with ProcessPoolExecutor(arguments.jobs) as executor:
+        print(measure(executor=executor))
+    return DONE

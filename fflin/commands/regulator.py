@@ -85,9 +85,13 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     from fflin.sampling import sampled_cost
 
     Q, R = _weights(lin, arguments)
-    if arguments.dt is None:
-        return lqr(lin, Q, R)
-    return lqr(lin.discretize(arguments.dt), *sampled_cost(lin, arguments.dt, Q, R))
+    try:
+        if arguments.dt is None:
+            return lqr(lin, Q, R)
+        return lqr(lin.discretize(arguments.dt), *sampled_cost(lin, arguments.dt, Q, R))
+    except StabilizabilityError as error:
+        hint = " (--reduce)" if "momentum_reduction" in str(error) else ""
+        raise StabilizabilityError(f"{error}{hint}") from None
 
 
 def _weights(lin: LinearModel, arguments: argparse.Namespace) -> tuple[Array, Array]:
@@ -123,11 +127,7 @@ def _lqr(arguments: argparse.Namespace) -> int:
         import fflin
 
         lin = fflin.momentum_reduction(lin)
-    try:
-        gain = gain_of(lin, arguments)
-    except StabilizabilityError as error:
-        hint = " (--reduce)" if "momentum_reduction" in str(error) else ""
-        raise StabilizabilityError(f"{error}{hint}") from None
+    gain = gain_of(lin, arguments)
     print(gain)
     if arguments.output_file:
         gain.save(arguments.output_file)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, add_pose, command, number
+from fflin.commands.arguments import Commands, add_pose, add_robot, command, number
 from fflin.commands.points import configuration_of, load_robot
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ def add_commands(commands: Commands) -> None:
         "show a robot live in the browser, with a slider for each joint",
         "fflin view servicer_7dof --joint joint_2=0.4",
     )
+    add_robot(view)
     add_pose(view)
     _add_scene(view)
     view.add_argument(
@@ -73,11 +74,11 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
     command.add_argument("--follow", action="store_true", help="let the camera follow the base")
 
 
-def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
+def check_pictures(arguments: argparse.Namespace) -> None:
     """Refuse files that cannot be written, before a motion is made for them."""
     from fflin.viewer import check_outputs
 
-    check_outputs(robot, {f".{name}": getattr(arguments, name) for name in _FILES})
+    check_outputs({f".{name}": getattr(arguments, name) for name in _FILES})
 
 
 def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> None:
