@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ class Live:
     """A robot in a browser, that moves as it is told; made by `visualize(robot)`.
 
     It is served by a thread of this process, to this machine only, and ends with it. Given to
-    `simulate` as an observer, it shows the simulation as it runs.
+    `simulate` as its callback, it shows the simulation as it runs.
 
     Parameters
     ----------
@@ -37,6 +38,8 @@ class Live:
         Frame that gets a triad.
     follow : bool
         Whether the camera follows the base.
+    speed : float
+        Seconds of simulation per second, at most.
     port : int
         0 for one that is free.
 
@@ -60,12 +63,16 @@ class Live:
         scene: str = "space",
         tool: str | None = None,
         follow: bool = False,
+        speed: float = 1.0,
         port: int = 0,
     ) -> None:
         self.robot = robot
         self._data = robot.model.createData()
         self._state_map = StateMap(robot)
         self._lock = threading.Lock()
+        self._speed = speed
+        # When on the clock, and at which time, the simulation that is shown began.
+        self._began: tuple[float, float] | None = None
         self._recorder = Recorder(self._forward)
         self.meshcat = Visualizer(window=self._recorder)
         drawing = Drawing(robot, self.meshcat["robot"])
@@ -120,7 +127,11 @@ class Live:
         self._server.update(json.dumps(state))
 
     def __call__(self, t: float, q: Array, *_: Any) -> None:
-        """Show a step of a running simulation."""
+        """Show a step of a running simulation, no sooner than it is due."""
+        now = monotonic()
+        if self._began is None or t <= self._began[1]:
+            self._began = now, t
+        sleep(max(0.0, self._began[0] + (t - self._began[1]) / self._speed - now))
         self.show(q, t)
 
     def open(self) -> None:

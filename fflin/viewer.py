@@ -75,7 +75,8 @@ def visualize(
     fps : float
         Frames per second of watching.
     speed : float, optional
-        Seconds of motion per second of watching; 1, or more for motions of over a minute.
+        Seconds of motion per second of watching; 1, or more for motions of over a minute. A
+        simulation that is shown live waits for it.
     follow : bool
         Whether the camera follows the base.
     target : array_like (nq,), optional
@@ -127,8 +128,8 @@ def visualize(
         if any(file is not None for file in (html, png, gif)):
             raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
         start = robot.neutral() if q is None else _configuration(robot, "q", q)
-        return _live(robot, start, open is None or open, scene, tool, follow, port)
-    outputs = check_outputs(robot, {".html": html, ".png": png, ".gif": gif})
+        return _live(robot, start, open is None or open, scene, tool, follow, speed, port)
+    outputs = check_outputs({".html": html, ".png": png, ".gif": gif}, robot.urdf)
     _check_motion(robot, motion)
     fps, speed = _rates(motion, fps, speed)
     if target is None:
@@ -161,13 +162,22 @@ def visualize(
 
 
 def _live(
-    robot: Robot, q: Array, open: bool, scene: str, tool: str | None, follow: bool, port: int
+    robot: Robot,
+    q: Array,
+    open: bool,
+    scene: str,
+    tool: str | None,
+    follow: bool,
+    speed: float | None,
+    port: int,
 ) -> Live:
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port < 2**16:
         raise InputError(f"port is {port!r}, expected 0 to 65535 (0: one that is free)")
     from fflin.live import Live
 
-    live = Live(robot, q, scene=scene, tool=tool, follow=follow, port=port)
+    live = Live(
+        robot, q, scene=scene, tool=tool, follow=follow, speed=_speed(speed, 1.0), port=port
+    )
     for note in live.notes:
         warn(note, FflinWarning, stacklevel=3)
     if open:
@@ -175,8 +185,11 @@ def _live(
     return live
 
 
-def check_outputs(robot: Robot, files: dict[str, Any]) -> dict[str, Path]:
-    """Return {ending: path} of the files that are named, or raise where one cannot be written."""
+def check_outputs(files: dict[str, Any], spare: Path | None = None) -> dict[str, Path]:
+    """Return {ending: path} of the files that are named, or raise where one cannot be written.
+
+    `spare` is a file that must not be overwritten, such as the robot's own.
+    """
     outputs = {}
     for ending, file in files.items():
         if file is None:
@@ -186,7 +199,7 @@ def check_outputs(robot: Robot, files: dict[str, Any]) -> dict[str, Path]:
             raise FileError(f"'{path}' ends in '{path.suffix}', expected {ending}")
         if not path.absolute().parent.is_dir():
             raise FileError(f"{path}: cannot be written: there is no folder {path.parent}")
-        if robot.urdf and path.resolve() == robot.urdf.resolve():
+        if spare and path.resolve() == spare.resolve():
             raise FileError(f"{path} is the robot's own file; name another to write")
         outputs[ending] = path
     if ".png" in outputs or ".gif" in outputs:
@@ -201,13 +214,15 @@ def _rates(motion: Motion, fps: float, speed: float | None) -> tuple[float, floa
     if not 0.0 < fps <= 240.0:
         raise InputError(f"fps is {fps:g}, expected more than 0 and at most 240")
     duration = float(motion.t[-1] - motion.t[0])
-    if speed is None:
-        nice = [1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5]
-        speed = next((s for s in nice if duration <= s * _LONGEST), 1e6)
-    speed = number("speed", speed)
+    nice = [1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5]
+    return fps, _speed(speed, next((s for s in nice if duration <= s * _LONGEST), 1e6))
+
+
+def _speed(speed: float | None, default: float) -> float:
+    speed = number("speed", default if speed is None else speed)
     if not speed > 0.0:
         raise InputError(f"speed is {speed:g}, expected more than 0")
-    return fps, speed
+    return speed
 
 
 def _check_motion(robot: Robot, motion: Motion) -> None:

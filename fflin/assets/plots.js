@@ -5,7 +5,8 @@ const LINES = ["#ff7a70", "#7ad97f", "#6aa5ff", "#f6c35b", "#c58bff", "#5fd6d0",
 function figure(value, digits) {
   if (value === 0) return "0";
   const size = Math.abs(value);
-  return size >= 1e4 || size < 1e-3 ? value.toExponential(1) : value.toPrecision(digits);
+  if (size >= 1e5 || size < 1e-3) return value.toExponential(1);
+  return size >= 10 ** digits ? value.toFixed(0) : value.toPrecision(digits);
 }
 
 function makeReadouts(parent, readouts) {
