@@ -60,6 +60,8 @@ def motion_page(
         clips += each.tracks(t - t[0], poses)
     window.send(Animation(clips))
 
+    # Without a policy that steers somewhere, errors are counted from the start.
+    ghost = "start" if np.array_equal(target, motion.q[0]) else "target"
     info = stage_info(robot, drawing, film.poses[0], scene=scene, subtitle=_subtitle(robot, t))
     info |= marks(robot, film, tool, info["size"])
     info |= panel(robot, state, q, u, target, motion.momentum_drift[shown])
@@ -69,7 +71,7 @@ def motion_page(
         "speed": speed,
         "follow": follow,
         "points": frame_points(drawing, film.poses, follow=follow).round(4).tolist(),
-        "legend": legend(info, linear=predicted is not None),
+        "legend": legend(info, ghost=ghost, linear=predicted is not None),
     }
     return build_page(info, window.commands()), drawing.notes
 
@@ -195,7 +197,7 @@ def marks(robot: Robot, film: Playback, tool: str | None, size: float) -> dict[s
     }
 
 
-def legend(shown: dict[str, Any], *, linear: bool) -> list[dict[str, Any]]:
+def legend(shown: dict[str, Any], *, ghost: str, linear: bool) -> list[dict[str, Any]]:
     """Return the entries of the legend, each of which can be switched off."""
     entries = [
         {"label": f"path of the {each['name']}", "colour": each["colour"],
@@ -207,7 +209,7 @@ def legend(shown: dict[str, Any], *, linear: bool) -> list[dict[str, Any]]:
          "paths": [["meshcat", "wrench", each["kind"]]]}
         for each in shown["arrows"]
     ]  # fmt: skip
-    entries.append({"label": "target", "colour": "#8fb4ff", "paths": [["meshcat", "target"]]})
+    entries.append({"label": ghost, "colour": "#8fb4ff", "paths": [["meshcat", "target"]]})
     if linear:
         entries.append(
             {"label": "linear model", "colour": "#ff7fc8", "paths": [["meshcat", "linear"]]}

@@ -1,5 +1,7 @@
 """Files and pictures: written whole or not at all, and one line for what cannot be done."""
 
+import base64
+import json
 import shutil
 import warnings
 from pathlib import Path
@@ -168,6 +170,27 @@ def test_view_on_the_command_line(capsys, monkeypatch):
     assert main(["view", "cubesat", "--no-open", "--port", "70000"]) == 2
     assert capsys.readouterr().err.splitlines()[-1].startswith("fflin: error: port is 70000")
     assert main(["view", "cubesat", "--no-open", "--tool", "x"]) == 2
+
+
+def test_simulate_on_the_command_line(capsys, tmp_path, monkeypatch):
+    page = tmp_path / "loop.html"
+    command = ["simulate", "cubesat", "--rpy", "30", "0", "0", "--duration", "5"]
+    assert main([*command, "--html", str(page), "--scene", "lab", "--fps", "10", "--follow"]) == 0
+    assert f"wrote {page}: " in capsys.readouterr().out
+    text = page.read_text()
+    assert '<body class="lab motion">' in text and '"follow":true' in text
+    data = json.loads(text.partition('id="data">')[2].partition("</script>")[0])
+    times = np.frombuffer(base64.b64decode(data["t"]), dtype="<f4")
+    np.testing.assert_allclose(times, np.linspace(0, 5, 51), atol=6e-3)
+    assert [entry["label"] for entry in data["legend"]][-2:] == ["target", "linear model"]
+    # What cannot be written is told before anything is simulated.
+    monkeypatch.setattr("fflin.simulation.simulate", lambda *_, **__: pytest.fail("simulated"))
+    assert main([*command, "--html", str(tmp_path / "no" / "m.html")]) == 2
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert main([*command, "--png", str(tmp_path / "m.png")]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2 and "no folder" in lines[0] and "apt install chromium" in lines[1]
+    assert [path.name for path in tmp_path.iterdir()] == ["loop.html"]
 
 
 def test_assets_are_part_of_the_package():

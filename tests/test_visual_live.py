@@ -133,6 +133,23 @@ def test_it_sends_where_the_robot_is_and_takes_the_sliders(live, robots):
     np.testing.assert_allclose(coupling, inertia / np.outer(scale, scale), atol=1e-4)
 
 
+def test_a_running_simulation_is_shown_as_it_runs(robots):
+    robot = robots["planar_detumble"]
+    v = fflin.velocity(robot, {"omega_b.z": 0.3})
+    seen = []
+    with fflin.visualize(robot, open=False, speed=4.0) as live:
+        show = live.show
+        live.show = lambda q, t: (seen.append((t, q.copy(), time.monotonic())), show(q, t))
+        motion = fflin.simulate(robot, v0=v, duration=2.0, callback=live)
+        assert json.loads(live._server.state)["time"] == pytest.approx(2.0)
+    assert [t for t, _, _ in seen] == motion.t.tolist()
+    assert (np.array([q for _, q, _ in seen]) == motion.q).all()
+    for t, _, when in seen:  # a quarter of a second for each second
+        assert when - seen[0][2] > t / 4.0 - 1e-3
+    with pytest.raises(fflin.InputError, match="speed is 0"):
+        fflin.visualize(robot, open=False, speed=0)
+
+
 def test_a_slow_browser_gets_the_newest_state_and_not_all(live, robots):
     """What waits for one that reads nothing stays small, and ends with the last state."""
     robot = robots["ets_vii"]
