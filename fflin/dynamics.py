@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike
 
 from fflin.aba import Aba
 from fflin.errors import InputError
-from fflin.state import StateMap
+from fflin.state import Chart, StateMap
 from fflin.validation import Array
 
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
 _aba = pin.aba
+_ANY = np.zeros(3)
 
 
 class Dynamics:
@@ -54,7 +55,7 @@ class Dynamics:
     def force(self, q: Array, u: Array) -> Array:
         """Return tau (nv,) of inputs that act along fixed columns."""
         if self.actuation.held:
-            u = self.actuation.in_base_axes(self._state.chart(q), u)
+            u = self.actuation.in_base_axes(self._turned(q), u)
         tau: Array = self._columns.dot(u)
         return tau
 
@@ -62,7 +63,7 @@ class Dynamics:
         """Return dv/dt (nv,) in Pinocchio's order."""
         if self._plain and self._disturbance is None:
             return _aba(self._model, self._data, q, v, self.force(q, u))
-        u = self.actuation.in_base_axes(self._state.chart(q), u) if self.actuation.held else u
+        u = self.actuation.in_base_axes(self._turned(q), u) if self.actuation.held else u
         if self._disturbance is None:
             return self._aba.acceleration(q, v, u)
         return self._aba.acceleration(q, v, u, self._disturbed(t, q, v))
@@ -73,7 +74,7 @@ class Dynamics:
         It is the sum of all wrenches from outside at the base origin, but for gravity.
         """
         held = self.actuation.held
-        in_base = self.actuation.in_base_axes(self._state.chart(q), u) if held else u
+        in_base = self.actuation.in_base_axes(self._turned(q), u) if held else u
         force: Array = self.actuation.columns(self._data, q)[:6] @ in_base
         if self._disturbance is not None:
             force = force + self._disturbed(t, q, v)[[3, 4, 5, 0, 1, 2]]
@@ -82,7 +83,7 @@ class Dynamics:
     @property
     def isolated(self) -> bool:
         """Whether nothing pushes from outside whatever the inputs are."""
-        base = self._columns[:6].any()
+        base = self._columns[:6].any() or self.actuation.carried
         return not (base or self._disturbance is not None or any(self._robot.gravity))
 
     def free(self, q: Array, v: Array) -> Callable[[float, Array, Array], Array]:
@@ -92,6 +93,10 @@ class Dynamics:
             return lambda _, q, v: _aba(model, data, q, v, zero)
         nothing = np.zeros(len(self.actuation.names))
         return lambda t, q, v: self.acceleration(t, q, v, nothing)
+
+    def _turned(self, q: Array) -> Chart:
+        """Return the attitude at any turn, beyond the chart too, for its rotation alone."""
+        return Chart(_ANY, 1.0, self._state.rotation(q))
 
     def _disturbed(self, t: float, q: Array, v: Array) -> Array:
         assert self._disturbance is not None

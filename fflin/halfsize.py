@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dgeev, dpotrf, dtrtrs
+from scipy.linalg.lapack import dgeev, dgeqrf, dpotrf, dtrtrs
 
 from fflin.modal import Modes, Spectrum
 from fflin.validation import Array
@@ -57,8 +57,7 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> Loop | N
         return None
     white = _lower(R_factor, B[m:].T)
     # Of the inverse weight on forces, S = Ls Ls'; squaring it would square its condition.
-    triangle: Any = np.linalg.qr(white, mode="r")
-    Ls: Array = triangle.T
+    Ls: Array = np.triu(dgeqrf(white)[0][:m]).T
     sizes = np.abs(Ls.diagonal())
     singular = len(white) < m or sizes.min() <= 1e-14 * sizes.max()
     A11, A12 = A[:m, :m], A[:m, m:]
@@ -82,6 +81,8 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> Loop | N
         return None
     C = np.zeros((nx, nx), order="F")
     C[:m, m:], C[m:, :m], C[m:, m:] = G.T, -G, D
+    if not np.isfinite(C).all():
+        return None
     real, imag, _, W, failed = dgeev(C, compute_vl=0, overwrite_a=1)
     if failed or ((imag == 0.0) & (real <= 0.0)).any():
         return None

@@ -59,15 +59,27 @@ class Modes:
     def __init__(self, V: Array, spectrum: Spectrum, poles: Any, discrete: bool) -> None:
         factors, pivots, _ = dgetrf(V)
         inverse, failed = dgetri(factors, pivots, overwrite_lu=1)
-        outer = poles[:, None] * poles - 1.0 if discrete else poles[:, None] + poles
-        if failed or not outer.all():
+        if failed:
             raise np.linalg.LinAlgError("the modes are not independent")
         self.V, self.inverse, self.spectrum = V, inverse, spectrum
-        self._factors = -1.0 / outer
+        # Of the real modes with each other and with the pairs, and of the pairs with each other
+        # and with their conjugates; the rest is conjugate or transposed.
+        alone, pairs = poles[: spectrum.first.start], poles[spectrum.first]
+        self._factors = [
+            _factors(left, right, discrete)
+            for left, right in (
+                (alone.real, alone.real),
+                (alone.real, pairs),
+                (pairs, pairs),
+                (pairs, pairs.conj()),
+            )
+        ]
 
     @classmethod
     def of(cls, F: Array, discrete: bool) -> Modes:
         """Compute the modes of a matrix."""
+        if not np.isfinite(F).all():
+            raise np.linalg.LinAlgError("the matrix is not finite")
         real, imag, _, V, failed = dgeev(F, compute_vl=0)
         if failed:
             raise np.linalg.LinAlgError("the eigenvalues did not converge")
@@ -81,19 +93,23 @@ class Modes:
     def lyapunov_modal(self, r: Array) -> Array:
         """Solve the same where V' r V is given."""
         first, second = self.spectrum.first, self.spectrum.second
-        # To the complex modes a + ib and a - ib from either side; there the equation is a
-        # division; and back.
-        z = r.astype(complex)
-        for side in (z, z.T):
-            a, b = side[first].copy(), 1j * side[second]
-            side[first] += b
-            np.subtract(a, b, out=side[second])
-        z *= self._factors
-        for side in (z, z.T):
-            a, b = side[first].copy(), side[second].copy()
-            side[first] = 0.5 * (a + b)
-            side[second] = -0.5j * (a - b)
-        D: Array = self.inverse.T @ z.real @ self.inverse
+        alone = slice(0, first.start)
+        of_alone, of_mixed, of_pairs, of_conjugates = self._factors
+        # In the complex modes a + ib and a - ib the equation is a division.
+        z = np.empty_like(r)
+        if first.start:
+            z[alone, alone] = r[alone, alone] * of_alone
+            mixed = (r[alone, first] + 1j * r[alone, second]) * of_mixed
+            z[alone, first], z[alone, second] = mixed.real, mixed.imag
+            z[first, alone], z[second, alone] = mixed.real.T, mixed.imag.T
+        aa, ab, ba, bb = r[first, first], r[first, second], r[second, first], r[second, second]
+        pairs = (aa - bb + 1j * (ab + ba)) * of_pairs
+        conjugates = (aa + bb + 1j * (ba - ab)) * of_conjugates
+        z[first, first] = 0.5 * (conjugates.real + pairs.real)
+        z[first, second] = 0.5 * (pairs.imag - conjugates.imag)
+        z[second, first] = 0.5 * (pairs.imag + conjugates.imag)
+        z[second, second] = 0.5 * (conjugates.real - pairs.real)
+        D: Array = self.inverse.T @ z @ self.inverse
         D += D.T.copy()
         D *= 0.5
         return D
@@ -101,7 +117,7 @@ class Modes:
     def poles(self, F: Array) -> Any:
         """Return the eigenvalues of a matrix near to that of these modes.
 
-        Where it is so near that they decouple to eight digits they are read off, else computed.
+        Where it is so near that they decouple to seven digits they are read off, else computed.
         """
         first, second = self.spectrum.first, self.spectrum.second
         M = self.inverse @ F @ self.V
@@ -114,13 +130,19 @@ class Modes:
         for block, sign in zip(blocks, (-1.0, 1.0), strict=True):
             block.flat[:: block.shape[1] + 1] += sign * pairs.imag
         # Those of a normal matrix times E + X move by the norm of X at most, relatively.
-        if np.linalg.norm(M / np.abs(values)) <= 1e-8:
+        if np.linalg.norm(M / np.abs(values)) <= 1e-7:
             return values
         return eigenvalues(F)
 
 
+def _factors(left: Any, right: Any, discrete: bool) -> Any:
+    return -1.0 / (left[:, None] * right - 1.0 if discrete else left[:, None] + right)
+
+
 def eigenvalues(F: Array) -> Any:
     """Return the eigenvalues of a real matrix."""
+    if not np.isfinite(F).all():
+        raise np.linalg.LinAlgError("the matrix is not finite")
     real, imag, _, _, failed = dgeev(F, compute_vl=0, compute_vr=0)
     if failed:
         raise np.linalg.LinAlgError("the eigenvalues did not converge")

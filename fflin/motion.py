@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.design import Design
-from fflin.errors import InputError
+from fflin.errors import FileError, InputError
 from fflin.validation import Array
 
 if TYPE_CHECKING:
@@ -122,6 +122,7 @@ class Motion(Design):
         from fflin.files import as_path, write_whole
 
         target = as_path(path)
+        check_motion_format(target)
         if target.suffix != ".csv":
             super().save(target)
             return
@@ -140,10 +141,11 @@ class Motion(Design):
 
 def check_motion_format(path: Path) -> None:
     """Raise `FileError` where a motion cannot be saved under that name."""
-    from fflin.design_files import check_design_format
+    from fflin.design_files import FORMATS
 
-    if path.suffix != ".csv":
-        check_design_format(path)
+    if path.suffix not in (*FORMATS, ".csv"):
+        expected = ", ".join((*FORMATS, ".csv"))
+        raise FileError(f"'{path}' ends in '{path.suffix}', expected one of {expected}")
 
 
 def require_motion(motion: Any) -> Motion:

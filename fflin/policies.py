@@ -172,7 +172,6 @@ class Allocation:
         data = robot.create_data()
         least = np.full(len(giving.names), -np.inf)
         least[giving.groups.get("thrust", [])] = 0.0
-        highest = np.full_like(least, np.inf)
 
         def policy(t: float, q: Array, v: Array) -> Array:
             u = np.asarray(inner(t, q, v), dtype=float)
@@ -184,15 +183,20 @@ class Allocation:
             M = given.project(pin.crba(robot.model, data, q).T)
             factor = np.linalg.cholesky(M)
             A, b = np.linalg.solve(factor, columns), np.linalg.solve(factor, force)
-            # Of the thrusts that do the same, the least: what is added is below rounding.
-            small = 1e-7 * float(np.linalg.norm(A)) * np.eye(len(least))
+            size = float(np.linalg.norm(b))
+            if size == 0.0:
+                return np.zeros(len(least))
+            # To unity, for the solver stops at absolute figures. Of the thrusts that do the
+            # same, the least: what is added is below rounding.
+            unit = float(np.linalg.norm(A))
             found = lsq_linear(
-                np.vstack((A, small)),
-                np.concatenate((b, np.zeros(len(least)))),
-                (least, highest),
+                np.vstack((A / unit, 1e-7 * np.eye(len(least)))),
+                np.concatenate((b / size, np.zeros(len(least)))),
+                (least, np.full_like(least, np.inf)),
                 method="bvls",
+                tol=1e-14,
             )
-            thrusts: Array = np.maximum(found.x, least)
+            thrusts: Array = np.maximum(found.x, least) * (size / unit)
             return thrusts
 
         return policy

@@ -185,9 +185,11 @@ def require_fixed_point(lin: LinearModel) -> None:
         )
     if lin.is_equilibrium():
         return
-    rows = [index for index in np.argsort(-np.abs(lin.f0)) if abs(lin.f0[index]) > 1e-9]
+    rate = lin.f0 if lin._drift is None else lin._drift
+    judged = [name not in lin.ignorable for name in lin.state_names]
+    rows = [i for i in np.argsort(-np.abs(rate)) if judged[i] and abs(rate[i]) > 1e-9]
     shown = ", ".join(
-        f"d {lin.state_names[i]}/dt = {lin.f0[i] / (lin.dt or 1.0):.6g}"
+        f"d {lin.state_names[i]}/dt = {rate[i] / (lin.dt or 1.0):.6g}"
         for i in rows[:_SHOWN_RESIDUALS]
     )
     more = f" and {len(rows) - _SHOWN_RESIDUALS} more" if len(rows) > _SHOWN_RESIDUALS else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from contextlib import suppress
 from typing import Any, NamedTuple
@@ -13,13 +14,15 @@ from fflin.halfsize import second_order_loop
 from fflin.modal import Modes, eigenvalues
 from fflin.validation import Array
 
-_EPS = float(np.finfo(float).eps)
+_EPS, _TINY = float(np.finfo(float).eps), 1e-300
 
 # A residual at which nothing is wrong with the solution but rounding.
 _SOUND = 1e-11
 _STEPS = 25
 
-# Of a residual below which Newton's method lowers it at every step.
+# Of a residual: where what a step does not lower is rounding, and where Newton's method lowers it
+# at every step.
+_ROUNDED = 1e-12
 _NEAR = 1e-3
 
 
@@ -83,7 +86,10 @@ class Riccati:
             second = self.rate.T @ change
             defect += 0.5 * (second + second.T)
             size += _norm(second)
-        return _Trial(P, defect, _norm(defect) / size)
+        residual = _norm(defect) / max(size, _TINY)
+        if not math.isfinite(residual):
+            raise np.linalg.LinAlgError("the weights or the model are beyond all numbers")
+        return _Trial(P, defect, residual)
 
     def closed_loop(self, P: Array) -> Array:
         """Return A - B K (nx, nx)."""
@@ -145,7 +151,7 @@ def solve(
         return start
     general = None
     # SciPy raises either where a pencil cannot be reordered.
-    with suppress(np.linalg.LinAlgError, ValueError):
+    with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
         general = _finished(equation, *_refined(equation, _general(equation), None), "general")
     found = [solution for solution in (start, general) if solution is not None]
     if not found:
@@ -162,7 +168,7 @@ def half_size(
 
 
 def _attempt(equation: Riccati) -> Solution | None:
-    with suppress(np.linalg.LinAlgError):
+    with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         return _half_size(equation)
     return None
 
@@ -225,15 +231,18 @@ def _refined(equation: Riccati, P: Array, modes: Modes | None) -> tuple[_Trial, 
         if modes is None:
             modes, fresh = Modes.of(equation.closed_loop(trial.P), equation.discrete), True
         better = equation.trial(trial.P + modes.lyapunov(trial.defect))
-        gain = trial.residual / max(better.residual, 1e-300)
+        gain = trial.residual / max(better.residual, _TINY)
         # From afar the first steps may raise the residual; what they do to P is for the better.
         if gain > 1.0 or (fresh and trial.residual > _NEAR):
             trial = better
         if trial.residual < best.residual:
             best = trial
-        if gain < 10.0:
-            # What is left is rounding, or these modes are those of another loop.
-            if trial.residual < 100.0 * enough or (fresh and gain <= 1.0 and trial is not better):
+        if trial.residual < _ROUNDED:
+            if gain < 2.0:
+                break
+        elif gain < 10.0:
+            # These modes are those of another loop.
+            if fresh and trial is not better:
                 break
             modes = None
     return best, modes

@@ -20,76 +20,73 @@ _RANK = 1e-7
 
 def require_stabilizable(lin: LinearModel) -> None:
     """Raise `StabilizabilityError` that names what no input can hold."""
-    hidden = hidden_modes(lin.A, lin.B, bool(lin.dt), margin=False)
-    if not hidden:
-        return
-    left = np.vstack([vectors for _, vectors in hidden])
-    words = _forces_missing(lin, left) or _dominant(left, lin.state_names)
-    raise StabilizabilityError(f"the inputs cannot hold {words}")
+    from fflin.mechanics import conserved
+    from fflin.naming import grouped
+    from fflin.structure import controllability
+
+    found = controllability(lin)
+    if not found.stabilizable:
+        weights = conserved(lin).weights
+        words = _forces_missing(lin, weights) if len(weights) else None
+        words = words or f"{', '.join(grouped(found.uncontrollable))}; add inputs"
+        raise StabilizabilityError(f"the inputs cannot hold {words}")
 
 
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
     """Raise `InputError` that names the modes on the boundary of stability that Q leaves out."""
-    hidden = hidden_modes(A.T, Q, bool(lin.dt), margin=True)
+    hidden = hidden_modes(A.T, Q, bool(lin.dt))
     if hidden:
-        words = _dominant(np.vstack([vectors for _, vectors in hidden]), lin.state_names)
+        words = _dominant(np.vstack(hidden), lin.state_names)
         raise InputError(f"Q does not weigh {words}, which do not settle by themselves; weigh them")
 
 
 def require_detectable(lin: LinearModel) -> None:
     """Raise `DetectabilityError` that names what no output shows and what does not settle."""
-    hidden = hidden_modes(lin.A.T, lin.C.T, bool(lin.dt), margin=False)
-    if hidden:
-        words = _dominant(np.vstack([vectors for _, vectors in hidden]), lin.state_names)
+    from fflin.naming import with_rates
+    from fflin.observation import observability
+
+    found = observability(lin)
+    if not found.detectable:
         raise DetectabilityError(
-            f"the outputs do not show {words}, which do not settle by themselves; add outputs"
+            f"the outputs do not show {with_rates(found.unobservable)}, which do not settle by "
+            "themselves; add outputs"
         )
 
 
 def require_disturbed(lin: LinearModel, W: Array) -> None:
     """Raise `InputError` that names the modes on the boundary that no disturbance reaches."""
-    hidden = hidden_modes(lin.A, W, bool(lin.dt), margin=True)
+    hidden = hidden_modes(lin.A, W, bool(lin.dt))
     if hidden:
-        words = _dominant(np.vstack([vectors for _, vectors in hidden]), lin.state_names)
+        words = _dominant(np.vstack(hidden), lin.state_names)
         raise InputError(
             f"W does not disturb {words}, which do not settle by themselves: a steady filter "
             "would not correct them; give them an intensity"
         )
 
 
-def hidden_modes(
-    A: Array, B: Array, discrete: bool, *, margin: bool
-) -> list[tuple[complex, Array]]:
-    """Return the eigenvalues that do not decay and left eigenvectors (k, nx) that B misses.
+def hidden_modes(A: Array, B: Array, discrete: bool) -> list[Array]:
+    """Return left eigenvectors (k, nx) that B misses, of eigenvalues that neither decay nor grow.
 
     Parameters
     ----------
     A : ndarray (nx, nx)
     B : ndarray (nx, nu)
     discrete : bool
-    margin : bool
-        Only those on the boundary of stability.
     """
     poles = np.linalg.eigvals(A)
     size = max(float(np.abs(poles - discrete).max()), 1e-300)
     beyond = np.abs(poles) - 1.0 if discrete else poles.real
     # A block of four moves by the fourth root of rounding.
-    near = np.abs(beyond) <= 1e-3 * size if margin else beyond >= -1e-3 * size
-    still = complex(discrete)
-    candidates = [still] + [
-        complex(pole)
-        for pole in poles[near & (poles.imag >= 0.0)]
-        if abs(pole - still) > 1e-3 * size
-    ]
-    found: list[tuple[complex, Array]] = []
+    still, near = complex(discrete), np.abs(beyond) <= 1e-3 * size
+    candidates = [still]
+    for pole in poles[near & (poles.imag >= 0.0)]:
+        if all(abs(pole - other) > 1e-3 * size for other in candidates):
+            candidates.append(complex(pole))
+    found = []
     for pole in candidates:
-        if any(abs(pole - other) <= 1e-3 * size for other, _ in found):
-            continue
-        shifted = A - pole * np.eye(len(A)) if pole.imag else A - pole.real * np.eye(len(A))
-        vectors = _left_null(np.column_stack((shifted, B)))
-        if len(vectors):
-            found.append((pole, vectors))
-    return found
+        shifted = A - (pole if pole.imag else pole.real) * np.eye(len(A))
+        found.append(_left_null(np.column_stack((shifted, B))))
+    return [vectors for vectors in found if len(vectors)]
 
 
 def _left_null(matrix: Array) -> Array:
@@ -107,21 +104,14 @@ def _left_null(matrix: Array) -> Array:
     return null / np.linalg.norm(null, axis=1, keepdims=True)
 
 
-def _forces_missing(lin: LinearModel, left: Array) -> str | None:
-    """Say which generalised forces are missing, about a point where momentum is conserved."""
-    m = len(lin.A) // 2
-    names = lin.state_names
-    if len(names) != 2 * m or names[m : m + 6] != _BASE_VELOCITIES or lin.M.shape != (m, m):
+def _forces_missing(lin: LinearModel, weights: Array) -> str | None:
+    """Say what the conserved momenta W M nu, W (k, nv), are those of; None of another model."""
+    names = lin.state_names[len(lin.M) :]
+    if names[:6] != _BASE_VELOCITIES:
         return None
-    # A left vector is M z on the velocities, where z is a force that no input makes.
-    if np.abs(left.imag).max(initial=0.0) > 0.0:
-        return None
-    forces = np.linalg.svd(np.linalg.solve(lin.M, left.real[:, m:].T).T)[2][: len(left)]
-    involved = np.linalg.norm(forces, axis=0) > 1e-6
+    involved = np.abs(weights).max(axis=0) > 0.0
     base = [word for word, rows in _BASE_WORDS if involved[rows].any()]
-    joints = [
-        name.partition(".")[2] for name, x in zip(names[m + 6 :], involved[6:], strict=True) if x
-    ]
+    joints = [name.partition(".")[2] for name, x in zip(names[6:], involved[6:], strict=True) if x]
     if joints:
         moved = f"joint{'s' * (len(joints) > 1)} {listed(joints)}, which no input moves"
         return " and ".join((*base, moved))

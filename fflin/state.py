@@ -192,6 +192,10 @@ class StateMap:
             )
         return Chart(quaternion[:3], q0, rotation_matrix(quaternion))
 
+    def rotation(self, q: Array) -> Array:
+        """Return refMb.rotation (3, 3) at a valid configuration, at any turn."""
+        return rotation_matrix(quaternion_product(self._quaternion, q[3:7]))
+
     def scalar(self, q: Array) -> float:
         """Return q0 at a valid configuration, with the sign of the quaternion in q."""
         return float(quaternion_product(self._quaternion, q[3:7])[3])

@@ -9,6 +9,7 @@ from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
 import fflin
+from fflin.margins import _norm
 from fflin.sampling import held_cost
 
 
@@ -111,12 +112,33 @@ def test_bad_weights_are_named(lin):
         fflin.lqr(fflin.load("ets_vii"), 1, 1)
 
 
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_weights_of_any_size_give_a_gain_or_one_clear_line(lin, dt):
+    model = lin.discretize(dt) if dt else lin
+    sizes = (1e-300, 1e-150, 1e-20, 1.0, 1e20, 1e150, 1e300)
+    solved = 0
+    for q in sizes:
+        for r in sizes:
+            try:
+                gain = fflin.lqr(model, q, r)
+            except fflin.StabilizabilityError as error:
+                assert "scale the weights" in str(error)
+            else:
+                assert np.isfinite(gain.K).all() and gain.margin > 0.0
+                solved += 1
+    assert solved >= 7
+
+
 def test_what_is_no_fixed_point_is_refused_with_its_rows():
     robot = fflin.load("ets_vii")
     v = fflin.velocity(robot, {"omega_b.z": 0.1, "joint_1": 0.2})
     for point in (fflin.linearize(robot, None, v), fflin.linearize(robot, None, v).discretize(0.1)):
         with pytest.raises(fflin.EquilibriumError, match=r"d q_m\.joint_1/dt = 0\.2.*and \d+ more"):
             fflin.lqr(point, 1, 1)
+    with pytest.raises(fflin.EquilibriumError, match=r"d qdot_m\.joint_2/dt"):
+        fflin.lqr(fflin.linearize(robot, None, v, moving=True), 1, 1)
+    # Flying along is steady.
+    v = fflin.velocity(robot, {"v_b.x": 0.1})
     steady = fflin.lqr(fflin.linearize(robot, None, v, moving=True), 1, 1)
     assert steady.residual < 1e-14 and steady.margin > 0.0
 
@@ -144,7 +166,9 @@ def test_springs_do_not_hide_that_momentum_is_conserved():
     robot = joints_only(fflin.load("servicer_7dof").replace(stiffness=20.0, damping=1.0))
     with pytest.raises(fflin.StabilizabilityError, match="base attitude and position"):
         fflin.lqr(fflin.linearize(robot), 1, 1)
-    # The base holds joints that springs hold.
+    # Without what is conserved it can be held, and so can all with the base's inputs.
+    reduced = fflin.lqr(fflin.momentum_reduction(fflin.linearize(robot)), 1, 1)
+    assert reduced.K.shape == (9, 18) and reduced.residual < 1e-14
     flexible = robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce()])
     gain = fflin.lqr(fflin.linearize(flexible), 1, 1e-4)
     assert gain.method == "general" and gain.residual < 1e-13 and gain.margin > 0.0
@@ -178,6 +202,21 @@ def test_margins_are_the_least_over_all_frequencies(lin, gain):
         factors = np.exp(rng.uniform(np.log(low), np.log(high), 12))
         loop = sampled.A - sampled.B @ (factors[:, None] * sampled.K)
         assert np.abs(np.linalg.eigvals(loop)).max() < 1.0
+
+
+def test_the_largest_gain_of_a_resonance_is_found_between_the_poles():
+    """w^2/(s^2 + 2 z w s + w^2) has its largest gain, 1/(2 z sqrt(1 - z^2)), below w."""
+    for z in (0.05, 0.3, 0.6):
+        A = np.array([[0.0, 1.0], [-9.0, -6.0 * z]])
+        B, C = np.array([[0.0], [9.0]]), np.array([[1.0, 0.0]])
+        exact = 1.0 / (2.0 * z * np.sqrt(1.0 - z**2))
+        assert _norm(A, B, C, np.zeros((1, 1))) == pytest.approx(exact, rel=2e-5)
+        # With a direct term, on a dense grid.
+        D = np.array([[0.7]])
+        response = D + [
+            C @ np.linalg.solve(1j * w * np.eye(2) - A, B) for w in np.linspace(0, 9, 9001)
+        ]
+        assert _norm(A, B, C, D) == pytest.approx(np.abs(response).max(), rel=3e-5)
 
 
 def test_sampled_cost_is_the_integral_under_held_inputs(lin):

@@ -49,6 +49,9 @@ def test_joints_alone_cannot_hold_the_base(capsys):
     code, out, err = run(capsys, "ets_vii", "--inputs", "joints")
     assert (code, out) == (2, "")
     assert re.search(r"base attitude and position \(momentum is conserved\).* \(--reduce\)$", err)
+    code, out, err = run(capsys, "ets_vii", "--inputs", "joints", "--reduce")
+    assert (code, err) == (0, "")
+    assert "K (6 x 12)" in out and "q_m.joint_6" in out
     code, _, err = run(capsys, "servicer_7dof", "--inputs", "base")
     assert code == 2 and "hold joints joint_1, joint_2" in err
     code, _, err = run(capsys, "cubesat", "--inputs", "joints")

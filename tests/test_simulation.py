@@ -41,24 +41,29 @@ def displaced(lin, degrees=30.0, offset=0.5, spread=0.3):
 def tumbling(robot, seed=0, size=0.4):
     rng = np.random.default_rng(seed)
     state = fflin.StateMap(robot)
-    q = fflin.configuration(robot, dict(zip(robot.joint_names, rng.normal(size=robot.n))))
+    q = fflin.configuration(
+        robot, dict(zip(robot.joint_names, rng.normal(size=robot.n), strict=True))
+    )
     return q, size * state.spread(rng.normal(size=6 + robot.n))
 
 
-def test_torque_free_axisymmetric_body_turns_as_the_closed_form_says():
+@pytest.mark.parametrize(("project", "accuracy"), [(False, 1e-12), (True, 1e-11)])
+def test_torque_free_axisymmetric_body_turns_as_the_closed_form_says(project, accuracy):
     # Andrle and Crassidis 2012: J = (a, a, c). With the momentum H in inertial axes
-    # R(t) = exp(H t / a) exp(-(c - a)/a omega_3 e3 t); one hour in steps of 0.1 s.
+    # R(t) = exp(H t / a) exp(-(c - a)/a omega_3 e3 t); one hour in steps of 0.1 s. Keeping the
+    # momentum in inertial axes turns the attitude's rounding into an error of the spin, which
+    # adds up over 36,000 steps.
     a, c, duration = 200.0, 100.0, 3600.0
     robot = free_body((a, a, c))
     omega = np.array([0.05, 0.0, 0.01])
     v0 = np.concatenate((np.zeros(3), omega))
-    motion = fflin.simulate(robot, v0=v0, duration=duration, dt=0.1, every=360)
+    motion = fflin.simulate(robot, v0=v0, duration=duration, dt=0.1, every=360, project=project)
     H = np.diag([a, a, c]) @ omega
     for t, q in zip(motion.t, motion.q, strict=True):
         spin = np.array([0.0, 0.0, -(c - a) / a * omega[2] * t])
         R = pin.exp3(H * t / a) @ pin.exp3(spin)
         apart = pin.log3(R.T @ pin.XYZQUATToSE3(q).rotation)
-        assert np.linalg.norm(apart) < 1e-12
+        assert np.linalg.norm(apart) < accuracy
 
 
 @pytest.mark.parametrize(
@@ -327,7 +332,7 @@ def test_rows_are_kept_where_a_run_is_interrupted():
         return np.ones(6)
 
     motion = fflin.simulate(robot, policy, duration=2.0, dt=0.1)
-    assert motion.stopped.startswith("interrupted at t = 0.6")
+    assert motion.stopped.startswith("interrupted at t = 0.5 s")
     assert 5 <= len(motion.t) <= 7
     assert np.isfinite(motion.x).all()
 
@@ -352,7 +357,7 @@ def test_an_event_ends_the_run():
 
     v0 = np.array([1.0, 0, 0, 0, 0, 0])
     motion = fflin.simulate(robot, v0=v0, duration=2.0, dt=0.01, events=[fence])
-    assert motion.stopped == "fence at t = 0.5"
+    assert motion.stopped == "fence at t = 0.5 s"
     assert motion.q[-1, 0] == pytest.approx(0.5)
 
 
@@ -409,7 +414,7 @@ def test_csv_has_names_and_rows(tmp_path):
 )
 def test_bad_input_is_one_clear_line(options, said):
     robot = fflin.load("ets_vii")
-    with pytest.raises(fflin.FflinError, match=".") as caught:
+    with pytest.raises(fflin.FflinError, match=r"\w") as caught:
         fflin.simulate(robot, **options)
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -4,6 +4,7 @@ import base64
 import json
 import shutil
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,9 @@ def test_nothing_is_left_behind_by_bad_input(robots, motion, tmp_path):
         assert "\n" not in str(caught.value)
     with pytest.raises(fflin.InputError, match="one of 'planar_detumble', not of 'ets_vii'"):
         fflin.visualize(other, motion, html=page)
+    alike = replace(motion, urdf_sha256="0" * 64, robot="another")
+    with pytest.raises(fflin.InputError, match="one of 'another', not of 'planar_detumble'"):
+        fflin.visualize(robot, alike, html=page)
     with pytest.raises(fflin.InputError, match="expected a Motion"):
         fflin.visualize(robot, "motion", html=page)
     with pytest.raises(fflin.InputError, match="expected a fflin"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from fflin.commands import DONE
@@ -51,7 +52,7 @@ def add_weights(command: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         help="weight on a state or a group of them, such as q_b or q_m.joint_1 (repeatable); "
-        "1 by default",
+        "1 by default; without any weight the cost is on states and accelerations, 1 on each",
     )
     command.add_argument(
         "--r",
@@ -80,10 +81,18 @@ def add_weights(command: argparse.ArgumentParser) -> None:
 
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
-    """Return the regulator that the weights say."""
+    """Return the regulator that the weights say.
+
+    Without any, a model of double integrators, as a driven robot at rest is, gets the cost on
+    accelerations: its poles are of the order of 1/s whatever the robot weighs.
+    """
+    from fflin.acceleration import acceleration_lqr
     from fflin.regulator import lqr
     from fflin.sampling import sampled_cost
 
+    if not (arguments.q or arguments.r or arguments.bryson):
+        with suppress(InputError, StabilizabilityError):
+            return acceleration_lqr(lin, 1.0, 1.0, 1.0, dt=arguments.dt)
     Q, R = _weights(lin, arguments)
     try:
         if arguments.dt is None:
