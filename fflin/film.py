@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +18,7 @@ from fflin.validation import Array
 
 if TYPE_CHECKING:
     from fflin.motion import Motion
+    from fflin.state import Frame
 
 # Where one looks from, and where the sun stands, in world axes.
 VIEWS = {"space": (1.0, -0.62, 0.50), "lab": (1.0, -0.62, 0.36)}
@@ -41,7 +42,7 @@ def motion_page(
     """Return the page of a motion, and what could not be drawn; see `visualize`."""
     shown = frame_indices(motion.t, fps, speed)
     t, q, u = motion.t[shown], motion.q[shown], motion.u[shown]
-    state = StateMap(robot, reference=motion.reference, frame=motion.frame)
+    state = chart_of(robot, motion)
     film = play_back(robot, state, t, q, u, tool)
 
     window, sent = Recorder(), set[str]()
@@ -74,6 +75,11 @@ def motion_page(
         "legend": legend(info, ghost=ghost, linear=predicted is not None),
     }
     return build_page(info, window.commands()), drawing.notes
+
+
+def chart_of(robot: Robot, motion: Motion) -> StateMap:
+    """Return the map between a motion's states and configurations."""
+    return StateMap(robot, reference=motion.reference, frame=cast("Frame", motion.frame))
 
 
 def _predicted(state: StateMap, motion: Motion, shown: Array) -> Array | None:

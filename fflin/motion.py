@@ -6,7 +6,7 @@ import csv
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -14,9 +14,6 @@ import pinocchio as pin
 from fflin.design import Design
 from fflin.errors import FileError, InputError
 from fflin.validation import Array
-
-if TYPE_CHECKING:
-    from fflin.state import Frame
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -69,7 +66,7 @@ class Motion(Design):
     input_names: tuple[str, ...]
     state_units: tuple[str, ...]
     input_units: tuple[str, ...]
-    frame: Frame
+    frame: str
     robot: str
     urdf_sha256: str
     stopped: str

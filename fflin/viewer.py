@@ -132,11 +132,11 @@ def visualize(
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif}, robot.urdf)
     _check_motion(robot, motion)
     fps, speed = _rates(motion, fps, speed)
+    from fflin.film import chart_of, motion_page
+
     if target is None:
-        state = StateMap(robot, reference=motion.reference, frame=motion.frame)
-        target = state.to_pinocchio(motion.target)[0]
+        target = chart_of(robot, motion).to_pinocchio(motion.target)[0]
     goal = _configuration(robot, "target", target)
-    from fflin.film import motion_page
 
     page, notes = motion_page(
         robot, motion, scene=scene, fps=fps, speed=speed, follow=follow, target=goal, tool=tool

@@ -141,7 +141,10 @@ def test_the_panel_says_what_the_motion_says(settled, watched):
         watched.do(f"fflin.seek({t})")
         column = watched.do("""(() => {
             const canvas = document.querySelector('.plot canvas'), { width, height } = canvas;
-            const pixels = canvas.getContext('2d').getImageData(0, 0, width, height).data;
+            const copy = new OffscreenCanvas(width, height);
+            const context = copy.getContext('2d', { willReadFrequently: true });
+            context.drawImage(canvas, 0, 0);
+            const pixels = context.getImageData(0, 0, width, height).data;
             const bright = new Array(width).fill(0);
             for (let k = 0; k < width * height; k++) {
                 const [r, g, b, a] = pixels.slice(4 * k, 4 * k + 4);
