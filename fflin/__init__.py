@@ -89,6 +89,7 @@ _PUBLIC = {
     "tvlqr": "schedules",
     "validity": "region",
     "velocity": "points",
+    "visualize": "viewer",
 }
 
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
@@ -153,6 +154,7 @@ if TYPE_CHECKING:
     from fflin.structure import Controllability, controllability
     from fflin.trajectory import LinearTrajectory, linearize_trajectory
     from fflin.verification import Check, check
+    from fflin.viewer import visualize
     from fflin.weights import bryson
 
 

@@ -77,6 +77,8 @@ class Robot:
         {joint: position [rad|m]} where a spring is relaxed; 0 where not named.
     gravity : tuple of float (3,)
         Uniform acceleration [m/s^2] in Pinocchio's world axes. `model` itself has none.
+    package_dirs : tuple of Path
+        Folders in which ``package://`` paths of meshes are looked up when it is drawn.
     """
 
     model: pin.Model
@@ -94,6 +96,7 @@ class Robot:
     damping: Mapping[str, float] = field(default_factory=dict)
     rest: Mapping[str, float] = field(default_factory=dict)
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    package_dirs: tuple[Path, ...] = ()
     # Where some of its joints are wheels: the same robot without them.
     _wheelless: Robot | None = None
 
