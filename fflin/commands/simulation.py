@@ -102,7 +102,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     if arguments.output_file:
         check_motion_format(arguments.output_file)
     if arguments.plot:
-        from fflin.plots import check_figure_format, require_matplotlib
+        from fflin.figures import check_figure_format, require_matplotlib
 
         check_figure_format(arguments.plot)
         require_matplotlib()
