@@ -168,7 +168,8 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
             xlabel="displacement [% of the largest]",
             ylabel="runs",
         )
-        right.legend(loc="lower left")
+        right.set_ylim(0.0, 1.25 * float(np.add(*counts).max()))
+        right.legend(loc="upper left", ncols=2)
         figure.suptitle(
             f"{validity.robot}, up to {shown(validity.largest)}; {percent * low:.1f} to "
             f"{percent * high:.1f} % settle ({percent * validity.confidence:g} % confidence)",

@@ -214,6 +214,8 @@ def test_nothing_is_left_when_its_process_is_killed(ending):
     )
     port = int(process.stdout.readline())
     assert urllib.request.urlopen(f"http://127.0.0.1:{port}/").status == 200
+    # Into the wait, of which Ctrl-C is the end; before it, it interrupts whatever runs.
+    time.sleep(1.0)
     process.send_signal(ending)
     out, error = process.communicate(timeout=20)
     if ending == signal.SIGINT:  # Ctrl-C is the way to end it
