@@ -80,13 +80,12 @@ class Dynamics:
             force = force + self._disturbed(t, q, v)[[3, 4, 5, 0, 1, 2]]
         return force
 
-    @property
-    def isolated(self) -> bool:
-        """Whether nothing pushes from outside whatever the inputs are."""
-        base = self._columns[:6].any() or self.actuation.carried
+    def isolated(self, *, driven: bool) -> bool:
+        """Whether nothing pushes from outside, whatever the inputs are or where none acts."""
+        base = driven and (self._columns[:6].any() or self.actuation.carried)
         return not (base or self._disturbance is not None or any(self._robot.gravity))
 
-    def free(self, q: Array, v: Array) -> Callable[[float, Array, Array], Array]:
+    def free(self) -> Callable[[float, Array, Array], Array]:
         """Return f(t, q, v) for inputs that are zero, with nothing in between where it can be."""
         if self._plain and self._disturbance is None:
             model, data, zero = self._model, self._data, np.zeros(self._robot.nv)

@@ -7,7 +7,7 @@ end. The weights say with which share of the step each stage counts, for what is
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -16,95 +16,127 @@ from fflin.errors import unknown
 from fflin.validation import Array
 
 Acceleration: TypeAlias = Callable[[float, Array, Array], Array]
-Step: TypeAlias = Callable[
-    [pin.Model, Acceleration, float, Array, Array, float], tuple[Array, Array]
-]
 
 _integrate = pin.integrate
 
 
-class Integrator(NamedTuple):
-    r"""A step and the weights of its stages.
+class Integrator:
+    """Steps of one size of one model.
 
     Attributes
     ----------
-    step : callable
     weights : tuple of float
+        Of the stages.
     reach : float
-        Largest |pole| dt with which it is stable on the negative real axis.
+        Largest pole times step with which it is stable on the negative real axis.
     """
 
-    step: Step
-    weights: tuple[float, ...]
-    reach: float
+    weights: ClassVar[tuple[float, ...]]
+    reach: ClassVar[float]
+
+    def __init__(self, model: pin.Model, dt: float) -> None:
+        self.model, self.dt = model, dt
+
+    def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return q and v one step later."""
+        raise NotImplementedError
 
 
-def _cf4(
-    model: pin.Model, f: Acceleration, t: float, q: Array, v: Array, h: float
-) -> tuple[Array, Array]:
-    """Commutator-free, of order 4, with two exponentials at the end.
+class CommutatorFree4(Integrator):
+    r"""CF4 of Celledoni, Marthinsen and Owren: order 4, with two exponentials at the end.
 
-    The stages of the velocity are put in, so that only accelerations are left to combine.
+    With the stages of the velocity put in, only accelerations :math:`l_i` are left to combine:
+
+    .. math:: k_2 = v + \tfrac h2 l_1,\quad k_3 = v + \tfrac h2 l_2,\quad k_4 = v + h l_3
+
+    and what moves q is :math:`\tfrac h2 v` and sums of :math:`l_i`. Each combination is a row of
+    a small matrix, so that a stage is one product with all stages so far.
     """
-    half = 0.5 * h
-    moved = half * v
-    l1 = f(t, q, v)
-    q2 = _integrate(model, q, moved)
-    l2 = f(t + half, q2, v + half * l1)
-    q3 = _integrate(model, q, moved + (half * half) * l1)
-    l3 = f(t + half, q3, v + half * l2)
-    q4 = _integrate(model, q2, moved + (h * half) * l2)
-    l4 = f(t + h, q4, v + h * l3)
-    sixth = h / 6.0
-    l12, last = l1 + l2, (half * sixth) * l3
-    moved += (half * sixth) * l12
-    q = _integrate(model, _integrate(model, q, moved - last), moved + 3.0 * last)
-    return q, v + sixth * (l12 + l2 + 2.0 * l3 + l4)
+
+    weights = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
+    reach = 2.78
+
+    def __init__(self, model: pin.Model, dt: float) -> None:
+        super().__init__(model, dt)
+        h, half, twelfth = dt, 0.5 * dt, dt * dt / 12.0
+        self._stages = np.zeros((5, model.nv))  # v, l1, ..., l4
+        self._two, self._three, self._four = (self._stages[:k] for k in (2, 3, 4))
+        self._after_1 = np.array([[half, 0.0], [1.0, half], [half, half * half]])
+        self._after_2 = np.array([[1.0, 0.0, half], [half, 0.0, h * half]])
+        self._after_3 = np.array(
+            [
+                [1.0, 0.0, 0.0, h],
+                [half, twelfth, twelfth, -twelfth],
+                [half, twelfth, twelfth, 3.0 * twelfth],
+            ]
+        )
+        self._after_4 = np.array([1.0, *(h * weight for weight in self.weights)])
+
+    def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return q and v one step later."""
+        model, stages, middle = self.model, self._stages, t + 0.5 * self.dt
+        stages[0] = v
+        stages[1] = f(t, q, v)
+        to_2, v2, to_3 = self._after_1.dot(self._two)
+        q2 = _integrate(model, q, to_2)
+        stages[2] = f(middle, q2, v2)
+        v3, to_4 = self._after_2.dot(self._three)
+        stages[3] = f(middle, _integrate(model, q, to_3), v3)
+        v4, first, second = self._after_3.dot(self._four)
+        stages[4] = f(t + self.dt, _integrate(model, q2, to_4), v4)
+        end = _integrate(model, _integrate(model, q, first), second)
+        return end, self._after_4.dot(stages)
 
 
-def _rkmk4(
-    model: pin.Model, f: Acceleration, t: float, q: Array, v: Array, h: float
-) -> tuple[Array, Array]:
-    """Runge-Kutta-Munthe-Kaas of order 4, with the inverse of dexp at each stage."""
+class RungeKuttaMuntheKaas4(Integrator):
+    """Order 4 in the tangent at q, with the inverse of dexp at each stage."""
 
-    def rate(theta: Array, velocity: Array) -> Array:
-        slope = pin.dIntegrate(model, q, theta, pin.ArgumentPosition.ARG1)
-        result: Array = np.linalg.solve(slope, velocity)
-        return result
+    weights = CommutatorFree4.weights
+    reach = 2.78
 
-    half = 0.5 * h
-    l1 = f(t, q, v)
-    k2, v2 = half * v, v + half * l1
-    d2 = rate(k2, v2)
-    l2 = f(t + half, _integrate(model, q, k2), v2)
-    k3, v3 = half * d2, v + half * l2
-    d3 = rate(k3, v3)
-    l3 = f(t + half, _integrate(model, q, k3), v3)
-    k4, v4 = h * d3, v + h * l3
-    d4 = rate(k4, v4)
-    l4 = f(t + h, _integrate(model, q, k4), v4)
-    moved = h / 6.0 * (v + 2.0 * (d2 + d3) + d4)
-    return _integrate(model, q, moved), v + h / 6.0 * (l1 + 2.0 * (l2 + l3) + l4)
+    def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return q and v one step later."""
+        model, h, half = self.model, self.dt, 0.5 * self.dt
 
+        def rate(theta: Array, velocity: Array) -> Array:
+            slope = pin.dIntegrate(model, q, theta, pin.ArgumentPosition.ARG1)
+            result: Array = np.linalg.solve(slope, velocity)
+            return result
 
-def _semi_implicit_euler(
-    model: pin.Model, f: Acceleration, t: float, q: Array, v: Array, h: float
-) -> tuple[Array, Array]:
-    """Of order 1: the new velocity moves the configuration."""
-    v = v + h * f(t, q, v)
-    return _integrate(model, q, h * v), v
+        l1 = f(t, q, v)
+        k2, v2 = half * v, v + half * l1
+        d2 = rate(k2, v2)
+        l2 = f(t + half, _integrate(model, q, k2), v2)
+        k3, v3 = half * d2, v + half * l2
+        d3 = rate(k3, v3)
+        l3 = f(t + half, _integrate(model, q, k3), v3)
+        k4, v4 = h * d3, v + h * l3
+        d4 = rate(k4, v4)
+        l4 = f(t + h, _integrate(model, q, k4), v4)
+        moved = h / 6.0 * (v + 2.0 * (d2 + d3) + d4)
+        return _integrate(model, q, moved), v + h / 6.0 * (l1 + 2.0 * (l2 + l3) + l4)
 
 
-_FOURTH = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
+class SemiImplicitEuler(Integrator):
+    """Order 1: the new velocity moves the configuration."""
 
-INTEGRATORS = {
-    "cf4": Integrator(_cf4, _FOURTH, 2.78),
-    "rkmk4": Integrator(_rkmk4, _FOURTH, 2.78),
-    "semi_implicit_euler": Integrator(_semi_implicit_euler, (1.0,), 2.0),
+    weights = (1.0,)
+    reach = 2.0
+
+    def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return q and v one step later."""
+        v = v + self.dt * f(t, q, v)
+        return _integrate(self.model, q, self.dt * v), v
+
+
+INTEGRATORS: dict[str, type[Integrator]] = {
+    "cf4": CommutatorFree4,
+    "rkmk4": RungeKuttaMuntheKaas4,
+    "semi_implicit_euler": SemiImplicitEuler,
 }
 
 
-def integrator(name: str) -> Integrator:
+def integrator(name: str) -> type[Integrator]:
     """Return the integrator of a name, or raise `UnknownNameError`."""
     if name not in INTEGRATORS:
         raise unknown("method", str(name), list(INTEGRATORS))

@@ -12,7 +12,8 @@ from fflin.conservation import Conserved
 from fflin.control import Channel, limits_of
 from fflin.dynamics import Disturbance, Dynamics
 from fflin.errors import ChartError, InputError
-from fflin.integrators import integrator
+from fflin.inputs import named_wheels
+from fflin.integrators import Acceleration, integrator
 from fflin.linear_loop import predict
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
@@ -137,14 +138,15 @@ class Run:
 
     def choose(self, method: str, project: bool) -> None:
         """Set the integrator."""
-        self.method = integrator(method)
+        kind = integrator(method)
         self.project = bool(project)
-        if self.fastest * self.dt > self.method.reach:
+        if self.fastest * self.dt > kind.reach:
             raise InputError(
                 f"dt is {self.dt:g} s, too large for a loop whose fastest pole is at "
-                f"{self.fastest:.4g} 1/s; take at most "
-                f"{self.method.reach / self.fastest:.2g} s, or `sample`"
+                f"{self.fastest:.4g} 1/s; take at most {kind.reach / self.fastest:.2g} s, or "
+                "`sample`"
             )
+        self.method = kind(self.robot.model, self.dt)
 
     def _fastest_pole(self) -> float:
         K = getattr(self.policy, "K", None)
@@ -168,14 +170,35 @@ class Run:
         self.rows_x, self.rows_u = np.empty((rows, self.state.nx)), np.empty((rows, nu))
         self.missing = np.zeros((rows, 6))
         self.count, self.orbital = 0, 0.0
+        self.acting: Array = self.initial
+        self.pushes: list[Array] = []
+        # A wheel is symmetric about its axis: no matter how far it turns in a step.
+        wheels = {name for name, _ in named_wheels(self.robot.inputs)}
+        joints = [joint.idx_v for joint in self.robot.joints if joint.name not in wheels]
+        self.turning = np.array([3, 4, 5, *joints], dtype=np.intp)
         self.point = self.q[:3].copy()
         self.expected: Array = self.conserved.about(self.q, self.v, self.point)
         bar = Progress(self.steps, progress)
         stopped, step = "", 0
+        isolated = self.dynamics.isolated(driven=self.channel is not None)
+        rate = self._rate(isolated)
+        weights = self.dt * np.array(self.method.weights)
         try:
             for step in range(self.steps):
-                u = self._advance(step)
-                stopped = self._fault(step) or self._event(step + 1)
+                t, before = step * self.dt, self.q
+                if self.channel is not None:
+                    self.acting = self.channel.begin(step, t, self.q, self.v)
+                if step % self.every == 0:
+                    self._record(t)
+                self.q, self.v = self.method.step(rate, t, self.q, self.v)
+                if not isolated:
+                    self.expected = self.expected + weights.dot(self.pushes)
+                    self.pushes.clear()
+                if self.project:
+                    self.v = self.conserved.impose(self.q, self.v, self.expected, self.point)
+                stopped = self._fault(step + 1, before)
+                if self.events and not stopped:
+                    stopped = self._event(step + 1)
                 if stopped:
                     break
                 bar.update(step + 1)
@@ -186,52 +209,44 @@ class Run:
         finally:
             bar.close()
         if not stopped.startswith(("diverged", "interrupted")):
-            self._record((step + 1) * self.dt, u)
+            self._record((step + 1) * self.dt)
         return stopped
 
-    def _advance(self, step: int) -> Array:
-        """Take one step; return what acted as it began."""
-        t, q, v, h = step * self.dt, self.q, self.v, self.dt
-        channel, dynamics = self.channel, self.dynamics
-        pushes: list[Array] = []
-        follow = not dynamics.isolated
-        if channel is None:
-            u = self.initial
-            plain = dynamics.free(q, v)
-        else:
-            u = channel.begin(step, t, q, v)
+    def _rate(self, isolated: bool) -> Acceleration:
+        """Return dv/dt = f(t, q, v), which notes what pushes from outside where anything may."""
+        channel, dynamics, conserved = self.channel, self.dynamics, self.conserved
+        if channel is None and isolated:
+            return dynamics.free()
+        continuous = channel is not None and channel.continuous
 
-        def f(t: float, q: Array, v: Array) -> Array:
-            acting = u
-            if channel is not None and channel.continuous:
-                acting = channel.ask(t, q, v)
-            if follow:
-                pushes.append(self.conserved.wrench(q, dynamics.push(t, q, v, acting), self.point))
-            return dynamics.acceleration(t, q, v, acting)
+        def rate(t: float, q: Array, v: Array) -> Array:
+            u = self.acting
+            if continuous and channel is not None:
+                u = channel.ask(t, q, v)
+            if not isolated:
+                self.pushes.append(conserved.wrench(q, dynamics.push(t, q, v, u), self.point))
+            return dynamics.acceleration(t, q, v, u)
 
-        if step % self.every == 0:
-            self._record(t, u)
-        self.q_before = q
-        rate = plain if channel is None and not follow else f
-        self.q, self.v = self.method.step(self.robot.model, rate, t, q, v, h)
-        if follow:
-            self.expected = self.expected + h * np.dot(self.method.weights, pushes)
-        if self.project:
-            self.v = self.conserved.impose(self.q, self.v, self.expected, self.point)
-        return u
+        return rate
 
-    def _fault(self, step: int) -> str:
+    def _fault(self, step: int, before: Array) -> str:
         """Say what is wrong with the step that was taken; drop it where it has no meaning."""
-        t = (step + 1) * self.dt
-        turn = float(np.abs(self.v[3:]).max()) * self.dt
-        if not (turn < _LARGEST_TURN and np.isfinite(self.q).all()):
-            self.q, self.v = self.rows_q[self.count - 1], self.rows_v[self.count - 1]
-            if not np.isfinite(turn) or turn > 1e3:
-                return f"diverged at t = {t:g} s"
-            return f"diverged at t = {t:g} s: a joint or the base turns by {turn:.2g} rad a step"
-        before, after = (self.state.scalar(q) for q in (self.q_before, self.q))
-        if self.lin is not None and before * after < 0.0:
-            return f"left the chart at t = {t:g} s: the base turned by 180 deg from the reference"
+        turning = self.v.take(self.turning)
+        square = float(turning.dot(turning)) * self.dt**2
+        if not square < _LARGEST_TURN**2:
+            t, turn = step * self.dt, float(np.abs(turning).max()) * self.dt
+            if not turn < _LARGEST_TURN:
+                self.q, self.v = self.rows_q[self.count - 1], self.rows_v[self.count - 1]
+                if not turn < 1e3:
+                    return f"diverged at t = {t:g} s"
+                return (
+                    f"diverged at t = {t:g} s: a joint or the base turns by {turn:.2g} rad a step"
+                )
+        if self.lin is not None and self.state.scalar(before) * self.state.scalar(self.q) < 0.0:
+            return (
+                f"left the chart at t = {step * self.dt:g} s: the base turned by 180 deg from the "
+                "reference"
+            )
         return ""
 
     def _event(self, step: int) -> str:
@@ -241,8 +256,8 @@ class Run:
                 return f"{getattr(event, '__name__', 'event')} at t = {t:g} s"
         return ""
 
-    def _record(self, t: float, u: Array) -> None:
-        row = self.count
+    def _record(self, t: float) -> None:
+        row, u = self.count, self.acting
         self.t[row] = t
         self.rows_q[row], self.rows_v[row], self.rows_u[row] = self.q, self.v, u
         self.x = self._read(self.q, self.v, self.x)
