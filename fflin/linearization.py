@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -29,6 +28,9 @@ from fflin.validation import Array, vector
 
 if TYPE_CHECKING:
     from fflin.sensing import Sensing
+
+# Sum of squares beyond which a matrix counts as not finite: its eigenvalues would not be.
+_LARGEST = 1e200
 
 
 class Linearizer:
@@ -173,7 +175,8 @@ class Linearizer:
             u = _frozen(vector("u", u, self._nu, "the robot's inputs").copy())
         v = self._zero_v if v is None else v
         u = self._zero_u if u is None else u
-        with self._lock:
+        # What overflows is refused, and not warned of.
+        with self._lock, np.errstate(over="ignore", invalid="ignore"):
             return self._anywhere(q, v, u)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -220,7 +223,8 @@ class Linearizer:
             f0[:] = 0.0
         C, D, y0 = self._seen(chart, rates, q, v, u_base, x0)
         for array in (A, B, C, D, f0, x0, y0):
-            if not _is_finite(array):
+            flat = array.ravel()
+            if not flat.dot(flat) < _LARGEST:  # nor NaN
                 raise InputError("q, v or u is so large that the model is not finite")
             array.setflags(write=False)
         point = {"A": A, "B": B, "C": C, "D": D, "f0": f0}
@@ -334,12 +338,6 @@ def linearize(
 
 def _rebuilt(robot: Robot, frame: Frame, reference: pin.SE3 | None, moving: bool) -> Linearizer:
     return Linearizer(robot, frame=frame, reference=reference, moving=moving)
-
-
-def _is_finite(array: Array) -> bool:
-    flat = array.ravel()
-    # The square tells at once, but for entries beyond 1e154.
-    return math.isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())
 
 
 def _frozen(array: Array) -> Array:
