@@ -69,6 +69,51 @@ def bench(name: str) -> tuple[int, list[float], list[float]]:
     return robot.n, medians(rest, floor), medians(point, calls)
 
 
+def bench_equipped() -> list[float]:
+    """Time a point of servicer_7dof with 12 thrusters, 3 wheels and two outputs of a frame."""
+    rng = np.random.default_rng(0)
+    robot = fflin.load("servicer_7dof")
+    thrusters = [
+        fflin.Thruster(frame, rng.normal(size=3), rng.normal(size=3))
+        for frame in ("base", "base", "base", "link_3", "link_5", "panel_left")
+        for _ in range(2)
+    ]
+    wheels = [fflin.ReactionWheel(axis, inertia=0.03) for axis in np.eye(3)]
+    robot = robot.replace(
+        inputs=[*thrusters, *wheels], outputs=[fflin.FramePose("tool"), fflin.FrameVelocity("tool")]
+    )
+    model, data = robot.model, robot.create_data()
+    q = pin.integrate(model, pin.neutral(model), rng.normal(size=model.nv))
+    v, u = rng.normal(size=model.nv), rng.normal(size=len(robot.inputs))
+    linearizer = fflin.Linearizer(robot)
+    if not fflin.check(robot, linearizer(q, v, u)).ok:
+        sys.exit("servicer_7dof with thrusters and wheels: wrong result")
+    a, wrenches = np.zeros(model.nv), pin.StdVec_Force(model.njoints, pin.Force.Zero())
+    tool = model.frames[model.getFrameId("tool", pin.FrameType.BODY)]
+    carriers = {model.frames[model.getFrameId(item.frame)].parentJoint for item in thrusters}
+    place = tool.parentJoint, tool.placement, pin.ReferenceFrame.LOCAL
+
+    def calls() -> None:
+        pin.crba(model, data, q)
+        pin.cholesky.decompose(model, data)
+        pin.cholesky.computeMinv(model, data)
+        pin.computeJointJacobians(model, data, q)
+        for joint in carriers:
+            pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL)
+        pin.nonLinearEffects(model, data, q, v)
+        pin.computeRNEADerivatives(model, data, q, v, a, wrenches)
+        pin.computeForwardKinematicsDerivatives(model, data, q, v, a)
+        for _ in range(2):
+            pin.getFrameVelocityDerivatives(model, data, *place)
+        pin.getFrameVelocity(model, data, *place)
+
+    def point() -> None:
+        lin = linearizer(q, v, u)
+        lin.A, lin.B, lin.C, lin.D  # noqa: B018
+
+    return medians(point, calls)
+
+
 def main() -> None:
     cpu = platform.processor() or platform.machine()
     try:
@@ -90,6 +135,9 @@ def main() -> None:
             f"{name:<15}{n:>4}{rest:>9.2f}{floor:>9.2f}{rest / floor:>7.2f}"
             f"{point:>10.2f}{calls:>9.2f}{point / calls:>7.2f}"
         )
+    point, calls = bench_equipped()
+    print("\nservicer_7dof with 12 thrusters, 3 wheels, and the tool's pose and velocity:")
+    print(f"{'':<44}{point:>10.2f}{calls:>9.2f}{point / calls:>7.2f}")
 
 
 if __name__ == "__main__":

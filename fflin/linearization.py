@@ -243,7 +243,8 @@ class Linearizer:
             return self._common["C"], self._common["D"], x0
         nu = state.velocities(v)
         a = rates.c.copy()
-        a[LINEAR] += rates.gravity - skew(nu[ANGULAR]).dot(nu[LINEAR])
+        if sensing.needs_acceleration:
+            a[LINEAR] += rates.gravity - skew(nu[ANGULAR]).dot(nu[LINEAR])
         sensed = sensing.evaluate(self._data, q, v, state.spread(a))
         C, D = output_equations(state, self._actuation, chart, sensed, rates, nu, u)
         for row, index in sensing.states:
