@@ -344,3 +344,13 @@ def test_command_line_takes_an_equilibrium(capsys):
         assert cli.main(["modes", "servicer_7dof", *point, "--equilibrium", *options]) == 2
         err = capsys.readouterr().err.splitlines()
         assert len(err) == 1 and err[0].startswith("fflin: error: ") and words in err[0]
+
+
+def test_inputs_that_cancel_leave_no_mode():
+    robot = fflin.load("servicer_7dof")
+    pair = [fflin.Thruster("panel_left", (0, 0, 0.3), (x, 0, 0)) for x in (1, -1)]
+    robot = robot.replace(inputs=[*pair, *robot.inputs])
+    q = fflin.configuration(robot, {"joint_2": 0.4, "panel_left": 0.3})
+    lin = fflin.linearize(robot, q, u=fflin.effort(robot, {"thruster_1": 5, "thruster_2": 5}))
+    found = fflin.modes(lin)
+    assert lin.is_equilibrium() and not found.modes and found.zero_eigenvalues == 30
