@@ -183,7 +183,12 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
         ("linearize", "ets_vii", "--damping", "viscous"): "'viscous' is not",
         ("linearize", "cubesat", "--inputs", typo, "-o", output): "bad.toml:2: no type of input",
         ("check", "cubesat", "--inputs", "none.toml"): "none.toml: cannot be read: No such file",
-        ("check", "cubesat", "--inputs", "servicer_7dof"): "no joint named 'joint_1'",
+        (
+            "check",
+            "cubesat",
+            "--inputs",
+            "servicer_7dof",
+        ): "servicer_7dof: no joint named 'joint_1'",
         ("check", "ets_vii", "--output", "pos:tool"): "no output named 'pos'; did you mean pose",
         ("check", "ets_vii", "--output", "pose"): "output 'pose' is of no frame; write pose:NAME",
         ("check", "ets_vii", "--output", "com:tool"): "is of the whole robot; write com",

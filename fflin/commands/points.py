@@ -6,7 +6,7 @@ import argparse
 import math
 from typing import TYPE_CHECKING, Any
 
-from fflin.errors import InputError
+from fflin.errors import FflinError, InputError
 
 if TYPE_CHECKING:
     from fflin.linear_model import LinearModel
@@ -32,7 +32,11 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
     if getattr(arguments, "inputs", None):
         from fflin.input_files import load_inputs
 
-        fields["inputs"] = load_inputs(arguments.inputs)
+        inputs = load_inputs(arguments.inputs)
+        try:
+            robot = robot.replace(inputs=inputs)
+        except FflinError as error:  # a name or an inertia that does not suit this robot
+            raise type(error)(f"{arguments.inputs}: {error}") from None
     if getattr(arguments, "output", []):
         from fflin.output_specs import parse_output
 
