@@ -145,7 +145,10 @@ def linearize_trajectory(
     worst = int(residual.argmax())
     said = f"at t = {times[worst]:g} s they miss it by {residual[worst]:.1%} of its largest rate"
     if residual[worst] > _NO_MOTION:
-        raise InputError(f"t, q, v, u are not a motion of '{robot.name}': {said}")
+        raise InputError(
+            f"t, q, v, u are not a motion of '{robot.name}': {said}; give those of one motion "
+            "under the robot's own inputs, springs and gravity, or closer knots"
+        )
     if residual[worst] > _COARSE:
         warnings.warn(f"the knots are coarse for a motion: {said}", FflinWarning, stacklevel=2)
     return LinearTrajectory(

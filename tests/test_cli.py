@@ -344,3 +344,13 @@ def test_wheels_from_a_file_at_speed(tmp_path):
     assert run("check", "cubesat", "--inputs", stored)[0] == 0
     err = refused("check", "cubesat", "--inputs", stored, "--velocity", "wheel_1=100")
     assert "wheel 'wheel_1' has no inertia" in err
+
+
+def test_linearize_shows_no_rounding_in_f0_and_calls_no_frozen_model_unstable():
+    hover = ["linearize", "servicer_7dof", "--gravity", 0, 0, -9.81]
+    code, held, _ = run(*hover, "--equilibrium")
+    assert code == 0 and "a fixed point" in held
+    assert "unstable: poles" in held and "f0:" not in held
+    code, falling, _ = run(*hover, "--joint", "joint_2=0.3", "--effort", "F_b.z=9000")
+    assert code == 0 and "not a fixed point" in falling
+    assert "unstable" not in falling and "f0:" in falling
