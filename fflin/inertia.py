@@ -38,7 +38,14 @@ class Inertia:
         Order of the coordinates.
     data : pin.Data
         Work space, overwritten at each call.
+
+    Attributes
+    ----------
+    least_coupling, warning_coupling : float
+        Between these the sum of M_ii (M^-1)_ii lies where M^-1 is good.
     """
+
+    warning_coupling = _WARNING_COUPLING
 
     def __init__(self, state: StateMap, data: pin.Data) -> None:
         self._state = state
@@ -48,7 +55,7 @@ class Inertia:
         self._M = data.M.T
         self._diagonal = self._M.diagonal()
         self._constrained = bool(state.robot.followers)
-        self._least_coupling = 0.999 * (6 + state.robot.n)
+        self.least_coupling = 0.999 * (6 + state.robot.n)
 
     def invert(self, q: Array, out: Array) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array.
@@ -67,7 +74,7 @@ class Inertia:
         inverse = _compute_inverse(model, data)
         self._state.project(inverse, out)
         coupling = self._diagonal.dot(inverse.diagonal())
-        if not self._least_coupling < coupling < _WARNING_COUPLING:
+        if not self.least_coupling < coupling < _WARNING_COUPLING:
             self._judge(coupling, self._state.project(self._M))
 
     def _invert_projected(self, out: Array) -> None:
@@ -82,7 +89,7 @@ class Inertia:
 
     def _judge(self, coupling: float, M: Array) -> None:
         # Written so that NaN, from a pivot that is zero, fails too.
-        if not self._least_coupling < coupling < _LARGEST_COUPLING:
+        if not self.least_coupling < coupling < _LARGEST_COUPLING:
             raise _singular(self._state, M)
         if coupling > _WARNING_COUPLING:
             warnings.warn(

@@ -1,0 +1,300 @@
+"""M^-1 of many configurations at once: CRBA and a sparse factorisation, eight to an instruction.
+
+All vectors stand in base axes, so that none is turned from joint to joint; moments are about the
+joints, since about the base origin those of a light tool at the end of a long arm would lose their
+digits. Row i of the packed M holds what is not zero left of the diagonal: the coordinates on the
+path from the base to i, of which those of any coordinate on the path are the beginning.
+
+References
+----------
+R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, sections 6.2 and 6.5.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from fflin.batch_tree import INERTIA, LANES, PLACE
+from fflin.lanes import load, splat, store, transpose
+
+
+@numba.njit(forceinline=True)
+def _put3(work, at, x, y, z):
+    store(work, at, x)
+    store(work, at + LANES, y)
+    store(work, at + 2 * LANES, z)
+
+
+@numba.njit(forceinline=True)
+def _get3(work, at):
+    return load(work, at), load(work, at + LANES), load(work, at + 2 * LANES)
+
+
+@numba.njit(forceinline=True)
+def _turned(ax, ay, az, bx, by, bz, cx, cy, cz, x, y, z):
+    """The columns a, b, c of a rotation, times the constants x, y, z."""
+    x, y, z = splat(x), splat(y), splat(z)
+    return ax * x + bx * y + cx * z, ay * x + by * y + cy * z, az * x + bz * y + cz * z
+
+
+@numba.njit(forceinline=True)
+def _place(work, at, parent, fixed, motion, first):
+    """Write the place of a body into `work` at `at`, that of its parent being at `parent`."""
+    ax, ay, az = _get3(work, parent)
+    bx, by, bz = _get3(work, parent + 3 * LANES)
+    cx, cy, cz = _get3(work, parent + 6 * LANES)
+    cosine, sine, shift = load(motion, first[0]), load(motion, first[1]), load(motion, first[2])
+    ux, uy, uz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[0], fixed[3], fixed[6])
+    vx, vy, vz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[1], fixed[4], fixed[7])
+    zx, zy, zz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[2], fixed[5], fixed[8])
+    dx, dy, dz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[9], fixed[10], fixed[11])
+    x = cosine * ux + sine * vx, cosine * uy + sine * vy, cosine * uz + sine * vz
+    y = cosine * vx - sine * ux, cosine * vy - sine * uy, cosine * vz - sine * uz
+    _put3(work, at, *x)
+    _put3(work, at + 3 * LANES, *y)
+    _put3(work, at + 6 * LANES, zx, zy, zz)
+    _put3(work, at + 9 * LANES, dx + shift * zx, dy + shift * zy, dz + shift * zz)
+
+
+@numba.njit(forceinline=True)
+def _inertia(work, at, place, body):
+    """Write a body's inertia about its joint: m, m c, and R I R^T by way of the columns of R I."""
+    ax, ay, az = _get3(work, place)
+    bx, by, bz = _get3(work, place + 3 * LANES)
+    cx, cy, cz = _get3(work, place + 6 * LANES)
+    hx, hy, hz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[1], body[2], body[3])
+    store(work, at, splat(body[0]))
+    _put3(work, at + LANES, hx, hy, hz)
+    ux, uy, uz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[4], body[5], body[6])
+    vx, vy, vz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[5], body[7], body[8])
+    wx, wy, wz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[6], body[8], body[9])
+    xx, xy, xz = (
+        ux * ax + vx * bx + wx * cx,
+        ux * ay + vx * by + wx * cy,
+        ux * az + vx * bz + wx * cz,
+    )
+    yy, yz = uy * ay + vy * by + wy * cy, uy * az + vy * bz + wy * cz
+    zz = uz * az + vz * bz + wz * cz
+    _put3(work, at + 4 * LANES, xx, xy, xz)
+    _put3(work, at + 7 * LANES, yy, yz, zz)
+
+
+@numba.njit(forceinline=True)
+def _carry(work, at, above, place):
+    """Add a composite inertia, seen from the parent's joint, to the parent's."""
+    m = load(work, at)
+    hx, hy, hz = _get3(work, at + LANES)
+    xx, xy, xz = _get3(work, at + 4 * LANES)
+    yy, yz, zz = _get3(work, at + 7 * LANES)
+    dx, dy, dz = _get3(work, place + 9 * LANES)
+    ex, ey, ez = hx + m * dx, hy + m * dy, hz + m * dz
+    px, py, pz = dx * (hx + ex), dy * (hy + ey), dz * (hz + ez)
+    _add(work, above, m)
+    _add3(work, above + LANES, ex, ey, ez)
+    xx, xy, xz = xx + (py + pz), xy - (dx * ey + hx * dy), xz - (dx * ez + hx * dz)
+    _add3(work, above + 4 * LANES, xx, xy, xz)
+    _add3(work, above + 7 * LANES, yy + (px + pz), yz - (dy * ez + hy * dz), zz + (px + py))
+
+
+@numba.njit(forceinline=True)
+def _momentum(work, at, x, y, z, turns, slides):
+    """The momentum (angular, linear) about its joint of an inertia that the joint moves."""
+    m = load(work, at)
+    hx, hy, hz = _get3(work, at + LANES)
+    xx, xy, xz = _get3(work, at + 4 * LANES)
+    yy, yz, zz = _get3(work, at + 7 * LANES)
+    w, v = splat(turns), splat(slides)
+    kx, ky, kz = hy * z - hz * y, hz * x - hx * z, hx * y - hy * x
+    return (
+        w * (xx * x + xy * y + xz * z) + v * kx,
+        w * (xy * x + yy * y + yz * z) + v * ky,
+        w * (xz * x + yz * y + zz * z) + v * kz,
+        v * (m * x) - w * kx,
+        v * (m * y) - w * ky,
+        v * (m * z) - w * kz,
+    )
+
+
+@numba.njit(forceinline=True)
+def _add(work, at, value):
+    store(work, at, load(work, at) + value)
+
+
+@numba.njit(forceinline=True)
+def _add3(work, at, x, y, z):
+    _add(work, at, x)
+    _add(work, at + LANES, y)
+    _add(work, at + 2 * LANES, z)
+
+
+@numba.njit(forceinline=True)
+def _assemble(work, tree, motion, size, first):
+    """Write the packed M: places and inertias outwards, composite inertias inwards."""
+    bodies = len(tree.parent)
+    places, inertias, packed = tree.places, tree.inertias, tree.packed
+    one, zero = splat(1.0), splat(0.0)
+    _put3(work, places, one, zero, zero)
+    _put3(work, places + 3 * LANES, zero, one, zero)
+    _put3(work, places + 6 * LANES, zero, zero, one)
+    for index in range(tree.entries):
+        store(work, packed + index * LANES, zero)
+    _inertia(work, inertias, places, tree.bodies[0])
+    for body in range(1, bodies):
+        at = places + body * PLACE * LANES
+        row = 3 * (body - 1) * size + first
+        columns = (row, row + size, row + 2 * size)
+        above = places + tree.parent[body] * PLACE * LANES
+        _place(work, at, above, tree.fixed[body], motion, columns)
+        _inertia(work, inertias + body * INERTIA * LANES, at, tree.bodies[body])
+    pair = 0
+    for body in range(bodies - 1, 0, -1):
+        at = inertias + body * INERTIA * LANES
+        place = places + body * PLACE * LANES
+        x, y, z = _get3(work, place + 6 * LANES)
+        nx, ny, nz, fx, fy, fz = _momentum(work, at, x, y, z, tree.turns[body], tree.slides[body])
+        _carry(work, at, inertias + tree.parent[body] * INERTIA * LANES, place)
+        above = body
+        while above > 0:
+            place = places + above * PLACE * LANES
+            x, y, z = _get3(work, place + 6 * LANES)
+            value = splat(tree.turns[above]) * (x * nx + y * ny + z * nz)
+            value = value + splat(tree.slides[above]) * (x * fx + y * fy + z * fz)
+            _add(work, packed + tree.target[pair] * LANES, splat(tree.share[pair]) * value)
+            pair += 1
+            # From here on about the joint of the parent.
+            dx, dy, dz = _get3(work, place + 9 * LANES)
+            nx = nx + (dy * fz - dz * fy)
+            ny = ny + (dz * fx - dx * fz)
+            nz = nz + (dx * fy - dy * fx)
+            above = tree.parent[above]
+        start, share = packed + tree.target[pair] * LANES, splat(tree.share[pair])
+        pair += 1
+        _add3(work, start, share * nx, share * ny, share * nz)
+        _add3(work, start + 3 * LANES, share * fx, share * fy, share * fz)
+    # Of the base: I, [m c]x, m, in the rows of a chain of six.
+    m = load(work, inertias)
+    hx, hy, hz = _get3(work, inertias + LANES)
+    rows = (
+        load(work, inertias + 4 * LANES),
+        load(work, inertias + 5 * LANES),
+        load(work, inertias + 7 * LANES),
+        load(work, inertias + 6 * LANES),
+        load(work, inertias + 8 * LANES),
+        load(work, inertias + 9 * LANES),
+        zero,
+        hz,
+        zero - hy,
+        m,
+        zero - hz,
+        zero,
+        hx,
+        zero,
+        m,
+        hy,
+        zero - hx,
+        zero,
+        zero,
+        zero,
+        m,
+    )
+    for index in range(21):
+        store(work, packed + index * LANES, rows[index])
+
+
+@numba.njit(forceinline=True)
+def _factorise(work, tree):
+    """Turn the packed M into U = L^-1 and V = L^-1 D^-1 with M = L^T D L, L of unit diagonal.
+
+    The sparse factorisation of Featherstone, from the tips to the base, which makes no entry that
+    was zero.
+    """
+    packed, scaled, diagonal = tree.packed, tree.scaled, tree.diagonal
+    one = splat(1.0)
+    size = len(tree.row)
+    for k in range(size):
+        store(
+            work, diagonal + k * LANES, load(work, packed + (tree.row[k] + tree.depth[k]) * LANES)
+        )
+    for k in range(size - 1, -1, -1):
+        row, depth = packed + tree.row[k] * LANES, tree.depth[k]
+        inverse = one / load(work, row + depth * LANES)
+        store(work, scaled + (tree.row[k] + depth) * LANES, inverse)
+        store(work, row + depth * LANES, one)
+        for t in range(depth - 1, -1, -1):
+            share = load(work, row + t * LANES) * inverse
+            other = packed + tree.row[tree.path[tree.row[k] + t]] * LANES
+            for s in range(t + 1):
+                at = other + s * LANES
+                store(work, at, load(work, at) - share * load(work, row + s * LANES))
+            store(work, row + t * LANES, share)
+    zero = splat(0.0)
+    for k in range(size):
+        row, depth = packed + tree.row[k] * LANES, tree.depth[k]
+        for t in range(depth):
+            total = zero - load(work, row + t * LANES)
+            for s in range(t + 1, depth):
+                other = packed + tree.row[tree.path[tree.row[k] + s]] * LANES
+                total = total - load(work, row + s * LANES) * load(work, other + t * LANES)
+            store(work, row + t * LANES, total)
+            above = tree.path[tree.row[k] + t]
+            pivot = load(work, scaled + (tree.row[above] + tree.depth[above]) * LANES)
+            store(work, scaled + (tree.row[k] + t) * LANES, total * pivot)
+
+
+@numba.njit(forceinline=True)
+def _multiply(work, tree, couplings, first):
+    """Write M^-1 = U D^-1 U^T lane beside lane, and sum M_ii (M^-1)_ii."""
+    packed, scaled, square = tree.packed, tree.scaled, tree.square
+    size = len(tree.row)
+    coupling = splat(0.0)
+    for i in range(size):
+        left = packed + tree.row[i] * LANES
+        for j in range(i + 1):
+            right = scaled + tree.row[j] * LANES
+            total = load(work, left) * load(work, right)
+            for t in range(LANES, tree.common[i, j] * LANES, LANES):
+                total = total + load(work, left + t) * load(work, right + t)
+            store(work, square + (i * size + j) * LANES, total)
+            store(work, square + (j * size + i) * LANES, total)
+            if i == j:
+                coupling = coupling + total * load(work, tree.diagonal + i * LANES)
+    store(couplings, first, coupling)
+
+
+@numba.njit(nogil=True, cache=True, boundscheck=False)
+def invert(tree, motion, out, couplings, work):
+    """Write M^-1 of each configuration.
+
+    Parameters
+    ----------
+    tree : Tree
+    motion : ndarray (bodies - 1, 3, rounded)
+        Cosine and sine of every joint's angle and its displacement, in as many columns as fill
+        the lanes.
+    out : ndarray (count, size * size)
+        Results, rows contiguous.
+    couplings : ndarray (rounded,)
+        The sums of M_ii (M^-1)_ii, which tell how singular M is.
+    work : ndarray
+        Work space.
+    """
+    count, entries = out.shape
+    rounded = motion.shape[2]
+    flat, motions, tail = out.reshape(-1), motion.reshape(-1), np.empty(LANES)
+    for first in range(0, count, LANES):
+        _assemble(work, tree, motions, rounded, first)
+        _factorise(work, tree)
+        _multiply(work, tree, couplings, first)
+        if first + LANES <= count:
+            whole = entries - entries % LANES
+            for entry in range(0, whole, LANES):
+                transpose(work, tree.square + entry * LANES, flat, first * entries + entry, entries)
+            for entry in range(whole, entries):
+                store(tail, 0, load(work, tree.square + entry * LANES))
+                for lane in range(LANES):
+                    out[first + lane, entry] = tail[lane]
+        else:
+            for lane in range(count - first):
+                for entry in range(entries):
+                    out[first + lane, entry] = work[tree.square + entry * LANES + lane]
