@@ -23,19 +23,23 @@ _PUBLIC = {
     "FrameVelocity": "outputs",
     "FullState": "outputs",
     "Gyroscope": "outputs",
+    "Grid": "configurations",
     "InputError": "errors",
     "JointPositions": "outputs",
     "JointTorque": "inputs",
     "JointVelocities": "outputs",
+    "LinearBatch": "linear_batch",
     "LinearModel": "linear_model",
     "LinearTrajectory": "trajectory",
     "Linearizer": "linearization",
     "MissingPackageError": "errors",
     "ModelError": "errors",
     "Momentum": "outputs",
+    "RandomConfigurations": "configurations",
     "Robot": "model",
     "SingularInertiaError": "errors",
     "StateMap": "state",
+    "SweepError": "errors",
     "Thruster": "inputs",
     "UnknownNameError": "errors",
     "UrdfError": "errors",
@@ -43,17 +47,21 @@ _PUBLIC = {
     "configuration": "model",
     "effort": "points",
     "from_model": "loading",
+    "grid": "configurations",
     "linearize": "linearization",
     "linearize_trajectory": "trajectory",
     "list_robots": "robots",
     "load": "loading",
     "load_inputs": "input_files",
+    "random_configurations": "configurations",
+    "sweep": "sweeping",
     "velocity": "points",
 }
 
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
 
 if TYPE_CHECKING:
+    from fflin.configurations import Grid, RandomConfigurations, grid, random_configurations
     from fflin.errors import (
         ChartError,
         FflinError,
@@ -63,11 +71,13 @@ if TYPE_CHECKING:
         MissingPackageError,
         ModelError,
         SingularInertiaError,
+        SweepError,
         UnknownNameError,
         UrdfError,
     )
     from fflin.input_files import load_inputs
     from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
+    from fflin.linear_batch import LinearBatch
     from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load
@@ -87,6 +97,7 @@ if TYPE_CHECKING:
     from fflin.points import effort, velocity
     from fflin.robots import list_robots
     from fflin.state import StateMap
+    from fflin.sweeping import sweep
     from fflin.trajectory import LinearTrajectory, linearize_trajectory
     from fflin.verification import Check, check
 

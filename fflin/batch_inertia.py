@@ -66,9 +66,15 @@ class BatchInertia:
         SingularInertiaError
             If a joint moves no mass; names the first such row.
         """
+        self.loop(q, out, self.compiled(q, out, threads))
+
+    def compiled(self, q: Array, out: Array, threads: int = 1) -> Array:
+        """Do with the kernel what it can and return the rows that are left, all where it is not.
+
+        Left are those where M is singular or nearly so, which the loop refuses or warns of.
+        """
         if not self._is_compiled(len(q)):
-            self._loop(q, out, np.arange(len(q)))
-            return
+            return np.arange(len(q))
         couplings = np.empty(len(q))
         kernel = _kernel()
         blocks = [slice(at, at + _BLOCK) for at in range(0, len(q), _BLOCK)]
@@ -84,7 +90,15 @@ class BatchInertia:
             list(map(work, blocks))
         # Written so that NaN, from a pivot that is zero, is among them.
         good = (self._inertia.least_coupling < couplings) & (couplings < Inertia.warning_coupling)
-        self._loop(q, out, np.flatnonzero(~good))
+        return np.flatnonzero(~good)
+
+    def loop(self, q: Array, out: Array, rows: Array) -> None:
+        """Do the rows that are named, one after the other; raises as `invert` does."""
+        for row in rows.tolist():
+            try:
+                self._inertia.invert(q[row], out[row])
+            except SingularInertiaError as error:
+                raise SingularInertiaError(f"configuration {row}: {error}") from None
 
     def _is_compiled(self, count: int) -> bool:
         if self._tree is None:
@@ -92,13 +106,6 @@ class BatchInertia:
         if self._compiled is not None:
             return self._compiled
         return count >= (_BREAK_EVEN if "numba" in sys.modules else _BREAK_EVEN_UNLOADED)
-
-    def _loop(self, q: Array, out: Array, rows: Array) -> None:
-        for row in rows.tolist():
-            try:
-                self._inertia.invert(q[row], out[row])
-            except SingularInertiaError as error:
-                raise SingularInertiaError(f"configuration {row}: {error}") from None
 
     def _run(self, kernel: Callable[..., None], q: Array, out: Array, couplings: Array) -> None:
         assert self._tree is not None

@@ -1,7 +1,5 @@
 """M^-1 of many configurations at once, against the one of each."""
 
-import warnings
-
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -9,7 +7,6 @@ from conftest import BUNDLED, random_tree
 
 import fflin
 from fflin.batch_inertia import BatchInertia
-from fflin.batch_tree import batch_tree
 from fflin.inertia import inertia_matrix
 
 numba = pytest.importorskip("numba")
