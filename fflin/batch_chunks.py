@@ -80,10 +80,8 @@ class ChunkJob:
                 shapes |= {"C": (ny, nx), "D": (ny, nu), "_y0": (ny,)}
         return shapes
 
-    def run(
-        self, points: Points, start: int, out: Mapping[str, Array] | None = None, threads: int = 1
-    ) -> Chunk:
-        """Linearise about the points of a chunk.
+    def run(self, points: Points, start: int, out: Mapping[str, Array] | None = None) -> Chunk:
+        """Linearise about the points of a chunk; threads may share a job.
 
         Parameters
         ----------
@@ -92,7 +90,6 @@ class ChunkJob:
             Number of its first point, for messages.
         out : mapping, optional
             Arrays to write to; new ones by default.
-        threads : int
 
         Raises
         ------
@@ -102,17 +99,17 @@ class ChunkJob:
         if out is None:
             out = {key: np.empty((len(points.q), *shape)) for key, shape in self.shapes.items()}
         if self.only_inertia:
-            return Chunk(dict(out), self._at_rest(points.q, start, out["B_lower"], threads))
+            return Chunk(dict(out), self._at_rest(points.q, start, out["B_lower"]))
         with _caught() as notes:
             self._anywhere(points, start, out)
         return Chunk(dict(out), [str(note.message) for note in notes])
 
-    def _at_rest(self, q: Array, start: int, out: Array, threads: int) -> list[str]:
+    def _at_rest(self, q: Array, start: int, out: Array) -> list[str]:
         actuation, state = self.linearizer._actuation, self.linearizer._map
         inverse = out
         if not actuation.default:
             inverse = np.empty((len(q), state.nx // 2, state.nx // 2))
-        left = self._inertia.compiled(q, inverse, threads)
+        left = self._inertia.compiled(q, inverse)
         try:
             with _caught() as notes:
                 self._inertia.loop(q, inverse, left)

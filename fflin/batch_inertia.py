@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,15 +18,12 @@ from fflin.model import Robot
 from fflin.state import StateMap
 from fflin.validation import Array
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 # The kernel beats the loop from here on; where numba is not loaded yet, that takes as long as the
 # loop over some thousands of configurations.
 _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
 
-# What a thread takes at a time, and how much of it is in the cache.
-_BLOCK, _TILE = 2048, 256
+# The kernel has sines of angles up to here [rad].
+_FARTHEST = 1e6
 
 _log = logging.getLogger("fflin")
 
@@ -49,7 +45,7 @@ class BatchInertia:
         self._compiled = compiled
         self._tree = batch_tree(robot) if compiled or _has_numba() else None
 
-    def invert(self, q: Array, out: Array, *, threads: int = 1) -> None:
+    def invert(self, q: Array, out: Array) -> None:
         """Write M^-1 (6 + n, 6 + n) in base axes at each of the configurations.
 
         Parameters
@@ -58,38 +54,37 @@ class BatchInertia:
             Valid configurations.
         out : ndarray (N, 6 + n, 6 + n)
             C-contiguous.
-        threads : int
-            How many the kernel may take.
 
         Raises
         ------
         SingularInertiaError
             If a joint moves no mass; names the first such row.
         """
-        self.loop(q, out, self.compiled(q, out, threads))
+        self.loop(q, out, self.compiled(q, out))
 
-    def compiled(self, q: Array, out: Array, threads: int = 1) -> Array:
+    def compiled(self, q: Array, out: Array) -> Array:
         """Do with the kernel what it can and return the rows that are left, all where it is not.
 
-        Left are those where M is singular or nearly so, which the loop refuses or warns of.
+        Left are those where M is singular or nearly so, which the loop refuses or warns of, and
+        those that are turned beyond all sense.
         """
-        if not self._is_compiled(len(q)):
+        if self._tree is None or not self._is_compiled(len(q)):
             return np.arange(len(q))
+        if len(q) < LANES:
+            filled = np.pad(q, ((0, LANES - len(q)), (0, 0)), mode="edge")
+            large: Array = np.empty((LANES, *out.shape[1:]))
+            left = self.compiled(filled, large)
+            out[:] = large[: len(q)]
+            return left[left < len(q)]
         couplings = np.empty(len(q))
-        kernel = _kernel()
-        blocks = [slice(at, at + _BLOCK) for at in range(0, len(q), _BLOCK)]
-        flat = out.reshape(len(q), -1)
-
-        def work(block: slice) -> None:
-            self._run(kernel, q[block], flat[block], couplings[block])
-
-        if threads > 1 and len(blocks) > 1:
-            with ThreadPoolExecutor(threads) as pool:
-                list(pool.map(work, blocks))
-        else:
-            list(map(work, blocks))
+        space = np.empty(self._tree.size + LANES)
+        # Its vectors are 64 bytes; where they begin at such an address it is faster.
+        space = space[-(space.ctypes.data // 8) % LANES :]
+        _kernel()(self._tree, q, out.reshape(len(q), -1), couplings, space)
         # Written so that NaN, from a pivot that is zero, is among them.
         good = (self._inertia.least_coupling < couplings) & (couplings < Inertia.warning_coupling)
+        if not -_FARTHEST < q.min() <= q.max() < _FARTHEST:
+            good &= (np.abs(q[:, 7:]) < _FARTHEST).all(axis=1)
         return np.flatnonzero(~good)
 
     def loop(self, q: Array, out: Array, rows: Array) -> None:
@@ -101,27 +96,9 @@ class BatchInertia:
                 raise SingularInertiaError(f"configuration {row}: {error}") from None
 
     def _is_compiled(self, count: int) -> bool:
-        if self._tree is None:
-            return False
         if self._compiled is not None:
             return self._compiled
         return count >= (_BREAK_EVEN if "numba" in sys.modules else _BREAK_EVEN_UNLOADED)
-
-    def _run(self, kernel: Callable[..., None], q: Array, out: Array, couplings: Array) -> None:
-        assert self._tree is not None
-        tree, motion = self._tree
-        work = np.empty(tree.size + LANES)
-        # The kernel's vectors are 64 bytes; where they begin at such an address it is faster.
-        work = work[-(work.ctypes.data // 8) % LANES :]
-        for start in range(0, len(q), _TILE):
-            tile = slice(start, min(start + _TILE, len(q)))
-            count = tile.stop - start
-            moved = motion.of(q[tile])
-            sums = np.empty(count + -count % LANES)
-            if -count % LANES:
-                moved = np.pad(moved, ((0, 0), (0, 0), (0, -count % LANES)), mode="edge")
-            kernel(tree, moved, out[tile], sums, work)
-            couplings[tile] = sums[:count]
 
 
 def available_threads() -> int:

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 
 from fflin.batch_tree import INERTIA, LANES, PLACE
-from fflin.lanes import load, splat, store, transpose
+from fflin.lanes import floor, gather, load, splat, store, transpose
 
 
 @numba.njit(forceinline=True)
@@ -33,18 +33,49 @@ def _get3(work, at):
 
 @numba.njit(forceinline=True)
 def _turned(ax, ay, az, bx, by, bz, cx, cy, cz, x, y, z):
-    """The columns a, b, c of a rotation, times the constants x, y, z."""
+    """Return the columns a, b, c of a rotation, times the constants x, y, z."""
     x, y, z = splat(x), splat(y), splat(z)
     return ax * x + bx * y + cx * z, ay * x + by * y + cy * z, az * x + bz * y + cz * z
 
 
 @numba.njit(forceinline=True)
-def _place(work, at, parent, fixed, motion, first):
+def _cosine_and_sine(x):
+    """Return both of |x| < 1e6: taken to one octant in three steps, and there by polynomials.
+
+    The numbers are those of fdlibm (Sun Microsystems, 1993), exact to a unit in the last place.
+    """
+    turns = floor(x * splat(2.0 / np.pi) + splat(0.5))
+    x = x - turns * splat(1.57079632673412561417e00)
+    x = x - turns * splat(6.07710050630396597660e-11)
+    x = x - turns * splat(2.02226624879595063154e-21)
+    z = x * x
+    p = splat(-2.50507602534068634195e-08) + z * splat(1.58969099521155010221e-10)
+    p = splat(2.75573137070700676789e-06) + z * p
+    p = splat(-1.98412698298579493134e-04) + z * p
+    p = splat(8.33333333332248946124e-03) + z * p
+    p = splat(-1.66666666666666324348e-01) + z * p
+    sine = x + x * z * p
+    p = splat(2.08757232129817482790e-09) + z * splat(-1.13596475577881948265e-11)
+    p = splat(-2.75573143513906633035e-07) + z * p
+    p = splat(2.48015872894767294178e-05) + z * p
+    p = splat(-1.38888888888741095749e-03) + z * p
+    p = splat(4.16666666666666019037e-02) + z * p
+    one = splat(1.0)
+    cosine = (one - splat(0.5) * z) + z * z * p
+    # By quarter turns back: (1, 0), (0, 1), (-1, 0), (0, -1).
+    half = floor(turns * splat(0.5))
+    odd = turns - half - half
+    sign = one - splat(2.0) * (half - splat(2.0) * floor(half * splat(0.5)))
+    even, odd = sign * (one - odd), sign * odd
+    return even * cosine - odd * sine, odd * cosine + even * sine
+
+
+@numba.njit(forceinline=True)
+def _place(work, at, parent, fixed, cosine, sine, shift):
     """Write the place of a body into `work` at `at`, that of its parent being at `parent`."""
     ax, ay, az = _get3(work, parent)
     bx, by, bz = _get3(work, parent + 3 * LANES)
     cx, cy, cz = _get3(work, parent + 6 * LANES)
-    cosine, sine, shift = load(motion, first[0]), load(motion, first[1]), load(motion, first[2])
     ux, uy, uz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[0], fixed[3], fixed[6])
     vx, vy, vz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[1], fixed[4], fixed[7])
     zx, zy, zz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[2], fixed[5], fixed[8])
@@ -99,7 +130,7 @@ def _carry(work, at, above, place):
 
 @numba.njit(forceinline=True)
 def _momentum(work, at, x, y, z, turns, slides):
-    """The momentum (angular, linear) about its joint of an inertia that the joint moves."""
+    """Return the momentum (angular, linear) about its joint of an inertia that the joint moves."""
     m = load(work, at)
     hx, hy, hz = _get3(work, at + LANES)
     xx, xy, xz = _get3(work, at + 4 * LANES)
@@ -129,7 +160,7 @@ def _add3(work, at, x, y, z):
 
 
 @numba.njit(forceinline=True)
-def _assemble(work, tree, motion, size, first):
+def _assemble(work, tree, q, first, stride):
     """Write the packed M: places and inertias outwards, composite inertias inwards."""
     bodies = len(tree.parent)
     places, inertias, packed = tree.places, tree.inertias, tree.packed
@@ -142,10 +173,17 @@ def _assemble(work, tree, motion, size, first):
     _inertia(work, inertias, places, tree.bodies[0])
     for body in range(1, bodies):
         at = places + body * PLACE * LANES
-        row = 3 * (body - 1) * size + first
-        columns = (row, row + size, row + 2 * size)
+        start = first + tree.index[body]
+        value = gather(q, start, stride)
+        if tree.unbounded[body]:
+            cosine, sine = value, gather(q, start + 1, stride)
+        elif tree.turns[body] != 0.0:
+            cosine, sine = _cosine_and_sine(splat(tree.turns[body]) * value)
+        else:
+            cosine, sine = one, zero
+        shift = splat(tree.slides[body]) * value
         above = places + tree.parent[body] * PLACE * LANES
-        _place(work, at, above, tree.fixed[body], motion, columns)
+        _place(work, at, above, tree.fixed[body], cosine, sine, shift)
         _inertia(work, inertias + body * INERTIA * LANES, at, tree.bodies[body])
     pair = 0
     for body in range(bodies - 1, 0, -1):
@@ -263,38 +301,34 @@ def _multiply(work, tree, couplings, first):
 
 
 @numba.njit(nogil=True, cache=True, boundscheck=False)
-def invert(tree, motion, out, couplings, work):
+def invert(tree, q, out, couplings, work):
     """Write M^-1 of each configuration.
 
     Parameters
     ----------
     tree : Tree
-    motion : ndarray (bodies - 1, 3, rounded)
-        Cosine and sine of every joint's angle and its displacement, in as many columns as fill
-        the lanes.
+    q : ndarray (count, nq)
+        Configurations, as many as there are lanes at least.
     out : ndarray (count, size * size)
-        Results, rows contiguous.
-    couplings : ndarray (rounded,)
+        Results.
+    couplings : ndarray (count,)
         The sums of M_ii (M^-1)_ii, which tell how singular M is.
     work : ndarray
         Work space.
     """
     count, entries = out.shape
-    rounded = motion.shape[2]
-    flat, motions, tail = out.reshape(-1), motion.reshape(-1), np.empty(LANES)
-    for first in range(0, count, LANES):
-        _assemble(work, tree, motions, rounded, first)
+    stride = q.shape[1]
+    configurations, flat, tail = q.reshape(-1), out.reshape(-1), np.empty(LANES)
+    whole = entries - entries % LANES
+    for block in range(0, count, LANES):
+        # The last are the last there are, some of them for the second time.
+        first = min(block, count - LANES)
+        _assemble(work, tree, configurations, first * stride, stride)
         _factorise(work, tree)
         _multiply(work, tree, couplings, first)
-        if first + LANES <= count:
-            whole = entries - entries % LANES
-            for entry in range(0, whole, LANES):
-                transpose(work, tree.square + entry * LANES, flat, first * entries + entry, entries)
-            for entry in range(whole, entries):
-                store(tail, 0, load(work, tree.square + entry * LANES))
-                for lane in range(LANES):
-                    out[first + lane, entry] = tail[lane]
-        else:
-            for lane in range(count - first):
-                for entry in range(entries):
-                    out[first + lane, entry] = work[tree.square + entry * LANES + lane]
+        for entry in range(0, whole, LANES):
+            transpose(work, tree.square + entry * LANES, flat, first * entries + entry, entries)
+        for entry in range(whole, entries):
+            store(tail, 0, load(work, tree.square + entry * LANES))
+            for lane in range(LANES):
+                out[first + lane, entry] = tail[lane]

@@ -31,8 +31,10 @@ def checked_configurations(robot: Robot, q: Any) -> Array:
             excess = np.abs(np.einsum("ij,ij->i", block[:, 3:7], block[:, 3:7]) - 1.0)
             for at in unbounded:
                 excess = np.maximum(excess, np.abs(block[:, at] ** 2 + block[:, at + 1] ** 2 - 1.0))
+            # The sum tells at once where all are finite.
+            finite = np.isfinite(block.sum()) or np.isfinite(block).all(axis=1)
         # Written so that NaN is among them.
-        doubtful = ~(excess <= _ROUND_OFF) | ~np.isfinite(block).all(axis=1)
+        doubtful = ~((excess <= _ROUND_OFF) & finite)
         if robot.followers:
             followed = block.copy()
             follow_rows(robot, followed)

@@ -26,6 +26,10 @@ class Tree(NamedTuple):
         Body that carries each.
     fixed : ndarray (bodies, 12)
         Rotation, row by row, and origin of each joint in its parent, z along the joint's axis.
+    index : ndarray (bodies,)
+        Entry of q of each joint: its angle, length or cosine.
+    unbounded : ndarray (bodies,) of bool
+        Whether it is stored as (cos, sin).
     turns, slides : ndarray (bodies,)
         Turn and displacement along z for a unit of the joint's coordinate.
     bodies : ndarray (bodies, 10)
@@ -45,6 +49,8 @@ class Tree(NamedTuple):
 
     parent: Any
     fixed: Any
+    index: Any
+    unbounded: Any
     turns: Any
     slides: Any
     bodies: Any
@@ -64,39 +70,7 @@ class Tree(NamedTuple):
     size: int
 
 
-class Motion(NamedTuple):
-    """Which entries of q move the bodies 1, 2, ...: (n,) each.
-
-    Attributes
-    ----------
-    index : ndarray
-        Of the angle, length or cosine.
-    unbounded : ndarray of bool
-        Stored as (cos, sin).
-    turns, slides : ndarray
-        Turn and displacement for a unit.
-    """
-
-    index: Any
-    unbounded: Any
-    turns: Any
-    slides: Any
-
-    def of(self, q: Array) -> Array:
-        """Return cosine, sine and displacement (n, 3, count) of configurations (count, nq)."""
-        values = q.T[self.index]
-        result = np.empty((len(values), 3, q.shape[0]))
-        np.multiply(values, self.turns[:, None], out=result[:, 1])
-        np.cos(result[:, 1], out=result[:, 0])
-        np.sin(result[:, 1], out=result[:, 1])
-        np.multiply(values, self.slides[:, None], out=result[:, 2])
-        if self.unbounded.any():
-            at = self.index[self.unbounded]
-            result[self.unbounded, 0], result[self.unbounded, 1] = q.T[at], q.T[at + 1]
-        return result
-
-
-def batch_tree(robot: Robot) -> tuple[Tree, Motion] | None:
+def batch_tree(robot: Robot) -> Tree | None:
     """Return a robot's tree, or None where a joint is not a screw about a fixed axis."""
     model = robot.model
     places, turns, slides = _screws(model)
@@ -129,13 +103,16 @@ def batch_tree(robot: Robot) -> tuple[Tree, Motion] | None:
         target.append(row[coordinate[body]])
         share.append(factor[body])
     size = 6 + robot.n
-    common = np.array([[_common(a, b) for b in paths] for a in paths])
+    common = _common(paths)
     entries = int(sum(map(len, paths)))
     sizes = (bodies * PLACE, bodies * INERTIA, entries, entries, size, size * size)
     starts = [int(x) for x in np.cumsum([0, *sizes]) * LANES]
-    tree = Tree(
+    joints = model.joints.tolist()[ROOT:]
+    return Tree(
         parent,
         fixed,
+        np.array([joint.idx_q for joint in joints]),
+        np.array([joint.nq == 2 for joint in joints]),
         turns,
         slides,
         inertias,
@@ -148,10 +125,6 @@ def batch_tree(robot: Robot) -> tuple[Tree, Motion] | None:
         entries,
         *starts,
     )
-    joints = model.joints.tolist()[ROOT + 1 :]
-    unbounded = np.array([joint.nq == 2 for joint in joints], dtype=bool)
-    index = np.array([joint.idx_q for joint in joints], dtype=np.intp)
-    return tree, Motion(index, unbounded, turns[1:], slides[1:])
 
 
 def _screws(model: pin.Model) -> tuple[list[pin.SE3] | None, Array, Array]:
@@ -216,8 +189,12 @@ def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
     return paths
 
 
-def _common(a: list[int], b: list[int]) -> int:
-    count = 0
-    while count < min(len(a), len(b)) and a[count] == b[count]:
-        count += 1
-    return count
+def _common(paths: list[list[int]]) -> Array:
+    """Return how many coordinates the paths of any two have in common."""
+    common = np.zeros((len(paths), len(paths)), dtype=np.intp)
+    for index, path in enumerate(paths):
+        if len(path) > 1:
+            # No path of an earlier one has this one in it.
+            common[index, :index] = common[:index, index] = common[path[-2], :index]
+        common[index, index] = len(path)
+    return common

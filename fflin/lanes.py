@@ -13,6 +13,7 @@ from typing import Any
 
 import numba
 from llvmlite import ir
+from numba.core import cgutils
 from numba.extending import (
     intrinsic,
     lower_builtin,
@@ -109,6 +110,35 @@ def splat(typing: Any, value: Any) -> Any:
         )
 
     return lanes(numba.types.float64), generate
+
+
+@intrinsic
+def gather(typing: Any, array: Any, index: Any, stride: Any) -> Any:
+    """Read eight doubles of a contiguous array that stand `stride` apart, from an index on."""
+
+    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
+        values, first, step = arguments
+        result = ir.Constant(_VECTOR, ir.Undefined)
+        for lane in range(LANES):
+            shift = builder.mul(step, ir.Constant(step.type, lane))
+            place = _pointer(context, builder, array, values, builder.add(first, shift))
+            result = builder.insert_element(result, builder.load(place), _INT32(lane))
+        return result
+
+    return lanes(array, numba.types.intp, numba.types.intp), generate
+
+
+@intrinsic
+def floor(typing: Any, value: Any) -> Any:
+    """Round every lane down to a whole number."""
+
+    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        kind = ir.FunctionType(_VECTOR, [_VECTOR])
+        name = f"llvm.floor.v{LANES}f64"
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        return builder.call(function, arguments)
+
+    return lanes(lanes), generate
 
 
 @intrinsic

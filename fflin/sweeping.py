@@ -6,8 +6,9 @@ import json
 import logging
 import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Executor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from hashlib import sha256
 from importlib.util import find_spec
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
 # A chunk's result is about this large, so that what it costs to send is small against it and a
 # handful of them fit in memory.
-_CHUNK_BYTES = 8 * 2**20
+_CHUNK_BYTES, _LEAST_CHUNK_BYTES = 8 * 2**20, 2**21
 _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
 
 # So many chunks where workers share them, so that all end at about the same time.
@@ -128,7 +129,8 @@ def sweep(
     )
     task = _Task(job, q, v, u)
     parallel = executor is not None or workers is not None
-    size = chunk or _chunk_size(task, parallel)
+    threads = threads or available_threads()
+    size = chunk or _chunk_size(task, _SHARES if parallel else 4 * threads)
     spans = [Span(at, min(at + size, task.count)) for at in range(0, task.count, size)]
     path = None if out is None else _path(out)
     store = _store(task, path, size)
@@ -138,7 +140,7 @@ def sweep(
         done: Iterable[Done] = (
             dispatch(job, left, task.points, own or executor)
             if parallel
-            else _here(task, left, store, threads or available_threads())
+            else _here(task, left, store, threads)
         )
         failed = _collect(task, done, store, (len(spans) - len(left)) * size, progress)
         if failed:
@@ -249,11 +251,9 @@ def _of_this_robot(configurations: Any, robot: Robot) -> Any:
     return replace(configurations, robot=robot)
 
 
-def _chunk_size(task: _Task, parallel: bool) -> int:
+def _chunk_size(task: _Task, shares: int) -> int:
     row = 8 * (task.robot.nq + sum(math.prod(shape) for shape in task.job.shapes.values()))
-    size = _CHUNK_BYTES // row
-    if parallel:
-        size = min(size, -(-task.count // _SHARES))
+    size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * task.count // shares)) // row
     size = min(max(size, _LEAST_CHUNK), _LARGEST_CHUNK)
     return size - size % _LEAST_CHUNK
 
@@ -281,16 +281,30 @@ def _store(task: _Task, path: Path | None, size: int) -> FileStore | MemoryStore
 
 
 def _here(
-    task: _Task, spans: Iterable[Span], store: FileStore | MemoryStore, threads: int
+    task: _Task, spans: Sequence[Span], store: FileStore | MemoryStore, threads: int
 ) -> Iterator[Done]:
-    """Do chunks in this process."""
-    for span in spans:
+    """Do chunks in this process, several at a time where the kernel does them."""
+
+    def run(span: Span) -> Done:
         place = store.place(*span)
         out = place and {key: place[key] for key in task.job.shapes}
         try:
-            yield Done(span, task.job.run(task.points(span), span.start, out, threads), "")
+            return Done(span, task.job.run(task.points(span), span.start, out), "")
         except FflinError as error:
-            yield Done(span, None, str(error))
+            return Done(span, None, str(error))
+
+    if threads == 1 or len(spans) == 1 or not task.job.only_inertia:
+        yield from map(run, spans)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        begun: deque[Future[Done]] = deque()
+        for span in spans:
+            begun.append(pool.submit(run, span))
+            # Not far ahead of what takes the results, which would fill the memory.
+            if len(begun) > 2 * threads:
+                yield begun.popleft().result()
+        while begun:
+            yield begun.popleft().result()
 
 
 def _collect(
