@@ -72,7 +72,7 @@ class ChunkJob:
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of each array that differs from point to point, for one point."""
         common, nx = self.linearizer._common, self.linearizer._map.nx
-        ny, nu = common["D"].shape
+        ny, nu = len(common["output_names"]), len(common["input_names"])
         shapes: dict[str, tuple[int, ...]] = {"B_lower": (nx // 2, nu)}
         if not self.only_inertia:
             shapes |= {"A": (nx, nx), "f0": (nx,), "_x0": (nx,)}

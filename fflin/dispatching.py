@@ -16,7 +16,7 @@ from multiprocessing import get_context
 from typing import NamedTuple
 
 from fflin.batch_chunks import Chunk, ChunkJob, Parcel, Points, packed, work
-from fflin.errors import FflinError, InputError
+from fflin.errors import FflinError
 
 # A chunk whose worker dies is given to others; what kills this many is not.
 _ATTEMPTS = 3
@@ -216,10 +216,6 @@ def _abandoned(queue: _Queue, error: BaseException) -> Iterator[Done]:
 
 def _count(executor: Executor) -> int:
     """How many workers an executor has, as far as it tells."""
-    if not hasattr(executor, "submit"):
-        raise InputError(
-            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
-        )
     for name in ("_max_workers", "num_workers"):
         count = getattr(executor, name, None)
         if isinstance(count, int) and count > 0:

@@ -138,6 +138,7 @@ class LinearBatch:
         count, nv, nu = self.B_lower.shape
         B = np.zeros((count, 2 * nv, nu))
         B[:, nv:] = self.B_lower
+        B.setflags(write=False)
         return B
 
     @property
@@ -270,8 +271,7 @@ class LinearBatch:
 
             certify = partial(certified, self._system)
             inertia = partial(inertia_matrix, self._system)
-        for array in (B, x0):
-            array.setflags(write=False)
+        B.setflags(write=False)
         names = {
             item.name: getattr(self, item.name)
             for item in fields(self)
@@ -288,6 +288,7 @@ class LinearBatch:
         positions = self._positions(rows)
         x0 = np.zeros((len(positions), len(self.state_names)))
         x0[:, 6 : 6 + positions.shape[1]] = positions
+        x0.setflags(write=False)
         return x0
 
     def _positions(self, rows: slice, joint: int | None = None) -> Array:

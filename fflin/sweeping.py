@@ -121,6 +121,10 @@ def sweep(
     """
     if executor is not None and workers is not None:
         raise InputError("executor and workers are both given; give either")
+    if executor is not None and not hasattr(executor, "submit"):
+        raise InputError(
+            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
+        )
     for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
         if value is not None and (not isinstance(value, int | np.integer) or value < 1):
             raise InputError(f"{name} is {value!r}, expected a whole number from 1 on")
