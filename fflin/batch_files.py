@@ -117,7 +117,8 @@ def _from_npz(path: Path) -> tuple[dict[str, Array], dict[str, str]]:
     from zipfile import BadZipFile
 
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # Opened here, since NumPy leaves a damaged file open.
+        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
             texts = {key: str(file[key]) for key in ("header", "constant")}
             return {key: file[key] for key in file.files if key not in texts}, texts
     except BadZipFile as error:

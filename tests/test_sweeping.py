@@ -53,9 +53,7 @@ def test_at_operating_points_every_model_is_that_of_linearize(frame, robots):
     reference = random_pose(np.random.default_rng(3), 20.0)
     batch = fflin.sweep(robot, q, v, u, frame=frame, reference=reference, chunk=2)
     for index, point in enumerate(zip(q, v, u, strict=True)):
-        assert_same(
-            batch[index], fflin.linearize(robot, *point, frame=frame, reference=reference)
-        )
+        assert_same(batch[index], fflin.linearize(robot, *point, frame=frame, reference=reference))
     # One velocity and one input for all.
     batch = fflin.sweep(robot, q, v[0], u[0], frame=frame)
     assert_same(batch[3], fflin.linearize(robot, q[3], v[0], u[0], frame=frame))
@@ -184,7 +182,10 @@ def damaged(robot, row, column, value):
         (lambda r: {"q": r.neutral()}, r"q has shape \(16,\), expected \(N, 16\)"),
         (lambda r: {"q": [["a"]]}, "expected real numbers"),
         (lambda r: {"q": damaged(r, 0, 7, 0.0), "v": np.zeros((3, r.nv))}, r"v has shape \(3, 15"),
-        (lambda r: {"q": damaged(r, 0, 7, 0.0), "u": np.full((40, 15), np.inf)}, r"u\[0, 0\] is inf"),
+        (
+            lambda r: {"q": damaged(r, 0, 7, 0.0), "u": np.full((40, 15), np.inf)},
+            r"u\[0, 0\] is inf",
+        ),
         (lambda r: {"q": damaged(r, 0, 7, 0.0), "workers": 0}, "workers is 0"),
         (lambda r: {"q": damaged(r, 0, 7, 0.0), "executor": 3}, "executor is a int"),
         (lambda r: {"q": fflin.grid(fflin.load("cubesat"), {})}, "axes of the grid"),
