@@ -9,6 +9,7 @@ __version__ = "0.1.0"
 # needs no dynamics does not pay for them.
 _PUBLIC = {
     "Accelerometer": "outputs",
+    "Allocation": "policies",
     "BaseForce": "inputs",
     "BasePose": "outputs",
     "BaseTorque": "inputs",
@@ -16,14 +17,23 @@ _PUBLIC = {
     "Certificate": "linear_model",
     "ChartError": "errors",
     "Check": "verification",
+    "Compensator": "estimation",
+    "Controllability": "structure",
+    "DetectabilityError": "errors",
+    "Equilibrium": "balance",
+    "EquilibriumError": "errors",
+    "Estimator": "estimation",
     "FflinError": "errors",
     "FflinWarning": "errors",
     "FileError": "errors",
     "FramePose": "outputs",
     "FrameVelocity": "outputs",
     "FullState": "outputs",
-    "Gyroscope": "outputs",
+    "Gain": "regulator",
+    "GainSchedule": "schedules",
+    "Gramians": "gramian",
     "Grid": "configurations",
+    "Gyroscope": "outputs",
     "InputError": "errors",
     "JointPositions": "outputs",
     "JointTorque": "inputs",
@@ -33,37 +43,72 @@ _PUBLIC = {
     "LinearTrajectory": "trajectory",
     "Linearizer": "linearization",
     "MissingPackageError": "errors",
+    "Mode": "eigenmodes",
     "ModelError": "errors",
+    "Modes": "eigenmodes",
     "Momentum": "outputs",
+    "Motion": "motion",
+    "Observability": "observation",
     "RandomConfigurations": "configurations",
+    "ReactionWheel": "inputs",
+    "ReducedModel": "momentum",
     "Robot": "model",
     "SingularInertiaError": "errors",
+    "StabilizabilityError": "errors",
+    "StateFeedback": "policies",
     "StateMap": "state",
     "SweepError": "errors",
     "Thruster": "inputs",
+    "TrajectoryFeedback": "policies",
     "UnknownNameError": "errors",
     "UrdfError": "errors",
+    "Validity": "region",
+    "acceleration_lqr": "acceleration",
+    "bryson": "weights",
     "check": "verification",
     "configuration": "model",
+    "controllability": "structure",
     "effort": "points",
+    "equilibrium": "balance",
     "from_model": "loading",
+    "generalized_inertia": "momentum",
+    "generalized_jacobian": "momentum",
+    "gramians": "gramian",
     "grid": "configurations",
+    "kalman": "estimation",
     "linearize": "linearization",
     "linearize_trajectory": "trajectory",
     "list_robots": "robots",
     "load": "loading",
     "load_inputs": "input_files",
+    "lqg": "estimation",
+    "lqr": "regulator",
+    "modes": "eigenmodes",
+    "momentum_reduction": "momentum",
+    "observability": "observation",
+    "plot_matrices": "plots",
+    "plot_motion": "plots",
+    "plot_poles": "plots",
     "random_configurations": "configurations",
+    "sampled_cost": "sampling",
+    "simulate": "simulation",
     "sweep": "sweeping",
+    "tvlqr": "schedules",
+    "validity": "region",
     "velocity": "points",
 }
 
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
 
 if TYPE_CHECKING:
+    from fflin.acceleration import acceleration_lqr
+    from fflin.balance import Equilibrium, equilibrium
     from fflin.configurations import Grid, RandomConfigurations, grid, random_configurations
+    from fflin.eigenmodes import Mode, Modes, modes
     from fflin.errors import (
         ChartError,
+        DetectabilityError,
+        EquilibriumError,
         FflinError,
         FflinWarning,
         FileError,
@@ -71,17 +116,28 @@ if TYPE_CHECKING:
         MissingPackageError,
         ModelError,
         SingularInertiaError,
+        StabilizabilityError,
         SweepError,
         UnknownNameError,
         UrdfError,
     )
+    from fflin.estimation import Compensator, Estimator, kalman, lqg
+    from fflin.gramian import Gramians, gramians
     from fflin.input_files import load_inputs
-    from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
+    from fflin.inputs import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
     from fflin.linear_batch import LinearBatch
     from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load
     from fflin.model import Robot, configuration
+    from fflin.momentum import (
+        ReducedModel,
+        generalized_inertia,
+        generalized_jacobian,
+        momentum_reduction,
+    )
+    from fflin.motion import Motion
+    from fflin.observation import Observability, observability
     from fflin.outputs import (
         Accelerometer,
         BasePose,
@@ -94,12 +150,21 @@ if TYPE_CHECKING:
         JointVelocities,
         Momentum,
     )
+    from fflin.plots import plot_matrices, plot_motion, plot_poles
     from fflin.points import effort, velocity
+    from fflin.policies import Allocation, StateFeedback, TrajectoryFeedback
+    from fflin.region import Validity, validity
+    from fflin.regulator import Gain, lqr
     from fflin.robots import list_robots
+    from fflin.sampling import sampled_cost
+    from fflin.schedules import GainSchedule, tvlqr
+    from fflin.simulation import simulate
     from fflin.state import StateMap
+    from fflin.structure import Controllability, controllability
     from fflin.sweeping import sweep
     from fflin.trajectory import LinearTrajectory, linearize_trajectory
     from fflin.verification import Check, check
+    from fflin.weights import bryson
 
 
 def __getattr__(name: str) -> Any:

@@ -5,11 +5,20 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import InputError, unknown
-from fflin.inputs import BaseForce, BaseTorque, JointTorque, Thruster
-from fflin.model import ROOT, Robot
+from fflin.errors import InputError
+from fflin.frames import find_frame
+from fflin.inputs import (
+    BaseForce,
+    BaseTorque,
+    JointTorque,
+    ReactionWheel,
+    Thruster,
+    named_wheels,
+)
+from fflin.model import Robot
 from fflin.state import ANGULAR, LINEAR, Chart, StateMap
 from fflin.validation import Array
+from fflin.wheels import carrier
 
 
 class Held(NamedTuple):
@@ -27,7 +36,8 @@ class Actuation:
     names, units : tuple of str
         Of the nu inputs.
     groups : dict
-        {name: slice} of the inputs by kind: tau_b, F_b, tau_m, thrust, in order of appearance.
+        {name: indices} of the inputs by kind: tau_b, F_b, tau_m, thrust, wheel, in order of
+        appearance.
     default : bool
         Whether they are tau_b, F_b and every joint's, so that the columns are the identity.
     held : tuple of Held
@@ -35,43 +45,49 @@ class Actuation:
     """
 
     def __init__(self, state: StateMap) -> None:
-        robot = state.robot
-        self._state = state
+        self._state, robot, nv = state, state.robot, 6 + state.robot.n
         self._model = robot.model
-        nv = 6 + robot.n
         names: list[str] = []
         units: list[str] = []
         kinds: list[str] = []
         columns: list[Array] = []
         held: list[Held] = []
-        # Thrusters by the Pinocchio joint that carries them: (input, wrench in its frame).
+        wheel_names = iter([name for name, _ in named_wheels(robot.inputs)])
+        # Thrusters and wheels that are no joints, by the Pinocchio joint that carries them:
+        # (input, wrench in its frame).
         carried: dict[int, list[tuple[int, Array]]] = {}
         identity = np.eye(nv)
         for item in robot.inputs:
             at = len(names)
             if isinstance(item, BaseTorque | BaseForce):
                 torque = isinstance(item, BaseTorque)
-                group, rows = ("tau_b", ANGULAR) if torque else ("F_b", LINEAR)
-                names += [f"{group}.{axis}" for axis in "xyz"]
-                units += ["N m" if torque else "N"] * 3
-                kinds += [group] * 3
+                kind, unit, rows = ("tau_b", "N m", ANGULAR) if torque else ("F_b", "N", LINEAR)
+                names += [f"{kind}.{axis}" for axis in "xyz"]
                 columns += list(identity[rows])
                 if state.axes[0 if torque else 1]:
                     held.append(Held(slice(at, at + 3), rows))
             elif isinstance(item, JointTorque):
-                joint = robot.joint(item.joint)
-                names.append(f"tau_m.{joint.name}")
-                units.append("N" if joint.prismatic else "N m")
-                kinds.append("tau_m")
-                columns.append(identity[6 + robot.joints.index(joint)])
+                index = robot.joints.index(robot.joint(item.joint))
+                kind, unit = "tau_m", "N" if robot.joints[index].prismatic else "N m"
+                names.append(f"tau_m.{item.joint}")
+                columns.append(identity[6 + index])
+            elif isinstance(item, ReactionWheel):
+                kind, unit = "wheel", "N m"
+                names.append(next(wheel_names))
+                if item.inertia:
+                    columns.append(identity[6 + robot.joint_names.index(names[-1])])
+                else:
+                    joint_index, wrench = _couple(robot, item)
+                    carried.setdefault(joint_index, []).append((at, wrench))
+                    columns.append(np.zeros(nv))
             else:
-                joint_index, wrench = _wrench(robot, item)
+                kind, unit = "thrust", "N"
+                names.append(item.name or f"thruster_{1 + kinds.count(kind)}")
+                joint_index, wrench = _push(robot, item)
                 carried.setdefault(joint_index, []).append((at, wrench))
-                number = 1 + kinds.count("thrust")
-                names.append(item.name or f"thruster_{number}")
-                units.append("N")
-                kinds.append("thrust")
                 columns.append(np.zeros(nv))
+            units += [unit] * (len(names) - at)
+            kinds += [kind] * (len(names) - at)
         twice = [name for index, name in enumerate(names) if name in names[:index]]
         if twice:
             raise InputError(f"two inputs are named '{twice[0]}'; give one of them another name")
@@ -87,6 +103,11 @@ class Actuation:
             (joint, np.array([at for at, _ in items]), np.column_stack([w for _, w in items]))
             for joint, items in carried.items()
         ]
+
+    @property
+    def carried(self) -> bool:
+        """Whether an input's column depends on the configuration."""
+        return bool(self._carried)
 
     def columns(self, data: pin.Data, q: Array) -> Array:
         """Return the generalised force (6 + n, nu), in base axes, of a unit of each input.
@@ -112,7 +133,10 @@ class Actuation:
         return u
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
-        """Return the wrench of the thrusters on every joint, in its frame, where there are any."""
+        """Return the wrench of thrusters and wheels on every joint, in its frame, if there is any.
+
+        It is constant there. Wheels that are joints, and stored momentum, have no part in it.
+        """
         if not self._carried:
             return None
         external = pin.StdVec_Force(self._model.njoints, pin.Force.Zero())
@@ -121,17 +145,19 @@ class Actuation:
         return external
 
     def torques(self, u: Array) -> Array:
-        """Return the generalised forces (6 + n,) in base axes of all but the thrusters."""
+        """Return the generalised forces (6 + n,) in base axes of all but those `wrenches`."""
         return self._fixed @ u
 
 
-def _wrench(robot: Robot, thruster: Thruster) -> tuple[int, Array]:
+def _push(robot: Robot, thruster: Thruster) -> tuple[int, Array]:
     """Return the joint that carries a thruster and its wrench (6,) per newton in that frame."""
-    model = robot.model
-    if not model.existFrame(thruster.frame):
-        frames = [frame.name for frame in model.frames.tolist() if frame.parentJoint >= ROOT]
-        raise unknown("frame", thruster.frame, frames)
-    frame = model.frames[model.getFrameId(thruster.frame)]
-    force = frame.placement.rotation @ np.array(thruster.direction)
-    point = frame.placement.act(np.array(thruster.position))
-    return frame.parentJoint, np.concatenate((force, np.cross(point, force)))
+    joint, placement = find_frame(robot.model, thruster.frame)
+    force = placement.rotation @ np.array(thruster.direction)
+    point = placement.act(np.array(thruster.position))
+    return joint, np.concatenate((force, np.cross(point, force)))
+
+
+def _couple(robot: Robot, wheel: ReactionWheel) -> tuple[int, Array]:
+    """Return the joint that carries a wheel and its wrench (6,) per newton metre of the motor."""
+    joint, axis = carrier(robot.model, wheel)
+    return joint, np.concatenate((np.zeros(3), -axis))

@@ -187,8 +187,9 @@ def _cancelling_terms(
     mobility, input_mobility = scales
     chart = state.chart(lin.q)
     steepness = _largest(chart.J) if column == "q_b" else 1.0
-    speed = np.abs(state.velocities(lin.v))
-    rate = max(_largest(speed[ANGULAR]), _largest(speed[6:]))
+    speed, rate, momentum = motion(state, lin.v)
+    # What the momentum of wheels does to a turning link, in the units of the rows.
+    spin = momentum * _largest(mobility[np.r_[ANGULAR, 6 : len(mobility)]])
     still = speed.copy()
     still[LINEAR] *= _ROUNDING_SHARE
     moving = {"omega_b", "v_b", "qdot_m"}
@@ -198,12 +199,26 @@ def _cancelling_terms(
         # A unit of this velocity under the motion, and, where it turns, of the base's speed.
         nu = state.groups._asdict()[column]
         turning = rate * _largest(1.0 / mobility[nu.start - state.nx : nu.stop - state.nx or None])
+        turning += spin * (column != "v_b")
         return max(turning, _largest(still[LINEAR] / mobility[LINEAR]) * (column != "v_b"))
     accelerations = np.abs(lin.f0[-len(mobility) :]) / mobility
     forces = np.abs(lin.u0) * input_mobility
     return steepness * (
-        _largest(accelerations) + _largest(forces) + rate * _largest(still / mobility)
+        _largest(accelerations) + _largest(forces) + rate * (_largest(still / mobility) + spin)
     )
+
+
+def motion(state: StateMap, v: Array) -> tuple[Array, float, float]:
+    """Return speeds (6 + n,) without those of wheels, the largest rate, and wheels' momentum.
+
+    A wheel's speed matters as the momentum [N m s] that it carries, however fast it is.
+    """
+    speed, robot = np.abs(state.velocities(v)), state.robot
+    inertia = np.array([robot.wheels.get(name, 0.0) for name in robot.joint_names])
+    momentum = float(inertia @ speed[6:])
+    momentum += sum(float(np.linalg.norm(stored)) for _, stored in robot.stored_momentum)
+    speed[6:][inertia > 0.0] = 0.0
+    return speed, max(_largest(speed[ANGULAR]), _largest(speed[6:])), momentum
 
 
 def _largest(x: Array) -> float:

@@ -12,7 +12,16 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from fflin import __version__
-from fflin.commands import BAD_INPUT, DONE, INTERRUPTED, models
+from fflin.commands import (
+    BAD_INPUT,
+    DONE,
+    INTERRUPTED,
+    analysis,
+    models,
+    natural_modes,
+    regulator,
+    simulation,
+)
 from fflin.errors import FflinError, FflinWarning
 
 
@@ -75,4 +84,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"fflin {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     models.add_commands(commands)
+    analysis.add_commands(commands)
+    regulator.add_commands(commands)
+    natural_modes.add_commands(commands)
+    simulation.add_commands(commands)
     return parser

@@ -36,6 +36,18 @@ class ChartError(FflinError, ValueError):
     """The base is turned by pi from the reference, where the attitude chart ends."""
 
 
+class EquilibriumError(FflinError, ValueError):
+    """A point is no fixed point where one is needed, or no input makes it one."""
+
+
+class StabilizabilityError(FflinError, ValueError):
+    """The inputs cannot hold what does not settle by itself."""
+
+
+class DetectabilityError(FflinError, ValueError):
+    """The outputs do not show what does not settle by itself."""
+
+
 class MissingPackageError(FflinError, ImportError):
     """An optional package is needed and not installed."""
 

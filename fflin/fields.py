@@ -4,7 +4,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from fflin.errors import InputError, ModelError, unknown
-from fflin.inputs import BaseForce, BaseTorque, Input, JointTorque, Thruster, three_numbers
+from fflin.inputs import (
+    BaseForce,
+    BaseTorque,
+    Input,
+    JointTorque,
+    Thruster,
+    named_wheels,
+    three_numbers,
+)
 from fflin.joints import Joint
 from fflin.outputs import Output
 from fflin.validation import number
@@ -15,7 +23,7 @@ FIELDS = ("inputs", "outputs", "stiffness", "damping", "rest", "gravity")
 def validated_fields(
     fields: Mapping[str, Any],
     find: Callable[[str], Joint],
-    joints: Sequence[Joint],
+    joints: Sequence[str],
     urdf_damping: Mapping[str, float],
 ) -> dict[str, Any]:
     """Return the fields as a robot holds them.
@@ -23,11 +31,11 @@ def validated_fields(
     Parameters
     ----------
     fields : mapping
-        As `Robot.replace` takes them.
+        As `Robot.replace` takes them, but for inputs.
     find : callable
         Returns the joint of a name or raises.
-    joints : sequence of Joint
-        All independent ones.
+    joints : sequence of str
+        What one value for all stands for.
     urdf_damping : mapping
         What damping="urdf" stands for.
 
@@ -44,9 +52,7 @@ def validated_fields(
             )
         if name not in FIELDS:
             raise unknown("field of a robot", name, FIELDS)
-        if name == "inputs":
-            checked[name] = _inputs(value, find)
-        elif name == "outputs":
+        if name == "outputs":
             checked[name] = _outputs(value)
         elif name == "gravity":
             checked[name] = three_numbers("gravity", value)
@@ -59,7 +65,8 @@ def validated_fields(
     return checked
 
 
-def _inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, ...]:
+def validated_inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, ...]:
+    """Return the inputs as a robot holds them; `find` returns the joint of a name or raises."""
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise InputError(f"inputs is a {type(value).__name__}, expected a sequence of inputs")
     if not value:
@@ -67,11 +74,13 @@ def _inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, ...]:
     for item in value:
         if not isinstance(item, Input):
             raise InputError(
-                f"{item!r} is not an input; expected BaseTorque, BaseForce, JointTorque, Thruster"
+                f"{item!r} is not an input; expected BaseTorque, BaseForce, JointTorque, "
+                "Thruster or ReactionWheel"
             )
         if isinstance(item, JointTorque):
             find(item.joint)
     names = [item.name for item in value if isinstance(item, Thruster) and item.name]
+    names += [name for name, _ in named_wheels(value)]
     plain = [item for item in value if isinstance(item, BaseTorque | BaseForce | JointTorque)]
     twice = [str(x) for x in (*names, *plain) if (*names, *plain).count(x) > 1]
     if twice:
@@ -89,12 +98,12 @@ def _outputs(value: Any) -> tuple[Output, ...]:
 
 
 def _by_joint(
-    what: str, value: Any, find: Callable[[str], Joint], joints: Sequence[Joint]
+    what: str, value: Any, find: Callable[[str], Joint], joints: Sequence[str]
 ) -> dict[str, float]:
     if not isinstance(value, Mapping):
         if what == "rest":
             raise InputError(f"rest is {value!r}, expected a mapping {{joint: position}}")
-        value = dict.fromkeys((joint.name for joint in joints), value)
+        value = dict.fromkeys(joints, value)
     result = {}
     for name, entry in value.items():
         find(name)

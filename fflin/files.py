@@ -23,7 +23,9 @@ _NAMES = (
     *("state_names", "input_names", "output_names"),
     *("state_units", "input_units", "output_units"),
 )
-_LISTS = (*_NAMES, "locked")
+_FIELDS = (*_NAMES, "locked")
+_LISTS = (*_FIELDS, "ignorable")
+_LATER: dict[str, Any] = {"ignorable": (), "drift": ()}  # which files once had not
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version")
 
 FORMATS = (".npz", ".mat", ".json", ".csv")
@@ -39,6 +41,7 @@ def save_model(lin: LinearModel, path: Path, spare: Path | None = None) -> None:
         raise InputError("the model has entries that are not finite; it is not saved")
     record: dict[str, Any] = {key: getattr(lin, key) for key in (*_MATRICES, *_VECTORS[:-1])}
     record["reference"] = lin._reference
+    record["drift"] = np.zeros(0) if lin._drift is None else lin._drift
     record |= {key: list(getattr(lin, key)) for key in _LISTS}
     record |= {key: getattr(lin, key) for key in _TEXTS}
     record["dt"], record["moving"] = float(lin.dt), float(lin.moving)
@@ -61,7 +64,7 @@ def load_model(path: Path) -> LinearModel:
     check_format(path)
     decode = {".npz": _from_npz, ".mat": _from_mat, ".json": _from_json, ".csv": _from_csv}
     try:
-        record = decode[path.suffix](path)
+        record = _LATER | decode[path.suffix](path)
         arrays = {key: np.array(record[key], dtype=float) for key in _VECTORS}
         sizes = {key: len(record[key]) for key in _NAMES[:3]}
         nx, nu, ny = sizes.values()
@@ -70,9 +73,11 @@ def load_model(path: Path) -> LinearModel:
         M = np.array(record["M"], dtype=float)
         M.setflags(write=False)
         reference = arrays.pop("reference")
-        named: dict[str, Any] = {key: tuple(map(str, record[key])) for key in _LISTS}
+        drift = np.array(record["drift"], dtype=float)
+        ignorable = tuple(map(str, record["ignorable"]))
+        named: dict[str, Any] = {key: tuple(map(str, record[key])) for key in _FIELDS}
         named |= {key: str(record[key]) for key in _TEXTS} | arrays
-        _check_sizes(arrays, M, reference, named)
+        _check_sizes(arrays, M, reference, drift, named)
         lin = LinearModel(
             **named,
             dt=float(record["dt"]),
@@ -80,6 +85,8 @@ def load_model(path: Path) -> LinearModel:
             _reference=reference,
             _inertia=partial(_given, M),
             _certify=partial(_given, None),
+            _ignorable=partial(_given, ignorable),
+            _drift=drift if drift.size else None,
         )
         certificate = Certificate(**{k: float(x) for k, x in record["certificate"].items()})
         return replace(lin, _certify=partial(_certified, certificate, lin.fingerprint))
@@ -99,7 +106,9 @@ _UNREADABLE = (
 )
 
 
-def _check_sizes(arrays: dict[str, Any], M: Any, reference: Any, named: dict[str, Any]) -> None:
+def _check_sizes(
+    arrays: dict[str, Any], M: Any, reference: Any, drift: Any, named: dict[str, Any]
+) -> None:
     nx, nu, ny = (len(named[key]) for key in _NAMES[:3])
     expected = {"f0": nx, "x0": nx, "u0": nu, "y0": ny}
     for key, size in expected.items():
@@ -108,11 +117,11 @@ def _check_sizes(arrays: dict[str, Any], M: Any, reference: Any, named: dict[str
     for key, size in zip(_NAMES[3:], (nx, nu, ny), strict=True):
         if len(named[key]) != size:
             raise ValueError(f"{key} has {len(named[key])} entries, expected {size}")
-    if M.shape != (nx // 2, nx // 2) or reference.shape != (7,):
-        raise ValueError("M or the reference has a wrong shape")
+    if M.shape != (nx // 2, nx // 2) or reference.shape != (7,) or drift.shape not in ((0,), (nx,)):
+        raise ValueError("M, the reference or the drift has a wrong shape")
     if named["frame"] not in ("hybrid", "local", "world"):
         raise ValueError(f"unknown frame '{named['frame']}'")
-    if not all(np.isfinite(array).all() for array in (*arrays.values(), M, reference)):
+    if not all(np.isfinite(array).all() for array in (*arrays.values(), M, reference, drift)):
         raise ValueError("an entry is not finite")
 
 
@@ -194,7 +203,7 @@ def _from_npz(path: Path) -> dict[str, Any]:
     except BadZipFile as error:
         raise ValueError(str(error)) from None
     for key in _LISTS:
-        record[key] = record[key].tolist()
+        record[key] = record.get(key, np.zeros(0)).tolist()
     return {**record, "certificate": json.loads(str(record["certificate"]))}
 
 
@@ -216,8 +225,8 @@ def _from_mat(path: Path) -> dict[str, Any]:
     except (MatReadError, NotImplementedError) as error:
         raise ValueError(str(error)) from None
     record: dict[str, Any] = {key: raw[key] for key in _MATRICES}
-    record |= {key: raw[key].ravel() for key in _VECTORS}
-    record |= {key: [str(cell[0]) for cell in raw[key].ravel()] for key in _LISTS}
+    record |= {key: raw[key].ravel() for key in (*_VECTORS, "drift") if key in raw}
+    record |= {key: [str(cell[0]) for cell in raw[key].ravel()] for key in _LISTS if key in raw}
     record |= {key: "".join(raw[key]) for key in _TEXTS}
     record["dt"], record["moving"] = raw["dt"].item(), raw["moving"].item()
     struct = raw["certificate"][0, 0]
@@ -266,12 +275,12 @@ def _to_csv(path: Path, record: dict[str, Any]) -> dict[Path, bytes]:
         tables[f"{title}s"] = [["name", "unit", *vectors], *rows]
     point = [
         [f"{key}[{i}]", x]
-        for key in ("q", "v", "reference")
+        for key in ("q", "v", "reference", "drift")
         for i, x in enumerate(record[key].tolist())
     ]
     tables["point"] = [["name", "value"], *point]
     info = {key: record[key] for key in (*_TEXTS, "dt", "moving")}
-    info["locked"] = ";".join(record["locked"])
+    info |= {key: ";".join(record[key]) for key in ("locked", "ignorable")}
     info |= {f"certificate.{key}": value for key, value in record["certificate"].items()}
     tables["info"] = [["name", "value"], *map(list, info.items())]
     return {_csv_path(path, key): _csv_text(rows) for key, rows in tables.items()}
@@ -289,14 +298,15 @@ def _from_csv(path: Path) -> dict[str, Any]:
         for vector, column in zip(vectors, columns[2:], strict=True):
             record[vector] = [float(x) for x in column]
     _, *body = _csv_rows(path, "point")
-    for key in ("q", "v", "reference"):
+    for key in ("q", "v", "reference", "drift"):
         record[key] = [float(x) for name, x in body if name.startswith(f"{key}[")]
     info = dict(_csv_rows(path, "info")[1:])
     prefix = "certificate."
     record["certificate"] = {
         key.removeprefix(prefix): float(x) for key, x in info.items() if key.startswith(prefix)
     }
-    record["locked"] = [entry for entry in info["locked"].split(";") if entry]
+    for key in ("locked", "ignorable"):
+        record[key] = [entry for entry in info.get(key, "").split(";") if entry]
     return {**record, **{key: info[key] for key in (*_TEXTS, "dt", "moving")}}
 
 

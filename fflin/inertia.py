@@ -97,7 +97,7 @@ class Inertia:
                 f"error of about {coupling * _EPS:.0e}; {_involved(self._state, M)} hardly move "
                 "mass against each other",
                 FflinWarning,
-                stacklevel=5,
+                stacklevel=6,
             )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fflin.errors import FflinError, InputError, UnknownNameError, unknown
-from fflin.inputs import BaseForce, BaseTorque, Input, JointTorque, Thruster
+from fflin.inputs import BaseForce, BaseTorque, Input, JointTorque, ReactionWheel, Thruster
 from fflin.reader import read_file
 from fflin.robots import find_inputs
 
@@ -22,8 +22,9 @@ _TYPES: dict[str, type[Input]] = {
     "base_force": BaseForce,
     "joint_torque": JointTorque,
     "thruster": Thruster,
+    "reaction_wheel": ReactionWheel,
 }
-_VECTORS = ("position", "direction")
+_VECTORS, _NUMBERS = ("position", "direction", "axis"), ("inertia", "momentum")
 
 # Some 1,000 inputs.
 _SIZE_LIMIT = 2**17
@@ -49,15 +50,17 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     The file is an array of tables ``[[input]]``; their order is that of u. Each has a ``type``
     and the keys of that type, which are the parameters of the class:
 
-    ================  ===========================================================
-    ``type``          keys
-    ================  ===========================================================
-    ``base_torque``   none: `BaseTorque`
-    ``base_force``    none: `BaseForce`
-    ``joint_torque``  ``joint``: `JointTorque`
-    ``thruster``      ``frame``, ``position`` [m], ``direction`` and, if it is to
-                      have one, ``name``: `Thruster`
-    ================  ===========================================================
+    ==================  =========================================================
+    ``type``            keys
+    ==================  =========================================================
+    ``base_torque``     none: `BaseTorque`
+    ``base_force``      none: `BaseForce`
+    ``joint_torque``    ``joint``: `JointTorque`
+    ``thruster``        ``frame``, ``position`` [m], ``direction`` and, if it is
+                        to have one, ``name``: `Thruster`
+    ``reaction_wheel``  ``axis`` and, as wanted, ``frame``, ``inertia`` [kg m^2]
+                        or ``momentum`` [N m s], ``name``: `ReactionWheel`
+    ==================  =========================================================
 
     Parameters
     ----------
@@ -100,7 +103,7 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     seen: dict[Input | str | None, int] = {}
     for index, table in enumerate(document.tables):
         item = _input(document, index, table)
-        what = item.name if isinstance(item, Thruster) else item
+        what = item.name if isinstance(item, Thruster | ReactionWheel) else item
         if what is not None and what in seen:
             shown = f"the name '{what}'" if isinstance(what, str) else what
             message = f"{shown} stands in line {document.line(seen[what])} already; take one out"
@@ -188,8 +191,12 @@ def _input(document: _Document, index: int, table: dict[str, Any]) -> Input:
     for key, value in values.items():
         if key not in known:
             raise document.unknown(index, key, unknown(f"key of a {kind}", key, ("type", *known)))
-        if not (_is_vector(value) if key in _VECTORS else isinstance(value, str) and value):
-            expected = "three finite numbers, [x, y, z]" if key in _VECTORS else "a name in quotes"
+        right, expected = isinstance(value, str) and value != "", "a name in quotes"
+        if key in _VECTORS:
+            right, expected = _is_vector(value), "three finite numbers, [x, y, z]"
+        elif key in _NUMBERS:
+            right, expected = _is_number(value), "a finite number"
+        if not right:
             raise document.error(index, key, f"{key} is {reprlib.repr(value)}, expected {expected}")
     for key, field in known.items():
         if field.default is MISSING and key not in values:
@@ -197,16 +204,18 @@ def _input(document: _Document, index: int, table: dict[str, Any]) -> Input:
     try:
         return _TYPES[kind](**values)
     except InputError as error:
-        raise document.error(index, "direction", str(error)) from None
+        message = str(error)  # begins with what is wrong, "thruster direction is ..."
+        wrong = next((key for key in values if f" {key} is " in message), None)
+        raise document.error(index, wrong, message) from None
 
 
 def _is_vector(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))
+
+
+def _is_number(value: Any) -> bool:
     # The limit keeps lengths finite, and integers that are no floats out.
-    return (
-        isinstance(value, list)
-        and len(value) == 3
-        and all(type(entry) in (int, float) and abs(entry) < 1e100 for entry in value)
-    )
+    return type(value) in (int, float) and abs(value) < 1e100
 
 
 def _explain(path: Path, text: str, problem: str) -> str:

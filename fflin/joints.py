@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.validation import Array
 
@@ -40,6 +41,11 @@ class Joint(NamedTuple):
         if self.unbounded:
             return float(np.arctan2(q[self.idx_q + 1], q[self.idx_q]))
         return float(q[self.idx_q])
+
+    def within(self, model: pin.Model) -> "Joint":
+        """Return the joint of this name where it begins in another model."""
+        joint = model.joints[model.getJointId(self.name)]
+        return self._replace(idx_q=joint.idx_q, idx_v=joint.idx_v)
 
 
 class Follower(NamedTuple):

@@ -110,6 +110,10 @@ class LinearModel:
     _reference: Array = field()
     _inertia: Callable[[LinearModel], Array] = field()
     _certify: Callable[[LinearModel], Certificate] = field()
+    _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
+    # Of a moving reference, whose f0 is zero by construction: its own rate (nx,), that of its
+    # attitude without turns about gravity. None otherwise.
+    _drift: Array | None = None
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -165,9 +169,31 @@ class LinearModel:
         """The figures that prove the model, computed when first asked for."""
         return self._certify(self)
 
+    @cached_property
+    def ignorable(self) -> tuple[str, ...]:
+        """The states that nothing in the model depends on, found on the robot.
+
+        Where the base is, and the angles of rotors; with `moving`, without gravity, the attitude
+        too. A rotor is symmetric about its axis and has nothing fixed on it.
+        """
+        return () if self._ignorable is None else self._ignorable(self)
+
     def is_equilibrium(self, tol: float = 1e-9) -> bool:
-        """Whether the point is a fixed point: no entry of f0 exceeds `tol`."""
-        return bool(np.abs(self.f0).max() <= number("tol", tol))
+        """Whether the point is a fixed point or a relative equilibrium, so that A and B stay.
+
+        At a relative equilibrium only ignorable coordinates move, at constant rates: a rotor
+        spins, or the base flies along. With ``moving=True`` the motion of the reference is
+        judged, not f0: its velocities in base axes must be constant, its joints stand but for
+        rotors, and under gravity it may turn about the vertical only.
+
+        Parameters
+        ----------
+        tol : float
+            What no rate may exceed, in SI units; those of ignorable coordinates may.
+        """
+        rate = self.f0 if self._drift is None else self._drift
+        judged = [name not in self.ignorable for name in self.state_names]
+        return bool(np.abs(rate[judged]).max(initial=0.0) <= number("tol", tol))
 
     def discretize(self, dt: float) -> LinearModel:
         r"""Sample the model with its input held constant between samples.

@@ -1,4 +1,4 @@
-"""The equations: A and B about any point, from CRBA's M and the derivatives of RNEA."""
+"""Linear models: A, B, C and D about any point."""
 
 from __future__ import annotations
 
@@ -14,19 +14,21 @@ from fflin import __version__
 from fflin.actuation import Actuation
 from fflin.certificate import certify
 from fflin.errors import InputError
-from fflin.inertia import Inertia, inertia_matrix
+from fflin.frames import ROOT
+from fflin.inertia import inertia_matrix
 from fflin.linear_model import LinearModel
-from fflin.model import ROOT, Robot
-from fflin.output_equations import Rates, output_equations
+from fflin.model import Robot
+from fflin.output_equations import output_equations
 from fflin.outputs import FullState
-from fflin.rotation import rotation_matrix, skew
+from fflin.rates import Accelerations, Rates
+from fflin.rotation import skew
 from fflin.state import ANGULAR, LINEAR, Chart, Frame, StateMap
+from fflin.state_equations import STANDING, at_rest, state_equations
+from fflin.symmetry import ignorable_states
 from fflin.validation import Array, vector
 
 if TYPE_CHECKING:
     from fflin.sensing import Sensing
-
-_STANDING = Chart(np.zeros(3), 1.0, np.eye(3))
 
 
 class Linearizer:
@@ -92,9 +94,8 @@ class Linearizer:
         self._own_reference = reference is None
         self._data = robot.create_data()
         self._lock = Lock()  # of the work space
-        self._inertia = Inertia(self._map, self._data)
         self._actuation = Actuation(self._map)
-        self._gravity = np.array(robot.gravity)
+        self._accelerations = Accelerations(self._map, self._actuation, self._data)
         self._sensing: Sensing | None = None
         if robot.outputs != (FullState(),):
             from fflin.sensing import Sensing
@@ -102,26 +103,22 @@ class Linearizer:
             self._sensing = Sensing(
                 self._map,
                 robot.outputs,
-                gravity=self._gravity,
+                gravity=np.array(robot.gravity),
                 own_reference=self._own_reference,
             )
         # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
         self._free = (
             self._sensing is None
             and not self._moving
-            and not self._gravity.any()
+            and not any(robot.gravity)
             and not any(values.any() for values in robot.passive)
         )
         self._plain = self._free and self._actuation.default
         nv, nx = 6 + robot.n, self._map.nx
-        self._nv = nv
         self._zero_v, self._zero_u, self._zero_x = (
             _frozen(np.zeros(size)) for size in (robot.nv, len(self._actuation.names), nx)
         )
-        self._rates = np.array([0.5] * 3 + [1.0] * (nv - 3))  # the diagonal of N
-        self._A_rest = _frozen(
-            np.block([[np.zeros((nv, nv)), np.diag(self._rates)], [np.zeros((nv, nx))]])
-        )
+        self._A_rest = _frozen(at_rest(self._map))
         self._nu = len(self._actuation.names)
         self._shape_B, self._lower = (nx, self._nu), slice(nv, nx)
         self._q_m = self._map.groups.q_m if robot.n else None
@@ -186,7 +183,7 @@ class Linearizer:
 
     def _at_rest(self, q: Array) -> LinearModel:
         B = np.zeros(self._shape_B)
-        self._inertia.invert(q, B[self._lower])
+        self._accelerations.invert(q, B[self._lower])
         B.setflags(write=False)
         values = self._at_rest_fields.copy()
         values["B"] = B
@@ -200,39 +197,26 @@ class Linearizer:
         return LinearModel._from_fields(values)
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
-        state, nv, groups = self._map, self._nv, self._map.groups
-        chart = _STANDING if self._own_reference else state.chart(q)
+        state, groups = self._map, self._map.groups
+        chart = STANDING if self._own_reference else state.chart(q)
         nu, q_m = state.velocities(v), state.joint_positions(q)
         u_base = self._actuation.in_base_axes(chart, u)
-        rates = self._rates_in_base_axes(q, v, nu, q_m, u_base)
-        A = self._A_rest.copy()
-        self._set_kinematics(A, chart, nu)
-        lower = A[-nv:]
-        lower[:, groups.q_m] = rates.by_q_m
-        lower[:, -nv:] = rates.by_nu
-        B = np.zeros(self._shape_B)
-        B[self._lower] = rates.by_u
-        c = rates.c.copy()
-        self._set_turning(lower, chart, nu, u_base, c, rates)
-        f0: Array = np.empty(state.nx)
+        rates = self._accelerations.rates(q, v, nu, q_m, u_base)
+        A, B, f0 = state_equations(self._A_rest, state, self._actuation, chart, rates, nu, u_base)
         x0: Array = np.zeros(state.nx)
-        np.multiply(nu, self._rates, out=f0[:nv])
-        f0[nv:] = c
-        if chart is _STANDING:
+        if chart is STANDING:
             x0[groups.q_m] = q_m
-            x0[nv:] = nu
+            x0[self._lower] = nu
         else:
             x0 = state.to_state(q, v)
-            f0[groups.q_b] = chart.Q @ f0[groups.q_b]
-            f0[groups.r_b] = chart.R @ f0[groups.r_b]
-            for rows in (f0[nv:], lower, lower[:, -nv:].T, B[self._lower]):
-                state.to_frame(chart, rows)
-            for columns_held, _ in self._actuation.held:
-                B[:, columns_held] = B[:, columns_held] @ chart.R.T
         if self._moving:
             # The reference turns and flies with the point, so that the error does not.
             turning = skew(nu[ANGULAR])
             A[groups.q_b, groups.q_b] = A[groups.r_b, groups.r_b] = -turning
+            drift, weight = f0.copy(), float(rates.gravity.dot(rates.gravity))
+            if weight:
+                about = rates.gravity * (drift[groups.q_b].dot(rates.gravity) / weight)
+                drift[groups.q_b] -= about
             f0[:] = 0.0
         C, D, y0 = self._seen(chart, rates, q, v, u_base, x0)
         for array in (A, B, C, D, f0, x0, y0):
@@ -242,31 +226,9 @@ class Linearizer:
         point = {"A": A, "B": B, "C": C, "D": D, "f0": f0}
         point |= {"x0": x0, "y0": y0, "u0": u, "q": q, "v": v}
         point["_reference"] = self._reference_of(q)
+        if self._moving:
+            point["_drift"] = _frozen(drift)
         return LinearModel._from_fields(self._common | point)
-
-    def _rates_in_base_axes(self, q: Array, v: Array, nu: Array, q_m: Array, u: Array) -> Rates:
-        """Return the accelerations and their slopes; `u` (nu,) in base axes."""
-        model, data, state, nv = self.robot.model, self._data, self._map, self._nv
-        # Without the base's position and linear velocity: nothing here depends on them, and
-        # Pinocchio's derivatives lose digits to both. Nor does it depend on gravity, which
-        # accelerates the base origin and nothing against it (equivalence).
-        q_still, v_still = q.copy(), v.copy()
-        q_still[:3] = v_still[:3] = 0.0
-        inverse = np.empty((nv, nv))
-        self._inertia.invert(q_still, inverse)
-        columns = self._actuation.columns(data, q_still)
-        bias = pin.nonLinearEffects(model, data, q_still, v_still)
-        force = columns.dot(u) - state.forces(bias)
-        stiffness, damping, rest = self.robot.passive
-        force[6:] -= stiffness * (q_m - rest) + damping * nu[6:]
-        c = inverse.dot(force)
-        by_q, by_v = self._bias_slopes(q_still, v_still, c, u)
-        by_nu = inverse.dot(-by_v)
-        by_nu[:, LINEAR] = 0.0
-        by_u = inverse if self._actuation.default else inverse.dot(columns)
-        root = model.jointPlacements[ROOT].rotation
-        gravity = rotation_matrix(q[3:7]).T @ (root.T @ self._gravity)
-        return Rates(c, inverse.dot(-by_q), by_nu, by_u, gravity)
 
     def _seen(
         self, chart: Chart, rates: Rates, q: Array, v: Array, u: Array, x0: Array
@@ -284,78 +246,6 @@ class Linearizer:
             C[row, index] = 1.0
             sensed.y[row] = x0[index]
         return C, D, sensed.y
-
-    def _bias_slopes(self, q: Array, v: Array, c: Array, u: Array) -> tuple[Array, Array]:
-        """Return the slopes of M a + b - B u + passive forces over q_m (.., n) and nu, a held.
-
-        The wrenches of thrusters are constant in the frames of their links, so that RNEA's
-        derivatives with them hold -d(B u)/dq.
-        """
-        model, data, state = self.robot.model, self._data, self._map
-        wrenches = self._actuation.wrenches(u)
-        external = () if wrenches is None else (wrenches,)
-        full_q, full_v, _ = pin.computeRNEADerivatives(
-            model, data, q, v, state.spread(c), *external
-        )
-        by_q, by_v = state.project(full_q)[:, 6:], state.project(full_v)
-        if not self._plain:
-            joints = np.arange(6, self._nv)
-            by_q[joints, joints - 6] += self.robot.passive.stiffness
-            by_v[joints, joints] += self.robot.passive.damping
-        return by_q, by_v
-
-    def _set_turning(
-        self,
-        lower: Array,
-        chart: Chart,
-        nu: Array,
-        u: Array,
-        c: Array,
-        rates: Rates,
-    ) -> None:
-        r"""Complete the velocity rows (6 + n, nx) for what is held in which axes.
-
-        `c` (6 + n,) is the acceleration of the base origin and the joints in base axes, without
-        gravity. A turn :math:`\delta\theta` of the base under a vector s held in reference axes
-        changes its base components by :math:`[s]_\times \delta\theta`: so the velocities,
-        inputs and gravity that are held in reference axes change, and the accelerations turn
-        back. A v_b in base axes has the rate :math:`c + g - \omega \times v_b`. The rate in the
-        frame is left in `c`.
-        """
-        groups = self._map.groups
-        turned_angular, turned_linear = self._map.axes
-        w, v = nu[ANGULAR], nu[LINEAR]
-        turn = np.zeros((self._nv, 3))
-        for columns, _ in self._actuation.held:
-            turn += rates.by_u[:, columns].dot(skew(u[columns]))
-        if turned_angular:
-            turn += lower[:, groups.omega_b].dot(skew(w))
-            turn[ANGULAR] -= skew(c[ANGULAR])
-        if turned_linear:
-            turn[LINEAR] -= skew(c[LINEAR])
-        else:
-            turning = skew(w)
-            lower[LINEAR, groups.omega_b] += skew(v)
-            lower[LINEAR, groups.v_b] -= turning
-            turn[LINEAR] += skew(rates.gravity)
-            c[LINEAR] -= turning.dot(v)
-        c[LINEAR] += rates.gravity
-        lower[:, groups.q_b] = turn.dot(chart.J)
-
-    def _set_kinematics(self, A: Array, chart: Chart, nu: Array) -> None:
-        """Set what the motion changes in the rows of q_b and r_b; `nu` (6 + n,) in base axes."""
-        g, (turned_angular, turned_linear) = self._map.groups, self._map.axes
-        w, Q, J, R = nu[ANGULAR], chart.Q, chart.J, chart.R
-        slope = -0.5 * skew(w)
-        if chart is not _STANDING:
-            slope -= np.outer(0.5 * w, chart.q_b / chart.q0)
-            A[g.q_b, g.omega_b] = 0.5 * Q @ R.T if turned_angular else 0.5 * Q
-        if turned_angular:
-            slope += 0.5 * Q.dot(skew(w)).dot(J)
-        A[g.q_b, g.q_b] = slope
-        if not turned_linear:
-            A[g.r_b, g.v_b] = R
-            A[g.r_b, g.q_b] = -R.dot(skew(nu[LINEAR])).dot(J)
 
     def _reference_of(self, q: Array) -> Array:
         if not self._own_reference:
@@ -388,6 +278,7 @@ class Linearizer:
             "pinocchio_version": pin.__version__,
             "_inertia": partial(inertia_matrix, robot),
             "_certify": partial(certify, robot),
+            "_ignorable": partial(ignorable_states, robot),
         }
 
 

@@ -43,6 +43,8 @@ class Point(NamedTuple):
         Rotation and position of the base relative to the reference.
     v_b, g : ndarray (3,)
         Velocity of the base's origin and gravity, in base axes.
+    stored : tuple of (int, ndarray (3,))
+        Momentum of wheels that are no joints: the joint that carries it, and it in its axes.
     """
 
     model: pin.Model
@@ -53,6 +55,7 @@ class Point(NamedTuple):
     r_b: Array
     v_b: Array
     g: Array
+    stored: tuple[tuple[int, Array], ...] = ()
 
 
 class Carried(NamedTuple):
@@ -74,7 +77,7 @@ def center_of_mass(at: Point, to: Sensed) -> None:
 
 
 def momentum(at: Point, to: Sensed) -> None:
-    """Angular about the centre of mass, then linear, in reference axes."""
+    """Angular about the centre of mass, wheels included, then linear, in reference axes."""
     # Its rate, which this differentiates too, is of no interest: any acceleration will do.
     by_q, _, _, by_v = pin.computeCentroidalDynamicsDerivatives(at.model, at.data, at.q, at.v, at.v)
     mass, still = pin.computeTotalMass(at.model), at.data.hg
@@ -84,6 +87,11 @@ def momentum(at: Point, to: Sensed) -> None:
         to.by_q[part] = at.R.dot(by_q[rows])
         to.by_v[part] = at.R.dot(by_v[rows])
     to.by_q[3:, ANGULAR] -= at.R.dot(skew(mass * at.v_b))
+    for joint, stored in at.stored:
+        jacobian = pin.getJointJacobian(at.model, at.data, joint, _LOCAL)
+        R = at.R.dot(at.data.oMi[joint].rotation)
+        to.y[:3] += R.dot(stored)
+        to.by_q[:3] -= R.dot(skew(stored)).dot(jacobian[ANGULAR])
 
 
 def frame_pose(at: Point, frame: Carried, to: Sensed) -> None:

@@ -68,6 +68,8 @@ class Measuring:
             momenta = [data.oMi[i].act(model.inertias[i] * data.v[i]) for i in links]
             linear = sum(h.linear for h in momenta)
             angular = sum(h.angular for h in momenta) - np.cross(com, linear)
+            for joint, stored in self.state.robot.stored_momentum:
+                angular += data.oMi[joint].rotation @ stored
             return np.concatenate((reference.rotation.T @ angular, reference.rotation.T @ linear))
         return x[states_of(self.state, output)]
 

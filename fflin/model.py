@@ -12,13 +12,13 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.errors import InputError, ModelError, unknown
-from fflin.fields import validated_fields
-from fflin.inputs import Input, default_inputs
+from fflin.fields import validated_fields, validated_inputs
+from fflin.frames import ROOT
+from fflin.inputs import Input, default_inputs, named_wheels
 from fflin.joints import Follower, Joint
 from fflin.outputs import FullState, Output
 from fflin.validation import NORM_TOLERANCE, Array, number, placement, vector
-
-ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
+from fflin.wheels import stored_momentum, with_wheels
 
 # What renormalising a unit quaternion leaves: two ulp of unity.
 _ROUND_OFF = 2.0 * float(np.finfo(float).eps)
@@ -43,8 +43,9 @@ class Robot:
     Attributes
     ----------
     model : pin.Model
-        Free-flyer root joint, zero gravity; its mimic joints are joints like the others. To be
-        read; what is changed in it after loading is not seen everywhere.
+        Free-flyer root joint, zero gravity; its mimic joints are joints like the others, and so
+        are the wheels with an inertia among the inputs. To be read; what is changed in it after
+        loading is not seen everywhere.
     name : str
         Name or file stem it was loaded by.
     urdf : Path or None
@@ -89,6 +90,8 @@ class Robot:
     damping: Mapping[str, float] = field(default_factory=dict)
     rest: Mapping[str, float] = field(default_factory=dict)
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # Where some of its joints are wheels: the same robot without them.
+    _wheelless: Robot | None = None
 
     def __post_init__(self) -> None:
         if not self.inputs:
@@ -100,13 +103,15 @@ class Robot:
         Parameters
         ----------
         inputs : sequence of Input
-            What acts on it, in the order of u.
+            What acts on it, in the order of u. Wheels with an inertia among them become joints
+            of the robot; those that it had before and that are not among them go.
         outputs : sequence of Output
             What is watched of it, in the order of y.
         stiffness : mapping or float
-            {joint: K [N m/rad | N/m]}, or one for all joints.
+            {joint: K [N m/rad | N/m]}, or one for all joints but wheels.
         damping : mapping, float or "urdf"
-            {joint: D [N m s/rad | N s/m]}, one for all joints, or what the URDF says.
+            {joint: D [N m s/rad | N s/m]}, one for all joints but wheels, or what the URDF
+            says.
         rest : mapping
             {joint: position [rad|m]} where its spring is relaxed.
         gravity : sequence of float (3,)
@@ -119,13 +124,29 @@ class Robot:
         Raises
         ------
         InputError
-            If a value is negative or not a number, or a field is not one of these.
+            If a value is negative or not a number, a field is not one of these, or a wheel has
+            more inertia than what carries it.
         UnknownNameError
-            If there is no such joint.
+            If there is no such joint, or no such frame for a wheel.
         ModelError
             If dry friction is asked for, which is not differentiable at rest.
         """
-        return replace(self, **validated_fields(fields, self.joint, self.joints, self.urdf_damping))
+        robot = self
+        if "inputs" in fields:
+            robot = self._with_inputs(fields.pop("inputs"))
+        own = (robot._wheelless or robot).joint_names
+        return replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
+
+    @cached_property
+    def wheels(self) -> dict[str, float]:
+        """{name: inertia [kg m^2]} of the wheels among its joints."""
+        wheels = named_wheels(self.inputs)
+        return {name: wheel.inertia for name, wheel in wheels if wheel.inertia}
+
+    @cached_property
+    def stored_momentum(self) -> tuple[tuple[int, Array], ...]:
+        """Of wheels without inertia: (Pinocchio joint, momentum (3,) [N m s] in its axes)."""
+        return stored_momentum(self.model, self.inputs)
 
     @cached_property
     def passive(self) -> Passive:
@@ -181,6 +202,11 @@ class Robot:
                 raise InputError(
                     f"joint '{name}' mimics '{follower.leader.name}'; place that one instead"
                 )
+        if name in (wheel for wheel, _ in named_wheels(self.inputs)):
+            raise InputError(
+                f"wheel '{name}' has no inertia, so that it is no joint and has no speed; give it "
+                "one, or its momentum"
+            )
         if any(locked.rpartition("=")[0] == name for locked in self.locked):
             raise InputError(f"joint '{name}' is locked; lock it at another value instead")
         raise unknown("joint", name, self.joint_names)
@@ -256,6 +282,29 @@ class Robot:
                     f"mimics '{leader.name}', which makes it {expected:.9g}"
                 )
         return v
+
+    def _with_inputs(self, inputs: Any) -> Robot:
+        """Return the robot with other inputs, and with the wheels among them as joints."""
+        bare = self._wheelless or self
+        checked = validated_inputs(inputs, bare.joint)
+        wheels = [(name, wheel) for name, wheel in named_wheels(checked) if wheel.inertia]
+        model, joints, followers = with_wheels(bare.model, bare.joints, bare.followers, wheels)
+        names = {joint.name for joint in joints}
+        stiffness, damping, rest = (
+            {name: x for name, x in values.items() if name in names}
+            for values in (self.stiffness, self.damping, self.rest)
+        )
+        return replace(
+            self,
+            model=model,
+            joints=joints,
+            followers=followers,
+            inputs=checked,
+            stiffness=stiffness,
+            damping=damping,
+            rest=rest,
+            _wheelless=bare if wheels else None,
+        )
 
     def create_data(self) -> pin.Data:
         """Make Pinocchio's work space for this robot.

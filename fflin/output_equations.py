@@ -2,40 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fflin.actuation import Actuation
+from fflin.rates import Rates
 from fflin.rotation import skew
 from fflin.state import ANGULAR, LINEAR, Chart, StateMap
 from fflin.validation import Array
 
 if TYPE_CHECKING:
     from fflin.measurements import Sensed
-
-
-class Rates(NamedTuple):
-    r"""The acceleration of the base origin and the joints, in base axes, and what it depends on.
-
-    Attributes
-    ----------
-    c : ndarray (6 + n,)
-        Without gravity and :math:`\omega \times v_b`.
-    by_q_m : ndarray (6 + n, n)
-    by_nu : ndarray (6 + n, 6 + n)
-        Without the base's linear velocity, on which it does not depend.
-    by_u : ndarray (6 + n, nu)
-        `u` held in base axes.
-    gravity : ndarray (3,)
-        In base axes.
-    """
-
-    c: Array
-    by_q_m: Array
-    by_nu: Array
-    by_u: Array
-    gravity: Array
 
 
 def output_equations(

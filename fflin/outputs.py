@@ -91,7 +91,8 @@ class CenterOfMass:
 class Momentum:
     """Momentum of the whole robot, in reference axes.
 
-    Angular momentum (3) [N m s] about the centre of mass, and linear momentum (3) [N s].
+    Angular momentum (3) [N m s] about the centre of mass, that of every wheel included, and
+    linear momentum (3) [N s].
     """
 
 

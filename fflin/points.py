@@ -6,6 +6,7 @@ import numpy as np
 
 from fflin.actuation import Actuation
 from fflin.errors import unknown
+from fflin.inputs import named_wheels
 from fflin.model import Robot
 from fflin.state import StateMap
 from fflin.validation import Array, number
@@ -39,6 +40,8 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
             index = base.index(name)
         elif name in robot.joint_names:
             index = 6 + robot.joint_names.index(name)
+        elif name in (wheel for wheel, _ in named_wheels(robot.inputs)):
+            robot.joint(name)  # says why it has no speed
         else:
             raise unknown("velocity", name, (*robot.joint_names, *base))
         nu[index] = number(f"velocity '{name}'", value)

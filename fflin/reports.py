@@ -10,10 +10,15 @@ from typing import TYPE_CHECKING
 from fflin.tables import grid, matrix, width
 
 if TYPE_CHECKING:
+    from fflin.eigenmodes import Mode, Modes
     from fflin.linear_model import LinearModel
     from fflin.model import Robot
     from fflin.validation import Array
     from fflin.verification import Check, Row
+
+
+# Below this rate [SI] nothing moves to speak of.
+_MOVES = 1e-9
 
 
 def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
@@ -43,6 +48,7 @@ def robot_info(robot: Robot) -> str:
         joint: "prismatic" if joint.prismatic else "continuous" if joint.unbounded else "revolute"
         for joint in robot.joints
     }
+    kinds |= {joint: "wheel" for joint in robot.joints if joint.name in robot.wheels}
     for joint, leader, multiplier, offset in robot.followers:
         kinds[joint] = f"mimics {leader.name} * {multiplier:g}"
         kinds[joint] += f" {'-' if offset < 0 else '+'} {abs(offset):g}" if offset else ""
@@ -83,12 +89,18 @@ def robot_info(robot: Robot) -> str:
 
 def linear_model(lin: LinearModel) -> str:
     """Show a linear model: its point, A, B, C, D and its certificate."""
+    import numpy as np
+
+    from fflin.eigenmodes import modes
+
     nx, nu = lin.B.shape
     point = "a fixed point" if lin.is_equilibrium() else "not a fixed point"
+    if lin.is_equilibrium() and (lin.moving or np.abs(lin.f0).max() > _MOVES):
+        point = "a relative equilibrium"
     parts = [f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}, {point}"]
-    growing = _growing_poles(lin)
+    growing = [] if lin.dt else modes(lin).unstable
     if growing:
-        shown = ", ".join(f"{pole:.5g}" for pole in growing)
+        shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
         parts.append(textwrap.fill(f"unstable: poles with a positive real part {shown}", width()))
     moved = [
         _signal(title, values, names, units)
@@ -150,14 +162,61 @@ def check_report(check: Check) -> str:
     return "\n\n".join(parts)
 
 
-def _growing_poles(lin: LinearModel) -> list[complex]:
-    """Poles that grow by more than the rounding of the repeated poles at zero can explain."""
-    import numpy as np
+def modes_report(found: Modes) -> str:
+    """Show natural modes: how many are rigid, and a table of the others with what moves most."""
+    vibrations, others = len(found.vibrations), len(found.modes) - len(found.vibrations)
+    head = (
+        f"{found.robot}: {_counted(found.rigid_body, 'rigid-body mode')} "
+        f"({_counted(found.zero_eigenvalues, 'eigenvalue')} at zero), "
+        f"{_counted(vibrations, 'vibration')}, {_counted(others, 'real pole')}"
+    )
+    if not found.equilibrium:
+        head += "; not an equilibrium, where eigenvalues are those of a frozen model"
+    parts = [textwrap.fill(head, width())]
+    if found.unstable:
+        poles = ", ".join(f"{mode.pole:.5g}" for mode in found.unstable)
+        parts.append(textwrap.fill(f"unstable: poles with a positive real part {poles}", width()))
+    rows = [["rad/s", "damping", "time [s]", "", "what moves"]]
+    rows += [
+        [
+            f"{mode.frequency:.6g}" if mode.oscillates else ".",
+            f"{mode.damping_ratio:.4g}" if mode.oscillates else ".",
+            f"{mode.time_constant:.4g}" if mode.pole.real else ".",
+            "unstable" if mode.unstable else "",
+            "",
+        ]
+        for mode in found.modes
+    ]
+    left = max(map(len, grid(rows, "rrrll").splitlines())) - len(rows[0][-1])
+    for row, mode in zip(rows[1:], found.modes, strict=True):
+        row[-1] = _moving_most(mode, found.state_names, width() - left)
+    if found.modes:
+        parts.append(grid(rows, "rrrll"))
+    return "\n\n".join(parts)
 
-    poles = np.linalg.eigvals(lin.A)
-    size = float(np.abs(poles).max())
-    # A Jordan block of four, two coupled free motions, moves by the fourth root of round-off.
-    return [complex(pole) for pole in poles if pole.real > 1e-3 * size] if size > 1e-3 else []
+
+def _moving_most(mode: Mode, names: Sequence[str], room: int) -> str:
+    """Name the positions that move most in a mode, as many as there is room for."""
+    shape = mode.shape[: len(names) // 2]
+    sizes = abs(shape)
+    text = ""
+    for i in (-sizes.round(9)).argsort(kind="stable").tolist():
+        value = complex(shape[i])
+        if abs(value) < 0.1:
+            break
+        amount = f"{value.real:.2g}"
+        if abs(value.imag) > 0.02 * abs(value):  # an angle of more than a degree
+            angle = math.degrees(math.atan2(value.imag, value.real))
+            amount = f"{abs(value):.2g} at {angle:.0f} deg"
+        longer = f"{text}, {names[i]} {amount}" if text else f"{names[i]} {amount}"
+        if text and len(longer) > room:
+            break
+        text = longer
+    return text
+
+
+def _counted(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:

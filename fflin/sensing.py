@@ -5,7 +5,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import InputError, unknown
+from fflin.errors import InputError
+from fflin.frames import ROOT, find_frame
 from fflin.measurements import (
     ANGULAR,
     LINEAR,
@@ -19,7 +20,7 @@ from fflin.measurements import (
     gyroscope,
     momentum,
 )
-from fflin.model import ROOT, Robot
+from fflin.model import Robot
 from fflin.outputs import (
     Accelerometer,
     BasePose,
@@ -97,7 +98,7 @@ class Sensing:
         own_reference: bool = False,
     ) -> None:
         robot = state.robot
-        self._model, self._nv = robot.model, robot.nv
+        self._model, self._nv, self._stored = robot.model, robot.nv, robot.stored_momentum
         self._gravity: Array = np.zeros(3) if gravity is None else np.array(gravity, dtype=float)
         self._weighed = bool(self._gravity.any())
         self._own_reference = own_reference
@@ -182,7 +183,8 @@ class Sensing:
         gravity = self._gravity
         if self._weighed:
             gravity = rotation_matrix(q[3:7]).T @ (self._root_rotation.T @ gravity)
-        return Point(self._model, data, still_q, still_v, R, r_b, v[LINEAR], gravity)
+        v_b = v[LINEAR]
+        return Point(self._model, data, still_q, still_v, R, r_b, v_b, gravity, self._stored)
 
 
 def states_of(state: StateMap, output: Output) -> list[int]:
@@ -201,12 +203,7 @@ def states_of(state: StateMap, output: Output) -> list[int]:
 
 def carried(robot: Robot, name: str) -> Carried:
     """Return where a frame is; a link's before a joint's of the same name."""
-    frames = [frame for frame in robot.model.frames.tolist() if frame.parentJoint >= ROOT]
-    found = [frame for frame in frames if frame.name == name]
-    if not found:
-        raise unknown("frame", str(name), [frame.name for frame in frames])
-    frame = next((frame for frame in found if frame.type == pin.FrameType.BODY), found[0])
-    return Carried(frame.parentJoint, pin.SE3(frame.placement))
+    return Carried(*find_frame(robot.model, name))
 
 
 def _components(vectors: list[tuple[str, str]]) -> list[tuple[str, str]]:

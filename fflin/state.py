@@ -192,6 +192,14 @@ class StateMap:
             )
         return Chart(quaternion[:3], q0, rotation_matrix(quaternion))
 
+    def rotation(self, q: Array) -> Array:
+        """Return refMb.rotation (3, 3) at a valid configuration, at any turn."""
+        return rotation_matrix(quaternion_product(self._quaternion, q[3:7]))
+
+    def scalar(self, q: Array) -> float:
+        """Return q0 at a valid configuration, with the sign of the quaternion in q."""
+        return float(quaternion_product(self._quaternion, q[3:7])[3])
+
     def to_state(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
         """Convert a Pinocchio configuration and velocity to a state.
 
@@ -218,6 +226,12 @@ class StateMap:
         """
         q = self.robot.checked_configuration(q)
         v = self.robot.checked_velocity(v)
+        if near is not None:
+            near = vector("near", near, self.nx, "a state (12 + 2n)")
+        return self.read(q, v, near=near)
+
+    def read(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
+        """Do as `to_state` for arguments that are valid."""
         chart = self.chart(q)
         x = np.empty(self.nx)
         g = self.groups
@@ -325,7 +339,8 @@ class StateMap:
         return angles
 
     def _unwrap(self, x: Array, near: Array) -> None:
-        near = vector("near", near, self.nx, "a state (12 + 2n)")
+        if not self._unbounded.size:
+            return
         index = 6 + self._unbounded
         x[index] += 2.0 * np.pi * np.round((near[index] - x[index]) / (2.0 * np.pi))
 

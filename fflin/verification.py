@@ -11,6 +11,7 @@ from fflin.certificate import (
     compare,
     inertia_residual,
     mobilities,
+    motion,
     scaled_condition,
 )
 from fflin.errors import InputError
@@ -187,10 +188,10 @@ def _point_errors(
     state = model.state
     mobility, input_mobility = mobilities(M, lin.B)
     rate = model(lin.x0, lin.u0)
-    speed = np.abs(state.velocities(v))
-    spinning = max(float(speed[ANGULAR].max()), float(speed[6:].max(initial=0.0)))
+    _, rate_of_turn, momentum = motion(state, v)
     push = float((np.abs(lin.u0) * input_mobility).max(initial=0.0))
-    push += spinning**2 * float((1.0 / mobility).max())
+    push += rate_of_turn**2 * float((1.0 / mobility).max())
+    push += rate_of_turn * momentum * float(mobility.max())
     natural = np.concatenate((np.ones(len(M)), mobility * push))
     errors = [("x0", _relative(lin.x0, state.to_state(q, v, near=lin.x0)))]
     for name, rows in state.groups._asdict().items():

@@ -133,11 +133,11 @@ def test_a_run_goes_on_from_the_chunks_that_are_there_and_intact(robot, tmp_path
 def test_a_killed_run_goes_on(robot, tmp_path):
     """SIGKILL in the middle of writing, as a cluster does it."""
     script = textwrap.dedent("""
-        import sys, fflin
+        import sys, time, fflin
         robot = fflin.load("ets_vii")
         points = fflin.random_configurations(robot, 4000, seed=3)
         fflin.sweep(robot, points, chunk=80, out=sys.argv[1], threads=1,
-                    progress=lambda *counts: print(counts, flush=True))
+                    progress=lambda *counts: (print(counts, flush=True), time.sleep(0.02)))
     """)
     path, part = tmp_path / "b.h5", tmp_path / "b.h5.part"
     command = [sys.executable, "-c", script, str(path)]

@@ -303,7 +303,7 @@ def test_check_exits_1_where_it_falls_short(monkeypatch, capsys):
 def test_help_has_an_example_in_every_command():
     code, out, _ = run("--help")
     assert code == 0
-    for command in ("robots", "info", "linearize", "check"):
+    for command in ("robots", "info", "linearize", "check", "modes"):
         assert command in out
         code, text, _ = run(command, "--help")
         assert code == 0 and f"example: fflin {command}" in " ".join(text.split())
@@ -320,3 +320,22 @@ def test_closed_pipe_is_no_error():
         cwd=Path(__file__).parent,
     )
     assert done.stdout.startswith("talos") and not without_warnings(done.stderr)
+
+
+def test_wheels_from_a_file_at_speed(tmp_path):
+    options = ("cubesat", "--inputs", "cubesat", "--velocity", "wheel_z=500")
+    code, out, err = run("linearize", *options, "-o", "m.json", cwd=tmp_path)
+    assert code == 0 and not err
+    saved = json.loads((tmp_path / "m.json").read_text())
+    names = saved["state_names"]
+    row, column = names.index("omega_b.x"), names.index("omega_b.y")
+    # (I - J a a^T) d(omega)/dt = -omega x h, h = 3e-6 * 500 about z
+    expected = -3e-6 * 500.0 / (0.01520407970002 - 3e-6)
+    assert saved["A"][row][column] == pytest.approx(expected, rel=1e-12)
+    code, out, _ = run("check", *options)
+    assert code == 0 and max(map(len, out.splitlines())) <= 80
+    stored = tmp_path / "stored.toml"
+    stored.write_text('[[input]]\ntype = "reaction_wheel"\naxis = [0, 0, 1]\nmomentum = 0.1\n')
+    assert run("check", "cubesat", "--inputs", stored)[0] == 0
+    err = refused("check", "cubesat", "--inputs", stored, "--velocity", "wheel_1=100")
+    assert "wheel 'wheel_1' has no inertia" in err

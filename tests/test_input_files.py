@@ -35,7 +35,18 @@ position = [
 direction = [1.0, 0, 0]
 [[input]]
 type = "base_torque"
+[[input]]
+type = "reaction_wheel"
+axis = [0, 2, 0]
+inertia = 1e-3
+[[input]]
+type = "reaction_wheel"
+frame = "tool"
+axis = [0, 0, 1]
+momentum = -2
+name = "spare"
 """
+WHEEL = '[[input]]\ntype = "reaction_wheel"\naxis = [0, 0, 1]\n'
 THRUSTER = '[[input]]\ntype = "thruster"\nframe = "base"\nposition = [0, 0, 0]\n'
 
 
@@ -59,10 +70,13 @@ def test_order_in_the_file_is_that_of_u(written, start, ending):
         fflin.BaseForce(),
         fflin.Thruster("base", (0, 0, 0), (1, 0, 0), "main"),
         fflin.BaseTorque(),
+        fflin.ReactionWheel((0, 1, 0), inertia=1e-3),
+        fflin.ReactionWheel((0, 0, 1), "tool", name="spare", momentum=-2),
     )
     assert fflin.load_inputs(path) == fflin.load_inputs(str(path)) == inputs
     lin = fflin.linearize(fflin.load("ets_vii", inputs=inputs))
     assert lin.input_names[::4] == ("thruster_1", "F_b.z", "tau_b.z")
+    assert lin.input_names[-2:] == ("wheel_1", "spare")
     assert lin.input_names[5] == "main"
 
 
@@ -86,7 +100,8 @@ def test_bundled_sets_by_name_and_by_path():
 
 def test_thrusters_of_cubesat_push_and_turn_every_way():
     """Pulling is not needed: nonnegative thrusts give each direction, and nothing but it."""
-    lin = fflin.linearize(fflin.load("cubesat", inputs=fflin.load_inputs("cubesat")))
+    thrusters = [x for x in fflin.load_inputs("cubesat") if isinstance(x, fflin.Thruster)]
+    lin = fflin.linearize(fflin.load("cubesat", inputs=thrusters))
     assert len(lin.input_names) == 12
     assert np.linalg.matrix_rank(lin.B) == 6
     wrenches = lin.M @ lin.B[6:]
@@ -133,6 +148,16 @@ CASES = {
     THRUSTER + "[input.direction]\nx = 1": ":5: input 1: direction is {'x': 1}, expected three",
     THRUSTER + "direction = '1 0 0'": ":5: input 1: direction is '1 0 0', expected three",
     (THRUSTER + "direction = [1, 0, 0]\nname = 'a'\n") * 2: ":12: input 2: the name 'a' stands in",
+    WHEEL.replace("1]", "0]"): ":3: input 1: wheel axis is zero; give what it turns about",
+    WHEEL + "inertia = 0": ":4: input 1: wheel inertia is 0 kg m^2, expected more than 0",
+    WHEEL + "inertia = -1.5": ":4: input 1: wheel inertia is -1.5 kg m^2, expected more than 0",
+    WHEEL + "inertia = '1'": ":4: input 1: inertia is '1', expected a finite number",
+    WHEEL + "inertia = true": ":4: input 1: inertia is True, expected a finite number",
+    WHEEL + "\nmomentum = inf": ":5: input 1: momentum is inf, expected a finite number",
+    WHEEL + "inertia = 1\nmomentum = 2": ":5: input 1: wheel momentum is given beside an inertia",
+    WHEEL + "inertias = 1": ":4: no key of a reaction_wheel named 'inertias'; did you mean inertia",
+    WHEEL.replace("axis = [0, 0, 1]\n", ""): ":1: input 1: a reaction_wheel needs the key 'axis'",
+    (WHEEL + "name = 'a'\n") * 2: ":8: input 2: the name 'a' stands in line 1 already",
     # What looks like keys and tables in texts and comments is none.
     "[[input]]\ntype = 'base_force'\nnote = '''\n[[input]]\nodd = 1\n'''": (
         ":3: no key of a base_force named 'note'"

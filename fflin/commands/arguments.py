@@ -80,6 +80,20 @@ def add_robot(command: argparse.ArgumentParser) -> None:
 def add_point(command: argparse.ArgumentParser) -> None:
     """Add the robot and what says the point that it is linearised about."""
     add_robot(command)
+    add_pose(command)
+    add_system(command)
+    add_inputs_there(command)
+    command.add_argument(
+        "--reference",
+        choices=("base", "world"),
+        default="base",
+        help="what attitude and position are relative to: the base where it stands (default), "
+        "or the world",
+    )
+
+
+def add_pose(command: argparse.ArgumentParser) -> None:
+    """Add what says where the robot is and how it moves."""
     command.add_argument(
         "--joint",
         metavar="NAME=VALUE",
@@ -104,6 +118,37 @@ def add_point(command: argparse.ArgumentParser) -> None:
         metavar=("X", "Y", "Z"),
         help="base position [m]",
     )
+    command.add_argument(
+        "--velocity",
+        metavar="NAME=VALUE",
+        type=assignment,
+        action="append",
+        default=[],
+        help="a velocity at the point (repeatable): the rate [rad/s|m/s] of a joint or "
+        "wheel, or omega_b.x ... v_b.z of the base in base axes",
+    )
+
+
+def add_inputs_there(command: argparse.ArgumentParser) -> None:
+    """Add what says the inputs at the point."""
+    command.add_argument(
+        "--effort",
+        metavar="NAME=VALUE",
+        type=assignment,
+        action="append",
+        default=[],
+        help="an input at the point (repeatable), by its name in u, such as tau_m.joint_1",
+    )
+    command.add_argument(
+        "--equilibrium",
+        action="store_true",
+        help="take the least inputs that balance springs, gravity and a steady motion at the "
+        "point; refused where there are none",
+    )
+
+
+def add_system(command: argparse.ArgumentParser) -> None:
+    """Add what acts on the robot, what is watched of it, and in which axes."""
     for name, unit in (("stiffness", "N m/rad|N/m"), ("damping", "N m s/rad|N s/m")):
         command.add_argument(
             f"--{name}",
@@ -122,27 +167,11 @@ def add_point(command: argparse.ArgumentParser) -> None:
         help="uniform gravity in world axes [m/s^2]; none by default",
     )
     command.add_argument(
-        "--velocity",
-        metavar="NAME=VALUE",
-        type=assignment,
-        action="append",
-        default=[],
-        help="a velocity at the point (repeatable): a joint's rate [rad/s|m/s], or omega_b.x ... "
-        "v_b.z of the base in base axes",
-    )
-    command.add_argument(
-        "--effort",
-        metavar="NAME=VALUE",
-        type=assignment,
-        action="append",
-        default=[],
-        help="an input at the point (repeatable), by its name in u, such as tau_m.joint_1",
-    )
-    command.add_argument(
         "--inputs",
         metavar="FILE.toml",
         help="what acts on the robot, as fflin.load_inputs reads it: a file, or the name of a "
-        "bundled one; by default torque and force on the base and every joint's",
+        "bundled one; `joints` or `base`: those alone; by default torque and force on the base "
+        "and every joint's",
     )
     command.add_argument(
         "--output",
@@ -152,13 +181,6 @@ def add_point(command: argparse.ArgumentParser) -> None:
         help="what is watched (repeatable): state (default), base, joints, rates, com, momentum, "
         "frame:NAME (pose and velocity), pose:NAME, velocity:NAME, gyroscope:NAME or "
         "accelerometer:NAME",
-    )
-    command.add_argument(
-        "--reference",
-        choices=("base", "world"),
-        default="base",
-        help="what attitude and position are relative to: the base where it stands (default), "
-        "or the world",
     )
     command.add_argument(
         "--frame",

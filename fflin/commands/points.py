@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING, Any
 from fflin.errors import InputError
 
 if TYPE_CHECKING:
+    import pinocchio as pin
+
+    from fflin.inputs import Input
     from fflin.linear_model import LinearModel
     from fflin.model import Robot
     from fflin.validation import Array
@@ -30,14 +33,26 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
     if getattr(arguments, "gravity", None):
         fields["gravity"] = arguments.gravity
     if getattr(arguments, "inputs", None):
-        from fflin.input_files import load_inputs
-
-        fields["inputs"] = load_inputs(arguments.inputs)
+        fields["inputs"] = _inputs(robot, arguments.inputs)
     if getattr(arguments, "output", []):
         from fflin.output_specs import parse_output
 
         fields["outputs"] = [output for text in arguments.output for output in parse_output(text)]
     return robot.replace(**fields) if fields else robot
+
+
+def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:
+    from fflin.inputs import BaseForce, BaseTorque, JointTorque
+
+    if name == "joints":
+        if not robot.n:
+            raise InputError(f"--inputs joints: '{robot.name}' has no joints")
+        return tuple(JointTorque(joint) for joint in robot.joint_names)
+    if name == "base":
+        return BaseTorque(), BaseForce()
+    from fflin.input_files import load_inputs
+
+    return load_inputs(name)
 
 
 def once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -64,11 +79,36 @@ def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
     import pinocchio as pin
 
     from fflin.linearization import linearize
-    from fflin.points import effort, velocity
 
     robot = load_robot(arguments)
     q = configuration_of(robot, arguments)
     reference = pin.SE3.Identity() if arguments.reference == "world" else None
-    v = velocity(robot, once("--velocity", arguments.velocity)) if arguments.velocity else None
-    u = effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
+    v = velocity_of(robot, arguments)
+    u = inputs_at(robot, q, v, arguments, reference)
     return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
+
+
+def velocity_of(robot: Robot, arguments: argparse.Namespace) -> Array | None:
+    """Return the velocity (nv,) that --velocity says."""
+    from fflin.points import velocity
+
+    return velocity(robot, once("--velocity", arguments.velocity)) if arguments.velocity else None
+
+
+def inputs_at(
+    robot: Robot,
+    q: Array,
+    v: Array | None,
+    arguments: argparse.Namespace,
+    reference: pin.SE3 | None = None,
+) -> Array | None:
+    """Return the inputs (nu,) that --effort or --equilibrium say."""
+    if not arguments.equilibrium:
+        from fflin.points import effort
+
+        return effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
+    if arguments.effort:
+        raise InputError("--effort and --equilibrium both say the inputs at the point; give either")
+    from fflin.balance import equilibrium
+
+    return equilibrium(robot, q, v=v, frame=arguments.frame, reference=reference).u

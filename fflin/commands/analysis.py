@@ -1,0 +1,135 @@
+"""The commands that say what a linear model is worth: its structure, and how far it reaches."""
+
+from __future__ import annotations
+
+import argparse
+import textwrap
+from functools import partial
+from typing import TYPE_CHECKING
+
+from fflin.commands import DONE
+from fflin.commands.arguments import Commands, add_point, command, number
+from fflin.commands.points import linear_model
+from fflin.commands.regulator import add_weights, gain_of
+from fflin.errors import InputError
+
+if TYPE_CHECKING:
+    from fflin.linear_model import LinearModel
+
+
+def add_commands(commands: Commands) -> None:
+    """Add analyze and validity."""
+    analyze = command(
+        commands,
+        "analyze",
+        _analyze,
+        "show what the inputs can move, what is conserved, the modes, and what the outputs show",
+        "fflin analyze servicer_7dof --stiffness panel_left=100 --output joints",
+    )
+    add_point(analyze)
+    validity = command(
+        commands,
+        "validity",
+        _validity,
+        "measure how far from the point the linear model can be trusted and its regulator holds",
+        "fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
+    )
+    add_point(validity)
+    add_weights(validity)
+    validity.add_argument(
+        "--reduce",
+        action="store_true",
+        help="judge the part that the inputs can hold where momentum is conserved",
+    )
+    for name, default, what in (
+        ("attitude", 90.0, "largest turn of the base [deg]"),
+        ("offset", 0.5, "largest displacement of the base [m]"),
+        ("spread", 1.0, "largest displacement of a joint [rad|m]"),
+    ):
+        validity.add_argument(
+            f"--{name}",
+            metavar="X",
+            type=number,
+            default=default,
+            help=f"{what}; {default:g} by default",
+        )
+    for name, default, what in (
+        ("samples", 100, "random runs"),
+        ("seed", 0, "seed of the random runs"),
+        ("jobs", 1, "processes"),
+    ):
+        validity.add_argument(
+            f"--{name}",
+            metavar="N",
+            type=int,
+            default=default,
+            help=f"{what}; {default} by default",
+        )
+
+
+def _analyze(arguments: argparse.Namespace) -> int:
+    from fflin.eigenmodes import modes
+    from fflin.observation import observability
+    from fflin.structure import controllability
+
+    _, lin = linear_model(arguments)
+    for title, text in (
+        ("inputs", str(controllability(lin))),
+        ("momentum", _momentum(lin)),
+        ("modes", str(modes(lin))),
+        ("outputs", str(observability(lin))),
+    ):
+        print(f"{title}\n{'-' * len(title)}\n{text}\n")
+    return DONE
+
+
+def _momentum(lin: LinearModel) -> str:
+    from fflin.momentum import momentum_reduction
+    from fflin.tables import width
+
+    try:
+        reduced = momentum_reduction(lin)
+    except InputError as error:
+        text = f"no reduction: {error}"
+    else:
+        count, left = len(reduced.momenta), len(reduced.A)
+        text = "none is conserved: the inputs, springs and dampers act on all of them"
+        if count:
+            text = (
+                f"{count} momenta are conserved whatever the inputs do; without them and what "
+                f"they drive {left} states are left"
+            )
+        elif not lin.is_equilibrium():
+            text = "none can be split off: the model is one of a point that moves on"
+    return textwrap.fill(text, width())
+
+
+def _validity(arguments: argparse.Namespace) -> int:
+    from concurrent.futures import ProcessPoolExecutor
+
+    from fflin.momentum import momentum_reduction
+    from fflin.region import validity
+
+    if arguments.jobs < 1:
+        raise InputError(f"--jobs is {arguments.jobs}, expected at least 1")
+    robot, lin = linear_model(arguments)
+    lin = momentum_reduction(lin) if arguments.reduce else lin
+    gain = gain_of(lin, arguments)
+    judged = lin.discretize(arguments.dt) if arguments.dt else lin
+    measure = partial(
+        validity,
+        robot,
+        judged,
+        gain,
+        attitude=arguments.attitude,
+        position=arguments.offset,
+        joint=arguments.spread,
+        samples=arguments.samples,
+        seed=arguments.seed,
+    )
+    if arguments.jobs == 1:
+        print(measure())
+        return DONE
+    with ProcessPoolExecutor(arguments.jobs) as executor:
+        print(measure(executor=executor))
+    return DONE

@@ -1,0 +1,144 @@
+"""The command that designs a regulator."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from fflin.commands import DONE
+from fflin.commands.arguments import (
+    Commands,
+    add_output_file,
+    add_point,
+    assignment,
+    command,
+    number,
+)
+from fflin.commands.points import linear_model, once
+from fflin.errors import InputError, StabilizabilityError
+
+if TYPE_CHECKING:
+    from fflin.linear_model import LinearModel
+    from fflin.regulator import Gain
+    from fflin.validation import Array
+
+
+def add_commands(commands: Commands) -> None:
+    """Add lqr."""
+    lqr = command(
+        commands,
+        "lqr",
+        _lqr,
+        "design the linear quadratic regulator: gain, poles, residual, margins",
+        "fflin lqr ets_vii --bryson q_b=0.05 --bryson tau_m=5 -o gain.npz",
+    )
+    add_point(lqr)
+    add_weights(lqr)
+    lqr.add_argument(
+        "--reduce",
+        action="store_true",
+        help="design on the part that the inputs can hold where momentum is conserved",
+    )
+    add_output_file(lqr, "save the gain to FILE: .npz, .mat or .json")
+
+
+def add_weights(command: argparse.ArgumentParser) -> None:
+    """Add what says the cost of a regulator: --q, --r, --bryson and --dt."""
+    command.add_argument(
+        "--q",
+        metavar="NAME=W",
+        type=assignment,
+        action="append",
+        default=[],
+        help="weight on a state or a group of them, such as q_b or q_m.joint_1 (repeatable); "
+        "1 by default; without any weight the cost is on states and accelerations, 1 on each",
+    )
+    command.add_argument(
+        "--r",
+        metavar="NAME=W",
+        type=assignment,
+        action="append",
+        default=[],
+        help="weight on an input or a group of them, such as tau_b (repeatable); by default the "
+        "squares of the accelerations that a unit of it gives the coordinates, each taken alone",
+    )
+    command.add_argument(
+        "--bryson",
+        metavar="NAME=VALUE",
+        type=assignment,
+        action="append",
+        default=[],
+        help="largest acceptable value of a state, an input or a group (repeatable): its weight "
+        "is 1/VALUE^2",
+    )
+    command.add_argument(
+        "--dt",
+        metavar="H",
+        type=number,
+        help="design for inputs held over H [s]; the cost stays the continuous one",
+    )
+
+
+def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
+    """Return the regulator that the weights say.
+
+    Without any, a model of double integrators, as a driven robot at rest is, gets the cost on
+    accelerations: its poles are of the order of 1/s whatever the robot weighs.
+    """
+    from fflin.acceleration import acceleration_lqr
+    from fflin.regulator import lqr
+    from fflin.sampling import sampled_cost
+
+    if not (arguments.q or arguments.r or arguments.bryson):
+        with suppress(InputError, StabilizabilityError):
+            return acceleration_lqr(lin, 1.0, 1.0, 1.0, dt=arguments.dt)
+    Q, R = _weights(lin, arguments)
+    try:
+        if arguments.dt is None:
+            return lqr(lin, Q, R)
+        return lqr(lin.discretize(arguments.dt), *sampled_cost(lin, arguments.dt, Q, R))
+    except StabilizabilityError as error:
+        hint = " (--reduce)" if "momentum_reduction" in str(error) else ""
+        raise StabilizabilityError(f"{error}{hint}") from None
+
+
+def _weights(lin: LinearModel, arguments: argparse.Namespace) -> tuple[Array, Array]:
+    """Return the diagonals of Q and R."""
+    from fflin.weights import default_weights, named_weights
+
+    values = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
+    squares = {}
+    for name, value in values["bryson"].items():
+        if value <= 0.0:
+            raise InputError(f"--bryson {name}={value:g}: expected a positive value")
+        squares[name] = value**-2
+    known = {*lin.input_names, *(name.partition(".")[0] for name in lin.input_names)}
+    of_inputs = {name: value for name, value in squares.items() if name in known}
+    of_states = {name: value for name, value in squares.items() if name not in known}
+    both = [*(set(values["q"]) & set(of_states)), *(set(values["r"]) & set(of_inputs))]
+    if both:
+        raise InputError(f"'{both[0]}' has a weight and a largest value; give either")
+    Q, R = default_weights(lin)
+    return (
+        named_weights("state", values["q"] | of_states, lin.state_names, Q),
+        named_weights("input", values["r"] | of_inputs, lin.input_names, R),
+    )
+
+
+def _lqr(arguments: argparse.Namespace) -> int:
+    if arguments.output_file:
+        from fflin.design_files import check_design_format
+
+        check_design_format(arguments.output_file)
+    _, lin = linear_model(arguments)
+    if arguments.reduce:
+        import fflin
+
+        lin = fflin.momentum_reduction(lin)
+    gain = gain_of(lin, arguments)
+    print(gain)
+    if arguments.output_file:
+        gain.save(arguments.output_file)
+        print(f"\nwrote {arguments.output_file}")
+    return DONE

@@ -1,0 +1,159 @@
+"""The command that closes the loop around the nonlinear robot."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fflin.commands import DONE, FELL_SHORT
+from fflin.commands.arguments import (
+    Commands,
+    add_inputs_there,
+    add_output_file,
+    add_pose,
+    add_robot,
+    add_system,
+    assignment,
+    command,
+    number,
+)
+from fflin.commands.points import configuration_of, inputs_at, load_robot, once, velocity_of
+from fflin.commands.regulator import add_weights, gain_of
+from fflin.errors import InputError
+
+if TYPE_CHECKING:
+    from fflin.linear_model import LinearModel
+    from fflin.model import Robot
+    from fflin.motion import Motion
+
+
+def add_commands(commands: Commands) -> None:
+    """Add simulate."""
+    simulate = command(
+        commands,
+        "simulate",
+        _simulate,
+        "let a regulator bring the nonlinear robot from where it is put to the target",
+        "fflin simulate ets_vii --rpy 30 0 0 --duration 60 --plot loop.png -o loop.npz",
+    )
+    add_robot(simulate)
+    add_pose(simulate)
+    add_system(simulate)
+    simulate.add_argument(
+        "--target-joint",
+        metavar="NAME=VALUE",
+        type=assignment,
+        action="append",
+        default=[],
+        help="where a joint is to go [rad|m] (repeatable); the others go to neutral, the base to "
+        "the world's origin",
+    )
+    add_inputs_there(simulate)
+    add_weights(simulate)
+    simulate.add_argument(
+        "--reduce",
+        action="store_true",
+        help="control the part that the inputs can hold where momentum is conserved",
+    )
+    simulate.add_argument(
+        "--free", action="store_true", help="let it move without a regulator or any input"
+    )
+    simulate.add_argument(
+        "--duration", metavar="T", type=number, default=60.0, help="time [s]; 60 by default"
+    )
+    simulate.add_argument(
+        "--step", metavar="H", type=number, help="step of the integration [s]; chosen by default"
+    )
+    simulate.add_argument(
+        "--method",
+        default="cf4",
+        help="cf4 (default), rkmk4 or semi_implicit_euler",
+    )
+    simulate.add_argument(
+        "--limit",
+        metavar="NAME=VALUE",
+        type=assignment,
+        action="append",
+        default=[],
+        help="largest magnitude of an input or of a group of them, such as tau_m (repeatable)",
+    )
+    simulate.add_argument(
+        "--delay",
+        metavar="T",
+        type=number,
+        default=0.0,
+        help="time from a sample to its effect [s]",
+    )
+    simulate.add_argument(
+        "--plot",
+        metavar="FILE",
+        type=Path,
+        help="draw linear beside nonlinear into FILE: .png, .pdf or .svg",
+    )
+    add_output_file(simulate, "save the motion to FILE: .npz, .mat, .json or .csv")
+
+
+def _simulate(arguments: argparse.Namespace) -> int:
+    from fflin.motion import check_motion_format
+
+    if arguments.output_file:
+        check_motion_format(arguments.output_file)
+    if arguments.plot:
+        from fflin.plots import check_figure_format, require_matplotlib
+
+        check_figure_format(arguments.plot)
+        require_matplotlib()
+    _, motion = simulated(arguments)
+    from fflin.motion_reports import motion_report
+
+    print(motion_report(motion, controlled=not arguments.free))
+    if arguments.output_file:
+        motion.save(arguments.output_file)
+        print(f"wrote {arguments.output_file}")
+    if arguments.plot:
+        motion.plot(arguments.plot)
+        print(f"wrote {arguments.plot}")
+    return FELL_SHORT if motion.stopped else DONE
+
+
+def simulated(arguments: argparse.Namespace) -> tuple[Robot, Motion]:
+    """Return the robot and the motion that the arguments ask for."""
+    from fflin.simulation import simulate
+
+    robot = load_robot(arguments)
+    options: dict[str, Any] = {
+        "q0": configuration_of(robot, arguments),
+        "v0": velocity_of(robot, arguments),
+        "duration": arguments.duration,
+        "dt": arguments.step,
+        "method": arguments.method,
+        "limits": once("--limit", arguments.limit) or None,
+        "delay": arguments.delay,
+    }
+    if arguments.free:
+        weighed = arguments.q or arguments.r or arguments.bryson or arguments.dt
+        if weighed or arguments.target_joint or arguments.reduce:
+            raise InputError("--free has no regulator to give weights or a target; leave one out")
+        return robot, simulate(robot, frame=arguments.frame, **options)
+    lin = _about_target(robot, arguments)
+    gain = gain_of(lin, arguments)
+    from fflin.policies import StateFeedback
+
+    if gain.dt:
+        lin = lin.discretize(gain.dt)
+    return robot, simulate(robot, StateFeedback(lin, gain.K), **options)
+
+
+def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
+    from fflin.linearization import linearize
+    from fflin.model import configuration
+
+    q = configuration(robot, once("--target-joint", arguments.target_joint))
+    u = inputs_at(robot, q, None, arguments)
+    lin = linearize(robot, q, None, u, frame=arguments.frame)
+    if arguments.reduce:
+        from fflin.momentum import momentum_reduction
+
+        lin = momentum_reduction(lin)
+    return lin

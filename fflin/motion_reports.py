@@ -1,0 +1,66 @@
+"""What the command line shows of a motion."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fflin.tables import grid
+
+if TYPE_CHECKING:
+    from fflin.motion import Motion
+
+# Of an error relative to its largest, where a motion is taken to have settled.
+_SETTLED = 0.02
+
+# Below which an error is rounding, in SI units.
+_NOTHING = 1e-14
+
+
+def motion_report(motion: Motion, *, controlled: bool = True) -> str:
+    """Show where a motion began and ended, what it took, and the figures that prove it."""
+    end = motion.t[-1]
+    parts = [f"{motion.robot}: {end:g} s, {len(motion.t)} rows, frame {motion.frame}"]
+    if motion.stopped:
+        parts.append(f"stopped: {motion.stopped}")
+    error = np.abs(motion.error)
+    if controlled:
+        rows = [["error", "unit", "first", "largest", "last", "settled after [s]"]]
+        rows.append(["attitude", "deg", *_course(motion.attitude_error, motion.t)])
+        groups = {"r_b": "position", "q_m": "joints", "omega_b": "omega_b", "v_b": "v_b"}
+        groups["qdot_m"] = "joint rates"
+        for group, title in groups.items():
+            at = [i for i, n in enumerate(motion.state_names) if n.partition(".")[0] == group]
+            if at:
+                units = "|".join(dict.fromkeys(motion.state_units[i] for i in at))
+                rows.append([title, units, *_course(error[:, at].max(axis=1), motion.t)])
+        parts.append(grid(rows, "ll"))
+        largest = np.abs(motion.u).max(axis=0)
+        kinds: dict[tuple[str, str], float] = {}
+        for name, unit, value in zip(motion.input_names, motion.input_units, largest, strict=True):
+            key = (name.partition(".")[0], unit)
+            kinds[key] = max(kinds.get(key, 0.0), float(value))
+        shown = ", ".join(f"{name} {value:.4g} {unit}" for (name, unit), value in kinds.items())
+        parts.append(f"largest inputs: {shown}")
+    energy = motion.energy
+    parts.append(
+        f"energy {energy[0]:.6g} J at first, {energy[-1]:.6g} J at last; "
+        f"momentum drift {motion.momentum_drift.max():.1e}"
+    )
+    if motion.linear is not None:
+        apart = np.abs(motion.x - motion.linear).max()
+        parts.append(f"largest difference from the linear model: {apart:.3g}")
+    return "\n\n".join(parts[:-1]) + f"\n{parts[-1]}" if controlled else "\n".join(parts)
+
+
+def _course(error: np.ndarray, t: np.ndarray) -> list[str]:
+    largest = float(error.max())
+    outside = np.flatnonzero(error > _SETTLED * largest)
+    if largest < _NOTHING:
+        return [".", ".", ".", "."]
+    if len(outside) and outside[-1] == len(error) - 1:
+        settled = "not yet"
+    else:
+        settled = f"{t[outside[-1] + 1]:.3g}"
+    return [*(f"{value:.3g}" for value in (error[0], largest, error[-1])), settled]

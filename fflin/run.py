@@ -1,0 +1,318 @@
+"""One simulation: prepared, stepped, recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.conservation import Conserved
+from fflin.control import Channel, limits_of
+from fflin.dynamics import Disturbance, Dynamics
+from fflin.errors import ChartError, InputError
+from fflin.integrators import integrator
+from fflin.linear_loop import predict
+from fflin.linear_model import LinearModel
+from fflin.model import Robot
+from fflin.motion import Motion
+from fflin.policies import bound
+from fflin.progress import Progress
+from fflin.state import Frame, StateMap
+from fflin.validation import Array, number, vector
+
+Event = Callable[[float, Array, Array], float]
+
+# A turn within one step [rad] beyond which no integrator follows.
+_LARGEST_TURN = 1.0
+_STEP = 0.01  # [s]
+_ROWS_LIMIT = 10_000_000
+
+
+class Run:
+    """One simulation; `simulate` says what its arguments mean."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        policy: Any,
+        frame: Frame | None,
+        reference: pin.SE3 | None,
+        disturbance: Disturbance | None,
+    ) -> None:
+        lin = getattr(policy, "lin", None)
+        self.lin: LinearModel | None = lin if isinstance(lin, LinearModel) else None
+        if self.lin is not None:
+            if frame is not None or reference is not None:
+                raise InputError("frame and reference are those of the policy's model; leave out")
+            frame, reference = self.lin.frame, self.lin.reference
+        self.robot = robot
+        self.policy = policy
+        self.state = StateMap(robot, reference=reference, frame=frame or "hybrid")
+        self.dynamics = Dynamics(self.state, disturbance)
+        self.conserved = Conserved(robot)
+        self._law = None if policy is None else bound(policy, robot)
+
+    def begin(self, x0: Any, q0: Any, v0: Any) -> None:
+        """Set the initial point."""
+        robot = self.robot
+        if x0 is not None:
+            if q0 is not None or v0 is not None:
+                raise InputError("x0 is given with q0 or v0; give either")
+            self.q, self.v = self.state.to_pinocchio(x0)
+        else:
+            self.q = robot.neutral() if q0 is None else robot.checked_configuration(q0).copy()
+            self.v = np.zeros(robot.nv) if v0 is None else robot.checked_velocity(v0).copy()
+        self.target = None if self.lin is None else self._target(self.lin)
+        near = x0 if x0 is not None else self.target
+        self.x = self._read(self.q, self.v, np.zeros(self.state.nx) if near is None else near)
+
+    def clock(
+        self, duration: float, dt: float | None, every: int, sample: float | None, delay: float
+    ) -> None:
+        """Set the times."""
+        if sample is None and self.lin is not None and self.lin.dt:
+            sample = self.lin.dt
+        self.fastest = 0.0 if sample else self._fastest_pole()
+        if dt is None:
+            dt = _STEP if sample is None else min(sample, sample / np.ceil(sample / _STEP))
+            if self.fastest * dt > 1.0:
+                dt = 0.5 ** np.ceil(np.log2(self.fastest))
+        self.dt = _positive("dt", dt)
+        duration = _positive("duration", duration)
+        self.steps = max(1, round(duration / self.dt))
+        if abs(self.steps * self.dt - duration) > 1e-6 * duration:
+            self.steps = int(np.ceil(duration / self.dt))
+            self.dt = duration / self.steps
+        if not isinstance(every, int) or every < 1:
+            raise InputError(f"every is {every!r}, expected a whole number of steps, 1 or more")
+        self.every = every
+        rows = self.steps // every + 2
+        if rows * (self.robot.nq + self.robot.nv + 2 * self.state.nx) > 50 * _ROWS_LIMIT:
+            raise InputError(
+                f"{duration:g} s in steps of {self.dt:g} s are {rows} rows; take a larger `every`"
+            )
+        delayed = number("delay", delay)
+        if delayed < 0.0:
+            raise InputError(f"delay is {delayed:g} s, expected 0 or more")
+        if sample is None and delayed:
+            sample = self.dt
+        self.sample = 0 if sample is None else self._whole("sample", _positive("sample", sample))
+        self.delay = self._whole("delay", delayed)
+
+    def _whole(self, name: str, time: float) -> int:
+        steps = round(time / self.dt)
+        if abs(steps * self.dt - time) > 1e-6 * self.dt:
+            raise InputError(
+                f"{name} is {time:g} s, expected a multiple of dt = {self.dt:g} s; choose dt so"
+            )
+        return steps
+
+    def actuate(self, limits: Any) -> None:
+        """Set what becomes of a command."""
+        nu = len(self.dynamics.actuation.names)
+        self.limits = limits_of(self.dynamics.actuation, limits)
+        self.initial = np.zeros(nu) if self.lin is None else self.lin.u0
+        self.channel = None
+        if self._law is not None:
+            self.channel = Channel(
+                self._command, self.initial, *self.limits, self.sample, self.delay
+            )
+
+    def _command(self, t: float, q: Array, v: Array) -> Array:
+        assert self._law is not None
+        u = np.asarray(self._law(t, q, v), dtype=float)
+        if u.shape != self.initial.shape:
+            raise InputError(
+                f"policy(t, q, v) gave shape {u.shape} at t = {t:g} s, expected "
+                f"{self.initial.shape}: a value for each of {', '.join(self._names[:8])}"
+                + (", ..." if len(self._names) > 8 else "")
+            )
+        return u
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return self.dynamics.actuation.names
+
+    def choose(self, method: str, project: bool) -> None:
+        """Set the integrator."""
+        self.method = integrator(method)
+        self.project = bool(project)
+        if self.fastest * self.dt > self.method.reach:
+            raise InputError(
+                f"dt is {self.dt:g} s, too large for a loop whose fastest pole is at "
+                f"{self.fastest:.4g} 1/s; take at most "
+                f"{self.method.reach / self.fastest:.2g} s, or `sample`"
+            )
+
+    def _fastest_pole(self) -> float:
+        K = getattr(self.policy, "K", None)
+        if self.lin is None or K is None or self.lin.dt:
+            return 0.0
+        return float(np.abs(np.linalg.eigvals(self.lin.A - self.lin.B @ K)).max())
+
+    def guard(self, events: Sequence[Event], callback: Any) -> None:
+        """Set what ends the run and what watches it."""
+        for each in (*events, *([] if callback is None else [callback])):
+            if not callable(each):
+                raise InputError(f"{each!r} is no function of (t, q, v), as an event would be")
+        self.events, self.callback = tuple(events), callback
+
+    def go(self, progress: bool | None) -> str:
+        """Run to the end; return why it ended before."""
+        rows = self.steps // self.every + 2
+        nu = len(self.initial)
+        self.t = np.empty(rows)
+        self.rows_q, self.rows_v = np.empty((rows, self.robot.nq)), np.empty((rows, self.robot.nv))
+        self.rows_x, self.rows_u = np.empty((rows, self.state.nx)), np.empty((rows, nu))
+        self.missing = np.zeros((rows, 6))
+        self.count, self.orbital = 0, 0.0
+        self.point = self.q[:3].copy()
+        self.expected: Array = self.conserved.about(self.q, self.v, self.point)
+        bar = Progress(self.steps, progress)
+        stopped, step = "", 0
+        try:
+            for step in range(self.steps):
+                u = self._advance(step)
+                stopped = self._fault(step) or self._event(step + 1)
+                if stopped:
+                    break
+                bar.update(step + 1)
+        except KeyboardInterrupt:
+            if not self.count:
+                raise
+            stopped = f"interrupted at t = {step * self.dt:g} s"
+        finally:
+            bar.close()
+        if not stopped.startswith(("diverged", "interrupted")):
+            self._record((step + 1) * self.dt, u)
+        return stopped
+
+    def _advance(self, step: int) -> Array:
+        """Take one step; return what acted as it began."""
+        t, q, v, h = step * self.dt, self.q, self.v, self.dt
+        channel, dynamics = self.channel, self.dynamics
+        pushes: list[Array] = []
+        follow = not dynamics.isolated
+        if channel is None:
+            u = self.initial
+            plain = dynamics.free(q, v)
+        else:
+            u = channel.begin(step, t, q, v)
+
+        def f(t: float, q: Array, v: Array) -> Array:
+            acting = u
+            if channel is not None and channel.continuous:
+                acting = channel.ask(t, q, v)
+            if follow:
+                pushes.append(self.conserved.wrench(q, dynamics.push(t, q, v, acting), self.point))
+            return dynamics.acceleration(t, q, v, acting)
+
+        if step % self.every == 0:
+            self._record(t, u)
+        self.q_before = q
+        rate = plain if channel is None and not follow else f
+        self.q, self.v = self.method.step(self.robot.model, rate, t, q, v, h)
+        if follow:
+            self.expected = self.expected + h * np.dot(self.method.weights, pushes)
+        if self.project:
+            self.v = self.conserved.impose(self.q, self.v, self.expected, self.point)
+        return u
+
+    def _fault(self, step: int) -> str:
+        """Say what is wrong with the step that was taken; drop it where it has no meaning."""
+        t = (step + 1) * self.dt
+        turn = float(np.abs(self.v[3:]).max()) * self.dt
+        if not (turn < _LARGEST_TURN and np.isfinite(self.q).all()):
+            self.q, self.v = self.rows_q[self.count - 1], self.rows_v[self.count - 1]
+            if not np.isfinite(turn) or turn > 1e3:
+                return f"diverged at t = {t:g} s"
+            return f"diverged at t = {t:g} s: a joint or the base turns by {turn:.2g} rad a step"
+        before, after = (self.state.scalar(q) for q in (self.q_before, self.q))
+        if self.lin is not None and before * after < 0.0:
+            return f"left the chart at t = {t:g} s: the base turned by 180 deg from the reference"
+        return ""
+
+    def _event(self, step: int) -> str:
+        t = step * self.dt
+        for event in self.events:
+            if not float(event(t, self.q, self.v)) > 0.0:
+                return f"{getattr(event, '__name__', 'event')} at t = {t:g} s"
+        return ""
+
+    def _record(self, t: float, u: Array) -> None:
+        row = self.count
+        self.t[row] = t
+        self.rows_q[row], self.rows_v[row], self.rows_u[row] = self.q, self.v, u
+        self.x = self._read(self.q, self.v, self.x)
+        self.rows_x[row] = self.x
+        about = self.conserved.about(self.q, self.v, self.point)
+        self.missing[row] = about - self.expected
+        arm = float(np.linalg.norm(self.q[:3] - self.point))
+        self.orbital = max(self.orbital, arm * float(np.linalg.norm(self.expected[3:])))
+        self.count += 1
+        if self.callback is not None:
+            self.callback(t, self.q, self.v, u)
+
+    def _read(self, q: Array, v: Array, near: Any) -> Array:
+        try:
+            near = vector("x0", near, self.state.nx, "a state (12 + 2n)")
+            return self.state.read(q, v, near=near)
+        except ChartError:
+            # Half a turn exactly: no digit of the chart is left, and none beside it is wrong.
+            nearby = pin.integrate(self.robot.model, q, np.full(self.robot.nv, 1e-7))
+            return self.state.read(nearby, v, near=near)
+
+    def finish(self, stopped: str, linear: LinearModel | bool | None) -> Motion:
+        """Make the motion of what was recorded."""
+        rows = slice(0, self.count)
+        q, v = self.rows_q[rows], self.rows_v[rows]
+        momenta = [self.conserved.momenta(*point) for point in zip(q, v, strict=True)]
+        scale = np.max([each.scale for each in momenta], axis=0)
+        # About a fixed point the flight of the whole counts too.
+        scale[0] += self.orbital
+        parts = self.missing[rows].reshape(-1, 2, 3)
+        sizes = np.linalg.norm(parts, axis=2)
+        drift = np.divide(sizes, scale, out=np.zeros_like(sizes), where=scale > 0.0)
+        lin = self.lin if linear is None or linear is True else linear or None
+        x = self.rows_x[rows]
+        prediction: Array = np.zeros((0, self.state.nx))
+        K = getattr(self.policy, "K", None)
+        if lin is not None and K is not None and lin.state_names == self.state.names:
+            loop = (lin, K, self.limits, self.sample, self.delay)
+            prediction = predict(*loop, x[0], self.dt, self.steps, self.every)[: self.count]
+        return Motion(
+            t=self.t[rows],
+            q=q,
+            v=v,
+            x=x,
+            u=self.rows_u[rows],
+            target=x[0] if self.target is None else self.target,
+            prediction=prediction if len(prediction) == self.count else prediction[:0],
+            energy=np.array([each.energy for each in momenta]),
+            momentum=np.array([each.central for each in momenta]),
+            momentum_drift=drift.max(axis=1),
+            placement=pin.SE3ToXYZQUAT(self.state.reference),
+            state_names=self.state.names,
+            input_names=self._names,
+            state_units=self.state.units,
+            input_units=self.dynamics.actuation.units,
+            frame=self.state.frame,
+            robot=self.robot.name,
+            urdf_sha256=self.robot.urdf_sha256,
+            stopped=stopped,
+        )
+
+    def _target(self, lin: LinearModel) -> Array:
+        target = self.state.read(lin.q, lin.v)
+        indices = [self.state.names.index(name) for name in lin.state_names]
+        target[indices] = lin.x0
+        return target
+
+
+def _positive(name: str, value: Any) -> float:
+    time = number(name, value)
+    if time <= 0.0:
+        raise InputError(f"{name} is {time:g} s, expected more than 0")
+    return time

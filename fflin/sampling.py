@@ -1,0 +1,106 @@
+"""The cost of a continuous system under inputs that are held."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from fflin.errors import InputError
+from fflin.linear_model import LinearModel
+from fflin.regulator import cost_weights
+from fflin.validation import Array, number
+from fflin.weights import Weight
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+
+class SampledCost(NamedTuple):
+    """Weights of a sum over samples: ``lqr(lin.discretize(dt), *cost)``."""
+
+    Q: Array
+    R: Array
+    N: Array
+
+
+def sampled_cost(
+    lin: LinearModel, dt: float, Q: Weight, R: Weight, N: ArrayLike | None = None
+) -> SampledCost:
+    r"""Return the sum over samples that equals an integral cost under held inputs.
+
+    .. math:: \begin{bmatrix} Q_d & N_d \\ N_d^T & R_d \end{bmatrix} = \int_0^h e^{F^T t}
+              \begin{bmatrix} Q & N \\ N^T & R \end{bmatrix} e^{F t}\,dt,\qquad
+              F = \begin{bmatrix} A & B \\ 0 & 0 \end{bmatrix}
+
+    At rest F^3 = 0, and the integral is a polynomial in h, exact; elsewhere it is that of a
+    short step (van Loan), doubled.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        Continuous.
+    dt : float
+        Sampling time h [s].
+    Q, R : see `lqr`
+    N : array_like (nx, nu), optional
+
+    Returns
+    -------
+    SampledCost
+        (Q, R, N) as `lqr` takes them.
+
+    Raises
+    ------
+    InputError
+        If the model is sampled already, `dt` is not positive, or a weight is not one of `lqr`.
+
+    References
+    ----------
+    C. F. van Loan, Computing integrals involving the matrix exponential, IEEE Trans. Automatic
+    Control 23(3), 1978.
+    """
+    if not isinstance(lin, LinearModel) or lin.dt:
+        raise InputError("lin must be a continuous LinearModel; give the one before discretize")
+    h = number("dt", dt)
+    if h <= 0.0:
+        raise InputError(f"dt is {h:g} s, expected a positive sampling time")
+    Q, R, cross = cost_weights(lin, Q, R, N)
+    nx, nu = lin.B.shape
+    F = np.zeros((nx + nu, nx + nu))
+    F[:nx, :nx], F[:nx, nx:] = lin.A, lin.B
+    W = np.zeros_like(F)
+    W[:nx, :nx], W[nx:, nx:] = Q, R
+    if cross is not None:
+        W[:nx, nx:], W[nx:, :nx] = cross, cross.T
+    total = held_cost(F, W, h)
+    if not np.isfinite(total).all():
+        raise InputError(f"dt is {h:g} s, over which the model grows beyond all numbers")
+    return SampledCost(total[:nx, :nx], total[nx:, nx:], total[:nx, nx:])
+
+
+def held_cost(F: Array, W: Array, h: float) -> Array:
+    """Return the integral of e^(F' t) W e^(F t) over [0, h]."""
+    square = F @ F
+    if not (square @ F).any():
+        total = np.zeros_like(W)
+        terms = (np.eye(len(F)), F, 0.5 * square)
+        for i, left in enumerate(terms):
+            for j, right in enumerate(terms):
+                total += left.T @ W @ right * (h ** (i + j + 1) / (i + j + 1))
+        return 0.5 * (total + total.T)
+    from scipy.linalg import expm
+
+    n = len(F)
+    doublings = math.ceil(math.log2(max(2.0 * h * float(np.linalg.norm(F, 1)), 1.0)))
+    block = np.zeros((2 * n, 2 * n))
+    block[:n, :n], block[:n, n:], block[n:, n:] = -F.T, W, F
+    with np.errstate(over="ignore", invalid="ignore"):
+        exponential = expm(block * (h / 2**doublings))
+        step = exponential[n:, n:]
+        total = step.T @ exponential[:n, n:]
+        for _ in range(doublings):
+            total = total + step.T @ total @ step
+            step = step @ step
+        return 0.5 * (total + total.T)

@@ -1,0 +1,125 @@
+"""The Kalman filter and the compensator."""
+
+from dataclasses import fields
+
+import control
+import numpy as np
+import pytest
+import scipy.linalg as sl
+
+import fflin
+
+
+@pytest.fixture(scope="module")
+def lin():
+    robot = fflin.load("ets_vii")
+    return fflin.linearize(
+        robot.replace(outputs=[fflin.BasePose(), fflin.JointPositions(), fflin.Gyroscope("base")])
+    )
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_filter_solves_its_riccati_equation(lin, dt):
+    model = lin.discretize(dt) if dt else lin
+    W, V = np.diag(np.linspace(1, 2, 24)) * 1e-3, np.diag(np.linspace(1, 3, len(lin.C))) * 1e-4
+    found = fflin.kalman(model, W, V)
+    assert found.residual < 1e-14 and found.margin > 0.0
+    A, C, P = model.A, model.C, found.P
+    if dt:
+        innovation = C @ P @ C.T + V
+        step = A @ (P - P @ C.T @ np.linalg.solve(innovation, C @ P)) @ A.T + W
+        assert step == pytest.approx(P, rel=1e-9, abs=1e-12 * P.max())
+        assert found.L == pytest.approx(A @ found.L_update, abs=1e-12)
+        expected, _, _ = control.dlqe(A, np.eye(24), C, W, V)
+    else:
+        assert found.L == pytest.approx(np.linalg.solve(V, C @ P).T)
+        expected, _, _ = control.lqe(A, np.eye(24), C, W, V)
+    assert found.L == pytest.approx(expected, rel=1e-6, abs=1e-8 * np.abs(expected).max())
+    poles = np.linalg.eigvals(A - found.L @ C)
+    edge = 1.0 - np.abs(poles).max() if dt else -poles.real.max()
+    assert found.margin == pytest.approx(edge)
+
+
+def test_P_is_the_covariance_of_the_error(lin):
+    """In the steady state the error e obeys de = (A - L C) e + w - L n."""
+    found = fflin.kalman(lin, {"tau_b": 1.0, "F_b": 4.0, "tau_m": 0.1}, 1e-3, G=lin.B)
+    assert found.W == pytest.approx(lin.B @ np.diag([1] * 3 + [4] * 3 + [0.1] * 6) @ lin.B.T)
+    F = lin.A - found.L @ lin.C
+    noise = found.W + found.L @ found.V @ found.L.T
+    covariance = sl.solve_continuous_lyapunov(F, -noise)
+    assert found.P == pytest.approx(covariance, rel=1e-6, abs=1e-9 * covariance.max())
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_compensator_gives_the_poles_of_both(lin, dt):
+    model = lin.discretize(dt) if dt else lin
+    M = lin.M.diagonal()
+    gain = fflin.lqr(model, 1.0, M**-2.0)
+    # D is not zero where accelerations are watched.
+    estimator = fflin.kalman(model, 1e-2, 1e-2)
+    compensator = fflin.lqg(gain, estimator)
+    plant, feedback = model.to_control(), compensator.to_control()
+    loop = np.block([[plant.A, plant.B @ feedback.C], [feedback.B @ plant.C, feedback.A]])
+    poles = np.linalg.eigvals(loop)
+    for pole in compensator.poles:
+        assert np.abs(poles - pole).min() < 1e-6 * abs(pole - bool(dt)) + 1e-10
+    assert compensator.input_names == model.output_names
+
+
+def test_a_direct_term_is_carried():
+    # With springs an accelerometer shows the state too.
+    robot = fflin.load("ets_vii").replace(stiffness=20.0, damping=5.0)
+    robot = robot.replace(outputs=[fflin.BasePose(), fflin.JointPositions()])
+    robot = robot.replace(outputs=[*robot.outputs, fflin.Accelerometer("base")])
+    lin = fflin.linearize(robot)
+    assert lin.D.any()
+    gain = fflin.lqr(lin, 1.0, lin.M.diagonal() ** -2.0)
+    c = fflin.lqg(gain, fflin.kalman(lin, 1e-2, 1e-2))
+    # y = C x + D u with u = c.C z.
+    loop = np.block([[lin.A, lin.B @ c.C], [c.B @ lin.C, c.A + c.B @ lin.D @ c.C]])
+    poles = np.linalg.eigvals(loop)
+    for pole in c.poles:
+        assert np.abs(poles - pole).min() < 1e-6 * abs(pole)
+
+
+def test_what_is_not_seen_or_not_disturbed_is_named(lin):
+    robot = fflin.load("ets_vii")
+    joints = fflin.linearize(robot.replace(outputs=[fflin.JointPositions()]))
+    for model in (joints, joints.discretize(0.1)):
+        words = r"do not show q_b\.x, q_b\.y, q_b\.z, r_b\.x, r_b\.y, r_b\.z and their"
+        with pytest.raises(fflin.DetectabilityError, match=words):
+            fflin.kalman(model, 1, 1)
+    for words, arguments in {
+        "W does not disturb omega_b.x": ({"q_b": 1.0}, 1),
+        "V is not positive definite": (1, 0),
+        "W is not positive semidefinite": (-1, 1),
+        "no entry of W named 'tau'": ({"tau": 1.0}, 1, lin.B),
+        r"G has shape \(3,\), expected \(24, nw\)": (1, 1, np.ones(3)),
+        r"G has shape \(3, 2\), expected \(24, 2\)": (1, 1, np.ones((3, 2))),
+    }.items():
+        with pytest.raises(fflin.FflinError, match=words):
+            fflin.kalman(lin, *arguments)
+    v = fflin.velocity(robot, {"omega_b.x": 0.1})
+    with pytest.raises(fflin.EquilibriumError):
+        fflin.kalman(fflin.linearize(robot, None, v), 1, 1)
+
+
+def test_parts_of_different_models_are_refused(lin):
+    gain = fflin.lqr(lin, 1, 1)
+    with pytest.raises(fflin.InputError, match="different models"):
+        fflin.lqg(gain, fflin.kalman(lin.discretize(0.1), 1, 1))
+    with pytest.raises(fflin.InputError, match="takes a Gain"):
+        fflin.lqg(gain, gain)
+
+
+@pytest.mark.parametrize("ending", ["npz", "mat", "json"])
+def test_files_keep_every_bit(lin, tmp_path, ending):
+    estimator = fflin.kalman(lin, 1, 1)
+    for design in (estimator, fflin.lqg(fflin.lqr(lin, 1, 1), estimator)):
+        path = tmp_path / f"design.{ending}"
+        design.save(path)
+        back = type(design).load(path)
+        for item in fields(design):
+            assert np.array_equal(getattr(design, item.name), getattr(back, item.name)), item.name
+        with pytest.raises(fflin.FileError, match=f"not a Gain .*it is a {type(design).__name__}"):
+            fflin.Gain.load(path)

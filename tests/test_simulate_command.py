@@ -1,0 +1,78 @@
+"""The command simulate as a user runs it."""
+
+import numpy as np
+import pytest
+from test_cli import refused, run
+
+import fflin
+
+
+def test_a_loop_settles_is_saved_and_drawn(tmp_path):
+    pytest.importorskip("matplotlib")
+    code, out, err = run(
+        *("simulate", "ets_vii", "--rpy", 30, 0, 0, "--duration", 60),
+        *("--plot", "loop.png", "-o", "loop.npz"),
+        cwd=tmp_path,
+    )
+    assert (code, err) == (0, "")
+    assert max(map(len, out.splitlines())) <= 80
+    motion = fflin.Motion.load(tmp_path / "loop.npz")
+    assert motion.t[-1] == 60.0
+    assert motion.attitude_error[0] == pytest.approx(30.0)
+    assert motion.attitude_error[-1] < 1e-4
+    assert (tmp_path / "loop.png").stat().st_size > 50_000
+    assert out.splitlines()[-2:] == ["wrote loop.npz", "wrote loop.png"]
+
+
+def test_target_sampling_limits_and_delay(tmp_path):
+    code, _, err = run(
+        *("simulate", "ets_vii", "--target-joint", "joint_1=0.5", "--dt", 0.1),
+        *("--limit", "tau_m=8", "--delay", 0.1, "--duration", 30, "--step", 0.02),
+        *("-o", "m.json"),
+        cwd=tmp_path,
+    )
+    assert (code, err) == (0, "")
+    motion = fflin.Motion.load(tmp_path / "m.json")
+    joints = [i for i, name in enumerate(motion.input_names) if name.startswith("tau_m")]
+    assert np.abs(motion.u[:, joints]).max() == 8.0
+    assert not motion.u[:5].any()
+    assert motion.x[-1, motion.state_names.index("q_m.joint_1")] == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_free_robot_keeps_its_energy():
+    code, out, _ = run(
+        *("simulate", "planar_detumble", "--free", "--velocity", "omega_b.z=0.3"),
+        *("--duration", 2),
+    )
+    assert code == 0
+    first, last = (word for word in out.split() if word.replace(".", "").isdigit() and "." in word)
+    assert float(first) == pytest.approx(float(last), rel=1e-5)
+
+
+def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
+    err = refused("simulate", "ets_vii", "--inputs", "joints", "--duration", 1)
+    assert "base attitude and position" in err
+    assert "--reduce" in err
+    code, out, _ = run(
+        *("simulate", "ets_vii", "--inputs", "joints", "--reduce", "--joint", "joint_1=0.3"),
+        *("--duration", 20),
+    )
+    assert code == 0
+    joints = next(line for line in out.splitlines() if line.startswith("joints"))
+    assert float(joints.split()[4]) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--plot", "loop.bmp"], "ends in '.bmp'"),
+        (["-o", "loop.xyz"], "ends in '.xyz'"),
+        (["--limit", "tau_x=1"], "tau_x"),
+        (["--free", "--reduce"], "--free has no regulator"),
+        (["--step", "5"], "too large for a loop"),
+        (["--method", "rk4"], "method"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, arguments, said):
+    assert said in refused("simulate", "ets_vii", "--duration", 20, *arguments, cwd=tmp_path)
+    assert not list(tmp_path.iterdir())
