@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from fflin.state import Frame
 
 
+# Of a linear model, by the names that a batch has for them.
+_ATTRIBUTES = {"_x0": "x0", "_y0": "y0"}
+
+
 class Points(NamedTuple):
     """Points of one chunk, checked; v and u (rows, ..) or None for rest and no input."""
 
@@ -76,6 +80,8 @@ class ChunkJob:
         shapes: dict[str, tuple[int, ...]] = {"B_lower": (nx // 2, nu)}
         if not self.only_inertia:
             shapes |= {"A": (nx, nx), "f0": (nx,), "_x0": (nx,)}
+            if self.linearizer._moving:
+                shapes["_drift"] = (nx,)
             if self.linearizer._sensing is not None:
                 shapes |= {"C": (ny, nx), "D": (ny, nu), "_y0": (ny,)}
         return shapes
@@ -115,7 +121,9 @@ class ChunkJob:
                 self._inertia.loop(q, inverse, left)
         except FflinError as error:
             raise _renumbered(error, start) from None
-        if inverse is not out:
+        if inverse is not out and not actuation.carried:
+            np.matmul(inverse, actuation.columns(self.linearizer._data, q[0]), out=out)
+        elif inverse is not out:
             data = self.linearizer.robot.create_data()
             for row, point in enumerate(q):
                 # What pushes depends on no base position, and would lose digits to it.
@@ -133,7 +141,9 @@ class ChunkJob:
             except FflinError as error:
                 raise type(error)(f"configuration {start + row}: {error}") from None
             for key, array in out.items():
-                array[row] = lin.B[nv:] if key == "B_lower" else getattr(lin, key.lstrip("_"))
+                array[row] = (
+                    lin.B[nv:] if key == "B_lower" else getattr(lin, _ATTRIBUTES.get(key, key))
+                )
 
     @cached_property
     def _inertia(self) -> BatchInertia:

@@ -25,9 +25,10 @@ _TEXTS = (
     *("state_names", "input_names", "output_names"),
     *("state_units", "input_units", "output_units"),
     *("frame", "moving", "robot", "urdf_sha256", "locked", "fflin_version", "pinocchio_version"),
+    "_ignorable",
 )
 _ARRAYS = ("A", "B_lower", "C", "D", "f0", "u0", "q", "v", "_root")
-_MAYBE = ("_x0", "_y0", "_reference")
+_MAYBE = ("_x0", "_y0", "_reference", "_drift")
 
 
 def check_format(path: Path) -> None:

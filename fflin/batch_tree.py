@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.model import ROOT, Robot
+from fflin.frames import ROOT
+from fflin.model import Robot
 from fflin.validation import Array
 
 LANES = 8  # configurations that the kernel does at once

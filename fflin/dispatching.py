@@ -74,22 +74,6 @@ class OwnWorkers:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
-class _Queue:
-    """What is still to be done, how often each was begun, and where it is."""
-
-    def __init__(self, spans: Sequence[Span]) -> None:
-        self.waiting = list(reversed(spans))
-        self.attempts: dict[Span, int] = {}
-        self.running: dict[Future[Chunk | None], Span] = {}
-
-    def lost(self, span: Span) -> bool:
-        """Put a span back whose worker died; whether it may be begun again."""
-        if self.attempts[span] < _ATTEMPTS:
-            self.waiting.append(span)
-            return True
-        return False
-
-
 def dispatch(
     job: ChunkJob,
     spans: Sequence[Span],
@@ -113,105 +97,110 @@ def dispatch(
     Done
         Each span once.
     """
-    parcel = packed(job)
-    ahead = _QUEUED * (workers.count if isinstance(workers, OwnWorkers) else _count(workers))
-    queue = _Queue(spans)
+    work_place = _WorkPlace(packed(job), spans, points, workers)
     try:
-        yield from _until_empty(queue, parcel, points, workers, ahead)
+        while work_place.waiting or work_place.running:
+            work_place.begin()
+            yield from work_place.finished()
+            if work_place.broken is not None:
+                yield from work_place.recovered()
     finally:
-        for future in queue.running:
+        for future in work_place.running:
             future.cancel()
 
 
-def _until_empty(
-    queue: _Queue,
-    parcel: Parcel,
-    points: Callable[[Span], Points],
-    workers: Executor | OwnWorkers,
-    ahead: int,
-) -> Iterator[Done]:
-    own = workers if isinstance(workers, OwnWorkers) else None
-    known = cautious = False
-    while queue.waiting or queue.running:
-        executor = workers.executor if isinstance(workers, OwnWorkers) else workers
-        broken = None
-        # Which of the running chunks killed a worker is not told: go on one at a time.
-        room = 1 if cautious else ahead
-        while queue.waiting and len(queue.running) < room and broken is None:
-            span = queue.waiting.pop()
-            sent = Parcel(parcel.key, None if known else parcel.content)
-            broken = _submit(executor, queue, span, sent, points)
-        finished = ()
-        if queue.running:
-            finished = wait(queue.running, return_when=FIRST_COMPLETED).done
-        for future in finished:
-            span = queue.running.pop(future)
+class _WorkPlace:
+    """The chunks that wait and those that run, how often each was begun, and the workers."""
+
+    def __init__(
+        self,
+        parcel: Parcel,
+        spans: Sequence[Span],
+        points: Callable[[Span], Points],
+        workers: Executor | OwnWorkers,
+    ) -> None:
+        self.waiting = list(reversed(spans))
+        self.running: dict[Future[Chunk | None], Span] = {}
+        self.broken: BaseException | None = None
+        self._attempts: dict[Span, int] = {}
+        self._parcel, self._points, self._workers = parcel, points, workers
+        count = workers.count if isinstance(workers, OwnWorkers) else _count(workers)
+        self._ahead = _QUEUED * count
+        self._known = self._cautious = False
+
+    def begin(self) -> None:
+        """Give the workers what they have room for."""
+        # Which of the running chunks killed a worker is not told: then one at a time, until all
+        # that ran beside it are done.
+        self._cautious &= any(span in self._attempts for span in self.waiting)
+        room = 1 if self._cautious else self._ahead
+        while self.waiting and len(self.running) < room and self.broken is None:
+            self._submit(self.waiting.pop(), None if self._known else self._parcel.content)
+
+    def finished(self) -> Iterator[Done]:
+        """Wait for a chunk and yield what is finished."""
+        if not self.running:
+            return
+        for future in wait(self.running, return_when=FIRST_COMPLETED).done:
+            span = self.running.pop(future)
             try:
                 chunk = future.result()
             except FflinError as error:
                 yield Done(span, None, str(error))
             except (BrokenExecutor, CancelledError) as error:
-                broken = broken or error
-                if not queue.lost(span):
-                    yield Done(span, None, "its worker died each time")
+                self.broken = self.broken or error
+                yield from self._lost(span, "its worker died each time")
             except Exception as error:
                 # Of the executor's own, such as a scheduler that gave up on a worker.
-                if not queue.lost(span):
-                    yield Done(span, None, f"{type(error).__name__}: {error}")
+                yield from self._lost(span, f"{type(error).__name__}: {error}")
             else:
                 if chunk is None:
-                    queue.attempts[span] -= 1
-                    sent = Parcel(parcel.key, parcel.content)
-                    broken = _submit(executor, queue, span, sent, points) or broken
-                    continue
-                known = True
-                yield Done(span, chunk, "")
-        cautious = cautious and any(span in queue.attempts for span in queue.waiting)
-        if broken is not None and own is None:
-            yield from _abandoned(queue, broken)
+                    self._attempts[span] -= 1
+                    self._submit(span, self._parcel.content)
+                else:
+                    self._known = True
+                    yield Done(span, chunk, "")
+
+    def recovered(self) -> Iterator[Done]:
+        """Replace our own workers that died; of a caller's executor yield what is lost."""
+        error, self.broken = self.broken, None
+        running, self.running = self.running, {}
+        if isinstance(self._workers, OwnWorkers):
+            for span in running.values():
+                yield from self._lost(span, "its worker died each time")
+            self._workers.replace()
+            self._known, self._cautious = False, True
             return
-        if broken is not None and own is not None:
-            for future, span in list(queue.running.items()):
-                if not queue.lost(span):
-                    yield Done(span, None, "its worker died each time")
-                del queue.running[future]
-            own.replace()
-            known, cautious = False, True
-
-
-def _submit(
-    executor: Executor,
-    queue: _Queue,
-    span: Span,
-    parcel: Parcel,
-    points: Callable[[Span], Points],
-) -> BaseException | None:
-    """Begin a chunk, or put it back and return what the executor died of."""
-    try:
-        future = executor.submit(work, parcel, points(span), span.start)
-    except (BrokenExecutor, CancelledError) as error:
-        queue.waiting.append(span)
-        return error
-    except RuntimeError as error:  # shut down
-        queue.waiting.append(span)
-        return error
-    queue.attempts[span] = queue.attempts.get(span, 0) + 1
-    queue.running[future] = span
-    return None
-
-
-def _abandoned(queue: _Queue, error: BaseException) -> Iterator[Done]:
-    """Give up what an executor of the caller's had not finished when it died."""
-    reason = f"the executor died: {type(error).__name__}: {error}".rstrip(": ")
-    for future, span in queue.running.items():
-        # Some are finished and not lost with it.
-        if future.done() and not future.cancelled() and future.exception() is None:
-            chunk = future.result()
+        reason = f"the executor died: {type(error).__name__}: {error}".rstrip(": ")
+        for future, span in running.items():
+            # Some are finished and not lost with it.
+            good = future.done() and not future.cancelled() and future.exception() is None
+            chunk = future.result() if good else None
             yield Done(span, chunk, "" if chunk is not None else reason)
+        waiting, self.waiting = self.waiting, []
+        for span in reversed(waiting):
+            yield Done(span, None, reason)
+
+    def _submit(self, span: Span, content: bytes | None) -> None:
+        """Begin a chunk, or put it back where the executor is dead."""
+        workers = self._workers
+        executor = workers.executor if isinstance(workers, OwnWorkers) else workers
+        parcel = Parcel(self._parcel.key, content)
+        try:
+            future = executor.submit(work, parcel, self._points(span), span.start)
+        except (RuntimeError, CancelledError) as error:  # broken or shut down
+            self.waiting.append(span)
+            self.broken = error
+        else:
+            self._attempts[span] = self._attempts.get(span, 0) + 1
+            self.running[future] = span
+
+    def _lost(self, span: Span, reason: str) -> Iterator[Done]:
+        """Put a chunk back whose worker died, or give it up."""
+        if self._attempts[span] < _ATTEMPTS:
+            self.waiting.append(span)
         else:
             yield Done(span, None, reason)
-    for span in reversed(queue.waiting):
-        yield Done(span, None, reason)
 
 
 def _count(executor: Executor) -> int:

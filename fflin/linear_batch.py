@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, overload
 import numpy as np
 
 from fflin.errors import InputError
+from fflin.joint_columns import away, positions
 from fflin.linear_model import LinearModel
 from fflin.validation import Array, number
 
@@ -83,6 +84,8 @@ class LinearBatch:
     # None where it is the base's own at each point; the free-flyer joint stands at the root.
     _reference: Array | None
     _root: Array
+    _drift: Array | None
+    _ignorable: tuple[str, ...]
     _columns: tuple[tuple[int, int], ...]
     _system: Robot | None
 
@@ -161,7 +164,7 @@ class LinearBatch:
     @property
     def joint_positions(self) -> Array:
         """Angles, in (-pi, pi] of continuous joints, and lengths (N, n) of the joints."""
-        return self._positions(slice(None))
+        return positions(self.q, self._columns)
 
     def nearest(self, joints: Mapping[str, float]) -> LinearModel:
         """Return the model whose joints are nearest to the values [rad|m], the others left out.
@@ -175,7 +178,8 @@ class LinearBatch:
         """
         distance = np.zeros(len(self))
         for index, value in self._named(joints).items():
-            distance += self._away(index, number(f"joint '{self.joint_names[index]}'", value)) ** 2
+            target = number(f"joint '{self.joint_names[index]}'", value)
+            distance += away(self.q, self._columns[index], target) ** 2
         return self[int(distance.argmin())]
 
     def select(self, joints: Mapping[str, float | tuple[float, float]]) -> LinearBatch:
@@ -195,10 +199,10 @@ class LinearBatch:
                 if len(value) != 2:
                     raise InputError(f"{what} is {value!r}, expected a value or (low, high)")
                 low, high = (number(what, end) for end in value)
-                at = self._positions(slice(None), index)[:, 0]
+                at = positions(self.q, self._columns[index : index + 1])[:, 0]
                 mask &= (at >= low - _SAME) & (at <= high + _SAME)
             else:
-                mask &= self._away(index, number(what, value)) <= _SAME
+                mask &= away(self.q, self._columns[index], number(what, value)) <= _SAME
         if not mask.any():
             raise InputError(f"no point of the batch has {dict(joints)}; `nearest` finds the next")
         return self[mask]
@@ -281,31 +285,16 @@ class LinearBatch:
             rows
             | names
             | {"B": B, "x0": x0, "y0": x0 if y0 is None else y0, "dt": 0.0}
-            | {"_inertia": inertia, "_certify": certify}
+            | {"_inertia": inertia, "_certify": certify, "_drift": rows.get("_drift")}
+            | {"_ignorable": partial(_given, self._ignorable)}
         )
 
     def _rest_states(self, rows: slice) -> Array:
-        positions = self._positions(rows)
-        x0 = np.zeros((len(positions), len(self.state_names)))
-        x0[:, 6 : 6 + positions.shape[1]] = positions
+        q_m = positions(self.q[rows], self._columns)
+        x0 = np.zeros((len(q_m), len(self.state_names)))
+        x0[:, 6 : 6 + q_m.shape[1]] = q_m
         x0.setflags(write=False)
         return x0
-
-    def _positions(self, rows: slice, joint: int | None = None) -> Array:
-        q = self.q[rows]
-        chosen = self._columns if joint is None else self._columns[joint : joint + 1]
-        columns = [
-            np.arctan2(q[:, second], q[:, first]) if second >= 0 else q[:, first]
-            for first, second in chosen
-        ]
-        return np.column_stack(columns) if columns else np.empty((len(q), 0))
-
-    def _away(self, joint: int, value: float) -> Array:
-        """Return how far a joint is from a value, (N,), the short way round where it turns."""
-        away = self._positions(slice(None), joint)[:, 0] - value
-        if self._columns[joint][1] >= 0:
-            away -= 2.0 * np.pi * np.round(away / (2.0 * np.pi))
-        return np.abs(away)
 
     def _named(self, joints: Mapping[str, Any]) -> dict[int, Any]:
         from fflin.errors import unknown
@@ -323,13 +312,6 @@ def is_constant(array: Array) -> bool:
     return array.strides[0] == 0
 
 
-def joint_columns(robot: Robot) -> tuple[tuple[int, int], ...]:
-    """Return where each joint stands in q: (index, -1), or those of (cos, sin)."""
-    return tuple(
-        (joint.idx_q, joint.idx_q + 1 if joint.unbounded else -1) for joint in robot.joints
-    )
-
-
 def _carried(root: Array, base: Array) -> Array:
     """Return the placement (7,) of a base that is placed relative to the root."""
     import pinocchio as pin
@@ -344,6 +326,10 @@ def _carried(root: Array, base: Array) -> Array:
 def _row(array: Array, index: int) -> Array:
     # A row of a file is read here; a plain array's keeps no file open.
     return np.asarray(array[index])
+
+
+def _given(value: Any, _: LinearModel) -> Any:
+    return value
 
 
 def _no_robot(what: str, name: str, _: LinearModel) -> NoReturn:

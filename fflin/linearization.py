@@ -111,6 +111,7 @@ class Linearizer:
             self._sensing is None
             and not self._moving
             and not any(robot.gravity)
+            and not robot.stored_momentum
             and not any(values.any() for values in robot.passive)
         )
         self._plain = self._free and self._actuation.default

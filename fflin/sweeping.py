@@ -7,30 +7,26 @@ import logging
 import math
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import replace
-from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
-from fflin import __version__
-from fflin.batch_chunks import ChunkJob, Points
+from fflin.batch_chunks import ChunkJob
 from fflin.batch_files import check_format, header, load_batch
 from fflin.batch_inertia import available_threads
-from fflin.batch_rows import checked_configurations, checked_inputs, checked_velocities
 from fflin.batch_store import FileStore, MemoryStore
 from fflin.configurations import Configurations, GivenConfigurations
 from fflin.dispatching import Done, OwnWorkers, Span, dispatch
 from fflin.errors import FflinError, FflinWarning, FileError, InputError, SweepError, listed
 from fflin.files import as_path
-from fflin.linear_batch import LinearBatch, joint_columns
-from fflin.model import ROOT, Robot
-from fflin.validation import Array
+from fflin.linear_batch import LinearBatch
+from fflin.model import Robot
+from fflin.sweep_task import SweepTask
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -131,7 +127,7 @@ def sweep(
     job = ChunkJob(
         robot, frame=frame, reference=reference, moving=moving, at_rest=v is None and u is None
     )
-    task = _Task(job, q, v, u)
+    task = SweepTask(job, q, v, u)
     parallel = executor is not None or workers is not None
     threads = threads or available_threads()
     size = chunk or _chunk_size(task, _SHARES if parallel else 4 * threads)
@@ -156,106 +152,7 @@ def sweep(
             own.close()
 
 
-class _Task:
-    """A sweep's points, and what of its result is the same at all of them."""
-
-    def __init__(self, job: ChunkJob, q: Any, v: Any, u: Any) -> None:
-        self.job, self.robot = job, job.linearizer.robot
-        if hasattr(q, "rows") and hasattr(q, "fingerprint"):
-            if getattr(q, "robot", self.robot) is not self.robot:
-                q = _of_this_robot(q, self.robot)
-            self.configurations: Configurations = q
-        else:
-            self.configurations = GivenConfigurations(checked_configurations(self.robot, q))
-        self.count = len(self.configurations)
-        names = job.linearizer._actuation.names
-        self.v = None if v is None else checked_velocities(self.robot, v, self.count)
-        self.u = None if u is None else checked_inputs(names, u, self.count)
-
-    def points(self, span: Span) -> Points:
-        """Return the points of a span."""
-        v, u = (None if rows is None else rows[slice(*span)] for rows in (self.v, self.u))
-        return Points(self.configurations.rows(*span), v, u)
-
-    def varying(self) -> dict[str, Array]:
-        """Return the arrays of points that differ from point to point and are there already."""
-        rows = {"v": self.v, "u0": self.u}
-        if isinstance(self.configurations, GivenConfigurations):
-            rows["q"] = self.configurations.q
-        return {key: x for key, x in rows.items() if x is not None and x.strides[0] != 0}
-
-    def constants(self, varying: Iterable[str]) -> dict[str, Array]:
-        """Return what is the same at all points, a row of each."""
-        linearizer = self.job.linearizer
-        common, root = linearizer._common, self.robot.model.jointPlacements[ROOT]
-        rows: dict[str, Array] = {
-            "A": linearizer._A_rest,
-            "C": common["C"],
-            "D": common["D"],
-            "f0": linearizer._zero_x,
-            "u0": linearizer._zero_u if self.u is None else self.u[0],
-            "v": linearizer._zero_v if self.v is None else self.v[0],
-            "_root": _NOWHERE if root.isIdentity(0.0) else pin.SE3ToXYZQUAT(root),
-        }
-        if not linearizer._own_reference:
-            rows["_reference"] = linearizer._reference
-        return {key: value for key, value in rows.items() if key not in varying}
-
-    def batch(self, arrays: Mapping[str, Array]) -> LinearBatch:
-        """Put a batch together of what differs from point to point."""
-        count = len(arrays["q"])
-        rows = {
-            key: np.broadcast_to(value, (count, *value.shape))
-            for key, value in self.constants(arrays).items()
-        }
-        common = self.job.linearizer._common
-        return LinearBatch(
-            **{"_x0": None, "_y0": None, "_reference": None, **rows, **arrays},
-            **{key: common[key] for key in common if key not in _OF_MODELS},
-            _columns=joint_columns(self.robot),
-            _system=self.robot,
-        )
-
-    @property
-    def request(self) -> str:
-        """Hash of all that the result depends on."""
-        robot, linearizer = self.robot, self.job.linearizer
-        model = robot.model
-        digest = sha256(
-            repr(
-                (robot.name, robot.urdf_sha256, robot.locked, robot.joints, robot.followers)
-                + tuple(getattr(robot, key) for key in ("inputs", "outputs", "gravity"))
-                + tuple(dict(getattr(robot, key)) for key in ("stiffness", "damping", "rest"))
-                + (linearizer._map.frame, linearizer._moving, linearizer._own_reference)
-                + (self.job.only_inertia, __version__, pin.__version__)
-            ).encode()
-        )
-        for inertia, placement in zip(model.inertias, model.jointPlacements, strict=True):
-            digest.update(inertia.toDynamicParameters().tobytes())
-            digest.update(placement.homogeneous.tobytes())
-        digest.update(linearizer._reference.tobytes())
-        digest.update(f"{self.count} {self.configurations.fingerprint}".encode())
-        for rows in (self.v, self.u):
-            digest.update(b"none" if rows is None else np.ascontiguousarray(rows))
-        return digest.hexdigest()
-
-
-# Fields of a linear model that a batch has as arrays, or not at all.
-_OF_MODELS = ("C", "D", "dt", "_inertia", "_certify")
-_NOWHERE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-
-
-def _of_this_robot(configurations: Any, robot: Robot) -> Any:
-    """Return a grid or random configurations of the same robot with other inputs or outputs."""
-    if configurations.robot.joints != robot.joints:
-        raise InputError(
-            f"q is of '{configurations.robot.name}', whose joints are others than those of "
-            f"'{robot.name}'"
-        )
-    return replace(configurations, robot=robot)
-
-
-def _chunk_size(task: _Task, shares: int) -> int:
+def _chunk_size(task: SweepTask, shares: int) -> int:
     row = 8 * (task.robot.nq + sum(math.prod(shape) for shape in task.job.shapes.values()))
     size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * task.count // shares)) // row
     size = min(max(size, _LEAST_CHUNK), _LARGEST_CHUNK)
@@ -270,7 +167,7 @@ def _path(out: str | Path) -> Path:
     return path
 
 
-def _store(task: _Task, path: Path | None, size: int) -> FileStore | MemoryStore:
+def _store(task: SweepTask, path: Path | None, size: int) -> FileStore | MemoryStore:
     shapes = dict(task.job.shapes)
     if path is None or (path.suffix == ".npz" and find_spec("h5py") is None):
         if not isinstance(task.configurations, GivenConfigurations):
@@ -285,7 +182,7 @@ def _store(task: _Task, path: Path | None, size: int) -> FileStore | MemoryStore
 
 
 def _here(
-    task: _Task, spans: Sequence[Span], store: FileStore | MemoryStore, threads: int
+    task: SweepTask, spans: Sequence[Span], store: FileStore | MemoryStore, threads: int
 ) -> Iterator[Done]:
     """Do chunks in this process, several at a time where the kernel does them."""
 
@@ -312,7 +209,7 @@ def _here(
 
 
 def _collect(
-    task: _Task,
+    task: SweepTask,
     done: Iterable[Done],
     store: FileStore | MemoryStore,
     count: int,
@@ -344,7 +241,7 @@ def _collect(
 
 
 def _failure(
-    task: _Task, store: FileStore | MemoryStore, failed: list[Done], chunks: int
+    task: SweepTask, store: FileStore | MemoryStore, failed: list[Done], chunks: int
 ) -> SweepError:
     spans = listed(f"{start} to {stop - 1}" for (start, stop), *_ in failed)
     verb = "has" if len(failed) == 1 else "have"
@@ -364,7 +261,7 @@ def _failure(
     return SweepError(said, tuple((*span, reason) for span, _, reason in failed), batch)
 
 
-def _finish(task: _Task, store: FileStore | MemoryStore, path: Path | None) -> LinearBatch:
+def _finish(task: SweepTask, store: FileStore | MemoryStore, path: Path | None) -> LinearBatch:
     if isinstance(store, MemoryStore):
         batch = task.batch(task.varying() | store.arrays)
         if path is not None:

@@ -38,7 +38,7 @@ def test_a_batch_that_is_saved_is_read_back_to_the_last_bit(ending, moving, robo
     assert_same(part[1], batch[4])
     alone = fflin.LinearBatch.load(tmp_path / f"b{ending}")
     assert_same(alone[3], batch[3])
-    with pytest.raises(fflin.InputError, match="load the batch with LinearBatch.load"):
+    with pytest.raises(fflin.InputError, match=r"load the batch with LinearBatch\.load"):
         _ = alone[3].certificate
     with pytest.raises(fflin.InputError, match="'cubesat' is not the robot"):
         fflin.LinearBatch.load(tmp_path / f"b{ending}", fflin.load("cubesat"))

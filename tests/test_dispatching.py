@@ -163,7 +163,7 @@ def test_an_executor_that_is_shut_down_is_one_line(robot):
     executor = ThreadPoolExecutor(1)
     executor.shutdown()
     q, _, _ = points(robot, 8)
-    with pytest.raises(fflin.SweepError, match="the executor died: .*shutdown"):
+    with pytest.raises(fflin.SweepError, match=r"the executor died: .*shutdown"):
         fflin.sweep(robot, q, executor=executor)
 
 

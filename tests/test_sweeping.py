@@ -69,9 +69,11 @@ def equipped(robot):
     yield robot.replace(outputs=[fflin.FramePose("tool"), fflin.Accelerometer("base")])
     yield robot.replace(stiffness=3.0, damping=0.1)
     yield robot.replace(gravity=(0.0, 0.0, -9.81))
+    yield robot.replace(inputs=[fflin.ReactionWheel((0.0, 0.0, 1.0), momentum=2.0)])
+    yield robot.replace(inputs=[fflin.ReactionWheel((0.0, 1.0, 0.0), frame="tool")])
 
 
-@pytest.mark.parametrize("case", range(5))
+@pytest.mark.parametrize("case", range(7))
 def test_inputs_outputs_springs_and_gravity(case, robots):
     robot = list(equipped(robots["servicer_7dof"]))[case]
     q, _, _ = points(robots["servicer_7dof"], 9)
@@ -80,6 +82,18 @@ def test_inputs_outputs_springs_and_gravity(case, robots):
         assert_same(batch[index], fflin.linearize(robot, point), 1e-11)
     moving = fflin.sweep(robot, q, moving=True)
     assert_same(moving[4], fflin.linearize(robot, q[4], moving=True))
+
+
+def test_wheels_with_an_inertia_are_joints(robots):
+    wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), inertia=0.1)
+    robot = robots["ets_vii"].replace(inputs=[fflin.BaseTorque(), wheel])
+    batch = fflin.sweep(robot, fflin.random_configurations(robot, 20, seed=1))
+    for lin in batch:
+        assert_same(lin, fflin.linearize(robot, lin.q), 1e-11)
+    moving = fflin.sweep(robot, batch.q, fflin.velocity(robot, {robot.joint_names[-1]: 50.0}))
+    lin = fflin.linearize(robot, batch.q[3], moving.v[3])
+    assert moving[3].ignorable == lin.ignorable and f"q_m.{robot.joint_names[-1]}" in lin.ignorable
+    assert moving[3].is_equilibrium() == lin.is_equilibrium()
 
 
 def test_root_that_stands_elsewhere(robots):
