@@ -91,12 +91,15 @@ class RandomConfigurations:
     count, seed : int
     ranges : mapping
         {joint: (low, high) [rad|m]}.
+    start : ndarray (nq,)
+        What the base is at.
     """
 
     robot: Robot
     count: int
     seed: int
     ranges: Mapping[str, tuple[float, float]]
+    start: Array
 
     def __len__(self) -> int:
         return self.count
@@ -111,12 +114,13 @@ class RandomConfigurations:
             blocks.append(drawn[max(start - first, 0) : stop - first])
         drawn = np.concatenate(blocks) if blocks else np.empty((0, len(low)))
         values = dict(zip(self.ranges, drawn.T, strict=True))
-        return _placed(self.robot, self.robot.neutral(), stop - start, values)
+        return _placed(self.robot, self.start, stop - start, values)
 
     @cached_property
     def fingerprint(self) -> str:
         """Hash of all rows."""
-        return sha256(f"{self.count} {self.seed} {dict(self.ranges)!r}".encode()).hexdigest()
+        drawn = f"{self.count} {self.seed} {dict(self.ranges)!r}"
+        return sha256(drawn.encode() + self.start.tobytes()).hexdigest()
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +205,7 @@ def random_configurations(
     *,
     seed: int = 0,
     ranges: Mapping[str, tuple[float, float]] | None = None,
+    base: pin.SE3 | None = None,
 ) -> RandomConfigurations:
     """Draw configurations evenly from the joints' limits.
 
@@ -214,6 +219,8 @@ def random_configurations(
     ranges : mapping, optional
         {joint: (low, high) [rad|m]} in place of its limits. What turns without limits is drawn
         from one turn.
+    base : pin.SE3, optional
+        Placement of the base; the identity by default.
 
     Returns
     -------
@@ -235,7 +242,9 @@ def random_configurations(
     for name in given:
         robot.joint(name)
     checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
-    return RandomConfigurations(robot, int(count), int(seed), checked)
+    start = configuration(robot, base=base)
+    start.setflags(write=False)
+    return RandomConfigurations(robot, int(count), int(seed), checked, start)
 
 
 def _range(robot: Robot, joint: Joint, given: Any) -> tuple[float, float]:

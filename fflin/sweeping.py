@@ -152,8 +152,25 @@ def sweep(
             own.close()
 
 
+def planned_bytes(
+    robot: Robot,
+    count: int,
+    *,
+    at_rest: bool,
+    frame: Frame | None = None,
+    reference: pin.SE3 | None = None,
+) -> int:
+    """Return how large the result of a sweep over so many points is [bytes]."""
+    job = ChunkJob(robot, frame=frame, reference=reference, moving=False, at_rest=at_rest)
+    return count * _row_bytes(job)
+
+
+def _row_bytes(job: ChunkJob) -> int:
+    return 8 * (job.linearizer.robot.nq + sum(map(math.prod, job.shapes.values())))
+
+
 def _chunk_size(task: SweepTask, shares: int) -> int:
-    row = 8 * (task.robot.nq + sum(math.prod(shape) for shape in task.job.shapes.values()))
+    row = _row_bytes(task.job)
     size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * task.count // shares)) // row
     size = min(max(size, _LEAST_CHUNK), _LARGEST_CHUNK)
     return size - size % _LEAST_CHUNK
