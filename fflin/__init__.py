@@ -30,6 +30,7 @@ _PUBLIC = {
     "FrameVelocity": "outputs",
     "FullState": "outputs",
     "Gain": "regulator",
+    "GainBatch": "gain_batches",
     "GainSchedule": "schedules",
     "Gramians": "gramian",
     "Grid": "configurations",
@@ -53,6 +54,7 @@ _PUBLIC = {
     "ReactionWheel": "inputs",
     "ReducedModel": "momentum",
     "Robot": "model",
+    "ScheduledFeedback": "gain_batches",
     "SingularInertiaError": "errors",
     "StabilizabilityError": "errors",
     "StateFeedback": "policies",
@@ -83,6 +85,7 @@ _PUBLIC = {
     "load_inputs": "input_files",
     "lqg": "estimation",
     "lqr": "regulator",
+    "lqr_batch": "gain_batches",
     "modes": "eigenmodes",
     "momentum_reduction": "momentum",
     "observability": "observation",
@@ -122,6 +125,7 @@ if TYPE_CHECKING:
         UrdfError,
     )
     from fflin.estimation import Compensator, Estimator, kalman, lqg
+    from fflin.gain_batches import GainBatch, ScheduledFeedback, lqr_batch
     from fflin.gramian import Gramians, gramians
     from fflin.input_files import load_inputs
     from fflin.inputs import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
