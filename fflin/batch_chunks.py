@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.batch_inertia import BatchInertia
+from fflin.batch_inertia import BatchInertia, pays
 from fflin.errors import FflinError, FflinWarning
 from fflin.linearization import Linearizer
 from fflin.model import Robot
@@ -53,6 +53,8 @@ class ChunkJob:
         As `Linearizer` takes them.
     at_rest : bool
         Whether all points have neither velocity nor input.
+    count : int
+        Points of all chunks.
     """
 
     def __init__(
@@ -63,8 +65,10 @@ class ChunkJob:
         reference: pin.SE3 | None,
         moving: bool,
         at_rest: bool,
+        count: int,
     ) -> None:
-        self._arguments = (robot, frame, reference, moving, at_rest)
+        self._arguments = (robot, frame, reference, moving, at_rest, count)
+        self._count = count
         self.linearizer = Linearizer(robot, frame=frame, reference=reference, moving=moving)
         # There all but M^-1 is known beforehand.
         self.only_inertia = at_rest and reference is None and self.linearizer._free
@@ -115,12 +119,16 @@ class ChunkJob:
         inverse = out
         if not actuation.default:
             inverse = np.empty((len(q), state.nx // 2, state.nx // 2))
-        left = self._inertia.compiled(q, inverse)
+        # Without joints M is the same everywhere.
+        rigid = not self.linearizer.robot.n
+        left = np.arange(1) if rigid else self._inertia.compiled(q, inverse)
         try:
             with _caught() as notes:
                 self._inertia.loop(q, inverse, left)
         except FflinError as error:
             raise _renumbered(error, start) from None
+        if rigid:
+            inverse[1:] = inverse[0]
         if inverse is not out and not actuation.carried:
             np.matmul(inverse, actuation.columns(self.linearizer._data, q[0]), out=out)
         elif inverse is not out:
@@ -147,7 +155,7 @@ class ChunkJob:
 
     @cached_property
     def _inertia(self) -> BatchInertia:
-        return BatchInertia(self.linearizer.robot)
+        return BatchInertia(self.linearizer.robot, compiled=pays(self._count))
 
 
 # Python's filters of warnings are the whole process's, so that threads take turns.
@@ -168,9 +176,16 @@ def _renumbered(error: FflinError, start: int) -> FflinError:
 
 
 def _rebuilt(
-    robot: Robot, frame: Frame | None, reference: pin.SE3 | None, moving: bool, at_rest: bool
+    robot: Robot,
+    frame: Frame | None,
+    reference: pin.SE3 | None,
+    moving: bool,
+    at_rest: bool,
+    count: int,
 ) -> ChunkJob:
-    return ChunkJob(robot, frame=frame, reference=reference, moving=moving, at_rest=at_rest)
+    return ChunkJob(
+        robot, frame=frame, reference=reference, moving=moving, at_rest=at_rest, count=count
+    )
 
 
 class Parcel(NamedTuple):

@@ -59,6 +59,7 @@ def hdf5() -> Any:
 def header(batch: LinearBatch) -> str:
     """Return what of a batch is text, as JSON."""
     record = {key: getattr(batch, key) for key in _TEXTS}
+    record["_ignorable"] = batch[0].ignorable
     return json.dumps({**record, "points": len(batch), "columns": batch._columns})
 
 

@@ -34,16 +34,15 @@ class BatchInertia:
     Parameters
     ----------
     robot : Robot
-    compiled : bool, optional
-        Whether to take the compiled kernel; by default where numba is installed and it pays.
+    compiled : bool
+        Whether to take the compiled kernel, where the robot's joints allow it; see `pays`.
     """
 
-    def __init__(self, robot: Robot, *, compiled: bool | None = None) -> None:
+    def __init__(self, robot: Robot, *, compiled: bool) -> None:
         self._robot = robot
         self._state = StateMap(robot)
         self._inertia = Inertia(self._state, robot.create_data())
-        self._compiled = compiled
-        self._tree = batch_tree(robot) if compiled or _has_numba() else None
+        self._tree = batch_tree(robot) if compiled else None
 
     def invert(self, q: Array, out: Array) -> None:
         """Write M^-1 (6 + n, 6 + n) in base axes at each of the configurations.
@@ -68,7 +67,7 @@ class BatchInertia:
         Left are those where M is singular or nearly so, which the loop refuses or warns of, and
         those that are turned beyond all sense.
         """
-        if self._tree is None or not self._is_compiled(len(q)):
+        if self._tree is None:
             return np.arange(len(q))
         if len(q) < LANES:
             filled = np.pad(q, ((0, LANES - len(q)), (0, 0)), mode="edge")
@@ -95,11 +94,6 @@ class BatchInertia:
             except SingularInertiaError as error:
                 raise SingularInertiaError(f"configuration {row}: {error}") from None
 
-    def _is_compiled(self, count: int) -> bool:
-        if self._compiled is not None:
-            return self._compiled
-        return count >= (_BREAK_EVEN if "numba" in sys.modules else _BREAK_EVEN_UNLOADED)
-
 
 def available_threads() -> int:
     """How many cores this process may use."""
@@ -108,8 +102,11 @@ def available_threads() -> int:
     return os.cpu_count() or 1
 
 
-def _has_numba() -> bool:
-    return "numba" in sys.modules or find_spec("numba") is not None
+def pays(count: int) -> bool:
+    """Whether the kernel is there and beats the loop over so many points."""
+    if "numba" in sys.modules:
+        return count >= _BREAK_EVEN
+    return count >= _BREAK_EVEN_UNLOADED and find_spec("numba") is not None
 
 
 def _kernel() -> Any:

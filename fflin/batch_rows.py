@@ -12,7 +12,7 @@ from fflin.errors import FflinError, InputError
 from fflin.model import _ROUND_OFF, Robot
 from fflin.validation import NORM_TOLERANCE, Array
 
-_BLOCK = 8192  # rows that are checked at once, so that what that takes is small
+_BLOCK = 2048  # rows that are checked at once, so that what that takes is small
 
 
 def checked_configurations(robot: Robot, q: Any) -> Array:

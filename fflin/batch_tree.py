@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pinocchio as pin
@@ -71,8 +72,18 @@ class Tree(NamedTuple):
     size: int
 
 
+# Trees of the robots that are alive, which do not change.
+_TREES: WeakKeyDictionary[Robot, Tree | None] = WeakKeyDictionary()
+
+
 def batch_tree(robot: Robot) -> Tree | None:
     """Return a robot's tree, or None where a joint is not a screw about a fixed axis."""
+    if robot not in _TREES:
+        _TREES[robot] = _tree(robot)
+    return _TREES[robot]
+
+
+def _tree(robot: Robot) -> Tree | None:
     model = robot.model
     places, turns, slides = _screws(model)
     if places is None:

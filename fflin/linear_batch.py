@@ -85,7 +85,8 @@ class LinearBatch:
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    _ignorable: tuple[str, ...]
+    # Of a file; else found on the robot when it is asked for.
+    _ignorable: tuple[str, ...] | None
     _columns: tuple[tuple[int, int], ...]
     _system: Robot | None
 
@@ -269,9 +270,13 @@ class LinearBatch:
             rows["_reference"] = _carried(root, rows["q"][:7])
         certify: Any = partial(_no_robot, "certificate", self.robot)
         inertia: Any = partial(_no_robot, "inertia M", self.robot)
+        ignorable: Any = partial(_given, self._ignorable)
         if self._system is not None:
             from fflin.certificate import certify as certified
             from fflin.inertia import inertia_matrix
+            from fflin.symmetry import ignorable_states
+
+            ignorable = partial(ignorable_states, self._system)
 
             certify = partial(certified, self._system)
             inertia = partial(inertia_matrix, self._system)
@@ -286,7 +291,7 @@ class LinearBatch:
             | names
             | {"B": B, "x0": x0, "y0": x0 if y0 is None else y0, "dt": 0.0}
             | {"_inertia": inertia, "_certify": certify, "_drift": rows.get("_drift")}
-            | {"_ignorable": partial(_given, self._ignorable)}
+            | {"_ignorable": ignorable}
         )
 
     def _rest_states(self, rows: slice) -> Array:

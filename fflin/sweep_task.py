@@ -13,29 +13,27 @@ import pinocchio as pin
 from fflin import __version__
 from fflin.batch_chunks import ChunkJob, Points
 from fflin.batch_rows import checked_configurations, checked_inputs, checked_velocities
-from fflin.configurations import Configurations, GivenConfigurations
+from fflin.configurations import (
+    Configurations,
+    GivenConfigurations,
+    Grid,
+    RandomConfigurations,
+)
 from fflin.dispatching import Span
 from fflin.errors import InputError
 from fflin.frames import ROOT
 from fflin.joint_columns import joint_columns
 from fflin.linear_batch import LinearBatch
 from fflin.model import Robot
-from fflin.symmetry import ignorable_states
 from fflin.validation import Array
 
 
 class SweepTask:
     """A sweep's points, and what of its result is the same at all of them."""
 
-    def __init__(self, job: ChunkJob, q: Any, v: Any, u: Any) -> None:
+    def __init__(self, job: ChunkJob, configurations: Configurations, v: Any, u: Any) -> None:
         self.job, self.robot = job, job.linearizer.robot
-        if hasattr(q, "rows") and hasattr(q, "fingerprint"):
-            if getattr(q, "robot", self.robot) is not self.robot:
-                q = _of_this_robot(q, self.robot)
-            self.configurations: Configurations = q
-        else:
-            self.configurations = GivenConfigurations(checked_configurations(self.robot, q))
-        self.count = len(self.configurations)
+        self.configurations, self.count = configurations, len(configurations)
         names = job.linearizer._actuation.names
         self.v = None if v is None else checked_velocities(self.robot, v, self.count)
         self.u = None if u is None else checked_inputs(names, u, self.count)
@@ -77,14 +75,13 @@ class SweepTask:
             for key, value in self.constants(arrays).items()
         }
         common = self.job.linearizer._common
-        batch = LinearBatch(
+        return LinearBatch(
             **{"_x0": None, "_y0": None, "_reference": None, "_drift": None, **rows, **arrays},
             **{key: common[key] for key in common if key not in _OF_MODELS},
-            _ignorable=(),
+            _ignorable=None,
             _columns=joint_columns(self.robot),
             _system=self.robot,
         )
-        return replace(batch, _ignorable=ignorable_states(self.robot, batch[0]))
 
     @property
     def request(self) -> str:
@@ -120,11 +117,23 @@ _OF_THE_ROBOT = (
 _NOWHERE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 
-def _of_this_robot(configurations: Any, robot: Robot) -> Any:
-    """Return a grid or random configurations of the same robot with other inputs or outputs."""
-    if configurations.robot.joints != robot.joints:
+def as_configurations(robot: Robot, q: Any) -> Configurations:
+    """Return the points that `sweep` is given as rows of this robot.
+
+    Raises
+    ------
+    InputError
+        If they are none, or of another robot.
+    """
+    if not isinstance(robot, Robot):
+        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
+    if not isinstance(q, Grid | RandomConfigurations):
+        return GivenConfigurations(checked_configurations(robot, q))
+    if q.robot is robot:
+        return q
+    # The same robot with other inputs or outputs will do.
+    if q.robot.joints != robot.joints:
         raise InputError(
-            f"q is of '{configurations.robot.name}', whose joints are others than those of "
-            f"'{robot.name}'"
+            f"q is of '{q.robot.name}', whose joints are others than those of '{robot.name}'"
         )
-    return replace(configurations, robot=robot)
+    return replace(q, robot=robot)

@@ -26,7 +26,7 @@ from fflin.errors import FflinError, FflinWarning, FileError, InputError, SweepE
 from fflin.files import as_path
 from fflin.linear_batch import LinearBatch
 from fflin.model import Robot
-from fflin.sweep_task import SweepTask
+from fflin.sweep_task import SweepTask, as_configurations
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -124,10 +124,16 @@ def sweep(
     for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
         if value is not None and (not isinstance(value, int | np.integer) or value < 1):
             raise InputError(f"{name} is {value!r}, expected a whole number from 1 on")
+    points = as_configurations(robot, q)
     job = ChunkJob(
-        robot, frame=frame, reference=reference, moving=moving, at_rest=v is None and u is None
+        robot,
+        frame=frame,
+        reference=reference,
+        moving=moving,
+        at_rest=v is None and u is None,
+        count=len(points),
     )
-    task = SweepTask(job, q, v, u)
+    task = SweepTask(job, points, v, u)
     parallel = executor is not None or workers is not None
     threads = threads or available_threads()
     size = chunk or _chunk_size(task, _SHARES if parallel else 4 * threads)
@@ -161,7 +167,9 @@ def planned_bytes(
     reference: pin.SE3 | None = None,
 ) -> int:
     """Return how large the result of a sweep over so many points is [bytes]."""
-    job = ChunkJob(robot, frame=frame, reference=reference, moving=False, at_rest=at_rest)
+    job = ChunkJob(
+        robot, frame=frame, reference=reference, moving=False, at_rest=at_rest, count=count
+    )
     return count * _row_bytes(job)
 
 

@@ -100,8 +100,10 @@ class KillingJob(batch_chunks.ChunkJob):
         return super().run(points, start, out)
 
 
-def _killing(marker, robot, frame, reference, moving, at_rest):
-    job = KillingJob(robot, frame=frame, reference=reference, moving=moving, at_rest=at_rest)
+def _killing(marker, robot, frame, reference, moving, at_rest, count):
+    job = KillingJob(
+        robot, frame=frame, reference=reference, moving=moving, at_rest=at_rest, count=count
+    )
     job.marker = marker
     return job
 
