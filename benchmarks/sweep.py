@@ -1,7 +1,7 @@
 """Cost of a sweep at rest, as a ratio to Pinocchio's computeMinverse one after the other.
 
-Run as ``OMP_NUM_THREADS=1 python benchmarks/sweep.py [N] [ROBOT ...]``. All figures are the least of
-interleaved repetitions in this one process; every tenth row is checked against `linearize` before.
+Run as ``OMP_NUM_THREADS=1 python benchmarks/sweep.py [N] [ROBOT ...]``. All figures are the least
+of interleaved repetitions in this one process; 200 rows are held against `linearize` before.
 """
 
 import os
@@ -33,7 +33,7 @@ def least(*functions: Callable[[], object], repetitions: int = 15) -> list[float
 
 
 def checked(robot: fflin.Robot, q: np.ndarray) -> fflin.LinearBatch:
-    """A sweep whose rows are those of `linearize`, relative to each coordinate's mobility."""
+    """Return a sweep that was held against `linearize`, relative to each coordinate's mobility."""
     batch = fflin.sweep(robot, q)
     linearizer = fflin.Linearizer(robot)
     for row in range(0, len(q), max(1, len(q) // 200)):

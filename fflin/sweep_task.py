@@ -127,6 +127,8 @@ def as_configurations(robot: Robot, q: Any) -> Configurations:
     """
     if not isinstance(robot, Robot):
         raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
+    if isinstance(q, GivenConfigurations):  # checked already
+        return q
     if not isinstance(q, Grid | RandomConfigurations):
         return GivenConfigurations(checked_configurations(robot, q))
     if q.robot is robot:

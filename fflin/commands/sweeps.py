@@ -168,6 +168,7 @@ def _sweep(arguments: argparse.Namespace) -> int:
     options: dict[str, Any] = {"frame": arguments.frame, "reference": reference}
     announce = _Announcement(robot, path, options, arguments.yes)
     q, v, u = _points(robot, arguments, v, u, announce)
+    announce.say()
     bar = Progress(len(q))
     with _executor(arguments.dask) as executor:
         try:
@@ -194,6 +195,7 @@ class _Announcement:
 
     def __init__(self, robot: Robot, path: Path, options: dict[str, Any], agreed: bool) -> None:
         self._robot, self._path, self._options, self._agreed = robot, path, options, agreed
+        self._said = ""
 
     def __call__(self, count: int, *, at_rest: bool) -> None:
         from fflin.sweeping import planned_bytes
@@ -209,7 +211,11 @@ class _Announcement:
             if size > free:
                 raise FileError(f"{said}: there are only {_readable(free)} free in {folder}")
         going_on = f", going on from {part}" if part.exists() else ""
-        print(f"fflin: {said} to {self._path}{going_on}", file=sys.stderr)
+        self._said = f"fflin: {said} to {self._path}{going_on}"
+
+    def say(self) -> None:
+        """Say it, once all that was asked for is found good."""
+        print(self._said, file=sys.stderr)
 
 
 def _readable(size: float) -> str:
@@ -231,6 +237,7 @@ def _points(
     import numpy as np
 
     from fflin.configurations import grid, random_configurations
+    from fflin.sweep_task import as_configurations
 
     kinds = [bool(arguments.grid), arguments.random is not None, bool(arguments.configurations)]
     if sum(kinds) != 1:
@@ -246,7 +253,7 @@ def _points(
                 raise InputError(f"{arguments.configurations} has {name}, which an option says too")
         v, u = given.get("v", v), given.get("u", u)
         announce(len(given["q"]), at_rest=v is None and u is None)
-        return given["q"], v, u
+        return as_configurations(robot, given["q"]), v, u
     start = configuration_of(robot, arguments)
     fixed = once("--joint", arguments.joint)
     base = _base(robot, start)
