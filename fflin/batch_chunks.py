@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.batch_inertia import BatchInertia, pays
+from fflin.batch_inertia import BatchInertia, Rows, pays
 from fflin.errors import FflinError, FflinWarning
 from fflin.linearization import Linearizer
 from fflin.model import Robot
@@ -121,7 +121,7 @@ class ChunkJob:
             inverse = np.empty((len(q), state.nx // 2, state.nx // 2))
         # Without joints M is the same everywhere.
         rigid = not self.linearizer.robot.n
-        left = np.arange(1) if rigid else self._inertia.compiled(q, inverse)
+        left: Rows = np.arange(1) if rigid else self._inertia.compiled(q, inverse)
         try:
             with _caught() as notes:
                 self._inertia.loop(q, inverse, left)

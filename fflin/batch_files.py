@@ -157,7 +157,7 @@ def _batch(
         if value is not None and (value.dtype != np.float64 or len(value) != count):
             raise ValueError(f"{key} has {len(value)} rows of {value.dtype}, expected {count}")
         rows[key] = value
-    texts = {
+    texts: dict[str, Any] = {
         key: tuple(value) if isinstance(value := record[key], list) else value for key in _TEXTS
     }
     nx, nu, ny = (len(texts[f"{kind}_names"]) for kind in ("state", "input", "output"))

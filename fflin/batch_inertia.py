@@ -7,9 +7,10 @@ import os
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fflin.batch_tree import LANES, batch_tree
 from fflin.errors import SingularInertiaError
@@ -24,6 +25,8 @@ _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
 
 # The kernel has sines of angles up to here [rad].
 _FARTHEST = 1e6
+
+Rows: TypeAlias = NDArray[np.integer[Any]]
 
 _log = logging.getLogger("fflin")
 
@@ -61,7 +64,7 @@ class BatchInertia:
         """
         self.loop(q, out, self.compiled(q, out))
 
-    def compiled(self, q: Array, out: Array) -> Array:
+    def compiled(self, q: Array, out: Array) -> Rows:
         """Do with the kernel what it can and return the rows that are left, all where it is not.
 
         Left are those where M is singular or nearly so, which the loop refuses or warns of, and
@@ -86,7 +89,7 @@ class BatchInertia:
             good &= (np.abs(q[:, 7:]) < _FARTHEST).all(axis=1)
         return np.flatnonzero(~good)
 
-    def loop(self, q: Array, out: Array, rows: Array) -> None:
+    def loop(self, q: Array, out: Array, rows: Rows) -> None:
         """Do the rows that are named, one after the other; raises as `invert` does."""
         for row in rows.tolist():
             try:

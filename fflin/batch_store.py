@@ -167,7 +167,7 @@ class FileStore:
     def _hash(self, arrays: Mapping[str, Array]) -> bytes:
         digest = sha256()
         for key in self.names:
-            digest.update(np.ascontiguousarray(arrays[key]))
+            digest.update(np.ascontiguousarray(arrays[key]).data)
         return digest.digest()
 
 

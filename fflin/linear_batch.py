@@ -123,15 +123,13 @@ class LinearBatch:
             if index.dtype.kind not in "iub" or index.ndim != 1:
                 raise InputError("a batch is indexed by a number, a slice, numbers or a mask")
         count = len(np.empty(len(self), dtype=bool)[index])
-        return replace(
-            self,
-            **{
-                key: np.broadcast_to(value[0], (count, *value.shape[1:]))
-                if is_constant(value)
-                else value[index]
-                for key, value in self._arrays().items()
-            },
-        )
+        rows: dict[str, Any] = {
+            key: np.broadcast_to(value[0], (count, *value.shape[1:]))
+            if is_constant(value)
+            else value[index]
+            for key, value in self._arrays().items()
+        }
+        return replace(self, **rows)
 
     def __iter__(self) -> Iterator[LinearModel]:
         return map(self._model, range(len(self)))

@@ -70,13 +70,14 @@ class SweepTask:
     def batch(self, arrays: Mapping[str, Array]) -> LinearBatch:
         """Put a batch together of what differs from point to point."""
         count = len(arrays["q"])
-        rows = {
+        rows: dict[str, Any] = {
             key: np.broadcast_to(value, (count, *value.shape))
             for key, value in self.constants(arrays).items()
         }
         common = self.job.linearizer._common
+        absent: dict[str, Any] = dict.fromkeys(("_x0", "_y0", "_reference", "_drift"))
         return LinearBatch(
-            **{"_x0": None, "_y0": None, "_reference": None, "_drift": None, **rows, **arrays},
+            **absent | rows | dict(arrays),
             **{key: common[key] for key in common if key not in _OF_MODELS},
             _ignorable=None,
             _columns=joint_columns(self.robot),
@@ -102,7 +103,7 @@ class SweepTask:
         digest.update(linearizer._reference.tobytes())
         digest.update(f"{self.count} {self.configurations.fingerprint}".encode())
         for rows in (self.v, self.u):
-            digest.update(b"none" if rows is None else np.ascontiguousarray(rows))
+            digest.update(b"none" if rows is None else np.ascontiguousarray(rows).data)
         return digest.hexdigest()
 
 

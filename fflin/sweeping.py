@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -141,12 +141,13 @@ def sweep(
     path = None if out is None else _path(out)
     store = _store(task, path, size)
     own = OwnWorkers(int(workers)) if workers else None
+    others = own or executor
     try:
         left = [span for span in spans if not store.finished(*span)]
         done: Iterable[Done] = (
-            dispatch(job, left, task.points, own or executor)
-            if parallel
-            else _here(task, left, store, threads)
+            _here(task, left, store, threads)
+            if others is None
+            else dispatch(job, left, task.points, others)
         )
         failed = _collect(task, done, store, (len(spans) - len(left)) * size, progress)
         if failed:
@@ -250,7 +251,7 @@ def _collect(
             failed.append(result)
         else:
             points = task.points(result.span)
-            rows = {"q": points.q, "v": points.v, "u0": points.u}
+            rows: dict[str, Any] = {"q": points.q, "v": points.v, "u0": points.u}
             arrays = {
                 key: rows[key] if key in rows else result.chunk.arrays[key] for key in store.names
             }
