@@ -30,13 +30,16 @@ _PUBLIC = {
     "FrameVelocity": "outputs",
     "FullState": "outputs",
     "Gain": "regulator",
+    "GainBatch": "gain_batches",
     "GainSchedule": "schedules",
     "Gramians": "gramian",
+    "Grid": "configurations",
     "Gyroscope": "outputs",
     "InputError": "errors",
     "JointPositions": "outputs",
     "JointTorque": "inputs",
     "JointVelocities": "outputs",
+    "LinearBatch": "linear_batch",
     "LinearModel": "linear_model",
     "LinearTrajectory": "trajectory",
     "Linearizer": "linearization",
@@ -47,13 +50,16 @@ _PUBLIC = {
     "Momentum": "outputs",
     "Motion": "motion",
     "Observability": "observation",
+    "RandomConfigurations": "configurations",
     "ReactionWheel": "inputs",
     "ReducedModel": "momentum",
     "Robot": "model",
+    "ScheduledFeedback": "gain_batches",
     "SingularInertiaError": "errors",
     "StabilizabilityError": "errors",
     "StateFeedback": "policies",
     "StateMap": "state",
+    "SweepError": "errors",
     "Thruster": "inputs",
     "TrajectoryFeedback": "policies",
     "UnknownNameError": "errors",
@@ -70,6 +76,7 @@ _PUBLIC = {
     "generalized_inertia": "momentum",
     "generalized_jacobian": "momentum",
     "gramians": "gramian",
+    "grid": "configurations",
     "kalman": "estimation",
     "linearize": "linearization",
     "linearize_trajectory": "trajectory",
@@ -78,6 +85,7 @@ _PUBLIC = {
     "load_inputs": "input_files",
     "lqg": "estimation",
     "lqr": "regulator",
+    "lqr_batch": "gain_batches",
     "modes": "eigenmodes",
     "momentum_reduction": "momentum",
     "observability": "observation",
@@ -85,8 +93,10 @@ _PUBLIC = {
     "plot_motion": "plots",
     "plot_poles": "model_plots",
     "plot_validity": "model_plots",
+    "random_configurations": "configurations",
     "sampled_cost": "sampling",
     "simulate": "simulation",
+    "sweep": "sweeping",
     "tvlqr": "schedules",
     "validity": "region",
     "velocity": "points",
@@ -98,6 +108,7 @@ __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of 
 if TYPE_CHECKING:
     from fflin.acceleration import acceleration_lqr
     from fflin.balance import Equilibrium, equilibrium
+    from fflin.configurations import Grid, RandomConfigurations, grid, random_configurations
     from fflin.eigenmodes import Mode, Modes, modes
     from fflin.errors import (
         ChartError,
@@ -111,13 +122,16 @@ if TYPE_CHECKING:
         ModelError,
         SingularInertiaError,
         StabilizabilityError,
+        SweepError,
         UnknownNameError,
         UrdfError,
     )
     from fflin.estimation import Compensator, Estimator, kalman, lqg
+    from fflin.gain_batches import GainBatch, ScheduledFeedback, lqr_batch
     from fflin.gramian import Gramians, gramians
     from fflin.input_files import load_inputs
     from fflin.inputs import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
+    from fflin.linear_batch import LinearBatch
     from fflin.linear_model import Certificate, LinearModel
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load
@@ -154,6 +168,7 @@ if TYPE_CHECKING:
     from fflin.simulation import simulate
     from fflin.state import StateMap
     from fflin.structure import Controllability, controllability
+    from fflin.sweeping import sweep
     from fflin.trajectory import LinearTrajectory, linearize_trajectory
     from fflin.verification import Check, check
     from fflin.viewer import visualize

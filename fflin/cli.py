@@ -21,6 +21,7 @@ from fflin.commands import (
     natural_modes,
     regulator,
     simulation,
+    sweeps,
     visual,
 )
 from fflin.errors import FflinError, FflinWarning
@@ -90,4 +91,5 @@ def _parser() -> argparse.ArgumentParser:
     natural_modes.add_commands(commands)
     simulation.add_commands(commands)
     visual.add_commands(commands)
+    sweeps.add_commands(commands)
     return parser

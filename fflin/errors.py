@@ -1,6 +1,7 @@
 """Errors that fflin raises; each message says what was given, what was expected, what to do."""
 
 from collections.abc import Iterable
+from typing import Any
 
 
 class FflinError(Exception):
@@ -49,6 +50,24 @@ class DetectabilityError(FflinError, ValueError):
 
 class MissingPackageError(FflinError, ImportError):
     """An optional package is needed and not installed."""
+
+
+class SweepError(FflinError, RuntimeError):
+    """Some chunks of a sweep have no result.
+
+    Attributes
+    ----------
+    failed : tuple
+        (start, stop, reason) of each: its points, stop not among them.
+    batch : LinearBatch or None
+        The others, in order, where they are in memory.
+    """
+
+    def __init__(
+        self, message: str, failed: tuple[tuple[int, int, str], ...] = (), batch: Any = None
+    ) -> None:
+        super().__init__(message)
+        self.failed, self.batch = failed, batch
 
 
 class FflinWarning(UserWarning):

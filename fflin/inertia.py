@@ -48,7 +48,14 @@ class Inertia:
         Order of the coordinates.
     data : pin.Data
         Work space, overwritten at each call.
+
+    Attributes
+    ----------
+    least_coupling, warning_coupling : float
+        Between these the sum of M_ii (M^-1)_ii lies where M^-1 is good.
     """
+
+    warning_coupling = _WARNING_COUPLING
 
     def __init__(self, state: StateMap, data: pin.Data) -> None:
         self._state = state
@@ -63,7 +70,7 @@ class Inertia:
         # The base at the world's origin: M does not depend on where it is, but Pinocchio works in
         # world axes and would lose digits to a base far away.
         self._still = pin.neutral(state.robot.model)
-        self._least_coupling = 0.999 * (6 + state.robot.n)
+        self.least_coupling = 0.999 * (6 + state.robot.n)
 
     def invert(self, q: Array, out: Array, *, quick: bool = False) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array.
@@ -83,7 +90,7 @@ class Inertia:
             _compute_inverse(self._model, self._data, still)
             self._state.project(self._inverse, out)
             # Written so that NaN, from a pivot that is zero, fails too.
-            if self._least_coupling < bounds.dot(self._inverse_diagonal) < _QUICK_COUPLING:
+            if self.least_coupling < bounds.dot(self._inverse_diagonal) < _QUICK_COUPLING:
                 return
         M = self._state.project(_crba(self._model, self._data, still).T)
         if self._constrained or len(M) > _DENSE_SIZE:
@@ -98,7 +105,7 @@ class Inertia:
 
     def _judge(self, coupling: float, M: Array) -> None:
         # Written so that NaN, from a pivot that is zero, fails too.
-        if not self._least_coupling < coupling < _LARGEST_COUPLING:
+        if not self.least_coupling < coupling < _LARGEST_COUPLING:
             raise _singular(self._state, M)
         if coupling > _WARNING_COUPLING:
             warnings.warn(

@@ -109,13 +109,14 @@ class Linearizer:
                 own_reference=self._own_reference,
             )
         # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
-        self._plain = (
-            self._actuation.default
-            and self._sensing is None
+        self._free = (
+            self._sensing is None
             and not self._moving
             and not any(robot.gravity)
+            and not robot.stored_momentum
             and not any(values.any() for values in robot.passive)
         )
+        self._plain = self._free and self._actuation.default
         nv, nx = 6 + robot.n, self._map.nx
         self._zero_v, self._zero_u, self._zero_x = (
             _frozen(np.zeros(size)) for size in (robot.nv, len(self._actuation.names), nx)

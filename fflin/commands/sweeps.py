@@ -1,0 +1,324 @@
+"""The command that linearises about many points."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fflin.commands import DONE
+from fflin.commands.arguments import (
+    Commands,
+    add_output_file,
+    add_pose,
+    add_robot,
+    add_system,
+    assignment,
+    command,
+    number,
+)
+from fflin.commands.points import configuration_of, load_robot, once, velocity_of
+from fflin.errors import FileError, InputError, MissingPackageError
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from fflin.configurations import Configurations
+    from fflin.model import Robot
+    from fflin.validation import Array
+
+# Beyond this the user is asked whether it is meant.
+_LARGE = 10e9
+
+_DASK_TIMEOUT = 10  # seconds
+
+
+def add_commands(commands: Commands) -> None:
+    """Add sweep."""
+    sweep = command(
+        commands,
+        "sweep",
+        _sweep,
+        "linearise about many points and save them all",
+        "fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 -o grid.h5",
+    )
+    add_robot(sweep)
+    points = sweep.add_argument_group("points", "one of these; at rest, unless --velocity says so")
+    points.add_argument(
+        "--grid",
+        metavar="JOINT=LO:HI:N",
+        type=_axis,
+        action="append",
+        default=[],
+        help="N values of a joint [rad|m] from LO to HI (repeatable: all combinations, the last "
+        "joint varies fastest)",
+    )
+    points.add_argument(
+        "--random", metavar="N", type=_count, help="N points drawn evenly from the joints' limits"
+    )
+    points.add_argument(
+        "--configurations",
+        metavar="FILE.npz",
+        type=Path,
+        help="q (N, nq) in Pinocchio's order, as numpy.savez writes it, and if it has them v "
+        "(N, nv) and u (N, nu)",
+    )
+    points.add_argument(
+        "--seed", metavar="S", type=_whole, default=0, help="of --random; 0 by default"
+    )
+    points.add_argument(
+        "--range",
+        metavar="JOINT=LO:HI",
+        type=_range,
+        action="append",
+        default=[],
+        help="of --random: range of a joint in place of its limits (repeatable)",
+    )
+    add_pose(sweep)
+    sweep.add_argument(
+        "--effort",
+        metavar="NAME=VALUE",
+        type=assignment,
+        action="append",
+        default=[],
+        help="an input at all points (repeatable), by its name in u, such as tau_m.joint_1",
+    )
+    add_system(sweep)
+    sweep.add_argument(
+        "--reference",
+        choices=("base", "world"),
+        default="base",
+        help="what attitude and position are relative to: the base where it stands (default), "
+        "or the world",
+    )
+    sweep.add_argument(
+        "--workers", metavar="N", type=_count, help="share the work among N processes"
+    )
+    sweep.add_argument(
+        "--dask", metavar="ADDRESS", help="share it among the workers of a dask scheduler"
+    )
+    sweep.add_argument(
+        "--yes", action="store_true", help="do not stop at results of more than 10 GB"
+    )
+    add_output_file(
+        sweep,
+        "save to FILE: .h5 (HDF5) or .npz; it grows as FILE.part, and the same command goes on "
+        "from what is there",
+    )
+
+
+def _axis(text: str) -> tuple[str, tuple[float, float, int]]:
+    """Read JOINT=LO:HI:N."""
+    name, _, values = text.rpartition("=")
+    parts = values.split(":")
+    if not name or len(parts) != 3:
+        raise argparse.ArgumentTypeError(f"'{text}' is not JOINT=LO:HI:N, as in joint_1=-1:1:21")
+    low, high, count = number(parts[0]), number(parts[1]), _count(parts[2])
+    if not (low < high or (count == 1 and low == high)):
+        raise argparse.ArgumentTypeError(f"'{text}' is empty: LO must be less than HI")
+    return name, (low, high, count)
+
+
+def _range(text: str) -> tuple[str, tuple[float, float]]:
+    """Read JOINT=LO:HI."""
+    name, _, values = text.rpartition("=")
+    parts = values.split(":")
+    if not name or len(parts) != 2:
+        raise argparse.ArgumentTypeError(f"'{text}' is not JOINT=LO:HI, as in joint_1=-1:1")
+    return name, (number(parts[0]), number(parts[1]))
+
+
+def _whole(text: str) -> int:
+    """Read a whole number that is not negative."""
+    if not text.isascii() or not text.isdigit():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number")
+    return int(text)
+
+
+def _count(text: str) -> int:
+    """Read a whole number from 1 on."""
+    if not (count := _whole(text)):
+        raise argparse.ArgumentTypeError("0 is too few, expected 1 or more")
+    return count
+
+
+def _sweep(arguments: argparse.Namespace) -> int:
+    import pinocchio as pin
+
+    from fflin.batch_files import check_format
+    from fflin.points import effort
+    from fflin.progress import Progress
+    from fflin.sweeping import sweep
+
+    path = arguments.output_file
+    if path is None:
+        raise InputError("-o says where the models go: a file .h5 or .npz")
+    if arguments.workers and arguments.dask:
+        raise InputError("--workers and --dask both share the work; give either")
+    check_format(path)
+    robot = load_robot(arguments)
+    v = velocity_of(robot, arguments)
+    u = effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
+    reference = pin.SE3.Identity() if arguments.reference == "world" else None
+    options: dict[str, Any] = {"frame": arguments.frame, "reference": reference}
+    announce = _Announcement(robot, path, options, arguments.yes)
+    q, v, u = _points(robot, arguments, v, u, announce)
+    announce.say()
+    bar = Progress(len(q))
+    with _executor(arguments.dask) as executor:
+        try:
+            batch = sweep(
+                robot,
+                q,
+                v,
+                u,
+                **options,
+                executor=executor,
+                workers=arguments.workers,
+                progress=lambda done, _: bar.update(done),
+                out=path,
+            )
+        finally:
+            bar.close()
+    states, inputs = len(batch.state_names), len(batch.input_names)
+    print(f"wrote {path}: {len(batch):,} points, {states} states, {inputs} inputs")
+    return DONE
+
+
+class _Announcement:
+    """Says how many points there are and how large the result is, and stops what is too much."""
+
+    def __init__(self, robot: Robot, path: Path, options: dict[str, Any], agreed: bool) -> None:
+        self._robot, self._path, self._options, self._agreed = robot, path, options, agreed
+        self._said = ""
+
+    def __call__(self, count: int, *, at_rest: bool) -> None:
+        from fflin.sweeping import planned_bytes
+
+        size = planned_bytes(self._robot, count, at_rest=at_rest, **self._options)
+        said = f"{count:,} points of '{self._robot.name}', {_readable(size)}"
+        if size > _LARGE and not self._agreed:
+            raise InputError(f"{said}: add --yes where it is meant, or choose fewer points")
+        part = self._path.with_name(self._path.name + ".part")
+        folder = self._path.parent
+        if folder.is_dir() and not part.exists():
+            free = shutil.disk_usage(folder).free
+            if size > free:
+                raise FileError(f"{said}: there are only {_readable(free)} free in {folder}")
+        going_on = f", going on from {part}" if part.exists() else ""
+        self._said = f"fflin: {said} to {self._path}{going_on}"
+
+    def say(self) -> None:
+        """Say it, once all that was asked for is found good."""
+        print(self._said, file=sys.stderr)
+
+
+def _readable(size: float) -> str:
+    """Show a number of bytes."""
+    for unit, scale in (("PB", 1e15), ("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if size >= scale:
+            return f"{size / scale:,.1f} {unit}"
+    return f"{size / 1e3:.1f} kB"
+
+
+def _points(
+    robot: Robot,
+    arguments: argparse.Namespace,
+    v: Array | None,
+    u: Array | None,
+    announce: _Announcement,
+) -> tuple[Array | Configurations, Array | None, Array | None]:
+    """Return q, v and u of the points."""
+    import numpy as np
+
+    from fflin.configurations import grid, random_configurations
+    from fflin.sweep_task import as_configurations
+
+    kinds = [bool(arguments.grid), arguments.random is not None, bool(arguments.configurations)]
+    if sum(kinds) != 1:
+        raise InputError("give the points by one of --grid, --random and --configurations")
+    if arguments.range and arguments.random is None:
+        raise InputError("--range is of --random; a grid has its own")
+    if arguments.configurations:
+        if arguments.joint:
+            raise InputError("--joint and --configurations both place joints; give either")
+        given = _given(arguments.configurations)
+        for name, value in (("v", v), ("u", u)):
+            if name in given and value is not None:
+                raise InputError(f"{arguments.configurations} has {name}, which an option says too")
+        v, u = given.get("v", v), given.get("u", u)
+        announce(len(given["q"]), at_rest=v is None and u is None)
+        return as_configurations(robot, given["q"]), v, u
+    start = configuration_of(robot, arguments)
+    fixed = once("--joint", arguments.joint)
+    base = _base(robot, start)
+    at_rest = v is None and u is None
+    if arguments.random is not None:
+        ranges = once("--range", arguments.range)
+        twice = sorted(set(ranges) & set(fixed))
+        if twice:
+            raise InputError(f"joint '{twice[0]}' is in --joint and in --range; give either")
+        ranges |= {name: (value, value) for name, value in fixed.items()}
+        drawn = random_configurations(
+            robot, arguments.random, seed=arguments.seed, ranges=ranges, base=base
+        )
+        announce(arguments.random, at_rest=at_rest)
+        return drawn, v, u
+    axes = once("--grid", arguments.grid)
+    for name in axes:
+        robot.joint(name)
+    # Counted before it is made.
+    announce(math.prod(count for _, _, count in axes.values()), at_rest=at_rest)
+    values = {name: np.linspace(*axis) for name, axis in axes.items()}
+    return grid(robot, values, joints=fixed, base=base), v, u
+
+
+def _base(robot: Robot, q: Array) -> Any:
+    import pinocchio as pin
+
+    return robot.model.jointPlacements[1] * pin.XYZQUATToSE3(q[:7])
+
+
+def _given(path: Path) -> dict[str, Array]:
+    import zipfile
+
+    import numpy as np
+
+    try:
+        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
+            given = {key: file[key] for key in ("q", "v", "u") if key in file.files}
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile):
+        raise FileError(f"{path}: not an npz file as numpy.savez writes it") from None
+    if "q" not in given:
+        raise FileError(f"{path}: has no array named q, the configurations (N, nq)")
+    if given["q"].ndim != 2:
+        raise InputError(f"{path}: q has shape {given['q'].shape}, expected (N, nq)")
+    return given
+
+
+@contextmanager
+def _executor(address: str | None) -> Iterator[Executor | None]:
+    """Yield the executor of a dask scheduler, or None where there is no address."""
+    if address is None:
+        yield None
+        return
+    try:
+        from distributed import Client
+    except ImportError:
+        raise MissingPackageError(
+            "--dask needs distributed; install it with: pip install 'fflin[dask]'"
+        ) from None
+    try:
+        client = Client(address, timeout=_DASK_TIMEOUT)
+    except (OSError, ValueError) as error:
+        said = " ".join(str(error).split())
+        raise InputError(f"no dask scheduler answers at '{address}': {said}") from None
+    with client:
+        yield client.get_executor()
