@@ -7,6 +7,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from fflin.frames import ROOT
 from fflin.model import Robot
@@ -201,7 +202,7 @@ def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
     return paths
 
 
-def _common(paths: list[list[int]]) -> Array:
+def _common(paths: list[list[int]]) -> NDArray[np.intp]:
     """Return how many coordinates the paths of any two have in common."""
     common = np.zeros((len(paths), len(paths)), dtype=np.intp)
     for index, path in enumerate(paths):

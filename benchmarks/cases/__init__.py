@@ -6,6 +6,7 @@ ORDER = (
     "equipped",
     "growth",
     "number",
+    "batch",
     "lqr",
     "simulation_step",
     "start_up",
