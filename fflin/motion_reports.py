@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fflin.tables import grid
+from fflin.tables import grid, width
 
 if TYPE_CHECKING:
     from fflin.motion import Motion
@@ -42,7 +43,7 @@ def motion_report(motion: Motion, *, controlled: bool = True) -> str:
             key = (name.partition(".")[0], unit)
             kinds[key] = max(kinds.get(key, 0.0), float(value))
         shown = ", ".join(f"{name} {value:.4g} {unit}" for (name, unit), value in kinds.items())
-        parts.append(f"largest inputs: {shown}")
+        parts.append(textwrap.fill(f"largest inputs: {shown}", width(), subsequent_indent="  "))
     energy = motion.energy
     parts.append(
         f"energy {energy[0]:.6g} J at first, {energy[-1]:.6g} J at last; "
