@@ -1,12 +1,14 @@
 """Steps of fixed size of a motion on the manifold, by name.
 
-Each takes the acceleration f(t, q, v), whose stages it calls in order, and returns q and v at the
-end. The weights say with which share of the step each stage counts, for what is summed along.
+Each is prepared for a model and a step, takes the acceleration f(t, q, v), whose stages it calls
+in order, and returns q and v at the end. What f gets as v is overwritten by the stages that
+follow. The weights say with which share of the step each stage counts, for what is summed along.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -16,54 +18,63 @@ from fflin.errors import unknown
 from fflin.validation import Array
 
 Acceleration: TypeAlias = Callable[[float, Array, Array], Array]
-Step: TypeAlias = Callable[
-    [pin.Model, Acceleration, float, Array, Array, float], tuple[Array, Array]
-]
+Step: TypeAlias = Callable[[Acceleration, float, Array, Array], tuple[Array, Array]]
 
 _integrate = pin.integrate
 
 
 class Integrator(NamedTuple):
-    r"""A step and the weights of its stages.
+    r"""A kind of step and the weights of its stages.
 
     Attributes
     ----------
-    step : callable
+    prepare : callable
+        prepare(model, h) -> step(f, t, q, v) -> (q, v), with a work space of its own.
     weights : tuple of float
     reach : float
         Largest |pole| dt with which it is stable on the negative real axis.
     """
 
-    step: Step
+    prepare: Callable[[pin.Model, float], Step]
     weights: tuple[float, ...]
     reach: float
 
 
-def _cf4(
-    model: pin.Model, f: Acceleration, t: float, q: Array, v: Array, h: float
-) -> tuple[Array, Array]:
+def _cf4(model: pin.Model, h: float) -> Step:
     """Commutator-free, of order 4, with two exponentials at the end.
 
-    The stages of the velocity are put in, so that only accelerations are left to combine.
+    The stages of the velocity are put in, so that v and the accelerations alone are left: all
+    that one of them makes known is one product of a small matrix with them as rows.
     """
-    half = 0.5 * h
-    moved = half * v
-    l1 = f(t, q, v)
-    q2 = _integrate(model, q, moved)
-    l2 = f(t + half, q2, v + half * l1)
-    q3 = _integrate(model, q, moved + (half * half) * l1)
-    l3 = f(t + half, q3, v + half * l2)
-    q4 = _integrate(model, q2, moved + (h * half) * l2)
-    l4 = f(t + h, q4, v + h * l3)
-    sixth = h / 6.0
-    l12, last = l1 + l2, (half * sixth) * l3
-    moved += (half * sixth) * l12
-    q = _integrate(model, _integrate(model, q, moved - last), moved + 3.0 * last)
-    return q, v + sixth * (l12 + l2 + 2.0 * l3 + l4)
+    half, s = 0.5 * h, h * h / 12.0
+    known = np.zeros((5, model.nv))
+    at, l1, l2, l3, l4 = known
+    # Moves to q2, v2 and the move to q3; v3 and the move from q2 to q4; v4 and the moves at last.
+    by_1 = np.array([[half, 0.0], [1.0, half], [half, half * half]])
+    by_2 = np.array([[1.0, 0.0, half], [half, 0.0, h * half]])
+    by_3 = np.array([[1.0, 0.0, 0.0, h], [half, s, s, -s], [half, s, s, 3.0 * s]])
+    by_4 = np.array([1.0, h / 6.0, h / 3.0, h / 3.0, h / 6.0])
+    of_1, of_2, of_3 = known[:2], known[:3], known[:4]
+    new_1, new_2, new_3 = np.empty((3, model.nv)), np.empty((2, model.nv)), np.empty((3, model.nv))
+    (to_2, v2, to_3), (v3, to_4), (v4, to_5, to_6) = new_1, new_2, new_3
+
+    def step(f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+        at[:] = v
+        l1[:] = f(t, q, at)
+        by_1.dot(of_1, new_1)
+        q2 = _integrate(model, q, to_2)
+        l2[:] = f(t + half, q2, v2)
+        by_2.dot(of_2, new_2)
+        l3[:] = f(t + half, _integrate(model, q, to_3), v3)
+        by_3.dot(of_3, new_3)
+        l4[:] = f(t + h, _integrate(model, q2, to_4), v4)
+        return _integrate(model, _integrate(model, q, to_5), to_6), by_4.dot(known)
+
+    return step
 
 
 def _rkmk4(
-    model: pin.Model, f: Acceleration, t: float, q: Array, v: Array, h: float
+    model: pin.Model, h: float, f: Acceleration, t: float, q: Array, v: Array
 ) -> tuple[Array, Array]:
     """Runge-Kutta-Munthe-Kaas of order 4, with the inverse of dexp at each stage."""
 
@@ -88,7 +99,7 @@ def _rkmk4(
 
 
 def _semi_implicit_euler(
-    model: pin.Model, f: Acceleration, t: float, q: Array, v: Array, h: float
+    model: pin.Model, h: float, f: Acceleration, t: float, q: Array, v: Array
 ) -> tuple[Array, Array]:
     """Of order 1: the new velocity moves the configuration."""
     v = v + h * f(t, q, v)
@@ -97,10 +108,15 @@ def _semi_implicit_euler(
 
 _FOURTH = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
 
+
+def _unprepared(step: Callable[..., tuple[Array, Array]]) -> Callable[[pin.Model, float], Step]:
+    return lambda model, h: partial(step, model, h)
+
+
 INTEGRATORS = {
     "cf4": Integrator(_cf4, _FOURTH, 2.78),
-    "rkmk4": Integrator(_rkmk4, _FOURTH, 2.78),
-    "semi_implicit_euler": Integrator(_semi_implicit_euler, (1.0,), 2.0),
+    "rkmk4": Integrator(_unprepared(_rkmk4), _FOURTH, 2.78),
+    "semi_implicit_euler": Integrator(_unprepared(_semi_implicit_euler), (1.0,), 2.0),
 }
 
 

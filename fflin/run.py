@@ -11,7 +11,7 @@ import pinocchio as pin
 from fflin.conservation import Conserved
 from fflin.control import Channel, limits_of
 from fflin.dynamics import Disturbance, Dynamics
-from fflin.errors import ChartError, InputError
+from fflin.errors import InputError
 from fflin.integrators import integrator
 from fflin.linear_loop import predict
 from fflin.linear_model import LinearModel
@@ -20,7 +20,8 @@ from fflin.motion import Motion
 from fflin.policies import bound
 from fflin.progress import Progress
 from fflin.state import Frame, StateMap
-from fflin.validation import Array, number, vector
+from fflin.symmetry import rotor_names
+from fflin.validation import Array, number
 
 Event = Callable[[float, Array, Array], float]
 
@@ -51,7 +52,6 @@ class Run:
         self.policy = policy
         self.state = StateMap(robot, reference=reference, frame=frame or "hybrid")
         self.dynamics = Dynamics(self.state, disturbance)
-        self.conserved = Conserved(robot)
         self._law = None if policy is None else bound(policy, robot)
 
     def begin(self, x0: Any, q0: Any, v0: Any) -> None:
@@ -66,7 +66,8 @@ class Run:
             self.v = np.zeros(robot.nv) if v0 is None else robot.checked_velocity(v0).copy()
         self.target = None if self.lin is None else self._target(self.lin)
         near = x0 if x0 is not None else self.target
-        self.x = self._read(self.q, self.v, np.zeros(self.state.nx) if near is None else near)
+        self.near = None if near is None else np.asarray(near, dtype=float)
+        self.conserved = Conserved(robot, self.q)
 
     def clock(
         self, duration: float, dt: float | None, every: int, sample: float | None, delay: float
@@ -158,18 +159,27 @@ class Run:
             if not callable(each):
                 raise InputError(f"{each!r} is no function of (t, q, v), as an event would be")
         self.events, self.callback = tuple(events), callback
+        # A rotor may spin as fast as it will: nothing depends on its angle.
+        joints = [joint for joint in self.robot.joints if not joint.prismatic]
+        rotors = rotor_names(self.robot)
+        at = [joint.idx_v for joint in joints if joint.name not in rotors]
+        self.turning = np.array([3, 4, 5, *at])
+        self.slow = (_LARGEST_TURN / self.dt) ** 2
+        self.acting: Array | None = None
 
     def go(self, progress: bool | None) -> str:
         """Run to the end; return why it ended before."""
         rows = self.steps // self.every + 2
-        nu = len(self.initial)
+        sizes = (self.robot.nq, self.robot.nv, len(self.initial), 6)
         self.t = np.empty(rows)
-        self.rows_q, self.rows_v = np.empty((rows, self.robot.nq)), np.empty((rows, self.robot.nv))
-        self.rows_x, self.rows_u = np.empty((rows, self.state.nx)), np.empty((rows, nu))
-        self.missing = np.zeros((rows, 6))
-        self.count, self.orbital = 0, 0.0
-        self.point = self.q[:3].copy()
-        self.expected: Array = self.conserved.about(self.q, self.v, self.point)
+        self.rows = tuple(np.empty((rows, size)) for size in sizes)
+        self.count = 0
+        # The momentum that the impulse from outside makes.
+        self.expected = self.conserved.momentum(self.q, self.v)
+        self.scalar = self.state.scalar(self.q)
+        self.step = self.method.prepare(self.robot.model, self.dt)
+        self.weights = self.dt * np.array(self.method.weights)
+        self.follow = not self.dynamics.isolated(self.channel is not None)
         bar = Progress(self.steps, progress)
         stopped, step = "", 0
         try:
@@ -191,46 +201,51 @@ class Run:
 
     def _advance(self, step: int) -> Array:
         """Take one step; return what acted as it began."""
-        t, q, v, h = step * self.dt, self.q, self.v, self.dt
-        channel, dynamics = self.channel, self.dynamics
-        pushes: list[Array] = []
-        follow = not dynamics.isolated
-        if channel is None:
-            u = self.initial
-            plain = dynamics.free(q, v)
-        else:
-            u = channel.begin(step, t, q, v)
-
-        def f(t: float, q: Array, v: Array) -> Array:
-            acting = u
-            if channel is not None and channel.continuous:
-                acting = channel.ask(t, q, v)
-            if follow:
-                pushes.append(self.conserved.wrench(q, dynamics.push(t, q, v, acting), self.point))
-            return dynamics.acceleration(t, q, v, acting)
-
+        t, q, v = step * self.dt, self.q, self.v
+        channel, stage = self.channel, self.dynamics.stage
+        u = self.initial if channel is None else channel.begin(step, t, q, v)
         if step % self.every == 0:
             self._record(t, u)
-        self.q_before = q
-        rate = plain if channel is None and not follow else f
-        self.q, self.v = self.method.step(self.robot.model, rate, t, q, v, h)
-        if follow:
-            self.expected = self.expected + h * np.dot(self.method.weights, pushes)
+        asked = channel is not None and channel.continuous
+        pushes: list[Array] = []
+
+        def f(t: float, q: Array, v: Array) -> Array:
+            # The first stage is the point that was asked about already.
+            acting = channel.ask(t, q, v.copy()) if asked and pushes else u
+            a, push = stage(t, q, v, acting)
+            pushes.append(self.conserved.wrench(q, push) if self.follow else push)
+            return a
+
+        rate = f if asked or self.follow else self._held(u)
+        self.q, self.v = self.step(rate, t, q, v)
+        if self.follow:
+            self.expected = self.expected + self.weights.dot(pushes)
         if self.project:
-            self.v = self.conserved.impose(self.q, self.v, self.expected, self.point)
+            self.conserved.impose(self.q, self.v, self.expected)
         return u
+
+    def _held(self, u: Array) -> Any:
+        """Return f(t, q, v) under an input that stays, made anew where it is another."""
+        if u is not self.acting:
+            self.acting, self.rate = u, self.dynamics.held(u)
+        return self.rate
 
     def _fault(self, step: int) -> str:
         """Say what is wrong with the step that was taken; drop it where it has no meaning."""
-        t = (step + 1) * self.dt
-        turn = float(np.abs(self.v[3:]).max()) * self.dt
-        if not (turn < _LARGEST_TURN and np.isfinite(self.q).all()):
-            self.q, self.v = self.rows_q[self.count - 1], self.rows_v[self.count - 1]
-            if not np.isfinite(turn) or turn > 1e3:
-                return f"diverged at t = {t:g} s"
-            return f"diverged at t = {t:g} s: a joint or the base turns by {turn:.2g} rad a step"
-        before, after = (self.state.scalar(q) for q in (self.q_before, self.q))
-        if self.lin is not None and before * after < 0.0:
+        # The square is larger than that of any turn, and not finite where an entry is not.
+        if not float(self.v.dot(self.v)) < self.slow:
+            turn = float(np.abs(self.v[self.turning]).max(initial=0.0)) * self.dt
+            if not (turn < _LARGEST_TURN and np.isfinite(self.v).all()):
+                self.q, self.v = (rows[self.count - 1] for rows in self.rows[:2])
+                t = (step + 1) * self.dt
+                if not np.isfinite(turn) or turn > 1e3:
+                    return f"diverged at t = {t:g} s"
+                return f"diverged at t = {t:g} s: a joint or the base turns {turn:.2g} rad a step"
+        if self.lin is None:
+            return ""
+        before, self.scalar = self.scalar, self.state.scalar(self.q)
+        if before * self.scalar < 0.0:
+            t = (step + 1) * self.dt
             return f"left the chart at t = {t:g} s: the base turned by 180 deg from the reference"
         return ""
 
@@ -244,39 +259,19 @@ class Run:
     def _record(self, t: float, u: Array) -> None:
         row = self.count
         self.t[row] = t
-        self.rows_q[row], self.rows_v[row], self.rows_u[row] = self.q, self.v, u
-        self.x = self._read(self.q, self.v, self.x)
-        self.rows_x[row] = self.x
-        about = self.conserved.about(self.q, self.v, self.point)
-        self.missing[row] = about - self.expected
-        arm = float(np.linalg.norm(self.q[:3] - self.point))
-        self.orbital = max(self.orbital, arm * float(np.linalg.norm(self.expected[3:])))
+        q, v, of_u, momentum = self.rows
+        q[row], v[row], of_u[row], momentum[row] = self.q, self.v, u, self.expected
         self.count += 1
         if self.callback is not None:
             self.callback(t, self.q, self.v, u)
 
-    def _read(self, q: Array, v: Array, near: Any) -> Array:
-        try:
-            near = vector("x0", near, self.state.nx, "a state (12 + 2n)")
-            return self.state.read(q, v, near=near)
-        except ChartError:
-            # Half a turn exactly: no digit of the chart is left, and none beside it is wrong.
-            nearby = pin.integrate(self.robot.model, q, np.full(self.robot.nv, 1e-7))
-            return self.state.read(nearby, v, near=near)
-
     def finish(self, stopped: str, linear: LinearModel | bool | None) -> Motion:
         """Make the motion of what was recorded."""
         rows = slice(0, self.count)
-        q, v = self.rows_q[rows], self.rows_v[rows]
-        momenta = [self.conserved.momenta(*point) for point in zip(q, v, strict=True)]
-        scale = np.max([each.scale for each in momenta], axis=0)
-        # About a fixed point the flight of the whole counts too.
-        scale[0] += self.orbital
-        parts = self.missing[rows].reshape(-1, 2, 3)
-        sizes = np.linalg.norm(parts, axis=2)
-        drift = np.divide(sizes, scale, out=np.zeros_like(sizes), where=scale > 0.0)
+        q, v, u, expected = (each[rows] for each in self.rows)
+        history = self.conserved.histories(q, v)
+        x = self.state.read_rows(q, v, near=self.near)
         lin = self.lin if linear is None or linear is True else linear or None
-        x = self.rows_x[rows]
         prediction: Array = np.zeros((0, self.state.nx))
         K = getattr(self.policy, "K", None)
         if lin is not None and K is not None and lin.state_names == self.state.names:
@@ -287,12 +282,12 @@ class Run:
             q=q,
             v=v,
             x=x,
-            u=self.rows_u[rows],
+            u=u,
             target=x[0] if self.target is None else self.target,
             prediction=prediction if len(prediction) == self.count else prediction[:0],
-            energy=np.array([each.energy for each in momenta]),
-            momentum=np.array([each.central for each in momenta]),
-            momentum_drift=drift.max(axis=1),
+            energy=history.energy,
+            momentum=np.roll(history.momentum, 3, axis=1),
+            momentum_drift=self.conserved.drift(history, expected),
             placement=pin.SE3ToXYZQUAT(self.state.reference),
             state_names=self.state.names,
             input_names=self._names,
