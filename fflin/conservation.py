@@ -49,6 +49,8 @@ class Conserved:
         self._weight = robot.mass * np.array(robot.gravity) if any(robot.gravity) else None
         self._free = self._root.isIdentity(0.0)
         self._stored = robot.stored_momentum
+        self._imposed: Array | None = None
+        self._force = pin.Force.Zero()
 
     def momentum(self, q: Array, v: Array) -> Array:
         """Return the momentum (6,) about the point."""
@@ -89,9 +91,11 @@ class Conserved:
             pin.forwardKinematics(self._model, self._data, q)
             momentum = momentum.copy()
             momentum[3:] -= self._of_wheels()
-        lack: Array = self._base(q).actInv(pin.Force(momentum)).vector
+        if momentum is not self._imposed:  # which stays where nothing pushes
+            self._imposed, self._force = momentum, pin.Force(momentum)
+        lack: Array = self._base(q).actInv(self._force).vector
         lack -= self._M.dot(v)
-        v[:6] += dposv(self._M_bb, lack)[1]
+        v[:6] += dposv(self._M_bb, lack, 0, 0, 1)[1]
 
     def histories(self, q: Array, v: Array) -> Histories:
         """Return what is conserved at each row of q (N, nq) and v (N, nv)."""

@@ -14,6 +14,7 @@ from fflin.actuation import Actuation
 from fflin.errors import InputError
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
+from fflin.readout import readout
 from fflin.rotation import conjugate, quaternion_product, rotation_matrix
 from fflin.state import StateMap
 from fflin.validation import Array
@@ -78,11 +79,12 @@ class StateFeedback:
         fed = np.array([state.names.index(name) for name in lin.state_names])
         near = np.zeros(state.nx)
         near[fed] = lin.x0
-        K, x0, u0 = self.K, lin.x0, lin.u0
+        K = np.zeros((len(self.K), state.nx))
+        K[:, fed] = self.K
+        command = readout(state, K, lin.u0 + self.K @ lin.x0, near)
 
         def policy(_: float, q: Array, v: Array) -> Array:
-            u: Array = u0 - K.dot(state.read(q, v, near=near)[fed] - x0)
-            return u
+            return command(q, v)
 
         return policy
 

@@ -206,17 +206,18 @@ class Run:
         u = self.initial if channel is None else channel.begin(step, t, q, v)
         if step % self.every == 0:
             self._record(t, u)
-        asked = channel is not None and channel.continuous
+        ask = channel.ask if channel is not None and channel.continuous else None
+        wrench = self.conserved.wrench if self.follow else None
         pushes: list[Array] = []
 
         def f(t: float, q: Array, v: Array) -> Array:
             # The first stage is the point that was asked about already.
-            acting = channel.ask(t, q, v.copy()) if asked and pushes else u
+            acting = ask(t, q, v.copy()) if ask and pushes else u
             a, push = stage(t, q, v, acting)
-            pushes.append(self.conserved.wrench(q, push) if self.follow else push)
+            pushes.append(wrench(q, push) if wrench else push)
             return a
 
-        rate = f if asked or self.follow else self._held(u)
+        rate = f if ask or wrench else self._held(u)
         self.q, self.v = self.step(rate, t, q, v)
         if self.follow:
             self.expected = self.expected + self.weights.dot(pushes)

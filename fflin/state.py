@@ -174,6 +174,11 @@ class StateMap:
         """The placement oMref, a copy."""
         return pin.SE3(self._reference)
 
+    @property
+    def origin(self) -> pin.SE3:
+        """Where the base is, seen from the reference, at q[:7] = 0, 0, 0, 0, 0, 0, 1."""
+        return pin.XYZQUATToSE3(np.concatenate((self._position, self._quaternion)))
+
     def chart(self, q: Array) -> Chart:
         """Return the attitude chart at a configuration.
 
@@ -332,8 +337,8 @@ class StateMap:
         return v
 
     def lift(self, forces: Array) -> Array:
-        """Return a tau (nv,) whose generalised forces (6 + n,) in base axes are the given ones."""
-        tau = np.zeros(self.robot.nv)
+        """Return a tau (nv, ...) whose generalised forces (6 + n, ...) in base axes are given."""
+        tau = np.zeros((self.robot.nv, *forces.shape[1:]))
         tau[self._order] = forces
         return tau
 
