@@ -49,8 +49,6 @@ class Conserved:
         self._weight = robot.mass * np.array(robot.gravity) if any(robot.gravity) else None
         self._free = self._root.isIdentity(0.0)
         self._stored = robot.stored_momentum
-        self._imposed: Array | None = None
-        self._force = pin.Force.Zero()
 
     def momentum(self, q: Array, v: Array) -> Array:
         """Return the momentum (6,) about the point."""
@@ -69,7 +67,7 @@ class Conserved:
         `push` (6,) is the wrench at the base origin in base axes, linear then angular: the sum
         of all that acts from outside. Gravity is added.
         """
-        total: Array = self._base(q).act(pin.Force(push)).vector
+        total: Array = self._base(q).toDualActionMatrix().dot(push)
         if self._weight is not None:
             near = q.copy()
             near[:7] -= self._start
@@ -91,9 +89,7 @@ class Conserved:
             pin.forwardKinematics(self._model, self._data, q)
             momentum = momentum.copy()
             momentum[3:] -= self._of_wheels()
-        if momentum is not self._imposed:  # which stays where nothing pushes
-            self._imposed, self._force = momentum, pin.Force(momentum)
-        lack: Array = self._base(q).actInv(self._force).vector
+        lack: Array = self._base(q).toActionMatrix().T.dot(momentum)
         lack -= self._M.dot(v)
         v[:6] += dposv(self._M_bb, lack, 0, 0, 1)[1]
 

@@ -28,6 +28,7 @@ Event = Callable[[float, Array, Array], float]
 # A turn within one step [rad] beyond which no integrator follows.
 _LARGEST_TURN = 1.0
 _STEP = 0.01  # [s]
+_LOOK = 16  # steps between looks at the clock
 _ROWS_LIMIT = 10_000_000
 
 
@@ -180,15 +181,22 @@ class Run:
         self.step = self.method.prepare(self.robot.model, self.dt)
         self.weights = self.dt * np.array(self.method.weights)
         self.follow = not self.dynamics.isolated(self.channel is not None)
+        continuous = self.channel is not None and self.channel.continuous
+        self.asked = self.channel.ask if self.channel is not None and continuous else None
         bar = Progress(self.steps, progress)
         stopped, step = "", 0
         try:
             for step in range(self.steps):
                 u = self._advance(step)
-                stopped = self._fault(step) or self._event(step + 1)
+                # The square is above that of any turn, and not finite where an entry is not.
+                if self.lin is not None or not float(self.v.dot(self.v)) < self.slow:
+                    stopped = self._fault(step)
+                if not stopped and self.events:
+                    stopped = self._event(step + 1)
                 if stopped:
                     break
-                bar.update(step + 1)
+                if step % _LOOK == 0:
+                    bar.update(step + 1)
         except KeyboardInterrupt:
             if not self.count:
                 raise
@@ -202,12 +210,21 @@ class Run:
     def _advance(self, step: int) -> Array:
         """Take one step; return what acted as it began."""
         t, q, v = step * self.dt, self.q, self.v
-        channel, stage = self.channel, self.dynamics.stage
-        u = self.initial if channel is None else channel.begin(step, t, q, v)
+        u = self.initial if self.channel is None else self.channel.begin(step, t, q, v)
         if step % self.every == 0:
             self._record(t, u)
-        ask = channel.ask if channel is not None and channel.continuous else None
-        wrench = self.conserved.wrench if self.follow else None
+        if self.follow or self.asked:
+            self._follow(t, q, v, u)
+        else:
+            self.q, self.v = self.step(self._held(u), t, q, v)
+        if self.project:
+            self.conserved.impose(self.q, self.v, self.expected)
+        return u
+
+    def _follow(self, t: float, q: Array, v: Array, u: Array) -> None:
+        """Take one step under a law that is asked at each stage, or of which pushes are summed."""
+        ask = self.asked
+        stage, wrench = self.dynamics.stage, self.conserved.wrench if self.follow else None
         pushes: list[Array] = []
 
         def f(t: float, q: Array, v: Array) -> Array:
@@ -217,13 +234,9 @@ class Run:
             pushes.append(wrench(q, push) if wrench else push)
             return a
 
-        rate = f if ask or wrench else self._held(u)
-        self.q, self.v = self.step(rate, t, q, v)
-        if self.follow:
+        self.q, self.v = self.step(f, t, q, v)
+        if wrench:
             self.expected = self.expected + self.weights.dot(pushes)
-        if self.project:
-            self.conserved.impose(self.q, self.v, self.expected)
-        return u
 
     def _held(self, u: Array) -> Any:
         """Return f(t, q, v) under an input that stays, made anew where it is another."""
@@ -233,20 +246,17 @@ class Run:
 
     def _fault(self, step: int) -> str:
         """Say what is wrong with the step that was taken; drop it where it has no meaning."""
-        # The square is larger than that of any turn, and not finite where an entry is not.
-        if not float(self.v.dot(self.v)) < self.slow:
-            turn = float(np.abs(self.v[self.turning]).max(initial=0.0)) * self.dt
-            if not (turn < _LARGEST_TURN and np.isfinite(self.v).all()):
-                self.q, self.v = (rows[self.count - 1] for rows in self.rows[:2])
-                t = (step + 1) * self.dt
-                if not np.isfinite(turn) or turn > 1e3:
-                    return f"diverged at t = {t:g} s"
-                return f"diverged at t = {t:g} s: a joint or the base turns {turn:.2g} rad a step"
+        t = (step + 1) * self.dt
+        turn = float(np.abs(self.v[self.turning]).max(initial=0.0)) * self.dt
+        if not (turn < _LARGEST_TURN and np.isfinite(self.v).all()):
+            self.q, self.v = (rows[self.count - 1] for rows in self.rows[:2])
+            if not np.isfinite(turn) or turn > 1e3:
+                return f"diverged at t = {t:g} s"
+            return f"diverged at t = {t:g} s: a joint or the base turns {turn:.2g} rad a step"
         if self.lin is None:
             return ""
         before, self.scalar = self.scalar, self.state.scalar(self.q)
         if before * self.scalar < 0.0:
-            t = (step + 1) * self.dt
             return f"left the chart at t = {t:g} s: the base turned by 180 deg from the reference"
         return ""
 

@@ -168,6 +168,7 @@ class StateMap:
         offset = pin.SE3ToXYZQUAT(oMref.actInv(robot.model.jointPlacements[ROOT]))
         self._position, self._quaternion = offset[:3], offset[3:]
         self._rotation = rotation_matrix(self._quaternion)
+        self._aligned = bool((self._rotation == np.eye(3)).all())
 
     @property
     def reference(self) -> pin.SE3:
@@ -205,8 +206,8 @@ class StateMap:
 
     def rotation(self, q: Array) -> Array:
         """Return refMb.rotation (3, 3) at a valid configuration, at any turn."""
-        turned: Array = self._rotation.dot(pin.XYZQUATToSE3(q[:7]).rotation)
-        return turned
+        turned: Array = pin.XYZQUATToSE3(q[:7]).rotation
+        return turned if self._aligned else self._rotation.dot(turned)
 
     def scalar(self, q: Array) -> float:
         """Return q0 at a valid configuration, with the sign of the quaternion in q."""
