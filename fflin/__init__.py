@@ -81,14 +81,16 @@ _PUBLIC = {
     "modes": "eigenmodes",
     "momentum_reduction": "momentum",
     "observability": "observation",
-    "plot_matrices": "plots",
+    "plot_matrices": "model_plots",
     "plot_motion": "plots",
-    "plot_poles": "plots",
+    "plot_poles": "model_plots",
+    "plot_validity": "model_plots",
     "sampled_cost": "sampling",
     "simulate": "simulation",
     "tvlqr": "schedules",
     "validity": "region",
     "velocity": "points",
+    "visualize": "viewer",
 }
 
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
@@ -120,6 +122,7 @@ if TYPE_CHECKING:
     from fflin.linearization import Linearizer, linearize
     from fflin.loading import from_model, load
     from fflin.model import Robot, configuration
+    from fflin.model_plots import plot_matrices, plot_poles, plot_validity
     from fflin.momentum import (
         ReducedModel,
         generalized_inertia,
@@ -140,7 +143,7 @@ if TYPE_CHECKING:
         JointVelocities,
         Momentum,
     )
-    from fflin.plots import plot_matrices, plot_motion, plot_poles
+    from fflin.plots import plot_motion
     from fflin.points import effort, velocity
     from fflin.policies import Allocation, StateFeedback, TrajectoryFeedback
     from fflin.region import Validity, validity
@@ -153,6 +156,7 @@ if TYPE_CHECKING:
     from fflin.structure import Controllability, controllability
     from fflin.trajectory import LinearTrajectory, linearize_trajectory
     from fflin.verification import Check, check
+    from fflin.viewer import visualize
     from fflin.weights import bryson
 
 

@@ -21,6 +21,7 @@ from fflin.commands import (
     natural_modes,
     regulator,
     simulation,
+    visual,
 )
 from fflin.errors import FflinError, FflinWarning
 
@@ -88,4 +89,5 @@ def _parser() -> argparse.ArgumentParser:
     regulator.add_commands(commands)
     natural_modes.add_commands(commands)
     simulation.add_commands(commands)
+    visual.add_commands(commands)
     return parser

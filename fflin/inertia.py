@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.errors import FflinWarning, SingularInertiaError, listed
+from fflin.inertia_bounds import STROKE
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
 from fflin.state import StateMap
@@ -18,19 +19,28 @@ from fflin.validation import Array
 _EPS = float(np.finfo(float).eps)
 _WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
+# The same with the moments about the base's origin, where Pinocchio's articulated bodies are
+# added up, bounds their rounding; up to here they are taken, beyond it a factor of M.
+_QUICK_COUPLING = 1e-11 / _EPS
+
+# From this size on LAPACK is quicker than a sparse factor.
+_DENSE_SIZE = 64
+
 # Bound once: the look-up of a name in a module costs as much as a small matrix.
-_crba, _decompose, _compute_inverse = (
+_crba, _decompose, _invert_factor, _compute_inverse = (
     pin.crba,
     pin.cholesky.decompose,
     pin.cholesky.computeMinv,
+    pin.computeMinverse,
 )
 
 
 class Inertia:
-    """M at a configuration, by CRBA, and M^-1, by the sparse Cholesky factor of M.
+    """M^-1 at a configuration, in base axes: angular, linear, joints.
 
-    Base axes: angular, linear, joints. Scaling M by its diagonal before it is factored would
-    gain nothing, since the rounding of a Cholesky factorisation is invariant under it.
+    By Pinocchio's articulated bodies where these are sure to lose no digit that matters, else by
+    a Cholesky factor of CRBA's M. Scaling M by its diagonal before it is factored would gain
+    nothing, since the rounding of a Cholesky factorisation is invariant under it.
 
     Parameters
     ----------
@@ -44,41 +54,47 @@ class Inertia:
         self._state = state
         self._data = data
         self._model = state.robot.model
-        # A view, since Pinocchio overwrites M in place; transposed, it is C-contiguous.
-        self._M = data.M.T
-        self._diagonal = self._M.diagonal()
+        # Views, since Pinocchio overwrites in place what they show.
+        self._inverse = data.Minv
+        self._inverse_diagonal = self._inverse.diagonal()
         self._constrained = bool(state.robot.followers)
+        self._bounds = None if self._constrained else state.robot.inertia_bounds
+        self._slides = [joint.idx_q for joint in state.robot.joints if joint.prismatic]
+        # The base at the world's origin: M does not depend on where it is, but Pinocchio works in
+        # world axes and would lose digits to a base far away.
+        self._still = pin.neutral(state.robot.model)
         self._least_coupling = 0.999 * (6 + state.robot.n)
 
-    def invert(self, q: Array, out: Array) -> None:
+    def invert(self, q: Array, out: Array, *, quick: bool = False) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array.
+
+        By articulated bodies only where `quick` is asked for: their rounding, small as it is,
+        takes from a slope M^-1 K the exactness of what M^-1 leaves alone.
 
         Raises
         ------
         SingularInertiaError
             If a joint moves no mass, named.
         """
-        model, data = self._model, self._data
-        _crba(model, data, q)
-        if self._constrained:
-            self._invert_projected(out)
-            return
-        _decompose(model, data)
-        inverse = _compute_inverse(model, data)
-        self._state.project(inverse, out)
-        coupling = self._diagonal.dot(inverse.diagonal())
-        if not self._least_coupling < coupling < _WARNING_COUPLING:
-            self._judge(coupling, self._state.project(self._M))
-
-    def _invert_projected(self, out: Array) -> None:
-        """Invert S^T M S, which is dense, where joints mimic others."""
-        from scipy.linalg.lapack import dpotrf, dpotri
-
-        M = self._state.project(self._M)
-        factor, failed = dpotrf(M)
-        upper = np.full_like(M, np.nan) if failed else dpotri(factor)[0]
-        np.copyto(out, np.triu(upper) + np.triu(upper, 1).T)
+        still = self._still
+        still[7:] = q[7:]
+        bounds = self._bounds if quick else None
+        if bounds is not None and (not self._slides or self._within_stroke(still)):
+            _compute_inverse(self._model, self._data, still)
+            self._state.project(self._inverse, out)
+            # Written so that NaN, from a pivot that is zero, fails too.
+            if self._least_coupling < bounds.dot(self._inverse_diagonal) < _QUICK_COUPLING:
+                return
+        M = self._state.project(_crba(self._model, self._data, still).T)
+        if self._constrained or len(M) > _DENSE_SIZE:
+            _invert_dense(M, out)
+        else:
+            _decompose(self._model, self._data)
+            self._state.project(_invert_factor(self._model, self._data), out)
         self._judge(M.diagonal().dot(out.diagonal()), M)
+
+    def _within_stroke(self, q: Array) -> bool:
+        return all(abs(q[index]) <= STROKE for index in self._slides)
 
     def _judge(self, coupling: float, M: Array) -> None:
         # Written so that NaN, from a pivot that is zero, fails too.
@@ -92,6 +108,15 @@ class Inertia:
                 FflinWarning,
                 stacklevel=6,
             )
+
+
+def _invert_dense(M: Array, out: Array) -> None:
+    from scipy.linalg.lapack import dpotrf, dpotri
+
+    factor, failed = dpotrf(M)
+    upper = np.full_like(M, np.nan) if failed else dpotri(factor)[0]  # zero below its diagonal
+    np.add(upper, upper.T, out=out)
+    out.flat[:: len(M) + 1] *= 0.5
 
 
 def inertia_matrix(robot: Robot, lin: LinearModel) -> Array:

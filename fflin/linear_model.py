@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from fflin.state import Frame
 
 
+_new, _set = object.__new__, object.__setattr__
+
+
 @dataclass(frozen=True)
 class Certificate:
     """The figures that prove a linear model; all are relative and of the order of round-off.
@@ -127,9 +130,16 @@ class LinearModel:
     def _from_fields(cls, values: dict[str, Any]) -> LinearModel:
         # The generated __init__ sets two dozen frozen fields one by one, which costs as much
         # as the dynamics of a small robot. The caller passes read-only arrays of its own.
-        lin = object.__new__(cls)
-        object.__setattr__(lin, "__dict__", values)
+        lin = _new(cls)
+        _set(lin, "__dict__", values)
         return lin
+
+    def __getattr__(self, name: str) -> Any:
+        # Of a model at rest: what costs as much as its dynamics is made when it is asked for.
+        make = vars(self).get("_when_asked", {}).get(name)
+        if make is None:
+            raise AttributeError(f"'LinearModel' object has no attribute '{name}'")
+        return vars(self).setdefault(name, make(self.q))
 
     def __repr__(self) -> str:
         nx, nu = self.B.shape

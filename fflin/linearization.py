@@ -121,17 +121,18 @@ class Linearizer:
         self._A_rest = _frozen(at_rest(self._map))
         self._nu = len(self._actuation.names)
         self._shape_B, self._lower = (nx, self._nu), slice(nv, nx)
-        self._q_m = self._map.groups.q_m if robot.n else None
-        self._root_at_origin = robot.model.jointPlacements[ROOT].isIdentity(0.0)
         self._reference = _frozen(pin.SE3ToXYZQUAT(self._map.reference))
         self._common = self._common_fields()
         self._at_rest_fields = self._common | {
             "A": self._A_rest,
             "f0": self._zero_x,
-            "x0": self._zero_x,
-            "y0": self._zero_x,
             "u0": self._zero_u,
             "v": self._zero_v,
+            "_when_asked": {
+                "x0": partial(_state_at_rest, self._map),
+                "y0": partial(_state_at_rest, self._map),
+                "_reference": partial(_own_reference, robot),
+            },
         }
 
     def __call__(
@@ -185,16 +186,7 @@ class Linearizer:
         B = np.zeros(self._shape_B)
         self._accelerations.invert(q, B[self._lower])
         B.setflags(write=False)
-        values = self._at_rest_fields.copy()
-        values["B"] = B
-        values["q"] = q
-        if self._q_m is not None:
-            x0 = np.zeros(self._map.nx)
-            x0[self._q_m] = self._map.joint_positions(q)
-            x0.setflags(write=False)
-            values["x0"] = values["y0"] = x0
-        values["_reference"] = q[:7] if self._root_at_origin else self._reference_of(q)
-        return LinearModel._from_fields(values)
+        return LinearModel._from_fields(self._at_rest_fields | {"B": B, "q": q})
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
         state, groups = self._map, self._map.groups
@@ -248,12 +240,7 @@ class Linearizer:
         return C, D, sensed.y
 
     def _reference_of(self, q: Array) -> Array:
-        if not self._own_reference:
-            return self._reference
-        if self._root_at_origin:
-            return q[:7]
-        root = self.robot.model.jointPlacements[ROOT]
-        return _frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q[:7])))
+        return _own_reference(self.robot, q) if self._own_reference else self._reference
 
     def _common_fields(self) -> dict[str, Any]:
         robot, state = self.robot, self._map
@@ -334,6 +321,19 @@ def linearize(
 
 def _rebuilt(robot: Robot, frame: Frame, reference: pin.SE3 | None, moving: bool) -> Linearizer:
     return Linearizer(robot, frame=frame, reference=reference, moving=moving)
+
+
+def _state_at_rest(state: StateMap, q: Array) -> Array:
+    x0: Array = np.zeros(state.nx)
+    x0[state.groups.q_m] = state.joint_positions(q)
+    return _frozen(x0)
+
+
+def _own_reference(robot: Robot, q: Array) -> Array:
+    root = robot.model.jointPlacements[ROOT]
+    if root.isIdentity(0.0):
+        return q[:7]
+    return _frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q[:7])))
 
 
 def _is_finite(array: Array) -> bool:

@@ -1,7 +1,8 @@
 """Making robots: from a file or from a model that was built by other means."""
 
+import os
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,13 @@ from fflin.validation import number
 Lock = Mapping[str, float | None] | Iterable[str]
 
 
-def load(robot: str | Path, *, lock: Lock | None = None, **fields: Any) -> Robot:
+def load(
+    robot: str | Path,
+    *,
+    lock: Lock | None = None,
+    package_dirs: Sequence[str | Path] = (),
+    **fields: Any,
+) -> Robot:
     """Load a robot as a free flyer, by default in zero gravity.
 
     Parameters
@@ -30,6 +37,9 @@ def load(robot: str | Path, *, lock: Lock | None = None, **fields: Any) -> Robot
     lock : mapping or iterable of str, optional
         {joint: value [rad|m]} welded at that value (None: at neutral), or names. What mimics a
         locked joint is welded with it.
+    package_dirs : sequence of path
+        Folders in which ``package://`` paths of meshes are looked up when the robot is drawn,
+        before those that the URDF lies in.
     **fields
         inputs, stiffness, damping, rest, gravity: see `Robot.replace`.
 
@@ -65,6 +75,7 @@ def load(robot: str | Path, *, lock: Lock | None = None, **fields: Any) -> Robot
         urdf=found.path,
         urdf_sha256=description.sha256,
         notes=description.notes,
+        package_dirs=(*_folders(package_dirs), *found.package_dirs),
         urdf_damping=_independent_damping(loaded, description.damping),
     )
     return loaded.replace(**fields) if fields else loaded
@@ -107,6 +118,14 @@ def from_model(
     own = {joint.name: float(robot.model.damping[joint.idx_v]) for joint in robot.joints}
     robot = replace(robot, urdf_damping=own)
     return robot.replace(**fields) if fields else robot
+
+
+def _folders(package_dirs: Any) -> tuple[Path, ...]:
+    from fflin.files import as_path
+
+    if isinstance(package_dirs, str | os.PathLike) or not isinstance(package_dirs, Sequence):
+        raise InputError(f"package_dirs is {package_dirs!r}, expected a list of folders")
+    return tuple(as_path(folder) for folder in package_dirs)
 
 
 def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, Mimic]) -> Robot:

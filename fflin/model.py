@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,11 +15,14 @@ import pinocchio as pin
 from fflin.errors import InputError, ModelError, unknown
 from fflin.fields import validated_fields, validated_inputs
 from fflin.frames import ROOT
+from fflin.inertia_bounds import bounds_of_inertia
 from fflin.inputs import Input, default_inputs, named_wheels
 from fflin.joints import Follower, Joint
 from fflin.outputs import FullState, Output
-from fflin.validation import NORM_TOLERANCE, Array, number, placement, vector
+from fflin.validation import DOUBLE, NORM_TOLERANCE, Array, number, placement, vector
 from fflin.wheels import stored_momentum, with_wheels
+
+_CONFIGURATION = "a configuration in Pinocchio's order"
 
 # What renormalising a unit quaternion leaves: two ulp of unity.
 _ROUND_OFF = 2.0 * float(np.finfo(float).eps)
@@ -73,6 +77,8 @@ class Robot:
         {joint: position [rad|m]} where a spring is relaxed; 0 where not named.
     gravity : tuple of float (3,)
         Uniform acceleration [m/s^2] in Pinocchio's world axes. `model` itself has none.
+    package_dirs : tuple of Path
+        Folders in which ``package://`` paths of meshes are looked up when it is drawn.
     """
 
     model: pin.Model
@@ -90,6 +96,7 @@ class Robot:
     damping: Mapping[str, float] = field(default_factory=dict)
     rest: Mapping[str, float] = field(default_factory=dict)
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    package_dirs: tuple[Path, ...] = ()
     # Where some of its joints are wheels: the same robot without them.
     _wheelless: Robot | None = None
 
@@ -178,6 +185,11 @@ class Robot:
         """Size of Pinocchio's velocity: 6 + n, and one for each mimic joint."""
         return int(self.model.nv)
 
+    @cached_property
+    def inertia_bounds(self) -> Array | None:
+        """Bounds (nv,) of what each coordinate moves, see `bounds_of_inertia`."""
+        return bounds_of_inertia(self.model)
+
     @property
     def mass(self) -> float:
         """Total mass in kg."""
@@ -242,8 +254,11 @@ class Robot:
             If the size is wrong, an entry is not finite, a part is not of unit length, or a mimic
             joint is not where its leader puts it.
         """
-        q = vector("q", q, self.nq, "a configuration in Pinocchio's order")
+        if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != self._shape:
+            q = vector("q", q, self.nq, _CONFIGURATION)
         entries = q.tolist()
+        if not math.isfinite(sum(entries)):
+            vector("q", q, self.nq, _CONFIGURATION)  # says which entry it is
         x, y, z, w = entries[3:7]
         worst = abs(x * x + y * y + z * z + w * w - 1.0)
         if worst > NORM_TOLERANCE:
@@ -254,12 +269,13 @@ class Robot:
         for index in self._unbounded:
             c, s = entries[index], entries[index + 1]
             excess = abs(c * c + s * s - 1.0)
-            if excess > NORM_TOLERANCE:
-                raise InputError(
-                    f"(cos, sin) of continuous joint '{self._unbounded[index]}', "
-                    f"q[{index}:{index + 2}], has length {np.hypot(c, s):.9g}, expected 1"
-                )
-            worst = max(worst, excess)
+            if excess > worst:
+                worst = excess
+                if excess > NORM_TOLERANCE:
+                    raise InputError(
+                        f"(cos, sin) of continuous joint '{self._unbounded[index]}', "
+                        f"q[{index}:{index + 2}], has length {np.hypot(c, s):.9g}, expected 1"
+                    )
         if worst > _ROUND_OFF:
             q = pin.normalize(self.model, q)
         return self._followed(q) if self.followers else q
@@ -321,6 +337,10 @@ class Robot:
                 f"{size / 2**30:.1f} GiB (limit 1 GiB); lock joints that do not matter"
             )
         return self.model.createData()
+
+    @cached_property
+    def _shape(self) -> tuple[int]:
+        return (self.nq,)
 
     @cached_property
     def _unbounded(self) -> dict[int, str]:

@@ -87,7 +87,7 @@ class Accelerations:
 
     def invert(self, q: Array, out: Array) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
-        self._inertia.invert(q, out)
+        self._inertia.invert(q, out, quick=True)
 
     def rates(self, q: Array, v: Array, nu: Array, q_m: Array, u: Array) -> Rates:
         """Return the accelerations and their slopes.

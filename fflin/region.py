@@ -28,7 +28,7 @@ _FORESIGHT, _PATIENCE = 3.0, 3.0
 _STEPS = 60
 
 # Relative prediction error up to which the linear model is called trusted.
-_TRUSTED = 0.1
+TRUSTED = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,11 +94,11 @@ class Validity:
         failures = ", ".join(f"{ends[key]} {words}" for key, words in _ENDS.items() if ends[key])
         lines = [
             f"{self.robot}: the linear loop foresees the nonlinear one within "
-            f"{100.0 * _TRUSTED:g} % up to {_shown(self.trusted)}; the error grows with the "
+            f"{100.0 * TRUSTED:g} % up to {shown(self.trusted)}; the error grows with the "
             f"displacement to the power {self.slope:.3f}",
-            f"every loop settled up to {_shown(self.holds)}: {self.inside} of {self.inside} runs, "
+            f"every loop settled up to {shown(self.holds)}: {self.inside} of {self.inside} runs, "
             f"so that at least {100.0 * self.inside_rate:.1f} % do ({sure} confidence)",
-            f"up to {_shown(self.largest)} {self.settled} of {count} settled, {100.0 * low:.1f} to "
+            f"up to {shown(self.largest)} {self.settled} of {count} settled, {100.0 * low:.1f} to "
             f"{100.0 * high:.1f} % ({sure} confidence)" + (f"; {failures}" if failures else ""),
         ]
         return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
@@ -175,7 +175,7 @@ def validity(
         raise InputError(f"confidence is {confidence:g}, expected a share between 0 and 1")
     if not 0.0 <= largest["attitude"] < 175.0 or min(largest.values()) < 0.0:
         raise InputError(
-            f"the displacements are {_shown(largest)}; expected none negative, and an attitude "
+            f"the displacements are {shown(largest)}; expected none negative, and an attitude "
             "below 175 deg, where the chart ends"
         )
     # Of each run its own stream, so that it does not matter who does which.
@@ -281,16 +281,16 @@ def _slope(errors: Array) -> float:
 
 def _crossing(errors: Array) -> float:
     """Return the level at which the relative error reaches what is trusted, between levels."""
-    beyond = np.flatnonzero(~(errors <= _TRUSTED))
+    beyond = np.flatnonzero(~(errors <= TRUSTED))
     if not len(beyond):
         return 1.0
     first = int(beyond[0])
     if first == 0 or not np.isfinite(errors[first]):
         # Below the first level the error is proportional to it.
         at = max(first - 1, 0)
-        return float(min(_LEVELS[at] * _TRUSTED / errors[at], _LEVELS[first]))
+        return float(min(_LEVELS[at] * TRUSTED / errors[at], _LEVELS[first]))
     pair = slice(first - 1, first + 1)
-    return float(np.exp(np.interp(np.log(_TRUSTED), np.log(errors[pair]), np.log(_LEVELS[pair]))))
+    return float(np.exp(np.interp(np.log(TRUSTED), np.log(errors[pair]), np.log(_LEVELS[pair]))))
 
 
 def _clopper_pearson(successes: int, count: int, confidence: float) -> tuple[float, float]:
@@ -303,7 +303,8 @@ def _clopper_pearson(successes: int, count: int, confidence: float) -> tuple[flo
     return float(low), float(high)
 
 
-def _shown(displacement: dict[str, float]) -> str:
+def shown(displacement: dict[str, float]) -> str:
+    """Say a displacement in words."""
     return (
         f"{displacement['attitude']:.3g} deg, {displacement['position']:.3g} m and "
         f"{displacement['joint']:.3g} rad|m"

@@ -22,7 +22,7 @@ else:
 NORM_TOLERANCE = 1e-6
 
 # Native double precision; NumPy makes one such object, so that identity tells it.
-_DOUBLE = np.dtype(np.float64)
+DOUBLE = np.dtype(np.float64)
 
 
 def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
@@ -49,7 +49,7 @@ def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
     InputError
         If the shape is another, an entry is masked, complex or not finite.
     """
-    if type(value) is np.ndarray and value.dtype is _DOUBLE:
+    if type(value) is np.ndarray and value.dtype is DOUBLE:
         array: Array = value
     else:
         array = _as_double(name, value)

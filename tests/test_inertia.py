@@ -6,9 +6,10 @@ from fractions import Fraction
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import random_tree
+from conftest import BUNDLED, random_tree
 
 import fflin
+from fflin.inertia_bounds import STROKE
 
 
 def chain(*inertias):
@@ -52,8 +53,8 @@ def test_inverse_is_as_right_as_the_conditioning_allows(n):
 
 
 def test_scaling_m_beforehand_would_gain_nothing():
-    """The inverse by way of a scaled M is no nearer to the exact one."""
-    lin = fflin.linearize(fflin.load("canadarm2"))
+    """Where M is factored, its inverse by way of a scaled M is no nearer to the exact one."""
+    lin = fflin.linearize(far_joint(1e3))
     exact = exact_inverse(lin.M)
     mobility = np.sqrt(exact.diagonal())
     scale = 1.0 / np.sqrt(lin.M.diagonal())
@@ -61,9 +62,63 @@ def test_scaling_m_beforehand_would_gain_nothing():
     scaled = scale[:, None] * (factor.T @ factor) * scale
     errors = [
         np.abs((inverse - exact) / np.outer(mobility, mobility)).max()
-        for inverse in (lin.B[13:], scaled)
+        for inverse in (lin.B[12:], scaled)
     ]
     assert errors[0] < 4 * errors[1]
+
+
+@pytest.mark.parametrize("name", [*BUNDLED, "ur5", "tiago_no_hand", "double_pendulum"])
+def test_bound_on_rounding_holds(name):
+    """Of M's diagonal at any configuration, and of the error of the quick way to M^-1."""
+    robot = fflin.load(name)
+    order = [3, 4, 5, 0, 1, 2, *(joint.idx_v for joint in robot.joints)]
+    bounds = robot.inertia_bounds[order]
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        joints = {
+            joint.name: rng.uniform(-STROKE, STROKE) * (1.0 if joint.prismatic else 3.0)
+            for joint in robot.joints
+        }
+        lin = fflin.linearize(robot, fflin.configuration(robot, joints))
+        assert (lin.M.diagonal() <= bounds * (1.0 + 1e-12)).all()
+        exact = exact_inverse(lin.M)
+        coupling = bounds @ exact.diagonal()
+        mobility = np.sqrt(exact.diagonal())
+        error = np.abs(lin.B[6 + robot.n :] - exact) / np.outer(mobility, mobility)
+        assert error.max() < np.finfo(float).eps * coupling
+
+
+def test_slide_beyond_its_bound_costs_no_digit():
+    robot = fflin.load("tiago_no_hand")
+    (slide,) = [joint.name for joint in robot.joints if joint.prismatic]
+    lin = fflin.linearize(robot, fflin.configuration(robot, {slide: 50.0}))
+    exact = exact_inverse(lin.M)
+    mobility = np.sqrt(exact.diagonal())
+    error = np.abs(lin.B[6 + robot.n :] - exact) / np.outer(mobility, mobility)
+    assert error.max() < 8 * len(exact) * np.finfo(float).eps * lin.certificate.condition
+
+
+def test_far_base_costs_no_digit():
+    robot = fflin.load("servicer_7dof")
+    orbit = pin.SE3(pin.exp3(np.array([0.3, -0.9, 0.4])), np.array([7e6, -2e6, 1e6]))
+    far = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}, orbit))
+    near = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}))
+    assert (far.B == near.B).all()
+
+
+@pytest.mark.parametrize("n", [10, 70])
+def test_long_chain_is_inverted_as_right_by_every_way(n):
+    """Beyond the quick way: by a sparse factor, and by a dense one."""
+    link = pin.Inertia(1e3, np.array([0.05, 0.01, 0.0]), np.diag([4.0, 4.0, 4.0]))
+    robot = chain(*[link] * (n - 1), pin.Inertia(1.0, np.zeros(3), 1e-6 * np.eye(3)))
+    lin = fflin.linearize(robot)
+    inverse = lin.B[6 + n :]
+    mobility = np.sqrt(inverse.diagonal())
+    assert robot.inertia_bounds[6:] @ mobility[6:] ** 2 > 4.6e5
+    scale = np.sqrt(lin.M.diagonal())
+    residual = (lin.M @ inverse - np.eye(6 + n)) / scale[:, None] * scale
+    assert np.abs(residual).max() < 8 * (6 + n) * np.finfo(float).eps * lin.certificate.condition
+    assert (inverse == inverse.T).all()
 
 
 def far_joint(distance):

@@ -1,8 +1,12 @@
 """Sampling and hand-over to other libraries."""
 
+import copy
+import pickle
 import sys
+from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from conftest import random_point
 from scipy.linalg import expm
@@ -79,3 +83,19 @@ def test_equilibrium_is_told_from_motion(rest, moving):
 def test_repr_says_what_it_is(rest):
     assert repr(rest) == "LinearModel('ets_vii', nx=24, nu=12, frame='hybrid', continuous)"
     assert "dt=0.1 s" in repr(rest.discretize(0.1))
+
+
+def test_what_is_made_when_asked_for_survives_copies_and_pickles(robots):
+    robot = robots["servicer_7dof"]
+    q = fflin.configuration(robot, {"joint_2": 0.4}, pin.SE3(np.eye(3), np.array([1.0, 2.0, 3.0])))
+    expected = np.zeros(30)
+    expected[6 + robot.joint_names.index("joint_2")] = 0.4
+    for again in (copy.copy, copy.deepcopy, replace, lambda lin: pickle.loads(pickle.dumps(lin))):
+        lin = again(fflin.linearize(robot, q))
+        for name in ("x0", "y0"):
+            assert getattr(lin, name) == pytest.approx(expected, abs=1e-15)
+            assert getattr(lin, name) is getattr(lin, name)
+            assert not getattr(lin, name).flags.writeable
+        assert lin.reference.translation == pytest.approx([1.0, 2.0, 3.0])
+        with pytest.raises(AttributeError, match="no attribute 'x1'"):
+            lin.x1  # noqa: B018 - the access raises

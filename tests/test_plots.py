@@ -73,6 +73,23 @@ def test_pole_map_and_pattern(loop):
         assert [label.get_text() for label in axes.get_xticklabels()] == list(names)
 
 
+def test_validity_shows_the_runs_and_the_order(tmp_path):
+    robot = fflin.load("cubesat")
+    lin = fflin.linearize(robot)
+    gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
+    found = fflin.validity(robot, lin, gain, attitude=170.0, samples=12)
+    figure = fflin.plot_validity(found, tmp_path / "validity.png")
+    left, right = figure.axes
+    curve = left.get_lines()[0]
+    known = np.isfinite(found.prediction_error)
+    np.testing.assert_allclose(curve.get_ydata(), 100.0 * found.prediction_error[known])
+    heights = [sum(bar.get_height() for bar in bars) for bars in right.containers]
+    assert heights == [found.settled, 12 - found.settled]
+    assert (tmp_path / "validity.png").exists()
+    with pytest.raises(fflin.InputError, match=r"expected what fflin\.validity returns"):
+        fflin.plot_validity(3)
+
+
 @pytest.mark.parametrize("suffix", [".png", ".pdf", ".svg"])
 def test_figures_are_saved_whole(loop, tmp_path, suffix):
     _, _, motion = loop

@@ -1,4 +1,4 @@
-"""What the README shows must run, as it stands there."""
+"""What the README and the guide show must run, as it stands there."""
 
 import re
 import shlex
@@ -6,21 +6,32 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import fflin
 
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def code_blocks(language):
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+def code_blocks(language, text=README):
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
-def test_python_examples_run(tmp_path):
-    (tmp_path / "example.py").write_text("\n".join(code_blocks("python")))
+@pytest.mark.parametrize("page", ["README.md", "docs/guide.md"])
+def test_python_examples_run(tmp_path, page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    (tmp_path / "example.py").write_text("\n".join(code_blocks("python", text)))
     done = subprocess.run(
         [sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_links_lead_somewhere():
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        for link in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):
+            assert (page.parent / link).exists(), f"{page.name}: {link}"
 
 
 def test_commands_run(tmp_path):

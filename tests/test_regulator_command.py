@@ -37,12 +37,23 @@ def test_it_shows_and_saves_the_gain_that_the_library_gives(capsys, tmp_path):
 
 def test_dt_keeps_the_continuous_cost(capsys, tmp_path):
     path = tmp_path / "gain.json"
-    assert run(capsys, "planar_detumble", "--dt", "0.2", "-o", str(path))[0] == 0
+    options = ("--q", "q_b=1", "--dt", "0.2", "-o", str(path))
+    assert run(capsys, "planar_detumble", *options)[0] == 0
     lin = fflin.linearize(fflin.load("planar_detumble"))
     cost = fflin.sampled_cost(lin, 0.2, 1.0, lin.M.diagonal() ** -2.0)
     saved = fflin.Gain.load(path)
     assert saved.dt == 0.2
     assert saved.K == pytest.approx(fflin.lqr(lin.discretize(0.2), *cost).K, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("dt", [None, 0.2])
+def test_without_weights_accelerations_cost(capsys, tmp_path, dt):
+    path = tmp_path / "gain.json"
+    options = () if dt is None else ("--dt", str(dt))
+    assert run(capsys, "servicer_7dof", *options, "-o", str(path))[0] == 0
+    lin = fflin.linearize(fflin.load("servicer_7dof"))
+    expected = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0, dt=dt)
+    assert fflin.Gain.load(path).K == pytest.approx(expected.K, rel=1e-9)
 
 
 def test_joints_alone_cannot_hold_the_base(capsys):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import textwrap
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fflin.commands import DONE
@@ -65,6 +66,9 @@ def add_commands(commands: Commands) -> None:
             default=default,
             help=f"{what}; {default} by default",
         )
+    validity.add_argument(
+        "--plot", metavar="FILE", type=Path, help="draw it into FILE: .png, .pdf or .svg"
+    )
 
 
 def _analyze(arguments: argparse.Namespace) -> int:
@@ -112,6 +116,11 @@ def _validity(arguments: argparse.Namespace) -> int:
 
     if arguments.jobs < 1:
         raise InputError(f"--jobs is {arguments.jobs}, expected at least 1")
+    if arguments.plot:
+        from fflin.figures import check_figure_format, require_matplotlib
+
+        check_figure_format(arguments.plot)
+        require_matplotlib()
     robot, lin = linear_model(arguments)
     lin = momentum_reduction(lin) if arguments.reduce else lin
     gain = gain_of(lin, arguments)
@@ -128,8 +137,14 @@ def _validity(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
     )
     if arguments.jobs == 1:
-        print(measure())
-        return DONE
-    with ProcessPoolExecutor(arguments.jobs) as executor:
-        print(measure(executor=executor))
+        found = measure()
+    else:
+        with ProcessPoolExecutor(arguments.jobs) as executor:
+            found = measure(executor=executor)
+    print(found)
+    if arguments.plot:
+        from fflin.model_plots import plot_validity
+
+        plot_validity(found, arguments.plot)
+        print(f"wrote {arguments.plot}")
     return DONE

@@ -20,6 +20,7 @@ from fflin.commands.arguments import (
 )
 from fflin.commands.points import configuration_of, inputs_at, load_robot, once, velocity_of
 from fflin.commands.regulator import add_weights, gain_of
+from fflin.commands.visual import add_pictures, check_pictures, show_motion
 from fflin.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def add_commands(commands: Commands) -> None:
         "simulate",
         _simulate,
         "let a regulator bring the nonlinear robot from where it is put to the target",
-        "fflin simulate ets_vii --rpy 30 0 0 --duration 60 --plot loop.png -o loop.npz",
+        "fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png",
     )
     add_robot(simulate)
     add_pose(simulate)
@@ -92,6 +93,7 @@ def add_commands(commands: Commands) -> None:
         help="draw linear beside nonlinear into FILE: .png, .pdf or .svg",
     )
     add_output_file(simulate, "save the motion to FILE: .npz, .mat, .json or .csv")
+    add_pictures(simulate)
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
@@ -100,11 +102,12 @@ def _simulate(arguments: argparse.Namespace) -> int:
     if arguments.output_file:
         check_motion_format(arguments.output_file)
     if arguments.plot:
-        from fflin.plots import check_figure_format, require_matplotlib
+        from fflin.figures import check_figure_format, require_matplotlib
 
         check_figure_format(arguments.plot)
         require_matplotlib()
-    _, motion = simulated(arguments)
+    check_pictures(arguments)
+    robot, motion = simulated(arguments)
     from fflin.motion_reports import motion_report
 
     print(motion_report(motion, controlled=not arguments.free))
@@ -114,6 +117,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     if arguments.plot:
         motion.plot(arguments.plot)
         print(f"wrote {arguments.plot}")
+    show_motion(robot, motion, arguments)
     return FELL_SHORT if motion.stopped else DONE
 
 

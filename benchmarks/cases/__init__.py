@@ -1,0 +1,3 @@
+"""The cases: in each module a function `run` that returns its table."""
+
+ORDER = ("at_rest", "at_point", "growth", "number", "lqr", "simulation_step", "start_up", "memory")

@@ -1,0 +1,29 @@
+"""A single linearisation at rest."""
+
+import fflin
+from benchmarks.comparison import Call, compare
+from benchmarks.robots import NAMES, Point, load, random_point
+from benchmarks.tables import Table
+
+
+def run() -> Table:
+    return compare(
+        "at_rest",
+        "One linearisation at rest",
+        "fflin's time, its ratio to its floor (crba, dpotrf and dpotri called by hand), and the "
+        "peers' times as multiples of fflin's: above 1, fflin is faster. MuJoCo by hand is "
+        "kinematics, inertia, factor, solve and B, without checks, names or units.",
+        (random_point(load(name)) for name in NAMES),
+        fflin_call,
+        in_readme=True,
+    )
+
+
+def fflin_call(point: Point) -> Call:
+    linearizer, q = fflin.Linearizer(point.robot), point.q
+
+    def call() -> None:
+        lin = linearizer(q)
+        lin.A, lin.B  # noqa: B018 - what a caller would take
+
+    return call

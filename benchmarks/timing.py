@@ -1,0 +1,50 @@
+"""Times of several functions, measured side by side."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+SAMPLE_SECONDS, CASE_SECONDS = 1e-3, 3.0
+FEWEST_ROUNDS, MOST_ROUNDS = 9, 101
+
+
+@dataclass(frozen=True)
+class Times:
+    """Samples of one function [s], taken in turns with those of the others.
+
+    The least is what the function costs; the others hold what else the machine did.
+    """
+
+    samples: tuple[float, ...]
+
+    @property
+    def least(self) -> float:
+        return min(self.samples)
+
+    def ratio(self, other: "Times") -> float:
+        return self.least / other.least
+
+
+def interleaved(functions: Mapping[str, Callable[[], object]]) -> dict[str, Times]:
+    """Time functions in turns, so that a machine that is busy for a while is so for all."""
+    once = {name: _once(function) for name, function in functions.items()}
+    loops = {name: max(1, min(2000, round(SAMPLE_SECONDS / each))) for name, each in once.items()}
+    round_seconds = sum(loops[name] * once[name] for name in functions)
+    rounds = max(FEWEST_ROUNDS, min(MOST_ROUNDS, round(CASE_SECONDS / round_seconds)))
+    samples: dict[str, list[float]] = {name: [] for name in functions}
+    for _ in range(rounds):
+        for name, function in functions.items():
+            samples[name].append(_sample(function, loops[name]))
+    return {name: Times(tuple(taken)) for name, taken in samples.items()}
+
+
+def _sample(function: Callable[[], object], loops: int) -> float:
+    start = time.perf_counter()
+    for _ in range(loops):
+        function()
+    return (time.perf_counter() - start) / loops
+
+
+def _once(function: Callable[[], object]) -> float:
+    function()  # the first call pays for what is prepared once
+    return max(1e-9, min(_sample(function, 1) for _ in range(3)))

@@ -1,0 +1,110 @@
+// The live page: sliders that move the robot, and what the server says of where it is now.
+
+function makeHeatMap(parent, names) {
+  const box = document.createElement("div");
+  box.className = "plot";
+  const name = document.createElement("div");
+  name.className = "name";
+  const title = "inertia coupling";
+  name.textContent = title;
+  const canvas = document.createElement("canvas");
+  canvas.width = canvas.height = names.length;
+  canvas.className = "heat";
+  box.append(name, canvas);
+  parent.append(box);
+  let values = [];
+  canvas.addEventListener("pointermove", (event) => {
+    const bounds = canvas.getBoundingClientRect(), n = names.length;
+    const j = Math.floor(((event.clientX - bounds.left) / bounds.width) * n);
+    const i = Math.floor(((event.clientY - bounds.top) / bounds.height) * n);
+    if (names[i] && names[j] && values.length) name.textContent = `${names[i]} · ${names[j]}: ${values[i * n + j].toFixed(3)}`;
+  });
+  canvas.addEventListener("pointerleave", () => { name.textContent = title; });
+  return (entries) => {
+    values = entries;
+    const context = canvas.getContext("2d"), image = context.createImageData(names.length, names.length);
+    entries.forEach((value, k) => {
+      const s = Math.sqrt(Math.abs(value));
+      const colour = value >= 0 ? [40 + 215 * s, 60 + 120 * s, 90 - 40 * s] : [40 + 20 * s, 60 + 110 * s, 90 + 165 * s];
+      image.data.set([...colour, 60 + 195 * s], 4 * k);
+    });
+    context.putImageData(image, 0, 0);
+  };
+}
+
+function makeSlider(parent, joint, send) {
+  const row = document.createElement("label");
+  row.className = "slider";
+  const name = document.createElement("span"), value = document.createElement("b"), slider = document.createElement("input");
+  name.textContent = joint.name;
+  slider.type = "range";
+  slider.min = joint.low; slider.max = joint.high; slider.step = "any";
+  row.append(name, value, slider);
+  parent.append(row);
+  const show = (x) => { value.textContent = joint.length ? `${x.toFixed(3)} m` : `${((x * 180) / Math.PI).toFixed(1)}°`; };
+  slider.addEventListener("input", () => { show(Number(slider.value)); send({ joints: { [joint.name]: Number(slider.value) } }); });
+  return (x) => {
+    show(x);
+    if (document.activeElement !== slider || !slider.matches(":active")) slider.value = x;
+  };
+}
+
+function makeLive({ viewer, aim, frame }, info) {
+  const panel = document.getElementById("panel");
+  let socket = null;
+  const send = (message) => { if (socket && socket.readyState === 1) socket.send(JSON.stringify(message)); };
+  const row = document.createElement("div");
+  row.className = "row";
+  for (const [label, message] of [["neutral", { neutral: true }], ["random", { random: true }]]) {
+    const button = document.createElement("button");
+    button.textContent = label;
+    button.addEventListener("click", () => send(message));
+    row.append(button);
+  }
+  if (info.joints.length) panel.append(row);
+  const sliders = info.joints.map((joint) => makeSlider(panel, joint, send));
+  const showHeat = makeHeatMap(panel, info.names);
+  info.triads.forEach((each, k) => viewer.scene_tree.find([...each.path, `frame ${k}`]).object.add(triad(each)));
+  const nodes = info.bodies.map((path) => viewer.scene_tree.find(path).object);
+  const centre = yUp(info.centre);
+  let last = null;
+  const live = { ready: false, state: null, messages: 0 };
+
+  const apply = (state) => {
+    state.poses.forEach((pose, k) => {
+      nodes[k].position.set(pose[0], pose[1], pose[2]);
+      nodes[k].quaternion.set(pose[3], pose[4], pose[5], pose[6]);
+    });
+    state.joints.forEach((x, k) => sliders[k](x));
+    if (state.coupling) showHeat(state.coupling);
+    document.querySelector("header p").textContent = state.time === null ? info.subtitle : `t = ${state.time.toFixed(2)} s`;
+    const base = yUp(state.poses[0]);
+    if (last) {
+      const shift = base.clone().sub(last);
+      centre.add(shift);
+      if (info.follow) { viewer.camera.position.add(shift); viewer.controls.target.add(shift); }
+    }
+    last = base;
+    aim(centre);
+    live.state = state;
+    viewer.set_dirty();
+  };
+  const connect = () => {
+    socket = new WebSocket(`ws://${location.host}/socket`);
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => { problem(""); live.ready = true; };
+    socket.onmessage = (message) => {
+      live.messages++;
+      if (typeof message.data === "string") { apply(JSON.parse(message.data)); return; }
+      try {
+        viewer.handle_command_bytearray(new Uint8Array(message.data));
+      } catch (error) {
+        console.warn("a piece cannot be drawn:", error);
+      }
+    };
+    socket.onclose = () => { problem("No connection to fflin; it will be taken up again."); setTimeout(connect, 1000); };
+  };
+  frame(info.points, info.direction);
+  connect();
+  return live;
+}

@@ -1,0 +1,109 @@
+// From the data of the page to the picture.
+
+function decode(text) {
+  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  return bytes;
+}
+
+const floats = (text) => new Float32Array(decode(text).buffer);
+
+function problem(message) {
+  const box = document.getElementById("problem");
+  box.textContent = message;
+  box.hidden = !message;
+}
+
+function makeLegend(viewer, entries) {
+  const legend = document.getElementById("legend");
+  for (const { label, colour, paths, off } of entries) {
+    const row = document.createElement("label"), check = document.createElement("input");
+    const swatch = document.createElement("i");
+    check.type = "checkbox";
+    check.checked = !off;
+    swatch.style.setProperty("--swatch", colour);
+    const set = () => {
+      for (const path of paths) viewer.set_property(path, "visible", check.checked);
+      viewer.set_dirty();
+    };
+    check.addEventListener("change", set);
+    row.append(check, swatch, label);
+    legend.append(row);
+    set();
+  }
+}
+
+function main() {
+  const info = JSON.parse(document.getElementById("data").textContent);
+  document.querySelector("h1").textContent = info.title;
+  document.querySelector("header p").textContent = info.subtitle;
+  let stage;
+  try {
+    stage = makeStage(info);
+  } catch (error) {
+    problem("This browser shows no WebGL, which the picture needs.");
+    console.warn(error);
+    return;
+  }
+  const { viewer, aim, frame, resize } = stage;
+  window.viewer = viewer;
+  for (const command of info.commands) {
+    try {
+      viewer.handle_command_bytearray(decode(command));
+    } catch (error) {
+      console.warn("a piece cannot be drawn:", error);
+    }
+  }
+  window.addEventListener("keydown", (event) => {
+    if (event.key === "g" && !event.target.matches("input, select, textarea")) {
+      document.body.classList.toggle("tree");
+      if (document.body.classList.contains("tree")) viewer.gui.open();
+    }
+  });
+  if (info.mode === "live") {
+    makeLegend(viewer, info.legend);
+    window.fflin = makeLive(stage, info);
+    return;
+  }
+
+  info.t = floats(info.t);
+  for (const each of info.trails) each.points = floats(each.points);
+  for (const each of [...info.arrows, ...info.plumes, ...info.readouts]) each.values = floats(each.values);
+  for (const plot of info.plots) for (const line of plot.lines) line.values = floats(line.values);
+  const panel = document.getElementById("panel");
+  const showMarks = makeMarks(viewer, info);
+  const showFigures = makeReadouts(panel, info.readouts);
+  const base = viewer.scene_tree.find(info.base).object;
+  const centre = yUp(info.centre), last = new THREE.Vector3().copy(base.position);
+  const camera = viewer.camera, controls = viewer.controls;
+  let follow = info.follow;
+  let plots = [];
+  const player = makePlayer(viewer, info, (i, time) => {
+    showMarks(i);
+    showFigures(i);
+    for (const show of plots) show(i, time);
+    const moved = base.position.clone().sub(last);
+    last.copy(base.position);
+    const shift = new THREE.Vector3(moved.x, moved.z, -moved.y);
+    if (follow) { camera.position.add(shift); controls.target.add(shift); }
+    centre.add(shift);
+    aim(centre);
+  });
+  plots = info.plots.map((plot) => makePlot(panel, info.t, plot, (time) => { player.pause(); player.seek(time); }));
+  makeLegend(viewer, info.legend);
+  const button = document.createElement("button");
+  const name = () => { button.textContent = follow ? "follows" : "fixed view"; button.setAttribute("aria-pressed", follow); };
+  button.title = "whether the camera follows the base";
+  button.addEventListener("click", () => { follow = !follow; name(); });
+  name();
+  document.getElementById("bar").append(button);
+  player.seek(player.first);
+  frame(info.points, info.direction);
+  resize();
+  window.addEventListener("resize", () => requestAnimationFrame(() => player.seek(player.state.time)));
+  const plain = (on) => {
+    document.body.classList.toggle("plain", on);
+    frame(info.points, info.direction);
+  };
+  window.fflin = { ...player, plain, ready: true };
+  if (!/[#&]pause\b/.test(location.hash)) player.play();
+}

@@ -1,0 +1,172 @@
+// What is drawn about the robot: frames, trails, forces, torques and plumes of thrusters.
+
+function flat(colour) {
+  return new THREE.MeshBasicMaterial({ color: new THREE.Color(colour).convertSRGBToLinear(), toneMapped: false });
+}
+
+function arrow(colour, thickness, material = flat(colour)) {
+  const group = new THREE.Group();
+  const shaft = new THREE.Mesh(new THREE.CylinderGeometry(thickness, thickness, 1, 16), material);
+  const tip = new THREE.Mesh(new THREE.ConeGeometry(2.6 * thickness, 7 * thickness, 20), material);
+  shaft.renderOrder = tip.renderOrder = material.depthTest ? 0 : 5;
+  group.add(shaft, tip);
+  group.setLength = (length) => {
+    const head = Math.min(7 * thickness, 0.6 * length);
+    tip.scale.setScalar(head / (7 * thickness));
+    tip.position.y = length - head / 2;
+    shaft.scale.y = Math.max(length - head, 1e-9);
+    shaft.position.y = (length - head) / 2;
+  };
+  return group;
+}
+
+// It begins inside the body that it acts on, and is seen through it.
+function seenThrough(colour) {
+  const material = flat(colour);
+  material.depthTest = false;
+  material.transparent = true;
+  material.opacity = 0.92;
+  return material;
+}
+
+const UP = new THREE.Vector3(0, 1, 0);
+
+function triad({ length, position, quaternion }) {
+  const group = new THREE.Group();
+  [[0xff5a52, [1, 0, 0]], [0x5fd068, [0, 1, 0]], [0x4c8dff, [0, 0, 1]]].forEach(([colour, axis]) => {
+    const one = arrow(colour, 0.022 * length);
+    one.setLength(length);
+    one.quaternion.setFromUnitVectors(UP, new THREE.Vector3(...axis));
+    group.add(one);
+  });
+  group.position.set(...position);
+  group.quaternion.set(...quaternion);
+  return group;
+}
+
+// A tube along all of the path, of which as much is drawn as has been passed.
+function trail({ points, colour, radius }) {
+  const group = new THREE.Group();
+  const n = points.length / 3;
+  const path = [];
+  const at = []; // index in the tube of each frame
+  for (let i = 0; i < n; i++) {
+    const p = new THREE.Vector3().fromArray(points, 3 * i);
+    if (!path.length || p.distanceTo(path[path.length - 1]) > 0.35 * radius) path.push(p);
+    at.push(path.length - 1);
+  }
+  group.show = () => {};
+  if (path.length < 2) return group;
+  const around = 6;
+  const curve = new THREE.CatmullRomCurve3(path, false, "centripetal");
+  curve.getPointAt = (u) => curve.getPoint(u); // the points themselves, not equal lengths
+  curve.getTangentAt = (u) => curve.getTangent(u);
+  const tube = new THREE.TubeGeometry(curve, path.length - 1, radius, around);
+  const whole = new THREE.Mesh(tube, Object.assign(flat(colour), { transparent: true, opacity: 0.16, depthWrite: false }));
+  const passed = new THREE.Mesh(tube.clone(), flat(colour));
+  group.add(whole, passed);
+  group.show = (i) => passed.geometry.setDrawRange(0, 6 * around * at[i]);
+  return group;
+}
+
+function forceArrow({ colour, values, most, size }) {
+  const group = arrow(colour, 0.010 * size, seenThrough(colour));
+  group.show = (i) => {
+    const force = new THREE.Vector3().fromArray(values, 3 * i);
+    const length = (0.62 * size * force.length()) / most;
+    group.visible = length > 0.004 * size;
+    if (!group.visible) return;
+    group.setLength(length);
+    group.quaternion.setFromUnitVectors(UP, force.normalize());
+  };
+  return group;
+}
+
+// An arrow along the axis with an arc about it, both as long as the torque is large.
+function torqueArrow({ colour, values, most, size }) {
+  const group = new THREE.Group();
+  const material = seenThrough(colour);
+  const axis = arrow(colour, 0.007 * size, material);
+  const radius = 0.17 * size;
+  const arc = new THREE.Group();
+  const ring = new THREE.Mesh(new THREE.TorusGeometry(radius, 0.007 * size, 10, 60, 1.6 * Math.PI), material);
+  const tip = new THREE.Mesh(new THREE.ConeGeometry(0.022 * size, 0.06 * size, 18), material);
+  ring.renderOrder = tip.renderOrder = 5;
+  tip.position.set(radius * Math.cos(1.6 * Math.PI), radius * Math.sin(1.6 * Math.PI), 0);
+  tip.rotation.z = 1.6 * Math.PI;
+  arc.add(ring, tip);
+  arc.rotation.x = -Math.PI / 2;
+  group.add(axis, arc);
+  group.show = (i) => {
+    const torque = new THREE.Vector3().fromArray(values, 3 * i);
+    const share = torque.length() / most;
+    group.visible = share > 0.006;
+    if (!group.visible) return;
+    const length = 0.62 * size * share;
+    axis.setLength(length);
+    arc.position.y = 0.55 * length;
+    arc.scale.setScalar(0.25 + 0.75 * share);
+    group.quaternion.setFromUnitVectors(UP, torque.normalize());
+  };
+  return group;
+}
+
+function plume({ position, direction, values, most, size }) {
+  const length = 0.48 * size, radius = 0.07 * size;
+  const cone = new THREE.ConeGeometry(radius, length, 28, 12, true);
+  cone.translate(0, -length / 2, 0); // the nozzle at the origin, the gas along -y
+  const material = new THREE.ShaderMaterial({
+    transparent: true, depthWrite: false, side: THREE.DoubleSide, blending: THREE.AdditiveBlending,
+    uniforms: { length: { value: length }, power: { value: 0 } },
+    vertexShader: `
+      varying float along; varying vec3 n; varying vec3 eye; uniform float length;
+      void main() {
+        along = -position.y / length;
+        vec4 p = modelViewMatrix * vec4(position, 1.0);
+        n = normalMatrix * normal; eye = -p.xyz;
+        gl_Position = projectionMatrix * p;
+      }`,
+    fragmentShader: `
+      varying float along; varying vec3 n; varying vec3 eye; uniform float power;
+      void main() {
+        float core = pow(abs(dot(normalize(n), normalize(eye))), 1.4);
+        float fade = pow(1.0 - along, 1.8);
+        vec3 colour = mix(vec3(0.35, 0.55, 1.0), vec3(1.0, 0.93, 0.85), pow(1.0 - along, 5.0));
+        gl_FragColor = vec4(1.9 * colour * core * fade * (0.4 + 0.6 * power), 1.0);
+      }`,
+  });
+  const group = new THREE.Group();
+  const gas = new THREE.Mesh(cone, material);
+  group.add(gas);
+  group.position.set(...position);
+  const push = new THREE.Vector3(...direction);
+  group.show = (i) => {
+    const share = values[i] / most;
+    group.visible = Math.abs(share) > 0.005;
+    material.uniforms.power.value = Math.abs(share);
+    gas.scale.set(0.5 + 0.5 * Math.sqrt(Math.abs(share)), Math.abs(share) || 1e-6, 0.5 + 0.5 * Math.sqrt(Math.abs(share)));
+    group.quaternion.setFromUnitVectors(UP, push.clone().multiplyScalar(share < 0 ? -1 : 1));
+  };
+  return group;
+}
+
+// Put all marks into the scene. Returns what shows frame i of them.
+function makeMarks(viewer, info) {
+  const shows = [];
+  const add = (path, mark) => {
+    viewer.scene_tree.find(path).object.add(mark);
+    if (mark.show) shows.push(mark.show);
+  };
+  info.triads.forEach((each, k) => add([...each.path, `frame ${k}`], triad(each)));
+  info.trails.forEach((each) => add(["meshcat", "trails", each.name], trail(each)));
+  const wrench = viewer.scene_tree.find(["meshcat", "wrench"]).object;
+  const base = viewer.scene_tree.find(info.base).object;
+  for (const each of info.arrows) {
+    add(["meshcat", "wrench", each.kind], (each.kind === "force" ? forceArrow : torqueArrow)({ ...each, size: info.size }));
+  }
+  info.plumes.forEach((each, k) => add([...each.path, `plume ${k}`], plume({ ...each, size: info.size })));
+  return (i) => {
+    wrench.position.copy(base.position);
+    for (const show of shows) show(i);
+  };
+}

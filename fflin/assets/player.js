@@ -1,0 +1,82 @@
+// The clock of a motion: slider, play, speed. It drives meshcat's own animator, whose seek, play
+// and pause stay the way to it from outside.
+
+function makePlayer(viewer, info, onTime) {
+  const { t } = info;
+  const first = t[0], last = t[t.length - 1];
+  const animator = viewer.animator;
+  const seekBodies = animator.seek.bind(animator);
+  // Until they have been played once, actions take no time.
+  Object.getPrototypeOf(animator).play.call(animator);
+  Object.getPrototypeOf(animator).pause.call(animator);
+  animator.folder.close();
+
+  const bar = document.getElementById("bar");
+  const button = document.createElement("button"), slider = document.createElement("input");
+  const clock = document.createElement("output"), speeds = document.createElement("select");
+  button.className = "play";
+  slider.type = "range";
+  slider.min = first; slider.max = last; slider.step = "any"; slider.value = first;
+  slider.setAttribute("aria-label", "time");
+  speeds.setAttribute("aria-label", "speed");
+  const choices = [...new Set([0.1, 0.25, 0.5, 1, 2, 5, 10, 20, 50, info.speed])].sort((a, b) => a - b);
+  for (const speed of choices) speeds.append(new Option(`${speed}×`, speed));
+  speeds.value = info.speed;
+  bar.append(button, slider, clock, speeds);
+
+  const state = { time: first, playing: false, speed: info.speed };
+  const digits = last - first > 200 ? 0 : last - first > 20 ? 1 : 2;
+  let then = 0, i = 0;
+
+  const seek = (time) => {
+    state.time = Math.min(last, Math.max(first, Number(time) || 0));
+    seekBodies(state.time - first);
+    animator.display_progress(state.time - first);
+    while (i > 0 && t[i] > state.time) i--;
+    while (i < t.length - 1 && t[i + 1] <= state.time) i++;
+    const next = Math.min(i + 1, t.length - 1);
+    onTime(state.time - t[i] <= t[next] - state.time ? i : next, state.time);
+    slider.value = state.time;
+    clock.textContent = `${state.time.toFixed(digits)} / ${last.toFixed(digits)} s`;
+    viewer.set_dirty();
+  };
+  const mark = () => {
+    button.textContent = state.playing ? "❚❚" : "▶";
+    button.setAttribute("aria-label", state.playing ? "pause" : "play");
+  };
+  const play = () => {
+    if (state.time >= last) seek(first);
+    state.playing = true;
+    then = performance.now();
+    mark();
+  };
+  const pause = () => { state.playing = false; mark(); };
+  const setSpeed = (speed) => { state.speed = Number(speed); speeds.value = speed; };
+
+  animator.seek = (time) => seek(first + time);
+  animator.play = play;
+  animator.pause = pause;
+  animator.reset = () => seek(first);
+  animator.update = () => {
+    if (!state.playing) return;
+    const now = performance.now();
+    const time = state.time + ((now - then) / 1000) * state.speed;
+    then = now;
+    seek(time);
+    if (state.time >= last) pause();
+  };
+  slider.addEventListener("input", () => { pause(); seek(slider.value); });
+  button.addEventListener("click", () => (state.playing ? pause() : play()));
+  speeds.addEventListener("change", () => setSpeed(speeds.value));
+  window.addEventListener("keydown", (event) => {
+    if (event.target.matches("input, select, button, textarea")) return;
+    const step = (last - first) / 100;
+    if (event.key === " ") { event.preventDefault(); state.playing ? pause() : play(); }
+    else if (event.key === "ArrowRight") { pause(); seek(state.time + step); }
+    else if (event.key === "ArrowLeft") { pause(); seek(state.time - step); }
+    else if (event.key === "Home") seek(first);
+    else if (event.key === "End") seek(last);
+  });
+  mark();
+  return { seek, play, pause, setSpeed, state, first, last };
+}

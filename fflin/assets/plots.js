@@ -1,0 +1,116 @@
+// Small plots over time with a cursor, and figures, on plain canvases.
+
+const LINES = ["#ff7a70", "#7ad97f", "#6aa5ff", "#f6c35b", "#c58bff", "#5fd6d0", "#ff9ed0", "#b6c46a", "#9aa7ff", "#d79a6a"];
+
+function figure(value, digits) {
+  if (value === 0) return "0";
+  const size = Math.abs(value);
+  if (size >= 1e5 || size < 1e-3) return value.toExponential(1);
+  return size >= 10 ** digits ? value.toFixed(0) : value.toPrecision(digits);
+}
+
+function makeReadouts(parent, readouts) {
+  if (!readouts.length) return () => {};
+  const grid = document.createElement("div");
+  grid.className = "readouts";
+  const shows = readouts.map((each) => {
+    const name = document.createElement("span"), value = document.createElement("b");
+    name.textContent = each.label;
+    grid.append(name, value);
+    return (i) => { value.textContent = `${figure(each.values[i], 3)} ${each.unit}`.trim(); };
+  });
+  parent.append(grid);
+  return (i) => shows.forEach((show) => show(i));
+}
+
+function makePlot(parent, t, plot, seek) {
+  const box = document.createElement("div");
+  box.className = "plot";
+  const name = document.createElement("div");
+  name.className = "name";
+  name.append(plot.unit ? `${plot.title} [${plot.unit}]` : plot.title);
+  const keys = document.createElement("span");
+  keys.className = "keys";
+  plot.lines.forEach((line, k) => {
+    if (!line.label) return;
+    const key = document.createElement("i");
+    key.textContent = line.label;
+    key.style.color = LINES[k % LINES.length];
+    keys.append(key);
+  });
+  if (plot.lines.length <= 4) name.append(keys);
+  const canvas = document.createElement("canvas");
+  box.append(name, canvas);
+  parent.append(box);
+
+  const values = plot.lines.flatMap((line) => Array.from(line.values)).filter(Number.isFinite);
+  let low = Math.min(0, ...[values.reduce((a, b) => Math.min(a, b), Infinity)]);
+  let high = Math.max(0, ...[values.reduce((a, b) => Math.max(a, b), -Infinity)]);
+  if (!(high - low > 0)) { low -= 1; high += 1; }
+  const spare = 0.06 * (high - low);
+  if (low < 0) low -= spare;
+  if (high > 0) high += spare;
+  const first = t[0], duration = t[t.length - 1] - first || 1;
+  let drawn = null, width = 0, height = 0, ratio = 1;
+  const x = (time) => ((time - first) / duration) * (width - 2 * ratio) + ratio;
+  const y = (value) => (1 - (value - low) / (high - low)) * (height - 2 * ratio) + ratio;
+
+  const draw = () => {
+    ratio = window.devicePixelRatio || 1;
+    width = canvas.width = Math.round(canvas.clientWidth * ratio);
+    height = canvas.height = Math.round(canvas.clientHeight * ratio);
+    if (!width) return;
+    drawn = document.createElement("canvas");
+    drawn.width = width; drawn.height = height;
+    const context = drawn.getContext("2d");
+    const style = getComputedStyle(document.body);
+    context.strokeStyle = style.getPropertyValue("--line");
+    context.lineWidth = ratio;
+    context.beginPath();
+    for (const level of [low, 0, high]) { context.moveTo(0, y(level)); context.lineTo(width, y(level)); }
+    context.stroke();
+    context.lineJoin = "round";
+    plot.lines.forEach((line, k) => {
+      context.strokeStyle = LINES[k % LINES.length];
+      context.lineWidth = 1.4 * ratio;
+      context.beginPath();
+      line.values.forEach((value, i) => context.lineTo(x(t[i]), y(value)));
+      context.stroke();
+    });
+    context.fillStyle = style.getPropertyValue("--faint");
+    context.font = `${10 * ratio}px system-ui, sans-serif`;
+    context.textBaseline = "top";
+    context.textAlign = "right";
+    if (high > 0) context.fillText(figure(high > 0 && low < 0 ? high - spare : high / 1.06, 2), width - 2 * ratio, 2 * ratio);
+    context.textBaseline = "bottom";
+    if (low < 0) context.fillText(figure(high > 0 ? low + spare : low / 1.06, 2), width - 2 * ratio, height - 2 * ratio);
+  };
+  const show = (i, time) => {
+    if (!drawn || canvas.width !== width) draw();
+    if (!drawn) return;
+    const context = canvas.getContext("2d");
+    context.clearRect(0, 0, width, height);
+    context.drawImage(drawn, 0, 0);
+    context.strokeStyle = getComputedStyle(document.body).getPropertyValue("--ink");
+    context.globalAlpha = 0.75;
+    context.lineWidth = ratio;
+    context.beginPath();
+    context.moveTo(x(time), 0); context.lineTo(x(time), height);
+    context.stroke();
+    context.globalAlpha = 1;
+    plot.lines.forEach((line, k) => {
+      context.fillStyle = LINES[k % LINES.length];
+      context.beginPath();
+      context.arc(x(time), y(line.values[i]), 2.3 * ratio, 0, 7);
+      context.fill();
+    });
+  };
+  const pick = (event) => {
+    const bounds = canvas.getBoundingClientRect();
+    seek(first + duration * Math.min(1, Math.max(0, (event.clientX - bounds.left) / bounds.width)));
+  };
+  canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); pick(event); });
+  canvas.addEventListener("pointermove", (event) => { if (event.buttons) pick(event); });
+  window.addEventListener("resize", () => { drawn = null; });
+  return show;
+}

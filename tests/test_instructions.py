@@ -1,0 +1,25 @@
+"""The hot paths take no more instructions than they did, beside the same written by hand."""
+
+import platform
+import shutil
+import sys
+
+import pytest
+
+from benchmarks.instructions import BASELINE, TOLERANCE, ratios
+
+
+@pytest.mark.skipif(shutil.which("valgrind") is None, reason="valgrind is not installed")
+@pytest.mark.skipif(
+    sys.implementation.name != "cpython" or platform.machine() != "x86_64",
+    reason="the baseline is of CPython on x86-64",
+)
+def test_hot_paths_take_no_more_instructions():
+    found = ratios()
+    assert found.keys() == BASELINE.keys()
+    worse = {
+        path: f"{ratio:.2f}, was {BASELINE[path]:.2f}"
+        for path, ratio in found.items()
+        if ratio > BASELINE[path] * (1.0 + TOLERANCE)
+    }
+    assert not worse, f"more instructions: {worse}; see benchmarks/instructions.py"
