@@ -75,9 +75,11 @@ class Dynamics:
         return not (base or self._disturbance is not None or any(self._robot.gravity))
 
     def held(self, u: Array) -> Callable[[float, Array, Array], Array]:
-        """Return f(t, q, v) for inputs that stay, with nothing in between where it can be."""
-        turning = any(u[held.columns].any() for held in self.actuation.held)
-        if self._plain and self._disturbance is None and not turning:
+        """Return f(t, q, v) for inputs that stay, with nothing in between where it can be.
+
+        What is held in reference axes must be zero.
+        """
+        if self._plain and self._disturbance is None:
             model, data, tau = self._model, self._data, self._columns.dot(u)
             return lambda _, q, v: _aba(model, data, q, v, tau)
         return lambda t, q, v: self.stage(t, q, v, u)[0]

@@ -120,3 +120,30 @@ def test_momentum_is_kept_far_away():
     # Of a place at 7e6 m the digits end at 1e-9 m.
     assert motion.momentum_drift.max() < 1e-9
     np.testing.assert_allclose(motion.momentum, np.tile(motion.momentum[:1], (101, 1)), atol=1e-8)
+
+
+def test_energy_counts_gravity_and_springs_from_where_they_are_zero():
+    model = fflin.load("servicer_7dof").model.copy()
+    model.jointPlacements[1] = random_pose(np.random.default_rng(3), 40.0)
+    robot = fflin.from_model(model, gravity=(0.3, -0.2, -1.5), stiffness=20.0)
+    q, v = anywhere(robot, np.random.default_rng(10))
+    motion = fflin.simulate(robot, q0=q, v0=0.2 * v, duration=0.2, dt=0.0005)
+    data = robot.create_data()
+    pin.centerOfMass(robot.model, data, q)
+    height = robot.mass * np.dot(robot.gravity, data.com[0])
+    angles = np.array([joint.value(q) for joint in robot.joints])
+    expected = pin.computeKineticEnergy(robot.model, data, q, 0.2 * v) - height
+    expected += 10.0 * float(angles @ angles)
+    assert motion.energy[0] == pytest.approx(expected, rel=1e-12)
+    np.testing.assert_allclose(motion.energy, expected, rtol=1e-7)
+
+
+def test_a_loop_that_leaves_the_chart_says_when():
+    # No feedback at all, and a turn of 1 rad/s: half a turn after pi seconds.
+    robot = fflin.load("cubesat")
+    lin = fflin.linearize(robot)
+    nothing = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
+    v0 = fflin.velocity(robot, {"omega_b.z": 1.0})
+    motion = fflin.simulate(robot, nothing, v0=v0, duration=10.0, dt=0.01)
+    assert motion.stopped.startswith("left the chart at t = 3.15 s")
+    assert motion.t[-1] == pytest.approx(3.15) and np.isfinite(motion.x).all()
