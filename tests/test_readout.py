@@ -8,6 +8,7 @@ from conftest import BUNDLED, FRAMES, random_pose
 import fflin
 from fflin.integrators import integrator
 from fflin.readout import readout
+from fflin.weights import default_weights
 
 
 def anywhere(robot, rng):
@@ -147,3 +148,35 @@ def test_a_loop_that_leaves_the_chart_says_when():
     motion = fflin.simulate(robot, nothing, v0=v0, duration=10.0, dt=0.01)
     assert motion.stopped.startswith("left the chart at t = 3.15 s")
     assert motion.t[-1] == pytest.approx(3.15) and np.isfinite(motion.x).all()
+
+
+def bent(robot):
+    """A model about a bent arm that is held against its springs, and a gain for it."""
+    joints = dict.fromkeys(robot.joint_names, 0.4)
+    q = fflin.configuration(robot, joints, random_pose(np.random.default_rng(11), 50.0))
+    lin = fflin.linearize(robot, q, None, fflin.equilibrium(robot, q).u)
+    return lin, fflin.lqr(lin, *default_weights(lin))
+
+
+@pytest.mark.parametrize("sample", [None, 0.02])
+def test_loop_about_a_bent_point_comes_to_it_and_differs_in_second_order(sample):
+    robot = fflin.load("ets_vii", stiffness=3.0)
+    lin, gain = bent(robot)
+    assert np.abs(lin.u0).max() > 1.0 and np.abs(lin.x0).max() > 0.3
+    policy = fflin.StateFeedback(lin, gain.K)
+
+    def run(size, duration):
+        x0 = lin.x0 + size * np.cos(np.arange(len(lin.x0)))
+        options = {"duration": duration, "dt": 0.01, "sample": sample}
+        return fflin.simulate(robot, policy, x0=x0, **options)
+
+    # What the two models differ by over the displacement halves with it.
+    apart = []
+    for size in (2e-3, 1e-3):
+        motion = run(size, 2.0)
+        apart.append(np.abs(motion.x - motion.linear).max() / size)
+    assert apart[0] < 0.05
+    assert apart[0] / apart[1] == pytest.approx(2.0, abs=0.1)
+    end = run(0.02, 60.0)
+    assert np.abs(end.error[-1]).max() < 1e-6
+    np.testing.assert_allclose(end.u[-1], lin.u0, atol=1e-3)
