@@ -1,4 +1,4 @@
-"""Combinations of the state read straight off a configuration and a velocity, for feedback."""
+"""The state, read off many points at once, and combinations of it straight off one point."""
 
 from __future__ import annotations
 
@@ -15,6 +15,35 @@ from fflin.validation import Array
 Readout: TypeAlias = Callable[[Array, Array], Array]
 
 _placement = pin.XYZQUATToSE3
+
+
+def states_of(state: StateMap, q: Array, v: Array, near: Array | None = None) -> Array:
+    """Return the states (N, nx) of a motion, rows of valid q (N, nq) and v (N, nv).
+
+    Continuous joints go on counting turns, from the turn nearest to `near` (nx,). A turn of pi,
+    where the chart ends, gives one of its two values.
+    """
+    robot, g, at = state.robot, state.groups, state.origin
+    x = np.empty((len(q), state.nx))
+    quaternion = q[:, 3:7] @ product_matrix(pin.SE3ToXYZQUAT(at)[3:]).T
+    quaternion *= np.where(quaternion[:, 3:] < 0.0, -1.0, 1.0)
+    vectors, scalars = quaternion[:, :3], quaternion[:, 3:]
+    x[:, g.q_b] = vectors
+    x[:, g.r_b] = at.translation + q[:, :3] @ at.rotation.T
+    for k, joint in enumerate(robot.joints):
+        if joint.unbounded:
+            angles = np.arctan2(q[:, joint.idx_q + 1], q[:, joint.idx_q])
+            first = 0.0 if near is None else near[6 + k]
+            x[:, 6 + k] = np.unwrap(np.concatenate(((first,), angles)))[1:]
+        else:
+            x[:, 6 + k] = q[:, joint.idx_q]
+    nu = v[:, state.velocities(np.arange(float(robot.nv))).astype(int)]
+    for part, turned in zip((ANGULAR, LINEAR), state.axes, strict=True):
+        if turned:
+            once = np.cross(vectors, nu[:, part]) + scalars * nu[:, part]
+            nu[:, part] += 2.0 * np.cross(vectors, once)
+    x[:, 6 + robot.n :] = nu
+    return x
 
 
 def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:

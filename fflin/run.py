@@ -13,10 +13,8 @@ from fflin.control import Channel, limits_of
 from fflin.dynamics import Disturbance, Dynamics
 from fflin.errors import InputError
 from fflin.integrators import integrator
-from fflin.linear_loop import predict
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
-from fflin.motion import Motion
 from fflin.policies import bound
 from fflin.progress import Progress
 from fflin.state import Frame, StateMap
@@ -275,40 +273,6 @@ class Run:
         self.count += 1
         if self.callback is not None:
             self.callback(t, self.q, self.v, u)
-
-    def finish(self, stopped: str, linear: LinearModel | bool | None) -> Motion:
-        """Make the motion of what was recorded."""
-        rows = slice(0, self.count)
-        q, v, u, expected = (each[rows] for each in self.rows)
-        history = self.conserved.histories(q, v)
-        x = self.state.read_rows(q, v, near=self.near)
-        lin = self.lin if linear is None or linear is True else linear or None
-        prediction: Array = np.zeros((0, self.state.nx))
-        K = getattr(self.policy, "K", None)
-        if lin is not None and K is not None and lin.state_names == self.state.names:
-            loop = (lin, K, self.limits, self.sample, self.delay)
-            prediction = predict(*loop, x[0], self.dt, self.steps, self.every)[: self.count]
-        return Motion(
-            t=self.t[rows],
-            q=q,
-            v=v,
-            x=x,
-            u=u,
-            target=x[0] if self.target is None else self.target,
-            prediction=prediction if len(prediction) == self.count else prediction[:0],
-            energy=history.energy,
-            momentum=np.roll(history.momentum, 3, axis=1),
-            momentum_drift=self.conserved.drift(history, expected),
-            placement=pin.SE3ToXYZQUAT(self.state.reference),
-            state_names=self.state.names,
-            input_names=self._names,
-            state_units=self.state.units,
-            input_units=self.dynamics.actuation.units,
-            frame=self.state.frame,
-            robot=self.robot.name,
-            urdf_sha256=self.robot.urdf_sha256,
-            stopped=stopped,
-        )
 
     def _target(self, lin: LinearModel) -> Array:
         target = self.state.read(lin.q, lin.v)

@@ -9,13 +9,7 @@ import pinocchio as pin
 
 from fflin.errors import ChartError, InputError
 from fflin.model import ROOT, Robot
-from fflin.rotation import (
-    conjugate,
-    product_matrix,
-    quaternion_product,
-    rotation_matrix,
-    skew,
-)
+from fflin.rotation import conjugate, quaternion_product, rotation_matrix, skew
 from fflin.validation import Array, placement, vector
 
 Frame = Literal["hybrid", "local", "world"]
@@ -256,32 +250,6 @@ class StateMap:
         nu = self.velocities(v)
         self.to_frame(chart, nu)
         x[6 + self.robot.n :] = nu
-        return x
-
-    def read_rows(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
-        """Return the states (N, nx) of a motion, rows of valid q (N, nq) and v (N, nv).
-
-        Continuous joints go on counting turns, from the turn nearest to `near` (nx,). A turn of
-        pi, where the chart ends, gives one of its two values.
-        """
-        x = np.empty((len(q), self.nx))
-        g = self.groups
-        quaternion = q[:, 3:7] @ product_matrix(self._quaternion).T
-        quaternion *= np.where(quaternion[:, 3:] < 0.0, -1.0, 1.0)
-        x[:, g.q_b] = quaternion[:, :3]
-        x[:, g.r_b] = self._position + q[:, :3] @ self._rotation.T
-        x[:, g.q_m] = q.take(self._idx_q, axis=1)
-        if self._unbounded.size:
-            angles = np.arctan2(q.take(self._sin, axis=1), q.take(self._cos, axis=1))
-            first = np.zeros(angles.shape[1]) if near is None else near[6 + self._unbounded]
-            x[:, 6 + self._unbounded] = np.unwrap(np.vstack((first, angles)), axis=0)[1:]
-        nu = v.take(self._order, axis=1)
-        vectors, scalars = quaternion[:, :3], quaternion[:, 3:]
-        for part, turned in zip((ANGULAR, LINEAR), self.axes, strict=True):
-            if turned:
-                once = np.cross(vectors, nu[:, part]) + scalars * nu[:, part]
-                nu[:, part] += 2.0 * np.cross(vectors, once)
-        x[:, 6 + self.robot.n :] = nu
         return x
 
     def to_pinocchio(self, x: Array) -> tuple[Array, Array]:
