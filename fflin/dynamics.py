@@ -69,8 +69,8 @@ class Dynamics:
         disturbed = self._disturbed(t, q, v.copy())
         return self._aba.acceleration(q, v, u, disturbed), push + disturbed[:6]
 
-    def isolated(self, driven: bool) -> bool:
-        """Whether nothing pushes from outside; `driven` if inputs act at all."""
+    def isolated(self, *, driven: bool) -> bool:
+        """Whether nothing pushes from outside, whatever the inputs are or where none acts."""
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         return not (base or self._disturbance is not None or any(self._robot.gravity))
 

@@ -137,14 +137,16 @@ class Run:
 
     def choose(self, method: str, project: bool) -> None:
         """Set the integrator."""
-        self.method = integrator(method)
+        kind = integrator(method)
         self.project = bool(project)
-        if self.fastest * self.dt > self.method.reach:
+        if self.fastest * self.dt > kind.reach:
             raise InputError(
                 f"dt is {self.dt:g} s, too large for a loop whose fastest pole is at "
-                f"{self.fastest:.4g} 1/s; take at most "
-                f"{self.method.reach / self.fastest:.2g} s, or `sample`"
+                f"{self.fastest:.4g} 1/s; take at most {kind.reach / self.fastest:.2g} s, or "
+                "`sample`"
             )
+        self.method = kind(self.robot.model, self.dt)
+        self.step = self.method.step
 
     def _fastest_pole(self) -> float:
         K = getattr(self.policy, "K", None)
@@ -176,9 +178,8 @@ class Run:
         # The momentum that the impulse from outside makes.
         self.expected = self.conserved.momentum(self.q, self.v)
         self.scalar = self.state.scalar(self.q)
-        self.step = self.method.prepare(self.robot.model, self.dt)
         self.weights = self.dt * np.array(self.method.weights)
-        self.follow = not self.dynamics.isolated(self.channel is not None)
+        self.follow = not self.dynamics.isolated(driven=self.channel is not None)
         continuous = self.channel is not None and self.channel.continuous
         self.asked = self.channel.ask if self.channel is not None and continuous else None
         bar = Progress(self.steps, progress)
@@ -250,7 +251,7 @@ class Run:
             self.q, self.v = (rows[self.count - 1] for rows in self.rows[:2])
             if not np.isfinite(turn) or turn > 1e3:
                 return f"diverged at t = {t:g} s"
-            return f"diverged at t = {t:g} s: a joint or the base turns {turn:.2g} rad a step"
+            return f"diverged at t = {t:g} s: a joint or the base turns by {turn:.2g} rad a step"
         if self.lin is None:
             return ""
         before, self.scalar = self.scalar, self.state.scalar(self.q)

@@ -69,7 +69,7 @@ def test_cf4_is_the_published_scheme():
     l4 = f(1.0 + h, q4, k4)
     half = move(model, q, h / 12 * (3 * k1 + 2 * k2 + 2 * k3 - k4))
     expected = move(model, half, h / 12 * (-k1 + 2 * k2 + 2 * k3 + 3 * k4))
-    step = integrator("cf4").prepare(model, h)
+    step = integrator("cf4")(model, h).step
     for _ in range(2):  # the work space of the first step does not reach the second
         found_q, found_v = step(f, 1.0, q, v)
         np.testing.assert_allclose(found_q, expected, rtol=0.0, atol=1e-14)

@@ -436,3 +436,14 @@ def test_policies_that_do_not_fit_are_refused():
     moving = fflin.linearize(robot, moving=True)
     with pytest.raises(fflin.InputError, match="TrajectoryFeedback"):
         fflin.StateFeedback(moving, gain.K)
+
+
+def test_a_wheel_may_turn_many_times_a_step():
+    robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
+    v0 = fflin.velocity(robot, {"wheel_x": 500.0, "omega_b.y": 0.01})
+    motion = fflin.simulate(robot, v0=v0, duration=20.0, dt=0.02, every=50)
+    assert not motion.stopped
+    assert motion.momentum_drift.max() < 1e-14
+    assert np.ptp(motion.energy) < 1e-9 * motion.energy[0]
+    fine = fflin.simulate(robot, v0=v0, duration=20.0, dt=0.005, every=200)
+    np.testing.assert_allclose(motion.v[:, 3:6], fine.v[:, 3:6], atol=1e-9)
