@@ -47,6 +47,7 @@ _PUBLIC = {
     "Momentum": "outputs",
     "Motion": "motion",
     "Observability": "observation",
+    "OutputFeedback": "output_feedback",
     "ReactionWheel": "inputs",
     "ReducedModel": "momentum",
     "Robot": "model",
@@ -131,6 +132,7 @@ if TYPE_CHECKING:
     )
     from fflin.motion import Motion
     from fflin.observation import Observability, observability
+    from fflin.output_feedback import OutputFeedback
     from fflin.outputs import (
         Accelerometer,
         BasePose,

@@ -75,7 +75,7 @@ class StateFeedback:
         """
         lin = self.lin
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-        _require_same_robot(lin, robot, state)
+        require_same_robot(lin, robot, state)
         fed = np.array([state.names.index(name) for name in lin.state_names])
         near = np.zeros(state.nx)
         near[fed] = lin.x0
@@ -226,7 +226,8 @@ def _gain(K: ArrayLike, shape: tuple[int, ...]) -> Array:
     return gain
 
 
-def _require_same_robot(lin: LinearModel, robot: Robot, state: StateMap) -> None:
+def require_same_robot(lin: LinearModel, robot: Robot, state: StateMap) -> None:
+    """Raise `InputError` where a model is not one of a robot with its inputs."""
     names = Actuation(state).names
     if (
         lin.urdf_sha256 != robot.urdf_sha256
