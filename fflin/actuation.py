@@ -20,6 +20,8 @@ from fflin.state import ANGULAR, LINEAR, Chart, StateMap
 from fflin.validation import Array
 from fflin.wheels import carrier
 
+_LOCAL = pin.ReferenceFrame.LOCAL
+
 
 class Held(NamedTuple):
     """Three inputs that are a vector on the base, held in reference axes."""
@@ -103,6 +105,7 @@ class Actuation:
             (joint, np.array([at for at, _ in items]), np.column_stack([w for _, w in items]))
             for joint, items in carried.items()
         ]
+        self._of_carried = [at for items in carried.values() for at, _ in items]
 
     @property
     def carried(self) -> bool:
@@ -118,9 +121,11 @@ class Actuation:
             return self._fixed
         columns = self._fixed.copy()
         pin.computeJointJacobians(self._model, data, q)
-        for joint, inputs, wrenches in self._carried:
-            jacobian = pin.getJointJacobian(self._model, data, joint, pin.ReferenceFrame.LOCAL)
-            columns[:, inputs] = self._state.forces(jacobian.T @ wrenches)
+        forces = [
+            pin.getJointJacobian(self._model, data, joint, _LOCAL).T.dot(wrenches)
+            for joint, _, wrenches in self._carried
+        ]
+        columns[:, self._of_carried] = self._state.forces(np.concatenate(forces, axis=1))
         return columns
 
     def in_base_axes(self, chart: Chart, u: Array) -> Array:
@@ -141,7 +146,7 @@ class Actuation:
             return None
         external = pin.StdVec_Force(self._model.njoints, pin.Force.Zero())
         for joint, inputs, wrenches in self._carried:
-            external[joint] = pin.Force(wrenches @ u[inputs])
+            external[joint] = pin.Force(wrenches.dot(u.take(inputs)))
         return external
 
     def torques(self, u: Array) -> Array:

@@ -168,15 +168,16 @@ def modes(lin: LinearModel) -> Modes:
     if nx != 2 * nv:
         raise InputError(f"the model has {nx} states, expected {nv} positions and their velocities")
     inertia = np.sqrt(lin.M.diagonal())
-    weight, fastest = _scales(lin, inertia)
-    found = _free_free(lin, inertia)
+    A = _significant(lin)
+    weight, fastest = _scales(A, inertia)
+    found = _free_free(A, lin.M, inertia)
     if found is None:
-        found = _general(lin, weight, fastest)
+        found = _general(A, weight, fastest)
     triples, rigid_body, zeros = found
     triples.sort(key=lambda triple: (abs(triple[0]), triple[0].real))
     residual = 0.0
     for pole, shape, _ in triples:
-        left = weight * (lin.A @ shape - pole * shape) / fastest
+        left = weight * (A @ shape - pole * shape) / fastest
         residual = max(residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape)))
     return Modes(
         tuple(Mode(pole, _normalised(shape), grows) for pole, shape, grows in triples),
@@ -193,16 +194,25 @@ def modes(lin: LinearModel) -> Modes:
 _Found = tuple[list[tuple[complex, Any, bool]], int, int]
 
 
-def _free_free(lin: LinearModel, inertia: Array) -> _Found | None:
+def _significant(lin: LinearModel) -> Array:
+    """Return A without slopes that are the rounding of inputs that cancel each other."""
+    nv, A = len(lin.M), lin.A.copy()
+    slopes = A[nv:, :nv]
+    pushed = np.abs(lin.B[nv:]) @ np.abs(lin.u0)
+    slopes[np.abs(slopes) <= 1e2 * _EPS * pushed[:, None]] = 0.0
+    return A
+
+
+def _free_free(A: Array, M: Array, inertia: Array) -> _Found | None:
     """Return the modes of a body at rest with symmetric stiffness; None for any other model."""
     from scipy.linalg import eigh
 
-    nv = len(lin.M)
-    N, slope = lin.A[:nv, nv:], lin.A[nv:, :nv] @ lin.A[:nv, nv:]
-    if lin.A[:nv, :nv].any() or lin.A[nv:, nv:].any():
+    nv = len(M)
+    N, slope = A[:nv, nv:], A[nv:, :nv] @ A[:nv, nv:]
+    if A[:nv, :nv].any() or A[nv:, nv:].any():
         return None
     # Over s with p = N s, ds/dt = nu; scaled to a unit diagonal of M.
-    unit = lin.M / np.outer(inertia, inertia)
+    unit = M / np.outer(inertia, inertia)
     by_s = slope * inertia[:, None] / inertia
     K = -unit @ by_s
     size = float(np.abs(K).max(initial=0.0))
@@ -231,21 +241,21 @@ def _free_free(lin: LinearModel, inertia: Array) -> _Found | None:
     return found, nv - counted // 2, 2 * nv - counted
 
 
-def _scales(lin: LinearModel, inertia: Array) -> tuple[Array, float]:
+def _scales(A: Array, inertia: Array) -> tuple[Array, float]:
     """Return weights of the states and a rate, over which the entries of A are of order 1.
 
     Velocities are weighed by sqrt(M_ii), and positions by the rate as well.
     """
     nv = len(inertia)
-    rates = np.abs(np.tile(inertia, 2)[:, None] * lin.A / np.tile(inertia, 2))
+    rates = np.abs(np.tile(inertia, 2)[:, None] * A / np.tile(inertia, 2))
     turning = max(float(rates[nv:, nv:].max()), float(rates[:nv, :nv].max()))
     fastest = max(float(rates[nv:, :nv].max()) ** 0.5, turning) or 1.0
     return np.concatenate((fastest * inertia, inertia)), fastest
 
 
-def _general(lin: LinearModel, weight: Array, fastest: float) -> _Found:
+def _general(A: Array, weight: Array, fastest: float) -> _Found:
     """Return the modes of any model, by the eigenvalues of A."""
-    scaled = weight[:, None] * lin.A / weight / fastest
+    scaled = weight[:, None] * A / weight / fastest
     found, nullity = nonzero_eigenpairs(scaled, _NO_STIFFNESS)
     listed: list[tuple[complex, Any, bool]] = []
     for pole, vector, error in found:

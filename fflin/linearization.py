@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -29,6 +28,9 @@ from fflin.validation import Array, vector
 
 if TYPE_CHECKING:
     from fflin.sensing import Sensing
+
+# Sum of squares beyond which a matrix counts as not finite: its eigenvalues would not be.
+_LARGEST = 1e200
 
 
 class Linearizer:
@@ -174,7 +176,8 @@ class Linearizer:
             u = _frozen(vector("u", u, self._nu, "the robot's inputs").copy())
         v = self._zero_v if v is None else v
         u = self._zero_u if u is None else u
-        with self._lock:
+        # What overflows is refused, and not warned of.
+        with self._lock, np.errstate(over="ignore", invalid="ignore"):
             return self._anywhere(q, v, u)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -212,7 +215,8 @@ class Linearizer:
             f0[:] = 0.0
         C, D, y0 = self._seen(chart, rates, q, v, u_base, x0)
         for array in (A, B, C, D, f0, x0, y0):
-            if not _is_finite(array):
+            flat = array.ravel()
+            if not flat.dot(flat) < _LARGEST:  # nor NaN
                 raise InputError("q, v or u is so large that the model is not finite")
             array.setflags(write=False)
         point = {"A": A, "B": B, "C": C, "D": D, "f0": f0}
@@ -231,7 +235,8 @@ class Linearizer:
             return self._common["C"], self._common["D"], x0
         nu = state.velocities(v)
         a = rates.c.copy()
-        a[LINEAR] += rates.gravity - skew(nu[ANGULAR]).dot(nu[LINEAR])
+        if sensing.needs_acceleration:
+            a[LINEAR] += rates.gravity - skew(nu[ANGULAR]).dot(nu[LINEAR])
         sensed = sensing.evaluate(self._data, q, v, state.spread(a))
         C, D = output_equations(state, self._actuation, chart, sensed, rates, nu, u)
         for row, index in sensing.states:
@@ -334,12 +339,6 @@ def _own_reference(robot: Robot, q: Array) -> Array:
     if root.isIdentity(0.0):
         return q[:7]
     return _frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q[:7])))
-
-
-def _is_finite(array: Array) -> bool:
-    flat = array.ravel()
-    # The square tells at once, but for entries beyond 1e154.
-    return math.isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())
 
 
 def _frozen(array: Array) -> Array:

@@ -22,13 +22,18 @@ class Sensed(NamedTuple):
         The outputs; zero where they are states.
     by_q, by_v, by_a : ndarray (ny, nv)
         Derivatives with respect to the tangent of q that pin.integrate moves along, v and a;
-        rows of states are zero.
+        rows of states are zero. None for by_a where no output depends on a.
     """
 
     y: Array
     by_q: Array
     by_v: Array
-    by_a: Array
+    by_a: Array | None
+
+    def part(self, rows: slice) -> "Sensed":
+        """Return views of the rows of one output."""
+        y, by_q, by_v, by_a = self
+        return Sensed(y[rows], by_q[rows], by_v[rows], None if by_a is None else by_a[rows])
 
 
 class Point(NamedTuple):
@@ -135,6 +140,7 @@ def accelerometer(at: Point, frame: Carried, to: Sensed) -> None:
         at.model, at.data, *frame, _LOCAL
     )
     to.y[:] = pin.getFrameClassicalAcceleration(at.model, at.data, *frame, _LOCAL).linear
+    assert to.by_a is not None
     to.by_q[:], to.by_v[:], to.by_a[:] = by_q, by_v, by_a
     # The terms of that sum; gravity turns against the base.
     of_base = by_a[:, LINEAR]

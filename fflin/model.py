@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from fflin.errors import InputError, ModelError, unknown
 from fflin.fields import validated_fields, validated_inputs
-from fflin.frames import ROOT
+from fflin.frames import ROOT, find_frame
 from fflin.inertia_bounds import bounds_of_inertia
 from fflin.inputs import Input, default_inputs, named_wheels
 from fflin.joints import Follower, Joint
@@ -134,7 +134,7 @@ class Robot:
             If a value is negative or not a number, a field is not one of these, or a wheel has
             more inertia than what carries it.
         UnknownNameError
-            If there is no such joint, or no such frame for a wheel.
+            If there is no such joint, or no such frame for an input or output.
         ModelError
             If dry friction is asked for, which is not differentiable at rest.
         """
@@ -142,7 +142,12 @@ class Robot:
         if "inputs" in fields:
             robot = self._with_inputs(fields.pop("inputs"))
         own = (robot._wheelless or robot).joint_names
-        return replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
+        robot = replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
+        for item in (*robot.inputs, *robot.outputs):
+            frame = getattr(item, "frame", None)
+            if frame is not None:
+                find_frame(robot.model, frame)
+        return robot
 
     @cached_property
     def wheels(self) -> dict[str, float]:

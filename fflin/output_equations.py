@@ -33,26 +33,29 @@ def output_equations(
     base components by :math:`[s]_\times \delta\theta`.
     """
     g = state.groups
-    w, v = nu[ANGULAR], nu[LINEAR]
-    by_q, by_nu, by_rate = (state.columns(part) for part in sensed[1:])
-    rate_by_nu = rates.by_nu.copy()
-    rate_by_nu[LINEAR, ANGULAR] += skew(v)
-    rate_by_nu[LINEAR, LINEAR] -= skew(w)
-    by_nu = by_nu + by_rate @ rate_by_nu
-    by_u = by_rate @ rates.by_u
-
-    turn = by_q[:, ANGULAR] + by_rate[:, LINEAR] @ skew(rates.gravity)
+    by_q, by_nu = state.columns(sensed.by_q), state.columns(sensed.by_v)
+    turn, by_q_m = by_q[:, ANGULAR].copy(), by_q[:, 6:]
+    D = np.zeros((len(by_q), len(u)))
+    if sensed.by_a is not None:
+        by_rate = state.columns(sensed.by_a)
+        rate_by_nu = rates.by_nu.copy()
+        rate_by_nu[LINEAR, ANGULAR] += skew(nu[LINEAR])
+        rate_by_nu[LINEAR, LINEAR] -= skew(nu[ANGULAR])
+        by_nu += by_rate.dot(rate_by_nu)
+        by_q_m = by_q_m + by_rate.dot(rates.by_q_m)
+        turn += by_rate[:, LINEAR].dot(skew(rates.gravity))
+        D = by_rate.dot(rates.by_u)
+        for columns, _ in actuation.held:
+            turn += D[:, columns].dot(skew(u[columns]))
+            D[:, columns] = D[:, columns].dot(chart.R.T)
     for turned, part in zip(state.axes, (ANGULAR, LINEAR), strict=True):
         if turned:
-            turn = turn + by_nu[:, part] @ skew(nu[part])
-    for columns, _ in actuation.held:
-        turn = turn + by_u[:, columns] @ skew(u[columns])
-        by_u[:, columns] = by_u[:, columns] @ chart.R.T
+            turn += by_nu[:, part].dot(skew(nu[part]))
 
     C = np.zeros((len(by_q), state.nx))
-    C[:, g.q_b] = turn @ chart.J
-    C[:, g.r_b] = by_q[:, LINEAR] @ chart.R.T
-    C[:, g.q_m] = by_q[:, 6:] + by_rate @ rates.by_q_m
+    C[:, g.q_b] = turn.dot(chart.J)
+    C[:, g.r_b] = by_q[:, LINEAR].dot(chart.R.T)
+    C[:, g.q_m] = by_q_m
     C[:, -len(nu) :] = by_nu
     state.to_frame(chart, C[:, -len(nu) :].T)
-    return C, by_u
+    return C, D

@@ -94,11 +94,13 @@ def linear_model(lin: LinearModel) -> str:
     from fflin.eigenmodes import modes
 
     nx, nu = lin.B.shape
-    point = "a fixed point" if lin.is_equilibrium() else "not a fixed point"
-    if lin.is_equilibrium() and (lin.moving or np.abs(lin.f0).max() > _MOVES):
+    stays, f0 = lin.is_equilibrium(), np.where(np.abs(lin.f0) > _MOVES, lin.f0, 0.0)
+    point = "a fixed point" if stays else "not a fixed point"
+    if stays and (lin.moving or f0.any()):
         point = "a relative equilibrium"
     parts = [f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}, {point}"]
-    growing = [] if lin.dt else modes(lin).unstable
+    # Elsewhere the poles of a frozen model say nothing about stability.
+    growing = modes(lin).unstable if stays and not lin.dt else []
     if growing:
         shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
         parts.append(textwrap.fill(f"unstable: poles with a positive real part {shown}", width()))
@@ -107,7 +109,7 @@ def linear_model(lin: LinearModel) -> str:
         for title, values, names, units in (
             ("x0", lin.x0, lin.state_names, lin.state_units),
             ("u0", lin.u0, lin.input_names, lin.input_units),
-            ("f0", lin.f0, lin.state_names, [f"{unit}/s" for unit in lin.state_units]),
+            ("f0", f0, lin.state_names, [f"{unit}/s" for unit in lin.state_units]),
         )
         if values.any()
     ]

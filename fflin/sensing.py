@@ -156,12 +156,13 @@ class Sensing:
         Sensed
         """
         ny, nv = len(self.names), self._nv
-        sensed = Sensed(np.zeros(ny), *np.zeros((3, ny, nv)))
+        by_a = np.zeros((ny, nv)) if self.needs_acceleration else None
+        sensed = Sensed(np.zeros(ny), np.zeros((ny, nv)), np.zeros((ny, nv)), by_a)
         if len(self.states) == ny:
             return sensed
         at = self._point(data, q, v)
         for rows, of_robot in self._of_robot:
-            of_robot(at, Sensed(*(part[rows] for part in sensed)))
+            of_robot(at, sensed.part(rows))
         if self.needs_acceleration:
             felt = a.copy()
             felt[LINEAR] += skew(v[ANGULAR]).dot(at.v_b) - at.g
@@ -169,7 +170,7 @@ class Sensing:
         elif self._of_frames:
             pin.computeForwardKinematicsDerivatives(self._model, data, at.q, at.v)
         for rows, of_frame, frame in self._of_frames:
-            of_frame(at, frame, Sensed(*(part[rows] for part in sensed)))
+            of_frame(at, frame, sensed.part(rows))
         return sensed
 
     def _point(self, data: pin.Data, q: Array, v: Array) -> Point:

@@ -266,6 +266,7 @@ def test_bad_fields_are_told():
         "no frame named 'tol'; did you mean tool": {
             "inputs": [fflin.Thruster("tol", (0, 0, 0), (1, 0, 0))]
         },
+        "no frame named 'tom'": {"outputs": [fflin.FramePose("tom")]},
         "no joint named 'joint_8'": {"inputs": [fflin.JointTorque("joint_8")]},
         "inputs is empty": {"inputs": []},
         "is not an input": {"inputs": ["thruster"]},
@@ -283,7 +284,9 @@ def test_bad_fields_are_told():
     }
     for words, fields in cases.items():
         with pytest.raises(fflin.FflinError, match=words):
-            fflin.linearize(robot.replace(**fields))
+            changed = robot.replace(**fields)
+            assert "two inputs" in words, "told too late"
+            fflin.linearize(changed)
     with pytest.raises(fflin.InputError, match="direction is zero"):
         fflin.Thruster("base", (0, 0, 0), (0, 0, 0))
     with pytest.raises(fflin.InputError, match="expected three numbers"):

@@ -183,7 +183,12 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
         ("linearize", "ets_vii", "--damping", "viscous"): "'viscous' is not",
         ("linearize", "cubesat", "--inputs", typo, "-o", output): "bad.toml:2: no type of input",
         ("check", "cubesat", "--inputs", "none.toml"): "none.toml: cannot be read: No such file",
-        ("check", "cubesat", "--inputs", "servicer_7dof"): "no joint named 'joint_1'",
+        (
+            "check",
+            "cubesat",
+            "--inputs",
+            "servicer_7dof",
+        ): "servicer_7dof: no joint named 'joint_1'",
         ("check", "ets_vii", "--output", "pos:tool"): "no output named 'pos'; did you mean pose",
         ("check", "ets_vii", "--output", "pose"): "output 'pose' is of no frame; write pose:NAME",
         ("check", "ets_vii", "--output", "com:tool"): "is of the whole robot; write com",
@@ -339,3 +344,13 @@ def test_wheels_from_a_file_at_speed(tmp_path):
     assert run("check", "cubesat", "--inputs", stored)[0] == 0
     err = refused("check", "cubesat", "--inputs", stored, "--velocity", "wheel_1=100")
     assert "wheel 'wheel_1' has no inertia" in err
+
+
+def test_linearize_shows_no_rounding_in_f0_and_calls_no_frozen_model_unstable():
+    hover = ["linearize", "servicer_7dof", "--gravity", 0, 0, -9.81]
+    code, held, _ = run(*hover, "--equilibrium")
+    assert code == 0 and "a fixed point" in held
+    assert "unstable: poles" in held and "f0:" not in held
+    code, falling, _ = run(*hover, "--joint", "joint_2=0.3", "--effort", "F_b.z=9000")
+    assert code == 0 and "not a fixed point" in falling
+    assert "unstable" not in falling and "f0:" in falling

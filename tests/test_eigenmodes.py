@@ -344,3 +344,33 @@ def test_command_line_takes_an_equilibrium(capsys):
         assert cli.main(["modes", "servicer_7dof", *point, "--equilibrium", *options]) == 2
         err = capsys.readouterr().err.splitlines()
         assert len(err) == 1 and err[0].startswith("fflin: error: ") and words in err[0]
+
+
+def test_inputs_that_cancel_leave_no_mode():
+    robot = fflin.load("servicer_7dof")
+    pair = [fflin.Thruster("panel_left", (0, 0, 0.3), (x, 0, 0)) for x in (1, -1)]
+    robot = robot.replace(inputs=[*pair, *robot.inputs])
+    q = fflin.configuration(robot, {"joint_2": 0.4, "panel_left": 0.3})
+    lin = fflin.linearize(robot, q, u=fflin.effort(robot, {"thruster_1": 5, "thruster_2": 5}))
+    found = fflin.modes(lin)
+    assert lin.is_equilibrium() and not found.modes and found.zero_eigenvalues == 30
+
+
+@pytest.mark.parametrize("thrust", [1e-3, 1.0])
+def test_a_weak_asymmetry_is_not_taken_for_a_spring(thrust):
+    robot = fflin.load("servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 50.0})
+    pair = [
+        fflin.Thruster("panel_left", (0, 0.2, 0.3), (1, 0, 0)),
+        fflin.Thruster("panel_right", (0, 0.1, 0.3), (-1, 0, 0)),
+    ]
+    robot = robot.replace(inputs=pair)
+    lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}), u=[thrust] * 2)
+    found = fflin.modes(lin)
+    expected = np.linalg.eigvals(lin.A)
+    expected = expected[np.abs(expected) > 1e-4 * thrust**0.5]
+    poles = found.poles[np.abs(found.poles) > 1e-4 * thrust**0.5]
+    assert len(poles) == len(expected)
+    distance = np.abs(poles[:, None] - expected).min(axis=1)
+    assert (distance <= 1e-5 * np.abs(poles)).all()
+    growing = (expected.real > 1e-6) & (expected.imag >= 0.0)
+    assert len(found.unstable) == growing.sum() > 0

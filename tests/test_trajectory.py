@@ -120,3 +120,42 @@ def test_coarse_knots_are_warned_of():
     t, q, v, u = motion(robot, knots=4)
     with pytest.warns(fflin.FflinWarning, match="coarse for a motion: at t ="):
         fflin.linearize_trajectory(robot, t, q, v, u)
+
+
+def test_an_orbit_and_a_fast_wheel_hide_nothing():
+    wheel = fflin.ReactionWheel((0, 0, 1), inertia=0.01)
+    robot = fflin.load("ets_vii", inputs=[fflin.BaseForce(), wheel])
+    t = np.linspace(0.0, 1.0, 51)
+    v = np.tile(fflin.velocity(robot, {"v_b.x": 7000.0, "wheel_1": 500.0}), (len(t), 1))
+    q0 = fflin.configuration(robot, base=pin.SE3(np.eye(3), np.array([7e6, 0.0, 0.0])))
+    q = np.array([pin.integrate(robot.model, q0, time * v[0]) for time in t])
+    u = np.zeros((len(t), 4))
+    assert fflin.linearize_trajectory(robot, t, q, v, u).residual.max() < 1e-9
+    for column in (2, robot.joints[0].idx_v):  # along z; a joint of the arm
+        step = 0.01 * np.eye(robot.nv)[column]
+        jump = np.array([pin.integrate(robot.model, x, (k >= 25) * step) for k, x in enumerate(q)])
+        with pytest.raises(fflin.InputError, match=r"at t = 0\.(48|5) s"):
+            fflin.linearize_trajectory(robot, t, jump, v, u)
+    drifting = v.copy()
+    drifting[:, robot.joints[0].idx_v] = 0.01
+    with pytest.raises(fflin.InputError, match="not a motion"):
+        fflin.linearize_trajectory(robot, t, q, drifting, u)
+
+
+def test_an_orbit_changes_no_residual():
+    robot = fflin.load("ets_vii")
+    t, q, v, u = motion(robot)
+    still = fflin.linearize_trajectory(robot, t, q, v, u).residual
+    q[:, :3] += np.outer(t, [0.0, 7000.0, 100.0])
+    v[:, :3] += [pin.Quaternion(x[3:7]).matrix().T @ [0.0, 7000.0, 100.0] for x in q]
+    orbit = fflin.linearize_trajectory(robot, t, q, v, u).residual
+    assert orbit == pytest.approx(still, rel=1e-2)
+
+
+def test_holding_still_in_gravity_is_a_motion():
+    robot = fflin.load("servicer_7dof", gravity=(0.3, 0.2, -9.81), stiffness=20.0)
+    q = fflin.configuration(robot, {"joint_2": 0.7, "joint_4": -0.4, "panel_left": 0.2})
+    u = fflin.equilibrium(robot, q).u
+    t = np.linspace(0.0, 1.0, 5)
+    still = (np.tile(x, (len(t), 1)) for x in (q, np.zeros(robot.nv), u))
+    assert fflin.linearize_trajectory(robot, t, *still).residual.max() < 1e-9

@@ -1,3 +1,13 @@
 """The cases: in each module a function `run` that returns its table."""
 
-ORDER = ("at_rest", "at_point", "growth", "number", "lqr", "simulation_step", "start_up", "memory")
+ORDER = (
+    "at_rest",
+    "at_point",
+    "equipped",
+    "growth",
+    "number",
+    "lqr",
+    "simulation_step",
+    "start_up",
+    "memory",
+)

@@ -6,7 +6,7 @@ import argparse
 import math
 from typing import TYPE_CHECKING, Any
 
-from fflin.errors import InputError
+from fflin.errors import FflinError, InputError
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -33,7 +33,11 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
     if getattr(arguments, "gravity", None):
         fields["gravity"] = arguments.gravity
     if getattr(arguments, "inputs", None):
-        fields["inputs"] = _inputs(robot, arguments.inputs)
+        inputs = _inputs(robot, arguments.inputs)
+        try:
+            robot = robot.replace(inputs=inputs)
+        except FflinError as error:  # a name or an inertia that does not suit this robot
+            raise type(error)(f"{arguments.inputs}: {error}") from None
     if getattr(arguments, "output", []):
         from fflin.output_specs import parse_output
 
