@@ -50,6 +50,7 @@ _PUBLIC = {
     "Momentum": "outputs",
     "Motion": "motion",
     "Observability": "observation",
+    "OutputFeedback": "output_feedback",
     "RandomConfigurations": "configurations",
     "ReactionWheel": "inputs",
     "ReducedModel": "momentum",
@@ -145,6 +146,7 @@ if TYPE_CHECKING:
     )
     from fflin.motion import Motion
     from fflin.observation import Observability, observability
+    from fflin.output_feedback import OutputFeedback
     from fflin.outputs import (
         Accelerometer,
         BasePose,

@@ -12,102 +12,131 @@ from fflin.model import ROOT, Robot
 from fflin.rotation import skew
 from fflin.validation import Array
 
+_crba = pin.crba
+_placement = pin.XYZQUATToSE3
 
-class Momenta(NamedTuple):
-    """Energy [J], momentum (6,) about the centre of mass, and what base and joints add to it."""
 
-    energy: float
-    central: Array
-    scale: Array
+class Histories(NamedTuple):
+    """Energy (N,), momentum (N, 6) about the centre of mass (N, 3), and the base's share of it."""
+
+    energy: Array
+    momentum: Array
+    center: Array
+    of_base: Array
 
 
 class Conserved:
     """Energy and momentum of a robot.
 
-    Momentum is angular, then linear, in world axes. Where one point is named it is about that,
-    which is fixed.
+    Momentum is linear, then angular about a fixed point, in world axes. That point stands in for
+    the world's origin throughout, for digits would be lost far away from it.
 
     Parameters
     ----------
     robot : Robot
+    start : ndarray (nq,)
+        A configuration; the point is near its base.
     """
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Robot, start: Array) -> None:
         self._robot = robot
         self._model = robot.model
-        self._data = robot.create_data()
+        self._data = data = robot.create_data()
+        self._M = data.M[:6]  # CRBA writes into it
+        self._M_bb = self._M[:, :6]
+        self._start = np.concatenate((start[:3], np.zeros(4)))
         self._root = robot.model.jointPlacements[ROOT]
-        self._gravity = np.array(robot.gravity)
-        self._mass = robot.mass
-        self._anywhere = self._root.isIdentity(0.0)
+        self._weight = robot.mass * np.array(robot.gravity) if any(robot.gravity) else None
+        self._free = self._root.isIdentity(0.0)
         self._stored = robot.stored_momentum
 
-    def about(self, q: Array, v: Array, point: Array) -> Array:
-        """Return the momentum (6,) about a fixed point (3,)."""
-        pin.computeCentroidalMomentum(self._model, self._data, q, v)
-        hg = self._data.hg.vector
-        angular = hg[3:] + skew(self._data.com[0] - point).dot(hg[:3])
-        return np.concatenate((angular + self._of_wheels(), hg[:3]))
+    def momentum(self, q: Array, v: Array) -> Array:
+        """Return the momentum (6,) about the point."""
+        history = self.histories(q[None], v[None])
+        return self.about_point(history)[0]
 
-    def wrench(self, q: Array, force: Array, point: Array) -> Array:
-        """Return the wrench (6,) about a point, in world axes, of what pushes the robot.
+    def about_point(self, history: Histories) -> Array:
+        """Return the momentum (N, 6) about the point."""
+        total = history.momentum.copy()
+        total[:, 3:] += np.cross(history.center, total[:, :3])
+        return total
 
-        `force` (6,) is the generalised force on the base, angular then linear in base axes: the
-        sum of all that acts from outside. Gravity is added.
+    def wrench(self, q: Array, push: Array) -> Array:
+        """Return the wrench (6,) about the point, in world axes, of what pushes the robot.
+
+        `push` (6,) is the wrench at the base origin in base axes, linear then angular: the sum
+        of all that acts from outside. Gravity is added.
         """
-        placement = self._base(q)
-        linear = placement.rotation @ force[3:]
-        angular = placement.rotation @ force[:3]
-        angular += skew(placement.translation - point).dot(linear)
-        if self._gravity.any():
-            weight = self._mass * self._gravity
-            com = pin.centerOfMass(self._model, self._data, q, False)
-            angular += skew(com - point).dot(weight)
-            linear += weight
-        return np.concatenate((angular, linear))
+        total: Array = self._base(q).toDualActionMatrix().dot(push)
+        if self._weight is not None:
+            near = q.copy()
+            near[:7] -= self._start
+            com = pin.centerOfMass(self._model, self._data, near, False)
+            total[:3] += self._weight
+            total[3:] += skew(com).dot(self._weight)
+        return total
 
-    def impose(self, q: Array, v: Array, momentum: Array, point: Array) -> Array:
-        r"""Return v with the base velocity that gives the momentum (6,) about a point.
+    def impose(self, q: Array, v: Array, momentum: Array) -> None:
+        r"""Give `v` the base velocity, in place, that makes the momentum (6,) the given one.
 
         .. math:: \nu_b = M_{bb}^{-1} (H_b - M_{bm} \dot q_m)
 
         The present velocity is corrected by what it lacks, so that rounding is of the second
         order.
         """
-        M = pin.crba(self._model, self._data, q)[:6]
-        placement = self._base(q)
-        R = placement.rotation.T
-        target = np.empty(6)
-        target[:3] = linear = R.dot(momentum[3:])
-        arm = R.dot(point - placement.translation)
-        angular = momentum[:3]
+        _crba(self._model, self._data, q)
         if self._stored:
             pin.forwardKinematics(self._model, self._data, q)
-            angular = angular - self._of_wheels()
-        target[3:] = R.dot(angular) + skew(arm).dot(linear)
-        v = v.copy()
-        v[:6] += dposv(M[:, :6], target - M.dot(v))[1]
-        return v
+            momentum = momentum.copy()
+            momentum[3:] -= self._of_wheels()
+        lack: Array = self._base(q).toActionMatrix().T.dot(momentum)
+        lack -= self._M.dot(v)
+        v[:6] += dposv(self._M_bb, lack, 0, 0, 1)[1]
 
-    def momenta(self, q: Array, v: Array) -> Momenta:
-        """Return energy, momentum, and the largest of what base and joints add to it (2,)."""
+    def histories(self, q: Array, v: Array) -> Histories:
+        """Return what is conserved at each row of q (N, nq) and v (N, nv)."""
         model, data = self._model, self._data
-        energy = pin.computeKineticEnergy(model, data, q, v)
-        pin.computeCentroidalMomentum(model, data, q, v)
-        hg = data.hg.vector
-        central = np.concatenate((hg[3:] + self._of_wheels(), hg[:3]))
-        energy -= self._mass * float(self._gravity @ data.com[0])
+        rows, q = len(q), q.copy()
+        q[:, :7] -= self._start
+        energy, center = np.empty(rows), np.empty((rows, 3))
+        momentum, of_base = np.empty((rows, 6)), np.empty((rows, 6))
+        for i, (q_i, v_i) in enumerate(zip(q, v, strict=True)):
+            energy[i] = pin.computeKineticEnergy(model, data, q_i, v_i)
+            of_base[i] = pin.ccrba(model, data, q_i, v_i)[:, :6].dot(v_i[:6])
+            # What CCRBA has of it was summed about the origin, with more rounding.
+            momentum[i] = pin.computeCentroidalMomentum(model, data, q_i, v_i).vector
+            center[i] = data.com[0]
+            if self._stored:
+                momentum[i, 3:] += self._of_wheels()
+        if self._weight is not None:
+            energy -= (center + self._root.rotation @ self._start[:3]) @ self._weight
         stiffness, _, rest = self._robot.passive
         if stiffness.any():
-            positions = np.array([joint.value(q) for joint in self._robot.joints])
-            energy += 0.5 * float(stiffness @ (positions - rest) ** 2)
-        maps = pin.computeCentroidalMap(model, data, q)
-        base, joints = maps[:, :6] @ v[:6], maps[:, 6:] @ v[6:]
-        scale = np.array(
-            [np.linalg.norm(base[part]) + np.linalg.norm(joints[part]) for part in _PARTS]
+            positions = [[joint.value(q_i) for joint in self._robot.joints] for q_i in q]
+            energy += 0.5 * (np.array(positions) - rest) ** 2 @ stiffness
+        return Histories(energy, momentum, center, of_base)
+
+    def drift(self, history: Histories, expected: Array) -> Array:
+        """Return how far the momentum is from what is expected (N, 6), relative (N,).
+
+        To the largest sum of what base, joints and wheels add to it; about a fixed point the
+        flight of the whole counts too.
+        """
+        p = history.momentum[:, :3]
+        flight = np.linalg.norm(history.center, axis=1) * np.linalg.norm(p, axis=1)
+        shares = (history.of_base, history.momentum - history.of_base)
+        linear, angular = (
+            sum(np.linalg.norm(share[:, part], axis=1) for share in shares).max()
+            for part in (slice(0, 3), slice(3, 6))
         )
-        scale[0] += sum(float(np.linalg.norm(stored)) for _, stored in self._stored)
-        return Momenta(float(energy), central, scale)
+        angular += flight.max()
+        angular += sum(float(np.linalg.norm(stored)) for _, stored in self._stored)
+        missing = self.about_point(history) - expected
+        sizes = np.linalg.norm(missing.reshape(-1, 2, 3), axis=2)
+        scale = np.array((linear, angular))
+        relative = np.divide(sizes, scale, out=np.zeros_like(sizes), where=scale > 0.0)
+        largest: Array = relative.max(axis=1)
+        return largest
 
     def _of_wheels(self) -> Array:
         """Return the stored momentum (3,) where the links were put last."""
@@ -117,8 +146,6 @@ class Conserved:
         return total
 
     def _base(self, q: Array) -> pin.SE3:
-        placement = pin.XYZQUATToSE3(q[:7])
-        return placement if self._anywhere else self._root * placement
-
-
-_PARTS = (slice(3, 6), slice(0, 3))  # angular, linear in Pinocchio's order
+        """Return the placement of the base, seen from the point."""
+        placement = _placement(q[:7] - self._start)
+        return placement if self._free else self._root * placement

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike
 
 from fflin.aba import Aba
 from fflin.errors import InputError
-from fflin.state import Chart, StateMap
+from fflin.state import StateMap
 from fflin.validation import Array
 
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
 _aba = pin.aba
-_ANY = np.zeros(3)
+_LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
 
 class Dynamics:
@@ -52,50 +52,45 @@ class Dynamics:
             and not any(robot.gravity)
         )
 
-    def force(self, q: Array, u: Array) -> Array:
-        """Return tau (nv,) of inputs that act along fixed columns."""
-        if self.actuation.held:
-            u = self.actuation.in_base_axes(self._turned(q), u)
-        tau: Array = self._columns.dot(u)
-        return tau
+    def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+        """Return dv/dt (nv,) in Pinocchio's order, and what pushes from outside.
 
-    def acceleration(self, t: float, q: Array, v: Array, u: Array) -> Array:
-        """Return dv/dt (nv,) in Pinocchio's order."""
-        if self._plain and self._disturbance is None:
-            return _aba(self._model, self._data, q, v, self.force(q, u))
-        u = self.actuation.in_base_axes(self._turned(q), u) if self.actuation.held else u
-        if self._disturbance is None:
-            return self._aba.acceleration(q, v, u)
-        return self._aba.acceleration(q, v, u, self._disturbed(t, q, v))
-
-    def push(self, t: float, q: Array, v: Array, u: Array) -> Array:
-        """Return the generalised force (6,) on the base, angular then linear in base axes.
-
-        It is the sum of all wrenches from outside at the base origin, but for gravity.
+        The latter is the sum (6,) of all wrenches but gravity's at the base origin, linear then
+        angular in base axes. What the disturbance is given is not overwritten later.
         """
-        held = self.actuation.held
-        in_base = self.actuation.in_base_axes(self._turned(q), u) if held else u
-        force: Array = self.actuation.columns(self._data, q)[:6] @ in_base
-        if self._disturbance is not None:
-            force = force + self._disturbed(t, q, v)[[3, 4, 5, 0, 1, 2]]
-        return force
+        if self.actuation.held:
+            u = self._in_base_axes(q, u)
+        if self._plain and self._disturbance is None:
+            tau = self._columns.dot(u)
+            return _aba(self._model, self._data, q, v, tau), tau[:6]
+        push = (self.actuation.columns(self._data, q)[:6] @ u)[_LINEAR_FIRST]
+        if self._disturbance is None:
+            return self._aba.acceleration(q, v, u), push
+        disturbed = self._disturbed(t, q, v.copy())
+        return self._aba.acceleration(q, v, u, disturbed), push + disturbed[:6]
 
     def isolated(self, *, driven: bool) -> bool:
         """Whether nothing pushes from outside, whatever the inputs are or where none acts."""
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         return not (base or self._disturbance is not None or any(self._robot.gravity))
 
-    def free(self) -> Callable[[float, Array, Array], Array]:
-        """Return f(t, q, v) for inputs that are zero, with nothing in between where it can be."""
-        if self._plain and self._disturbance is None:
-            model, data, zero = self._model, self._data, np.zeros(self._robot.nv)
-            return lambda _, q, v: _aba(model, data, q, v, zero)
-        nothing = np.zeros(len(self.actuation.names))
-        return lambda t, q, v: self.acceleration(t, q, v, nothing)
+    def held(self, u: Array) -> Callable[[float, Array, Array], Array]:
+        """Return f(t, q, v) for inputs that stay, with nothing in between where it can be.
 
-    def _turned(self, q: Array) -> Chart:
-        """Return the attitude at any turn, beyond the chart too, for its rotation alone."""
-        return Chart(_ANY, 1.0, self._state.rotation(q))
+        What is held in reference axes must be zero.
+        """
+        if self._plain and self._disturbance is None:
+            model, data, tau = self._model, self._data, self._columns.dot(u)
+            return lambda _, q, v: _aba(model, data, q, v, tau)
+        return lambda t, q, v: self.stage(t, q, v, u)[0]
+
+    def _in_base_axes(self, q: Array, u: Array) -> Array:
+        """Return u (nu,) with what is held in reference axes in base axes, at any turn."""
+        R = self._state.rotation(q)
+        u = u.copy()
+        for held in self.actuation.held:
+            u[held.columns] = u[held.columns].dot(R)
+        return u
 
     def _disturbed(self, t: float, q: Array, v: Array) -> Array:
         assert self._disturbance is not None

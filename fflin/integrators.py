@@ -50,7 +50,8 @@ class CommutatorFree4(Integrator):
     .. math:: k_2 = v + \tfrac h2 l_1,\quad k_3 = v + \tfrac h2 l_2,\quad k_4 = v + h l_3
 
     and what moves q is :math:`\tfrac h2 v` and sums of :math:`l_i`. Each combination is a row of
-    a small matrix, so that a stage is one product with all stages so far.
+    a small matrix, so that a stage is one product with all stages so far. What f gets as v lies
+    in the work space, and the next step overwrites it.
     """
 
     weights = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
@@ -71,21 +72,25 @@ class CommutatorFree4(Integrator):
             ]
         )
         self._after_4 = np.array([1.0, *(h * weight for weight in self.weights)])
+        self._new_1, self._new_3 = np.empty((3, model.nv)), np.empty((3, model.nv))
+        self._new_2 = np.empty((2, model.nv))
+        self._rows = (*self._stages, *self._new_1, *self._new_2, *self._new_3)
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and v one step later."""
-        model, stages, middle = self.model, self._stages, t + 0.5 * self.dt
-        stages[0] = v
-        stages[1] = f(t, q, v)
-        to_2, v2, to_3 = self._after_1.dot(self._two)
+        model, middle = self.model, t + 0.5 * self.dt
+        at, l1, l2, l3, l4, to_2, v2, to_3, v3, to_4, v4, first, second = self._rows
+        at[:] = v
+        l1[:] = f(t, q, at)
+        self._after_1.dot(self._two, self._new_1)
         q2 = _integrate(model, q, to_2)
-        stages[2] = f(middle, q2, v2)
-        v3, to_4 = self._after_2.dot(self._three)
-        stages[3] = f(middle, _integrate(model, q, to_3), v3)
-        v4, first, second = self._after_3.dot(self._four)
-        stages[4] = f(t + self.dt, _integrate(model, q2, to_4), v4)
+        l2[:] = f(middle, q2, v2)
+        self._after_2.dot(self._three, self._new_2)
+        l3[:] = f(middle, _integrate(model, q, to_3), v3)
+        self._after_3.dot(self._four, self._new_3)
+        l4[:] = f(t + self.dt, _integrate(model, q2, to_4), v4)
         end = _integrate(model, _integrate(model, q, first), second)
-        return end, self._after_4.dot(stages)
+        return end, self._after_4.dot(self._stages)
 
 
 class RungeKuttaMuntheKaas4(Integrator):

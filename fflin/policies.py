@@ -14,6 +14,7 @@ from fflin.actuation import Actuation
 from fflin.errors import InputError
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
+from fflin.readout import readout
 from fflin.rotation import conjugate, quaternion_product, rotation_matrix
 from fflin.state import StateMap
 from fflin.validation import Array
@@ -74,15 +75,16 @@ class StateFeedback:
         """
         lin = self.lin
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-        _require_same_robot(lin, robot, state)
+        require_same_robot(lin, robot, state)
         fed = np.array([state.names.index(name) for name in lin.state_names])
         near = np.zeros(state.nx)
         near[fed] = lin.x0
-        K, x0, u0 = self.K, lin.x0, lin.u0
+        K = np.zeros((len(self.K), state.nx))
+        K[:, fed] = self.K
+        command = readout(state, K, lin.u0 + self.K @ lin.x0, near)
 
         def policy(_: float, q: Array, v: Array) -> Array:
-            u: Array = u0 - K.dot(state.read(q, v, near=near)[fed] - x0)
-            return u
+            return command(q, v)
 
         return policy
 
@@ -224,7 +226,8 @@ def _gain(K: ArrayLike, shape: tuple[int, ...]) -> Array:
     return gain
 
 
-def _require_same_robot(lin: LinearModel, robot: Robot, state: StateMap) -> None:
+def require_same_robot(lin: LinearModel, robot: Robot, state: StateMap) -> None:
+    """Raise `InputError` where a model is not one of a robot with its inputs."""
     names = Actuation(state).names
     if (
         lin.urdf_sha256 != robot.urdf_sha256

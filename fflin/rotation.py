@@ -29,6 +29,12 @@ def quaternion_product(a: Array, b: Array) -> Array:
     return np.array((x / norm, y / norm, z / norm, w / norm))
 
 
+def product_matrix(a: Array) -> Array:
+    """Return the matrix (4, 4) that takes a quaternion b to the product a b."""
+    x, y, z, w = a.tolist()
+    return np.array(((w, -z, y, x), (z, w, -x, y), (-y, x, w, z), (-x, -y, -z, w)))
+
+
 def conjugate(a: Array) -> Array:
     """Return the inverse of a unit quaternion."""
     x, y, z, w = a.tolist()

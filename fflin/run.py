@@ -11,23 +11,22 @@ import pinocchio as pin
 from fflin.conservation import Conserved
 from fflin.control import Channel, limits_of
 from fflin.dynamics import Disturbance, Dynamics
-from fflin.errors import ChartError, InputError
-from fflin.inputs import named_wheels
-from fflin.integrators import Acceleration, integrator
-from fflin.linear_loop import predict
+from fflin.errors import InputError
+from fflin.integrators import integrator
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
-from fflin.motion import Motion
 from fflin.policies import bound
 from fflin.progress import Progress
 from fflin.state import Frame, StateMap
-from fflin.validation import Array, number, vector
+from fflin.symmetry import rotor_names
+from fflin.validation import Array, number
 
 Event = Callable[[float, Array, Array], float]
 
 # A turn within one step [rad] beyond which no integrator follows.
 _LARGEST_TURN = 1.0
 _STEP = 0.01  # [s]
+_LOOK = 16  # steps between looks at the clock
 _ROWS_LIMIT = 10_000_000
 
 
@@ -52,7 +51,6 @@ class Run:
         self.policy = policy
         self.state = StateMap(robot, reference=reference, frame=frame or "hybrid")
         self.dynamics = Dynamics(self.state, disturbance)
-        self.conserved = Conserved(robot)
         self._law = None if policy is None else bound(policy, robot)
 
     def begin(self, x0: Any, q0: Any, v0: Any) -> None:
@@ -67,7 +65,8 @@ class Run:
             self.v = np.zeros(robot.nv) if v0 is None else robot.checked_velocity(v0).copy()
         self.target = None if self.lin is None else self._target(self.lin)
         near = x0 if x0 is not None else self.target
-        self.x = self._read(self.q, self.v, np.zeros(self.state.nx) if near is None else near)
+        self.near = None if near is None else np.asarray(near, dtype=float)
+        self.conserved = Conserved(robot, self.q)
 
     def clock(
         self, duration: float, dt: float | None, every: int, sample: float | None, delay: float
@@ -147,6 +146,7 @@ class Run:
                 "`sample`"
             )
         self.method = kind(self.robot.model, self.dt)
+        self.step = self.method.step
 
     def _fastest_pole(self) -> float:
         K = getattr(self.policy, "K", None)
@@ -160,48 +160,42 @@ class Run:
             if not callable(each):
                 raise InputError(f"{each!r} is no function of (t, q, v), as an event would be")
         self.events, self.callback = tuple(events), callback
+        # A rotor may spin as fast as it will: nothing depends on its angle.
+        joints = [joint for joint in self.robot.joints if not joint.prismatic]
+        rotors = rotor_names(self.robot)
+        at = [joint.idx_v for joint in joints if joint.name not in rotors]
+        self.turning = np.array([3, 4, 5, *at])
+        self.slow = (_LARGEST_TURN / self.dt) ** 2
+        self.acting: Array | None = None
 
     def go(self, progress: bool | None) -> str:
         """Run to the end; return why it ended before."""
         rows = self.steps // self.every + 2
-        nu = len(self.initial)
+        sizes = (self.robot.nq, self.robot.nv, len(self.initial), 6)
         self.t = np.empty(rows)
-        self.rows_q, self.rows_v = np.empty((rows, self.robot.nq)), np.empty((rows, self.robot.nv))
-        self.rows_x, self.rows_u = np.empty((rows, self.state.nx)), np.empty((rows, nu))
-        self.missing = np.zeros((rows, 6))
-        self.count, self.orbital = 0, 0.0
-        self.acting: Array = self.initial
-        self.pushes: list[Array] = []
-        # A wheel is symmetric about its axis: no matter how far it turns in a step.
-        wheels = {name for name, _ in named_wheels(self.robot.inputs)}
-        joints = [joint.idx_v for joint in self.robot.joints if joint.name not in wheels]
-        self.turning = np.array([3, 4, 5, *joints], dtype=np.intp)
-        self.point = self.q[:3].copy()
-        self.expected: Array = self.conserved.about(self.q, self.v, self.point)
+        self.rows = tuple(np.empty((rows, size)) for size in sizes)
+        self.count = 0
+        # The momentum that the impulse from outside makes.
+        self.expected = self.conserved.momentum(self.q, self.v)
+        self.scalar = self.state.scalar(self.q)
+        self.weights = self.dt * np.array(self.method.weights)
+        self.follow = not self.dynamics.isolated(driven=self.channel is not None)
+        continuous = self.channel is not None and self.channel.continuous
+        self.asked = self.channel.ask if self.channel is not None and continuous else None
         bar = Progress(self.steps, progress)
         stopped, step = "", 0
-        isolated = self.dynamics.isolated(driven=self.channel is not None)
-        rate = self._rate(isolated)
-        weights = self.dt * np.array(self.method.weights)
         try:
             for step in range(self.steps):
-                t, before = step * self.dt, self.q
-                if self.channel is not None:
-                    self.acting = self.channel.begin(step, t, self.q, self.v)
-                if step % self.every == 0:
-                    self._record(t)
-                self.q, self.v = self.method.step(rate, t, self.q, self.v)
-                if not isolated:
-                    self.expected = self.expected + weights.dot(self.pushes)
-                    self.pushes.clear()
-                if self.project:
-                    self.v = self.conserved.impose(self.q, self.v, self.expected, self.point)
-                stopped = self._fault(step + 1, before)
-                if self.events and not stopped:
+                u = self._advance(step)
+                # The square is above that of any turn, and not finite where an entry is not.
+                if self.lin is not None or not float(self.v.dot(self.v)) < self.slow:
+                    stopped = self._fault(step)
+                if not stopped and self.events:
                     stopped = self._event(step + 1)
                 if stopped:
                     break
-                bar.update(step + 1)
+                if step % _LOOK == 0:
+                    bar.update(step + 1)
         except KeyboardInterrupt:
             if not self.count:
                 raise
@@ -209,44 +203,60 @@ class Run:
         finally:
             bar.close()
         if not stopped.startswith(("diverged", "interrupted")):
-            self._record((step + 1) * self.dt)
+            self._record((step + 1) * self.dt, u)
         return stopped
 
-    def _rate(self, isolated: bool) -> Acceleration:
-        """Return dv/dt = f(t, q, v), which notes what pushes from outside where anything may."""
-        channel, dynamics, conserved = self.channel, self.dynamics, self.conserved
-        if channel is None and isolated:
-            return dynamics.free()
-        continuous = channel is not None and channel.continuous
+    def _advance(self, step: int) -> Array:
+        """Take one step; return what acted as it began."""
+        t, q, v = step * self.dt, self.q, self.v
+        u = self.initial if self.channel is None else self.channel.begin(step, t, q, v)
+        if step % self.every == 0:
+            self._record(t, u)
+        if self.follow or self.asked:
+            self._follow(t, q, v, u)
+        else:
+            self.q, self.v = self.step(self._held(u), t, q, v)
+        if self.project:
+            self.conserved.impose(self.q, self.v, self.expected)
+        return u
 
-        def rate(t: float, q: Array, v: Array) -> Array:
-            u = self.acting
-            if continuous and channel is not None:
-                u = channel.ask(t, q, v)
-            if not isolated:
-                self.pushes.append(conserved.wrench(q, dynamics.push(t, q, v, u), self.point))
-            return dynamics.acceleration(t, q, v, u)
+    def _follow(self, t: float, q: Array, v: Array, u: Array) -> None:
+        """Take one step under a law that is asked at each stage, or of which pushes are summed."""
+        ask = self.asked
+        stage, wrench = self.dynamics.stage, self.conserved.wrench if self.follow else None
+        pushes: list[Array] = []
 
-        return rate
+        def f(t: float, q: Array, v: Array) -> Array:
+            # The first stage is the point that was asked about already.
+            acting = ask(t, q, v.copy()) if ask and pushes else u
+            a, push = stage(t, q, v, acting)
+            pushes.append(wrench(q, push) if wrench else push)
+            return a
 
-    def _fault(self, step: int, before: Array) -> str:
+        self.q, self.v = self.step(f, t, q, v)
+        if wrench:
+            self.expected = self.expected + self.weights.dot(pushes)
+
+    def _held(self, u: Array) -> Any:
+        """Return f(t, q, v) under an input that stays, made anew where it is another."""
+        if u is not self.acting:
+            self.acting, self.rate = u, self.dynamics.held(u)
+        return self.rate
+
+    def _fault(self, step: int) -> str:
         """Say what is wrong with the step that was taken; drop it where it has no meaning."""
-        turning = self.v.take(self.turning)
-        square = float(turning.dot(turning)) * self.dt**2
-        if not square < _LARGEST_TURN**2:
-            t, turn = step * self.dt, float(np.abs(turning).max()) * self.dt
-            if not turn < _LARGEST_TURN:
-                self.q, self.v = self.rows_q[self.count - 1], self.rows_v[self.count - 1]
-                if not turn < 1e3:
-                    return f"diverged at t = {t:g} s"
-                return (
-                    f"diverged at t = {t:g} s: a joint or the base turns by {turn:.2g} rad a step"
-                )
-        if self.lin is not None and self.state.scalar(before) * self.state.scalar(self.q) < 0.0:
-            return (
-                f"left the chart at t = {step * self.dt:g} s: the base turned by 180 deg from the "
-                "reference"
-            )
+        t = (step + 1) * self.dt
+        turn = float(np.abs(self.v[self.turning]).max(initial=0.0)) * self.dt
+        if not (turn < _LARGEST_TURN and np.isfinite(self.v).all()):
+            self.q, self.v = (rows[self.count - 1] for rows in self.rows[:2])
+            if not np.isfinite(turn) or turn > 1e3:
+                return f"diverged at t = {t:g} s"
+            return f"diverged at t = {t:g} s: a joint or the base turns by {turn:.2g} rad a step"
+        if self.lin is None:
+            return ""
+        before, self.scalar = self.scalar, self.state.scalar(self.q)
+        if before * self.scalar < 0.0:
+            return f"left the chart at t = {t:g} s: the base turned by 180 deg from the reference"
         return ""
 
     def _event(self, step: int) -> str:
@@ -256,68 +266,14 @@ class Run:
                 return f"{getattr(event, '__name__', 'event')} at t = {t:g} s"
         return ""
 
-    def _record(self, t: float) -> None:
-        row, u = self.count, self.acting
+    def _record(self, t: float, u: Array) -> None:
+        row = self.count
         self.t[row] = t
-        self.rows_q[row], self.rows_v[row], self.rows_u[row] = self.q, self.v, u
-        self.x = self._read(self.q, self.v, self.x)
-        self.rows_x[row] = self.x
-        about = self.conserved.about(self.q, self.v, self.point)
-        self.missing[row] = about - self.expected
-        arm = float(np.linalg.norm(self.q[:3] - self.point))
-        self.orbital = max(self.orbital, arm * float(np.linalg.norm(self.expected[3:])))
+        q, v, of_u, momentum = self.rows
+        q[row], v[row], of_u[row], momentum[row] = self.q, self.v, u, self.expected
         self.count += 1
         if self.callback is not None:
             self.callback(t, self.q, self.v, u)
-
-    def _read(self, q: Array, v: Array, near: Any) -> Array:
-        try:
-            near = vector("x0", near, self.state.nx, "a state (12 + 2n)")
-            return self.state.read(q, v, near=near)
-        except ChartError:
-            # Half a turn exactly: no digit of the chart is left, and none beside it is wrong.
-            nearby = pin.integrate(self.robot.model, q, np.full(self.robot.nv, 1e-7))
-            return self.state.read(nearby, v, near=near)
-
-    def finish(self, stopped: str, linear: LinearModel | bool | None) -> Motion:
-        """Make the motion of what was recorded."""
-        rows = slice(0, self.count)
-        q, v = self.rows_q[rows], self.rows_v[rows]
-        momenta = [self.conserved.momenta(*point) for point in zip(q, v, strict=True)]
-        scale = np.max([each.scale for each in momenta], axis=0)
-        # About a fixed point the flight of the whole counts too.
-        scale[0] += self.orbital
-        parts = self.missing[rows].reshape(-1, 2, 3)
-        sizes = np.linalg.norm(parts, axis=2)
-        drift = np.divide(sizes, scale, out=np.zeros_like(sizes), where=scale > 0.0)
-        lin = self.lin if linear is None or linear is True else linear or None
-        x = self.rows_x[rows]
-        prediction: Array = np.zeros((0, self.state.nx))
-        K = getattr(self.policy, "K", None)
-        if lin is not None and K is not None and lin.state_names == self.state.names:
-            loop = (lin, K, self.limits, self.sample, self.delay)
-            prediction = predict(*loop, x[0], self.dt, self.steps, self.every)[: self.count]
-        return Motion(
-            t=self.t[rows],
-            q=q,
-            v=v,
-            x=x,
-            u=self.rows_u[rows],
-            target=x[0] if self.target is None else self.target,
-            prediction=prediction if len(prediction) == self.count else prediction[:0],
-            energy=np.array([each.energy for each in momenta]),
-            momentum=np.array([each.central for each in momenta]),
-            momentum_drift=drift.max(axis=1),
-            placement=pin.SE3ToXYZQUAT(self.state.reference),
-            state_names=self.state.names,
-            input_names=self._names,
-            state_units=self.state.units,
-            input_units=self.dynamics.actuation.units,
-            frame=self.state.frame,
-            robot=self.robot.name,
-            urdf_sha256=self.robot.urdf_sha256,
-            stopped=stopped,
-        )
 
     def _target(self, lin: LinearModel) -> Array:
         target = self.state.read(lin.q, lin.v)

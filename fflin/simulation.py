@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from fflin.recording import motion_of
 from fflin.run import Run
 
 if TYPE_CHECKING:
@@ -119,4 +120,4 @@ def simulate(
     run.actuate(limits)
     run.choose(method, project)
     run.guard(events, callback)
-    return run.finish(run.go(progress), linear)
+    return motion_of(run, run.go(progress), linear)

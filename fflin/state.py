@@ -162,11 +162,17 @@ class StateMap:
         offset = pin.SE3ToXYZQUAT(oMref.actInv(robot.model.jointPlacements[ROOT]))
         self._position, self._quaternion = offset[:3], offset[3:]
         self._rotation = rotation_matrix(self._quaternion)
+        self._aligned = bool((self._rotation == np.eye(3)).all())
 
     @property
     def reference(self) -> pin.SE3:
         """The placement oMref, a copy."""
         return pin.SE3(self._reference)
+
+    @property
+    def origin(self) -> pin.SE3:
+        """Where the base is, seen from the reference, at q[:7] = 0, 0, 0, 0, 0, 0, 1."""
+        return pin.XYZQUATToSE3(np.concatenate((self._position, self._quaternion)))
 
     def chart(self, q: Array) -> Chart:
         """Return the attitude chart at a configuration.
@@ -194,7 +200,8 @@ class StateMap:
 
     def rotation(self, q: Array) -> Array:
         """Return refMb.rotation (3, 3) at a valid configuration, at any turn."""
-        return rotation_matrix(quaternion_product(self._quaternion, q[3:7]))
+        turned: Array = pin.XYZQUATToSE3(q[:7]).rotation
+        return turned if self._aligned else self._rotation.dot(turned)
 
     def scalar(self, q: Array) -> float:
         """Return q0 at a valid configuration, with the sign of the quaternion in q."""
@@ -299,8 +306,8 @@ class StateMap:
         return v
 
     def lift(self, forces: Array) -> Array:
-        """Return a tau (nv,) whose generalised forces (6 + n,) in base axes are the given ones."""
-        tau = np.zeros(self.robot.nv)
+        """Return a tau (nv, ...) whose generalised forces (6 + n, ...) in base axes are given."""
+        tau = np.zeros((self.robot.nv, *forces.shape[1:]))
         tau[self._order] = forces
         return tau
 

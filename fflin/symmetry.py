@@ -21,6 +21,11 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     """
     groups = ["r_b"] if any(robot.gravity) or not lin.moving else ["q_b", "r_b"]
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
+    return (*base, *(f"q_m.{name}" for name in rotor_names(robot)))
+
+
+def rotor_names(robot: Robot) -> tuple[str, ...]:
+    """Return the names of the joints that are rotors, as `ignorable_states` says."""
     model = robot.model
     index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}
     named = {getattr(item, "frame", None) for item in (*robot.inputs, *robot.outputs)} - {None}
@@ -31,8 +36,7 @@ def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     if named:
         busy |= {frame.parentJoint for frame in model.frames if frame.name in named}
     free = (joint for joint in robot.joints if index_of[joint.name] not in busy)
-    rotors = (joint.name for joint in free if _is_symmetric(robot, joint, index_of[joint.name]))
-    return (*base, *(f"q_m.{name}" for name in rotors))
+    return tuple(joint.name for joint in free if _is_symmetric(robot, joint, index_of[joint.name]))
 
 
 def _is_symmetric(robot: Robot, joint: Joint, index: int) -> bool:

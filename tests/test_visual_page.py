@@ -40,7 +40,8 @@ def watched(settled, browser):
 def placements(robot, q):
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, q)
-    return dict(zip(robot.model.names, data.oMi.tolist(), strict=True))
+    # Copies: what the list holds dies with the data.
+    return dict(zip(robot.model.names, map(pin.SE3, data.oMi.tolist()), strict=True))
 
 
 def largest_difference(watched, robot, q, node="robot"):

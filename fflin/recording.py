@@ -1,0 +1,52 @@
+"""The motion that a run has recorded."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.linear_loop import predict
+from fflin.motion import Motion
+from fflin.readout import states_of
+from fflin.validation import Array
+
+if TYPE_CHECKING:
+    from fflin.linear_model import LinearModel
+    from fflin.run import Run
+
+
+def motion_of(run: Run, stopped: str, linear: LinearModel | bool | None) -> Motion:
+    """Make the motion of what a run has recorded; `stopped` says why it ended early."""
+    rows = slice(0, run.count)
+    q, v, u, expected = (each[rows] for each in run.rows)
+    history = run.conserved.histories(q, v)
+    x = states_of(run.state, q, v, run.near)
+    lin = run.lin if linear is None or linear is True else linear or None
+    prediction: Array = np.zeros((0, run.state.nx))
+    K = getattr(run.policy, "K", None)
+    if lin is not None and K is not None and lin.state_names == run.state.names:
+        loop = (lin, K, run.limits, run.sample, run.delay)
+        prediction = predict(*loop, x[0], run.dt, run.steps, run.every)[: run.count]
+    return Motion(
+        t=run.t[rows],
+        q=q,
+        v=v,
+        x=x,
+        u=u,
+        target=x[0] if run.target is None else run.target,
+        prediction=prediction if len(prediction) == run.count else prediction[:0],
+        energy=history.energy,
+        momentum=np.roll(history.momentum, 3, axis=1),
+        momentum_drift=run.conserved.drift(history, expected),
+        placement=pin.SE3ToXYZQUAT(run.state.reference),
+        state_names=run.state.names,
+        input_names=run.dynamics.actuation.names,
+        state_units=run.state.units,
+        input_units=run.dynamics.actuation.units,
+        frame=run.state.frame,
+        robot=run.robot.name,
+        urdf_sha256=run.robot.urdf_sha256,
+        stopped=stopped,
+    )
