@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -24,7 +25,7 @@ from fflin.validation import Array
 _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
 
 # The kernel has sines of angles up to here [rad].
-_FARTHEST = 1e6
+FARTHEST = 1e6
 
 Rows: TypeAlias = NDArray[np.integer[Any]]
 
@@ -82,11 +83,11 @@ class BatchInertia:
         space = np.empty(self._tree.size + LANES)
         # Its vectors are 64 bytes; where they begin at such an address it is faster.
         space = space[-(space.ctypes.data // 8) % LANES :]
-        _kernel()(self._tree, q, out.reshape(len(q), -1), couplings, space)
+        kernel("batch_kernel", "invert")(self._tree, q, out.reshape(len(q), -1), couplings, space)
         # Written so that NaN, from a pivot that is zero, is among them.
         good = (self._inertia.least_coupling < couplings) & (couplings < Inertia.warning_coupling)
-        if not -_FARTHEST < q.min() <= q.max() < _FARTHEST:
-            good &= (np.abs(q[:, 7:]) < _FARTHEST).all(axis=1)
+        if not -FARTHEST < q.min() <= q.max() < FARTHEST:
+            good &= (np.abs(q[:, 7:]) < FARTHEST).all(axis=1)
         return np.flatnonzero(~good)
 
     def loop(self, q: Array, out: Array, rows: Rows) -> None:
@@ -112,15 +113,13 @@ def pays(count: int) -> bool:
     return count >= _BREAK_EVEN_UNLOADED and find_spec("numba") is not None
 
 
-def _kernel() -> Any:
-    """Return the kernel, compiled at the first call ever and kept on disk."""
-    from fflin import batch_kernel
-
-    kernel = batch_kernel.invert
-    if not kernel.signatures:
-        folder = Path(kernel.stats.cache_path)
-        source = Path(batch_kernel.__file__).stat().st_mtime
-        kept = [entry.stat().st_mtime for entry in folder.glob("batch_kernel.invert-*.nbi")]
+def kernel(module: str, name: str) -> Any:
+    """Return a function of the kernel, compiled at the first call ever and kept on disk."""
+    compiled = getattr(import_module(f"fflin.{module}"), name)
+    if not compiled.signatures:
+        folder, package = Path(compiled.stats.cache_path), Path(__file__).parent
+        source = (package / f"{module}.py").stat().st_mtime
+        kept = [entry.stat().st_mtime for entry in folder.glob(f"{module}.{name}-*.nbi")]
         if not any(time > source for time in kept):
             _log.warning("fflin: compiling the batch kernel, once; it is kept in %s", folder)
-    return kernel
+    return compiled

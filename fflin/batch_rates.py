@@ -25,7 +25,6 @@ using spatial vector algebra, IEEE Robotics and Automation Letters 7(2), 2022.
 from __future__ import annotations
 
 import numba
-import numpy as np
 
 from fflin.batch_crba import inwards, outwards
 from fflin.batch_kernel import factorise, multiply, unpack
@@ -136,9 +135,7 @@ def _move(work, tree, layout, nu, first):
         alpha, a = _step(work, above + _BIAS, place)
         _write(work, at + _VELOCITY, plus(w, times(axis[0], rate)), plus(v, times(axis[1], rate)))
         _write(work, at + _PSI, *psi)
-        _write(
-            work, at + _BIAS, plus(alpha, times(psi[0], rate)), plus(a, times(psi[1], rate))
-        )
+        _write(work, at + _BIAS, plus(alpha, times(psi[0], rate)), plus(a, times(psi[1], rate)))
         _write(work, at + _ADDED, none, none)
 
 
@@ -146,13 +143,13 @@ def _move(work, tree, layout, nu, first):
 def _load(work, tree, layout, loads, u, first):
     """Write momenta and forces of the bodies alone, and what a unit of each carried input is."""
     zero = splat(0.0)
-    two, half = splat(2.0), splat(0.5)
+    half = splat(0.5)
     for body in range(len(tree.parent)):
         at = layout.load + body * LOAD * LANES
         moving = layout.motion + body * MOTION * LANES
         inertia = tree.inertias + body * INERTIA * LANES
         w, v = get3(work, moving), get3(work, moving + 3 * LANES)
-        m, h = load(work, inertia), get3(work, inertia + LANES)
+        h = get3(work, inertia + LANES)
         turning, p = _weighed(work, inertia, w, v)
         for entry in range(LOAD):
             store(work, at + entry * LANES, zero)
@@ -272,7 +269,6 @@ def _move_on(work, tree, layout):
         first = _crossed(plus(alpha, bias[0]), plus(a, bias[1]), axis)
         second = _crossed(w, v, psi)
         _write(work, at + _PSI2, plus(first[0], second[0]), plus(first[1], second[1]))
-        # That of the carrier alone for now, which the force of c on all that is carried needs.
         _write(work, at + _ADDED, plus(alpha, times(axis[0], rate)), plus(a, times(axis[1], rate)))
     for body in range(len(tree.parent) - 1, 0, -1):
         at = layout.load + body * LOAD * LANES
