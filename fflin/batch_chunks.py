@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.batch_inertia import BatchInertia, Rows, pays
+from fflin.batch_inertia import BatchInertia, Rows
 from fflin.errors import FflinError, FflinWarning
+from fflin.kernel_code import pays
 from fflin.linearization import Linearizer
 from fflin.model import Robot
 from fflin.validation import Array

@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import os
-import sys
-from importlib import import_module
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,20 +10,15 @@ from numpy.typing import NDArray
 from fflin.batch_tree import LANES, batch_tree
 from fflin.errors import SingularInertiaError
 from fflin.inertia import Inertia
+from fflin.kernel_code import kernel
 from fflin.model import Robot
 from fflin.state import StateMap
 from fflin.validation import Array
-
-# The kernel beats the loop from here on; where numba is not loaded yet, that takes as long as the
-# loop over some thousands of configurations.
-_BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
 
 # The kernel has sines of angles up to here [rad].
 FARTHEST = 1e6
 
 Rows: TypeAlias = NDArray[np.integer[Any]]
-
-_log = logging.getLogger("fflin")
 
 
 class BatchInertia:
@@ -97,29 +86,3 @@ class BatchInertia:
                 self._inertia.invert(q[row], out[row])
             except SingularInertiaError as error:
                 raise SingularInertiaError(f"configuration {row}: {error}") from None
-
-
-def available_threads() -> int:
-    """How many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def pays(count: int) -> bool:
-    """Whether the kernel is there and beats the loop over so many points."""
-    if "numba" in sys.modules:
-        return count >= _BREAK_EVEN
-    return count >= _BREAK_EVEN_UNLOADED and find_spec("numba") is not None
-
-
-def kernel(module: str, name: str) -> Any:
-    """Return a function of the kernel, compiled at the first call ever and kept on disk."""
-    compiled = getattr(import_module(f"fflin.{module}"), name)
-    if not compiled.signatures:
-        folder, package = Path(compiled.stats.cache_path), Path(__file__).parent
-        source = (package / f"{module}.py").stat().st_mtime
-        kept = [entry.stat().st_mtime for entry in folder.glob(f"{module}.{name}-*.nbi")]
-        if not any(time > source for time in kept):
-            _log.warning("fflin: compiling the batch kernel, once; it is kept in %s", folder)
-    return compiled

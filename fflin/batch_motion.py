@@ -9,6 +9,7 @@ import numpy as np
 from fflin.actuation import Actuation
 from fflin.batch_tree import LANES, Tree, batch_tree
 from fflin.frames import ROOT
+from fflin.kernel_code import kernel
 from fflin.model import Robot
 from fflin.state import StateMap
 from fflin.validation import Array
@@ -119,8 +120,6 @@ class BatchRates:
 
     def evaluate(self, points: Points, out: Rates) -> None:
         """Write the rates of all points, of which there are as many as lanes at least."""
-        from fflin.batch_inertia import kernel
-
         space = np.empty(self._layout.size + LANES)
         # Its vectors are 64 bytes; where they begin at such an address it is faster.
         space = space[-(space.ctypes.data // 8) % LANES :]
@@ -154,7 +153,7 @@ def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
 
 
 def _layout(tree: Tree, carried: int) -> Layout:
-    from fflin.batch_rates import LOAD, MOTION
+    from fflin.batch_rnea import LOAD, MOTION
 
     size, bodies = len(tree.row), len(tree.parent)
     width = 2 * size - 9

@@ -18,12 +18,12 @@ import pinocchio as pin
 
 from fflin.batch_chunks import ChunkJob
 from fflin.batch_files import check_format, header, load_batch
-from fflin.batch_inertia import available_threads
 from fflin.batch_store import FileStore, MemoryStore
 from fflin.configurations import Configurations, GivenConfigurations
 from fflin.dispatching import Done, OwnWorkers, Span, dispatch
 from fflin.errors import FflinError, FflinWarning, FileError, InputError, SweepError, listed
 from fflin.files import as_path
+from fflin.kernel_code import available_threads
 from fflin.linear_batch import LinearBatch
 from fflin.model import Robot
 from fflin.sweep_task import SweepTask, as_configurations
