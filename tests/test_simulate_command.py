@@ -21,6 +21,9 @@ def test_a_loop_settles_is_saved_and_drawn(tmp_path):
     assert motion.attitude_error[0] == pytest.approx(30.0)
     assert motion.attitude_error[-1] < 1e-4
     assert (tmp_path / "loop.png").stat().st_size > 50_000
+    apart = np.abs(motion.x - motion.linear).max(axis=0)
+    most = motion.state_names[apart.argmax()]
+    assert f"difference from the linear model: {apart.max():.3g} rad in {most}" in out
     assert out.splitlines()[-2:] == ["wrote loop.npz", "wrote loop.png"]
 
 

@@ -18,7 +18,7 @@ from fflin.commands.arguments import (
     command,
     number,
 )
-from fflin.commands.points import configuration_of, inputs_at, load_robot, once, velocity_of
+from fflin.commands.points import configuration_of, inputs_at, load_robot, once, placed, velocity_of
 from fflin.commands.regulator import add_weights, gain_of
 from fflin.commands.visual import add_pictures, check_pictures, show_motion
 from fflin.errors import InputError
@@ -151,9 +151,8 @@ def simulated(arguments: argparse.Namespace) -> tuple[Robot, Motion]:
 
 def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
     from fflin.linearization import linearize
-    from fflin.model import configuration
 
-    q = configuration(robot, once("--target-joint", arguments.target_joint))
+    q = placed(robot, "--target-joint", arguments.target_joint)
     u = inputs_at(robot, q, None, arguments)
     lin = linearize(robot, q, None, u, frame=arguments.frame)
     if arguments.reduce:
