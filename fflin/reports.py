@@ -40,7 +40,7 @@ def robot_info(robot: Robot) -> str:
     model = robot.model
     source = str(robot.urdf) if robot.urdf else "a Pinocchio model"
     head = (
-        f"{robot.name}: {robot.n} joints, {12 + 2 * robot.n} states, {6 + robot.n} inputs, "
+        f"{robot.name}: {_counted(robot.n, 'joint')}, {12 + 2 * robot.n} states, {6 + robot.n} inputs, "
         f"mass {robot.mass:.6g} kg\nfrom {source}"
     )
     depth = {0: -1, 1: 0}
