@@ -40,8 +40,8 @@ def robot_info(robot: Robot) -> str:
     model = robot.model
     source = str(robot.urdf) if robot.urdf else "a Pinocchio model"
     head = (
-        f"{robot.name}: {_counted(robot.n, 'joint')}, {12 + 2 * robot.n} states, {6 + robot.n} inputs, "
-        f"mass {robot.mass:.6g} kg\nfrom {source}"
+        f"{robot.name}: {_counted(robot.n, 'joint')}, {12 + 2 * robot.n} states, "
+        f"{6 + robot.n} inputs, mass {robot.mass:.6g} kg\nfrom {source}"
     )
     depth = {0: -1, 1: 0}
     rows = [["joint", "type", "mass [kg]", "lower", "upper", "effort", "velocity"]]
