@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Lock
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -29,6 +31,7 @@ _FARTHEST = 1e6
 Rows: TypeAlias = NDArray[np.integer[Any]]
 
 _log = logging.getLogger("fflin")
+_TELLING = Lock()
 
 
 class BatchInertia:
@@ -122,5 +125,11 @@ def _kernel() -> Any:
         source = Path(batch_kernel.__file__).stat().st_mtime
         kept = [entry.stat().st_mtime for entry in folder.glob("batch_kernel.invert-*.nbi")]
         if not any(time > source for time in kept):
-            _log.warning("fflin: compiling the batch kernel, once; it is kept in %s", folder)
+            with _TELLING:  # threads come here together
+                _tell(folder)
     return kernel
+
+
+@cache
+def _tell(folder: Path) -> None:
+    _log.warning("fflin: compiling the batch kernel, once; it is kept in %s", folder)

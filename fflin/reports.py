@@ -112,7 +112,7 @@ def linear_model(lin: LinearModel) -> str:
         shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
         parts.append(textwrap.fill(f"unstable: poles with a positive real part {shown}", width()))
     moved = [
-        _signal(title, values, names, units)
+        signals(title, values, names, units)
         for title, values, names, units in (
             ("x0", lin.x0, lin.state_names, lin.state_units),
             ("u0", lin.u0, lin.input_names, lin.input_units),
@@ -236,7 +236,8 @@ def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Seque
     return f"{size}; rows and columns of zeros are not shown\n\n{matrix(values, rows, columns)}"
 
 
-def _signal(title: str, values: Array, names: Sequence[str], units: Sequence[str]) -> str:
+def signals(title: str, values: Array, names: Sequence[str], units: Sequence[str]) -> str:
+    """Show what is not zero of a state, an input or a force, with its unit."""
     # A line is broken between entries alone, not at the spaces within them.
     entries = [
         f"{name}\xa0=\xa0{value:.6g}" + (f"\xa0{unit}" if unit != "1" else "")

@@ -53,3 +53,22 @@ def test_kernel_agrees_with_pinocchio_on_every_bundled_robot(name, robots):
 def test_kernel_agrees_on_random_trees_of_every_joint_type(n):
     robot = random_tree(np.random.default_rng(n), n)
     assert agreement(robot, spread_configurations(robot, 11)) < 1e-14
+
+
+def test_compilation_is_told_once_whatever_the_threads(monkeypatch, caplog, tmp_path):
+    pytest.importorskip("numba")
+    from concurrent.futures import ThreadPoolExecutor
+    from threading import Barrier
+    from types import SimpleNamespace
+
+    from fflin import batch_inertia, batch_kernel
+
+    ready = Barrier(4)
+    new = SimpleNamespace(signatures=(), stats=SimpleNamespace(cache_path=tmp_path))
+    monkeypatch.setattr(batch_kernel, "invert", new)
+    with ThreadPoolExecutor(4) as threads:
+        found = [threads.submit(lambda: (ready.wait(), batch_inertia._kernel())) for _ in range(4)]
+    assert all(each.result()[1] is new for each in found)
+    assert [record.message for record in caplog.records] == [
+        f"fflin: compiling the batch kernel, once; it is kept in {tmp_path}"
+    ]
