@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 # The kernel beats the loop from here on. To load numba takes half a second, once, which a sweep of
@@ -18,6 +20,7 @@ _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
 _SOURCES = ("batch_*.py", "lane*.py")
 
 _log = logging.getLogger("fflin")
+_TURN = Lock()
 
 
 def available_threads() -> int:
@@ -36,17 +39,22 @@ def pays(count: int) -> bool:
 
 def kernel(module: str, name: str) -> Any:
     """Return a function of the kernel, compiled at the first call ever and kept on disk."""
+    with _TURN:  # threads come here together
+        return _prepared(module, name)
+
+
+@cache
+def _prepared(module: str, name: str) -> Any:
     compiled = getattr(import_module(f"fflin.{module}"), name)
-    if not compiled.signatures:
-        folder = Path(compiled.stats.cache_path)
-        kept = list(folder.glob(f"{module}.{name}-*.nbi"))
-        # numba looks at the file of the function alone, not at those that it calls.
-        source = max(file.stat().st_mtime for file in _sources())
-        for entry in [entry for entry in kept if entry.stat().st_mtime < source]:
-            entry.unlink(missing_ok=True)
-            kept.remove(entry)
-        if not kept:
-            _log.warning("fflin: compiling the batch kernel, once; it is kept in %s", folder)
+    folder = Path(compiled.stats.cache_path)
+    kept = list(folder.glob(f"{module}.{name}-*.nbi"))
+    # numba looks at the file of the function alone, not at those that it calls.
+    source = max(file.stat().st_mtime for file in _sources())
+    for entry in [entry for entry in kept if entry.stat().st_mtime < source]:
+        entry.unlink(missing_ok=True)
+        kept.remove(entry)
+    if not kept:
+        _log.warning("fflin: compiling the batch kernel, once; it is kept in %s", folder)
     return compiled
 
 

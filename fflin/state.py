@@ -110,6 +110,9 @@ class StateMap:
         If the frame is unknown or the reference is not a pin.SE3.
     """
 
+    def __repr__(self) -> str:
+        return f"StateMap('{self.robot.name}', nx={self.nx}, frame='{self.frame}')"
+
     def __init__(
         self, robot: Robot, *, reference: pin.SE3 | None = None, frame: Frame = "hybrid"
     ) -> None:

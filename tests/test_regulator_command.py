@@ -74,6 +74,7 @@ def test_bad_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
         "no state named 'nope'": ("--q", "nope=1"),
         "no input named 'nope'": ("--r", "nope=1"),
         "expected a positive value": ("--bryson", "q_b=0"),
+        "no state or input named 'taum'; did you mean tau_m": ("--bryson", "taum=5"),
         "'q_b' has a weight and a largest value": ("--bryson", "q_b=1", "--q", "q_b=1"),
         "Q is not positive semidefinite: its eigenvalue -1": ("--q", "q_b=-1"),
         "R is not positive definite: its eigenvalue 0": ("--r", "F_b.y=0"),

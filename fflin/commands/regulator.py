@@ -16,7 +16,7 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import linear_model, once
-from fflin.errors import InputError, StabilizabilityError
+from fflin.errors import InputError, StabilizabilityError, unknown
 
 if TYPE_CHECKING:
     from fflin.linear_model import LinearModel
@@ -113,7 +113,13 @@ def _weights(lin: LinearModel, arguments: argparse.Namespace) -> tuple[Array, Ar
         if value <= 0.0:
             raise InputError(f"--bryson {name}={value:g}: expected a positive value")
         squares[name] = value**-2
-    known = {*lin.input_names, *(name.partition(".")[0] for name in lin.input_names)}
+    known, states = (
+        dict.fromkeys((*(name.partition(".")[0] for name in names), *names))
+        for names in (lin.input_names, lin.state_names)
+    )
+    for name in squares:
+        if name not in known and name not in states:
+            raise unknown("state or input", name, (*states, *known))
     of_inputs = {name: value for name, value in squares.items() if name in known}
     of_states = {name: value for name, value in squares.items() if name not in known}
     both = [*(set(values["q"]) & set(of_states)), *(set(values["r"]) & set(of_inputs))]
