@@ -100,9 +100,9 @@ class BatchEquations:
         good = within & (np.abs(q[:, 7:]) < FARTHEST).all(axis=1)
         good &= self._least_coupling < rates.couplings
         good &= rates.couplings < Inertia.warning_coupling
-        for array in out.values():
-            flat = array.reshape(len(q), -1)
-            good &= np.einsum("ij,ij->i", flat, flat) < LARGEST  # nor NaN
+        # What is not finite shows in these, NaN too.
+        for array in (A[:, nv:], B, out["f0"][:, None]):
+            good &= np.einsum("ijk,ijk->i", array, array) < LARGEST
         return good
 
     def _evaluate(self, points: Points, A: Array) -> Rates:

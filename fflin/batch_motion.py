@@ -23,8 +23,8 @@ class Layout(NamedTuple):
     bias: int
     c: int
     columns: int
-    slopes: int
     lower: int
+    held: int
     size: int
 
 
@@ -156,9 +156,8 @@ def _layout(tree: Tree, carried: int) -> Layout:
     from fflin.batch_rnea import LOAD, MOTION
 
     size, bodies = len(tree.row), len(tree.parent)
-    width = 2 * size - 9
     sizes = (
         *(bodies * MOTION, bodies * LOAD, size, size, size * carried),
-        *(size * width, size * 2 * size),
+        *(size * 2 * size, size * 8),
     )
     return Layout(*(tree.size + int(x) * LANES for x in np.cumsum([0, *sizes])))

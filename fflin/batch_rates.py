@@ -29,24 +29,55 @@ def solve_accelerations(work, tree, layout, forces, first):
 
 
 @numba.njit(forceinline=True)
+def _load4(work, at):
+    return (
+        load(work, at),
+        load(work, at + LANES),
+        load(work, at + 2 * LANES),
+        load(work, at + 3 * LANES),
+    )
+
+
+@numba.njit(forceinline=True)
+def _subtract4(total, entry, values):
+    return (
+        total[0] - entry * values[0],
+        total[1] - entry * values[1],
+        total[2] - entry * values[2],
+        total[3] - entry * values[3],
+    )
+
+
+@numba.njit(forceinline=True)
+def _store4(work, at, values):
+    for index in range(4):
+        store(work, at + index * LANES, values[index])
+
+
+@numba.njit(forceinline=True)
 def solve_slopes(work, tree, layout):
-    """Write the lower half of A, (6 + n, 12 + 2 n): -M^-1 slopes, and zeros between."""
+    """Turn the slopes, rows of the lower half of A, into -M^-1 slopes, eight columns at a time."""
     size = len(tree.row)
-    n = size - 6
-    width = 3 + 2 * n
+    width = 2 * size
     zero = splat(0.0)
-    for row in range(size):
-        out = layout.lower + row * 2 * size * LANES
-        for index in range(2 * size):
-            store(work, out + index * LANES, zero)
-        for index in range(width):
-            total = zero
+    none = zero, zero, zero, zero
+    # The first columns, of q_b and r_b, are zeros that need no product.
+    for column in range(width % 8, width, 8):
+        slopes = layout.lower + column * LANES
+        for k in range(size):
+            at, to = slopes + k * width * LANES, layout.held + k * 8 * LANES
+            _store4(work, to, _load4(work, at))
+            _store4(work, to + 4 * LANES, _load4(work, at + 4 * LANES))
+        for row in range(size):
+            left, right = none, none
             for k in range(size):
                 entry = load(work, tree.square + (row * size + k) * LANES)
-                total = total - entry * load(work, layout.slopes + (k * width + index) * LANES)
-            # After q_b and r_b; beyond omega_b after v_b too.
-            place = 6 + index if index < n + 3 else 9 + index
-            store(work, out + place * LANES, total)
+                at = layout.held + k * 8 * LANES
+                left = _subtract4(left, entry, _load4(work, at))
+                right = _subtract4(right, entry, _load4(work, at + 4 * LANES))
+            at = slopes + row * width * LANES
+            _store4(work, at, left)
+            _store4(work, at + 4 * LANES, right)
 
 
 @numba.njit(nogil=True, cache=True, boundscheck=False)

@@ -69,15 +69,14 @@ def _coriolis_transposed(work, at, along):
 def _passive_slopes(work, tree, layout, loads):
     """Write those of springs and dampers, and zeros."""
     size = len(tree.row)
-    n = size - 6
-    width = 3 + 2 * n
+    n, width = size - 6, 2 * size
     zero = splat(0.0)
     for entry in range(size * width):
-        store(work, layout.slopes + entry * LANES, zero)
+        store(work, layout.lower + entry * LANES, zero)
     for index in range(n):
-        row = layout.slopes + (6 + index) * width * LANES
-        store(work, row + index * LANES, splat(loads.stiffness[index]))
-        store(work, row + (n + 3 + index) * LANES, splat(loads.damping[index]))
+        row = layout.lower + (6 + index) * width * LANES
+        store(work, row + (6 + index) * LANES, splat(loads.stiffness[index]))
+        store(work, row + (12 + n + index) * LANES, splat(loads.damping[index]))
 
 
 @numba.njit(forceinline=True)
@@ -91,8 +90,7 @@ def _add_column(work, at, width, moment, force):
 @numba.njit(forceinline=True)
 def _joint_slopes(work, tree, layout):
     """Add those over each joint, and those of each joint's force over omega_b."""
-    n = len(tree.row) - 6
-    width = 3 + 2 * n
+    n, width = len(tree.row) - 6, 2 * len(tree.row)
     spin = get3(work, layout.motion)
     for body in range(len(tree.parent) - 1, 0, -1):
         at = layout.load + body * LOAD * LANES
@@ -113,13 +111,13 @@ def _joint_slopes(work, tree, layout):
         weight, heft = weighed(work, inertia, psi[0], psi[1])
         v = plus(turning, plus(weight, weight))
         vf = plus(pushing, plus(heft, heft))
-        own = layout.slopes + column * width * LANES
-        by_q, by_v = (column - 6) * LANES, (column - 3 + n) * LANES
+        own = layout.lower + column * width * LANES
+        by_q, by_v = column * LANES, (column + 6 + n) * LANES
         above = body
         while above > 0:
             other = tree.coordinate[above]
             axis = joint_axis(work, tree, above)
-            row = layout.slopes + other * width * LANES
+            row = layout.lower + other * width * LANES
             add(work, row + by_q, dot(axis[0], p) + dot(axis[1], pf))
             add(work, row + by_v, dot(axis[0], v) + dot(axis[1], vf))
             if above != body:
@@ -127,24 +125,23 @@ def _joint_slopes(work, tree, layout):
                 psi = get3(work, moving + PSI), get3(work, moving + PSI + 3 * LANES)
                 psi2 = get3(work, moving + PSI2), get3(work, moving + PSI2 + 3 * LANES)
                 value = dot(w, psi[0]) + (dot(u, psi2[0]) + dot(uf, psi2[1]))
-                add(work, own + (other - 6) * LANES, value)
+                add(work, own + other * LANES, value)
                 value = dot(u, psi[0]) + dot(uf, psi[1])
                 value = dot(w, axis[0]) + (value + value)
-                add(work, own + (other - 3 + n) * LANES, value)
+                add(work, own + (other + 6 + n) * LANES, value)
             d = get3(work, tree.places + (above * PLACE + 9) * LANES)
             u, p, v = plus(u, cross(d, uf)), plus(p, cross(d, pf)), plus(v, cross(d, vf))
             above = tree.parent[above]
         turning = plus(w, cross(u, spin))
-        add3(work, own + n * LANES, turning[0], turning[1], turning[2])
-        _add_column(work, layout.slopes + by_q, width, p, pf)
-        _add_column(work, layout.slopes + by_v, width, v, vf)
+        add3(work, own + (6 + n) * LANES, turning[0], turning[1], turning[2])
+        _add_column(work, layout.lower + by_q, width, p, pf)
+        _add_column(work, layout.lower + by_v, width, v, vf)
 
 
 @numba.njit(forceinline=True)
 def _base_slopes(work, tree, layout):
     """Write those of the base's force over omega_b."""
-    n = len(tree.row) - 6
-    width = 3 + 2 * n
+    n, width = len(tree.row) - 6, 2 * len(tree.row)
     zero = splat(0.0)
     spin = get3(work, layout.motion)
     one = splat(1.0)
@@ -158,14 +155,17 @@ def _base_slopes(work, tree, layout):
         turning, pushing = _coriolis(work, layout.load, e)
         weight, heft = weighed(work, tree.inertias, cross(spin, e), (zero, zero, zero))
         for axis in range(3):
-            row = layout.slopes + (axis * width + n + index) * LANES
+            row = layout.lower + (axis * width + 6 + n + index) * LANES
             store(work, row, turning[axis] + weight[axis])
             store(work, row + 3 * width * LANES, pushing[axis] + heft[axis])
 
 
 @numba.njit(forceinline=True)
 def differentiate(work, tree, layout, loads):
-    """Write the slopes of M c + bias less the forces, over q_m, omega_b and q'_m."""
+    """Write the slopes of M c + bias less the forces over the state, rows of 12 + 2 n.
+
+    Those over q_b, r_b and v_b are zero.
+    """
     _passive_slopes(work, tree, layout, loads)
     _joint_slopes(work, tree, layout)
     _base_slopes(work, tree, layout)
