@@ -1,9 +1,12 @@
 """Models about many operating points at once, against the one about each."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import BUNDLED, random_tree
+from test_inertia import LINKS, MIMIC
 
 import fflin
 from fflin.batch_equations import BatchEquations
@@ -88,10 +91,21 @@ def test_kernel_knows_springs_gravity_thrusters_and_wheels(case, robots):
     assert agreement(robot, **CASES[case]) < 1e-13
 
 
-def test_kernel_counts_rotors_and_joints_that_mimic_others(robots):
+def test_kernel_counts_rotors(robots):
     model = robots["servicer_7dof"].model.copy()
     model.armature = np.linspace(0.1, 2.0, model.nv)
     assert agreement(fflin.from_model(model)) < 1e-13
+
+
+@pytest.mark.parametrize("types", [("revolute", "revolute"), ("prismatic", "continuous")])
+def test_kernel_knows_joints_that_turn_against_others_with_rotors_of_their_own(types, tmp_path):
+    mimic = '<mimic joint="b" multiplier="-2" offset="0.3"/>'
+    document = MIMIC.format(links=LINKS, a=types[0], b=types[1], parent="la", mimic=mimic)
+    (tmp_path / "r.urdf").write_text(document)
+    robot = fflin.load(tmp_path / "r.urdf")
+    model = robot.model.copy()
+    model.armature = np.linspace(0.1, 2.0, model.nv)
+    assert agreement(replace(robot, model=model)) < 1e-13
 
 
 @pytest.mark.parametrize("name", ["panda", "tiago"])
