@@ -87,7 +87,7 @@ class Riccati:
             defect += 0.5 * (second + second.T)
             size += _norm(second)
         residual = _norm(defect) / max(size, _TINY)
-        if not math.isfinite(residual):
+        if not math.isfinite(residual + size):
             raise np.linalg.LinAlgError("the weights or the model are beyond all numbers")
         return _Trial(P, defect, residual)
 

@@ -72,11 +72,23 @@ def test_brysons_rule_is_the_square_of_the_largest_value(lin):
         "is an input and 'q_b' a state": {"q_b": 1.0, "tau_b": 1.0},
         "no value for F_b.x": {"tau_b": 1.0},
         "is 0, expected a positive": {"q_b": 0.0},
+        "is 1e-200, expected one between": {"q_b": 1e-200},
+        r"is 1e\+200, expected one between": {"tau_b": 1e200},
         "no state or input named 'qb'": {"qb": 1.0},
         "expected {name": {},
     }.items():
         with pytest.raises(fflin.FflinError, match=words):
             fflin.bryson(lin, largest)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_a_mode_that_the_weights_leave_out_is_not_held_by_rounding(lin, dt, seed):
+    V = np.random.default_rng(seed).normal(size=(12, 11))
+    Q = np.eye(24)
+    Q[:12, :12] = V @ V.T
+    with pytest.raises(fflin.InputError, match="Q does not weigh a combination of "):
+        fflin.lqr(lin.discretize(dt) if dt else lin, Q, 1.0)
 
 
 def test_bad_weights_are_named(lin):
@@ -125,6 +137,7 @@ def test_weights_of_any_size_give_a_gain_or_one_clear_line(lin, dt):
                 assert "scale the weights" in str(error)
             else:
                 assert np.isfinite(gain.K).all() and gain.margin > 0.0
+                assert gain.residual < 1e-3
                 solved += 1
     assert solved >= 7
 
@@ -158,6 +171,11 @@ def test_what_the_inputs_cannot_hold_is_named(robots, name, dt):
     refused(joints, r"cannot hold base attitude and position \(momentum is conserved\).*_reduction")
     refused([fflin.BaseTorque(), *joints], r"hold base position \(linear momentum is conserved\)")
     refused([fflin.BaseForce(), *joints], r"hold base attitude \(angular momentum is conserved\)")
+    plane = [
+        fflin.Thruster(robot.model.frames[2].name, position=(0.1, y, 0.0), direction=direction)
+        for y, direction in ((0.1, (1, 0, 0)), (-0.1, (-1, 0, 0)), (0.1, (0, 1, 0)))
+    ]
+    refused([*plane, *joints], r"hold base attitude x/y and position z \(momentum is conserved\)")
     base = [fflin.BaseTorque(), fflin.BaseForce()]
     refused([*base, *joints[1:]], f"hold joint {robot.joint_names[0]}, which no input moves")
 

@@ -105,14 +105,12 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
 
 def _weights(lin: LinearModel, arguments: argparse.Namespace) -> tuple[Array, Array]:
     """Return the diagonals of Q and R."""
-    from fflin.weights import default_weights, named_weights
+    from fflin.weights import default_weights, inverse_square, named_weights
 
     values = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
     squares = {}
     for name, value in values["bryson"].items():
-        if value <= 0.0:
-            raise InputError(f"--bryson {name}={value:g}: expected a positive value")
-        squares[name] = value**-2
+        squares[name] = inverse_square(f"largest value of '{name}' (--bryson)", value)
     known = {*lin.input_names, *(name.partition(".")[0] for name in lin.input_names)}
     of_inputs = {name: value for name, value in squares.items() if name in known}
     of_states = {name: value for name, value in squares.items() if name not in known}
