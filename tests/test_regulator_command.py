@@ -80,6 +80,7 @@ def test_bad_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
         "R is not positive definite: its eigenvalue 0": ("--r", "F_b.y=0"),
         "dt is -1 s, expected a positive": ("--dt", "-1"),
         "the point is not a fixed point: d q_b.x/dt": ("--velocity", "omega_b.x=0.1"),
+        "with moving=True (--equilibrium)\n": ("--gravity", "0", "0", "-9.81", "--q", "q_b=1"),
         "--q names": ("--q", "q_b=1", "--q", "q_b=2"),
     }.items():
         code, out, err = run(capsys, "ets_vii", *arguments, "-o", str(tmp_path / "k.npz"))

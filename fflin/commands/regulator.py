@@ -16,7 +16,7 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import linear_model, once
-from fflin.errors import InputError, StabilizabilityError
+from fflin.errors import EquilibriumError, InputError, StabilizabilityError
 
 if TYPE_CHECKING:
     from fflin.linear_model import LinearModel
@@ -87,9 +87,14 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     accelerations: its poles are of the order of 1/s whatever the robot weighs.
     """
     from fflin.acceleration import acceleration_lqr
-    from fflin.regulator import lqr
+    from fflin.regulator import lqr, require_fixed_point
     from fflin.sampling import sampled_cost
 
+    try:
+        require_fixed_point(lin)
+    except EquilibriumError as error:
+        hint = "" if arguments.equilibrium else " (--equilibrium)"
+        raise EquilibriumError(f"{error}{hint}") from None
     if not (arguments.q or arguments.r or arguments.bryson):
         with suppress(InputError, StabilizabilityError):
             return acceleration_lqr(lin, 1.0, 1.0, 1.0, dt=arguments.dt)
