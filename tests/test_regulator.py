@@ -237,6 +237,20 @@ def test_the_largest_gain_of_a_resonance_is_found_between_the_poles():
         assert _norm(A, B, C, D) == pytest.approx(np.abs(response).max(), rel=3e-5)
 
 
+@pytest.mark.parametrize("fields", [{}, {"stiffness": 50.0, "damping": 3.0}])
+def test_a_cross_weight_is_sampled_with_the_rest(fields):
+    model = fflin.linearize(fflin.load("astrobee_arm").replace(**fields))
+    nx, nu = model.B.shape
+    rng, h = np.random.default_rng(5), 0.3
+    V = rng.normal(size=(nx + nu, nx + nu))
+    W = V @ V.T
+    Q, R, N = fflin.sampled_cost(model, h, W[:nx, :nx], W[nx:, nx:], W[:nx, nx:])
+    F = np.vstack((np.hstack((model.A, model.B)), np.zeros((nu, nx + nu))))
+    integral = quad_vec(lambda t: expm(F * t).T @ W @ expm(F * t), 0.0, h, epsrel=1e-11)[0]
+    scale = np.abs(integral).max()
+    assert np.block([[Q, N], [N.T, R]]) == pytest.approx(integral, rel=1e-9, abs=1e-11 * scale)
+
+
 def test_sampled_cost_is_the_integral_under_held_inputs(lin):
     h = 0.4
     Q, R = np.diag(np.linspace(1, 5, 24)), np.diag(np.linspace(1, 2, 12))

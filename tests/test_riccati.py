@@ -11,7 +11,7 @@ import fflin
 from fflin import modal
 from fflin.halfsize import second_order_loop
 from fflin.modal import Modes
-from fflin.riccati import Riccati, _finished, half_size, solve
+from fflin.riccati import Riccati, _bilinear, _finished, half_size, solve
 
 
 def weightings(lin, rng):
@@ -109,6 +109,21 @@ def loops(robots):
         Q = np.diag(rng.uniform(1.0, 10.0, len(lin.A)))
         R = np.diag(lin.M.diagonal() ** -2.0)
         yield lin, Q, R, second_order_loop(lin.A, lin.B, Q, np.sqrt(R)), even
+
+
+def test_the_continuous_equation_of_a_sampled_model_has_the_same_P(robots):
+    lin = fflin.linearize(robots["ets_vii"])
+    rng = np.random.default_rng(8)
+    V = rng.normal(size=(36, 36))
+    W = V @ V.T
+    cost = fflin.sampled_cost(lin, 0.2, W[:24, :24], W[24:, 24:], W[:24, 24:])
+    held = lin.discretize(0.2)
+    equation = Riccati(held.A, held.B, *cost, held.dt)
+    found = solve(held.A, held.B, *cost, held.dt)
+    assert found.method == "structured" and found.residual < 1e-13
+    assert _bilinear(equation).trial(found.P).residual < 1e-12
+    other = Riccati(held.A, held.B, cost.Q, cost.R, -cost.N, held.dt)
+    assert _bilinear(other).trial(found.P).residual > 1e-6
 
 
 def test_half_size_loops_are_loops_of_the_model_and_optimal_without_odd_powers(robots):

@@ -93,7 +93,8 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     try:
         require_fixed_point(lin)
     except EquilibriumError as error:
-        hint = "" if arguments.equilibrium else " (--equilibrium)"
+        # It balances forces; a base that moves stays no fixed point.
+        hint = "" if arguments.equilibrium or lin.v.any() else " (--equilibrium)"
         raise EquilibriumError(f"{error}{hint}") from None
     if not (arguments.q or arguments.r or arguments.bryson):
         with suppress(InputError, StabilizabilityError):
