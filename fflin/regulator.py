@@ -224,6 +224,13 @@ _FROM_MODEL = (
 )
 
 
+def _difference(a: Array, b: Array, c: Array) -> Array:
+    """Return a - b c with zeros for what is rounding."""
+    rounding = 1e3 * np.finfo(float).eps * (np.abs(a) + np.abs(b) @ np.abs(c))
+    difference = a - b @ c
+    return np.where(np.abs(difference) > rounding, difference, 0.0)
+
+
 def _still(poles: Any, dt: float) -> bool:
     """Whether a pole of a stable loop hardly moves."""
     decay = 1.0 - np.abs(poles) if dt else -poles.real
@@ -244,7 +251,7 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
     free, A = Q, lin.A
     if N is not None:
         toward = np.linalg.solve(R, N.T)
-        free, A = Q - N @ toward, A - lin.B @ toward
+        free, A = _difference(Q, N, toward), _difference(A, lin.B, toward)
     require_weighed(lin, A, free)
     if structured is not None:
         return structured

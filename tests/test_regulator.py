@@ -237,6 +237,15 @@ def test_the_largest_gain_of_a_resonance_is_found_between_the_poles():
         assert _norm(A, B, C, D) == pytest.approx(np.abs(response).max(), rel=3e-5)
 
 
+def test_a_cross_weight_that_takes_a_spring_away_leaves_its_joint_unweighed():
+    model = fflin.linearize(fflin.load("astrobee_arm").replace(stiffness=20.0))
+    N = np.zeros(model.B.shape)
+    N[:8] = np.linalg.solve(model.B[8:], model.A[8:, :8]).T
+    Q = N @ N.T + np.diag([1.0] * 6 + [0.0] * 10)
+    with pytest.raises(fflin.InputError, match="Q does not weigh q_m.arm_"):
+        fflin.lqr(model, Q, 1.0, N)
+
+
 @pytest.mark.parametrize("fields", [{}, {"stiffness": 50.0, "damping": 3.0}])
 def test_a_cross_weight_is_sampled_with_the_rest(fields):
     model = fflin.linearize(fflin.load("astrobee_arm").replace(**fields))

@@ -11,7 +11,7 @@ import fflin
 from fflin import modal
 from fflin.halfsize import second_order_loop
 from fflin.modal import Modes
-from fflin.riccati import Riccati, _bilinear, _finished, half_size, solve
+from fflin.riccati import Riccati, _bilinear, _finished, _general, half_size, solve
 
 
 def weightings(lin, rng):
@@ -220,6 +220,21 @@ def test_badly_scaled_weights_never_cost_the_residual(robots):
                 P = general(lin.A, lin.B, Q, R)
             assert found.residual <= Riccati(lin.A, lin.B, Q, R, None, 0.0).trial(P).residual
             assert found.poles.real.max() < 0.0
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+@pytest.mark.parametrize("cross", [False, True])
+def test_inputs_whose_costs_are_far_apart_are_scaled_first(robots, dt, cross):
+    """SciPy's solver takes such an R for a singular one."""
+    lin = fflin.linearize(robots["astrobee_arm"].replace(stiffness=20.0, damping=1.0))
+    lin = lin.discretize(dt) if dt else lin
+    nx, nu = lin.B.shape
+    R = np.diag(np.geomspace(1e-12, 1e12, nu))
+    N = 0.1 * np.sqrt(R)[np.arange(nx) % nu] if cross else None
+    with pytest.raises((ValueError, np.linalg.LinAlgError)):
+        _general(Riccati(lin.A, lin.B, np.eye(nx), R, N, 0.0), False)
+    found = solve(lin.A, lin.B, np.eye(nx), R, N, dt)
+    assert found.residual < 1e-10
 
 
 def test_lyapunov_equations_by_modes(monkeypatch):
