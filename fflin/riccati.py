@@ -253,7 +253,7 @@ def _refined(equation: Riccati, P: Array, modes: Modes | None) -> tuple[_Trial, 
 
 
 def _general(equation: Riccati, unit: bool) -> Array:
-    """Solve by SciPy, which takes a badly scaled R for singular; `unit`: with inputs that cost 1."""
+    """Solve by SciPy, which takes an R badly scaled for singular; `unit`: inputs that cost 1."""
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 
     solver = solve_discrete_are if equation.discrete else solve_continuous_are

@@ -242,7 +242,7 @@ def test_a_cross_weight_that_takes_a_spring_away_leaves_its_joint_unweighed():
     N = np.zeros(model.B.shape)
     N[:8] = np.linalg.solve(model.B[8:], model.A[8:, :8]).T
     Q = N @ N.T + np.diag([1.0] * 6 + [0.0] * 10)
-    with pytest.raises(fflin.InputError, match="Q does not weigh q_m.arm_"):
+    with pytest.raises(fflin.InputError, match=r"Q does not weigh q_m.arm_"):
         fflin.lqr(model, Q, 1.0, N)
 
 
