@@ -64,7 +64,9 @@ def once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return the pairs of a repeatable option; a name that is given twice is refused."""
     values = dict(pairs)
     if len(values) < len(pairs):
-        raise InputError(f"{option} names a joint twice; give one value for each")
+        names = [name for name, _ in pairs]
+        double = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{option} names '{double}' twice; give it one value")
     return values
 
 
