@@ -144,6 +144,8 @@ def simulated(arguments: argparse.Namespace) -> tuple[Robot, Motion]:
     gain = gain_of(lin, arguments)
     from fflin.policies import StateFeedback
 
+    if not arguments.reduce:
+        options["linear"] = lin  # at every row, where the sampled model has the samples alone
     if gain.dt:
         lin = lin.discretize(gain.dt)
     return robot, simulate(robot, StateFeedback(lin, gain.K), **options)
