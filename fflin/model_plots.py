@@ -164,8 +164,9 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
             xlabel="displacement [% of the largest]",
             ylabel="error [% of the displacement]",
         )
-        order = f"error ~ displacement^{validity.slope:.2f}"
-        left.text(0.97, 0.05, order, transform=left.transAxes, ha="right")
+        if np.isfinite(validity.slope):
+            order = f"error ~ displacement^{validity.slope:.2f}"
+            left.text(0.97, 0.05, order, transform=left.transAxes, ha="right")
 
         settled = np.array([outcome == "settled" for outcome in validity.outcomes])
         edges = np.linspace(0.0, 1.0, 11)

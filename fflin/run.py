@@ -93,7 +93,7 @@ class Run:
                 dt = float(0.5 ** np.ceil(np.log2(self.fastest)))
             if sample or delayed:
                 dt = _part_of(sample or delayed, dt, duration, delayed)
-        self.dt = _positive("dt", dt)
+        self.dt = _positive("the step dt", dt)
         self.steps = max(1, round(duration / self.dt))
         if abs(self.steps * self.dt - duration) > 1e-6 * duration:
             if sample or delayed:
@@ -110,7 +110,7 @@ class Run:
         if rows * (self.robot.nq + self.robot.nv + 2 * self.state.nx) > 50 * _ROWS_LIMIT:
             raise InputError(
                 f"{duration:g} s in steps of {self.dt:g} s are {rows:.3g} rows; take a larger "
-                "`every`"
+                "dt or `every`"
             )
         if sample is None and delayed:
             sample = self.dt

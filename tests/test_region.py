@@ -144,6 +144,38 @@ def test_joints_only_hold_the_reduced_model(robots):
     assert found.settled == 5
 
 
+def test_what_cannot_be_told_is_not(robots, arm):
+    robot = robots["cubesat"]
+    lin, gain = held(robot)
+    # A body that is only moved away comes back as the linear model says, to the last digit.
+    found = fflin.validity(robot, lin, gain, attitude=0.0, samples=2)
+    assert np.isnan(found.slope) and found.trusted == found.largest
+    assert found.largest == {"attitude": 0.0, "position": 0.5, "joint": 0.0}
+    said = " ".join(str(found).split())
+    assert "up to 0.5 m and beyond; no order of the error can be told" in said
+    # One that is hurled away is nowhere foreseen.
+    lin, gain = held(arm)
+    found = fflin.validity(arm, lin, gain, attitude=170.0, position=1e6, samples=2)
+    assert np.isnan(found.slope) and found.inside == 0
+    assert set(found.trusted.values()) == {0.0}
+    said = " ".join(str(found).split())
+    assert "smallest displacement tried, 42.5 deg, 2.5e+05 m and 0.25 rad|m, it did not" in said
+    assert "nan" not in said
+    pytest.importorskip("matplotlib")
+    fflin.plot_validity(found).draw_without_rendering()
+
+
+def test_what_a_reduced_model_has_not_is_not_told(robots):
+    robot = robots["ets_vii"]
+    robot = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
+    lin, gain = held(robot, reduce=True)
+    found = fflin.validity(robot, lin, gain, joint=0.5, samples=2)
+    assert found.largest == {"attitude": 0.0, "position": 0.0, "joint": 0.5}
+    assert "deg" not in str(found)
+    with pytest.raises(fflin.InputError, match="none of the coordinates that are displaced"):
+        fflin.validity(robot, lin, gain, joint=0.0, samples=2)
+
+
 def test_bad_input(arm):
     lin, gain = held(arm)
     for arguments, words in (

@@ -20,8 +20,9 @@ from fflin.commands.arguments import (
 )
 from fflin.commands.points import configuration_of, inputs_at, load_robot, once, velocity_of
 from fflin.commands.regulator import add_weights, gain_of
-from fflin.commands.visual import add_pictures, check_pictures, show_motion
+from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
 from fflin.errors import InputError
+from fflin.files import check_place
 
 if TYPE_CHECKING:
     from fflin.linear_model import LinearModel
@@ -101,22 +102,26 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
     if arguments.output_file:
         check_motion_format(arguments.output_file)
+        check_place(arguments.output_file)
     if arguments.plot:
-        from fflin.figures import check_figure_format, require_matplotlib
-
-        check_figure_format(arguments.plot)
-        require_matplotlib()
+        check_figure(arguments.plot)
     check_pictures(arguments)
     robot, motion = simulated(arguments)
     from fflin.motion_reports import motion_report
 
-    print(motion_report(motion, controlled=not arguments.free))
-    if arguments.output_file:
-        motion.save(arguments.output_file)
-        print(f"wrote {arguments.output_file}")
-    if arguments.plot:
-        motion.plot(arguments.plot)
-        print(f"wrote {arguments.plot}")
+    written = []
+    try:
+        # Files first, for nobody may be there any more to read what is printed.
+        if arguments.output_file:
+            motion.save(arguments.output_file)
+            written.append(arguments.output_file)
+        if arguments.plot:
+            motion.plot(arguments.plot)
+            written.append(arguments.plot)
+    finally:
+        print(motion_report(motion, controlled=not arguments.free))
+        for path in written:
+            print(f"wrote {path}")
     show_motion(robot, motion, arguments)
     return FELL_SHORT if motion.stopped else DONE
 
@@ -136,6 +141,8 @@ def simulated(arguments: argparse.Namespace) -> tuple[Robot, Motion]:
         "delay": arguments.delay,
     }
     if arguments.free:
+        if arguments.limit or arguments.delay:
+            raise InputError("--free has no input to limit or delay; leave one out")
         weighed = arguments.q or arguments.r or arguments.bryson or arguments.dt
         if weighed or arguments.target_joint or arguments.reduce:
             raise InputError("--free has no regulator to give weights or a target; leave one out")
