@@ -199,6 +199,10 @@ def validity(
     streams = np.random.SeedSequence(seed).spawn(samples + _DIRECTIONS)
     levels = (np.arange(samples) + 0.5) / samples
     each: Any = map
+    if executor is not None and not isinstance(executor, Executor):
+        raise InputError(
+            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
+        )
     if executor:
         each = partial(executor.map, chunksize=1 + samples // 16)
     errors = np.array(list(each(partial(_foreseen, loop, largest), streams[:_DIRECTIONS])))

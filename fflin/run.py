@@ -79,8 +79,11 @@ class Run:
         self, duration: float, dt: float | None, every: int, sample: float | None, delay: float
     ) -> None:
         """Set the times."""
-        if sample is None and self.lin is not None and self.lin.dt:
-            sample = self.lin.dt
+        if sample is None:
+            decides = self.policy
+            while hasattr(decides, "policy"):  # such as what an Allocation carries out
+                decides = decides.policy
+            sample = getattr(getattr(decides, "lin", None), "dt", None) or None
         if sample is not None:
             sample = _positive("sample", sample)
         duration, delayed = _positive("duration", duration), number("delay", delay)

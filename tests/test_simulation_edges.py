@@ -3,13 +3,16 @@
 Nothing that is not finite is ever recorded, and nobody else's memory is shared.
 """
 
+import json
 import math
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from test_simulation import displaced, free_body, regulated
 
 import fflin
+from fflin.weights import default_weights
 
 
 def finite(motion):
@@ -185,3 +188,137 @@ def test_a_model_that_cannot_predict_is_refused():
 def test_whole_numbers_of_numpy_are_whole_numbers():
     robot = free_body((20.0, 30.0, 40.0))
     assert len(fflin.simulate(robot, duration=1.0, every=np.int64(10)).t) == 11
+
+
+def test_energy_of_gravity_and_springs_is_part_of_the_whole():
+    robot = fflin.load(
+        "servicer_7dof", gravity=(0.3, 0.1, -0.5), stiffness={"panel_left": 50.0, "joint_2": 20.0}
+    )
+    q0 = fflin.configuration(robot, {"panel_left": 0.4, "joint_2": -0.3})
+    motion = fflin.simulate(robot, q0=q0, duration=1.0, dt=0.0025, every=20)
+    kinetic = motion.energy[-1] - motion.energy[0]
+    assert abs(kinetic) < 1e-6 * np.abs(motion.v[-1, :3] @ motion.v[-1, :3] * robot.mass)
+    # A spring at rest but bent holds k a^2 / 2.
+    assert motion.energy[0] - fflin.simulate(
+        robot.replace(stiffness={}), q0=q0, duration=0.01
+    ).energy[0] == pytest.approx(25.0 * 0.16 + 10.0 * 0.09)
+
+
+def test_the_linear_loop_is_that_of_scipy_late_limited_and_off_a_fixed_point():
+    from scipy.signal import cont2discrete
+
+    robot = fflin.load("ets_vii", gravity=(0.0, 0.0, -0.2))
+    u0 = 0.1 * np.ones(12)
+    lin = fflin.linearize(robot, u=u0)
+    assert not lin.is_equilibrium()
+    calm = fflin.linearize(fflin.load("ets_vii"))
+    K = fflin.lqr(calm, *default_weights(calm)).K
+    policy, x0 = fflin.StateFeedback(lin, K), displaced(lin)
+    options = {"x0": x0, "duration": 2.0, "dt": 0.05, "limits": {"tau_b": 300.0, "tau_m": 4.0}}
+    late = fflin.simulate(robot, policy, sample=0.1, delay=0.15, **options)
+    high = np.r_[np.full(3, 300.0), np.full(3, np.inf), np.full(6, 4.0)]
+    # f0 is one more input, of the value 1.
+    B = np.column_stack((lin.B, lin.f0))
+    Ad, Bd, *_ = cont2discrete((lin.A, B, np.eye(24), np.zeros((24, 13))), 0.05)
+    e, acting, sent, rows = x0 - lin.x0, u0, {}, [x0]
+    for step in range(40):
+        if step % 2 == 0:
+            sent[step + 3] = np.clip(u0 - K @ e, -high, high)
+        acting = sent.get(step, acting)
+        e = Ad @ e + Bd @ np.append(acting - u0, 1.0)
+        rows.append(e + lin.x0)
+    np.testing.assert_allclose(late.linear, rows, atol=1e-11)
+    # Asked all the time and without limits, the loop is a matrix exponential.
+    from scipy.linalg import expm
+
+    free = fflin.simulate(robot, policy, x0=x0, duration=2.0, dt=0.01)
+    flow = np.zeros((25, 25))
+    flow[:24] = np.column_stack((lin.A - lin.B @ K, lin.f0))
+    ends = [expm(flow * t) @ np.append(x0 - lin.x0, 1.0) for t in free.t]
+    np.testing.assert_allclose(free.linear, np.array(ends)[:, :24] + lin.x0, atol=1e-6)
+
+
+def test_feedback_along_a_trajectory_does_not_see_the_quaternions_sign():
+    robot = fflin.load("ets_vii")
+    t = np.linspace(0.0, 1.0, 5)
+    q = np.tile(robot.neutral(), (5, 1))
+    traj = fflin.linearize_trajectory(robot, t, q, np.zeros((5, 12)), np.zeros((5, 12)))
+    lin = fflin.linearize(robot)
+    Q, R = default_weights(lin)
+    policy = fflin.TrajectoryFeedback(traj, fflin.tvlqr(traj, Q, R, Q)).bind(robot)
+    here, speed = fflin.StateMap(robot).to_pinocchio(displaced(lin))
+    other = here.copy()
+    other[3:7] *= -1.0
+    asked = policy(0.5, here, speed)
+    assert np.abs(asked).max() > 1.0
+    np.testing.assert_array_equal(policy(0.5, other, speed), asked)
+    with pytest.raises(fflin.InputError, match="takes a LinearTrajectory and a GainSchedule"):
+        fflin.TrajectoryFeedback(3, 4)
+
+
+def test_an_allocation_is_sampled_as_its_policy_is_and_refuses_what_is_no_command():
+    design = fflin.load("cubesat", inputs=[fflin.BaseTorque(), fflin.BaseForce()])
+    robot = design.replace(
+        inputs=[x for x in fflin.load_inputs("cubesat") if isinstance(x, fflin.Thruster)]
+    )
+    lin = fflin.linearize(design)
+    gain = fflin.acceleration_lqr(lin, 0.04, 0.2, 1.0)
+    inner = fflin.StateFeedback(lin.discretize(0.1), gain.K)
+    x0 = np.r_[np.full(6, 0.1), np.zeros(6)]
+    motion = fflin.simulate(robot, fflin.Allocation(inner, design), x0=x0, duration=1.0, dt=0.05)
+    changes = np.flatnonzero(np.diff(motion.u, axis=0).any(axis=1)) + 1
+    np.testing.assert_array_equal(changes, np.arange(2, 20, 2))
+    for asked, said in (
+        (lambda t, q, v: np.zeros(3), "gave shape (3,) at t = 0 s, expected (6,)"),
+        (lambda t, q, v: "push", "expected real numbers"),
+        (lambda t, q, v: np.full(6, math.nan), "gave nan for tau_b.x"),
+    ):
+        with pytest.raises(fflin.InputError) as caught:
+            fflin.simulate(robot, fflin.Allocation(asked, design), duration=1.0)
+        assert said in str(caught.value)
+    with pytest.raises(fflin.InputError, match=r"design is a int, expected a fflin\.Robot"):
+        fflin.simulate(robot, fflin.Allocation(inner, 3), duration=1.0)
+
+
+def test_an_allocation_to_the_same_inputs_gives_what_was_asked():
+    # The force is held in reference axes, while the base is turned.
+    robot = fflin.load("ets_vii")
+    lin = fflin.linearize(robot)
+    asked = np.arange(1.0, 13.0)
+    policy = fflin.Allocation(lambda t, q, v: asked, robot).bind(robot)
+    q, v = fflin.StateMap(robot).to_pinocchio(displaced(lin, 100.0))
+    np.testing.assert_allclose(policy(0.0, q, v), asked, rtol=1e-6)
+
+
+def test_the_attitude_error_is_the_angle_to_the_target_that_is_turned_too():
+    robot = fflin.load("cubesat")
+    aim = pin.SE3(pin.exp3(np.array([0.9, -0.4, 0.7])), np.zeros(3))
+    at = pin.SE3(pin.exp3(np.array([-0.5, 1.1, 0.3])), np.zeros(3))
+    lin = fflin.linearize(robot, fflin.configuration(robot, base=aim), reference=pin.SE3.Identity())
+    K = fflin.acceleration_lqr(fflin.linearize(robot), 1.0, 1.0, 1.0).K
+    motion = fflin.simulate(
+        robot, fflin.StateFeedback(lin, K), q0=fflin.configuration(robot, base=at), duration=0.01
+    )
+    angle = np.degrees(np.linalg.norm(pin.log3(aim.rotation.T @ at.rotation)))
+    assert motion.attitude_error[0] == pytest.approx(angle, abs=1e-9)
+
+
+def test_a_motion_of_unequal_rows_is_none(tmp_path):
+    motion = fflin.simulate(free_body((20.0, 30.0, 40.0)), duration=0.1)
+    motion.save(tmp_path / "m.json")
+    record = json.loads((tmp_path / "m.json").read_text())
+    record["x"] = record["x"][:-1]
+    (tmp_path / "m.json").write_text(json.dumps(record))
+    with pytest.raises(fflin.FileError, match="not a Motion saved by fflin"):
+        fflin.Motion.load(tmp_path / "m.json")
+
+
+def test_a_motion_that_is_not_finite_is_not_saved(tmp_path):
+    from dataclasses import replace
+
+    motion = fflin.simulate(free_body((20.0, 30.0, 40.0)), duration=0.1)
+    bad = replace(motion, x=math.nan * motion.x)
+    for name in ("m.npz", "m.json", "m.mat", "m.csv"):
+        with pytest.raises(fflin.InputError, match="not finite; it is not saved"):
+            bad.save(tmp_path / name)
+    assert not list(tmp_path.iterdir())
