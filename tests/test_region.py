@@ -97,6 +97,21 @@ def test_displacements_are_as_large_as_they_say(robots):
     assert np.abs((x - lin.x0)[6:12]).max() == pytest.approx(0.7) and not v.any()
 
 
+def test_displacements_of_a_point_that_is_turned_from_the_reference(robots):
+    import pinocchio as pin
+
+    robot = robots["cubesat"]
+    turned = pin.SE3(pin.exp3(np.array([0.0, 2.6, 0.0])), np.zeros(3))
+    q0 = fflin.configuration(robot, base=turned)
+    lin = fflin.linearize(robot, q0, reference=pin.SE3.Identity())
+    loop = Loop(robot, lin, np.zeros((6, 12)))
+    for seed in range(8):  # on either side of a turn of 180 degrees from the reference
+        x = loop.displaced(np.random.default_rng(seed), 100.0, 0.0, 0.0)
+        q, _ = loop.state.to_pinocchio(x)
+        moved = turned.rotation.T @ pin.XYZQUATToSE3(q[:7]).rotation
+        assert np.rad2deg(np.linalg.norm(pin.log3(moved))) == pytest.approx(100.0)
+
+
 def test_same_seed_same_result_whoever_runs_it(robots):
     robot = robots["cubesat"]
     lin, gain = held(robot)
