@@ -22,7 +22,6 @@ from fflin.commands.points import configuration_of, inputs_at, load_robot, once,
 from fflin.commands.regulator import add_weights, gain_of
 from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
 from fflin.errors import InputError
-from fflin.files import check_place
 
 if TYPE_CHECKING:
     from fflin.linear_model import LinearModel
@@ -98,6 +97,7 @@ def add_commands(commands: Commands) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
+    from fflin.files import check_place
     from fflin.motion import check_motion_format
 
     if arguments.output_file:
