@@ -74,11 +74,25 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
     command.add_argument("--follow", action="store_true", help="let the camera follow the base")
 
 
+def check_figure(path: Path) -> None:
+    """Refuse a figure that cannot be drawn or written, before anything is done for it."""
+    from fflin.figures import check_figure_format, require_matplotlib
+    from fflin.files import check_place
+
+    check_figure_format(path)
+    check_place(path)
+    require_matplotlib()
+
+
 def check_pictures(arguments: argparse.Namespace) -> None:
     """Refuse files that cannot be written, before a motion is made for them."""
+    from fflin.files import check_place
     from fflin.viewer import check_outputs
 
-    check_outputs({f".{name}": getattr(arguments, name) for name in _FILES})
+    paths = {f".{name}": getattr(arguments, name) for name in _FILES}
+    check_outputs(paths)
+    for path in filter(None, paths.values()):
+        check_place(path)
 
 
 def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> None:
