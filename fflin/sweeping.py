@@ -21,11 +21,12 @@ from fflin.batch_files import check_format, header, load_batch
 from fflin.batch_inertia import available_threads
 from fflin.batch_store import FileStore, MemoryStore
 from fflin.configurations import Configurations, GivenConfigurations
-from fflin.dispatching import Done, OwnWorkers, Span, dispatch
+from fflin.dispatching import Done, Span, dispatch
 from fflin.errors import FflinError, FflinWarning, FileError, InputError, SweepError, listed
 from fflin.files import as_path
 from fflin.linear_batch import LinearBatch
 from fflin.model import Robot
+from fflin.own_workers import OwnWorkers
 from fflin.sweep_task import SweepTask, as_configurations
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 
 # A chunk's result is about this large, so that what it costs to send is small against it and a
 # handful of them fit in memory.
-_CHUNK_BYTES, _LEAST_CHUNK_BYTES = 8 * 2**20, 2**21
+_CHUNK_BYTES, _LEAST_CHUNK_BYTES = 4 * 2**20, 2**21
 _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
 
 # So many chunks where workers share them, so that all end at about the same time.
@@ -156,7 +157,7 @@ def sweep(
     finally:
         store.close()
         if own is not None:
-            own.close()
+            own.shutdown()
 
 
 def planned_bytes(
@@ -228,7 +229,7 @@ def _here(
         for span in spans:
             begun.append(pool.submit(run, span))
             # Not far ahead of what takes the results, which would fill the memory.
-            if len(begun) > 2 * threads:
+            if len(begun) > threads:
                 yield begun.popleft().result()
         while begun:
             yield begun.popleft().result()

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 
@@ -11,6 +13,7 @@ from test_sweeping import assert_same, points, singular_at
 
 import fflin
 from fflin import batch_chunks, dispatching
+from fflin.own_workers import OwnWorkers, WorkerDied
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +143,68 @@ def test_a_chunk_that_kills_every_worker_is_named_and_the_rest_is_there(robot, k
     assert np.array_equal(caught.value.batch.q, q[rest])
     expected = fflin.sweep(robot, q[rest]).B_lower
     assert np.abs(caught.value.batch.B_lower - expected).max() < 1e-13
+
+
+def half_sent():
+    """Return a large result of which only half is sent before the worker is killed."""
+    from multiprocessing.connection import Connection
+
+    whole = Connection._send
+
+    def send(self, buffer, *arguments):
+        if len(buffer) < 10**6:
+            return whole(self, buffer, *arguments)
+        whole(self, buffer[: len(buffer) // 2], *arguments)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    Connection._send = send
+    return np.zeros(10**6)
+
+
+def test_a_worker_that_is_killed_in_the_middle_of_its_result_harms_no_other():
+    workers = OwnWorkers(2)
+    try:
+        lost = workers.submit(half_sent)
+        kept = [workers.submit(pow, 2, each) for each in range(9)]
+        with pytest.raises(WorkerDied):
+            lost.result(timeout=60)
+        assert [each.result(timeout=60) for each in kept] == [2**each for each in range(9)]
+    finally:
+        workers.shutdown()
+    with pytest.raises(RuntimeError):
+        workers.submit(pow, 2, 3)
+
+
+@pytest.mark.parametrize("end", ["os.kill(os.getpid(), signal.SIGKILL)", "workers.shutdown()"])
+def test_no_worker_outlives_its_caller(end, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import os, signal, time\nfrom fflin.own_workers import OwnWorkers\n"
+        "if __name__ == '__main__':\n"
+        "    workers = OwnWorkers(2)\n"
+        "    workers.submit(pow, 2, 3).result()\n"
+        "    workers.submit(time.sleep, 2)\n"
+        f"    {end}\n"
+    )
+    # The workers have the same stdout, which ends with the last of them.
+    subprocess.run([sys.executable, script], stdout=subprocess.PIPE, timeout=30, check=False)
+
+
+def test_workers_that_cannot_start_are_one_line(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import fflin\nrobot = fflin.load('ets_vii')\n"
+        "try:\n"
+        "    fflin.sweep(robot, fflin.random_configurations(robot, 40), workers=2)\n"
+        "except fflin.SweepError as error:\n"
+        "    print(error)\n"
+        "    raise SystemExit(3)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", script], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 3
+    assert 'call sweep under `if __name__ == "__main__":`' in done.stdout
 
 
 def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(robot, killing, tmp_path):
