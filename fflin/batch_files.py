@@ -66,6 +66,8 @@ def header(batch: LinearBatch) -> str:
 def save_batch(batch: LinearBatch, path: Path) -> None:
     """Write a batch; see `LinearBatch.save`."""
     check_format(path)
+    if not len(batch):
+        raise InputError("the batch has no points; there is nothing to save")
     arrays = batch._arrays()
     held = {key: value[0] if is_constant(value) else value for key, value in arrays.items()}
     constant = json.dumps([key for key, value in arrays.items() if is_constant(value)])

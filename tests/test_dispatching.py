@@ -234,6 +234,24 @@ def test_an_executor_that_is_shut_down_is_one_line(robot):
         fflin.sweep(robot, q, executor=executor)
 
 
+def test_an_executor_that_takes_no_more_is_one_line(robot):
+    class Full(ThreadPoolExecutor):
+        def submit(self, *arguments):
+            if len(taken) == 2:
+                raise ValueError("no slots")
+            taken.append(arguments)
+            return super().submit(*arguments)
+
+    taken = []
+    q, _, _ = points(robot, 32)
+    with (
+        Full(1) as executor,
+        pytest.raises(fflin.SweepError, match="the executor died: ValueError: no slots") as caught,
+    ):
+        fflin.sweep(robot, q, executor=executor, chunk=8)
+    assert len(caught.value.batch) == 16
+
+
 def test_a_singular_configuration_is_named_by_processes_too(pool):
     robot = singular_at(0.5)
     configurations = fflin.grid(robot, {"slide": np.arange(64) / 64.0})

@@ -91,6 +91,9 @@ def test_gains_between_the_points(robots, tmp_path):
     beyond[1] = 7.0
     joints[1] = 1.0
     assert np.array_equal(gains.gain(beyond), gains.gain(joints))
+    for wrong in (joints[:2], np.full(6, np.nan), {"joint_2": 0.0}):
+        with pytest.raises(fflin.InputError, match="joints"):
+            gains.gain(wrong)
     gains.save(tmp_path / "g.npz")
     assert np.array_equal(fflin.GainBatch.load(tmp_path / "g.npz").gain(joints), gains.gain(joints))
     scattered = fflin.lqr_batch(batch[[0, 4, 5]], 1.0, 1.0)
@@ -115,5 +118,7 @@ def test_a_scheduled_feedback_brings_the_robot_to_the_target(robots):
     )
     with pytest.raises(fflin.InputError, match="frame"):
         fflin.ScheduledFeedback(fflin.linearize(robot, frame="world"), gains)
+    with pytest.raises(fflin.InputError, match="gains is a Gain, expected a GainBatch"):
+        fflin.ScheduledFeedback(target, fflin.lqr(target, 1.0, 1.0))
     with pytest.raises(fflin.InputError):
         policy.bind(fflin.load("cubesat"))

@@ -207,12 +207,33 @@ def damaged(robot, row, column, value):
         (lambda r: {"q": fflin.grid(r, {"joint_1": [1.0, 0.0]})}, "increase"),
         (lambda r: {"q": fflin.random_configurations(r, 0)}, "count is 0"),
         (lambda r: {"q": fflin.grid(fflin.load("ur5"), {"elbow_joint": [1.0]})}, "q is of 'ur5'"),
+        (
+            lambda r: {"q": fflin.grid(r, {f"joint_{i}": range(10**4) for i in range(1, 7)})},
+            "1,000,000,000,000,000,000,000,000 points are too many",
+        ),
+        (lambda r: {"q": fflin.random_configurations(r, 10**20)}, "points are too many"),
+        (lambda r: {"q": fflin.random_configurations("ur5", 3)}, "robot is a str"),
+        (lambda r: {"q": fflin.random_configurations(r, 3, ranges=[0, 1])}, "ranges is"),
+        (lambda r: {"q": fflin.random_configurations(r, 3), "progress": 3}, "progress is 3"),
+        (lambda r: {"q": fflin.random_configurations(r, 3), "workers": True}, "workers is True"),
     ],
 )
 def test_bad_input_is_one_line_that_names_the_row(make, message, robots, tmp_path):
     robot = robots["servicer_7dof"]
     with pytest.raises(fflin.InputError, match=message):
         fflin.sweep(robot, **make(robot), out=tmp_path / "x.npz")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_has_no_room_is_refused_before_it_is_begun(robots, tmp_path):
+    robot = robots["servicer_7dof"]
+    many = fflin.random_configurations(robot, 10**15)
+    with pytest.raises(fflin.InputError, match=r"points are 1,928.0 PB, and the machine has"):
+        fflin.sweep(robot, many)
+    pytest.importorskip("h5py")
+    for name in ("x.h5", "x.npz"):
+        with pytest.raises(fflin.FileError, match=r"points are 1,928.0 PB.* only .* are free in"):
+            fflin.sweep(robot, many, out=tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 
