@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from threading import Lock, local
@@ -82,7 +83,8 @@ class OwnWorkers(Executor):
             if self._closed:
                 raise NoWorkers("the workers are shut down")
             try:
-                process.start()
+                with _deaf():
+                    process.start()
             except OSError as error:
                 raise NoWorkers(f"no worker can be started: {error}") from None
             self._processes[process] = ours
@@ -106,14 +108,31 @@ class OwnWorkers(Executor):
         process.close()
 
 
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Let what is started now not hear Ctrl-C, which is the caller's, who then ends it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    # Where it starts with a process, it takes the mask away.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _serve(pipe: Connection) -> None:
     """Do tasks until the pipe ends, with the caller or at its word."""
-    # Ctrl-C is the caller's, who then ends this process.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         pipe.send(None)
         while True:
             function, args, kwargs = pipe.recv()
+            answer: tuple[Exception | None, Any]
             try:
                 answer = None, function(*args, **kwargs)
             except Exception as error:

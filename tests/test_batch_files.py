@@ -160,7 +160,7 @@ def test_a_file_that_another_run_writes_is_left_alone(robot, tmp_path):
 def test_where_nothing_is_finished_nothing_is_left(robot, tmp_path):
     executor = ThreadPoolExecutor(1)
     executor.shutdown()
-    with pytest.raises(fflin.SweepError, match="after shutdown$"):
+    with pytest.raises(fflin.SweepError, match=r"after shutdown$"):
         fflin.sweep(robot, points(robot, 8)[0], executor=executor, out=tmp_path / "b.h5")
     assert not list(tmp_path.iterdir())
 

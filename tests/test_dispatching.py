@@ -200,9 +200,8 @@ def test_workers_that_cannot_start_are_one_line(tmp_path):
         "    print(error)\n"
         "    raise SystemExit(3)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", script], capture_output=True, text=True, timeout=60
-    )
+    command = [sys.executable, "-W", "ignore", script]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 3
     assert 'call sweep under `if __name__ == "__main__":`' in done.stdout
 
