@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 
 FORMATS = (".npz", ".h5")
 
+# The version of HDF5 from which the file's own records have checksums: without them, a damaged
+# file can take the process with it.
+CHECKED = ("v108", "v108")
+
 # Fields of a batch that are text or lists of it; they stand in the file as one JSON document.
 _TEXTS = (
     *("state_names", "input_names", "output_names"),
@@ -82,7 +86,7 @@ def save_batch(batch: LinearBatch, path: Path) -> None:
             plain: dict[str, Any] = {**held, **texts}
             np.savez(temporary, **plain)
         else:
-            with hdf5().File(temporary, "w") as file:
+            with hdf5().File(temporary, "w", libver=CHECKED) as file:
                 for key, value in held.items():
                     file.create_dataset(key, data=value)
                 file.attrs.update(texts)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fflin.batch_files import hdf5
+from fflin.batch_files import CHECKED, hdf5
 from fflin.batch_room import part_of
 from fflin.errors import FileError
 from fflin.validation import Array
@@ -97,7 +98,7 @@ class FileStore:
         try:
             if self.path.is_dir():
                 raise FileError(f"{path}: is a folder; give the name of a file")
-            self._file = h5py.File(self.part, "r+" if self.resumed else "x")
+            self._file = h5py.File(self.part, "r+" if self.resumed else "x", libver=CHECKED)
         except FileError:
             raise
         except OSError as error:
@@ -106,13 +107,11 @@ class FileStore:
             hint = "; remove it to begin anew" * self.resumed
             raise FileError(f"{self.part}: cannot be opened: {_short(error)}{hint}") from None
         if self.resumed:
-            if self._file.attrs.get("request") != request:
-                self._file.close()
-                raise FileError(
-                    f"{self.part} is what another sweep left behind; remove it, or choose another "
-                    "name"
-                )
-            self.chunk = int(self._file.attrs["chunk"])
+            try:
+                self._go_on(request)
+            except BaseException:
+                self.close()
+                raise
             return
         try:
             for key, shape in shapes.items():
@@ -126,12 +125,30 @@ class FileStore:
             self.discard()
             raise FileError(f"{self.part}: cannot be written: {_short(error)}") from None
 
+    def _go_on(self, request: str) -> None:
+        with self._readable():
+            found = self._file.attrs.get("request")
+            self.chunk = int(self._file.attrs.get("chunk", self.chunk))
+        if found != request:
+            raise FileError(
+                f"{self.part} is what another sweep left behind; remove it, or choose another name"
+            )
+
+    @contextmanager
+    def _readable(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+            said = " ".join(str(error).split()).strip("'\"")
+            raise FileError(f"{self.part} is damaged ({said}); remove it to begin anew") from None
+
     def finished(self, start: int, stop: int) -> bool:
         """Whether a chunk is there, and is what was written."""
-        kept = self._file["finished"][start // self.chunk]
-        return bool(kept.any()) and kept.tobytes() == self._hash(
-            {key: self._file[key][start:stop] for key in self.names}
-        )
+        with self._readable():
+            kept = self._file["finished"][start // self.chunk]
+            return bool(kept.any()) and kept.tobytes() == self._hash(
+                {key: self._file[key][start:stop] for key in self.names}
+            )
 
     def place(self, start: int, stop: int) -> None:
         """Return where the rows of a chunk are, to be written: nowhere in memory."""

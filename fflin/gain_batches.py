@@ -244,6 +244,9 @@ def _gains(rates: Array, L: Array, Q: Array, R: Array) -> tuple[Array, Array, Ar
     residual = np.linalg.norm(left, axis=(1, 2)) / scale
     residual[odd > _ODD * np.abs(cost).max(axis=(1, 2))] = np.nan
     K = np.linalg.solve(R, np.swapaxes(L, 1, 2) @ P[:, m:])
+    # The squares of the poles that K was made from lose the digits of slow ones beside fast ones.
+    moved = np.concatenate((rates[:, None] * motions[:, m:], -L @ (K @ motions)), axis=1)
+    poles = np.einsum("nij,nji->ni", inverse, moved)
     return K, residual, -poles.real.max(axis=1)
 
 

@@ -157,6 +157,27 @@ def test_a_file_that_another_run_writes_is_left_alone(robot, tmp_path):
     fflin.sweep(robot, q, chunk=16, out=path)
 
 
+def test_a_damaged_unfinished_file_is_one_line_or_its_chunk_is_done_again(robot, tmp_path):
+    q, _, _ = points(robot, 80)
+    path, part = tmp_path / "b.h5", tmp_path / "b.h5.part"
+    interrupted(robot, q, path, 64)
+    whole, rng = part.read_bytes(), np.random.default_rng(0)
+    expected = fflin.sweep(robot, q, threads=1).B_lower
+    refused = 0
+    for trial in range(60):
+        content = bytearray(whole)
+        # Half of them in the file's own records, which are few and in front.
+        content[rng.integers(0, 2500 if trial % 2 else len(whole))] ^= 0xFF
+        part.write_bytes(content if trial % 10 else content[: rng.integers(len(whole))])
+        try:
+            assert np.array_equal(fflin.sweep(robot, q, out=path, threads=1).B_lower, expected)
+        except fflin.FileError as error:
+            refused += 1
+            assert "remove it" in str(error) and "\n" not in str(error)
+            part.unlink()
+    assert 5 < refused < 55
+
+
 def test_where_nothing_is_finished_nothing_is_left(robot, tmp_path):
     executor = ThreadPoolExecutor(1)
     executor.shutdown()

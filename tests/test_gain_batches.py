@@ -27,7 +27,8 @@ def test_every_gain_is_that_of_lqr(name, robots):
             assert gains.K[index] == pytest.approx(
                 gain.K, rel=1e-6, abs=1e-7 * np.abs(gain.K).max()
             )
-            assert gains.margin[index] == pytest.approx(gain.margin, rel=1e-5)
+            slowest = -np.linalg.eigvals(lin.A - lin.B @ gains.K[index]).real.max()
+            assert gains.margin[index] == pytest.approx(slowest, rel=1e-9)
 
 
 def test_closed_form_of_a_single_body(robots):
