@@ -7,6 +7,7 @@ import os
 import tempfile
 import zlib
 from pathlib import Path
+from tokenize import TokenError
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -117,7 +118,7 @@ def load_batch(path: Path, robot: Robot | None = None, *, suffix: str | None = N
 
 _UNREADABLE = (
     *(OSError, KeyError, ValueError, TypeError, IndexError, AttributeError, EOFError),
-    *(OverflowError, zlib.error),
+    *(OverflowError, RuntimeError, SyntaxError, zlib.error, TokenError),
 )
 
 

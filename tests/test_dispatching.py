@@ -175,15 +175,21 @@ def test_a_worker_that_is_killed_in_the_middle_of_its_result_harms_no_other():
         workers.submit(pow, 2, 3)
 
 
-@pytest.mark.parametrize("end", ["os.kill(os.getpid(), signal.SIGKILL)", "workers.shutdown()"])
-def test_no_worker_outlives_its_caller(end, tmp_path):
+@pytest.mark.parametrize(
+    "task, end",
+    [
+        ("time.sleep, 2", "os.kill(os.getpid(), signal.SIGKILL)"),
+        ("time.sleep, 99", "workers.shutdown()"),
+    ],
+)
+def test_no_worker_outlives_its_caller(task, end, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "import os, signal, time\nfrom fflin.own_workers import OwnWorkers\n"
         "if __name__ == '__main__':\n"
         "    workers = OwnWorkers(2)\n"
         "    workers.submit(pow, 2, 3).result()\n"
-        "    workers.submit(time.sleep, 2)\n"
+        f"    workers.submit({task})\n"
         f"    {end}\n"
     )
     # The workers have the same stdout, which ends with the last of them.

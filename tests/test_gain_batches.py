@@ -92,6 +92,8 @@ def test_gains_between_the_points(robots, tmp_path):
     beyond[1] = 7.0
     joints[1] = 1.0
     assert np.array_equal(gains.gain(beyond), gains.gain(joints))
+    shuffled = fflin.lqr_batch(batch[np.random.default_rng(1).permutation(len(batch))], 1.0, 1.0)
+    assert shuffled.gain(joints) == pytest.approx(gains.gain(joints), rel=1e-9, abs=1e-12)
     for wrong in (joints[:2], np.full(6, np.nan), {"joint_2": 0.0}):
         with pytest.raises(fflin.InputError, match="joints"):
             gains.gain(wrong)

@@ -8,6 +8,7 @@ import sys
 import time
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from test_cli import refused, run
 
@@ -94,6 +95,17 @@ def test_what_is_missing_or_damaged_is_one_line(tmp_path, robots):
     assert "q.npz is what --configurations reads" in error
     assert [entry.name for entry in tmp_path.iterdir()] == ["q.npz"]
     assert np.array_equal(np.load(tmp_path / "q.npz")["q"], q)
+
+
+def test_the_reference_may_be_the_world(tmp_path, robots):
+    options = ("--random", "3", "--rpy", "30", "0", "0", "--reference", "world", "-o")
+    code, *_ = run("sweep", "ets_vii", *options, tmp_path / "w.h5")
+    assert code == 0
+    batch = fflin.LinearBatch.load(tmp_path / "w.h5", robots["ets_vii"])
+    lin = fflin.linearize(robots["ets_vii"], batch.q[1], reference=pin.SE3.Identity())
+    assert batch[1].x0[0] == pytest.approx(np.sin(np.pi / 12), rel=1e-12)
+    assert batch[1].x0 == pytest.approx(lin.x0, abs=1e-14)
+    assert batch[1].A == pytest.approx(lin.A, abs=1e-14)
 
 
 @pytest.mark.parametrize("workers", [(), ("--workers", "2")])

@@ -181,6 +181,29 @@ def test_mimic_joints_follow_on_a_grid():
     assert batch.joint_positions[:, -1] == pytest.approx([0.0, 0.01, 0.04])
 
 
+def test_mimic_joints_follow_with_their_offset(tmp_path):
+    body = (
+        '<inertial><mass value="2"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+        "</inertial>"
+    )
+    links = "".join(f'<link name="l{i}">{body}</link>' for i in range(3))
+    joint = (
+        '<joint name="j{0}" type="{1}"><parent link="l{2}"/><child link="l{0}"/>'
+        '<origin xyz="0 0 1"/><axis xyz="1 0 0"/>{3}<limit effort="9" velocity="9" lower="-3" '
+        'upper="3"/></joint>'
+    )
+    mimic = '<mimic joint="j1" multiplier="-2" offset="0.3"/>'
+    joints = joint.format(1, "revolute", 0, "") + joint.format(2, "revolute", 1, mimic)
+    path = tmp_path / "mimic.urdf"
+    path.write_text(f'<robot name="mimic">{links}{joints}</robot>')
+    robot = fflin.load(path)
+    values = [-0.5, 0.1, 0.7]
+    rows = fflin.grid(robot, {"j1": values}).rows(0, 3)
+    assert rows[:, 8] == pytest.approx([1.3, 0.1, -1.1])
+    for row, value in zip(rows, values, strict=True):
+        assert row == pytest.approx(fflin.configuration(robot, {"j1": value}))
+
+
 def damaged(robot, row, column, value):
     q = np.tile(robot.neutral(), (40, 1))
     q[row, column] = value
