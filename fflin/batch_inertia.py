@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Lock
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -112,15 +114,27 @@ def pays(count: int) -> bool:
     return count >= _BREAK_EVEN_UNLOADED and find_spec("numba") is not None
 
 
+# Threads that begin at the same time tell it once.
+_TURN = Lock()
+
+
 def _kernel() -> Any:
     """Return the kernel, compiled at the first call ever and kept on disk."""
     from fflin import batch_kernel
 
+    with _TURN:
+        _tell()
+    return batch_kernel.invert
+
+
+@cache
+def _tell() -> None:
+    """Say that the kernel is going to be compiled where it is."""
+    from fflin import batch_kernel
+
     kernel = batch_kernel.invert
-    if not kernel.signatures:
-        folder = Path(kernel.stats.cache_path)
-        source = Path(batch_kernel.__file__).stat().st_mtime
-        kept = [entry.stat().st_mtime for entry in folder.glob("batch_kernel.invert-*.nbi")]
-        if not any(time > source for time in kept):
-            _log.warning("fflin: compiling the batch kernel, once; it is kept in %s", folder)
-    return kernel
+    folder = Path(kernel.stats.cache_path)
+    source = Path(batch_kernel.__file__).stat().st_mtime
+    kept = [entry.stat().st_mtime for entry in folder.glob("batch_kernel.invert-*.nbi")]
+    if not any(time > source for time in kept):
+        _log.warning("fflin: compiling the batch kernel, once; it is kept in %s", folder)
