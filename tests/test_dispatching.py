@@ -178,7 +178,7 @@ def test_a_worker_that_is_killed_in_the_middle_of_its_result_harms_no_other():
 @pytest.mark.parametrize(
     "task, end",
     [
-        ("time.sleep, 2", "os.kill(os.getpid(), signal.SIGKILL)"),
+        ("time.sleep, 3", "os.kill(os.getpid(), signal.SIGKILL)"),
         ("time.sleep, 99", "workers.shutdown()"),
     ],
 )
@@ -189,7 +189,7 @@ def test_no_worker_outlives_its_caller(task, end, tmp_path):
         "if __name__ == '__main__':\n"
         "    workers = OwnWorkers(2)\n"
         "    workers.submit(pow, 2, 3).result()\n"
-        f"    workers.submit({task})\n"
+        f"    workers.submit({task})\n    time.sleep(1)\n"
         f"    {end}\n"
     )
     # The workers have the same stdout, which ends with the last of them.
