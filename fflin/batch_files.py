@@ -7,6 +7,7 @@ import os
 import tempfile
 import zlib
 from pathlib import Path
+from tokenize import TokenError
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +20,10 @@ if TYPE_CHECKING:
     from fflin.model import Robot
 
 FORMATS = (".npz", ".h5")
+
+# The version of HDF5 from which the file's own records have checksums: without them, a damaged
+# file can take the process with it.
+CHECKED = ("v108", "v108")
 
 # Fields of a batch that are text or lists of it; they stand in the file as one JSON document.
 _TEXTS = (
@@ -66,6 +71,8 @@ def header(batch: LinearBatch) -> str:
 def save_batch(batch: LinearBatch, path: Path) -> None:
     """Write a batch; see `LinearBatch.save`."""
     check_format(path)
+    if not len(batch):
+        raise InputError("the batch has no points; there is nothing to save")
     arrays = batch._arrays()
     held = {key: value[0] if is_constant(value) else value for key, value in arrays.items()}
     constant = json.dumps([key for key, value in arrays.items() if is_constant(value)])
@@ -80,7 +87,7 @@ def save_batch(batch: LinearBatch, path: Path) -> None:
             plain: dict[str, Any] = {**held, **texts}
             np.savez(temporary, **plain)
         else:
-            with hdf5().File(temporary, "w") as file:
+            with hdf5().File(temporary, "w", libver=CHECKED) as file:
                 for key, value in held.items():
                     file.create_dataset(key, data=value)
                 file.attrs.update(texts)
@@ -111,7 +118,7 @@ def load_batch(path: Path, robot: Robot | None = None, *, suffix: str | None = N
 
 _UNREADABLE = (
     *(OSError, KeyError, ValueError, TypeError, IndexError, AttributeError, EOFError),
-    *(OverflowError, zlib.error),
+    *(OverflowError, RuntimeError, SyntaxError, zlib.error, TokenError),
 )
 
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fflin.batch_files import hdf5
+from fflin.batch_files import CHECKED, hdf5
+from fflin.batch_room import part_of
 from fflin.errors import FileError
 from fflin.validation import Array
 
@@ -21,14 +23,14 @@ class MemoryStore:
 
     Parameters
     ----------
-    count : int
-        Points.
+    count, chunk : int
+        Points, and points in a chunk.
     shapes : mapping
         Shape of each array for one point.
     """
 
-    def __init__(self, count: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        self.names = tuple(shapes)
+    def __init__(self, count: int, chunk: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        self.names, self.chunk = tuple(shapes), chunk
         self.arrays = {key: np.empty((count, *shape)) for key, shape in shapes.items()}
 
     def finished(self, start: int, stop: int) -> bool:
@@ -72,6 +74,8 @@ class FileStore:
         Of the arrays.
     resumed : bool
         Whether a file of the same request was there.
+    chunk : int
+        Points in a chunk; of a file that was there its own.
 
     Raises
     ------
@@ -87,44 +91,64 @@ class FileStore:
         chunk: int,
         shapes: Mapping[str, tuple[int, ...]],
     ) -> None:
-        self.path, self.part = path, path.with_name(path.name + ".part")
-        self._chunk, self.names = chunk, tuple(shapes)
+        self.path, self.part = path, part_of(path)
+        self.chunk, self.names = chunk, tuple(shapes)
         self.resumed = self.part.exists()
         h5py = hdf5()
         try:
             if self.path.is_dir():
                 raise FileError(f"{path}: is a folder; give the name of a file")
-            self._file = h5py.File(self.part, "r+" if self.resumed else "x")
+            self._file = h5py.File(self.part, "r+" if self.resumed else "x", libver=CHECKED)
         except FileError:
             raise
         except OSError as error:
+            if self.resumed and "unable to lock" in str(error):
+                raise FileError(f"{self.part} is in use by another run; wait for it") from None
             hint = "; remove it to begin anew" * self.resumed
             raise FileError(f"{self.part}: cannot be opened: {_short(error)}{hint}") from None
         if self.resumed:
-            if self._file.attrs.get("request") != request:
-                self._file.close()
-                raise FileError(
-                    f"{self.part} is what another sweep left behind; remove it, or choose another "
-                    "name"
-                )
+            try:
+                self._go_on(request)
+            except BaseException:
+                self.close()
+                raise
             return
         try:
             for key, shape in shapes.items():
                 _fixed(h5py, self._file, key, (count, *shape), np.float64)
             _fixed(h5py, self._file, "finished", (-(-count // chunk), 32), np.uint8)
             self._file["finished"][:] = 0
+            self._file.attrs["chunk"] = chunk
             self._file.attrs["request"] = request
             self._file.flush()
         except OSError as error:
             self.discard()
             raise FileError(f"{self.part}: cannot be written: {_short(error)}") from None
 
+    def _go_on(self, request: str) -> None:
+        with self._readable():
+            found = self._file.attrs.get("request")
+            self.chunk = int(self._file.attrs.get("chunk", self.chunk))
+        if found != request:
+            raise FileError(
+                f"{self.part} is what another sweep left behind; remove it, or choose another name"
+            )
+
+    @contextmanager
+    def _readable(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+            said = " ".join(str(error).split()).strip("'\"")
+            raise FileError(f"{self.part} is damaged ({said}); remove it to begin anew") from None
+
     def finished(self, start: int, stop: int) -> bool:
         """Whether a chunk is there, and is what was written."""
-        kept = self._file["finished"][start // self._chunk]
-        return bool(kept.any()) and kept.tobytes() == self._hash(
-            {key: self._file[key][start:stop] for key in self.names}
-        )
+        with self._readable():
+            kept = self._file["finished"][start // self.chunk]
+            return bool(kept.any()) and kept.tobytes() == self._hash(
+                {key: self._file[key][start:stop] for key in self.names}
+            )
 
     def place(self, start: int, stop: int) -> None:
         """Return where the rows of a chunk are, to be written: nowhere in memory."""
@@ -136,7 +160,7 @@ class FileStore:
                 self._file[key][start:stop] = arrays[key]
             self._file.flush()
             digest = np.frombuffer(self._hash(arrays), dtype=np.uint8)
-            self._file["finished"][start // self._chunk] = digest
+            self._file["finished"][start // self.chunk] = digest
             self._file.flush()
         except OSError as error:
             raise FileError(f"{self.part}: cannot be written: {_short(error)}") from None
@@ -144,7 +168,7 @@ class FileStore:
     def complete(self, constants: Mapping[str, Array], header: str, *, keep_name: bool) -> None:
         """Add what is the same at all points, and, unless it is to be kept, change the name."""
         try:
-            del self._file["finished"], self._file.attrs["request"]
+            del self._file["finished"], self._file.attrs["request"], self._file.attrs["chunk"]
             for key, value in constants.items():
                 self._file.create_dataset(key, data=value)
             self._file.attrs["header"] = header

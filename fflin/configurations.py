@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,6 +20,9 @@ from fflin.validation import Array, number
 
 # Random rows are drawn in blocks of this many, so that they do not depend on how they are read.
 _DRAWN = 4096
+
+# More than these cannot even be counted.
+_MOST = sys.maxsize
 
 # A joint that turns without limits is drawn from one turn.
 _TURN = (-math.pi, math.pi)
@@ -195,6 +199,7 @@ def grid(
             raise InputError(f"grid of joint '{name}' must be finite numbers that increase")
         axis.setflags(write=False)
         checked[name] = axis
+    _countable(math.prod(len(axis) for axis in checked.values()))
     start.setflags(write=False)
     return Grid(robot, checked, start)
 
@@ -238,13 +243,21 @@ def random_configurations(
     for what, value, least in (("count", count, 1), ("seed", seed, 0)):
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
             raise InputError(f"{what} is {value!r}, expected a whole number from {least} on")
+    _countable(int(count))
+    start = configuration(robot, base=base)
+    if not (ranges is None or isinstance(ranges, Mapping)):
+        raise InputError(f"ranges is {ranges!r}, expected {{joint: (low, high)}}")
     given = dict(ranges or {})
     for name in given:
         robot.joint(name)
     checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
-    start = configuration(robot, base=base)
     start.setflags(write=False)
     return RandomConfigurations(robot, int(count), int(seed), checked, start)
+
+
+def _countable(count: int) -> None:
+    if count > _MOST:
+        raise InputError(f"{count:,} points are too many; choose fewer")
 
 
 def _range(robot: Robot, joint: Joint, given: Any) -> tuple[float, float]:

@@ -8,6 +8,7 @@ import zipfile
 import zlib
 from dataclasses import Field, fields
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,7 +23,7 @@ Kind = TypeVar("Kind", bound=Design)
 
 _UNREADABLE = (
     *(KeyError, ValueError, TypeError, IndexError, AttributeError, EOFError, OverflowError),
-    *(NotImplementedError, RecursionError, OSError, zlib.error, zipfile.BadZipFile),
+    *(NotImplementedError, RecursionError, OSError, zlib.error, zipfile.BadZipFile, TokenError),
 )
 
 

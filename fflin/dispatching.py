@@ -9,14 +9,13 @@ from concurrent.futures import (
     CancelledError,
     Executor,
     Future,
-    ProcessPoolExecutor,
     wait,
 )
-from multiprocessing import get_context
 from typing import NamedTuple
 
 from fflin.batch_chunks import Chunk, ChunkJob, Parcel, Points, packed, work
 from fflin.errors import FflinError
+from fflin.own_workers import NoWorkers, WorkerDied
 
 # A chunk whose worker dies is given to others; what kills this many is not.
 _ATTEMPTS = 3
@@ -43,42 +42,11 @@ class Done(NamedTuple):
     reason: str
 
 
-class OwnWorkers:
-    """Processes of our own, which are replaced where one dies.
-
-    Parameters
-    ----------
-    count : int
-    """
-
-    def __init__(self, count: int) -> None:
-        self.count = count
-        self._pool = self._start()
-
-    def _start(self) -> ProcessPoolExecutor:
-        # A fork would take a copy of locks that other threads hold.
-        return ProcessPoolExecutor(self.count, mp_context=get_context("spawn"))
-
-    @property
-    def executor(self) -> ProcessPoolExecutor:
-        """The pool that stands now."""
-        return self._pool
-
-    def replace(self) -> None:
-        """Start the processes anew."""
-        self.close()
-        self._pool = self._start()
-
-    def close(self) -> None:
-        """End the processes."""
-        self._pool.shutdown(wait=True, cancel_futures=True)
-
-
 def dispatch(
     job: ChunkJob,
     spans: Sequence[Span],
     points: Callable[[Span], Points],
-    workers: Executor | OwnWorkers,
+    workers: Executor,
 ) -> Iterator[Done]:
     """Do chunks on workers and yield them as they are finished.
 
@@ -90,7 +58,7 @@ def dispatch(
     spans : sequence of Span
     points : callable
         Makes the points of a span.
-    workers : Executor or OwnWorkers
+    workers : Executor
 
     Yields
     ------
@@ -103,7 +71,7 @@ def dispatch(
             work_place.begin()
             yield from work_place.finished()
             if work_place.broken is not None:
-                yield from work_place.recovered()
+                yield from work_place.lost()
     finally:
         for future in work_place.running:
             future.cancel()
@@ -117,24 +85,19 @@ class _WorkPlace:
         parcel: Parcel,
         spans: Sequence[Span],
         points: Callable[[Span], Points],
-        workers: Executor | OwnWorkers,
+        workers: Executor,
     ) -> None:
         self.waiting = list(reversed(spans))
         self.running: dict[Future[Chunk | None], Span] = {}
         self.broken: BaseException | None = None
         self._attempts: dict[Span, int] = {}
         self._parcel, self._points, self._workers = parcel, points, workers
-        count = workers.count if isinstance(workers, OwnWorkers) else _count(workers)
-        self._ahead = _QUEUED * count
-        self._known = self._cautious = False
+        self._ahead = _QUEUED * _count(workers)
+        self._known = False
 
     def begin(self) -> None:
         """Give the workers what they have room for."""
-        # Which of the running chunks killed a worker is not told: then one at a time, until all
-        # that ran beside it are done.
-        self._cautious &= any(span in self._attempts for span in self.waiting)
-        room = 1 if self._cautious else self._ahead
-        while self.waiting and len(self.running) < room and self.broken is None:
+        while self.waiting and len(self.running) < self._ahead and self.broken is None:
             self._submit(self.waiting.pop(), None if self._known else self._parcel.content)
 
     def finished(self) -> Iterator[Done]:
@@ -149,7 +112,9 @@ class _WorkPlace:
                 yield Done(span, None, str(error))
             except (BrokenExecutor, CancelledError) as error:
                 self.broken = self.broken or error
-                yield from self._lost(span, "its worker died each time")
+                self.waiting.append(span)
+            except WorkerDied as error:
+                yield from self._lost(span, str(error))
             except Exception as error:
                 # Of the executor's own, such as a scheduler that gave up on a worker.
                 yield from self._lost(span, f"{type(error).__name__}: {error}")
@@ -161,17 +126,13 @@ class _WorkPlace:
                     self._known = True
                     yield Done(span, chunk, "")
 
-    def recovered(self) -> Iterator[Done]:
-        """Replace our own workers that died; of a caller's executor yield what is lost."""
+    def lost(self) -> Iterator[Done]:
+        """Yield what is lost with an executor that died."""
         error, self.broken = self.broken, None
         running, self.running = self.running, {}
-        if isinstance(self._workers, OwnWorkers):
-            for span in running.values():
-                yield from self._lost(span, "its worker died each time")
-            self._workers.replace()
-            self._known, self._cautious = False, True
-            return
         reason = f"the executor died: {type(error).__name__}: {error}".rstrip(": ")
+        if isinstance(error, NoWorkers):
+            reason = str(error)
         for future, span in running.items():
             # Some are finished and not lost with it.
             good = future.done() and not future.cancelled() and future.exception() is None
@@ -183,12 +144,10 @@ class _WorkPlace:
 
     def _submit(self, span: Span, content: bytes | None) -> None:
         """Begin a chunk, or put it back where the executor is dead."""
-        workers = self._workers
-        executor = workers.executor if isinstance(workers, OwnWorkers) else workers
-        parcel = Parcel(self._parcel.key, content)
+        arguments = Parcel(self._parcel.key, content), self._points(span), span.start
         try:
-            future = executor.submit(work, parcel, self._points(span), span.start)
-        except (RuntimeError, CancelledError) as error:  # broken or shut down
+            future = self._workers.submit(work, *arguments)
+        except Exception as error:  # broken, shut down, or of its own
             self.waiting.append(span)
             self.broken = error
         else:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -102,7 +103,7 @@ def load_model(path: Path) -> LinearModel:
 # What decoders raise at files that are not theirs, or are damaged.
 _UNREADABLE = (
     *(KeyError, ValueError, TypeError, IndexError, AttributeError, EOFError, OverflowError),
-    *(NotImplementedError, RecursionError, zlib.error),
+    *(NotImplementedError, RecursionError, zlib.error, TokenError),
 )
 
 

@@ -16,7 +16,7 @@ from fflin.linear_model import LinearModel
 from fflin.policies import StateFeedback
 from fflin.regulator import lqr
 from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.validation import Array, vector
 from fflin.weights import weight
 
 if TYPE_CHECKING:
@@ -90,7 +90,15 @@ class GainBatch(Design):
         """Return K (nu, nx) at joint positions (n,) by linear interpolation.
 
         Beyond the grid it is that at its edge.
+
+        Raises
+        ------
+        InputError
+            If the points are not on a grid, or the positions are not n finite numbers.
         """
+        return self._between(vector("joints", joints, len(self.joint_names), "the joint positions"))
+
+    def _between(self, joints: Array) -> Array:
         point = [
             min(max(joints[self.joint_names.index(name)], values[0]), values[-1])
             for name, values in self._axes.items()
@@ -162,6 +170,8 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
     """
     if not isinstance(batch, LinearBatch):
         raise InputError(f"batch is a {type(batch).__name__}, expected a LinearBatch of sweep")
+    if not len(batch):
+        raise InputError("the batch has no points")
     Q = weight("Q", Q, batch.state_names)
     R = weight("R", R, batch.input_names, definite=True)
     nv, nu = batch.B_lower.shape[1:]
@@ -234,6 +244,9 @@ def _gains(rates: Array, L: Array, Q: Array, R: Array) -> tuple[Array, Array, Ar
     residual = np.linalg.norm(left, axis=(1, 2)) / scale
     residual[odd > _ODD * np.abs(cost).max(axis=(1, 2))] = np.nan
     K = np.linalg.solve(R, np.swapaxes(L, 1, 2) @ P[:, m:])
+    # The squares of the poles that K was made from lose the digits of slow ones beside fast ones.
+    moved = np.concatenate((rates[:, None] * motions[:, m:], -L @ (K @ motions)), axis=1)
+    poles = np.einsum("nij,nji->ni", inverse, moved)
     return K, residual, -poles.real.max(axis=1)
 
 
@@ -284,6 +297,9 @@ class ScheduledFeedback:
     gains: GainBatch
 
     def __post_init__(self) -> None:
+        for name, kind in (("lin", LinearModel), ("gains", GainBatch)):
+            if not isinstance(value := getattr(self, name), kind):
+                raise InputError(f"{name} is a {type(value).__name__}, expected a {kind.__name__}")
         for key in ("state_names", "input_names", "frame"):
             if getattr(self.lin, key) != getattr(self.gains, key):
                 raise InputError(f"the {key} of the model and of the gains differ")
@@ -306,7 +322,7 @@ class ScheduledFeedback:
         )
 
         def policy(_: float, q: Array, v: Array) -> Array:
-            K = gains.gain(positions(q[None], columns)[0])
+            K = gains._between(positions(q[None], columns)[0])
             u: Array = lin.u0 - K.dot(state.to_state(q, v, near=lin.x0) - lin.x0)
             return u
 

@@ -18,14 +18,16 @@ import pinocchio as pin
 
 from fflin.batch_chunks import ChunkJob
 from fflin.batch_files import check_format, header, load_batch
+from fflin.batch_room import check_room
 from fflin.batch_store import FileStore, MemoryStore
 from fflin.configurations import Configurations, GivenConfigurations
-from fflin.dispatching import Done, OwnWorkers, Span, dispatch
+from fflin.dispatching import Done, Span, dispatch
 from fflin.errors import FflinError, FflinWarning, FileError, InputError, SweepError, listed
 from fflin.files import as_path
 from fflin.kernel_code import available_threads
 from fflin.linear_batch import LinearBatch
 from fflin.model import Robot
+from fflin.own_workers import OwnWorkers
 from fflin.sweep_task import SweepTask, as_configurations
 
 if TYPE_CHECKING:
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
 
 # A chunk's result is about this large, so that what it costs to send is small against it and a
 # handful of them fit in memory.
-_CHUNK_BYTES, _LEAST_CHUNK_BYTES = 8 * 2**20, 2**21
+_CHUNK_BYTES, _LEAST_CHUNK_BYTES = 4 * 2**20, 2**21
 _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
 
 # So many chunks where workers share them, so that all end at about the same time.
@@ -89,7 +91,8 @@ def sweep(
     threads : int, optional
         Threads of the kernel in this process; all cores that it may use by default.
     chunk : int, optional
-        Points in a chunk; by default so many that a chunk's result is about 8 MB.
+        Points in a chunk; by default so many that a chunk's result is about 4 MB, or
+        as in the unfinished file.
     progress : callable, optional
         ``progress(done, total)`` is called with the number of points after every chunk.
     out : str or Path, optional
@@ -123,8 +126,12 @@ def sweep(
             f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
         )
     for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
-        if value is not None and (not isinstance(value, int | np.integer) or value < 1):
+        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        if value is not None and (not whole or value < 1):
             raise InputError(f"{name} is {value!r}, expected a whole number from 1 on")
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
+    path = None if out is None else output_path(out)
     points = as_configurations(robot, q)
     job = ChunkJob(
         robot,
@@ -134,13 +141,13 @@ def sweep(
         at_rest=v is None and u is None,
         count=len(points),
     )
+    check_room(len(points), len(points) * _row_bytes(job), path)
     task = SweepTask(job, points, v, u)
     parallel = executor is not None or workers is not None
     threads = threads or available_threads()
-    size = chunk or _chunk_size(task, _SHARES if parallel else 4 * threads)
+    store = _store(task, path, chunk or _chunk_size(task, _SHARES if parallel else 4 * threads))
+    size = store.chunk
     spans = [Span(at, min(at + size, task.count)) for at in range(0, task.count, size)]
-    path = None if out is None else _path(out)
-    store = _store(task, path, size)
     own = OwnWorkers(int(workers)) if workers else None
     others = own or executor
     try:
@@ -157,7 +164,7 @@ def sweep(
     finally:
         store.close()
         if own is not None:
-            own.close()
+            own.shutdown()
 
 
 def planned_bytes(
@@ -186,7 +193,8 @@ def _chunk_size(task: SweepTask, shares: int) -> int:
     return size - size % _LEAST_CHUNK
 
 
-def _path(out: str | Path) -> Path:
+def output_path(out: str | Path) -> Path:
+    """Return where a batch can be written, or raise `FileError` or `MissingPackageError`."""
     path = as_path(out)
     check_format(path)
     if not path.parent.is_dir():
@@ -199,7 +207,7 @@ def _store(task: SweepTask, path: Path | None, size: int) -> FileStore | MemoryS
     if path is None or (path.suffix == ".npz" and find_spec("h5py") is None):
         if not isinstance(task.configurations, GivenConfigurations):
             shapes["q"] = (task.robot.nq,)
-        return MemoryStore(task.count, shapes)
+        return MemoryStore(task.count, size, shapes)
     shapes |= {"q": (task.robot.nq,)}
     shapes |= {key: rows.shape[1:] for key, rows in task.varying().items()}
     store = FileStore(path, task.request, task.count, size, shapes)
@@ -229,7 +237,7 @@ def _here(
         for span in spans:
             begun.append(pool.submit(run, span))
             # Not far ahead of what takes the results, which would fill the memory.
-            if len(begun) > 2 * threads:
+            if len(begun) > threads:
                 yield begun.popleft().result()
         while begun:
             yield begun.popleft().result()
@@ -278,6 +286,9 @@ def _failure(
     )
     batch = None
     if isinstance(store, FileStore):
+        if len(failed) == chunks:
+            store.discard()
+            return SweepError(said, tuple((*span, reason) for span, _, reason in failed), None)
         said += f"; the others are in {store.part}, and the same call goes on from them"
     elif len(failed) < chunks:
         kept = np.ones(task.count, dtype=bool)

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -128,6 +129,71 @@ def test_a_run_goes_on_from_the_chunks_that_are_there_and_intact(robot, tmp_path
     assert written == [16, 64] and told == [(48, 80), (64, 80), (80, 80)]
     assert [entry.name for entry in tmp_path.iterdir()] == ["b.h5"]
     assert np.abs(batch.B_lower / fflin.sweep(robot, q).B_lower - 1).max() < 1e-9
+
+
+@pytest.mark.parametrize("chunk", [10, 16, 23, 80])
+def test_a_run_goes_on_in_the_chunks_that_it_was_begun_in(chunk, robot, tmp_path):
+    """Another number of threads or workers would choose others."""
+    q, _, _ = points(robot, 80)
+    path = tmp_path / "b.h5"
+    interrupted(robot, q, path, 64)
+    told = []
+    batch = fflin.sweep(robot, q, chunk=chunk, out=path, progress=lambda *x: told.append(x))
+    assert told == [(64, 80), (80, 80)]
+    assert np.array_equal(batch.B_lower, fflin.sweep(robot, q, threads=1).B_lower)
+
+
+def test_a_file_that_another_run_writes_is_left_alone(robot, tmp_path):
+    q, _, _ = points(robot, 80)
+    path = tmp_path / "b.h5"
+    interrupted(robot, q, path, 64)
+    script = "import h5py, sys; f = h5py.File(sys.argv[1], 'r+'); print(1, flush=True); input()"
+    command = [sys.executable, "-c", script, f"{path}.part"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline()
+        with pytest.raises(fflin.FileError, match="in use by another run; wait for it"):
+            fflin.sweep(robot, q, chunk=16, out=path)
+        process.communicate(b"\n")
+    fflin.sweep(robot, q, chunk=16, out=path)
+
+
+def test_a_damaged_unfinished_file_is_one_line_or_its_chunk_is_done_again(robot, tmp_path):
+    q, _, _ = points(robot, 80)
+    path, part = tmp_path / "b.h5", tmp_path / "b.h5.part"
+    interrupted(robot, q, path, 64)
+    whole, rng = part.read_bytes(), np.random.default_rng(0)
+    expected = fflin.sweep(robot, q, threads=1).B_lower
+    refused = 0
+    for trial in range(60):
+        content = bytearray(whole)
+        # Half of them in the file's own records, which are few and in front.
+        content[rng.integers(0, 2500 if trial % 2 else len(whole))] ^= 0xFF
+        part.write_bytes(content if trial % 10 else content[: rng.integers(len(whole))])
+        try:
+            assert np.array_equal(fflin.sweep(robot, q, out=path, threads=1).B_lower, expected)
+        except fflin.FileError as error:
+            refused += 1
+            assert "remove it" in str(error) and "\n" not in str(error)
+            part.unlink()
+    assert 5 < refused < 55
+
+
+def test_where_nothing_is_finished_nothing_is_left(robot, tmp_path):
+    executor = ThreadPoolExecutor(1)
+    executor.shutdown()
+    with pytest.raises(fflin.SweepError, match=r"after shutdown$"):
+        fflin.sweep(robot, points(robot, 8)[0], executor=executor, out=tmp_path / "b.h5")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_empty_batch_is_not_saved(robot, tmp_path):
+    batch = fflin.sweep(robot, points(robot, 8)[0])
+    for ending in FORMATS:
+        with pytest.raises(fflin.InputError, match="no points"):
+            batch[:0].save(tmp_path / f"b{ending}")
+    with pytest.raises(fflin.InputError, match="no points"):
+        fflin.lqr_batch(batch[:0], 1.0, 1.0)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_killed_run_goes_on(robot, tmp_path):

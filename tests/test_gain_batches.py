@@ -27,7 +27,8 @@ def test_every_gain_is_that_of_lqr(name, robots):
             assert gains.K[index] == pytest.approx(
                 gain.K, rel=1e-6, abs=1e-7 * np.abs(gain.K).max()
             )
-            assert gains.margin[index] == pytest.approx(gain.margin, rel=1e-5)
+            slowest = -np.linalg.eigvals(lin.A - lin.B @ gains.K[index]).real.max()
+            assert gains.margin[index] == pytest.approx(slowest, rel=1e-9)
 
 
 def test_closed_form_of_a_single_body(robots):
@@ -91,6 +92,11 @@ def test_gains_between_the_points(robots, tmp_path):
     beyond[1] = 7.0
     joints[1] = 1.0
     assert np.array_equal(gains.gain(beyond), gains.gain(joints))
+    shuffled = fflin.lqr_batch(batch[np.random.default_rng(1).permutation(len(batch))], 1.0, 1.0)
+    assert shuffled.gain(joints) == pytest.approx(gains.gain(joints), rel=1e-9, abs=1e-12)
+    for wrong in (joints[:2], np.full(6, np.nan), {"joint_2": 0.0}):
+        with pytest.raises(fflin.InputError, match="joints"):
+            gains.gain(wrong)
     gains.save(tmp_path / "g.npz")
     assert np.array_equal(fflin.GainBatch.load(tmp_path / "g.npz").gain(joints), gains.gain(joints))
     scattered = fflin.lqr_batch(batch[[0, 4, 5]], 1.0, 1.0)
@@ -115,5 +121,7 @@ def test_a_scheduled_feedback_brings_the_robot_to_the_target(robots):
     )
     with pytest.raises(fflin.InputError, match="frame"):
         fflin.ScheduledFeedback(fflin.linearize(robot, frame="world"), gains)
+    with pytest.raises(fflin.InputError, match="gains is a Gain, expected a GainBatch"):
+        fflin.ScheduledFeedback(target, fflin.lqr(target, 1.0, 1.0))
     with pytest.raises(fflin.InputError):
         policy.bind(fflin.load("cubesat"))

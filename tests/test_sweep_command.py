@@ -1,8 +1,14 @@
 """fflin sweep as a user runs it."""
 
+import os
 import re
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from test_cli import refused, run
 
@@ -60,10 +66,15 @@ def test_grid_random_and_file_say_the_same(tmp_path, robots):
         (("--random", "3", "--joint", "joint_2=1", "--range", "joint_2=0:1"), "give either"),
         (("--configurations", "none.npz"), "none.npz: cannot be read"),
         (("--random", "3", "--workers", "2", "--dask", "x"), "give either"),
+        (("--random", "3", "--dask", "nowhere"), "no dask scheduler answers at 'nowhere'"),
+        (("--configurations", "none.npz", "--rpy", "1", "0", "0"), "all place the base"),
+        (("--random", "3", "-o", "none/x.npz"), "there is no folder none"),
     ],
 )
 def test_bad_input_is_one_line(arguments, message, tmp_path):
-    error = refused("sweep", "ets_vii", *arguments, "-o", "out.npz", cwd=tmp_path)
+    if "--dask" in arguments:
+        pytest.importorskip("distributed")
+    error = refused("sweep", "ets_vii", "-o", "out.npz", *arguments, cwd=tmp_path)
     assert re.search(message, error), error
     assert not list(tmp_path.iterdir())
 
@@ -78,4 +89,49 @@ def test_what_is_missing_or_damaged_is_one_line(tmp_path, robots):
     np.savez(tmp_path / "q.npz", q=q)
     error = refused("sweep", "ets_vii", "--configurations", "q.npz", "-o", "x.npz", cwd=tmp_path)
     assert error.startswith("fflin: error: configuration 4: q[8] is nan")
+    q[4, 8] = 0.0
+    np.savez(tmp_path / "q.npz", q=q)
+    error = refused("sweep", "ets_vii", "--configurations", "q.npz", "-o", "q.npz", cwd=tmp_path)
+    assert "q.npz is what --configurations reads" in error
     assert [entry.name for entry in tmp_path.iterdir()] == ["q.npz"]
+    assert np.array_equal(np.load(tmp_path / "q.npz")["q"], q)
+
+
+def test_the_reference_may_be_the_world(tmp_path, robots):
+    options = ("--random", "3", "--rpy", "30", "0", "0", "--reference", "world", "-o")
+    code, *_ = run("sweep", "ets_vii", *options, tmp_path / "w.h5")
+    assert code == 0
+    batch = fflin.LinearBatch.load(tmp_path / "w.h5", robots["ets_vii"])
+    lin = fflin.linearize(robots["ets_vii"], batch.q[1], reference=pin.SE3.Identity())
+    assert batch[1].x0[0] == pytest.approx(np.sin(np.pi / 12), rel=1e-12)
+    assert batch[1].x0 == pytest.approx(lin.x0, abs=1e-14)
+    assert batch[1].A == pytest.approx(lin.A, abs=1e-14)
+
+
+@pytest.mark.parametrize("workers", [(), ("--workers", "2")])
+def test_ctrl_c_leaves_what_is_finished_and_no_process(workers, tmp_path):
+    """The whole group is interrupted, as a terminal does it."""
+    pytest.importorskip("h5py")
+    command = [sys.executable, "-m", "fflin", "sweep", "ets_vii", "--random", "100000"]
+    options = ["--velocity", "joint_1=0.3", "-o", "x.h5", *workers]
+    with subprocess.Popen(
+        [*command, *options],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        part = tmp_path / "x.h5.part"
+        end = time.monotonic() + 60
+        while not part.exists() and time.monotonic() < end:
+            time.sleep(0.05)
+        time.sleep(0.3)
+        os.killpg(process.pid, signal.SIGINT)
+        # These end with the last process that has them.
+        _, error = process.communicate(timeout=30)
+    assert process.returncode == 130
+    *_, last = error.splitlines()
+    assert last == "fflin: stopped; the same command goes on from x.h5.part"
+    assert "Traceback" not in error
+    assert [entry.name for entry in tmp_path.iterdir()] == ["x.h5.part"]

@@ -181,6 +181,29 @@ def test_mimic_joints_follow_on_a_grid():
     assert batch.joint_positions[:, -1] == pytest.approx([0.0, 0.01, 0.04])
 
 
+def test_mimic_joints_follow_with_their_offset(tmp_path):
+    body = (
+        '<inertial><mass value="2"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+        "</inertial>"
+    )
+    links = "".join(f'<link name="l{i}">{body}</link>' for i in range(3))
+    joint = (
+        '<joint name="j{0}" type="{1}"><parent link="l{2}"/><child link="l{0}"/>'
+        '<origin xyz="0 0 1"/><axis xyz="1 0 0"/>{3}<limit effort="9" velocity="9" lower="-3" '
+        'upper="3"/></joint>'
+    )
+    mimic = '<mimic joint="j1" multiplier="-2" offset="0.3"/>'
+    joints = joint.format(1, "revolute", 0, "") + joint.format(2, "revolute", 1, mimic)
+    path = tmp_path / "mimic.urdf"
+    path.write_text(f'<robot name="mimic">{links}{joints}</robot>')
+    robot = fflin.load(path)
+    values = [-0.5, 0.1, 0.7]
+    rows = fflin.grid(robot, {"j1": values}).rows(0, 3)
+    assert rows[:, 8] == pytest.approx([1.3, 0.1, -1.1])
+    for row, value in zip(rows, values, strict=True):
+        assert row == pytest.approx(fflin.configuration(robot, {"j1": value}))
+
+
 def damaged(robot, row, column, value):
     q = np.tile(robot.neutral(), (40, 1))
     q[row, column] = value
@@ -207,12 +230,33 @@ def damaged(robot, row, column, value):
         (lambda r: {"q": fflin.grid(r, {"joint_1": [1.0, 0.0]})}, "increase"),
         (lambda r: {"q": fflin.random_configurations(r, 0)}, "count is 0"),
         (lambda r: {"q": fflin.grid(fflin.load("ur5"), {"elbow_joint": [1.0]})}, "q is of 'ur5'"),
+        (
+            lambda r: {"q": fflin.grid(r, {f"joint_{i}": range(10**4) for i in range(1, 7)})},
+            "1,000,000,000,000,000,000,000,000 points are too many",
+        ),
+        (lambda r: {"q": fflin.random_configurations(r, 10**20)}, "points are too many"),
+        (lambda r: {"q": fflin.random_configurations("ur5", 3)}, "robot is a str"),
+        (lambda r: {"q": fflin.random_configurations(r, 3, ranges=[0, 1])}, "ranges is"),
+        (lambda r: {"q": fflin.random_configurations(r, 3), "progress": 3}, "progress is 3"),
+        (lambda r: {"q": fflin.random_configurations(r, 3), "workers": True}, "workers is True"),
     ],
 )
 def test_bad_input_is_one_line_that_names_the_row(make, message, robots, tmp_path):
     robot = robots["servicer_7dof"]
     with pytest.raises(fflin.InputError, match=message):
         fflin.sweep(robot, **make(robot), out=tmp_path / "x.npz")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_has_no_room_is_refused_before_it_is_begun(robots, tmp_path):
+    robot = robots["servicer_7dof"]
+    many = fflin.random_configurations(robot, 10**15)
+    with pytest.raises(fflin.InputError, match=r"points are 1,928.0 PB, and the machine has"):
+        fflin.sweep(robot, many)
+    pytest.importorskip("h5py")
+    for name in ("x.h5", "x.npz"):
+        with pytest.raises(fflin.FileError, match=r"points are 1,928.0 PB.* only .* are free in"):
+            fflin.sweep(robot, many, out=tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 

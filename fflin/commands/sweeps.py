@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -150,17 +149,17 @@ def _count(text: str) -> int:
 def _sweep(arguments: argparse.Namespace) -> int:
     import pinocchio as pin
 
-    from fflin.batch_files import check_format
+    from fflin.batch_room import part_of
     from fflin.points import effort
     from fflin.progress import Progress
-    from fflin.sweeping import sweep
+    from fflin.sweeping import output_path, sweep
 
     path = arguments.output_file
     if path is None:
         raise InputError("-o says where the models go: a file .h5 or .npz")
     if arguments.workers and arguments.dask:
         raise InputError("--workers and --dask both share the work; give either")
-    check_format(path)
+    output_path(path)
     robot = load_robot(arguments)
     v = velocity_of(robot, arguments)
     u = effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
@@ -168,9 +167,9 @@ def _sweep(arguments: argparse.Namespace) -> int:
     options: dict[str, Any] = {"frame": arguments.frame, "reference": reference}
     announce = _Announcement(robot, path, options, arguments.yes)
     q, v, u = _points(robot, arguments, v, u, announce)
-    announce.say()
     bar = Progress(len(q))
     with _executor(arguments.dask) as executor:
+        announce.say()
         try:
             batch = sweep(
                 robot,
@@ -183,6 +182,14 @@ def _sweep(arguments: argparse.Namespace) -> int:
                 progress=lambda done, _: bar.update(done),
                 out=path,
             )
+        except KeyboardInterrupt:
+            bar.close()
+            if part_of(path).exists():
+                print(
+                    f"fflin: stopped; the same command goes on from {part_of(path)}",
+                    file=sys.stderr,
+                )
+            raise
         finally:
             bar.close()
     states, inputs = len(batch.state_names), len(batch.input_names)
@@ -198,32 +205,21 @@ class _Announcement:
         self._said = ""
 
     def __call__(self, count: int, *, at_rest: bool) -> None:
+        from fflin.batch_room import check_room, part_of, readable
         from fflin.sweeping import planned_bytes
 
         size = planned_bytes(self._robot, count, at_rest=at_rest, **self._options)
-        said = f"{count:,} points of '{self._robot.name}', {_readable(size)}"
+        said = f"{count:,} points of '{self._robot.name}', {readable(size)}"
         if size > _LARGE and not self._agreed:
             raise InputError(f"{said}: add --yes where it is meant, or choose fewer points")
-        part = self._path.with_name(self._path.name + ".part")
-        folder = self._path.parent
-        if folder.is_dir() and not part.exists():
-            free = shutil.disk_usage(folder).free
-            if size > free:
-                raise FileError(f"{said}: there are only {_readable(free)} free in {folder}")
+        check_room(count, size, self._path)
+        part = part_of(self._path)
         going_on = f", going on from {part}" if part.exists() else ""
         self._said = f"fflin: {said} to {self._path}{going_on}"
 
     def say(self) -> None:
         """Say it, once all that was asked for is found good."""
         print(self._said, file=sys.stderr)
-
-
-def _readable(size: float) -> str:
-    """Show a number of bytes."""
-    for unit, scale in (("PB", 1e15), ("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
-        if size >= scale:
-            return f"{size / scale:,.1f} {unit}"
-    return f"{size / 1e3:.1f} kB"
 
 
 def _points(
@@ -247,6 +243,10 @@ def _points(
     if arguments.configurations:
         if arguments.joint:
             raise InputError("--joint and --configurations both place joints; give either")
+        if any(arguments.rpy) or any(arguments.position):
+            raise InputError("--rpy, --position and --configurations all place the base; give one")
+        if arguments.configurations.resolve() == arguments.output_file.resolve():
+            raise FileError(f"{arguments.output_file} is what --configurations reads; name another")
         given = _given(arguments.configurations)
         for name, value in (("v", v), ("u", u)):
             if name in given and value is not None:
