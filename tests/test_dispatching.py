@@ -279,8 +279,8 @@ def test_dask(robot, monkeypatch):
         expected = fflin.sweep(robot, configurations)
         q, v, u = points(robot, 30)
         moving = fflin.sweep(robot, q, v, u, executor=client.get_executor(), chunk=7)
-        expected = fflin.sweep(robot, q, v, u).A
-        assert np.abs(moving.A - expected).max() < 1e-12 * np.abs(expected).max()
+        here = fflin.sweep(robot, q, v, u).A
+        assert np.abs(moving.A - here).max() < 1e-12 * np.abs(here).max()
         worker = next(iter(client.scheduler_info()["workers"].values()))["id"]
         pid = next(nanny.pid for name, nanny in cluster.workers.items() if name == worker)
         killed = []
