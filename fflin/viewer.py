@@ -42,7 +42,7 @@ def visualize(
     scene: str | None = None,
     fps: float = 30.0,
     speed: float | None = None,
-    follow: bool = False,
+    follow: bool | None = None,
     target: Array | None = None,
     tool: str | None = None,
     q: Array | None = None,
@@ -77,8 +77,9 @@ def visualize(
     speed : float, optional
         Seconds of motion per second of watching; 1, or more for motions of over a minute. A
         simulation that is shown live waits for it.
-    follow : bool
-        Whether the camera follows the base.
+    follow : bool, optional
+        Whether the camera follows the base; by default where a motion goes so far that the robot
+        would be a dot on its way.
     target : array_like (nq,), optional
         Configuration that errors are counted from; by default the one that the motion was steered
         to, or where it begins.
@@ -128,7 +129,7 @@ def visualize(
         if any(file is not None for file in (html, png, gif)):
             raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
         start = robot.neutral() if q is None else _configuration(robot, "q", q)
-        return _live(robot, start, open is None or open, scene, tool, follow, speed, port)
+        return _live(robot, start, open is None or open, scene, tool, bool(follow), speed, port)
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif}, robot.urdf)
     _check_motion(robot, motion)
     fps, speed = _rates(motion, fps, speed)

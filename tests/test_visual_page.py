@@ -1,5 +1,6 @@
 """The page of a motion in a real browser: it is whole, plays, and shows what Pinocchio says."""
 
+import json
 import os
 import re
 
@@ -42,6 +43,12 @@ def placements(robot, q):
     pin.forwardKinematics(robot.model, data, q)
     # Copies: what the list holds dies with the data.
     return dict(zip(robot.model.names, map(pin.SE3, data.oMi.tolist()), strict=True))
+
+
+def page_data(path):
+    """Return what the scripts of a page are given."""
+    (data,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', path.read_text())
+    return json.loads(data)
 
 
 def largest_difference(watched, robot, q, node="robot"):
@@ -153,9 +160,9 @@ def test_the_panel_says_what_the_motion_says(settled, watched):
             }
             return bright.indexOf(Math.max(...bright)) / width;
         })()""")
-        assert column == pytest.approx(t / 20.0, abs=0.01)
-    box = canvas.bounding_box()
-    canvas.click(position={"x": box["width"] / 4, "y": 20})
+        ruled = canvas.bounding_box()["width"] - 44  # figures stand in the rest
+        assert column * canvas.bounding_box()["width"] == pytest.approx(t / 20.0 * ruled, abs=2.5)
+    canvas.click(position={"x": ruled / 4, "y": 20})
     assert watched.do("fflin.state.time") == pytest.approx(5.0, abs=0.1)
 
 
@@ -175,19 +182,39 @@ def test_the_picture_is_not_blank_and_changes(settled, watched):
     assert len(np.unique(middle.reshape(-1, 3), axis=0)) > 500
 
 
-def test_all_of_the_motion_is_within_the_view(settled, watched):
-    """The corners of what moves lie in the window, and fill a good part of it."""
-    seen = watched.do("""(() => {
+def on_screen(watched, points):
+    """Return where points (N, 3) of the world are seen, in CSS pixels (N, 2)."""
+    width, height = watched.do("[innerWidth, innerHeight]")
+    seen = watched.do(f"""(() => {{
         viewer.render();
-        const info = JSON.parse(document.getElementById('data').textContent);
-        return info.points.map(([x, y, z]) => {
+        return {np.asarray(points).tolist()}.map(([x, y, z]) => {{
             const p = new MeshCat.THREE.Vector3(x, z, -y).project(viewer.camera);
             return [p.x, p.y];
-        });
-    })()""")
-    points = np.array(seen)
-    assert np.abs(points).max() < 1.0
-    assert np.ptp(points, axis=0).max() > 1.0
+        }});
+    }})()""")
+    return (np.array(seen) * (1, -1) + 1) / 2 * (width, height)
+
+
+@pytest.mark.parametrize(("width", "height"), [(400, 800), (1024, 700), (1280, 720)])
+def test_all_of_the_motion_is_within_the_view(settled, watched, width, height):
+    """Robot, target and tips of forces lie in what the panels leave free, and fill it well."""
+    robot, motion, _ = settled
+    watched.page.set_viewport_size({"width": width, "height": height})
+    watched.page.wait_for_timeout(300)
+    points = watched.do("JSON.parse(document.getElementById('data').textContent).points")
+    seen = on_screen(watched, points)
+    panel, bar = (watched.page.locator(name).bounding_box() for name in ("#panel", "#bar"))
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    assert bar["x"] >= 0 and bar["x"] + bar["width"] <= width
+    for item in watched.page.locator("#bar > *").all():
+        box = item.bounding_box()
+        assert box["x"] >= bar["x"] and box["x"] + box["width"] <= bar["x"] + bar["width"]
+    assert low.min() > 0 and high[0] < width and high[1] < bar["y"]
+    assert high[0] < panel["x"] or low[1] > panel["y"] + panel["height"]
+    assert (high - low).max() > 0.4 * min(width, height)
+    # The pieces of the robot are among these points, at any time.
+    body = on_screen(watched, motion.q[::200, :3])
+    assert (body > low).all() and (body < high).all()
 
 
 def test_forces_trails_and_the_legend(settled, watched):
@@ -231,15 +258,17 @@ def test_the_camera_follows_the_base_when_it_is_told_to(settled, watched):
     fixed = watched.do(target)
     watched.do("fflin.seek(8)")
     assert watched.do(target) == fixed
-    button = watched.page.locator("#bar button", has_text="fixed view")
+    button = watched.page.get_by_role("button", name="follow", exact=True)
     button.click()
+    assert button.get_attribute("aria-pressed") == "true"
     before = watched.pose(["meshcat", "robot", "root_joint"])
     watched.do("fflin.seek(0)")
     after = watched.pose(["meshcat", "robot", "root_joint"])
     moved = np.subtract(after, before)[:3]
     shift = np.subtract(watched.do(target), fixed)
     np.testing.assert_allclose(shift, [moved[0], moved[2], -moved[1]], atol=1e-9)
-    watched.page.locator("#bar button", has_text="follows").click()
+    button.click()
+    assert button.get_attribute("aria-pressed") == "false"
 
 
 def test_no_complaint_and_no_request(settled, watched):
@@ -317,3 +346,27 @@ def test_the_files_are_small(name, limit, tmp_path):
     path = tmp_path / "motion.html"
     fflin.visualize(robot, settling(robot, duration=20.0, predicted=True), html=path, fps=30)
     assert os.path.getsize(path) < limit
+
+
+def test_the_floor_lies_below_all_of_the_motion_and_the_target(tmp_path):
+    robot = fflin.load("ur5").replace(gravity=(0.0, 0.0, -9.81))
+    start = fflin.configuration(robot, base=pin.SE3(np.eye(3), np.array([0.5, 0.0, 2.0])))
+    motion = fflin.simulate(robot, None, q0=start, duration=0.2)
+    path = tmp_path / "high.html"
+    fflin.visualize(robot, motion, html=path, target=robot.neutral())
+    shown = page_data(path)
+    assert shown["scene"] == "lab" and shown["floor"][2] < 0.1
+    assert min(z for _, _, z in shown["points"]) == pytest.approx(shown["floor"][2], abs=1e-4)
+    assert not shown["follow"]
+
+
+def test_on_a_long_way_the_camera_follows_unless_it_is_told_not_to(robots, tmp_path):
+    robot = robots["servicer_7dof"]
+    v0 = fflin.velocity(robot, {"v_b.x": 1000.0})
+    motion = fflin.simulate(robot, None, v0=v0, duration=10.0, dt=0.1)
+    path = tmp_path / "away.html"
+    for told, expected in ((None, True), (False, False), (True, True)):
+        fflin.visualize(robot, motion, html=path, follow=told)
+        shown = page_data(path)
+        assert shown["follow"] is expected
+        assert (np.ptp(shown["points"], axis=0).max() > 5e3) is not expected

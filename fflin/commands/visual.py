@@ -71,7 +71,11 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
         help="sky and planet, or a floor with a grid (default where there is gravity)",
     )
     command.add_argument("--tool", metavar="FRAME", help="frame whose axes and trail are drawn")
-    command.add_argument("--follow", action="store_true", help="let the camera follow the base")
+    command.add_argument(
+        "--follow",
+        action=argparse.BooleanOptionalAction,
+        help="whether the camera follows the base (default: on a long way)",
+    )
 
 
 def check_pictures(arguments: argparse.Namespace) -> None:
