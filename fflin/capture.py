@@ -80,21 +80,26 @@ def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes
     return content.getvalue()
 
 
-def take_gif(page: Path, duration: float, speed: float, size: tuple[int, int]) -> bytes:
+def take_gif(
+    page: Path, span: tuple[float, float], speed: float, size: tuple[int, int]
+) -> bytes:
     """Return a GIF of a motion's page.
 
     Parameters
     ----------
     page : Path
-    duration, speed : float
-        Of the motion [s], and seconds of it per second; a long one is shown faster.
+    span : tuple of float
+        When the motion begins and ends [s].
+    speed : float
+        Seconds of it per second; a long one is shown faster.
     size : tuple of int
         Width and height [pixels].
     """
     from PIL import Image
 
-    count = max(2, min(_GIF_FRAMES, round(duration / speed * _GIF_FPS)))
-    times = [duration * index / (count - 1) for index in range(count)]
+    start, duration = span[0], span[1] - span[0]
+    count = round(max(2, min(_GIF_FRAMES, duration / speed * _GIF_FPS)))
+    times = [start + duration * index / (count - 1) for index in range(count)]
     frames = _film(page, times, size, plain=True)
     images = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
     palette = images[0].quantize(160)

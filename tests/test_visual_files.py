@@ -194,7 +194,46 @@ def test_simulate_on_the_command_line(capsys, tmp_path, monkeypatch):
     assert main([*command, "--png", str(tmp_path / "m.png")]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2 and "no folder" in lines[0] and "apt install chromium" in lines[1]
-    assert [path.name for path in tmp_path.iterdir()] == ["loop.html"]
+    page = ["--html", str(tmp_path / "m.html"), "-o", str(tmp_path / "m.npz")]
+    (tmp_path / "folder.html").mkdir()
+    for wrong, message in (
+        (["--fps", "0"], "fps is 0"),
+        (["--fps", "1e6"], "fps is 1e+06"),
+        (["--speed", "-1"], "speed is -1"),
+        (["--tool", "tol"], "no frame named 'tol'"),
+        (["--times", "9"], "times are [9.0], expected some from 0 to 5 s"),
+        (["--html", str(tmp_path / "folder.html")], "is a folder"),
+    ):
+        assert main([*command, *page, *wrong]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert message in line
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert left == ["folder.html", "loop.html"]
+
+
+@needs_chromium
+def test_films(robots, motion, tmp_path, monkeypatch):
+    """Whenever a motion begins all of it is shown, and nothing is left behind."""
+    folder = tmp_path / "t"  # sockets have short names
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    monkeypatch.setenv("TMPDIR", str(folder))
+    later = replace(motion, t=motion.t + 100.0)
+    fflin.visualize(robots["planar_detumble"], later, gif=tmp_path / "m.gif", speed=8.0)
+    with Image.open(tmp_path / "m.gif") as image:
+        first = np.asarray(image.convert("RGB"), dtype=int)
+        image.seek(image.n_frames - 1)
+        last = np.asarray(image.convert("RGB"), dtype=int)
+    assert (np.abs(first - last).max(axis=2) > 30).mean() > 0.01
+    assert not list(folder.iterdir())
+
+
+def test_a_name_that_is_no_files_name_does_no_harm(robots, monkeypatch):
+    robot = fflin.from_model(robots["planar_detumble"].model, name="../a/b \u2603" * 99)
+    with pytest.warns(fflin.FflinWarning, match="boxes"):
+        path = fflin.visualize(robot, settling(robot, 1.0), open=False)
+    path.unlink()
+    assert path.name.startswith("fflin-_a_b_")
 
 
 def test_assets_are_part_of_the_package():

@@ -106,8 +106,9 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
         check_figure_format(arguments.plot)
         require_matplotlib()
-    check_pictures(arguments)
-    robot, motion = simulated(arguments)
+    robot = load_robot(arguments)
+    check_pictures(robot, arguments)
+    motion = simulated(robot, arguments)
     from fflin.motion_reports import motion_report
 
     print(motion_report(motion, controlled=not arguments.free))
@@ -121,11 +122,10 @@ def _simulate(arguments: argparse.Namespace) -> int:
     return FELL_SHORT if motion.stopped else DONE
 
 
-def simulated(arguments: argparse.Namespace) -> tuple[Robot, Motion]:
-    """Return the robot and the motion that the arguments ask for."""
+def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
+    """Return the motion that the arguments ask for."""
     from fflin.simulation import simulate
 
-    robot = load_robot(arguments)
     options: dict[str, Any] = {
         "q0": configuration_of(robot, arguments),
         "v0": velocity_of(robot, arguments),
@@ -139,14 +139,14 @@ def simulated(arguments: argparse.Namespace) -> tuple[Robot, Motion]:
         weighed = arguments.q or arguments.r or arguments.bryson or arguments.dt
         if weighed or arguments.target_joint or arguments.reduce:
             raise InputError("--free has no regulator to give weights or a target; leave one out")
-        return robot, simulate(robot, frame=arguments.frame, **options)
+        return simulate(robot, frame=arguments.frame, **options)
     lin = _about_target(robot, arguments)
     gain = gain_of(lin, arguments)
     from fflin.policies import StateFeedback
 
     if gain.dt:
         lin = lin.discretize(gain.dt)
-    return robot, simulate(robot, StateFeedback(lin, gain.K), **options)
+    return simulate(robot, StateFeedback(lin, gain.K), **options)
 
 
 def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:

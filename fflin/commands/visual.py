@@ -78,11 +78,17 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
     )
 
 
-def check_pictures(arguments: argparse.Namespace) -> None:
-    """Refuse files that cannot be written, before a motion is made for them."""
-    from fflin.viewer import check_outputs
+def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
+    """Refuse what `show_motion` would, before a motion is made for it."""
+    from fflin.viewer import check_outputs, check_rates, check_times, check_tool
 
-    check_outputs({f".{name}": getattr(arguments, name) for name in _FILES})
+    files = {f".{name}": getattr(arguments, name) for name in _FILES}
+    if not check_outputs(files, robot.urdf):
+        return
+    check_tool(robot, arguments.tool)
+    check_rates(arguments.fps, arguments.speed, arguments.duration)
+    if arguments.times:
+        check_times(arguments.times, 0.0, arguments.duration)
 
 
 def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> None:
