@@ -111,14 +111,18 @@ def _simulate(arguments: argparse.Namespace) -> int:
     motion = simulated(robot, arguments)
     from fflin.motion_reports import motion_report
 
-    print(motion_report(motion, controlled=not arguments.free))
-    if arguments.output_file:
-        motion.save(arguments.output_file)
-        print(f"wrote {arguments.output_file}")
-    if arguments.plot:
-        motion.plot(arguments.plot)
-        print(f"wrote {arguments.plot}")
-    show_motion(robot, motion, arguments)
+    # Said when the files are there, which they are then even where nobody reads it to its end.
+    lines = [motion_report(motion, controlled=not arguments.free)]
+    try:
+        if arguments.output_file:
+            motion.save(arguments.output_file)
+            lines.append(f"wrote {arguments.output_file}")
+        if arguments.plot:
+            motion.plot(arguments.plot)
+            lines.append(f"wrote {arguments.plot}")
+        lines += show_motion(robot, motion, arguments)
+    finally:
+        print("\n".join(lines))
     return FELL_SHORT if motion.stopped else DONE
 
 

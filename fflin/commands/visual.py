@@ -91,11 +91,11 @@ def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
         check_times(arguments.times, 0.0, arguments.duration)
 
 
-def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> None:
-    """Write what the options of `add_pictures` ask for."""
+def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> list[str]:
+    """Write what the options of `add_pictures` ask for, and return a line for each file."""
     files = {name: path for name in _FILES if (path := getattr(arguments, name))}
     if not files:
-        return
+        return []
     from fflin.viewer import visualize
 
     visualize(
@@ -109,8 +109,7 @@ def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> 
         follow=arguments.follow,
         tool=arguments.tool,
     )
-    for path in files.values():
-        print(f"wrote {path}: {path.stat().st_size / 1e6:.2f} MB")
+    return [f"wrote {path}: {path.stat().st_size / 1e6:.2f} MB" for path in files.values()]
 
 
 def _view(arguments: argparse.Namespace) -> int:
