@@ -81,9 +81,7 @@ def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes
     return content.getvalue()
 
 
-def take_gif(
-    page: Path, span: tuple[float, float], speed: float, size: tuple[int, int]
-) -> bytes:
+def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[int, int]) -> bytes:
     """Return a GIF of a motion's page.
 
     Parameters

@@ -47,7 +47,9 @@ def placements(robot, q):
 
 def page_data(path):
     """Return what the scripts of a page are given."""
-    (data,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', path.read_text())
+    (data,) = re.findall(
+        r'<script type="application/json" id="data">(.*?)</script>', path.read_text()
+    )
     return json.loads(data)
 
 
@@ -141,6 +143,7 @@ def test_the_panel_says_what_the_motion_says(settled, watched):
         assert float(values[0].split()[0]) == pytest.approx(angle, rel=6e-3)
         distance = np.linalg.norm(base.translation)
         assert float(values[1].split()[0]) == pytest.approx(distance, rel=6e-3, abs=1e-9)
+        assert values[3] == "1.0e-13"  # the motion's own
     plots = watched.page.locator(".plot .name").all_text_contents()
     assert plots[0].startswith("attitude error") and any("joint torques" in p for p in plots)
     # The cursor moves with the slider, and a click moves the slider.
@@ -198,7 +201,7 @@ def on_screen(watched, points):
 @pytest.mark.parametrize(("width", "height"), [(400, 800), (1024, 700), (1280, 720)])
 def test_all_of_the_motion_is_within_the_view(settled, watched, width, height):
     """Robot, target and tips of forces lie in what the panels leave free, and fill it well."""
-    robot, motion, _ = settled
+    _, motion, _ = settled
     watched.page.set_viewport_size({"width": width, "height": height})
     watched.page.wait_for_timeout(300)
     points = watched.do("JSON.parse(document.getElementById('data').textContent).points")
@@ -217,8 +220,26 @@ def test_all_of_the_motion_is_within_the_view(settled, watched, width, height):
     assert (body > low).all() and (body < high).all()
 
 
+def test_a_camera_that_was_taken_stays_where_it_was_put(settled, browser):
+    watched = Watched(browser, settled[2].as_uri() + "#pause", size=(960, 600))
+    at = "viewer.camera.position.toArray()"
+    framed = watched.do(at)
+    watched.page.set_viewport_size({"width": 500, "height": 600})
+    watched.page.wait_for_timeout(200)
+    assert not np.allclose(watched.do(at), framed)
+    watched.page.mouse.move(150, 300)
+    watched.page.mouse.down()
+    watched.page.mouse.move(220, 320, steps=3)
+    watched.page.mouse.up()
+    put = watched.do(at)
+    watched.page.set_viewport_size({"width": 960, "height": 600})
+    watched.page.wait_for_timeout(200)
+    np.testing.assert_allclose(watched.do(at), put, atol=1e-6)
+    watched.page.close()
+
+
 def test_forces_trails_and_the_legend(settled, watched):
-    _, motion, _ = settled
+    robot, motion, _ = settled
     for kind, part in (("torque", ".children[0]"), ("force", "")):
         node = f"viewer.scene_tree.find(['meshcat', 'wrench', '{kind}']).object.children[0]{part}"
         lengths = []
@@ -243,6 +264,26 @@ def test_forces_trails_and_the_legend(settled, watched):
             lengths.append(np.linalg.norm(arrow) / np.linalg.norm(pushed))
             np.testing.assert_allclose(arrow / lengths[-1], pushed, rtol=1e-4, atol=1e-3)
         assert lengths[0] == pytest.approx(lengths[1], rel=1e-4)
+    # Trails are drawn as far as tool and centre of mass have come, and by a line's width exact.
+    model, data = robot.model, robot.model.createData()
+    for t in (2.0, 9.0):
+        watched.do(f"fflin.seek({t})")
+        q = motion.q[np.argmin(np.abs(motion.t - t))]
+        com = pin.centerOfMass(model, data, q).copy()
+        pin.framesForwardKinematics(model, data, q)
+        tool = data.oMf[model.getFrameId("tool")].translation
+        for name, expected in (("tool", tool), ("centre of mass", com)):
+            end = watched.do(f"""(() => {{
+                const trail = viewer.scene_tree.find(['meshcat', 'trails', '{name}']).object;
+                const tube = trail.children[0].children[1].geometry, around = 6;
+                const ring = tube.drawRange.count / (6 * around), at = tube.attributes.position;
+                const sum = new MeshCat.THREE.Vector3(), p = new MeshCat.THREE.Vector3();
+                for (let k = 0; k < around; k++) {{
+                    sum.add(p.fromBufferAttribute(at, ring * (around + 1) + k));
+                }}
+                return sum.divideScalar(around).toArray();
+            }})()""")
+            np.testing.assert_allclose(end, expected, atol=0.01)
     box = watched.page.get_by_label("path of the tool")
     trail = "viewer.scene_tree.find(['meshcat', 'trails', 'tool']).object.visible"
     assert watched.do(trail)
@@ -332,6 +373,18 @@ def test_a_lab_with_meshes_plumes_and_a_prediction(robots, browser, tmp_path):
         "viewer.scene_tree.find(['meshcat', 'robot', 'root_joint', 'plume 0']).object.children[0]"
     )
     assert watched.do(f"{node}.visible")
+    # The gas leaves the thruster against its push.
+    gas = watched.do(f"""(() => {{
+        viewer.scene.updateMatrixWorld(true);
+        const m = {node}.children[0].matrixWorld, V = MeshCat.THREE.Vector3;
+        const [at, to] = [[0, 0, 0], [0, -1, 0]].map((p) => new V(...p).applyMatrix4(m));
+        return [at, to].map((p) => [p.x, -p.z, p.y]);
+    }})()""")
+    link = placements(robot, motion.q[index])["root_joint"]
+    link = link * robot.model.frames[robot.model.getFrameId("panda_link0")].placement
+    np.testing.assert_allclose(gas[0], link.act(np.array([0.1, 0, 0])), atol=EXACT)
+    away = np.subtract(gas[1], gas[0])
+    np.testing.assert_allclose(away / np.linalg.norm(away), -link.rotation[:, 2], atol=EXACT)
     strong = watched.do(f"{node}.children[0].scale.y")
     watched.do("fflin.seek(2)")
     assert watched.do(f"{node}.children[0].scale.y") < strong

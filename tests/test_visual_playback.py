@@ -6,8 +6,8 @@ import pytest
 from conftest import random_point, random_pose
 
 import fflin
-from fflin.model import ROOT
 from fflin.film import subtitle
+from fflin.model import ROOT
 from fflin.panel import errors, panel
 from fflin.playback import play_back, thrusters
 
