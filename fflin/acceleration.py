@@ -15,6 +15,8 @@ from fflin.stabilizability import require_stabilizable
 from fflin.validation import Array
 from fflin.weights import Weight, weight
 
+_BEYOND = "the weights or dt are beyond what numbers hold: scale Qp, Qv and Ra nearer to each other"
+
 
 class _Channel(NamedTuple):
     """Gains, blocks of P and poles of every double integrator, an entry each."""
@@ -87,7 +89,9 @@ def acceleration_lqr(
             ("Ra", Ra, velocities),
         )
     )
-    channel = _sampled(rates, qp, qv, ra, lin.dt) if lin.dt else _continuous(rates, qp, qv, ra)
+    with np.errstate(all="ignore"):
+        channel = _sampled(rates, qp, qv, ra, lin.dt) if lin.dt else _continuous(rates, qp, qv, ra)
+    _require_sound(channel, lin.dt)
     inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
     K = inverse @ np.hstack((np.diag(channel.kp), np.diag(channel.kd)))
     P = np.block(
@@ -101,10 +105,21 @@ def acceleration_lqr(
     hold = np.vstack((np.diag(0.5 * lin.dt**2 * rates), lin.dt * np.eye(m)))
     by_acceleration = hold if lin.dt else np.vstack((np.zeros((m, m)), np.eye(m)))
     equation = Riccati(lin.A, by_acceleration, Q, np.diag(ra), None, lin.dt)
-    residual = equation.trial(P).residual
     R = L.T @ (ra[:, None] * L)
+    try:
+        with np.errstate(all="ignore"):
+            residual = equation.trial(P).residual
+    except np.linalg.LinAlgError:
+        raise InputError(_BEYOND) from None
     solution = Solution(P, K, channel.poles, residual, "closed form")
     return make_gain(lin, solution, Q, 0.5 * (R + R.T), None)
+
+
+def _require_sound(channel: _Channel, dt: float) -> None:
+    poles = channel.poles
+    stable = np.abs(poles) < 1.0 if dt else poles.real < 0.0
+    if not stable.all() or not all(np.isfinite(part).all() for part in channel):
+        raise InputError(_BEYOND)
 
 
 def _integrators(lin: LinearModel) -> tuple[Array, Array]:

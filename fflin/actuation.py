@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from fflin.errors import InputError
 from fflin.frames import find_frame
@@ -108,6 +109,16 @@ class Actuation:
         self._of_carried = [at for items in carried.values() for at, _ in items]
 
     @property
+    def fixed(self) -> Array:
+        """Generalised force (6 + n, nu) of the inputs that the configuration does not change."""
+        return self._fixed
+
+    @property
+    def wrench_columns(self) -> list[tuple[int, NDArray[np.intp], Array]]:
+        """By joint: the inputs that it carries, and their wrenches (6, ..) in its frame."""
+        return self._carried
+
+    @property
     def carried(self) -> bool:
         """Whether an input's column depends on the configuration."""
         return bool(self._carried)
@@ -129,12 +140,12 @@ class Actuation:
         return columns
 
     def in_base_axes(self, chart: Chart, u: Array) -> Array:
-        """Return u (nu,) with what is held in reference axes in base axes."""
+        """Return u (.., nu) with what is held in reference axes in base axes."""
         if not self.held:
             return u
         u = u.copy()
         for held in self.held:
-            u[held.columns] = chart.R.T @ u[held.columns]
+            u[..., held.columns] = (chart.R.mT @ u[..., held.columns, None])[..., 0]
         return u
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:

@@ -56,6 +56,13 @@ class Equilibrium:
         self.u.setflags(write=False)
         self.residual.setflags(write=False)
 
+    def __str__(self) -> str:
+        from fflin.reports import signals
+
+        if not self.u.any():
+            return "u: all zero"
+        return signals("u", self.u, self.input_names, self.input_units)
+
 
 def equilibrium(
     robot: Robot,

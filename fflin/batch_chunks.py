@@ -14,13 +14,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.batch_inertia import BatchInertia, Rows, pays
+from fflin.batch_inertia import BatchInertia, Rows
 from fflin.errors import FflinError, FflinWarning
+from fflin.kernel_code import pays
 from fflin.linearization import Linearizer
 from fflin.model import Robot
 from fflin.validation import Array
 
 if TYPE_CHECKING:
+    from fflin.batch_equations import BatchEquations
     from fflin.state import Frame
 
 
@@ -110,9 +112,7 @@ class ChunkJob:
             out = {key: np.empty((len(points.q), *shape)) for key, shape in self.shapes.items()}
         if self.only_inertia:
             return Chunk(dict(out), self._at_rest(points.q, start, out["B_lower"]))
-        with _caught() as notes:
-            self._anywhere(points, start, out)
-        return Chunk(dict(out), [str(note.message) for note in notes])
+        return Chunk(dict(out), self._anywhere(points, start, out))
 
     def _at_rest(self, q: Array, start: int, out: Array) -> list[str]:
         actuation, state = self.linearizer._actuation, self.linearizer._map
@@ -140,18 +140,38 @@ class ChunkJob:
                 np.matmul(inverse[row], actuation.columns(data, still), out=out[row])
         return [str(note.message) for note in notes]
 
-    def _anywhere(self, points: Points, start: int, out: Mapping[str, Array]) -> None:
+    def _anywhere(self, points: Points, start: int, out: Mapping[str, Array]) -> list[str]:
         nv = self.linearizer._map.nx // 2
-        for row, q in enumerate(points.q):
-            v, u = (None if rows is None else rows[row] for rows in (points.v, points.u))
-            try:
-                lin = self.linearizer(q, v, u)
-            except FflinError as error:
-                raise type(error)(f"configuration {start + row}: {error}") from None
-            for key, array in out.items():
-                array[row] = (
-                    lin.B[nv:] if key == "B_lower" else getattr(lin, _ATTRIBUTES.get(key, key))
-                )
+        left: Rows = np.arange(len(points.q))
+        if self._equations is not None:
+            left = self._equations.write(*points, out)
+        if not len(left):
+            return []
+        with _caught() as notes:
+            for row in left.tolist():
+                q, v, u = (None if rows is None else rows[row] for rows in points)
+                try:
+                    lin = self.linearizer(q, v, u)
+                except FflinError as error:
+                    raise type(error)(f"configuration {start + row}: {error}") from None
+                for key, array in out.items():
+                    array[row] = (
+                        lin.B[nv:] if key == "B_lower" else getattr(lin, _ATTRIBUTES.get(key, key))
+                    )
+        return [str(note.message) for note in notes]
+
+    @property
+    def parallel(self) -> bool:
+        """Whether threads do chunks at the same time."""
+        return self.only_inertia or self._equations is not None
+
+    @cached_property
+    def _equations(self) -> BatchEquations | None:
+        from fflin.batch_equations import BatchEquations
+
+        if not (pays(self._count) and BatchEquations.possible(self.linearizer)):
+            return None
+        return BatchEquations(self.linearizer)
 
     @cached_property
     def _inertia(self) -> BatchInertia:

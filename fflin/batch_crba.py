@@ -16,19 +16,8 @@ import numba
 import numpy as np
 
 from fflin.batch_tree import INERTIA, LANES, PLACE
+from fflin.lane_vectors import add, add3, get3, put3
 from fflin.lanes import floor, gather, load, splat, store
-
-
-@numba.njit(forceinline=True)
-def _put3(work, at, x, y, z):
-    store(work, at, x)
-    store(work, at + LANES, y)
-    store(work, at + 2 * LANES, z)
-
-
-@numba.njit(forceinline=True)
-def _get3(work, at):
-    return load(work, at), load(work, at + LANES), load(work, at + 2 * LANES)
 
 
 @numba.njit(forceinline=True)
@@ -73,30 +62,30 @@ def _cosine_and_sine(x):
 @numba.njit(forceinline=True)
 def _place(work, at, parent, fixed, cosine, sine, shift):
     """Write the place of a body into `work` at `at`, that of its parent being at `parent`."""
-    ax, ay, az = _get3(work, parent)
-    bx, by, bz = _get3(work, parent + 3 * LANES)
-    cx, cy, cz = _get3(work, parent + 6 * LANES)
+    ax, ay, az = get3(work, parent)
+    bx, by, bz = get3(work, parent + 3 * LANES)
+    cx, cy, cz = get3(work, parent + 6 * LANES)
     ux, uy, uz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[0], fixed[3], fixed[6])
     vx, vy, vz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[1], fixed[4], fixed[7])
     zx, zy, zz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[2], fixed[5], fixed[8])
     dx, dy, dz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[9], fixed[10], fixed[11])
     x = cosine * ux + sine * vx, cosine * uy + sine * vy, cosine * uz + sine * vz
     y = cosine * vx - sine * ux, cosine * vy - sine * uy, cosine * vz - sine * uz
-    _put3(work, at, *x)
-    _put3(work, at + 3 * LANES, *y)
-    _put3(work, at + 6 * LANES, zx, zy, zz)
-    _put3(work, at + 9 * LANES, dx + shift * zx, dy + shift * zy, dz + shift * zz)
+    put3(work, at, *x)
+    put3(work, at + 3 * LANES, *y)
+    put3(work, at + 6 * LANES, zx, zy, zz)
+    put3(work, at + 9 * LANES, dx + shift * zx, dy + shift * zy, dz + shift * zz)
 
 
 @numba.njit(forceinline=True)
 def _inertia(work, at, place, body):
     """Write a body's inertia about its joint: m, m c, and R I R^T by way of the columns of R I."""
-    ax, ay, az = _get3(work, place)
-    bx, by, bz = _get3(work, place + 3 * LANES)
-    cx, cy, cz = _get3(work, place + 6 * LANES)
+    ax, ay, az = get3(work, place)
+    bx, by, bz = get3(work, place + 3 * LANES)
+    cx, cy, cz = get3(work, place + 6 * LANES)
     hx, hy, hz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[1], body[2], body[3])
     store(work, at, splat(body[0]))
-    _put3(work, at + LANES, hx, hy, hz)
+    put3(work, at + LANES, hx, hy, hz)
     ux, uy, uz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[4], body[5], body[6])
     vx, vy, vz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[5], body[7], body[8])
     wx, wy, wz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[6], body[8], body[9])
@@ -107,34 +96,34 @@ def _inertia(work, at, place, body):
     )
     yy, yz = uy * ay + vy * by + wy * cy, uy * az + vy * bz + wy * cz
     zz = uz * az + vz * bz + wz * cz
-    _put3(work, at + 4 * LANES, xx, xy, xz)
-    _put3(work, at + 7 * LANES, yy, yz, zz)
+    put3(work, at + 4 * LANES, xx, xy, xz)
+    put3(work, at + 7 * LANES, yy, yz, zz)
 
 
 @numba.njit(forceinline=True)
 def _carry(work, at, above, place):
     """Add a composite inertia, seen from the parent's joint, to the parent's."""
     m = load(work, at)
-    hx, hy, hz = _get3(work, at + LANES)
-    xx, xy, xz = _get3(work, at + 4 * LANES)
-    yy, yz, zz = _get3(work, at + 7 * LANES)
-    dx, dy, dz = _get3(work, place + 9 * LANES)
+    hx, hy, hz = get3(work, at + LANES)
+    xx, xy, xz = get3(work, at + 4 * LANES)
+    yy, yz, zz = get3(work, at + 7 * LANES)
+    dx, dy, dz = get3(work, place + 9 * LANES)
     ex, ey, ez = hx + m * dx, hy + m * dy, hz + m * dz
     px, py, pz = dx * (hx + ex), dy * (hy + ey), dz * (hz + ez)
-    _add(work, above, m)
-    _add3(work, above + LANES, ex, ey, ez)
+    add(work, above, m)
+    add3(work, above + LANES, ex, ey, ez)
     xx, xy, xz = xx + (py + pz), xy - (dx * ey + hx * dy), xz - (dx * ez + hx * dz)
-    _add3(work, above + 4 * LANES, xx, xy, xz)
-    _add3(work, above + 7 * LANES, yy + (px + pz), yz - (dy * ez + hy * dz), zz + (px + py))
+    add3(work, above + 4 * LANES, xx, xy, xz)
+    add3(work, above + 7 * LANES, yy + (px + pz), yz - (dy * ez + hy * dz), zz + (px + py))
 
 
 @numba.njit(forceinline=True)
-def _momentum(work, at, x, y, z, turns, slides):
+def momentum(work, at, x, y, z, turns, slides):
     """Return the momentum (angular, linear) about its joint of an inertia that the joint moves."""
     m = load(work, at)
-    hx, hy, hz = _get3(work, at + LANES)
-    xx, xy, xz = _get3(work, at + 4 * LANES)
-    yy, yz, zz = _get3(work, at + 7 * LANES)
+    hx, hy, hz = get3(work, at + LANES)
+    xx, xy, xz = get3(work, at + 4 * LANES)
+    yy, yz, zz = get3(work, at + 7 * LANES)
     w, v = splat(turns), splat(slides)
     kx, ky, kz = hy * z - hz * y, hz * x - hx * z, hx * y - hy * x
     return (
@@ -148,28 +137,14 @@ def _momentum(work, at, x, y, z, turns, slides):
 
 
 @numba.njit(forceinline=True)
-def _add(work, at, value):
-    store(work, at, load(work, at) + value)
-
-
-@numba.njit(forceinline=True)
-def _add3(work, at, x, y, z):
-    _add(work, at, x)
-    _add(work, at + LANES, y)
-    _add(work, at + 2 * LANES, z)
-
-
-@numba.njit(forceinline=True)
-def assemble(work, tree, q, first, stride):
-    """Write the packed M: places and inertias outwards, composite inertias inwards."""
+def outwards(work, tree, q, first, stride):
+    """Write the places of all bodies and their own inertias, outwards."""
     bodies = len(tree.parent)
-    places, inertias, packed = tree.places, tree.inertias, tree.packed
+    places, inertias = tree.places, tree.inertias
     one, zero = splat(1.0), splat(0.0)
-    _put3(work, places, one, zero, zero)
-    _put3(work, places + 3 * LANES, zero, one, zero)
-    _put3(work, places + 6 * LANES, zero, zero, one)
-    for index in range(tree.entries):
-        store(work, packed + index * LANES, zero)
+    put3(work, places, one, zero, zero)
+    put3(work, places + 3 * LANES, zero, one, zero)
+    put3(work, places + 6 * LANES, zero, zero, one)
     _inertia(work, inertias, places, tree.bodies[0])
     for body in range(1, bodies):
         at = places + body * PLACE * LANES
@@ -185,34 +160,44 @@ def assemble(work, tree, q, first, stride):
         above = places + tree.parent[body] * PLACE * LANES
         _place(work, at, above, tree.fixed[body], cosine, sine, shift)
         _inertia(work, inertias + body * INERTIA * LANES, at, tree.bodies[body])
+
+
+@numba.njit(forceinline=True)
+def inwards(work, tree):
+    """Write the packed M, and turn the inertias into composite ones, inwards."""
+    bodies = len(tree.parent)
+    places, inertias, packed = tree.places, tree.inertias, tree.packed
+    zero = splat(0.0)
+    for index in range(tree.entries):
+        store(work, packed + index * LANES, zero)
     pair = 0
     for body in range(bodies - 1, 0, -1):
         at = inertias + body * INERTIA * LANES
         place = places + body * PLACE * LANES
-        x, y, z = _get3(work, place + 6 * LANES)
-        nx, ny, nz, fx, fy, fz = _momentum(work, at, x, y, z, tree.turns[body], tree.slides[body])
+        x, y, z = get3(work, place + 6 * LANES)
+        nx, ny, nz, fx, fy, fz = momentum(work, at, x, y, z, tree.turns[body], tree.slides[body])
         _carry(work, at, inertias + tree.parent[body] * INERTIA * LANES, place)
         above = body
         while above > 0:
             place = places + above * PLACE * LANES
-            x, y, z = _get3(work, place + 6 * LANES)
+            x, y, z = get3(work, place + 6 * LANES)
             value = splat(tree.turns[above]) * (x * nx + y * ny + z * nz)
             value = value + splat(tree.slides[above]) * (x * fx + y * fy + z * fz)
-            _add(work, packed + tree.target[pair] * LANES, splat(tree.share[pair]) * value)
+            add(work, packed + tree.target[pair] * LANES, splat(tree.share[pair]) * value)
             pair += 1
             # From here on about the joint of the parent.
-            dx, dy, dz = _get3(work, place + 9 * LANES)
+            dx, dy, dz = get3(work, place + 9 * LANES)
             nx = nx + (dy * fz - dz * fy)
             ny = ny + (dz * fx - dx * fz)
             nz = nz + (dx * fy - dy * fx)
             above = tree.parent[above]
         start, share = packed + tree.target[pair] * LANES, splat(tree.share[pair])
         pair += 1
-        _add3(work, start, share * nx, share * ny, share * nz)
-        _add3(work, start + 3 * LANES, share * fx, share * fy, share * fz)
+        add3(work, start, share * nx, share * ny, share * nz)
+        add3(work, start + 3 * LANES, share * fx, share * fy, share * fz)
     # Of the base: I, [m c]x, m, in the rows of a chain of six.
     m = load(work, inertias)
-    hx, hy, hz = _get3(work, inertias + LANES)
+    hx, hy, hz = get3(work, inertias + LANES)
     rows = (
         load(work, inertias + 4 * LANES),
         load(work, inertias + 5 * LANES),
@@ -238,3 +223,6 @@ def assemble(work, tree, q, first, stride):
     )
     for index in range(21):
         store(work, packed + index * LANES, rows[index])
+    for index in range(len(tree.row)):
+        at = packed + (tree.row[index] + tree.depth[index]) * LANES
+        add(work, at, splat(tree.armature[index]))

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import os
-import sys
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -15,20 +10,15 @@ from numpy.typing import NDArray
 from fflin.batch_tree import LANES, batch_tree
 from fflin.errors import SingularInertiaError
 from fflin.inertia import Inertia
+from fflin.kernel_code import kernel
 from fflin.model import Robot
 from fflin.state import StateMap
 from fflin.validation import Array
 
-# The kernel beats the loop from here on; where numba is not loaded yet, that takes as long as the
-# loop over some thousands of configurations.
-_BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
-
 # The kernel has sines of angles up to here [rad].
-_FARTHEST = 1e6
+FARTHEST = 1e6
 
 Rows: TypeAlias = NDArray[np.integer[Any]]
-
-_log = logging.getLogger("fflin")
 
 
 class BatchInertia:
@@ -82,11 +72,11 @@ class BatchInertia:
         space = np.empty(self._tree.size + LANES)
         # Its vectors are 64 bytes; where they begin at such an address it is faster.
         space = space[-(space.ctypes.data // 8) % LANES :]
-        _kernel()(self._tree, q, out.reshape(len(q), -1), couplings, space)
+        kernel("batch_kernel", "invert")(self._tree, q, out.reshape(len(q), -1), couplings, space)
         # Written so that NaN, from a pivot that is zero, is among them.
         good = (self._inertia.least_coupling < couplings) & (couplings < Inertia.warning_coupling)
-        if not -_FARTHEST < q.min() <= q.max() < _FARTHEST:
-            good &= (np.abs(q[:, 7:]) < _FARTHEST).all(axis=1)
+        if not -FARTHEST < q.min() <= q.max() < FARTHEST:
+            good &= (np.abs(q[:, 7:]) < FARTHEST).all(axis=1)
         return np.flatnonzero(~good)
 
     def loop(self, q: Array, out: Array, rows: Rows) -> None:
@@ -96,31 +86,3 @@ class BatchInertia:
                 self._inertia.invert(q[row], out[row])
             except SingularInertiaError as error:
                 raise SingularInertiaError(f"configuration {row}: {error}") from None
-
-
-def available_threads() -> int:
-    """How many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def pays(count: int) -> bool:
-    """Whether the kernel is there and beats the loop over so many points."""
-    if "numba" in sys.modules:
-        return count >= _BREAK_EVEN
-    return count >= _BREAK_EVEN_UNLOADED and find_spec("numba") is not None
-
-
-def _kernel() -> Any:
-    """Return the kernel, compiled at the first call ever and kept on disk."""
-    from fflin import batch_kernel
-
-    kernel = batch_kernel.invert
-    if not kernel.signatures:
-        folder = Path(kernel.stats.cache_path)
-        source = Path(batch_kernel.__file__).stat().st_mtime
-        kept = [entry.stat().st_mtime for entry in folder.glob("batch_kernel.invert-*.nbi")]
-        if not any(time > source for time in kept):
-            _log.warning("fflin: compiling the batch kernel, once; it is kept in %s", folder)
-    return kernel

@@ -8,15 +8,14 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, section 6.5.
 from __future__ import annotations
 
 import numba
-import numpy as np
 
-from fflin.batch_crba import assemble
+from fflin.batch_crba import inwards, outwards
 from fflin.batch_tree import LANES
-from fflin.lanes import load, splat, store, transpose
+from fflin.lanes import load, scatter, splat, store, transpose
 
 
 @numba.njit(forceinline=True)
-def _factorise(work, tree):
+def factorise(work, tree):
     """Turn the packed M into U = L^-1 and V = L^-1 D^-1 with M = L^T D L, L of unit diagonal.
 
     The sparse factorisation of Featherstone, from the tips to the base, which makes no entry that
@@ -56,7 +55,7 @@ def _factorise(work, tree):
 
 
 @numba.njit(forceinline=True)
-def _multiply(work, tree, couplings, first):
+def multiply(work, tree, couplings, first):
     """Write M^-1 = U D^-1 U^T lane beside lane, and sum M_ii (M^-1)_ii."""
     packed, scaled, square = tree.packed, tree.scaled, tree.square
     size = len(tree.row)
@@ -73,6 +72,18 @@ def _multiply(work, tree, couplings, first):
             if i == j:
                 coupling = coupling + total * load(work, tree.diagonal + i * LANES)
     store(couplings, first, coupling)
+
+
+@numba.njit(forceinline=True)
+def unpack(work, start, entries, out, first, offset):
+    """Write entries that stand lane beside lane to the rows of eight points, from a column on."""
+    flat, stride = out.reshape(-1), out.shape[1]
+    whole = entries - entries % LANES
+    to = first * stride + offset
+    for entry in range(0, whole, LANES):
+        transpose(work, start + entry * LANES, flat, to + entry, stride)
+    for entry in range(whole, entries):
+        scatter(flat, to + entry, stride, load(work, start + entry * LANES))
 
 
 @numba.njit(nogil=True, cache=True, boundscheck=False)
@@ -93,17 +104,12 @@ def invert(tree, q, out, couplings, work):
     """
     count, entries = out.shape
     stride = q.shape[1]
-    configurations, flat, tail = q.reshape(-1), out.reshape(-1), np.empty(LANES)
-    whole = entries - entries % LANES
+    configurations = q.reshape(-1)
     for block in range(0, count, LANES):
         # The last are the last there are, some of them for the second time.
         first = min(block, count - LANES)
-        assemble(work, tree, configurations, first * stride, stride)
-        _factorise(work, tree)
-        _multiply(work, tree, couplings, first)
-        for entry in range(0, whole, LANES):
-            transpose(work, tree.square + entry * LANES, flat, first * entries + entry, entries)
-        for entry in range(whole, entries):
-            store(tail, 0, load(work, tree.square + entry * LANES))
-            for lane in range(LANES):
-                out[first + lane, entry] = tail[lane]
+        outwards(work, tree, configurations, first * stride, stride)
+        inwards(work, tree)
+        factorise(work, tree)
+        multiply(work, tree, couplings, first)
+        unpack(work, tree.square, entries, out, first, 0)

@@ -37,6 +37,12 @@ class Tree(NamedTuple):
         Turn and displacement along z for a unit of the joint's coordinate.
     bodies : ndarray (bodies, 10)
         Mass, times centre, and inertia about the joint's origin (xx xy xz yy yz zz).
+    axes : ndarray (bodies, 3, 3)
+        Rotation of the frame in which all this stands, z along the joint's axis, in Pinocchio's.
+    coordinate, factor : ndarray (bodies,)
+        The coordinate that moves each, and how far it moves for a unit of it.
+    armature : ndarray (6 + n,)
+        Inertia of rotors, which the diagonal of M has besides.
     target, share : ndarray (pairs,)
         For every body, and for every body from it inwards: the entry of the packed M that it adds
         to, and how often; last, of the base, the first of six entries.
@@ -57,6 +63,10 @@ class Tree(NamedTuple):
     turns: Any
     slides: Any
     bodies: Any
+    axes: Any
+    coordinate: Any
+    factor: Any
+    armature: Any
     target: Any
     share: Any
     row: Any
@@ -129,6 +139,10 @@ def _tree(robot: Robot) -> Tree | None:
         turns,
         slides,
         inertias,
+        np.array([place.rotation for place in places]),
+        np.array(coordinate),
+        np.array(factor),
+        _armature(model, coordinate, factor),
         np.array(target, dtype=np.intp),
         np.array(share, dtype=float),
         row,
@@ -175,6 +189,17 @@ def _coordinates(robot: Robot) -> tuple[list[int], list[float]]:
         at[joint.idx_v] = (at[leader.idx_v][0], multiplier)
     moved = [at[joint.idx_v] for joint in robot.model.joints.tolist()[ROOT + 1 :]]
     return [5, *(index for index, _ in moved)], [1.0, *(factor for _, factor in moved)]
+
+
+def _armature(model: pin.Model, coordinate: list[int], factor: list[float]) -> Array:
+    """Return what the rotors of all joints that move with each coordinate add to M."""
+    of_joints = model.armature
+    armature = np.zeros(1 + max(coordinate))
+    armature[:3], armature[3:6] = of_joints[3:6], of_joints[:3]
+    joints = model.joints.tolist()[ROOT + 1 :]
+    for joint, index, share in zip(joints, coordinate[1:], factor[1:], strict=True):
+        armature[index] += share**2 * of_joints[joint.idx_v]
+    return armature
 
 
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:

@@ -12,7 +12,7 @@ from fflin.errors import DetectabilityError, InputError, MissingPackageError
 from fflin.linear_model import LinearModel
 from fflin.regulator import Gain, require_fixed_point
 from fflin.validation import Array
-from fflin.weights import Weight, cross_weight, weight
+from fflin.weights import Weight, columns, weight
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -272,10 +272,8 @@ _FROM_MODEL = (
 def _disturbance(lin: LinearModel, W: Weight, G: ArrayLike | None) -> Array:
     if G is None:
         return weight("W", W, lin.state_names)
-    if np.ndim(G) != 2:
-        raise InputError(f"G has shape {np.shape(G)}, expected ({len(lin.A)}, nw)")
-    count = np.shape(G)[1]
-    through = cross_weight("G", G, len(lin.A), count)
+    through = columns("G", G, len(lin.A))
+    count = through.shape[1]
     same = np.array_equal(through, lin.B)
     names = lin.input_names if same else [f"w_{i + 1}" for i in range(count)]
     spread = through @ weight("W", W, names) @ through.T

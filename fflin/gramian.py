@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,7 +45,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
         W_o = \int_0^T e^{A^T t} C^T C e^{A t}\,dt,
 
     or the sums over the samples of a sampled model. Over all time they solve Lyapunov's
-    equations; over a horizon they are built by doubling a short step,
+    equations. Over a horizon they are polynomials of it at rest, where :math:`A^2 = 0`, and
+    elsewhere built by doubling a short step,
     :math:`W(2 t) = W(t) + e^{A t} W(t) e^{A^T t}`.
 
     Parameters
@@ -114,23 +114,9 @@ def _finite(A: Array, Q: Array, dt: float, duration: float) -> Array:
         if not steps or abs(steps * dt - duration) > 1e-9 * duration:
             raise InputError(f"duration is {duration:g} s, expected a multiple of dt = {dt:g} s")
         return _summed(A, Q, steps)
-    from scipy.linalg import expm
+    from fflin.sampling import held_cost
 
-    size = len(A)
-    # Halved until the exponential of -A cannot grow.
-    growth = float(np.linalg.norm(A, 1)) * duration
-    halvings = max(0, math.ceil(math.log2(growth)) + 1) if growth > 0.0 else 0
-    block = np.block([[-A, Q], [np.zeros_like(A), A.T]]) * (duration / 2.0**halvings)
-    exponential = expm(block)
-    step: Array = exponential[size:, size:].T
-    return _doubled(step, step @ exponential[:size, size:], halvings)
-
-
-def _doubled(step: Array, W: Array, times: int) -> Array:
-    for _ in range(times):
-        W = W + step @ W @ step.T
-        step = step @ step
-    return W
+    return held_cost(A.T, Q, duration)
 
 
 def _summed(A: Array, Q: Array, steps: int) -> Array:

@@ -129,6 +129,22 @@ def gather(typing: Any, array: Any, index: Any, stride: Any) -> Any:
 
 
 @intrinsic
+def scatter(typing: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
+    """Write eight doubles to a contiguous array, `stride` apart, from an index on."""
+
+    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
+        values, first, step, eight = arguments
+        for lane in range(LANES):
+            shift = builder.mul(step, ir.Constant(step.type, lane))
+            place = _pointer(context, builder, array, values, builder.add(first, shift))
+            builder.store(builder.extract_element(eight, _INT32(lane)), place)
+        return context.get_dummy_value()
+
+    index_type = numba.types.intp
+    return numba.types.void(array, index_type, index_type, lanes), generate
+
+
+@intrinsic
 def floor(typing: Any, value: Any) -> Any:
     """Round every lane down to a whole number."""
 

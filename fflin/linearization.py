@@ -22,7 +22,7 @@ from fflin.outputs import FullState
 from fflin.rates import Accelerations, Rates
 from fflin.rotation import skew
 from fflin.state import ANGULAR, LINEAR, Chart, Frame, StateMap
-from fflin.state_equations import STANDING, at_rest, state_equations
+from fflin.state_equations import STANDING, Point, at_rest, ride_along, state_equations
 from fflin.symmetry import ignorable_states
 from fflin.validation import Array, vector
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from fflin.sensing import Sensing
 
 # Sum of squares beyond which a matrix counts as not finite: its eigenvalues would not be.
-_LARGEST = 1e200
+LARGEST = 1e200
 
 
 class Linearizer:
@@ -198,34 +198,31 @@ class Linearizer:
         nu, q_m = state.velocities(v), state.joint_positions(q)
         u_base = self._actuation.in_base_axes(chart, u)
         rates = self._accelerations.rates(q, v, nu, q_m, u_base)
-        A, B, f0 = state_equations(self._A_rest, state, self._actuation, chart, rates, nu, u_base)
+        A, B = self._A_rest.copy(), np.zeros(self._shape_B)
+        A[self._lower, groups.q_m] = rates.by_q_m
+        A[self._lower, self._lower] = rates.by_nu
+        B[self._lower] = rates.by_u
+        point = Point(nu, u_base, rates.c, rates.gravity)
+        f0 = state_equations(state, self._actuation, chart, point, A, B[self._lower])
         x0: Array = np.zeros(state.nx)
         if chart is STANDING:
             x0[groups.q_m] = q_m
             x0[self._lower] = nu
         else:
             x0 = state.to_state(q, v)
-        if self._moving:
-            # The reference turns and flies with the point, so that the error does not.
-            turning = skew(nu[ANGULAR])
-            A[groups.q_b, groups.q_b] = A[groups.r_b, groups.r_b] = -turning
-            drift, weight = f0.copy(), float(rates.gravity.dot(rates.gravity))
-            if weight:
-                about = rates.gravity * (drift[groups.q_b].dot(rates.gravity) / weight)
-                drift[groups.q_b] -= about
-            f0[:] = 0.0
+        drift = ride_along(state, point, A, f0) if self._moving else None
         C, D, y0 = self._seen(chart, rates, q, v, u_base, x0)
         for array in (A, B, C, D, f0, x0, y0):
             flat = array.ravel()
-            if not flat.dot(flat) < _LARGEST:  # nor NaN
+            if not flat.dot(flat) < LARGEST:  # nor NaN
                 raise InputError("q, v or u is so large that the model is not finite")
             array.setflags(write=False)
-        point = {"A": A, "B": B, "C": C, "D": D, "f0": f0}
-        point |= {"x0": x0, "y0": y0, "u0": u, "q": q, "v": v}
-        point["_reference"] = self._reference_of(q)
-        if self._moving:
-            point["_drift"] = _frozen(drift)
-        return LinearModel._from_fields(self._common | point)
+        fields = {"A": A, "B": B, "C": C, "D": D, "f0": f0}
+        fields |= {"x0": x0, "y0": y0, "u0": u, "q": q, "v": v}
+        fields["_reference"] = self._reference_of(q)
+        if drift is not None:
+            fields["_drift"] = _frozen(drift)
+        return LinearModel._from_fields(self._common | fields)
 
     def _seen(
         self, chart: Chart, rates: Rates, q: Array, v: Array, u: Array, x0: Array

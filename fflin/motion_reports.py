@@ -50,8 +50,13 @@ def motion_report(motion: Motion, *, controlled: bool = True) -> str:
         f"momentum drift {motion.momentum_drift.max():.1e}"
     )
     if motion.linear is not None:
-        apart = np.abs(motion.x - motion.linear).max()
-        parts.append(f"largest difference from the linear model: {apart:.3g}")
+        apart = np.abs(motion.x - motion.linear).max(axis=0)
+        most = int(apart.argmax())
+        unit = motion.state_units[most].replace("1", "")
+        shown = f"{apart[most]:.3g} {unit}".rstrip()
+        parts.append(
+            f"largest difference from the linear model: {shown} in {motion.state_names[most]}"
+        )
     return "\n\n".join(parts[:-1]) + f"\n{parts[-1]}" if controlled else "\n".join(parts)
 
 

@@ -64,7 +64,8 @@ def with_rates(names: tuple[str, ...]) -> str:
     if not pairs:
         return ", ".join(names) or "none"
     alone = [name for name in names if name not in pairs and name not in pairs.values()]
-    return "; ".join((", ".join(pairs) + " and their rates", *alone))
+    rates = "its rate" if len(pairs) == 1 else "their rates"
+    return "; ".join((f"{', '.join(pairs)} and {rates}", *alone))
 
 
 def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int = 3) -> str:

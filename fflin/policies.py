@@ -150,6 +150,11 @@ class Allocation:
     policy: Any
     design: Robot
 
+    @property
+    def lin(self) -> LinearModel | None:
+        """The model that the policy was made for, where it has one; its inputs are the design's."""
+        return getattr(self.policy, "lin", None)
+
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
 
@@ -165,7 +170,7 @@ class Allocation:
                 f"the design's joints are not those of '{robot.name}'; allocate for the same robot"
             )
         inner = bound(self.policy, self.design)
-        lin = getattr(self.policy, "lin", None)
+        lin = self.lin
         asked, given = (
             StateMap(each, reference=lin.reference, frame=lin.frame) if lin else StateMap(each)
             for each in (self.design, robot)

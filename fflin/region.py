@@ -98,8 +98,9 @@ class Validity:
             f"displacement to the power {self.slope:.3f}",
             f"every loop settled up to {shown(self.holds)}: {self.inside} of {self.inside} runs, "
             f"so that at least {100.0 * self.inside_rate:.1f} % do ({sure} confidence)",
-            f"up to {shown(self.largest)} {self.settled} of {count} settled, {100.0 * low:.1f} to "
-            f"{100.0 * high:.1f} % ({sure} confidence)" + (f"; {failures}" if failures else ""),
+            f"of displacements up to {shown(self.largest)} {self.settled} of {count} runs settled: "
+            f"between {100.0 * low:.1f} and {100.0 * high:.1f} % do ({sure} confidence)"
+            + (f"; {failures}" if failures else ""),
         ]
         return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
 

@@ -22,8 +22,12 @@ if TYPE_CHECKING:
 
 _SHOWN_RESIDUALS = 6
 
-# A relative residual that a user should know of.
-_COARSE = 1e-8
+# Relative residuals that a user should know of, and beyond which a gain means nothing.
+_COARSE, _USELESS = 1e-8, 1e-3
+
+# A pole this near to the boundary of stability, relative to the others, may be one that Q leaves
+# on it, moved by rounding.
+_STILL = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -194,8 +198,8 @@ def require_fixed_point(lin: LinearModel) -> None:
     )
     more = f" and {len(rows) - _SHOWN_RESIDUALS} more" if len(rows) > _SHOWN_RESIDUALS else ""
     raise EquilibriumError(
-        f"the point is not a fixed point: {shown}{more}; linearise about one, or about a steady "
-        "motion with moving=True"
+        f"the point is not a fixed point: {shown}{more}; linearise about one, with the inputs of "
+        "fflin.equilibrium, or about a steady motion with moving=True"
     )
 
 
@@ -220,23 +224,41 @@ _FROM_MODEL = (
 )
 
 
+def _difference(a: Array, b: Array, c: Array) -> Array:
+    """Return a - b c with zeros for what is rounding."""
+    rounding = 1e3 * np.finfo(float).eps * (np.abs(a) + np.abs(b) @ np.abs(c))
+    difference = a - b @ c
+    return np.where(np.abs(difference) > rounding, difference, 0.0)
+
+
+def _still(poles: Any, dt: float) -> bool:
+    """Whether a pole of a stable loop hardly moves."""
+    decay = 1.0 - np.abs(poles) if dt else -poles.real
+    still: bool = decay.min() < _STILL * np.abs(poles - 1.0 if dt else poles).max()
+    return still
+
+
 def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
     from fflin.riccati import half_size, solve
     from fflin.stabilizability import require_stabilizable, require_weighed
 
     arguments = (lin.A, lin.B, Q, R, N, lin.dt)
-    solution = half_size(*arguments)
-    if solution is not None:
-        return solution
+    structured = half_size(*arguments)
+    if structured is not None and not _still(structured.poles, lin.dt):
+        return structured
     # Before a general solver fails without a word.
     require_stabilizable(lin)
     free, A = Q, lin.A
     if N is not None:
         toward = np.linalg.solve(R, N.T)
-        free, A = Q - N @ toward, A - lin.B @ toward
+        free, A = _difference(Q, N, toward), _difference(A, lin.B, toward)
     require_weighed(lin, A, free)
+    if structured is not None:
+        return structured
     try:
         solution = solve(*arguments)
+        if solution.residual > _USELESS:
+            raise np.linalg.LinAlgError("the weights are too badly scaled")
     except np.linalg.LinAlgError as error:
         raise StabilizabilityError(
             f"no stabilising solution of the Riccati equation was found: {error}; scale the "

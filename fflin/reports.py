@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from fflin.verification import Check, Row
 
 
+_LIMITS = "limits in rad, N m and rad/s; of a prismatic joint in m, N and m/s"
+
 # Below this rate [SI] nothing moves to speak of.
 _MOVES = 1e-9
 
@@ -38,8 +40,8 @@ def robot_info(robot: Robot) -> str:
     model = robot.model
     source = str(robot.urdf) if robot.urdf else "a Pinocchio model"
     head = (
-        f"{robot.name}: {robot.n} joints, {12 + 2 * robot.n} states, {6 + robot.n} inputs, "
-        f"mass {robot.mass:.6g} kg\nfrom {source}"
+        f"{robot.name}: {_counted(robot.n, 'joint')}, {12 + 2 * robot.n} states, "
+        f"{6 + robot.n} inputs, mass {robot.mass:.6g} kg\nfrom {source}"
     )
     depth = {0: -1, 1: 0}
     rows = [["joint", "type", "mass [kg]", "lower", "upper", "effort", "velocity"]]
@@ -77,7 +79,8 @@ def robot_info(robot: Robot) -> str:
     wrapped = textwrap.fill(
         ", ".join(dict.fromkeys(frames)), width(), initial_indent="  ", subsequent_indent="  "
     )
-    parts = [head, grid(rows, "ll"), f"frames\n{wrapped}"]
+    limited = any(cell != "." for row in rows[1:] for cell in row[3:])
+    parts = [head, grid(rows, "ll"), *[_LIMITS] * limited, f"frames\n{wrapped}"]
     if robot.notes:
         notes = (
             textwrap.fill(note, width(), initial_indent="  ", subsequent_indent="    ")
@@ -98,18 +101,22 @@ def linear_model(lin: LinearModel) -> str:
     point = "a fixed point" if stays else "not a fixed point"
     if stays and (lin.moving or f0.any()):
         point = "a relative equilibrium"
-    parts = [f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}, {point}"]
+    head = f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}, {point}"
+    if lin.dt:
+        head += f", sampled every {lin.dt:g} s"
+    parts = [f"{textwrap.fill(head, width(), subsequent_indent='  ')}\n{_units(lin)}"]
+    rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
     # Elsewhere the poles of a frozen model say nothing about stability.
     growing = modes(lin).unstable if stays and not lin.dt else []
     if growing:
         shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
         parts.append(textwrap.fill(f"unstable: poles with a positive real part {shown}", width()))
     moved = [
-        _signal(title, values, names, units)
+        signals(title, values, names, units)
         for title, values, names, units in (
             ("x0", lin.x0, lin.state_names, lin.state_units),
             ("u0", lin.u0, lin.input_names, lin.input_units),
-            ("f0", f0, lin.state_names, [f"{unit}/s" for unit in lin.state_units]),
+            ("f0", f0, lin.state_names, rates),
         )
         if values.any()
     ]
@@ -170,8 +177,9 @@ def modes_report(found: Modes) -> str:
     head = (
         f"{found.robot}: {_counted(found.rigid_body, 'rigid-body mode')} "
         f"({_counted(found.zero_eigenvalues, 'eigenvalue')} at zero), "
-        f"{_counted(vibrations, 'vibration')}, {_counted(others, 'real pole')}"
+        f"{_counted(vibrations, 'vibration')}"
     )
+    head += f", {_counted(others, 'real pole')}" if others else ""
     if not found.equilibrium:
         head += "; not an equilibrium, where eigenvalues are those of a frozen model"
     parts = [textwrap.fill(head, width())]
@@ -228,15 +236,51 @@ def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Seque
     return f"{size}; rows and columns of zeros are not shown\n\n{matrix(values, rows, columns)}"
 
 
-def _signal(title: str, values: Array, names: Sequence[str], units: Sequence[str]) -> str:
+def signals(title: str, values: Array, names: Sequence[str], units: Sequence[str]) -> str:
+    """Show what is not zero of a state, an input or a force, with its unit."""
+    # A line is broken between entries alone, not at the spaces within them.
     entries = [
-        f"{name} = {value:.6g}" + (f" {unit}" if unit != "1" else "")
+        f"{name}\xa0=\xa0{value:.6g}" + (f"\xa0{unit}" if unit != "1" else "")
         for name, value, unit in zip(names, values.tolist(), units, strict=True)
         if value
     ]
-    return textwrap.fill(
+    text = textwrap.fill(
         f"{title}: {', '.join(entries)}", width(), subsequent_indent=" " * (len(title) + 2)
     )
+    return text.replace("\xa0", " ")
+
+
+def _units(lin: LinearModel) -> str:
+    """Say the units of states, inputs and outputs, once for each group of them."""
+    lines = [("x", lin.state_names, lin.state_units), ("u", lin.input_names, lin.input_units)]
+    if lin.output_names != lin.state_names:
+        lines.append(("y", lin.output_names, lin.output_units))
+    return "\n".join(
+        textwrap.fill(f"{title}: {_grouped(names, units)}", width(), subsequent_indent="   ")
+        for title, names, units in lines
+    )
+
+
+def _grouped(names: Sequence[str], units: Sequence[str]) -> str:
+    # Names without a group, such as a thruster's, stand together as long as their unit is one.
+    groups: list[tuple[str, list[str], list[str]]] = []
+    for name, unit in zip(names, units, strict=True):
+        group = name.partition(".")[0] if name.count(".") == 1 else name.rpartition(".")[0]
+        last = groups[-1] if groups else None
+        if last and last[0] == group and (group or unit in last[2]):
+            last[1].append(name)
+            last[2].append(unit)
+        else:
+            groups.append((group, [name], [unit]))
+    return ", ".join(
+        f"{group or ' ... '.join(dict.fromkeys((members[0], members[-1])))} "
+        f"[{'|'.join(dict.fromkeys(of))}]"
+        for group, members, of in groups
+    )
+
+
+def _rate(unit: str) -> str:
+    return "1/s" if unit == "1" else f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
 
 
 def _error(row: Row) -> str:

@@ -87,7 +87,7 @@ class Riccati:
             defect += 0.5 * (second + second.T)
             size += _norm(second)
         residual = _norm(defect) / max(size, _TINY)
-        if not math.isfinite(residual):
+        if not math.isfinite(residual + size):
             raise np.linalg.LinAlgError("the weights or the model are beyond all numbers")
         return _Trial(P, defect, residual)
 
@@ -149,11 +149,15 @@ def solve(
     start = _attempt(equation)
     if start is not None and start.residual <= _SOUND:
         return start
-    general = None
-    # SciPy raises either where a pencil cannot be reordered.
-    with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
-        general = _finished(equation, *_refined(equation, _general(equation), None), "general")
-    found = [solution for solution in (start, general) if solution is not None]
+    found = [] if start is None else [start]
+    for unit in (False, True):
+        # SciPy raises either where a pencil cannot be reordered.
+        with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
+            refined = _refined(equation, _general(equation, unit), None)
+            if (general := _finished(equation, *refined, "general")) is not None:
+                found.append(general)
+                if general.residual <= _SOUND:
+                    break
     if not found:
         raise np.linalg.LinAlgError("the weights or the model are too badly scaled")
     return min(found, key=lambda solution: solution.residual)
@@ -248,13 +252,19 @@ def _refined(equation: Riccati, P: Array, modes: Modes | None) -> tuple[_Trial, 
     return best, modes
 
 
-def _general(equation: Riccati) -> Array:
+def _general(equation: Riccati, unit: bool) -> Array:
+    """Solve by SciPy, which takes an R badly scaled for singular; `unit`: inputs that cost 1."""
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 
     solver = solve_discrete_are if equation.discrete else solve_continuous_are
+    B, R, N = equation.B, equation.R, equation.N
+    if unit:
+        B = dtrtrs(equation.R_factor, B.T, lower=1)[0].T
+        N = None if N is None else dtrtrs(equation.R_factor, N.T, lower=1)[0].T
+        R = np.eye(len(R))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of ill-conditioning: the residual is measured
-        P: Array = solver(equation.A, equation.B, equation.Q, equation.R, s=equation.N)
+        P: Array = solver(equation.A, B, equation.Q, R, s=N)
     return 0.5 * (P + P.T)
 
 

@@ -139,9 +139,16 @@ def find_inputs(inputs: str | Path) -> Path:
     Raises
     ------
     InputError
-        If it is neither.
+        If it is no path.
+    UnknownNameError
+        If it is a bare name, neither of a bundled file nor of one that exists.
     """
     if not isinstance(inputs, str | os.PathLike) or "\0" in str(inputs):
         raise InputError(f"{inputs!r} is not the path of a file of inputs")
     bundled = {path.stem: path for path in bundled_directory().glob("*.toml")}
-    return bundled.get(str(inputs), Path(inputs))
+    path = Path(inputs)
+    if str(inputs) in bundled:
+        return bundled[str(inputs)]
+    if path.name == str(inputs) and not path.suffix and not os.path.lexists(path):
+        raise unknown("file or bundled set of inputs", str(inputs), sorted(bundled))
+    return path

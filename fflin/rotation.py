@@ -13,8 +13,10 @@ _CROSS[[5, 6, 1], [0, 1, 2]] = -1.0
 
 
 def skew(a: Array) -> Array:
-    """Return [a]x (3, 3), with ``[a]x b = a x b``."""
-    return _CROSS.dot(a).reshape(3, 3)
+    """Return [a]x (..., 3, 3) of vectors (..., 3), with ``[a]x b = a x b``."""
+    if a.ndim == 1:
+        return _CROSS.dot(a).reshape(3, 3)
+    return (a @ _CROSS.T).reshape(*a.shape, 3)
 
 
 def quaternion_product(a: Array, b: Array) -> Array:
@@ -51,3 +53,9 @@ def rotation_matrix(a: Array) -> Array:
             (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
         )
     )
+
+
+def rotation_matrices(a: Array) -> Array:
+    """Return the rotations (N, 3, 3) of unit quaternions (N, 4)."""
+    crossed = skew(a[:, :3])
+    return np.eye(3) + 2.0 * (a[:, 3, None, None] * crossed + crossed @ crossed)

@@ -15,7 +15,7 @@ from fflin.errors import InputError
 from fflin.integrators import integrator
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
-from fflin.policies import bound
+from fflin.policies import Allocation, bound
 from fflin.progress import Progress
 from fflin.state import Frame, StateMap
 from fflin.symmetry import rotor_names
@@ -111,9 +111,10 @@ class Run:
 
     def actuate(self, limits: Any) -> None:
         """Set what becomes of a command."""
-        nu = len(self.dynamics.actuation.names)
         self.limits = limits_of(self.dynamics.actuation, limits)
-        self.initial = np.zeros(nu) if self.lin is None else self.lin.u0
+        # The model's inputs are others where they are allocated to the robot's.
+        same = self.lin is not None and self.lin.input_names == self._names
+        self.initial = self.lin.u0 if self.lin is not None and same else np.zeros(len(self._names))
         self.channel = None
         if self._law is not None:
             self.channel = Channel(
@@ -149,7 +150,8 @@ class Run:
         self.step = self.method.step
 
     def _fastest_pole(self) -> float:
-        K = getattr(self.policy, "K", None)
+        decides = self.policy.policy if isinstance(self.policy, Allocation) else self.policy
+        K = getattr(decides, "K", None)
         if self.lin is None or K is None or self.lin.dt:
             return 0.0
         return float(np.abs(np.linalg.eigvals(self.lin.A - self.lin.B @ K)).max())

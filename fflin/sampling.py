@@ -81,21 +81,26 @@ def sampled_cost(
 
 
 def held_cost(F: Array, W: Array, h: float) -> Array:
-    """Return the integral of e^(F' t) W e^(F t) over [0, h]."""
+    """Return the integral of e^(F' t) W e^(F t) over [0, h].
+
+    W is taken as of the size of F: the exponential rounds relative to the larger.
+    """
     square = F @ F
     if not (square @ F).any():
-        total = np.zeros_like(W)
+        total, step = np.zeros_like(W), np.float64(h)
         terms = (np.eye(len(F)), F, 0.5 * square)
-        for i, left in enumerate(terms):
-            for j, right in enumerate(terms):
-                total += left.T @ W @ right * (h ** (i + j + 1) / (i + j + 1))
-        return 0.5 * (total + total.T)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i, left in enumerate(terms):
+                for j, right in enumerate(terms):
+                    total += left.T @ W @ right * (step ** (i + j + 1) / (i + j + 1))
+            return 0.5 * (total + total.T)
     from scipy.linalg import expm
 
     n = len(F)
     doublings = math.ceil(math.log2(max(2.0 * h * float(np.linalg.norm(F, 1)), 1.0)))
     block = np.zeros((2 * n, 2 * n))
-    block[:n, :n], block[:n, n:], block[n:, n:] = -F.T, W, F
+    size = float(np.linalg.norm(W, 1)) / float(np.linalg.norm(F, 1)) or 1.0
+    block[:n, :n], block[:n, n:], block[n:, n:] = -F.T, W / size, F
     with np.errstate(over="ignore", invalid="ignore"):
         exponential = expm(block * (h / 2**doublings))
         step = exponential[n:, n:]
@@ -103,4 +108,4 @@ def held_cost(F: Array, W: Array, h: float) -> Array:
         for _ in range(doublings):
             total = total + step.T @ total @ step
             step = step @ step
-        return 0.5 * (total + total.T)
+        return 0.5 * size * (total + total.T)

@@ -110,26 +110,33 @@ def _forces_missing(lin: LinearModel, weights: Array) -> str | None:
     if names[:6] != _BASE_VELOCITIES:
         return None
     involved = np.abs(weights).max(axis=0) > 0.0
-    base = [word for word, rows in _BASE_WORDS if involved[rows].any()]
+    base = [f"{word}{_axes(involved[rows])}" for word, rows in _BASE_WORDS if involved[rows].any()]
     joints = [name.partition(".")[2] for name, x in zip(names[6:], involved[6:], strict=True) if x]
     if joints:
         moved = f"joint{'s' * (len(joints) > 1)} {listed(joints)}, which no input moves"
         return " and ".join((*base, moved))
-    both = len(base) == 2
-    kind = "momentum" if both else f"{_MOMENTA[base[0]]} momentum"
+    kind = "" if len(base) == 2 else "angular " if involved[:3].any() else "linear "
+    what = " and ".join(base).replace("and base", "and")
     return (
-        f"{'base attitude and position' if both else base[0]} ({kind} is conserved); add inputs "
-        "on the base, or design on fflin.momentum_reduction(lin)"
+        f"{what} ({kind}momentum is conserved); add inputs on the base, or design on "
+        "fflin.momentum_reduction(lin)"
     )
+
+
+def _axes(involved: Array) -> str:
+    return "" if involved.all() else " " + "/".join(np.array(list("xyz"))[involved])
 
 
 _BASE_VELOCITIES = tuple(f"{group}.{axis}" for group in ("omega_b", "v_b") for axis in "xyz")
 _BASE_WORDS = (("base attitude", slice(0, 3)), ("base position", slice(3, 6)))
-_MOMENTA = {"base attitude": "angular", "base position": "linear"}
 
 
 def _dominant(vectors: Array, names: Sequence[str]) -> str:
     """Name the states that vectors (k, nx) stand on most, one each at least."""
     sizes = np.abs(vectors)
     large = (sizes >= 0.3 * sizes.max(axis=1, keepdims=True)).any(axis=0)
-    return listed(name for name, chosen in zip(names, large, strict=True) if chosen)
+    words = listed(name for name, chosen in zip(names, large, strict=True) if chosen)
+    count = len(vectors)
+    if large.sum() <= count:
+        return words
+    return f"{'a combination' if count == 1 else f'{count} combinations'} of {words}"

@@ -23,7 +23,7 @@ _IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
 }
 
 # Where q0 is below the square root of the rounding unit, sqrt(1 - |q_b|^2) has no correct digit.
-_SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
+SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
 
 
 # Rows of the base's angular and linear part in any (6 + n) velocity or wrench of state order.
@@ -43,32 +43,36 @@ class Groups(NamedTuple):
 
 @dataclass(frozen=True)
 class Chart:
-    """The attitude chart at one base attitude, relative to the reference.
+    """The attitude chart at one base attitude, relative to the reference, or at many.
 
     Attributes
     ----------
-    q_b : ndarray (3,)
+    q_b : ndarray (.., 3)
         Vector part of the quaternion of refMb.
-    q0 : float
+    q0 : float or ndarray (.., 1)
         Its scalar part, positive.
-    R : ndarray (3, 3)
+    R : ndarray (.., 3, 3)
         refMb.rotation.
     """
 
     q_b: Array
-    q0: float
+    q0: float | Array
     R: Array
 
     @cached_property
     def Q(self) -> Array:
-        """Q (3, 3) with ``d q_b/dt = Q omega / 2``, omega in base axes."""
-        return self.q0 * np.eye(3) + skew(self.q_b)
+        """Q (.., 3, 3) with ``d q_b/dt = Q omega / 2``, omega in base axes."""
+        return self._scalar + skew(self.q_b)
 
     @cached_property
     def J(self) -> Array:
-        """J = 2 Q^-1 (3, 3) with ``d theta = J d q_b``, d theta in base axes."""
-        outer = np.outer(self.q_b, self.q_b)
-        return 2.0 * (self.q0 * np.eye(3) - skew(self.q_b) + outer / self.q0)
+        """J = 2 Q^-1 (.., 3, 3) with ``d theta = J d q_b``, d theta in base axes."""
+        outer = self.q_b[..., :, None] * (self.q_b / self.q0)[..., None, :]
+        return 2.0 * (self._scalar - skew(self.q_b) + outer)
+
+    @property
+    def _scalar(self) -> Array:
+        return np.asarray(self.q0)[..., None] * np.eye(3)
 
 
 class StateMap:
@@ -105,6 +109,9 @@ class StateMap:
     InputError
         If the frame is unknown or the reference is not a pin.SE3.
     """
+
+    def __repr__(self) -> str:
+        return f"StateMap('{self.robot.name}', nx={self.nx}, frame='{self.frame}')"
 
     def __init__(
         self, robot: Robot, *, reference: pin.SE3 | None = None, frame: Frame = "hybrid"
@@ -170,6 +177,11 @@ class StateMap:
         return pin.SE3(self._reference)
 
     @property
+    def origin_quaternion(self) -> Array:
+        """Attitude (4,) of `origin`."""
+        return self._quaternion
+
+    @property
     def origin(self) -> pin.SE3:
         """Where the base is, seen from the reference, at q[:7] = 0, 0, 0, 0, 0, 0, 1."""
         return pin.XYZQUATToSE3(np.concatenate((self._position, self._quaternion)))
@@ -191,7 +203,7 @@ class StateMap:
         if quaternion[3] < 0.0:
             quaternion = -quaternion
         q0 = float(quaternion[3])
-        if q0 < _SMALLEST_Q0:
+        if q0 < SMALLEST_Q0:
             raise ChartError(
                 "the base is turned by 180 deg from the reference, where the attitude chart "
                 "(quaternion vector part) is singular; give a reference nearer to the base"
@@ -243,7 +255,7 @@ class StateMap:
         x = np.empty(self.nx)
         g = self.groups
         x[g.q_b] = chart.q_b
-        x[g.r_b] = self._position + self._rotation @ q[:3]
+        x[g.r_b] = self.positions(q)
         x[g.q_m] = self.joint_positions(q)
         if near is not None:
             self._unwrap(x, near)
@@ -275,7 +287,7 @@ class StateMap:
         g = self.groups
         q_b = x[g.q_b]
         square = 1.0 - float(q_b @ q_b)
-        if square < _SMALLEST_Q0**2:
+        if square < SMALLEST_Q0**2:
             raise ChartError(
                 f"|q_b| is {np.sqrt(1.0 - square):.9g}, expected less than 1: at 1 the base is "
                 "turned by 180 deg from the reference, where the attitude chart is singular"
@@ -294,8 +306,8 @@ class StateMap:
         return q, self.spread(nu)
 
     def velocities(self, v: Array) -> Array:
-        """Return (omega_b, v_b, qdot_m) (6 + n,) in base axes of Pinocchio's v (nv,)."""
-        return v.take(self._order)
+        """Return (omega_b, v_b, qdot_m) (.., 6 + n) in base axes of Pinocchio's v (.., nv)."""
+        return v.take(self._order, axis=-1)
 
     def spread(self, nu: Array) -> Array:
         """Return Pinocchio's v (nv,) of (omega_b, v_b, qdot_m) in base axes: v = S nu."""
@@ -339,11 +351,16 @@ class StateMap:
                 vectors[rows] = chart.R.T @ vectors[rows]
 
     def joint_positions(self, q: Array) -> Array:
-        """Return q_m (n,), one angle or length a joint, of a valid configuration."""
-        angles = q.take(self._idx_q)
+        """Return q_m (.., n), one angle or length a joint, of valid configurations (.., nq)."""
+        angles = q.take(self._idx_q, axis=-1)
         if self._cos.size:
-            angles[self._unbounded] = np.arctan2(q.take(self._sin), q.take(self._cos))
+            sines, cosines = q.take(self._sin, axis=-1), q.take(self._cos, axis=-1)
+            angles[..., self._unbounded] = np.arctan2(sines, cosines)
         return angles
+
+    def positions(self, q: Array) -> Array:
+        """Return r_b (.., 3) at valid configurations (.., nq)."""
+        return self._position + q[..., :3] @ self._rotation.T
 
     def _unwrap(self, x: Array, near: Array) -> None:
         if not self._unbounded.size:

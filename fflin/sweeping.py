@@ -18,12 +18,12 @@ import pinocchio as pin
 
 from fflin.batch_chunks import ChunkJob
 from fflin.batch_files import check_format, header, load_batch
-from fflin.batch_inertia import available_threads
 from fflin.batch_store import FileStore, MemoryStore
 from fflin.configurations import Configurations, GivenConfigurations
 from fflin.dispatching import Done, OwnWorkers, Span, dispatch
 from fflin.errors import FflinError, FflinWarning, FileError, InputError, SweepError, listed
 from fflin.files import as_path
+from fflin.kernel_code import available_threads
 from fflin.linear_batch import LinearBatch
 from fflin.model import Robot
 from fflin.sweep_task import SweepTask, as_configurations
@@ -64,9 +64,10 @@ def sweep(
 ) -> LinearBatch:
     r"""Linearise a robot about many points.
 
-    At rest M depends on the joints only and :math:`B = [0;\, M^{-1}]`: with numba installed
-    (``pip install 'fflin[fast]'``) a compiled kernel inverts M at eight configurations at a time,
-    on all threads. Elsewhere each point is linearised by a `Linearizer`, which processes share.
+    With numba installed (``pip install 'fflin[fast]'``) a compiled kernel does eight points at a
+    time, on all threads: at rest, where M depends on the joints only and
+    :math:`B = [0;\, M^{-1}]`, and at operating points. Without it, and where the robot has other
+    outputs than its state, each point is linearised by a `Linearizer`, which processes share.
 
     Parameters
     ----------
@@ -220,7 +221,7 @@ def _here(
         except FflinError as error:
             return Done(span, None, str(error))
 
-    if threads == 1 or len(spans) == 1 or not task.job.only_inertia:
+    if threads == 1 or len(spans) == 1 or not task.job.parallel:
         yield from map(run, spans)
         return
     with ThreadPoolExecutor(threads) as pool:

@@ -70,14 +70,21 @@ def bryson(lin: LinearModel, largest: Mapping[str, float]) -> Array:
     values = {}
     for name, value in largest.items():
         size = number(f"largest value of '{name}'", value)
-        if size <= 0.0:
-            raise InputError(f"largest value of '{name}' is {size:g}, expected a positive number")
-        values[name] = size**-2
+        values[name] = inverse_square(f"largest value of '{name}'", size)
     if not of_inputs:
         for name in values:
             if name not in {*names, *map(_group, names)}:
                 raise unknown("state or input", name, (*names, *lin.input_names))
     return _diagonal("largest", values, names, complete=bool(of_inputs))
+
+
+def inverse_square(what: str, size: float) -> float:
+    """Return 1/size^2, or raise `InputError` where that is no positive number."""
+    if size <= 0.0:
+        raise InputError(f"{what} is {size:g}, expected a positive number")
+    if not 1e-150 <= size <= 1e150:
+        raise InputError(f"{what} is {size:g}, expected one between 1e-150 and 1e150")
+    return size**-2
 
 
 def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = False) -> Array:
@@ -126,6 +133,14 @@ def cross_weight(what: str, value: ArrayLike, rows: int, columns: int) -> Array:
     if _dimension(what, value) != 2 or np.shape(value) != (rows, columns):
         raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, {columns})")
     return vector(what, np.ravel(value), rows * columns, "its entries").reshape(rows, columns)
+
+
+def columns(what: str, value: ArrayLike, rows: int) -> Array:
+    """Return a matrix (rows, k) with k >= 1."""
+    shape = np.shape(value) if _dimension(what, value) == 2 else ()
+    if not shape or not shape[1]:
+        raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, k) with k >= 1")
+    return cross_weight(what, value, rows, shape[1])
 
 
 def require_semidefinite(what: str, matrix: Array, names: Sequence[str]) -> None:
@@ -196,7 +211,7 @@ def _diagonal(
     diagonal = named_weights(f"entry of {what}", values, names, others)
     missing = np.flatnonzero(np.isnan(diagonal))
     if missing.size:
-        raise InputError(f"{what} has no value for {names[missing[0]]}; every input needs one")
+        raise InputError(f"{what} has no value for {names[missing[0]]}; each needs one")
     return diagonal
 
 

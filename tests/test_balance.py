@@ -143,6 +143,15 @@ def test_refusal_names_what_is_left():
         fflin.equilibrium(heavy.replace(inputs=[fflin.BaseTorque(), down]))
 
 
+def test_what_is_needed_is_shown_with_units():
+    robot = fflin.load("servicer_7dof", gravity=(0.0, 0.0, -9.81))
+    found = fflin.equilibrium(robot)
+    lines = str(found).splitlines()
+    assert lines[0].startswith("u: ") and max(map(len, lines)) <= 80
+    assert f"F_b.z = {9.81 * robot.mass:.6g} N" in str(found) and "tau_b.x" not in str(found)
+    assert str(fflin.equilibrium(fflin.load("cubesat"))) == "u: all zero"
+
+
 def test_nothing_to_balance_takes_nothing():
     """Exactly zero, also where no input could do anything, or rounding asks for something."""
     robot = fflin.load("ets_vii", inputs=[fflin.JointTorque("joint_1")])

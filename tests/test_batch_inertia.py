@@ -53,3 +53,10 @@ def test_kernel_agrees_with_pinocchio_on_every_bundled_robot(name, robots):
 def test_kernel_agrees_on_random_trees_of_every_joint_type(n):
     robot = random_tree(np.random.default_rng(n), n)
     assert agreement(robot, spread_configurations(robot, 11)) < 1e-14
+
+
+def test_kernel_counts_the_rotors_of_joints_and_base(robots):
+    model = robots["servicer_7dof"].model.copy()
+    model.armature = np.linspace(0.1, 2.0, model.nv)
+    robot = fflin.from_model(model)
+    assert agreement(robot, spread_configurations(robot, 11)) < 1e-14

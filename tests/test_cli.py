@@ -47,7 +47,8 @@ def test_robots_lists_all_with_n_mass_and_origin():
     table, *refused = out.split("\n\n")
     rows = {line.split()[0]: line.split() for line in table.splitlines()}
     assert set(fflin.list_robots()) - set(rows) == {"alex_psyonic_hands"}
-    assert "does not load" in refused[0] and "mimics" in refused[0]
+    # By the name of its file: where that lies is of no use here, and breaks the lines.
+    assert "does not load: alex_psyonic_hands.urdf:" in refused[0] and "mimics" in refused[0]
     assert max(map(len, out.splitlines())) <= 80
     assert rows["ets_vii"][1:4] == ["6", "2690.4", "fflin"]
     assert rows["talos"][1] == "32" and rows["talos"][3] == "example-robot-data"
@@ -61,6 +62,7 @@ def test_info_shows_tree_masses_and_limits():
     left, deeper = (next(x for x in lines if x.strip().startswith(n)) for n in ("left_1", "left_2"))
     assert len(deeper) - len(deeper.lstrip()) == len(left) - len(left.lstrip()) + 2
     assert "revolute" in left and "tool_left" in out
+    assert "limits in rad, N m and rad/s" in out
     assert max(map(len, lines)) <= 80
 
 
@@ -111,6 +113,58 @@ def test_linearize_prints_readable_tables():
     lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.5}))
     row = next(x for x in out.splitlines() if x.startswith("omega_b.x") and "e-" in x)
     assert f"{lin.B[12, 0]:.5g}" in row.split()
+
+
+def test_units_stand_above_the_tables():
+    motion = ("--velocity", "joint_1=0.1", "--stiffness", "panel_left=100")
+    code, out, err = run("linearize", "servicer_7dof", *motion, "--output", "frame:tool")
+    assert code == 0 and not err
+    text = " ".join(out.split())
+    assert "u: tau_b [N m], F_b [N], tau_m [N m] y: tool.position [m], tool.rotation [rad]" in text
+    assert "f0: q_m.joint_1 = 0.1 rad/s," in text and "rad/s^2" in text and "/s/s" not in text
+    assert max(map(len, out.splitlines())) <= 80
+    # No entry is broken between its name, its value and its unit.
+    shown = out.split("f0: ")[1].split("\n\n")[0]
+    assert all(line.count(" = ") == line.count("/s") for line in shown.splitlines())
+    code, out, _ = run("linearize", "cubesat", "--inputs", "cubesat")
+    assert "u: x_plus_top ... z_minus_right [N], wheel_x ... wheel_z [N m]" in out
+    assert "q_m [rad], omega_b [rad/s]" in out
+
+
+def test_sampled_model_is_that_of_python(tmp_path):
+    path = tmp_path / "m.mat"
+    options = ("planar_detumble", "--dt", 0.1, "--velocity", "joint_1=0.1")
+    code, _, err = run("linearize", *options, "-o", path)
+    assert code == 0 and not err
+    robot = fflin.load("planar_detumble")
+    expected = fflin.linearize(robot, v=fflin.velocity(robot, {"joint_1": 0.1})).discretize(0.1)
+    saved = fflin.LinearModel.load(path)
+    assert saved.dt == 0.1
+    for key in ("A", "B", "f0"):
+        # The command reads the robot by another route, which rounds otherwise.
+        np.testing.assert_allclose(getattr(saved, key), getattr(expected, key), rtol=0, atol=1e-13)
+    code, out, err = run("linearize", *options)
+    assert code == 0 and not err and "sampled every 0.1 s" in " ".join(out.split())
+    assert "q_m.joint_1 = 0.0099" in out and "/s^2" not in out  # f0 is what a step adds
+    assert max(map(len, out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("linearize", "servicer_7dof", "--joint", "joint_2=9", "--joint", "joint_4=1"),
+        ("simulate", "servicer_7dof", "--target-joint", "joint_2=9", "--duration", "0.01"),
+    ],
+)
+def test_joints_beyond_their_limits_are_named(command):
+    done = subprocess.run(
+        [sys.executable, "-m", "fflin", *command], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0
+    assert done.stderr == (
+        "fflin: warning: joint 'joint_2' is put at 9 rad, outside its limits from -2.094 to "
+        "2.094 rad\n"
+    )
 
 
 def test_terminal_dims_zeros():
@@ -177,7 +231,14 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
         ("linearize", "ets_vii", "--lock", "tail", "-o", output): "no joint to lock named 'tail'",
         ("linearize", "ets_vii", "-o", tmp_path / "m.xls"): "ends in '.xls'",
         ("linearize", "ets_vii", "-o", tmp_path / "none" / "m.npz"): "cannot be written",
-        ("linearize", "ets_vii", "--joint", "joint_1=1", "--joint", "joint_1=2"): "joint twice",
+        (
+            "linearize",
+            "ets_vii",
+            "--joint",
+            "joint_1=1",
+            "--joint",
+            "joint_1=2",
+        ): "names 'joint_1' twice",
         ("linearize", "ets_vii", "--lock", "joint_1", "--joint", "joint_1=2"): "is locked",
         ("linearize", "ets_vii", "--stiffness", "joint_1=-1"): "is -1, expected 0 or more",
         ("linearize", "ets_vii", "--damping", "viscous"): "'viscous' is not",
@@ -189,6 +250,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
             "--inputs",
             "servicer_7dof",
         ): "servicer_7dof: no joint named 'joint_1'",
+        ("check", "cubesat", "--inputs", "cubesats"): "named 'cubesats'; did you mean cubesat",
+        ("linearize", "ets_vii", "--dt", 0, "-o", output): "expected a positive sampling time",
         ("check", "ets_vii", "--output", "pos:tool"): "no output named 'pos'; did you mean pose",
         ("check", "ets_vii", "--output", "pose"): "output 'pose' is of no frame; write pose:NAME",
         ("check", "ets_vii", "--output", "com:tool"): "is of the whole robot; write com",

@@ -94,7 +94,10 @@ def test_what_is_not_seen_or_not_disturbed_is_named(lin):
         "V is not positive definite": (1, 0),
         "W is not positive semidefinite": (-1, 1),
         "no entry of W named 'tau'": ({"tau": 1.0}, 1, lin.B),
-        r"G has shape \(3,\), expected \(24, nw\)": (1, 1, np.ones(3)),
+        r"G has shape \(3,\), expected \(24, k\)": (1, 1, np.ones(3)),
+        r"G has shape \(24, 0\), expected \(24, k\) with k >= 1": (1, 1, np.ones((24, 0))),
+        "G is not an array: its rows differ": (1, 1, [[1.0], [1.0, 2.0]]),
+        r"V has no value for r_b.x; each needs one": (1, {"q_b": 1.0}),
         r"G has shape \(3, 2\), expected \(24, 2\)": (1, 1, np.ones((3, 2))),
     }.items():
         with pytest.raises(fflin.FflinError, match=words):

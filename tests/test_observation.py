@@ -135,6 +135,19 @@ def test_finite_gramians_are_the_integrals(robots):
     )
 
 
+@pytest.mark.parametrize("T", [1e-3, 1e5, 1e8])
+def test_gramians_at_rest_are_exact_over_any_horizon(robots, T):
+    lin = fflin.linearize(robots["astrobee_arm"])
+    found = fflin.gramians(lin, T)
+    for A, B, W in (
+        (lin.A, lin.B, found.controllability),
+        (lin.A.T, lin.C.T, found.observability),
+    ):
+        Q = B @ B.T
+        expected = Q * T + (A @ Q + Q @ A.T) * T**2 / 2 + A @ Q @ A.T * T**3 / 3
+        np.testing.assert_allclose(W, expected, rtol=1e-12, atol=1e-14 * np.abs(expected).max())
+
+
 def test_gramians_that_do_not_exist(robots):
     lin = fflin.linearize(robots["ets_vii"])
     for model in (lin, lin.discretize(0.1)):

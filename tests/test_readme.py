@@ -5,6 +5,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from shutil import which
 
 import pytest
 
@@ -26,6 +27,51 @@ def test_python_examples_run(tmp_path, page):
         [sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_inputs_of_the_guide_are_read(tmp_path):
+    (block,) = code_blocks("toml", (ROOT / "docs" / "guide.md").read_text(encoding="utf-8"))
+    path = tmp_path / "inputs.toml"
+    path.write_text(block)
+    robot = fflin.load("servicer_7dof", inputs=fflin.load_inputs(path))
+    names = fflin.linearize(robot).input_names
+    assert names[3:] == ("tau_m.joint_1", "nozzle", "wheel_z")
+
+
+@pytest.mark.skipif(not which("octave"), reason="needs Octave")
+def test_octave_reads_the_model_as_the_guide_says(tmp_path):
+    (block,) = code_blocks("matlab", (ROOT / "docs" / "guide.md").read_text(encoding="utf-8"))
+    robot = fflin.load("servicer_7dof")
+    lin = fflin.linearize(robot, v=fflin.velocity(robot, {"joint_1": 0.1}))
+    lin.save(tmp_path / "model.mat")
+    # `ss` belongs to a toolbox; this one takes the same arguments and looks at them.
+    (tmp_path / "ss.m").write_text(
+        "function sys = ss(A, B, C, D, dt, varargin)\n"
+        "  printf('%.17g %.17g %d %g\\n', sum(A(:)), B(end, end), columns(D), dt);\n"
+        "  assert(all(cellfun(@(x) ischar(x) || iscellstr(x), varargin)));\n"
+        "  names = struct(); for k = 1:2:numel(varargin), "
+        "names.(varargin{k}) = varargin{k + 1}; end\n"
+        "  assert(numel(names.StateName) == rows(A) && numel(names.StateUnit) == rows(A));\n"
+        "  assert(numel(names.InputName) == columns(B) && numel(names.InputUnit) == columns(B));\n"
+        "  assert(numel(names.OutputName) == rows(C) && numel(names.OutputUnit) == rows(C));\n"
+        "  printf('%s %s', names.StateName{8}, names.InputUnit{1});\n"
+        "end\n"
+    )
+    script = block[: block.index("bode")]
+    (tmp_path / "read.m").write_text(script.replace("sys = ss", "ss_made = 0; ss"))
+    done = subprocess.run(
+        ["octave", "--no-gui", "--quiet", "read.m"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    numbers, words = done.stdout.splitlines()
+    total, corner, inputs, dt = map(float, numbers.split())
+    assert total == pytest.approx(lin.A.sum(), rel=1e-12)
+    assert (corner, inputs, dt) == (lin.B[-1, -1], 15, 0.0)
+    assert words == f"{lin.state_names[7]} N m"
 
 
 def test_links_lead_somewhere():
@@ -58,7 +104,8 @@ def test_two_commands_set_up_from_nothing():
     setups = [line for block in code_blocks("sh") for line in block.splitlines() if "venv" in line]
     assert len(setups) == 2
     job, tests = setups
-    assert job.startswith("python3 -m venv .venv && .venv/bin/pip install -q -e . && ")
+    # With matplotlib, so that every command further down runs after it.
+    assert job.startswith("python3 -m venv .venv && .venv/bin/pip install -q -e '.[plot]' && ")
     # The part behind the installation, in this environment.
     for step in job.split(" && ")[2:]:
         arguments = shlex.split(step.removeprefix(".venv/bin/fflin "))

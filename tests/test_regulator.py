@@ -72,11 +72,23 @@ def test_brysons_rule_is_the_square_of_the_largest_value(lin):
         "is an input and 'q_b' a state": {"q_b": 1.0, "tau_b": 1.0},
         "no value for F_b.x": {"tau_b": 1.0},
         "is 0, expected a positive": {"q_b": 0.0},
+        "is 1e-200, expected one between": {"q_b": 1e-200},
+        r"is 1e\+200, expected one between": {"tau_b": 1e200},
         "no state or input named 'qb'": {"qb": 1.0},
         "expected {name": {},
     }.items():
         with pytest.raises(fflin.FflinError, match=words):
             fflin.bryson(lin, largest)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_a_mode_that_the_weights_leave_out_is_not_held_by_rounding(lin, dt, seed):
+    V = np.random.default_rng(seed).normal(size=(12, 11))
+    Q = np.eye(24)
+    Q[:12, :12] = V @ V.T
+    with pytest.raises(fflin.InputError, match="Q does not weigh a combination of "):
+        fflin.lqr(lin.discretize(dt) if dt else lin, Q, 1.0)
 
 
 def test_bad_weights_are_named(lin):
@@ -125,6 +137,7 @@ def test_weights_of_any_size_give_a_gain_or_one_clear_line(lin, dt):
                 assert "scale the weights" in str(error)
             else:
                 assert np.isfinite(gain.K).all() and gain.margin > 0.0
+                assert gain.residual < 1e-3
                 solved += 1
     assert solved >= 7
 
@@ -158,6 +171,11 @@ def test_what_the_inputs_cannot_hold_is_named(robots, name, dt):
     refused(joints, r"cannot hold base attitude and position \(momentum is conserved\).*_reduction")
     refused([fflin.BaseTorque(), *joints], r"hold base position \(linear momentum is conserved\)")
     refused([fflin.BaseForce(), *joints], r"hold base attitude \(angular momentum is conserved\)")
+    plane = [
+        fflin.Thruster(robot.model.frames[2].name, position=(0.1, y, 0.0), direction=direction)
+        for y, direction in ((0.1, (1, 0, 0)), (-0.1, (-1, 0, 0)), (0.1, (0, 1, 0)))
+    ]
+    refused([*plane, *joints], r"hold base attitude x/y and position z \(momentum is conserved\)")
     base = [fflin.BaseTorque(), fflin.BaseForce()]
     refused([*base, *joints[1:]], f"hold joint {robot.joint_names[0]}, which no input moves")
 
@@ -217,6 +235,29 @@ def test_the_largest_gain_of_a_resonance_is_found_between_the_poles():
             C @ np.linalg.solve(1j * w * np.eye(2) - A, B) for w in np.linspace(0, 9, 9001)
         ]
         assert _norm(A, B, C, D) == pytest.approx(np.abs(response).max(), rel=3e-5)
+
+
+def test_a_cross_weight_that_takes_a_spring_away_leaves_its_joint_unweighed():
+    model = fflin.linearize(fflin.load("astrobee_arm").replace(stiffness=20.0))
+    N = np.zeros(model.B.shape)
+    N[:8] = np.linalg.solve(model.B[8:], model.A[8:, :8]).T
+    Q = N @ N.T + np.diag([1.0] * 6 + [0.0] * 10)
+    with pytest.raises(fflin.InputError, match=r"Q does not weigh q_m.arm_"):
+        fflin.lqr(model, Q, 1.0, N)
+
+
+@pytest.mark.parametrize("fields", [{}, {"stiffness": 50.0, "damping": 3.0}])
+def test_a_cross_weight_is_sampled_with_the_rest(fields):
+    model = fflin.linearize(fflin.load("astrobee_arm").replace(**fields))
+    nx, nu = model.B.shape
+    rng, h = np.random.default_rng(5), 0.3
+    V = rng.normal(size=(nx + nu, nx + nu))
+    W = V @ V.T
+    Q, R, N = fflin.sampled_cost(model, h, W[:nx, :nx], W[nx:, nx:], W[:nx, nx:])
+    F = np.vstack((np.hstack((model.A, model.B)), np.zeros((nu, nx + nu))))
+    integral = quad_vec(lambda t: expm(F * t).T @ W @ expm(F * t), 0.0, h, epsrel=1e-11)[0]
+    scale = np.abs(integral).max()
+    assert np.block([[Q, N], [N.T, R]]) == pytest.approx(integral, rel=1e-9, abs=1e-11 * scale)
 
 
 def test_sampled_cost_is_the_integral_under_held_inputs(lin):

@@ -73,12 +73,15 @@ def test_bad_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
     for words, arguments in {
         "no state named 'nope'": ("--q", "nope=1"),
         "no input named 'nope'": ("--r", "nope=1"),
-        "expected a positive value": ("--bryson", "q_b=0"),
+        "no state or input named 'taum'; did you mean tau_m": ("--bryson", "taum=5"),
+        "'q_b' (--bryson) is 0, expected a positive number": ("--bryson", "q_b=0"),
+        "(--bryson) is 1e-200, expected one between": ("--bryson", "q_b=1e-200"),
         "'q_b' has a weight and a largest value": ("--bryson", "q_b=1", "--q", "q_b=1"),
         "Q is not positive semidefinite: its eigenvalue -1": ("--q", "q_b=-1"),
         "R is not positive definite: its eigenvalue 0": ("--r", "F_b.y=0"),
         "dt is -1 s, expected a positive": ("--dt", "-1"),
         "the point is not a fixed point: d q_b.x/dt": ("--velocity", "omega_b.x=0.1"),
+        "with moving=True (--equilibrium)\n": ("--gravity", "0", "0", "-9.81", "--q", "q_b=1"),
         "--q names": ("--q", "q_b=1", "--q", "q_b=2"),
     }.items():
         code, out, err = run(capsys, "ets_vii", *arguments, "-o", str(tmp_path / "k.npz"))

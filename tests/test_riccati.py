@@ -11,7 +11,7 @@ import fflin
 from fflin import modal
 from fflin.halfsize import second_order_loop
 from fflin.modal import Modes
-from fflin.riccati import Riccati, _finished, half_size, solve
+from fflin.riccati import Riccati, _bilinear, _finished, _general, half_size, solve
 
 
 def weightings(lin, rng):
@@ -111,6 +111,21 @@ def loops(robots):
         yield lin, Q, R, second_order_loop(lin.A, lin.B, Q, np.sqrt(R)), even
 
 
+def test_the_continuous_equation_of_a_sampled_model_has_the_same_P(robots):
+    lin = fflin.linearize(robots["ets_vii"])
+    rng = np.random.default_rng(8)
+    V = rng.normal(size=(36, 36))
+    W = V @ V.T
+    cost = fflin.sampled_cost(lin, 0.2, W[:24, :24], W[24:, 24:], W[:24, 24:])
+    held = lin.discretize(0.2)
+    equation = Riccati(held.A, held.B, *cost, held.dt)
+    found = solve(held.A, held.B, *cost, held.dt)
+    assert found.method == "structured" and found.residual < 1e-13
+    assert _bilinear(equation).trial(found.P).residual < 1e-12
+    other = Riccati(held.A, held.B, cost.Q, cost.R, -cost.N, held.dt)
+    assert _bilinear(other).trial(found.P).residual > 1e-6
+
+
 def test_half_size_loops_are_loops_of_the_model_and_optimal_without_odd_powers(robots):
     for lin, Q, R, loop, even in loops(robots):
         m = len(lin.A) // 2
@@ -205,6 +220,23 @@ def test_badly_scaled_weights_never_cost_the_residual(robots):
                 P = general(lin.A, lin.B, Q, R)
             assert found.residual <= Riccati(lin.A, lin.B, Q, R, None, 0.0).trial(P).residual
             assert found.poles.real.max() < 0.0
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+@pytest.mark.parametrize("cross", [False, True])
+def test_inputs_whose_costs_are_far_apart_are_scaled_first(robots, dt, cross):
+    """SciPy's solver takes such an R for a singular one."""
+    lin = fflin.linearize(robots["astrobee_arm"].replace(stiffness=20.0, damping=1.0))
+    lin = lin.discretize(dt) if dt else lin
+    nx, nu = lin.B.shape
+    R = np.diag(np.geomspace(1e-12, 1e12, nu))
+    N = 0.1 * np.sqrt(R)[np.arange(nx) % nu] if cross else None
+    if not dt:
+        equation = Riccati(lin.A, lin.B, np.eye(nx), R, N, dt)
+        with pytest.raises((ValueError, np.linalg.LinAlgError)):
+            _general(equation, unit=False)
+    found = solve(lin.A, lin.B, np.eye(nx), R, N, dt)
+    assert found.residual < 1e-10
 
 
 def test_lyapunov_equations_by_modes(monkeypatch):

@@ -1,5 +1,8 @@
 """The command simulate as a user runs it."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from test_cli import refused, run
@@ -21,6 +24,9 @@ def test_a_loop_settles_is_saved_and_drawn(tmp_path):
     assert motion.attitude_error[0] == pytest.approx(30.0)
     assert motion.attitude_error[-1] < 1e-4
     assert (tmp_path / "loop.png").stat().st_size > 50_000
+    apart = np.abs(motion.x - motion.linear).max(axis=0)
+    most = motion.state_names[apart.argmax()]
+    assert f"difference from the linear model: {apart.max():.3g} rad in {most}" in out
     assert out.splitlines()[-2:] == ["wrote loop.npz", "wrote loop.png"]
 
 
@@ -37,6 +43,52 @@ def test_target_sampling_limits_and_delay(tmp_path):
     assert np.abs(motion.u[:, joints]).max() == 8.0
     assert not motion.u[:5].any()
     assert motion.x[-1, motion.state_names.index("q_m.joint_1")] == pytest.approx(0.5, abs=0.02)
+
+
+def test_thrusts_are_allocated_or_their_cut_is_told(tmp_path):
+    command = ("simulate", "cubesat", "--inputs", "cubesat", "--rpy", 20, 0, 0, "--duration", 20)
+    command = [sys.executable, "-m", "fflin", *map(str, command), "--dt", "0.1"]
+    settled = []
+    for option in ((), ("--allocate",)):
+        done = subprocess.run(
+            [*command, *option, "-o", "m.npz"],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            check=False,
+        )
+        assert done.returncode == 0
+        motion = fflin.Motion.load(tmp_path / "m.npz")
+        assert motion.input_names[0] == "x_plus_top" and (motion.u[:, :12] >= 0.0).all()
+        assert motion.attitude_error[0] == pytest.approx(20.0)
+        assert motion.attitude_error[-1] < 0.1
+        settled.append(motion.t[motion.attitude_error > 0.4].max())
+        cut = "fflin: warning: thrusters cannot pull: in 100.0 % of the run"
+        assert done.stderr.startswith(cut) if not option else not done.stderr
+    assert settled[1] < 0.8 * settled[0]  # half of the torque was cut
+    assert "--allocate: 'ets_vii' has no thrusters" in refused("simulate", "ets_vii", "--allocate")
+
+
+def test_the_share_of_cut_thrust_is_that_of_the_motion(tmp_path):
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "fflin", "simulate", "servicer_7dof"),
+            *("--inputs", "servicer_7dof", "--position", "-0.3", "0", "0", "--damping", "5"),
+            *("--stiffness", "panel_left=100", "--stiffness", "panel_right=100"),
+            *("--duration", "10", "-o", "m.npz"),
+        ],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert done.returncode == 0
+    motion = fflin.Motion.load(tmp_path / "m.npz")
+    back = [i for i, name in enumerate(motion.input_names) if name.startswith("back_")]
+    share = 100.0 * (motion.u[:-1, back] == 0.0).any(axis=1).mean()
+    assert 5.0 < share < 95.0 and abs(share - 50.0) > 2.0  # forward first, then braking
+    told = float(done.stderr.split("in ")[1].split(" %")[0])
+    assert told == pytest.approx(share, abs=0.1)
 
 
 def test_a_free_robot_keeps_its_energy():

@@ -289,6 +289,26 @@ def test_allocation_gives_the_wrench_with_thrusts_that_push():
     motion = fflin.simulate(robot, policy, x0=x0, duration=60.0, dt=0.05, sample=0.1)
     assert (motion.u >= 0.0).all()
     assert np.abs(motion.x[-1]).max() < 2e-3
+    # Attitude and position are those relative to the model's reference, wherever it starts.
+    turned = fflin.configuration(robot, {}, pin.SE3(pin.rpy.rpyToMatrix(0.2, 0, 0), np.zeros(3)))
+    motion = fflin.simulate(robot, policy, q0=turned, duration=60.0, dt=0.05, sample=0.1)
+    assert motion.attitude_error[0] == pytest.approx(np.degrees(0.2))
+    assert motion.attitude_error[-1] < 0.2
+    # A model that is sampled says when the thrusters are told.
+    sampled = lin.discretize(0.1)
+    held = fflin.simulate(
+        robot,
+        fflin.Allocation(fflin.StateFeedback(sampled, gain.K), design),
+        q0=turned,
+        duration=1.0,
+        dt=0.05,
+    )
+    assert (held.u[0:-1:2] == held.u[1::2]).all() and held.u[0].any()
+    # The loop is the design's, whose fastest pole the step must follow.
+    stiff = fflin.acceleration_lqr(lin, 1e4, 1e4, 1.0)
+    with pytest.raises(fflin.InputError, match="too large for a loop whose fastest pole"):
+        hasty = fflin.Allocation(fflin.StateFeedback(lin, stiff.K), design)
+        fflin.simulate(robot, hasty, q0=turned, duration=5.0, dt=1.0)
 
 
 def test_feedback_along_a_trajectory_brings_the_robot_back_to_it():

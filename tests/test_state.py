@@ -184,6 +184,11 @@ def test_random_trees_round_trip():
         assert v_again == pytest.approx(v, abs=1e-14)
 
 
+def test_it_says_of_which_robot_it_is():
+    shown = repr(fflin.StateMap(fflin.load("cubesat"), frame="world"))
+    assert shown == "StateMap('cubesat', nx=12, frame='world')"
+
+
 def test_bad_arguments_name_what_is_wrong():
     robot = fflin.load("ets_vii")
     state = fflin.StateMap(robot)

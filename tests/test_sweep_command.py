@@ -49,7 +49,7 @@ def test_grid_random_and_file_say_the_same(tmp_path, robots):
         (("--grid", "joint_2=0:1"), "is not JOINT=LO:HI:N"),
         (("--grid", "joint_2=1:1:3"), "'joint_2=1:1:3' is empty"),
         (("--grid", "joint_2=0:1:0"), "0 is too few"),
-        (("--grid", "joint_2=0:1:2", "--grid", "joint_2=0:1:3"), "names a joint twice"),
+        (("--grid", "joint_2=0:1:2", "--grid", "joint_2=0:1:3"), "names 'joint_2' twice"),
         (("--grid", "joint_2=0:1:2", "--joint", "joint_2=1"), "is on the grid and in joints"),
         (
             ("--grid", "joint_2=0:1:100000", "--grid", "joint_3=0:1:100000"),

@@ -7,6 +7,7 @@ ORDER = (
     "growth",
     "number",
     "batch",
+    "batch_at_points",
     "lqr",
     "simulation_step",
     "start_up",

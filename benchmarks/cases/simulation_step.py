@@ -15,7 +15,7 @@ from benchmarks.timing import interleaved
 
 NAMES = ("ur5", "servicer_7dof", "talos")
 STEP, STEPS = 1e-3, 1000  # [s], and how many are timed together
-BARE = "four pin.aba"
+BARE, FREE = "four pin.aba", "fflin, momentum not kept"
 
 
 @dataclass(frozen=True)
@@ -41,17 +41,16 @@ def run() -> Table:
                 raise WrongResultError(f"{key} on {name}: velocities differ by {error:.1e}")
         calls = {key: each.run for key, each in simulations.items()}
         times = interleaved(calls | {BARE: _bare(point)})
-        first = "fflin" if "fflin" in times else BARE
-        own = times.pop(first)
+        own = times.pop("fflin")
         columns += [key for key in times if key not in columns]
         row = {key: figure(each.ratio(own)) for key, each in times.items()}
         rows.append((name, point.robot.n, figure(own.least / STEPS * 1e6), row))
     return Table(
         "Simulation step",
         f"One of {STEPS} steps of {STEP * 1e3:g} ms at fourth order (Drake: third, its highest of "
-        f"fixed step), without inputs; fflin keeps the momentum besides: time of {first}, the "
+        f"fixed step), without inputs; fflin keeps the momentum besides: time of fflin, the "
         "others' as multiples of it.",
-        ("robot", "n", f"{first} [us]", *columns),
+        ("robot", "n", "fflin [us]", *columns),
         tuple(
             (name, str(n), time, *(row.get(key, figure(None)) for key in columns))
             for name, n, time, row in rows
@@ -91,8 +90,8 @@ def _midpoint(point: Point, steps: int) -> Array:
 def _simulations(point: Point) -> tuple[dict[str, Simulation], list[str]]:
     found: dict[str, Simulation] = {}
     notes = []
-    if hasattr(fflin, "simulate"):
-        found["fflin"] = _fflin(point)
+    found["fflin"] = _fflin(point, project=True)
+    found[FREE] = _fflin(point, project=False)
     for name, make in (("MuJoCo RK4", _mujoco), ("Drake RK3", _drake)):
         try:
             found[name] = make(point)
@@ -101,7 +100,7 @@ def _simulations(point: Point) -> tuple[dict[str, Simulation], list[str]]:
     return found, notes
 
 
-def _fflin(point: Point) -> Simulation:
+def _fflin(point: Point, *, project: bool) -> Simulation:
     kept = {}
 
     def call() -> None:
@@ -113,6 +112,7 @@ def _fflin(point: Point) -> Simulation:
             duration=STEP * STEPS,
             dt=STEP,
             every=STEPS,
+            project=project,
         )
 
     return Simulation(call, lambda: kept["motion"].v[-1][point.order[6:]])

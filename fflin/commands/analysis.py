@@ -77,13 +77,13 @@ def _analyze(arguments: argparse.Namespace) -> int:
     from fflin.structure import controllability
 
     _, lin = linear_model(arguments)
-    for title, text in (
-        ("inputs", str(controllability(lin))),
-        ("momentum", _momentum(lin)),
-        ("modes", str(modes(lin))),
-        ("outputs", str(observability(lin))),
-    ):
-        print(f"{title}\n{'-' * len(title)}\n{text}\n")
+    parts = {
+        "inputs": str(controllability(lin)),
+        "momentum": _momentum(lin),
+        "modes": str(modes(lin)),
+        "outputs": str(observability(lin)),
+    }
+    print("\n\n".join(f"{title}\n{'-' * len(title)}\n{text}" for title, text in parts.items()))
     return DONE
 
 

@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import os
 import warnings
 from typing import TYPE_CHECKING
 
 from fflin.commands import DONE, FELL_SHORT
-from fflin.commands.arguments import Commands, add_output_file, add_point, add_robot, command
+from fflin.commands.arguments import (
+    Commands,
+    add_output_file,
+    add_point,
+    add_robot,
+    command,
+    number,
+)
 from fflin.commands.points import linear_model, load_robot
 from fflin.errors import FflinError, FflinWarning
 
@@ -30,6 +38,9 @@ def add_commands(commands: Commands) -> None:
         "fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat",
     )
     add_point(linearize)
+    linearize.add_argument(
+        "--dt", metavar="H", type=number, help="sample it, with inputs held over H [s]"
+    )
     add_output_file(
         linearize, "save to FILE: .npz, .mat, .json, or .csv (one file a matrix: NAME.A.csv, ...)"
     )
@@ -56,7 +67,9 @@ def _robots(_: argparse.Namespace) -> int:
                 warnings.simplefilter("ignore", FflinWarning)
                 entries.append((name, load(name), find_robot(name).origin))
         except FflinError as error:
-            entries.append((name, str(error), find_robot(name).origin))
+            found = find_robot(name)
+            reason = str(error).replace(f"{found.path.parent}{os.sep}", "")
+            entries.append((name, reason, found.origin))
     print(robot_list(entries))
     return DONE
 
@@ -74,6 +87,8 @@ def _linearize(arguments: argparse.Namespace) -> int:
 
         check_format(arguments.output_file)
     robot, lin = linear_model(arguments)
+    if arguments.dt is not None:
+        lin = lin.discretize(arguments.dt)
     if arguments.output_file:
         save_model(lin, arguments.output_file, spare=robot.urdf)
         print(f"wrote {arguments.output_file}: {lin.B.shape[0]} states, {lin.B.shape[1]} inputs")

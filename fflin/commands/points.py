@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
+import warnings
 from typing import TYPE_CHECKING, Any
 
-from fflin.errors import FflinError, InputError
+from fflin.errors import FflinError, FflinWarning, InputError
 
 if TYPE_CHECKING:
     import pinocchio as pin
@@ -63,7 +64,9 @@ def once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return the pairs of a repeatable option; a name that is given twice is refused."""
     values = dict(pairs)
     if len(values) < len(pairs):
-        raise InputError(f"{option} names a joint twice; give one value for each")
+        names = [name for name, _ in pairs]
+        double = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{option} names '{double}' twice; give it one value")
     return values
 
 
@@ -71,11 +74,36 @@ def configuration_of(robot: Robot, arguments: argparse.Namespace) -> Array:
     """Return the configuration (nq,) that --joint, --rpy and --position say."""
     import pinocchio as pin
 
-    from fflin.model import configuration
-
     rotation = pin.rpy.rpyToMatrix(*(math.radians(angle) for angle in arguments.rpy))
     base = pin.SE3(rotation, pin.SE3.Identity().translation + arguments.position)
-    return configuration(robot, once("--joint", arguments.joint), base)
+    return placed(robot, "--joint", arguments.joint, base)
+
+
+def placed(
+    robot: Robot, option: str, pairs: list[tuple[str, Any]], base: pin.SE3 | None = None
+) -> Array:
+    """Return the configuration (nq,) with the joints that an option says; warn beyond limits."""
+    from fflin.model import configuration
+
+    joints = once(option, pairs)
+    q = configuration(robot, joints, base)
+    model = robot.model
+    for joint in robot.joints:
+        if joint.name not in joints or joint.unbounded:
+            continue
+        low, high = (
+            float(limits[joint.idx_q])
+            for limits in (model.lowerPositionLimit, model.upperPositionLimit)
+        )
+        value, unit = joints[joint.name], "m" if joint.prismatic else "rad"
+        if not low <= value <= high:
+            warnings.warn(
+                f"joint '{joint.name}' is put at {value:g} {unit}, outside its limits from "
+                f"{low:g} to {high:g} {unit}",
+                FflinWarning,
+                stacklevel=2,
+            )
+    return q
 
 
 def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:

@@ -16,7 +16,7 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import linear_model, once
-from fflin.errors import InputError, StabilizabilityError
+from fflin.errors import EquilibriumError, InputError, StabilizabilityError, unknown
 
 if TYPE_CHECKING:
     from fflin.linear_model import LinearModel
@@ -87,9 +87,15 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     accelerations: its poles are of the order of 1/s whatever the robot weighs.
     """
     from fflin.acceleration import acceleration_lqr
-    from fflin.regulator import lqr
+    from fflin.regulator import lqr, require_fixed_point
     from fflin.sampling import sampled_cost
 
+    try:
+        require_fixed_point(lin)
+    except EquilibriumError as error:
+        # It balances forces; a base that moves stays no fixed point.
+        hint = "" if arguments.equilibrium or lin.v.any() else " (--equilibrium)"
+        raise EquilibriumError(f"{error}{hint}") from None
     if not (arguments.q or arguments.r or arguments.bryson):
         with suppress(InputError, StabilizabilityError):
             return acceleration_lqr(lin, 1.0, 1.0, 1.0, dt=arguments.dt)
@@ -105,15 +111,19 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
 
 def _weights(lin: LinearModel, arguments: argparse.Namespace) -> tuple[Array, Array]:
     """Return the diagonals of Q and R."""
-    from fflin.weights import default_weights, named_weights
+    from fflin.weights import default_weights, inverse_square, named_weights
 
     values = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
     squares = {}
     for name, value in values["bryson"].items():
-        if value <= 0.0:
-            raise InputError(f"--bryson {name}={value:g}: expected a positive value")
-        squares[name] = value**-2
-    known = {*lin.input_names, *(name.partition(".")[0] for name in lin.input_names)}
+        squares[name] = inverse_square(f"largest value of '{name}' (--bryson)", value)
+    known, states = (
+        dict.fromkeys((*(name.partition(".")[0] for name in names), *names))
+        for names in (lin.input_names, lin.state_names)
+    )
+    for name in squares:
+        if name not in known and name not in states:
+            raise unknown("state or input", name, (*states, *known))
     of_inputs = {name: value for name, value in squares.items() if name in known}
     of_states = {name: value for name, value in squares.items() if name not in known}
     both = [*(set(values["q"]) & set(of_states)), *(set(values["r"]) & set(of_inputs))]

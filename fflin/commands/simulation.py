@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,15 +19,16 @@ from fflin.commands.arguments import (
     command,
     number,
 )
-from fflin.commands.points import configuration_of, inputs_at, load_robot, once, velocity_of
+from fflin.commands.points import configuration_of, inputs_at, load_robot, once, placed, velocity_of
 from fflin.commands.regulator import add_weights, gain_of
 from fflin.commands.visual import add_pictures, check_pictures, show_motion
-from fflin.errors import InputError
+from fflin.errors import FflinWarning, InputError
 
 if TYPE_CHECKING:
     from fflin.linear_model import LinearModel
     from fflin.model import Robot
     from fflin.motion import Motion
+    from fflin.policies import StateFeedback
 
 
 def add_commands(commands: Commands) -> None:
@@ -56,6 +58,12 @@ def add_commands(commands: Commands) -> None:
         "--reduce",
         action="store_true",
         help="control the part that the inputs can hold where momentum is conserved",
+    )
+    simulate.add_argument(
+        "--allocate",
+        action="store_true",
+        help="design with torque and force on the base, and let the thrusters, none of which "
+        "pulls, give what comes nearest; else a thrust below zero is cut",
     )
     simulate.add_argument(
         "--free", action="store_true", help="let it move without a regulator or any input"
@@ -141,23 +149,61 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     }
     if arguments.free:
         weighed = arguments.q or arguments.r or arguments.bryson or arguments.dt
-        if weighed or arguments.target_joint or arguments.reduce:
-            raise InputError("--free has no regulator to give weights or a target; leave one out")
+        if weighed or arguments.target_joint or arguments.reduce or arguments.allocate:
+            raise InputError(
+                "--free has no regulator to give weights, a target or thrusters; leave one out"
+            )
         return simulate(robot, frame=arguments.frame, **options)
-    lin = _about_target(robot, arguments)
-    gain = gain_of(lin, arguments)
-    from fflin.policies import StateFeedback
+    from fflin.policies import Allocation, StateFeedback
 
+    design = _without_thrusters(robot) if arguments.allocate else robot
+    lin = _about_target(design, arguments)
+    gain = gain_of(lin, arguments)
     if gain.dt:
         lin = lin.discretize(gain.dt)
-    return simulate(robot, StateFeedback(lin, gain.K), **options)
+    policy = StateFeedback(lin, gain.K)
+    if arguments.allocate:
+        return simulate(robot, Allocation(policy, design), **options)
+    motion = simulate(robot, policy, **options)
+    _warn_of_cut_thrust(robot, motion, policy)
+    return motion
+
+
+def _warn_of_cut_thrust(robot: Robot, motion: Motion, policy: StateFeedback) -> None:
+    from fflin.actuation import Actuation
+    from fflin.state import StateMap
+
+    groups = Actuation(StateMap(robot)).groups
+    if "thrust" not in groups:
+        return
+    lin, names = policy.lin, motion.state_names
+    deviation = motion.x[:, [names.index(name) for name in lin.state_names]] - lin.x0
+    asked = (lin.u0 - deviation @ policy.K.T)[:, groups["thrust"]]
+    # What rounding asks of a thruster that has nothing to do is no thrust.
+    pulled = (asked < -1e-9 * abs(asked).max(initial=0.0)).any(axis=1).mean()
+    if pulled > 0.0:
+        warnings.warn(
+            f"thrusters cannot pull: in {100.0 * pulled:.1f} % of the run a thrust below zero was "
+            "asked for and cut; --allocate gives the wrench with thrusts that push",
+            FflinWarning,
+            stacklevel=2,
+        )
+
+
+def _without_thrusters(robot: Robot) -> Robot:
+    from fflin.inputs import BaseForce, BaseTorque, Thruster
+
+    others = tuple(each for each in robot.inputs if not isinstance(each, Thruster))
+    if len(others) == len(robot.inputs):
+        raise InputError(f"--allocate: '{robot.name}' has no thrusters; give --inputs with some")
+    base = tuple(each() for each in (BaseTorque, BaseForce) if each() not in others)
+    return robot.replace(inputs=(*base, *others))
 
 
 def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
     from fflin.linearization import linearize
-    from fflin.model import configuration
 
-    q = configuration(robot, once("--target-joint", arguments.target_joint))
+    q = placed(robot, "--target-joint", arguments.target_joint)
     u = inputs_at(robot, q, None, arguments)
     lin = linearize(robot, q, None, u, frame=arguments.frame)
     if arguments.reduce:
