@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 
 from fflin.actuation import Actuation
 from fflin.errors import InputError, unknown
-from fflin.validation import Array, number
+from fflin.validation import DOUBLE, Array, as_double, number
 
 
 def limits_of(actuation: Actuation, limits: Any) -> tuple[Array, Array]:
@@ -58,6 +59,55 @@ def limits_of(actuation: Actuation, limits: Any) -> tuple[Array, Array]:
     thrusters = groups.get("thrust", np.zeros(0, dtype=int))
     low[thrusters] = np.maximum(low[thrusters], 0.0)
     return low, high
+
+
+class Law:
+    """A policy of which nothing but inputs is taken, and that shares no memory with the robot.
+
+    Parameters
+    ----------
+    policy : callable
+        policy(t, q, v) -> u (nu,)
+    names : tuple of str
+        Of the inputs.
+    limits : tuple of ndarray (nu,)
+        Within which it will act.
+    slow : float
+        Square of the velocity beyond which it need not be finite: the motion diverges.
+    """
+
+    def __init__(
+        self,
+        policy: Callable[[float, Array, Array], Any],
+        names: tuple[str, ...],
+        limits: tuple[Array, Array],
+        slow: float,
+    ) -> None:
+        self._policy, self._names, self._limits, self._slow = policy, names, limits, slow
+        self._shape = (len(names),)
+
+    def __call__(self, t: float, q: Array, v: Array) -> Array:
+        """Return the command (nu,), or raise `InputError` where it is none."""
+        u = self._policy(t, q.copy(), v.copy())
+        if type(u) is not np.ndarray or u.dtype is not DOUBLE:
+            u = as_double(f"policy(t, q, v) at t = {t:g} s", u)
+        else:
+            u = u.copy()
+        if u.shape == self._shape and math.isfinite(u.dot(u)):
+            return u
+        names = self._names
+        if u.shape != self._shape:
+            raise InputError(
+                f"policy(t, q, v) gave shape {u.shape} at t = {t:g} s, expected {self._shape}: "
+                f"a value for each of {', '.join(names[:8])}" + (", ..." if names[8:] else "")
+            )
+        wrong = np.flatnonzero(~np.isfinite(np.clip(u, *self._limits)))
+        if len(wrong) and float(v.dot(v)) < self._slow:
+            raise InputError(
+                f"policy(t, q, v) gave {u[wrong[0]]} for {names[wrong[0]]} at t = {t:g} s, "
+                "expected finite numbers"
+            )
+        return u
 
 
 class Channel:

@@ -12,11 +12,13 @@ from numpy.typing import ArrayLike
 from fflin.aba import Aba
 from fflin.errors import InputError
 from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.validation import Array, as_double
 
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
 _aba = pin.aba
+# Velocity from which on a disturbance need not be finite: the motion is not.
+_DIVERGED = 1e6
 _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
 
@@ -37,6 +39,10 @@ class Dynamics:
         self._state, self._robot = state, robot
         self._aba = Aba(state)
         self.actuation = self._aba.actuation
+        if disturbance is not None and not callable(disturbance):
+            raise InputError(
+                f"disturbance is a {type(disturbance).__name__}, expected a function of (t, q, v)"
+            )
         self._disturbance = disturbance
         self._model, self._data = robot.model, robot.create_data()
         nu = len(self.actuation.names)
@@ -56,7 +62,7 @@ class Dynamics:
         """Return dv/dt (nv,) in Pinocchio's order, and what pushes from outside.
 
         The latter is the sum (6,) of all wrenches but gravity's at the base origin, linear then
-        angular in base axes. What the disturbance is given is not overwritten later.
+        angular in base axes.
         """
         if self.actuation.held:
             u = self._in_base_axes(q, u)
@@ -66,7 +72,7 @@ class Dynamics:
         push = (self.actuation.columns(self._data, q)[:6] @ u)[_LINEAR_FIRST]
         if self._disturbance is None:
             return self._aba.acceleration(q, v, u), push
-        disturbed = self._disturbed(t, q, v.copy())
+        disturbed = self._disturbed(t, q, v)
         return self._aba.acceleration(q, v, u, disturbed), push + disturbed[:6]
 
     def isolated(self, *, driven: bool) -> bool:
@@ -94,8 +100,10 @@ class Dynamics:
 
     def _disturbed(self, t: float, q: Array, v: Array) -> Array:
         assert self._disturbance is not None
-        force = np.asarray(self._disturbance(t, q, v), dtype=float)
-        if force.shape != (self._robot.nv,) or not np.isfinite(force).all():
+        given = self._disturbance(t, q.copy(), v.copy())
+        force = as_double(f"disturbance(t, q, v) at t = {t:g} s", given)
+        finite = np.isfinite(force).all() or not np.abs(v).max() < _DIVERGED
+        if force.shape != (self._robot.nv,) or not finite:
             raise InputError(
                 f"disturbance(t, q, v) gave shape {force.shape} at t = {t:g} s, expected "
                 f"({self._robot.nv},) finite numbers: a generalised force in Pinocchio's order"

@@ -21,12 +21,14 @@ _STYLE: dict[Any, Any] = {
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
     "axes.grid": True,
+    "axes.axisbelow": True,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "grid.color": "#dddddd",
     "grid.linewidth": 0.6,
     "lines.linewidth": 1.4,
-    "legend.frameon": False,
+    "legend.framealpha": 0.8,
+    "legend.edgecolor": "none",
     "legend.fontsize": 8,
     "figure.dpi": 150,
     "savefig.dpi": 150,
@@ -34,8 +36,13 @@ _STYLE: dict[Any, Any] = {
 
 
 def cycle(count: int) -> list[str]:
-    """Return that many colours, from the first on."""
-    return [COLORS[i % len(COLORS)] for i in range(count)]
+    """Return that many colours, all different."""
+    if count <= len(COLORS):
+        return list(COLORS[:count])
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    return [to_hex(colormaps["turbo"](i / (count - 1))) for i in range(count)]
 
 
 class styled:

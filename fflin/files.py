@@ -159,10 +159,7 @@ def write_whole(contents: dict[Path, bytes]) -> None:
     target = Path()
     try:
         for target, content in contents.items():
-            real = Path(os.path.realpath(target))  # so that a link stays one
-            if real.exists() and not real.is_file():
-                kind = "a folder" if real.is_dir() else "not a regular file"
-                raise FileError(f"{target}: is {kind}; give the name of a file")
+            real = _real(target)
             handle, name = tempfile.mkstemp(prefix=".fflin-", dir=real.parent)
             temporary = Path(name)
             written[temporary] = real
@@ -179,6 +176,24 @@ def write_whole(contents: dict[Path, bytes]) -> None:
     finally:
         for temporary in written:
             temporary.unlink(missing_ok=True)
+
+
+def check_place(target: Path) -> None:
+    """Raise `FileError` where no file can be written there, before work is done for it."""
+    try:
+        with tempfile.TemporaryFile(prefix=".fflin-", dir=_real(target).parent):
+            pass
+    except OSError as error:
+        raise FileError(f"{target}: cannot be written: {error.strerror}") from None
+
+
+def _real(target: Path) -> Path:
+    """Return the file that is meant, so that a link stays one."""
+    real = Path(os.path.realpath(target))
+    if real.exists() and not real.is_file():
+        kind = "a folder" if real.is_dir() else "not a regular file"
+        raise FileError(f"{target}: is {kind}; give the name of a file")
+    return real
 
 
 def _umask() -> int:

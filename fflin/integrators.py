@@ -143,6 +143,6 @@ INTEGRATORS: dict[str, type[Integrator]] = {
 
 def integrator(name: str) -> type[Integrator]:
     """Return the integrator of a name, or raise `UnknownNameError`."""
-    if name not in INTEGRATORS:
+    if not isinstance(name, str) or name not in INTEGRATORS:
         raise unknown("method", str(name), list(INTEGRATORS))
     return INTEGRATORS[name]

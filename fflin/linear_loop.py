@@ -35,7 +35,7 @@ def predict(
     dt : float
         Step [s].
     steps, every : int
-        Steps in all, and from one row to the next.
+        Steps in all, and from one row to the next; the last step has a row in any case.
     """
     x0, u0 = lin.x0, lin.u0
 
@@ -49,7 +49,7 @@ def predict(
     if lin.dt:
         # Between the samples of a sampled model there is nothing to say.
         whole = round(lin.dt / dt)
-        if sample != whole or delay % whole or every % whole:
+        if sample != whole or any(count % whole for count in (delay, every, steps)):
             return np.zeros((0, len(x)))
         for step in range(0, steps, whole):
             u = channel.begin(step, e)

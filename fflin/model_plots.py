@@ -96,19 +96,20 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     with styled() as figure_class:
         nx, nu = lin.B.shape
         size = min(1.0, 24.0 / nx)
+        letters = min(8.0, 16.0 * size)
         figure = figure_class(figsize=(2.8 + 0.26 * size * (nx + nu), 2.0 + 0.26 * size * nx))
         figure.set_layout_engine("constrained")
         axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})
         entries = np.abs(np.hstack((lin.A, lin.B)))
-        top = float(np.log10(entries.max()))
+        top = float(np.log10(entries.max() or 1.0))
         # What is below the rounding of the largest entry would take all the colours.
-        least = max(top - 12.0, float(np.log10(entries[entries > 0.0].min())))
+        least = max(top - 12.0, float(np.log10(entries[entries > 0.0].min(initial=10.0**top))))
         for ax, values, name, columns in zip(
             axes, (lin.A, lin.B), "AB", (lin.state_names, lin.input_names), strict=True
         ):
-            image = _spy(ax, values, columns, 8.0 * size, (least, top))
+            image = _spy(ax, values, columns, letters, (least, top))
             ax.set_title(f"{name} ({values.shape[0]} x {values.shape[1]})")
-        axes[0].set_yticks(range(nx), lin.state_names, fontsize=8.0 * size)
+        axes[0].set_yticks(range(nx), lin.state_names, fontsize=letters)
         axes[1].set_yticks([])
         figure.colorbar(image, ax=axes, shrink=0.7).set_label("log10 of the magnitude")
         figure.suptitle(f"{lin.robot}, frame {lin.frame}")
@@ -148,13 +149,24 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
         levels, errors = (each[measured] for each in (validity.levels, validity.prediction_error))
         left.loglog(percent * levels, percent * errors, "o-", color=COLORS[0], ms=3)
         left.axhline(percent * TRUSTED, color="#888888", lw=0.8)
+        left.annotate(
+            f"trusted up to {percent * TRUSTED:g} %",
+            (0.01, percent * TRUSTED),
+            xytext=(0, 3),
+            xycoords=left.get_yaxis_transform(),
+            textcoords="offset points",
+            fontsize=8,
+        )
+        left.set_xticks(percent * validity.levels, [f"{percent * x:.3g}" for x in validity.levels])
+        left.minorticks_off()
         left.set(
             title="prediction error of the linear loop",
             xlabel="displacement [% of the largest]",
             ylabel="error [% of the displacement]",
         )
-        order = f"error ~ displacement^{validity.slope:.2f}"
-        left.text(0.05, 0.9, order, transform=left.transAxes)
+        if np.isfinite(validity.slope):
+            order = f"error ~ displacement^{validity.slope:.2f}"
+            left.text(0.97, 0.05, order, transform=left.transAxes, ha="right")
 
         settled = np.array([outcome == "settled" for outcome in validity.outcomes])
         edges = np.linspace(0.0, 1.0, 11)
@@ -168,6 +180,7 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
             xlabel="displacement [% of the largest]",
             ylabel="runs",
         )
+        right.yaxis.get_major_locator().set_params(integer=True)
         right.set_ylim(0.0, 1.25 * float(np.add(*counts).max()))
         right.legend(loc="upper left", ncols=2)
         figure.suptitle(

@@ -71,6 +71,15 @@ class Motion(Design):
     urdf_sha256: str
     stopped: str
 
+    def __post_init__(self) -> None:
+        rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)
+        if {len(each) for each in rows} != {len(self.t)} or len(self.prediction) not in (
+            0,
+            len(self.t),
+        ):
+            raise InputError("the rows of the motion are not as many as its times")
+        super().__post_init__()
+
     def __repr__(self) -> str:
         stopped = f", stopped: {self.stopped}" if self.stopped else ""
         return (
@@ -123,6 +132,8 @@ class Motion(Design):
         if target.suffix != ".csv":
             super().save(target)
             return
+        if not all(np.isfinite(each).all() for each in (self.t, self.x, self.u)):
+            raise InputError("the motion has entries that are not finite; it is not saved")
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(["t", *self.state_names, *(f"u.{name}" for name in self.input_names)])

@@ -24,7 +24,7 @@ def motion_report(motion: Motion, *, controlled: bool = True) -> str:
     end = motion.t[-1]
     parts = [f"{motion.robot}: {end:g} s, {len(motion.t)} rows, frame {motion.frame}"]
     if motion.stopped:
-        parts.append(f"stopped: {motion.stopped}")
+        parts.append(textwrap.fill(f"stopped: {motion.stopped}", width(), subsequent_indent="  "))
     error = np.abs(motion.error)
     if controlled:
         rows = [["error", "unit", "first", "largest", "last", "settled after [s]"]]
@@ -36,14 +36,19 @@ def motion_report(motion: Motion, *, controlled: bool = True) -> str:
             if at:
                 units = "|".join(dict.fromkeys(motion.state_units[i] for i in at))
                 rows.append([title, units, *_course(error[:, at].max(axis=1), motion.t)])
-        parts.append(grid(rows, "ll"))
+        parts.append(f"\n{grid(rows, 'll')}\n")
         largest = np.abs(motion.u).max(axis=0)
         kinds: dict[tuple[str, str], float] = {}
         for name, unit, value in zip(motion.input_names, motion.input_units, largest, strict=True):
-            key = (name.partition(".")[0], unit)
+            if value < _NOTHING:
+                continue
+            key = (name.partition(".")[0], unit.replace(" ", "\u00a0"))
             kinds[key] = max(kinds.get(key, 0.0), float(value))
-        shown = ", ".join(f"{name} {value:.4g} {unit}" for (name, unit), value in kinds.items())
-        parts.append(textwrap.fill(f"largest inputs: {shown}", width(), subsequent_indent="  "))
+        shown = [f"{name}\u00a0{value:.4g}\u00a0{unit}" for (name, unit), value in kinds.items()]
+        line = f"largest inputs: {', '.join(shown) or 'none'}"
+        # Name, value and unit stay on one line.
+        line = textwrap.fill(line, width(), subsequent_indent="  ", break_on_hyphens=False)
+        parts.append(line.replace("\u00a0", " "))
     energy = motion.energy
     parts.append(
         f"energy {energy[0]:.6g} J at first, {energy[-1]:.6g} J at last; "
@@ -53,11 +58,11 @@ def motion_report(motion: Motion, *, controlled: bool = True) -> str:
         apart = np.abs(motion.x - motion.linear).max(axis=0)
         most = int(apart.argmax())
         unit = motion.state_units[most].replace("1", "")
-        shown = f"{apart[most]:.3g} {unit}".rstrip()
+        size = f"{apart[most]:.3g} {unit}".rstrip()
         parts.append(
-            f"largest difference from the linear model: {shown} in {motion.state_names[most]}"
+            f"largest difference from the linear model: {size} in {motion.state_names[most]}"
         )
-    return "\n\n".join(parts[:-1]) + f"\n{parts[-1]}" if controlled else "\n".join(parts)
+    return "\n".join(parts)
 
 
 def _course(error: np.ndarray, t: np.ndarray) -> list[str]:

@@ -92,9 +92,16 @@ class OutputFeedback:
         aba = Aba(state) if any(isinstance(o, Accelerometer) for o in robot.outputs) else None
         near = state.read(lin.q, lin.v)
         z: Array = np.zeros(len(by.A))
+        asked = -np.inf
 
         def policy(t: float, q: Array, v: Array) -> Array:
-            nonlocal z
+            nonlocal z, asked
+            if asked >= 0.0 and abs(t - asked - lin.dt) > 1e-6 * lin.dt:
+                raise InputError(
+                    f"the compensator is asked {t - asked:g} s after its last sample, expected "
+                    f"{lin.dt:g} s; leave `sample` out"
+                )
+            asked = t
             u: Array = by.u0 + by.C @ z
             a: Array = np.zeros(robot.nv)
             if aba is not None:

@@ -11,6 +11,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from fflin.actuation import Actuation
+from fflin.control import Law
 from fflin.errors import InputError
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
@@ -106,6 +107,15 @@ class TrajectoryFeedback:
     trajectory: LinearTrajectory
     schedule: GainSchedule
 
+    def __post_init__(self) -> None:
+        if not hasattr(self.trajectory, "point") or not callable(
+            getattr(self.schedule, "gain", None)
+        ):
+            raise InputError(
+                "TrajectoryFeedback takes a LinearTrajectory and a GainSchedule, as "
+                "fflin.linearize_trajectory and fflin.tvlqr return them"
+            )
+
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
 
@@ -165,23 +175,26 @@ class Allocation:
         """
         from scipy.optimize import lsq_linear
 
+        if not isinstance(self.design, Robot):
+            raise InputError(f"design is a {type(self.design).__name__}, expected a fflin.Robot")
         if self.design.joint_names != robot.joint_names:
             raise InputError(
                 f"the design's joints are not those of '{robot.name}'; allocate for the same robot"
             )
-        inner = bound(self.policy, self.design)
         lin = self.lin
         asked, given = (
             StateMap(each, reference=lin.reference, frame=lin.frame) if lin else StateMap(each)
             for each in (self.design, robot)
         )
         asking, giving = Actuation(asked), Actuation(given)
+        free = np.full(len(asking.names), np.inf)
+        inner = Law(bound(self.policy, self.design), asking.names, (-free, free), np.inf)
         data = robot.create_data()
         least = np.full(len(giving.names), -np.inf)
         least[giving.groups.get("thrust", [])] = 0.0
 
         def policy(t: float, q: Array, v: Array) -> Array:
-            u = np.asarray(inner(t, q, v), dtype=float)
+            u = inner(t, q, v)
             force = asking.columns(data, q) @ asking.in_base_axes(asked.chart(q), u)
             columns = giving.columns(data, q)
             for held in giving.held:

@@ -2,19 +2,38 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.errors import InputError
 from fflin.linear_loop import predict
+from fflin.linear_model import LinearModel
 from fflin.motion import Motion
 from fflin.readout import states_of
 from fflin.validation import Array
 
 if TYPE_CHECKING:
-    from fflin.linear_model import LinearModel
     from fflin.run import Run
+
+
+def check_prediction(run: Run, linear: Any) -> None:
+    """Raise `InputError` where a model is given that cannot predict the run."""
+    if linear is None or isinstance(linear, bool | np.bool_):
+        return
+    if not isinstance(linear, LinearModel):
+        raise InputError(
+            f"linear is a {type(linear).__name__}, expected a fflin.LinearModel, True or False"
+        )
+    names = (run.state.names, run.dynamics.actuation.names, run.state.frame)
+    if (linear.state_names, linear.input_names, linear.frame) != names or linear.moving:
+        raise InputError(
+            f"linear is a model of '{linear.robot}' that has not the states, inputs and frame of "
+            f"the run of '{run.robot.name}'; linearise that robot in the policy's frame"
+        )
+    if getattr(run.policy, "K", None) is None:
+        raise InputError("linear predicts under a StateFeedback alone; leave it out")
 
 
 def motion_of(run: Run, stopped: str, linear: LinearModel | bool | None) -> Motion:
@@ -28,7 +47,11 @@ def motion_of(run: Run, stopped: str, linear: LinearModel | bool | None) -> Moti
     K = getattr(run.policy, "K", None)
     if lin is not None and K is not None and lin.state_names == run.state.names:
         loop = (lin, K, run.limits, run.sample, run.delay)
-        prediction = predict(*loop, x[0], run.dt, run.steps, run.every)[: run.count]
+        # What overflows is no prediction.
+        with np.errstate(over="ignore", invalid="ignore"):
+            prediction = predict(*loop, x[0], run.dt, run.taken, run.every)[: run.count]
+        if not np.isfinite(prediction).all():
+            prediction = prediction[:0]
     return Motion(
         t=run.t[rows],
         q=q,

@@ -27,6 +27,9 @@ _DIRECTIONS = 4
 _FORESIGHT, _PATIENCE = 3.0, 3.0
 _STEPS = 60
 
+# Relative error of the integration, and prediction errors too small to be told from it.
+_PRECISION, _ROUNDING = 1e-9, 1e-7
+
 # Relative prediction error up to which the linear model is called trusted.
 TRUSTED = 0.1
 
@@ -46,7 +49,8 @@ class Validity:
         Largest error of the linear closed loop over three of its time constants, relative to the
         displacement, in the norm of its Lyapunov function; NaN where a run left the chart.
     slope : float
-        Order of the error itself in the displacement, over the four smallest levels: 2.
+        Order of the error itself in the displacement, over the four smallest levels: 2. NaN where
+        one of these is of the size of the integration's errors, or left the chart.
     trusted : dict
         {"attitude" [deg], "position" [m], "joint" [rad|m]} where `prediction_error` reaches 10 %.
     sampled : ndarray (N,)
@@ -92,12 +96,18 @@ class Validity:
         low, high = self.rate
         ends = Counter(self.outcomes)
         failures = ", ".join(f"{ends[key]} {words}" for key, words in _ENDS.items() if ends[key])
+        order = "no order of the error can be told"
+        if np.isfinite(self.slope):
+            order = f"the error grows with the displacement to the power {self.slope:.3f}"
+        beyond = " and beyond" if self.trusted == self.largest else ""
+        first = {key: value * self.sampled[0] for key, value in self.largest.items()}
         lines = [
             f"{self.robot}: the linear loop foresees the nonlinear one within "
-            f"{100.0 * TRUSTED:g} % up to {shown(self.trusted)}; the error grows with the "
-            f"displacement to the power {self.slope:.3f}",
+            f"{100.0 * TRUSTED:g} % up to {shown(self.trusted)}{beyond}; {order}",
             f"every loop settled up to {shown(self.holds)}: {self.inside} of {self.inside} runs, "
-            f"so that at least {100.0 * self.inside_rate:.1f} % do ({sure} confidence)",
+            f"so that at least {100.0 * self.inside_rate:.1f} % do ({sure} confidence)"
+            if self.inside
+            else f"even from the smallest displacement tried, {shown(first)}, it did not settle",
             f"of displacements up to {shown(self.largest)} {self.settled} of {count} runs settled: "
             f"between {100.0 * low:.1f} and {100.0 * high:.1f} % do ({sure} confidence)"
             + (f"; {failures}" if failures else ""),
@@ -142,7 +152,7 @@ def validity(
         K, which makes the linear loop stable.
     attitude, position, joint : float
         Largest displacement of the base [deg], [m], and of the joint displaced most [rad|m]. What
-        is not among the states of a reduced model is not displaced.
+        is not among the states of a reduced model is not displaced, and told as 0.
     samples : int
         Number of random runs.
     seed : int
@@ -179,10 +189,21 @@ def validity(
             f"the displacements are {shown(largest)}; expected none negative, and an attitude "
             "below 175 deg, where the chart ends"
         )
+    there = {name.partition(".")[0] for name in lin.state_names}
+    groups = {"attitude": "q_b", "position": "r_b", "joint": "q_m"}
+    largest = {key: largest[key] if groups[key] in there else 0.0 for key in groups}
+    if not any(largest.values()):
+        raise InputError(
+            "the model has none of the coordinates that are displaced; give others than 0"
+        )
     # Of each run its own stream, so that it does not matter who does which.
     streams = np.random.SeedSequence(seed).spawn(samples + _DIRECTIONS)
     levels = (np.arange(samples) + 0.5) / samples
     each: Any = map
+    if executor is not None and not isinstance(executor, Executor):
+        raise InputError(
+            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
+        )
     if executor:
         each = partial(executor.map, chunksize=1 + samples // 16)
     errors = np.array(list(each(partial(_foreseen, loop, largest), streams[:_DIRECTIONS])))
@@ -252,7 +273,7 @@ def _foreseen(loop: Loop, largest: dict[str, float], stream: np.random.SeedSeque
     errors = []
     for level in _LEVELS:
         x = loop.displaced(np.random.default_rng(stream), **_scaled(largest, float(level)))
-        _, motion = loop.run(x, times, 1e-9)
+        _, motion = loop.run(x, times, _PRECISION)
         foreseen = loop.linear(motion[0], times)[: len(motion)]
         worst = max(loop.size(one - two) for one, two in zip(motion, foreseen, strict=True))
         complete = len(motion) == len(times) or loop.size(motion[-1]) <= SETTLED * loop.size(
@@ -277,6 +298,8 @@ def _scaled(largest: dict[str, float], level: float) -> dict[str, float]:
 
 def _slope(errors: Array) -> float:
     """Return the order of the error itself, one more than that of the relative error."""
+    if not errors[:4].min() > _ROUNDING:
+        return np.nan
     return 1.0 + float(np.polyfit(np.log(_LEVELS[:4]), np.log(errors[:4]), 1)[0])
 
 
@@ -288,6 +311,8 @@ def _crossing(errors: Array) -> float:
     first = int(beyond[0])
     if first == 0 or not np.isfinite(errors[first]):
         # Below the first level the error is proportional to it.
+        if not np.isfinite(errors[0]):
+            return 0.0
         at = max(first - 1, 0)
         return float(min(_LEVELS[at] * TRUSTED / errors[at], _LEVELS[first]))
     pair = slice(first - 1, first + 1)
@@ -305,8 +330,7 @@ def _clopper_pearson(successes: int, count: int, confidence: float) -> tuple[flo
 
 
 def shown(displacement: dict[str, float]) -> str:
-    """Say a displacement in words."""
-    return (
-        f"{displacement['attitude']:.3g} deg, {displacement['position']:.3g} m and "
-        f"{displacement['joint']:.3g} rad|m"
-    )
+    """Say in words what of a displacement is not zero."""
+    units = {"attitude": "deg", "position": "m", "joint": "rad|m"}
+    words = [f"{displacement[key]:.3g} {unit}" for key, unit in units.items() if displacement[key]]
+    return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:]))) or "0"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.conservation import Conserved
-from fflin.control import Channel, limits_of
+from fflin.control import Channel, Law, limits_of
 from fflin.dynamics import Disturbance, Dynamics
 from fflin.errors import InputError
 from fflin.integrators import integrator
@@ -25,6 +26,7 @@ Event = Callable[[float, Array, Array], float]
 
 # A turn within one step [rad] beyond which no integrator follows.
 _LARGEST_TURN = 1.0
+_LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
 _STEP = 0.01  # [s]
 _LOOK = 16  # steps between looks at the clock
 _ROWS_LIMIT = 10_000_000
@@ -63,6 +65,11 @@ class Run:
         else:
             self.q = robot.neutral() if q0 is None else robot.checked_configuration(q0).copy()
             self.v = np.zeros(robot.nv) if v0 is None else robot.checked_velocity(v0).copy()
+        if not np.abs(self.v).max() < _LARGEST_SPEED:
+            raise InputError(
+                f"the initial velocity has an entry of {np.abs(self.v).max():.3g}, expected less "
+                f"than {_LARGEST_SPEED:g} [rad/s|m/s]"
+            )
         self.target = None if self.lin is None else self._target(self.lin)
         near = x0 if x0 is not None else self.target
         self.near = None if near is None else np.asarray(near, dtype=float)
@@ -72,69 +79,65 @@ class Run:
         self, duration: float, dt: float | None, every: int, sample: float | None, delay: float
     ) -> None:
         """Set the times."""
-        if sample is None and self.lin is not None and self.lin.dt:
-            sample = self.lin.dt
+        if sample is None:
+            sample = getattr(getattr(self.policy, "lin", None), "dt", None) or None
+        if sample is not None:
+            sample = _positive("sample", sample)
+        duration, delayed = _positive("duration", duration), number("delay", delay)
+        if delayed < 0.0:
+            raise InputError(f"delay is {delayed:g} s, expected 0 or more")
         self.fastest = 0.0 if sample else self._fastest_pole()
         if dt is None:
-            dt = _STEP if sample is None else min(sample, sample / np.ceil(sample / _STEP))
+            dt = _STEP
             if self.fastest * dt > 1.0:
-                dt = 0.5 ** np.ceil(np.log2(self.fastest))
-        self.dt = _positive("dt", dt)
-        duration = _positive("duration", duration)
+                dt = float(0.5 ** np.ceil(np.log2(self.fastest)))
+            if sample or delayed:
+                dt = _part_of(sample or delayed, dt, duration, delayed)
+        self.dt = _positive("the step dt", dt)
         self.steps = max(1, round(duration / self.dt))
         if abs(self.steps * self.dt - duration) > 1e-6 * duration:
+            if sample or delayed:
+                raise InputError(
+                    f"duration is {duration:g} s, expected a multiple of the step dt = "
+                    f"{self.dt:g} s where the input is sampled or late; choose the step so"
+                )
             self.steps = int(np.ceil(duration / self.dt))
             self.dt = duration / self.steps
-        if not isinstance(every, int) or every < 1:
+        if not isinstance(every, int | np.integer) or every < 1:
             raise InputError(f"every is {every!r}, expected a whole number of steps, 1 or more")
-        self.every = every
+        self.every = int(every)
         rows = self.steps // every + 2
         if rows * (self.robot.nq + self.robot.nv + 2 * self.state.nx) > 50 * _ROWS_LIMIT:
             raise InputError(
-                f"{duration:g} s in steps of {self.dt:g} s are {rows} rows; take a larger `every`"
+                f"{duration:g} s in steps of {self.dt:g} s are {rows:.3g} rows; take a larger "
+                "dt or `every`"
             )
-        delayed = number("delay", delay)
-        if delayed < 0.0:
-            raise InputError(f"delay is {delayed:g} s, expected 0 or more")
         if sample is None and delayed:
             sample = self.dt
-        self.sample = 0 if sample is None else self._whole("sample", _positive("sample", sample))
+        self.sample = 0 if sample is None else self._whole("sample", sample)
         self.delay = self._whole("delay", delayed)
 
     def _whole(self, name: str, time: float) -> int:
         steps = round(time / self.dt)
         if abs(steps * self.dt - time) > 1e-6 * self.dt:
             raise InputError(
-                f"{name} is {time:g} s, expected a multiple of dt = {self.dt:g} s; choose dt so"
+                f"{name} is {time:g} s, expected a multiple of the step dt = {self.dt:g} s; "
+                "choose the step so"
             )
         return steps
 
     def actuate(self, limits: Any) -> None:
         """Set what becomes of a command."""
+        names = self.dynamics.actuation.names
         self.limits = limits_of(self.dynamics.actuation, limits)
         # The model's inputs are others where they are allocated to the robot's.
-        same = self.lin is not None and self.lin.input_names == self._names
-        self.initial = self.lin.u0 if self.lin is not None and same else np.zeros(len(self._names))
+        same = self.lin is not None and self.lin.input_names == names
+        self.initial = self.lin.u0 if self.lin is not None and same else np.zeros(len(names))
         self.channel = None
+        self.slow = (_LARGEST_TURN / self.dt) ** 2
         if self._law is not None:
-            self.channel = Channel(
-                self._command, self.initial, *self.limits, self.sample, self.delay
-            )
-
-    def _command(self, t: float, q: Array, v: Array) -> Array:
-        assert self._law is not None
-        u = np.asarray(self._law(t, q, v), dtype=float)
-        if u.shape != self.initial.shape:
-            raise InputError(
-                f"policy(t, q, v) gave shape {u.shape} at t = {t:g} s, expected "
-                f"{self.initial.shape}: a value for each of {', '.join(self._names[:8])}"
-                + (", ..." if len(self._names) > 8 else "")
-            )
-        return u
-
-    @property
-    def _names(self) -> tuple[str, ...]:
-        return self.dynamics.actuation.names
+            law = Law(self._law, names, self.limits, self.slow)
+            self.channel = Channel(law, self.initial, *self.limits, self.sample, self.delay)
 
     def choose(self, method: str, project: bool) -> None:
         """Set the integrator."""
@@ -142,7 +145,7 @@ class Run:
         self.project = bool(project)
         if self.fastest * self.dt > kind.reach:
             raise InputError(
-                f"dt is {self.dt:g} s, too large for a loop whose fastest pole is at "
+                f"the step dt is {self.dt:g} s, too large for a loop whose fastest pole is at "
                 f"{self.fastest:.4g} 1/s; take at most {kind.reach / self.fastest:.2g} s, or "
                 "`sample`"
             )
@@ -158,6 +161,10 @@ class Run:
 
     def guard(self, events: Sequence[Event], callback: Any) -> None:
         """Set what ends the run and what watches it."""
+        if not isinstance(events, Sequence):
+            raise InputError(
+                f"events is a {type(events).__name__}, expected a list of functions event(t, q, v)"
+            )
         for each in (*events, *([] if callback is None else [callback])):
             if not callable(each):
                 raise InputError(f"{each!r} is no function of (t, q, v), as an event would be")
@@ -167,11 +174,15 @@ class Run:
         rotors = rotor_names(self.robot)
         at = [joint.idx_v for joint in joints if joint.name not in rotors]
         self.turning = np.array([3, 4, 5, *at])
-        self.slow = (_LARGEST_TURN / self.dt) ** 2
         self.acting: Array | None = None
 
     def go(self, progress: bool | None) -> str:
         """Run to the end; return why it ended before."""
+        # What overflows is told as a divergence.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self._go(progress)
+
+    def _go(self, progress: bool | None) -> str:
         rows = self.steps // self.every + 2
         sizes = (self.robot.nq, self.robot.nv, len(self.initial), 6)
         self.t = np.empty(rows)
@@ -188,6 +199,7 @@ class Run:
         stopped, step = "", 0
         try:
             for step in range(self.steps):
+                self.taken = step + 1
                 u = self._advance(step)
                 # The square is above that of any turn, and not finite where an entry is not.
                 if self.lin is not None or not float(self.v.dot(self.v)) < self.slow:
@@ -230,7 +242,7 @@ class Run:
 
         def f(t: float, q: Array, v: Array) -> Array:
             # The first stage is the point that was asked about already.
-            acting = ask(t, q, v.copy()) if ask and pushes else u
+            acting = ask(t, q, v) if ask and pushes else u
             a, push = stage(t, q, v, acting)
             pushes.append(wrench(q, push) if wrench else push)
             return a
@@ -249,9 +261,10 @@ class Run:
         """Say what is wrong with the step that was taken; drop it where it has no meaning."""
         t = (step + 1) * self.dt
         turn = float(np.abs(self.v[self.turning]).max(initial=0.0)) * self.dt
-        if not (turn < _LARGEST_TURN and np.isfinite(self.v).all()):
+        fast = not np.abs(self.v).max() < _LARGEST_SPEED
+        if fast or not turn < _LARGEST_TURN:
             self.q, self.v = (rows[self.count - 1] for rows in self.rows[:2])
-            if not np.isfinite(turn) or turn > 1e3:
+            if fast or turn > 1e3:
                 return f"diverged at t = {t:g} s"
             return f"diverged at t = {t:g} s: a joint or the base turns by {turn:.2g} rad a step"
         if self.lin is None:
@@ -264,7 +277,14 @@ class Run:
     def _event(self, step: int) -> str:
         t = step * self.dt
         for event in self.events:
-            if not float(event(t, self.q, self.v)) > 0.0:
+            value = event(t, self.q.copy(), self.v.copy())
+            try:
+                margin = float(value)
+            except (TypeError, ValueError):
+                margin = math.nan
+            if math.isnan(margin):
+                raise InputError(f"an event gave {value!r} at t = {t:g} s, expected a number")
+            if margin <= 0.0:
                 return f"{getattr(event, '__name__', 'event')} at t = {t:g} s"
         return ""
 
@@ -275,7 +295,7 @@ class Run:
         q[row], v[row], of_u[row], momentum[row] = self.q, self.v, u, self.expected
         self.count += 1
         if self.callback is not None:
-            self.callback(t, self.q, self.v, u)
+            self.callback(t, self.q.copy(), self.v.copy(), u.copy())
 
     def _target(self, lin: LinearModel) -> Array:
         target = self.state.read(lin.q, lin.v)
@@ -284,8 +304,18 @@ class Run:
         return target
 
 
+def _part_of(sample: float, largest: float, *times: float) -> float:
+    """Return a step of which the sample and, where there is one, the other times are multiples."""
+    least = int(np.ceil(sample / largest))
+    for parts in range(least, least + 1000):
+        dt = sample / parts
+        if all(abs(round(time / dt) * dt - time) <= 1e-6 * dt for time in times):
+            return dt
+    return sample / least
+
+
 def _positive(name: str, value: Any) -> float:
     time = number(name, value)
-    if time <= 0.0:
+    if time <= 1e-100:  # its inverse is squared
         raise InputError(f"{name} is {time:g} s, expected more than 0")
     return time

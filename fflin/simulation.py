@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from fflin.recording import motion_of
+from fflin.recording import check_prediction, motion_of
 from fflin.run import Run
 
 if TYPE_CHECKING:
@@ -67,7 +67,8 @@ def simulate(
     duration : float
         [s]
     dt : float, optional
-        Step [s]; by default 0.01, or less where the loop's fastest pole asks for it.
+        Step [s]; by default 0.01, or less where the loop's fastest pole or the samples ask for it.
+        Where the input is neither sampled nor late, it is made to divide the duration.
     method : {"cf4", "rkmk4", "semi_implicit_euler"}
     project : bool
         Whether the momentum is kept as above.
@@ -88,6 +89,7 @@ def simulate(
         callback(t, q, v, u), called at every recorded row.
     linear : LinearModel or bool, optional
         Predicts the motion under the same law; by default the policy's own model, False for none.
+        Sampled, it does so where every row is at a sample.
     frame : {"hybrid", "local", "world"}, optional
     reference : pin.SE3, optional
         Chart of x and axes of u; the policy's model's by default, else hybrid and the identity.
@@ -115,6 +117,7 @@ def simulate(
     E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
     """
     run = Run(robot, policy, frame, reference, disturbance)
+    check_prediction(run, linear)
     run.begin(x0, q0, v0)
     run.clock(duration, dt, every, sample, delay)
     run.actuate(limits)

@@ -52,7 +52,7 @@ def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
     if type(value) is np.ndarray and value.dtype is DOUBLE:
         array: Array = value
     else:
-        array = _as_double(name, value)
+        array = as_double(name, value)
     if array.shape != (size,):
         raise InputError(f"{name} has shape {array.shape}, expected ({size},): {of_what}")
     # Python's sum is quicker than NumPy's here, and overflows without a warning.
@@ -91,7 +91,8 @@ def placement(name: str, value: Any) -> pin.SE3:
     return pin.SE3(pin.Quaternion(rotation).normalized().matrix(), value.translation)
 
 
-def _as_double(name: str, value: ArrayLike) -> Array:
+def as_double(name: str, value: ArrayLike) -> Array:
+    """Return a new array of native floats, or raise `InputError` where it is none of numbers."""
     if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
         raise InputError(f"{name} has masked entries; fill them first")
     try:

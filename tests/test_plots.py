@@ -36,7 +36,7 @@ def test_motion_shows_linear_beside_nonlinear_and_their_difference(loop):
     np.testing.assert_array_equal(full.get_ydata(), motion.x[:, 2])
     np.testing.assert_array_equal(dashed.get_ydata(), motion.linear[:, 2])
     assert dashed.get_linestyle() == "--"
-    differences = [each for each in figure.axes if each.get_ylabel() == "difference"]
+    differences = [each for each in figure.axes if each.get_ylabel().startswith("difference")]
     assert len(differences) == 6
     apart = differences[0].get_lines()[2].get_ydata()
     np.testing.assert_array_equal(apart, motion.x[:, 2] - motion.linear[:, 2])
@@ -44,7 +44,7 @@ def test_motion_shows_linear_beside_nonlinear_and_their_difference(loop):
     torque = lines(axes["inputs"])["tau_b.z"]
     np.testing.assert_array_equal(torque.get_ydata(), motion.u[:, 2])
     assert set(lines(axes["joint inputs tau_m"])) == {
-        name.partition(".")[2] for name in motion.input_names if name.startswith("tau_m")
+        name for name in motion.input_names if name.startswith("tau_m")
     }
     assert "momentum drift, relative" in axes
 
@@ -53,7 +53,46 @@ def test_motion_without_a_prediction_has_no_differences():
     robot = fflin.load("cubesat")
     motion = fflin.simulate(robot, v0=[0, 0, 0, 0.1, 0, 0.2], duration=1.0, every=10)
     figure = motion.plot()
-    assert not [each for each in figure.axes if each.get_ylabel() == "difference"]
+    assert not [each for each in figure.axes if each.get_ylabel().startswith("difference")]
+
+
+def test_many_inputs_and_joints_are_named_beside_the_panels_each_in_its_colour():
+    bare = fflin.load("servicer_7dof")
+    thrusters = [
+        fflin.Thruster("tool", (0, 0, 0), (1.0, k, 0.0), f"a_thruster_with_a_long_name_{k}")
+        for k in range(12)
+    ]
+    robot = bare.replace(inputs=[*thrusters, *bare.inputs[2:]])
+    motion = fflin.simulate(robot, duration=0.05)
+    figure = motion.plot()
+    named = {legend.get_title().get_text(): legend for legend in figure.legends}
+    shown = [text.get_text() for text in named["joints"].get_texts()]
+    assert shown == list(robot.joint_names)
+    assert len(named["inputs"].get_texts()) == 12
+    for legend in named.values():
+        colors = {line.get_color() for line in legend.get_lines()}
+        assert len(colors) == len(legend.get_lines())
+    axes = {each.get_title(): each for each in figure.axes}
+    torques, angles = (
+        {line.get_label().rpartition(".")[2]: line.get_color() for line in axes[title].get_lines()}
+        for title in ("joint inputs tau_m", "joints q_m")
+    )
+    assert torques == angles
+    # Nothing lies on anything else.
+    figure.draw_without_rendering()
+    boxes = [each.get_tightbbox() for each in (*figure.axes, *figure.legends)]
+    for i, one in enumerate(boxes):
+        assert not any(one.overlaps(other) for other in boxes[:i])
+        assert one.x0 >= 0.0
+        assert one.x1 <= figure.bbox.x1 + 1.0
+
+
+def test_attitude_through_180_degrees_has_a_gap():
+    robot = fflin.load("cubesat")
+    motion = fflin.simulate(robot, v0=[0, 0, 0, 0, 0, 2.0], duration=2.0)
+    z = motion.plot().axes[0].get_lines()[2].get_ydata()
+    assert np.isnan(z).sum() == 1
+    assert np.nanmax(np.abs(np.diff(z))) < 0.1
 
 
 def test_pole_map_and_pattern(loop):

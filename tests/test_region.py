@@ -97,6 +97,21 @@ def test_displacements_are_as_large_as_they_say(robots):
     assert np.abs((x - lin.x0)[6:12]).max() == pytest.approx(0.7) and not v.any()
 
 
+def test_displacements_of_a_point_that_is_turned_from_the_reference(robots):
+    import pinocchio as pin
+
+    robot = robots["cubesat"]
+    turned = pin.SE3(pin.exp3(np.array([0.0, 2.6, 0.0])), np.zeros(3))
+    q0 = fflin.configuration(robot, base=turned)
+    lin = fflin.linearize(robot, q0, reference=pin.SE3.Identity())
+    loop = Loop(robot, lin, np.zeros((6, 12)))
+    for seed in range(8):  # on either side of a turn of 180 degrees from the reference
+        x = loop.displaced(np.random.default_rng(seed), 100.0, 0.0, 0.0)
+        q, _ = loop.state.to_pinocchio(x)
+        moved = turned.rotation.T @ pin.XYZQUATToSE3(q[:7]).rotation
+        assert np.rad2deg(np.linalg.norm(pin.log3(moved))) == pytest.approx(100.0)
+
+
 def test_same_seed_same_result_whoever_runs_it(robots):
     robot = robots["cubesat"]
     lin, gain = held(robot)
@@ -142,6 +157,38 @@ def test_joints_only_hold_the_reduced_model(robots):
     found = fflin.validity(robot, lin, gain, joint=0.5, samples=5)
     assert found.slope == pytest.approx(2.0, abs=0.1)
     assert found.settled == 5
+
+
+def test_what_cannot_be_told_is_not(robots, arm):
+    robot = robots["cubesat"]
+    lin, gain = held(robot)
+    # A body that is only moved away comes back as the linear model says, to the last digit.
+    found = fflin.validity(robot, lin, gain, attitude=0.0, samples=2)
+    assert np.isnan(found.slope) and found.trusted == found.largest
+    assert found.largest == {"attitude": 0.0, "position": 0.5, "joint": 0.0}
+    said = " ".join(str(found).split())
+    assert "up to 0.5 m and beyond; no order of the error can be told" in said
+    # One that is hurled away is nowhere foreseen.
+    lin, gain = held(arm)
+    found = fflin.validity(arm, lin, gain, attitude=170.0, position=1e6, samples=2)
+    assert np.isnan(found.slope) and found.inside == 0
+    assert set(found.trusted.values()) == {0.0}
+    said = " ".join(str(found).split())
+    assert "smallest displacement tried, 42.5 deg, 2.5e+05 m and 0.25 rad|m, it did not" in said
+    assert "nan" not in said
+    pytest.importorskip("matplotlib")
+    fflin.plot_validity(found).draw_without_rendering()
+
+
+def test_what_a_reduced_model_has_not_is_not_told(robots):
+    robot = robots["ets_vii"]
+    robot = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
+    lin, gain = held(robot, reduce=True)
+    found = fflin.validity(robot, lin, gain, joint=0.5, samples=2)
+    assert found.largest == {"attitude": 0.0, "position": 0.0, "joint": 0.5}
+    assert "deg" not in str(found)
+    with pytest.raises(fflin.InputError, match="none of the coordinates that are displaced"):
+        fflin.validity(robot, lin, gain, joint=0.0, samples=2)
 
 
 def test_bad_input(arm):

@@ -1,5 +1,6 @@
 """The command simulate as a user runs it."""
 
+import os
 import subprocess
 import sys
 
@@ -91,6 +92,51 @@ def test_the_share_of_cut_thrust_is_that_of_the_motion(tmp_path):
     assert told == pytest.approx(share, abs=0.1)
 
 
+def test_the_linear_model_is_shown_between_samples_and_inputs_stay_with_their_units(tmp_path):
+    code, out, _ = run(
+        *("simulate", "cubesat", "--inputs", "cubesat", "--rpy", 5, 0, 0, "--dt", 0.5),
+        *("--duration", 5, "-o", "m.npz"),
+        cwd=tmp_path,
+    )
+    assert code == 0
+    motion = fflin.Motion.load(tmp_path / "m.npz")
+    assert motion.linear.shape == motion.x.shape
+    assert np.abs(motion.linear - motion.x).max() < 1e-4
+    lines = out.splitlines()
+    at = next(i for i, line in enumerate(lines) if line.startswith("largest inputs"))
+    until = next(i for i, line in enumerate(lines) if line.startswith("energy"))
+    inputs = [part for line in lines[at:until] for part in line.split(", ")]
+    assert all(part.rstrip(",").endswith((" N", " N m")) for part in inputs)
+    assert "e-1" not in " ".join(inputs)  # what is rounding is none of the largest
+    assert max(map(len, lines)) <= 80
+
+
+def test_the_motion_is_kept_though_nobody_reads_the_table(tmp_path):
+    pipe = os.pipe()
+    os.close(pipe[0])
+    with os.fdopen(pipe[1], "w") as closed:
+        command = [sys.executable, "-m", "fflin", "simulate", "cubesat", "--duration", "1"]
+        done = subprocess.run(
+            [*command, "-o", "m.npz"],
+            cwd=tmp_path,
+            stdout=closed,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.stderr == ""
+    assert len(fflin.Motion.load(tmp_path / "m.npz").t) == 101
+
+
+@pytest.mark.parametrize("option", ["-o", "--plot"])
+def test_a_place_that_cannot_be_written_is_said_before_the_run(tmp_path, option):
+    there = tmp_path / "nowhere" / ("m.npz" if option == "-o" else "m.png")
+    code, out, err = run("simulate", "cubesat", option, there, cwd=tmp_path)
+    assert (code, out) == (2, "")
+    assert "cannot be written" in err
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_free_robot_keeps_its_energy():
     code, out, _ = run(
         *("simulate", "planar_detumble", "--free", "--velocity", "omega_b.z=0.3"),
@@ -121,6 +167,7 @@ def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
         (["-o", "loop.xyz"], "ends in '.xyz'"),
         (["--limit", "tau_x=1"], "tau_x"),
         (["--free", "--reduce"], "--free has no regulator"),
+        (["--free", "--limit", "tau_m=1"], "--free has no input"),
         (["--step", "5"], "too large for a loop"),
         (["--method", "rk4"], "method"),
     ],

@@ -419,7 +419,7 @@ def test_csv_has_names_and_rows(tmp_path):
         ({"duration": -1.0}, "duration is -1 s"),
         ({"duration": 1.0, "dt": 0.0}, "dt is 0 s"),
         ({"duration": 1.0, "method": "euler"}, "method"),
-        ({"duration": 1.0, "dt": 0.1, "sample": 0.15}, "multiple of dt"),
+        ({"duration": 1.0, "dt": 0.1, "sample": 0.15}, "multiple of the step dt"),
         ({"duration": 1.0, "delay": -0.1}, "delay is -0.1 s"),
         ({"duration": 1.0, "limits": {"tau_x": 1.0}}, "tau_x"),
         ({"duration": 1.0, "limits": -2.0}, "limit of 'tau_b'"),

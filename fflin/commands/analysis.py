@@ -12,6 +12,7 @@ from fflin.commands import DONE
 from fflin.commands.arguments import Commands, add_point, command, number
 from fflin.commands.points import linear_model
 from fflin.commands.regulator import add_weights, gain_of
+from fflin.commands.visual import check_figure
 from fflin.errors import InputError
 
 if TYPE_CHECKING:
@@ -117,10 +118,7 @@ def _validity(arguments: argparse.Namespace) -> int:
     if arguments.jobs < 1:
         raise InputError(f"--jobs is {arguments.jobs}, expected at least 1")
     if arguments.plot:
-        from fflin.figures import check_figure_format, require_matplotlib
-
-        check_figure_format(arguments.plot)
-        require_matplotlib()
+        check_figure(arguments.plot)
     robot, lin = linear_model(arguments)
     lin = momentum_reduction(lin) if arguments.reduce else lin
     gain = gain_of(lin, arguments)

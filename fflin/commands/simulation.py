@@ -21,7 +21,7 @@ from fflin.commands.arguments import (
 )
 from fflin.commands.points import configuration_of, inputs_at, load_robot, once, placed, velocity_of
 from fflin.commands.regulator import add_weights, gain_of
-from fflin.commands.visual import add_pictures, check_pictures, show_motion
+from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
 from fflin.errors import FflinWarning, InputError
 
 if TYPE_CHECKING:
@@ -105,15 +105,14 @@ def add_commands(commands: Commands) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
+    from fflin.files import check_place
     from fflin.motion import check_motion_format
 
     if arguments.output_file:
         check_motion_format(arguments.output_file)
+        check_place(arguments.output_file)
     if arguments.plot:
-        from fflin.figures import check_figure_format, require_matplotlib
-
-        check_figure_format(arguments.plot)
-        require_matplotlib()
+        check_figure(arguments.plot)
     robot = load_robot(arguments)
     check_pictures(robot, arguments)
     motion = simulated(robot, arguments)
@@ -148,6 +147,8 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
         "delay": arguments.delay,
     }
     if arguments.free:
+        if arguments.limit or arguments.delay:
+            raise InputError("--free has no input to limit or delay; leave one out")
         weighed = arguments.q or arguments.r or arguments.bryson or arguments.dt
         if weighed or arguments.target_joint or arguments.reduce or arguments.allocate:
             raise InputError(
@@ -159,6 +160,8 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     design = _without_thrusters(robot) if arguments.allocate else robot
     lin = _about_target(design, arguments)
     gain = gain_of(lin, arguments)
+    if not (arguments.reduce or arguments.allocate):
+        options["linear"] = lin  # at every row, where the sampled model has the samples alone
     if gain.dt:
         lin = lin.discretize(gain.dt)
     policy = StateFeedback(lin, gain.K)
