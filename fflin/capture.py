@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -80,21 +81,24 @@ def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes
     return content.getvalue()
 
 
-def take_gif(page: Path, duration: float, speed: float, size: tuple[int, int]) -> bytes:
+def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[int, int]) -> bytes:
     """Return a GIF of a motion's page.
 
     Parameters
     ----------
     page : Path
-    duration, speed : float
-        Of the motion [s], and seconds of it per second; a long one is shown faster.
+    span : tuple of float
+        When the motion begins and ends [s].
+    speed : float
+        Seconds of it per second; a long one is shown faster.
     size : tuple of int
         Width and height [pixels].
     """
     from PIL import Image
 
-    count = max(2, min(_GIF_FRAMES, round(duration / speed * _GIF_FPS)))
-    times = [duration * index / (count - 1) for index in range(count)]
+    start, duration = span[0], span[1] - span[0]
+    count = round(max(2, min(_GIF_FRAMES, duration / speed * _GIF_FPS)))
+    times = [start + duration * index / (count - 1) for index in range(count)]
     frames = _film(page, times, size, plain=True)
     images = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
     palette = images[0].quantize(160)
@@ -108,23 +112,40 @@ def take_gif(page: Path, duration: float, speed: float, size: tuple[int, int]) -
 
 def _film(page: Path, times: Sequence[float], size: tuple[int, int], *, plain: bool) -> list[bytes]:
     """Return a PNG of the page at each time."""
+    started: list[subprocess.Popen[bytes]] = []
     # In a notebook this thread has an event loop already.
     with ThreadPoolExecutor(1) as other:
-        return other.submit(lambda: asyncio.run(_browse(page, times, size, plain))).result()
+        film = other.submit(lambda: asyncio.run(_browse(page, times, size, plain, started)))
+        try:
+            return film.result()
+        finally:
+            for process in started:  # at Ctrl-C it is still there, and would go on
+                process.terminate()
 
 
 async def _browse(
-    page: Path, times: Sequence[float], size: tuple[int, int], plain: bool
+    page: Path,
+    times: Sequence[float],
+    size: tuple[int, int],
+    plain: bool,
+    started: list[subprocess.Popen[bytes]],
 ) -> list[bytes]:
     program = find_chromium()
+    # Where there is such a thing, it ends with this process, however that ends.
+    guard = shutil.which("setpriv")
+    guarded = [guard, "--pdeathsig", "TERM"] if guard and sys.platform == "linux" else []
     with tempfile.TemporaryDirectory(prefix="fflin-", ignore_cleanup_errors=True) as folder:
         root = ["--no-sandbox"] if getattr(os, "geteuid", lambda: 1)() == 0 else []
         process = subprocess.Popen(
-            [program, *_ARGUMENTS, *root, f"--user-data-dir={folder}", "about:blank"],
+            [*guarded, program, *_ARGUMENTS, *root, f"--user-data-dir={folder}", "about:blank"],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
+            # What it leaves behind goes with the folder, unless the path of its socket, which may
+            # have some hundred letters, got too long by that.
+            env={**os.environ, **({"TMPDIR": folder} if len(folder) < 56 else {})},
         )
+        started.append(process)
         try:
             return await asyncio.wait_for(
                 _shoot(Path(folder, "DevToolsActivePort"), page, times, size, plain),
@@ -135,11 +156,11 @@ async def _browse(
                 f"{program} takes no picture of {page}: {str(error) or 'it does not answer'}"
             ) from None
         finally:
-            process.terminate()
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(10.0)
-            process.kill()
-            process.wait()
+            for end in (lambda: None, process.terminate, process.kill):
+                end()
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(5.0)
+                    break
 
 
 class _BrowserError(Exception):
@@ -149,7 +170,7 @@ class _BrowserError(Exception):
 async def _shoot(
     ready: Path, page: Path, times: Sequence[float], size: tuple[int, int], plain: bool
 ) -> list[bytes]:
-    from tornado.websocket import websocket_connect
+    from tornado.websocket import WebSocketClosedError, websocket_connect
 
     while not (ready.is_file() and len(ready.read_text().split()) == 2):
         await asyncio.sleep(0.05)
@@ -158,6 +179,9 @@ async def _shoot(
     try:
         return await _Tab(socket).shoot(page, times, size, plain)
     finally:
+        # Told to go it clears up behind itself, which it does not when it is ended.
+        with suppress(WebSocketClosedError):
+            await socket.write_message(json.dumps({"id": 0, "method": "Browser.close"}))
         socket.close()
         while await asyncio.wait_for(socket.read_message(), 10.0) is not None:
             pass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -27,6 +28,10 @@ SUN = (0.62, -0.78, 0.62)
 TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
 FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
 
+# Length of the arrow of the largest force, and the way on which the camera goes along with the
+# base unless it is told otherwise, both in sizes of the robot.
+ARROW, _FAR = 0.62, 20.0
+
 
 def motion_page(
     robot: Robot,
@@ -35,7 +40,7 @@ def motion_page(
     scene: str,
     fps: float,
     speed: float,
-    follow: bool,
+    follow: bool | None,
     target: Array,
     tool: str | None,
 ) -> tuple[str, tuple[str, ...]]:
@@ -63,7 +68,16 @@ def motion_page(
 
     # Without a policy that steers somewhere, errors are counted from the start.
     ghost = "start" if np.array_equal(target, motion.q[0]) else "target"
-    info = stage_info(robot, drawing, film.poses[0], scene=scene, subtitle=_subtitle(robot, t))
+    about = f"{subtitle(robot)}, {t[-1] - t[0]:.4g} s"
+    info = stage_info(robot, drawing, film.poses[0], scene=scene, subtitle=about)
+    goal = corner_points(drawing, body_poses(robot, data, target))
+    shown_points = np.concatenate((frame_points(drawing, film, info["size"]), goal))
+    info["floor"][2] = float(shown_points[:, 2].min())
+    if follow is None:
+        # All of a long way at once, and nothing is to be seen of the robot.
+        follow = bool(np.ptp(shown_points, axis=0).max() > _FAR * info["size"])
+    if follow:
+        shown_points = frame_points(drawing, film, info["size"], follow=True)
     info |= marks(robot, film, tool, info["size"])
     info |= panel(robot, state, q, u, target, motion.momentum_drift[shown])
     info |= {
@@ -71,7 +85,7 @@ def motion_page(
         "t": packed(t),
         "speed": speed,
         "follow": follow,
-        "points": frame_points(drawing, film.poses, follow=follow).round(4).tolist(),
+        "points": rounded(shown_points, info["size"]),
         "legend": legend(info, ghost=ghost, linear=predicted is not None),
     }
     return build_page(info, window.commands()), drawing.notes
@@ -89,19 +103,36 @@ def _predicted(state: StateMap, motion: Motion, shown: Array) -> Array | None:
     return np.array([state.to_pinocchio(x)[0] for x in motion.linear[shown]])
 
 
-def _subtitle(robot: Robot, t: Array) -> str:
-    joints = f"{robot.n} joint{'s' * (robot.n != 1)}"
-    return f"{joints}, {robot.mass:.4g} kg, {t[-1] - t[0]:.4g} s"
+def subtitle(robot: Robot) -> str:
+    """Return what the page says of a robot below its name."""
+    wheels = len(robot.wheels)
+    joints = robot.n - wheels
+    parts = [f"{joints} joint{'s' * (joints != 1)}"]
+    if wheels:
+        parts.append(f"{wheels} wheel{'s' * (wheels != 1)}")
+    return ", ".join([*parts, f"{robot.mass:.4g} kg"])
 
 
-def frame_points(drawing: Drawing, poses: Array, *, follow: bool, most: int = 12) -> Array:
-    """Return corners (M, 3) of all that moves at some frames, for a camera to frame."""
-    chosen = np.unique(np.linspace(0, len(poses) - 1, most).astype(int))
+def frame_points(
+    drawing: Drawing, film: Playback, size: float, *, follow: bool = False, most: int = 24
+) -> Array:
+    """Return corners of all that moves and tips of forces (M, 3) at some frames, for a camera."""
+    chosen = np.unique(np.linspace(0, len(film.t) - 1, most).astype(int))
+    strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []
     for index in chosen:
-        shift = poses[index, 0, :3] - poses[0, 0, :3] if follow else np.zeros(3)
-        points.append(corner_points(drawing, poses[index]) - shift)
+        base = film.poses[index, 0, :3]
+        tip = base + ARROW * size * film.force[index] / strongest
+        shift = base - film.poses[0, 0, :3] if follow else np.zeros(3)
+        points.append(np.vstack((corner_points(drawing, film.poses[index]), tip)) - shift)
     return np.concatenate(points)
+
+
+def rounded(points: Array, size: float) -> list[list[float]]:
+    """Return points (M, 3) as they are sent: as exact as a robot of that size needs."""
+    digits = max(4, 4 - math.floor(math.log10(size)))
+    found: list[list[float]] = points.round(digits).tolist()
+    return found
 
 
 def corner_points(drawing: Drawing, poses: Array) -> Array:
@@ -181,6 +212,7 @@ def marks(robot: Robot, film: Playback, tool: str | None, size: float) -> dict[s
         "arrows": [
             {
                 "kind": kind,
+                "longest": ARROW * size,
                 "colour": color,
                 "values": packed(values),
                 "most": float(np.linalg.norm(values, axis=1).max()),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.film import corner_points, stage_info, triads
+from fflin.film import corner_points, rounded, stage_info, subtitle, triads
 from fflin.model import Robot
 from fflin.page import build_page
 from fflin.playback import body_poses
@@ -69,6 +69,7 @@ class Live:
         self.robot = robot
         self._data = robot.model.createData()
         self._state_map = StateMap(robot)
+        self._joints = _joints(robot)
         self._lock = threading.Lock()
         self._speed = speed
         # When on the clock, and at which time, the simulation that is shown began.
@@ -78,13 +79,13 @@ class Live:
         drawing = Drawing(robot, self.meshcat["robot"])
         self.notes = drawing.notes
         poses = body_poses(robot, self._data, q)
-        info = stage_info(robot, drawing, poses, scene=scene, subtitle=_subtitle(robot))
+        info = stage_info(robot, drawing, poses, scene=scene, subtitle=subtitle(robot))
         info |= {
             "mode": "live",
             "follow": follow,
             "legend": [],
-            "points": corner_points(drawing, poses).round(4).tolist(),
-            "joints": _joints(robot),
+            "points": rounded(corner_points(drawing, poses), info["size"]),
+            "joints": self._joints,
             "names": [name.partition(".")[2] for name in self._state_map.names[-6 - robot.n :]],
             "bodies": [["meshcat", "robot", path] for path in body_paths(robot)],
             "triads": triads(robot, tool, info["size"]),
@@ -120,7 +121,7 @@ class Live:
             state = {
                 "time": None if t is None else float(t),
                 "poses": poses.round(7).tolist(),
-                "joints": self._state_map.joint_positions(q).tolist(),
+                "joints": [self.robot.joint(each["name"]).value(q) for each in self._joints],
                 "coupling": (inertia / np.outer(scale, scale)).round(4).ravel().tolist(),
             }
             self.q = q
@@ -164,7 +165,7 @@ class Live:
         q = self.q.copy()
         if message.get("neutral"):
             q[7:] = self.robot.neutral()[7:]
-        limits = {each["name"]: each for each in _joints(self.robot)}
+        limits = {each["name"]: each for each in self._joints}
         wanted = dict(message.get("joints", {}))
         if message.get("random"):
             rng = np.random.default_rng()
@@ -175,15 +176,13 @@ class Live:
         self.show(q)
 
 
-def _subtitle(robot: Robot) -> str:
-    return f"{robot.n} joint{'s' * (robot.n != 1)}, {robot.mass:.4g} kg"
-
-
 def _joints(robot: Robot) -> list[dict[str, Any]]:
-    """Return name and range of the slider of every joint."""
+    """Return name and range of the slider of every joint; nobody sees a wheel turn."""
     model = robot.model
     found = []
     for joint in robot.joints:
+        if joint.name in robot.wheels:
+            continue
         low, high = -np.pi, np.pi
         if not joint.unbounded:
             low = max(

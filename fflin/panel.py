@@ -18,6 +18,7 @@ _TITLES = {
     "F_b": ("base force", "N"),
     "tau_m": ("joint torques", "N m"),
     "thrust": ("thrusters", "N"),
+    "wheel": ("wheel torques", "N m"),
 }
 
 
@@ -27,7 +28,8 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, Array]:
     Returns
     -------
     dict
-        attitude [deg], position [m] of the base, joints: the largest error [rad|m]; each (N,).
+        attitude [deg], position [m] of the base, turns [deg] and slides [m]: the largest errors of
+        joints that turn and that slide, which reaction wheels do not count as; each (N,).
     """
     state = StateMap(robot)
     goal = pin.XYZQUATToSE3(target[:7])
@@ -36,10 +38,14 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, Array]:
     for index, joint in enumerate(robot.joints):
         if joint.unbounded:
             joints[:, index] = np.angle(np.exp(1j * joints[:, index]))
+    wheels = robot.wheels
+    turns = [not j.prismatic and j.name not in wheels for j in robot.joints]
+    slides = [j.prismatic for j in robot.joints]
     return {
         "attitude": np.degrees([np.linalg.norm(pin.log3(each.rotation)) for each in relative]),
         "position": np.array([np.linalg.norm(each.translation) for each in relative]),
-        "joints": np.abs(joints).max(axis=1) if robot.n else np.zeros(len(q)),
+        "turns": np.degrees(np.abs(joints[:, turns]).max(axis=1, initial=0.0)),
+        "slides": np.abs(joints[:, slides]).max(axis=1, initial=0.0),
     }
 
 
@@ -59,12 +65,13 @@ def panel(
         Of the momentum, relative.
     """
     found = errors(robot, q, target)
-    angular = not all(joint.prismatic for joint in robot.joints)
-    joints = np.degrees(found["joints"]) if angular else found["joints"]
+    slide = any(joint.prismatic for joint in robot.joints)
+    turn = robot.n > len(robot.wheels) + sum(joint.prismatic for joint in robot.joints)
     readouts = [
         ("attitude error", "°", found["attitude"]),
         ("position error", "m", found["position"]),
-        *([("largest joint error", "°" if angular else "m", joints)] if robot.n else []),
+        *([("largest joint error", "°", found["turns"])] if turn else []),
+        *([("largest slide error", "m", found["slides"])] if slide else []),
         ("momentum drift", "", drift),
     ]
     plots: list[dict[str, Any]] = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,7 +43,7 @@ def visualize(
     scene: str | None = None,
     fps: float = 30.0,
     speed: float | None = None,
-    follow: bool = False,
+    follow: bool | None = None,
     target: Array | None = None,
     tool: str | None = None,
     q: Array | None = None,
@@ -77,8 +78,9 @@ def visualize(
     speed : float, optional
         Seconds of motion per second of watching; 1, or more for motions of over a minute. A
         simulation that is shown live waits for it.
-    follow : bool
-        Whether the camera follows the base.
+    follow : bool, optional
+        Whether the camera follows the base; by default where a motion goes so far that the robot
+        would be a dot on its way.
     target : array_like (nq,), optional
         Configuration that errors are counted from; by default the one that the motion was steered
         to, or where it begins.
@@ -118,9 +120,7 @@ def visualize(
         scene = "lab" if any(robot.gravity) else "space"
     if scene not in SCENES:
         raise InputError(f"scene is {scene!r}, expected one of {', '.join(SCENES)}")
-    if tool is not None and not robot.model.existFrame(tool):
-        frames = [frame.name for frame in robot.model.frames.tolist() if frame.parentJoint >= ROOT]
-        raise unknown("frame", tool, frames)
+    check_tool(robot, tool)
     from fflin.playback import default_tool
 
     tool = tool or default_tool(robot)
@@ -128,10 +128,10 @@ def visualize(
         if any(file is not None for file in (html, png, gif)):
             raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
         start = robot.neutral() if q is None else _configuration(robot, "q", q)
-        return _live(robot, start, open is None or open, scene, tool, follow, speed, port)
+        return _live(robot, start, open is None or open, scene, tool, bool(follow), speed, port)
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif}, robot.urdf)
     _check_motion(robot, motion)
-    fps, speed = _rates(motion, fps, speed)
+    fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
     from fflin.film import chart_of, motion_page
 
     if target is None:
@@ -149,8 +149,9 @@ def visualize(
     write_whole(contents)
     shown = outputs.get(".html")
     if not outputs:
+        name = re.sub(r"\W+", "_", robot.name, flags=re.ASCII)[:40]
         with tempfile.NamedTemporaryFile(
-            "wb", prefix=f"fflin-{robot.name}-", suffix=".html", delete=False
+            "wb", prefix=f"fflin-{name}-", suffix=".html", delete=False
         ) as file:
             file.write(page.encode())
         shown = Path(file.name)
@@ -199,6 +200,8 @@ def check_outputs(files: dict[str, Any], spare: Path | None = None) -> dict[str,
             raise FileError(f"'{path}' ends in '{path.suffix}', expected {ending}")
         if not path.absolute().parent.is_dir():
             raise FileError(f"{path}: cannot be written: there is no folder {path.parent}")
+        if path.is_dir():
+            raise FileError(f"{path}: is a folder; give the name of a file")
         if spare and path.resolve() == spare.resolve():
             raise FileError(f"{path} is the robot's own file; name another to write")
         outputs[ending] = path
@@ -209,11 +212,18 @@ def check_outputs(files: dict[str, Any], spare: Path | None = None) -> dict[str,
     return outputs
 
 
-def _rates(motion: Motion, fps: float, speed: float | None) -> tuple[float, float]:
+def check_tool(robot: Robot, tool: str | None) -> None:
+    """Raise UnknownNameError where there is no such frame."""
+    if tool is not None and not robot.model.existFrame(tool):
+        frames = [frame.name for frame in robot.model.frames.tolist() if frame.parentJoint >= ROOT]
+        raise unknown("frame", tool, frames)
+
+
+def check_rates(fps: float, speed: float | None, duration: float) -> tuple[float, float]:
+    """Return frames per second and speed, one that suits the duration [s] where it is None."""
     fps = number("fps", fps)
     if not 0.0 < fps <= 240.0:
         raise InputError(f"fps is {fps:g}, expected more than 0 and at most 240")
-    duration = float(motion.t[-1] - motion.t[0])
     nice = [1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5]
     return fps, _speed(speed, next((s for s in nice if duration <= s * _LONGEST), 1e6))
 
@@ -245,6 +255,14 @@ def _configuration(robot: Robot, name: str, value: Array) -> Array:
         raise InputError(f"{name} is no configuration: {error}") from None
 
 
+def check_times(times: Sequence[float], start: float, end: float) -> list[float]:
+    """Return the times [s] of pictures, or raise where one is not in the motion."""
+    times = [number("a time", time) for time in times]
+    if not times or not all(start <= time <= end for time in times):
+        raise InputError(f"times are {times}, expected some from {start:g} to {end:g} s")
+    return times
+
+
 def _pictures(
     page: str,
     outputs: dict[str, Path],
@@ -260,9 +278,7 @@ def _pictures(
     if times is None:
         # What settles moves most at first.
         times = [start + share * (end - start) for share in (0.0, 0.08, 0.25, 1.0)]
-    times = [number("a time", time) for time in times]
-    if not times or not all(start <= time <= end for time in times):
-        raise InputError(f"times are {times}, expected some from {start:g} to {end:g} s")
+    times = check_times(times, start, end)
     contents = {}
     with tempfile.TemporaryDirectory(prefix="fflin-") as folder:
         file = Path(folder, "page.html")
@@ -271,5 +287,5 @@ def _pictures(
             size = _PICTURE if len(times) == 1 else _STRIP
             contents[outputs[".png"]] = take_png(file, times, size)
         if ".gif" in outputs:
-            contents[outputs[".gif"]] = take_gif(file, end - start, speed, _GIF)
+            contents[outputs[".gif"]] = take_gif(file, (start, end), speed, _GIF)
     return contents

@@ -1,8 +1,15 @@
 """Files and pictures: written whole or not at all, and one line for what cannot be done."""
 
 import base64
+import contextlib
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -194,7 +201,108 @@ def test_simulate_on_the_command_line(capsys, tmp_path, monkeypatch):
     assert main([*command, "--png", str(tmp_path / "m.png")]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2 and "no folder" in lines[0] and "apt install chromium" in lines[1]
-    assert [path.name for path in tmp_path.iterdir()] == ["loop.html"]
+    page = ["--html", str(tmp_path / "m.html"), "-o", str(tmp_path / "m.npz")]
+    (tmp_path / "folder.html").mkdir()
+    for wrong, message in (
+        (["--fps", "0"], "fps is 0"),
+        (["--fps", "1e6"], "fps is 1e+06"),
+        (["--speed", "-1"], "speed is -1"),
+        (["--tool", "tol"], "no frame named 'tol'"),
+        (["--times", "9"], "times are [9.0], expected some from 0 to 5 s"),
+        (["--html", str(tmp_path / "folder.html")], "is a folder"),
+    ):
+        assert main([*command, *page, *wrong]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert message in line
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert left == ["folder.html", "loop.html"]
+
+
+@needs_chromium
+def test_films(robots, motion, tmp_path, monkeypatch):
+    """Whenever a motion begins all of it is shown, and nothing is left behind."""
+    folder = tmp_path / "t"  # a longer path is too long for Chromium's sockets
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    monkeypatch.setenv("TMPDIR", str(folder))
+    later = replace(motion, t=motion.t + 100.0)
+    fflin.visualize(robots["planar_detumble"], later, gif=tmp_path / "m.gif", speed=8.0)
+    with Image.open(tmp_path / "m.gif") as image:
+        first = np.asarray(image.convert("RGB"), dtype=int)
+        image.seek(image.n_frames - 1)
+        last = np.asarray(image.convert("RGB"), dtype=int)
+    assert (np.abs(first - last).max(axis=2) > 30).mean() > 0.01
+    assert not list(folder.iterdir())
+
+
+@needs_chromium
+@pytest.mark.skipif(not shutil.which("setpriv"), reason="no setpriv")
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+def test_the_browser_ends_with_the_one_who_films(tmp_path, sent, code):
+    """At once, and not when the film is done."""
+    folder = Path(tempfile.mkdtemp(dir="/tmp"))  # Chromium's sockets need a short name
+    command = ["simulate", "cubesat", "--rpy", "10", "0", "0", "--duration", "20"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "fflin", *command, "--gif", str(tmp_path / "m.gif")],
+        env={**os.environ, "TMPDIR": str(folder)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    browsing = f"--user-data-dir={folder}".encode()
+    try:
+        wait_until(lambda: list(folder.glob("*/DevToolsActivePort")), 60.0)
+        assert running(browsing)
+        process.send_signal(sent)
+        _, error = process.communicate(timeout=15.0)
+        assert process.returncode == code and "Traceback" not in error
+        wait_until(lambda: not running(browsing), 15.0)
+        assert not (tmp_path / "m.gif").exists()
+        assert sent == signal.SIGKILL or not list(folder.iterdir())
+    finally:
+        process.kill()
+        process.communicate()
+        shutil.rmtree(folder)
+
+
+def test_files_are_written_even_where_nobody_reads_what_is_said(tmp_path):
+    page = tmp_path / "m.html"
+    command = ["simulate", "cubesat", "--rpy", "10", "0", "0", "--duration", "1"]
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "wb") as closed:
+        done = subprocess.run(
+            [sys.executable, "-u", "-m", "fflin", *command, "--html", str(page)],
+            stdout=closed,
+            stderr=subprocess.PIPE,
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == (0, b"") and page.is_file()
+
+
+def running(argument):
+    """Whether a process has an argument that begins so."""
+    for file in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            if any(each.startswith(argument) for each in file.read_bytes().split(b"\0")):
+                return True
+    return False
+
+
+def wait_until(done, seconds):
+    end = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def test_a_name_that_is_no_files_name_does_no_harm(robots, monkeypatch):
+    robot = fflin.from_model(robots["planar_detumble"].model, name="../a/b \u2603" * 99)
+    with pytest.warns(fflin.FflinWarning, match="boxes"):
+        path = fflin.visualize(robot, settling(robot, 1.0), open=False)
+    path.unlink()
+    assert path.name.startswith("fflin-_a_b_")
 
 
 def test_assets_are_part_of_the_package():

@@ -234,6 +234,7 @@ def test_the_page_follows_in_a_browser(live, robots):
         assert watched.page.locator("#panel input[type=range]").count() == robot.n
         still = watched.picture()
         slider = watched.page.locator("#panel input[type=range]").nth(1)
+        assert slider.bounding_box()["width"] > 80  # enough to aim with
         slider.fill("1.25")
         watched.page.wait_for_function("fflin.state.joints[1] === 1.25")
         assert live.robot.joint("joint_2").value(live.q) == pytest.approx(1.25)

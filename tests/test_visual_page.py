@@ -1,5 +1,6 @@
 """The page of a motion in a real browser: it is whole, plays, and shows what Pinocchio says."""
 
+import json
 import os
 import re
 
@@ -42,6 +43,14 @@ def placements(robot, q):
     pin.forwardKinematics(robot.model, data, q)
     # Copies: what the list holds dies with the data.
     return dict(zip(robot.model.names, map(pin.SE3, data.oMi.tolist()), strict=True))
+
+
+def page_data(path):
+    """Return what the scripts of a page are given."""
+    (data,) = re.findall(
+        r'<script type="application/json" id="data">(.*?)</script>', path.read_text()
+    )
+    return json.loads(data)
 
 
 def largest_difference(watched, robot, q, node="robot"):
@@ -134,6 +143,7 @@ def test_the_panel_says_what_the_motion_says(settled, watched):
         assert float(values[0].split()[0]) == pytest.approx(angle, rel=6e-3)
         distance = np.linalg.norm(base.translation)
         assert float(values[1].split()[0]) == pytest.approx(distance, rel=6e-3, abs=1e-9)
+        assert values[3] == "1.0e-13"  # the motion's own
     plots = watched.page.locator(".plot .name").all_text_contents()
     assert plots[0].startswith("attitude error") and any("joint torques" in p for p in plots)
     # The cursor moves with the slider, and a click moves the slider.
@@ -153,9 +163,9 @@ def test_the_panel_says_what_the_motion_says(settled, watched):
             }
             return bright.indexOf(Math.max(...bright)) / width;
         })()""")
-        assert column == pytest.approx(t / 20.0, abs=0.01)
-    box = canvas.bounding_box()
-    canvas.click(position={"x": box["width"] / 4, "y": 20})
+        ruled = canvas.bounding_box()["width"] - 44  # figures stand in the rest
+        assert column * canvas.bounding_box()["width"] == pytest.approx(t / 20.0 * ruled, abs=2.5)
+    canvas.click(position={"x": ruled / 4, "y": 20})
     assert watched.do("fflin.state.time") == pytest.approx(5.0, abs=0.1)
 
 
@@ -175,23 +185,61 @@ def test_the_picture_is_not_blank_and_changes(settled, watched):
     assert len(np.unique(middle.reshape(-1, 3), axis=0)) > 500
 
 
-def test_all_of_the_motion_is_within_the_view(settled, watched):
-    """The corners of what moves lie in the window, and fill a good part of it."""
-    seen = watched.do("""(() => {
+def on_screen(watched, points):
+    """Return where points (N, 3) of the world are seen, in CSS pixels (N, 2)."""
+    width, height = watched.do("[innerWidth, innerHeight]")
+    seen = watched.do(f"""(() => {{
         viewer.render();
-        const info = JSON.parse(document.getElementById('data').textContent);
-        return info.points.map(([x, y, z]) => {
+        return {np.asarray(points).tolist()}.map(([x, y, z]) => {{
             const p = new MeshCat.THREE.Vector3(x, z, -y).project(viewer.camera);
             return [p.x, p.y];
-        });
-    })()""")
-    points = np.array(seen)
-    assert np.abs(points).max() < 1.0
-    assert np.ptp(points, axis=0).max() > 1.0
+        }});
+    }})()""")
+    return (np.array(seen) * (1, -1) + 1) / 2 * (width, height)
+
+
+@pytest.mark.parametrize(("width", "height"), [(400, 800), (1024, 700), (1280, 720)])
+def test_all_of_the_motion_is_within_the_view(settled, watched, width, height):
+    """Robot, target and tips of forces lie in what the panels leave free, and fill it well."""
+    _, motion, _ = settled
+    watched.page.set_viewport_size({"width": width, "height": height})
+    watched.page.wait_for_timeout(300)
+    points = watched.do("JSON.parse(document.getElementById('data').textContent).points")
+    seen = on_screen(watched, points)
+    panel, bar = (watched.page.locator(name).bounding_box() for name in ("#panel", "#bar"))
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    assert bar["x"] >= 0 and bar["x"] + bar["width"] <= width
+    for item in watched.page.locator("#bar > *").all():
+        box = item.bounding_box()
+        assert box["x"] >= bar["x"] and box["x"] + box["width"] <= bar["x"] + bar["width"]
+    assert low.min() > 0 and high[0] < width and high[1] < bar["y"]
+    assert high[0] < panel["x"] or low[1] > panel["y"] + panel["height"]
+    assert (high - low).max() > 0.4 * min(width, height)
+    # The pieces of the robot are among these points, at any time.
+    body = on_screen(watched, motion.q[::200, :3])
+    assert (body > low).all() and (body < high).all()
+
+
+def test_a_camera_that_was_taken_stays_where_it_was_put(settled, browser):
+    watched = Watched(browser, settled[2].as_uri() + "#pause", size=(960, 600))
+    at = "viewer.camera.position.toArray()"
+    framed = watched.do(at)
+    watched.page.set_viewport_size({"width": 500, "height": 600})
+    watched.page.wait_for_timeout(200)
+    assert not np.allclose(watched.do(at), framed)
+    watched.page.mouse.move(150, 300)
+    watched.page.mouse.down()
+    watched.page.mouse.move(220, 320, steps=3)
+    watched.page.mouse.up()
+    put = watched.do(at)
+    watched.page.set_viewport_size({"width": 960, "height": 600})
+    watched.page.wait_for_timeout(200)
+    np.testing.assert_allclose(watched.do(at), put, atol=1e-6)
+    watched.page.close()
 
 
 def test_forces_trails_and_the_legend(settled, watched):
-    _, motion, _ = settled
+    robot, motion, _ = settled
     for kind, part in (("torque", ".children[0]"), ("force", "")):
         node = f"viewer.scene_tree.find(['meshcat', 'wrench', '{kind}']).object.children[0]{part}"
         lengths = []
@@ -216,6 +264,26 @@ def test_forces_trails_and_the_legend(settled, watched):
             lengths.append(np.linalg.norm(arrow) / np.linalg.norm(pushed))
             np.testing.assert_allclose(arrow / lengths[-1], pushed, rtol=1e-4, atol=1e-3)
         assert lengths[0] == pytest.approx(lengths[1], rel=1e-4)
+    # Trails are drawn as far as tool and centre of mass have come, and by a line's width exact.
+    model, data = robot.model, robot.model.createData()
+    for t in (2.0, 9.0):
+        watched.do(f"fflin.seek({t})")
+        q = motion.q[np.argmin(np.abs(motion.t - t))]
+        com = pin.centerOfMass(model, data, q).copy()
+        pin.framesForwardKinematics(model, data, q)
+        tool = data.oMf[model.getFrameId("tool")].translation
+        for name, expected in (("tool", tool), ("centre of mass", com)):
+            end = watched.do(f"""(() => {{
+                const trail = viewer.scene_tree.find(['meshcat', 'trails', '{name}']).object;
+                const tube = trail.children[0].children[1].geometry, around = 6;
+                const ring = tube.drawRange.count / (6 * around), at = tube.attributes.position;
+                const sum = new MeshCat.THREE.Vector3(), p = new MeshCat.THREE.Vector3();
+                for (let k = 0; k < around; k++) {{
+                    sum.add(p.fromBufferAttribute(at, ring * (around + 1) + k));
+                }}
+                return sum.divideScalar(around).toArray();
+            }})()""")
+            np.testing.assert_allclose(end, expected, atol=0.01)
     box = watched.page.get_by_label("path of the tool")
     trail = "viewer.scene_tree.find(['meshcat', 'trails', 'tool']).object.visible"
     assert watched.do(trail)
@@ -231,15 +299,17 @@ def test_the_camera_follows_the_base_when_it_is_told_to(settled, watched):
     fixed = watched.do(target)
     watched.do("fflin.seek(8)")
     assert watched.do(target) == fixed
-    button = watched.page.locator("#bar button", has_text="fixed view")
+    button = watched.page.get_by_role("button", name="follow", exact=True)
     button.click()
+    assert button.get_attribute("aria-pressed") == "true"
     before = watched.pose(["meshcat", "robot", "root_joint"])
     watched.do("fflin.seek(0)")
     after = watched.pose(["meshcat", "robot", "root_joint"])
     moved = np.subtract(after, before)[:3]
     shift = np.subtract(watched.do(target), fixed)
     np.testing.assert_allclose(shift, [moved[0], moved[2], -moved[1]], atol=1e-9)
-    watched.page.locator("#bar button", has_text="follows").click()
+    button.click()
+    assert button.get_attribute("aria-pressed") == "false"
 
 
 def test_no_complaint_and_no_request(settled, watched):
@@ -303,6 +373,18 @@ def test_a_lab_with_meshes_plumes_and_a_prediction(robots, browser, tmp_path):
         "viewer.scene_tree.find(['meshcat', 'robot', 'root_joint', 'plume 0']).object.children[0]"
     )
     assert watched.do(f"{node}.visible")
+    # The gas leaves the thruster against its push.
+    gas = watched.do(f"""(() => {{
+        viewer.scene.updateMatrixWorld(true);
+        const m = {node}.children[0].matrixWorld, V = MeshCat.THREE.Vector3;
+        const [at, to] = [[0, 0, 0], [0, -1, 0]].map((p) => new V(...p).applyMatrix4(m));
+        return [at, to].map((p) => [p.x, -p.z, p.y]);
+    }})()""")
+    link = placements(robot, motion.q[index])["root_joint"]
+    link = link * robot.model.frames[robot.model.getFrameId("panda_link0")].placement
+    np.testing.assert_allclose(gas[0], link.act(np.array([0.1, 0, 0])), atol=EXACT)
+    away = np.subtract(gas[1], gas[0])
+    np.testing.assert_allclose(away / np.linalg.norm(away), -link.rotation[:, 2], atol=EXACT)
     strong = watched.do(f"{node}.children[0].scale.y")
     watched.do("fflin.seek(2)")
     assert watched.do(f"{node}.children[0].scale.y") < strong
@@ -317,3 +399,27 @@ def test_the_files_are_small(name, limit, tmp_path):
     path = tmp_path / "motion.html"
     fflin.visualize(robot, settling(robot, duration=20.0, predicted=True), html=path, fps=30)
     assert os.path.getsize(path) < limit
+
+
+def test_the_floor_lies_below_all_of_the_motion_and_the_target(tmp_path):
+    robot = fflin.load("ur5").replace(gravity=(0.0, 0.0, -9.81))
+    start = fflin.configuration(robot, base=pin.SE3(np.eye(3), np.array([0.5, 0.0, 2.0])))
+    motion = fflin.simulate(robot, None, q0=start, duration=0.2)
+    path = tmp_path / "high.html"
+    fflin.visualize(robot, motion, html=path, target=robot.neutral())
+    shown = page_data(path)
+    assert shown["scene"] == "lab" and shown["floor"][2] < 0.1
+    assert min(z for _, _, z in shown["points"]) == pytest.approx(shown["floor"][2], abs=1e-4)
+    assert not shown["follow"]
+
+
+def test_on_a_long_way_the_camera_follows_unless_it_is_told_not_to(robots, tmp_path):
+    robot = robots["servicer_7dof"]
+    v0 = fflin.velocity(robot, {"v_b.x": 1000.0})
+    motion = fflin.simulate(robot, None, v0=v0, duration=10.0, dt=0.1)
+    path = tmp_path / "away.html"
+    for told, expected in ((None, True), (False, False), (True, True)):
+        fflin.visualize(robot, motion, html=path, follow=told)
+        shown = page_data(path)
+        assert shown["follow"] is expected
+        assert (np.ptp(shown["points"], axis=0).max() > 5e3) is not expected

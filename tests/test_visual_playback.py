@@ -6,8 +6,9 @@ import pytest
 from conftest import random_point, random_pose
 
 import fflin
+from fflin.film import subtitle
 from fflin.model import ROOT
-from fflin.panel import errors
+from fflin.panel import errors, panel
 from fflin.playback import play_back, thrusters
 
 FRAMES = ("hybrid", "local", "world")
@@ -103,4 +104,32 @@ def test_errors_are_those_of_the_pose(robots):
     found = errors(robot, np.array([target, q]), target)
     np.testing.assert_allclose(found["attitude"], [0, 37.0], atol=1e-6)
     np.testing.assert_allclose(found["position"], [0, np.linalg.norm(step[:3])], atol=1e-12)
-    np.testing.assert_allclose(found["joints"], [0, 1.1], atol=1e-9)
+    np.testing.assert_allclose(found["turns"], np.degrees([0, 1.1]), atol=1e-7)
+    assert not found["slides"].any()
+
+
+def test_metres_are_not_taken_for_degrees_nor_wheels_for_joints():
+    robot = fflin.load("panda")  # its fingers slide
+    robot = robot.replace(inputs=[*robot.inputs, fflin.ReactionWheel((0, 0, 1), inertia=1e-3)])
+    target = robot.neutral()
+    q = fflin.configuration(robot, {"panda_joint2": -0.1, "panda_finger_joint1": 0.03})
+    robot.joint("wheel_1").place(q, 2.0)
+    found = errors(robot, np.array([q]), target)
+    assert found["turns"] == pytest.approx(np.degrees(0.1))
+    assert found["slides"] == pytest.approx(0.03)
+    state = fflin.StateMap(robot)
+    u = np.zeros((1, len(robot.joint_names) + 6))
+    u[0, -1] = 3.0
+    shown = panel(robot, state, q[None], u, target, np.zeros(1))
+    labels = {each["label"]: each["unit"] for each in shown["readouts"]}
+    assert labels["largest joint error"] == "°" and labels["largest slide error"] == "m"
+    assert [each["title"] for each in shown["plots"]][2:] == ["wheel torques"]
+    assert subtitle(robot) == f"{robot.n - 1} joints, 1 wheel, 17.45 kg"
+
+
+def test_a_free_flyer_alone_has_no_joint_error(robots):
+    robot = fflin.load("cubesat").replace(inputs=fflin.load_inputs("cubesat"))
+    q = robot.neutral()
+    shown = panel(robot, fflin.StateMap(robot), q[None], np.zeros((1, 15)), q, np.zeros(1))
+    assert not any("joint" in each["label"] for each in shown["readouts"])
+    assert subtitle(robot) == "0 joints, 3 wheels, 3.5 kg"

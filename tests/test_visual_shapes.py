@@ -207,6 +207,33 @@ def test_welding_keeps_a_mesh_within_its_grid():
     )
 
 
+def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
+    from fflin.recorder import Recorder
+    from fflin.scene import Drawing, Visualizer
+
+    tetrahedron(tmp_path / "t.stl")
+    path = write(
+        tmp_path,
+        more='<visual><origin xyz="1 0 0" rpy="0.3 0.2 0.1"/>'
+        '<geometry><mesh filename="t.stl" scale="0.5 -2 3"/></geometry></visual>',
+    )
+    placement = pin.SE3(pin.rpy.rpyToMatrix(0.3, 0.2, 0.1), np.array([1.0, 0, 0]))
+    corners = np.array([[0, 0, 0], [0.5, 0, 0], [0, -2, 0], [0, 0, 3.0]])
+    theirs = np.array([placement.act(corner) for corner in corners])
+
+    window = Recorder()
+    Drawing(fflin.load(path), Visualizer(window=window)["robot"])
+    pieces = [umsgpack.unpackb(each) for each in window.commands()]
+    pieces = [each["object"] for each in pieces if each["type"] == "set_object"]
+    (piece,) = (each for each in pieces if each["geometries"][0]["type"] == "BufferGeometry")
+    data = piece["geometries"][0]["data"]["attributes"]["position"]["array"].data
+    vertices = np.frombuffer(data, dtype="<f4").reshape(-1, 3)
+    matrix = np.reshape(piece["object"]["matrix"], (4, 4)).T
+    ours = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    np.testing.assert_allclose(cKDTree(ours).query(theirs)[0], 0.0, atol=1e-6)
+    np.testing.assert_allclose(cKDTree(theirs).query(ours)[0], 0.0, atol=1e-6)
+
+
 def test_the_recorder_keeps_the_last_value_of_a_property_per_path():
     from fflin.recorder import Recorder
     from fflin.scene import Visualizer

@@ -39,7 +39,7 @@ function makeSlider(parent, joint, send) {
   name.textContent = joint.name;
   slider.type = "range";
   slider.min = joint.low; slider.max = joint.high; slider.step = "any";
-  row.append(name, value, slider);
+  row.append(name, slider, value);
   parent.append(row);
   const show = (x) => { value.textContent = joint.length ? `${x.toFixed(3)} m` : `${((x * 180) / Math.PI).toFixed(1)}°`; };
   slider.addEventListener("input", () => { show(Number(slider.value)); send({ joints: { [joint.name]: Number(slider.value) } }); });
@@ -49,7 +49,7 @@ function makeSlider(parent, joint, send) {
   };
 }
 
-function makeLive({ viewer, aim, frame }, info) {
+function makeLive({ viewer, aim, keepFramed }, info) {
   const panel = document.getElementById("panel");
   let socket = null;
   const send = (message) => { if (socket && socket.readyState === 1) socket.send(JSON.stringify(message)); };
@@ -67,6 +67,7 @@ function makeLive({ viewer, aim, frame }, info) {
   info.triads.forEach((each, k) => viewer.scene_tree.find([...each.path, `frame ${k}`]).object.add(triad(each)));
   const nodes = info.bodies.map((path) => viewer.scene_tree.find(path).object);
   const centre = yUp(info.centre);
+  const gone = new THREE.Vector3(); // how far the camera has followed
   let last = null;
   const live = { ready: false, state: null, messages: 0 };
 
@@ -82,7 +83,7 @@ function makeLive({ viewer, aim, frame }, info) {
     if (last) {
       const shift = base.clone().sub(last);
       centre.add(shift);
-      if (info.follow) { viewer.camera.position.add(shift); viewer.controls.target.add(shift); }
+      if (info.follow) { viewer.camera.position.add(shift); viewer.controls.target.add(shift); gone.add(shift); }
     }
     last = base;
     aim(centre);
@@ -104,7 +105,7 @@ function makeLive({ viewer, aim, frame }, info) {
     };
     socket.onclose = () => { problem("No connection to fflin; it will be taken up again."); setTimeout(connect, 1000); };
   };
-  frame(info.points, info.direction);
+  keepFramed(() => [info.points.map(([x, y, z]) => [x + gone.x, y - gone.z, z + gone.y]), info.direction]);
   connect();
   return live;
 }

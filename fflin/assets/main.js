@@ -44,7 +44,7 @@ function main() {
     console.warn(error);
     return;
   }
-  const { viewer, aim, frame, resize } = stage;
+  const { viewer, aim, keepFramed } = stage;
   window.viewer = viewer;
   for (const command of info.commands) {
     try {
@@ -75,6 +75,7 @@ function main() {
   const base = viewer.scene_tree.find(info.base).object;
   const centre = yUp(info.centre), last = new THREE.Vector3().copy(base.position);
   const camera = viewer.camera, controls = viewer.controls;
+  const gone = new THREE.Vector3(); // how far the camera has followed
   let follow = info.follow;
   let plots = [];
   const player = makePlayer(viewer, info, (i, time) => {
@@ -84,25 +85,26 @@ function main() {
     const moved = base.position.clone().sub(last);
     last.copy(base.position);
     const shift = new THREE.Vector3(moved.x, moved.z, -moved.y);
-    if (follow) { camera.position.add(shift); controls.target.add(shift); }
+    if (follow) { camera.position.add(shift); controls.target.add(shift); gone.add(shift); }
     centre.add(shift);
     aim(centre);
   });
   plots = info.plots.map((plot) => makePlot(panel, info.t, plot, (time) => { player.pause(); player.seek(time); }));
+  if (plots.length) makeSpan(panel, info.t);
   makeLegend(viewer, info.legend);
   const button = document.createElement("button");
-  const name = () => { button.textContent = follow ? "follows" : "fixed view"; button.setAttribute("aria-pressed", follow); };
+  const press = () => button.setAttribute("aria-pressed", follow);
+  button.textContent = "follow";
   button.title = "whether the camera follows the base";
-  button.addEventListener("click", () => { follow = !follow; name(); });
-  name();
+  button.addEventListener("click", () => { follow = !follow; press(); });
+  press();
   document.getElementById("bar").append(button);
   player.seek(player.first);
-  frame(info.points, info.direction);
-  resize();
+  keepFramed(() => [info.points.map(([x, y, z]) => [x + gone.x, y - gone.z, z + gone.y]), info.direction]);
   window.addEventListener("resize", () => requestAnimationFrame(() => player.seek(player.state.time)));
   const plain = (on) => {
     document.body.classList.toggle("plain", on);
-    frame(info.points, info.direction);
+    window.dispatchEvent(new Event("resize"));
   };
   window.fflin = { ...player, plain, ready: true };
   if (!/[#&]pause\b/.test(location.hash)) player.play();

@@ -69,11 +69,11 @@ function trail({ points, colour, radius }) {
   return group;
 }
 
-function forceArrow({ colour, values, most, size }) {
+function forceArrow({ colour, values, most, longest, size }) {
   const group = arrow(colour, 0.010 * size, seenThrough(colour));
   group.show = (i) => {
     const force = new THREE.Vector3().fromArray(values, 3 * i);
-    const length = (0.62 * size * force.length()) / most;
+    const length = (longest * force.length()) / most;
     group.visible = length > 0.004 * size;
     if (!group.visible) return;
     group.setLength(length);
@@ -83,7 +83,7 @@ function forceArrow({ colour, values, most, size }) {
 }
 
 // An arrow along the axis with an arc about it, both as long as the torque is large.
-function torqueArrow({ colour, values, most, size }) {
+function torqueArrow({ colour, values, most, longest, size }) {
   const group = new THREE.Group();
   const material = seenThrough(colour);
   const axis = arrow(colour, 0.007 * size, material);
@@ -102,7 +102,7 @@ function torqueArrow({ colour, values, most, size }) {
     const share = torque.length() / most;
     group.visible = share > 0.006;
     if (!group.visible) return;
-    const length = 0.62 * size * share;
+    const length = longest * share;
     axis.setLength(length);
     arc.position.y = 0.55 * length;
     arc.scale.setScalar(0.25 + 0.75 * share);

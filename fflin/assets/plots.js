@@ -1,5 +1,7 @@
 // Small plots over time with a cursor, and figures, on plain canvases.
 
+const GUTTER = 44; // for the figures of the axis, right of the lines [CSS pixels]
+
 const LINES = ["#ff7a70", "#7ad97f", "#6aa5ff", "#f6c35b", "#c58bff", "#5fd6d0", "#ff9ed0", "#b6c46a", "#9aa7ff", "#d79a6a"];
 
 function figure(value, digits) {
@@ -21,6 +23,18 @@ function makeReadouts(parent, readouts) {
   });
   parent.append(grid);
   return (i) => shows.forEach((show) => show(i));
+}
+
+// Where the time of the plots begins and ends.
+function makeSpan(parent, t) {
+  const row = document.createElement("div");
+  row.className = "span";
+  for (const time of [t[0], t[t.length - 1]]) {
+    const end = document.createElement("span");
+    end.textContent = `${Number(time.toPrecision(6))} s`;
+    row.append(end);
+  }
+  parent.append(row);
 }
 
 function makePlot(parent, t, plot, seek) {
@@ -46,13 +60,14 @@ function makePlot(parent, t, plot, seek) {
   const values = plot.lines.flatMap((line) => Array.from(line.values)).filter(Number.isFinite);
   let low = Math.min(0, ...[values.reduce((a, b) => Math.min(a, b), Infinity)]);
   let high = Math.max(0, ...[values.reduce((a, b) => Math.max(a, b), -Infinity)]);
+  const least = low, most = high;
   if (!(high - low > 0)) { low -= 1; high += 1; }
   const spare = 0.06 * (high - low);
   if (low < 0) low -= spare;
   if (high > 0) high += spare;
   const first = t[0], duration = t[t.length - 1] - first || 1;
   let drawn = null, width = 0, height = 0, ratio = 1;
-  const x = (time) => ((time - first) / duration) * (width - 2 * ratio) + ratio;
+  const x = (time) => ((time - first) / duration) * (width - (GUTTER + 2) * ratio) + ratio;
   const y = (value) => (1 - (value - low) / (high - low)) * (height - 2 * ratio) + ratio;
 
   const draw = () => {
@@ -67,7 +82,7 @@ function makePlot(parent, t, plot, seek) {
     context.strokeStyle = style.getPropertyValue("--line");
     context.lineWidth = ratio;
     context.beginPath();
-    for (const level of [low, 0, high]) { context.moveTo(0, y(level)); context.lineTo(width, y(level)); }
+    for (const level of [low, 0, high]) { context.moveTo(0, y(level)); context.lineTo(width - GUTTER * ratio, y(level)); }
     context.stroke();
     context.lineJoin = "round";
     plot.lines.forEach((line, k) => {
@@ -79,11 +94,15 @@ function makePlot(parent, t, plot, seek) {
     });
     context.fillStyle = style.getPropertyValue("--faint");
     context.font = `${10 * ratio}px system-ui, sans-serif`;
-    context.textBaseline = "top";
+    context.textBaseline = "middle";
     context.textAlign = "right";
-    if (high > 0) context.fillText(figure(high > 0 && low < 0 ? high - spare : high / 1.06, 2), width - 2 * ratio, 2 * ratio);
-    context.textBaseline = "bottom";
-    if (low < 0) context.fillText(figure(high > 0 ? low + spare : low / 1.06, 2), width - 2 * ratio, height - 2 * ratio);
+    const half = 6 * ratio, taken = [];
+    for (const value of [most, least, 0]) {
+      const at = Math.min(height - half, Math.max(half, y(value)));
+      if (taken.some((other) => Math.abs(other - at) < 1.7 * half)) continue;
+      taken.push(at);
+      context.fillText(figure(value, 2), width - ratio, at);
+    }
   };
   const show = (i, time) => {
     if (!drawn || canvas.width !== width) draw();
@@ -107,7 +126,7 @@ function makePlot(parent, t, plot, seek) {
   };
   const pick = (event) => {
     const bounds = canvas.getBoundingClientRect();
-    seek(first + duration * Math.min(1, Math.max(0, (event.clientX - bounds.left) / bounds.width)));
+    seek(first + duration * Math.min(1, Math.max(0, (event.clientX - bounds.left) / (bounds.width - GUTTER))));
   };
   canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); pick(event); });
   canvas.addEventListener("pointermove", (event) => { if (event.buttons) pick(event); });

@@ -56,10 +56,15 @@ function makeStage(info) {
 
   // The part of the window that the panels leave free.
   const free = () => {
+    if (document.body.classList.contains("plain")) return { right: 0, top: 0, bottom: 0 };
     const panel = document.getElementById("panel").getBoundingClientRect();
-    const plain = document.body.classList.contains("plain");
-    const right = plain || !panel.width ? 0 : window.innerWidth - panel.left;
-    return { right, top: plain ? 0 : 40, bottom: plain ? 0 : 70 };
+    const bar = document.getElementById("bar").getBoundingClientRect();
+    const w = window.innerWidth, h = window.innerHeight;
+    const bottom = bar.height ? h - bar.top : 70;
+    if (!panel.width) return { right: 0, top: 40, bottom };
+    if (panel.width < 0.6 * w) return { right: w - panel.left, top: 40, bottom };
+    // In a narrow window the panel takes all of the width, above or below.
+    return panel.top < 0.3 * h ? { right: 0, top: panel.bottom, bottom } : { right: 0, top: 60, bottom: h - panel.top };
   };
   const resize = () => {
     viewer.set_3d_pane_size();
@@ -68,7 +73,16 @@ function makeStage(info) {
     camera.setViewOffset(w, h, right / 2, (bottom - top) / 2, w, h);
     viewer.set_dirty();
   };
-  window.addEventListener("resize", resize);
+  // Until somebody takes the camera, it frames the robot anew in every window.
+  let taken = false, framed = null;
+  const before = new THREE.Vector3();
+  controls.addEventListener("start", () => before.copy(camera.position));
+  controls.addEventListener("end", () => { taken ||= !before.equals(camera.position); });
+  window.addEventListener("resize", () => {
+    resize();
+    if (framed && !taken) frame(...framed());
+  });
+  const keepFramed = (what) => { framed = what; frame(...what()); };
 
   // Stand back along a direction until every point lies within the free part of the window.
   const frame = (points, direction) => {
@@ -79,7 +93,7 @@ function makeStage(info) {
     const up = back.clone().cross(side);
     const tall = Math.tan((FIELD_OF_VIEW / 2) * (Math.PI / 180));
     const h = window.innerHeight, w = window.innerWidth;
-    const ty = (tall * (h - top - bottom)) / h * 0.90, tx = (tall * Math.max(w - right, 0.4 * w)) / h * 0.90;
+    const ty = (tall * Math.max(h - top - bottom, 0.2 * h)) / h * 0.90, tx = (tall * Math.max(w - right, 0.4 * w)) / h * 0.90;
     const seen = points.map(yUp).map((p) => [p.dot(side), p.dot(up), p.dot(back)]);
     const middle = (k) => (Math.min(...seen.map((p) => p[k])) + Math.max(...seen.map((p) => p[k]))) / 2;
     let centre = [middle(0), middle(1), middle(2)], distance = 0;
@@ -107,13 +121,13 @@ function makeStage(info) {
   viewer.set_object = (path, object) => { object.traverse(dress); setObject(path, object); };
   aim(new THREE.Vector3());
   viewer.animate();
-  return { viewer, aim, frame, resize };
+  return { viewer, aim, keepFramed };
 }
 
 function makeFloor(info) {
   const size = 60 * info.size;
   const floor = new THREE.Group();
-  const shade = new THREE.Mesh(new THREE.PlaneGeometry(size, size), new THREE.ShadowMaterial({ opacity: 0.28 }));
+  const shade = new THREE.Mesh(new THREE.PlaneGeometry(size, size), new THREE.ShadowMaterial({ opacity: 0.28, depthWrite: false }));
   shade.receiveShadow = true;
   const cell = Math.pow(10, Math.round(Math.log10(info.size / 2)));
   const lines = new THREE.Mesh(new THREE.PlaneGeometry(size, size), new THREE.ShaderMaterial({

@@ -113,32 +113,30 @@ def _simulate(arguments: argparse.Namespace) -> int:
         check_place(arguments.output_file)
     if arguments.plot:
         check_figure(arguments.plot)
-    check_pictures(arguments)
-    robot, motion = simulated(arguments)
+    robot = load_robot(arguments)
+    check_pictures(robot, arguments)
+    motion = simulated(robot, arguments)
     from fflin.motion_reports import motion_report
 
-    written = []
+    # Said when the files are there, which they are then even where nobody reads it to its end.
+    lines = [motion_report(motion, controlled=not arguments.free)]
     try:
-        # Files first, for nobody may be there any more to read what is printed.
         if arguments.output_file:
             motion.save(arguments.output_file)
-            written.append(arguments.output_file)
+            lines.append(f"wrote {arguments.output_file}")
         if arguments.plot:
             motion.plot(arguments.plot)
-            written.append(arguments.plot)
+            lines.append(f"wrote {arguments.plot}")
+        lines += show_motion(robot, motion, arguments)
     finally:
-        print(motion_report(motion, controlled=not arguments.free))
-        for path in written:
-            print(f"wrote {path}")
-    show_motion(robot, motion, arguments)
+        print("\n".join(lines))
     return FELL_SHORT if motion.stopped else DONE
 
 
-def simulated(arguments: argparse.Namespace) -> tuple[Robot, Motion]:
-    """Return the robot and the motion that the arguments ask for."""
+def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
+    """Return the motion that the arguments ask for."""
     from fflin.simulation import simulate
 
-    robot = load_robot(arguments)
     options: dict[str, Any] = {
         "q0": configuration_of(robot, arguments),
         "v0": velocity_of(robot, arguments),
@@ -156,7 +154,7 @@ def simulated(arguments: argparse.Namespace) -> tuple[Robot, Motion]:
             raise InputError(
                 "--free has no regulator to give weights, a target or thrusters; leave one out"
             )
-        return robot, simulate(robot, frame=arguments.frame, **options)
+        return simulate(robot, frame=arguments.frame, **options)
     from fflin.policies import Allocation, StateFeedback
 
     design = _without_thrusters(robot) if arguments.allocate else robot
@@ -168,10 +166,10 @@ def simulated(arguments: argparse.Namespace) -> tuple[Robot, Motion]:
         lin = lin.discretize(gain.dt)
     policy = StateFeedback(lin, gain.K)
     if arguments.allocate:
-        return robot, simulate(robot, Allocation(policy, design), **options)
+        return simulate(robot, Allocation(policy, design), **options)
     motion = simulate(robot, policy, **options)
     _warn_of_cut_thrust(robot, motion, policy)
-    return robot, motion
+    return motion
 
 
 def _warn_of_cut_thrust(robot: Robot, motion: Motion, policy: StateFeedback) -> None:

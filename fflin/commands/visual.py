@@ -71,7 +71,11 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
         help="sky and planet, or a floor with a grid (default where there is gravity)",
     )
     command.add_argument("--tool", metavar="FRAME", help="frame whose axes and trail are drawn")
-    command.add_argument("--follow", action="store_true", help="let the camera follow the base")
+    command.add_argument(
+        "--follow",
+        action=argparse.BooleanOptionalAction,
+        help="whether the camera follows the base (default: on a long way)",
+    )
 
 
 def check_figure(path: Path) -> None:
@@ -84,22 +88,28 @@ def check_figure(path: Path) -> None:
     require_matplotlib()
 
 
-def check_pictures(arguments: argparse.Namespace) -> None:
-    """Refuse files that cannot be written, before a motion is made for them."""
+def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
+    """Refuse what `show_motion` would, before a motion is made for it."""
     from fflin.files import check_place
-    from fflin.viewer import check_outputs
+    from fflin.viewer import check_outputs, check_rates, check_times, check_tool
 
-    paths = {f".{name}": getattr(arguments, name) for name in _FILES}
-    check_outputs(paths)
-    for path in filter(None, paths.values()):
+    files = {f".{name}": getattr(arguments, name) for name in _FILES}
+    outputs = check_outputs(files, robot.urdf)
+    if not outputs:
+        return
+    for path in outputs.values():
         check_place(path)
+    check_tool(robot, arguments.tool)
+    check_rates(arguments.fps, arguments.speed, arguments.duration)
+    if arguments.times:
+        check_times(arguments.times, 0.0, arguments.duration)
 
 
-def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> None:
-    """Write what the options of `add_pictures` ask for."""
+def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> list[str]:
+    """Write what the options of `add_pictures` ask for, and return a line for each file."""
     files = {name: path for name in _FILES if (path := getattr(arguments, name))}
     if not files:
-        return
+        return []
     from fflin.viewer import visualize
 
     visualize(
@@ -113,8 +123,7 @@ def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> 
         follow=arguments.follow,
         tool=arguments.tool,
     )
-    for path in files.values():
-        print(f"wrote {path}: {path.stat().st_size / 1e6:.2f} MB")
+    return [f"wrote {path}: {path.stat().st_size / 1e6:.2f} MB" for path in files.values()]
 
 
 def _view(arguments: argparse.Namespace) -> int:
