@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from math import hypot
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
@@ -29,8 +30,9 @@ from fflin.validation import Array, vector
 if TYPE_CHECKING:
     from fflin.sensing import Sensing
 
-# Sum of squares beyond which a matrix counts as not finite: its eigenvalues would not be.
-LARGEST = 1e200
+# Sum of squares beyond which a matrix counts as not finite: its eigenvalues would not be. Up to
+# velocities and inputs of the other size nothing overflows on the way to it.
+LARGEST, _MODERATE = 1e200, 1e50
 
 
 class Linearizer:
@@ -124,6 +126,7 @@ class Linearizer:
         self._A_rest = _frozen(at_rest(self._map))
         self._nu = len(self._actuation.names)
         self._shape_B, self._lower = (nx, self._nu), slice(nv, nx)
+        self._rooted = robot.model.jointPlacements[ROOT].isIdentity(0.0)
         self._reference = _frozen(pin.SE3ToXYZQUAT(self._map.reference))
         self._common = self._common_fields()
         self._at_rest_fields = self._common | {
@@ -177,9 +180,12 @@ class Linearizer:
             u = _frozen(vector("u", u, self._nu, "the robot's inputs").copy())
         v = self._zero_v if v is None else v
         u = self._zero_u if u is None else u
-        # What overflows is refused, and not warned of.
-        with self._lock, np.errstate(over="ignore", invalid="ignore"):
-            return self._anywhere(q, v, u)
+        with self._lock:
+            if hypot(*v.tolist(), *u.tolist()) < _MODERATE:
+                return self._anywhere(q, v, u)
+            # What overflows is refused, and not warned of. Every call of NumPy costs more here.
+            with np.errstate(over="ignore", invalid="ignore"):
+                return self._anywhere(q, v, u)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy, in this process or another, needs a work space of its own.
@@ -196,7 +202,7 @@ class Linearizer:
         state, groups = self._map, self._map.groups
         chart = STANDING if self._own_reference else state.chart(q)
         nu, q_m = state.velocities(v), state.joint_positions(q)
-        u_base = self._actuation.in_base_axes(chart, u)
+        u_base = u if chart is STANDING else self._actuation.in_base_axes(chart, u)
         rates = self._accelerations.rates(q, v, nu, q_m, u_base)
         A, B = self._A_rest.copy(), np.zeros(self._shape_B)
         A[self._lower, groups.q_m] = rates.by_q_m
@@ -212,11 +218,12 @@ class Linearizer:
             x0 = state.to_state(q, v)
         drift = ride_along(state, point, A, f0) if self._moving else None
         C, D, y0 = self._seen(chart, rates, q, v, u_base, x0)
-        for array in (A, B, C, D, f0, x0, y0):
+        for array in (A, B, f0) if self._sensing is None else (A, B, f0, C, D, y0):
             flat = array.ravel()
             if not flat.dot(flat) < LARGEST:  # nor NaN
                 raise InputError("q, v or u is so large that the model is not finite")
             array.setflags(write=False)
+        x0.setflags(write=False)
         fields = {"A": A, "B": B, "C": C, "D": D, "f0": f0}
         fields |= {"x0": x0, "y0": y0, "u0": u, "q": q, "v": v}
         fields["_reference"] = self._reference_of(q)
@@ -243,7 +250,9 @@ class Linearizer:
         return C, D, sensed.y
 
     def _reference_of(self, q: Array) -> Array:
-        return _own_reference(self.robot, q) if self._own_reference else self._reference
+        if not self._own_reference:
+            return self._reference
+        return q[:7] if self._rooted else _own_reference(self.robot, q)
 
     def _common_fields(self) -> dict[str, Any]:
         robot, state = self.robot, self._map

@@ -81,7 +81,7 @@ class Accelerations:
         self._passive = robot.passive
         self._resists = any(values.any() for values in robot.passive)
         self._joints = np.arange(6, self._nv)
-        self._gravity = np.array(robot.gravity)
+        self._gravity, self._falls = np.array(robot.gravity), any(robot.gravity)
         self._root = robot.model.jointPlacements[ROOT].rotation
         self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
 
@@ -114,17 +114,20 @@ class Accelerations:
         gyroscopic = self._gyroscopic(q_still, v_still, u) if self._stored else None
         if gyroscopic:
             bias = bias - gyroscopic.force
-        force = columns.dot(u) - state.forces(bias)
+        force = (u if self._actuation.default else columns.dot(u)) - state.forces(bias)
         if self._resists:
             stiffness, damping, rest = self._passive
             force[6:] -= stiffness * (q_m - rest) + damping * nu[6:]
         c = inverse.dot(force)
         by_q, by_v = self._bias_slopes(q_still, v_still, c, u, gyroscopic)
-        by_nu = inverse.dot(-by_v)
+        negative = -inverse
+        by_nu = negative.dot(by_v)
         by_nu[:, LINEAR] = 0.0
         by_u = inverse if self._actuation.default else inverse.dot(columns)
-        gravity = rotation_matrix(q[3:7]).T @ (self._root.T @ self._gravity)
-        return Rates(c, inverse.dot(-by_q), by_nu, by_u, gravity)
+        gravity = self._gravity
+        if self._falls:
+            gravity = rotation_matrix(q[3:7]).T @ (self._root.T @ gravity)
+        return Rates(c, negative.dot(by_q), by_nu, by_u, gravity)
 
     def _bias_slopes(
         self, q: Array, v: Array, c: Array, u: Array, gyroscopic: Gyroscopic | None

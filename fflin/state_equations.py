@@ -89,6 +89,11 @@ def turned(matrices: Array, vectors: Array) -> Array:
     return product
 
 
+def _turned_columns(chart: Chart, by_turn: Array) -> Array:
+    """Return slopes (.., k, 3) over turns of the base as slopes over q_b."""
+    return 2.0 * by_turn if chart is STANDING else by_turn @ chart.J
+
+
 def _to_frame(state: StateMap, chart: Chart, vectors: Array) -> None:
     """Turn velocities or wrenches (.., 6 + n, k) in place from base axes to the frame's."""
     for rows, held in zip((ANGULAR, LINEAR), state.axes, strict=True):
@@ -133,7 +138,7 @@ def _set_kinematics(A: Array, state: StateMap, chart: Chart, nu: Array) -> None:
     A[..., g.q_b, g.q_b] = slope
     if not turned_linear:
         A[..., g.r_b, g.v_b] = R
-        A[..., g.r_b, g.q_b] = -(R @ skew(nu[..., LINEAR]) @ J)
+        A[..., g.r_b, g.q_b] = -_turned_columns(chart, R @ skew(nu[..., LINEAR]))
 
 
 def _set_turning(
@@ -175,4 +180,4 @@ def _set_turning(
         turn[..., LINEAR, :] += skew(gravity)
         c[..., LINEAR] -= turned(turning, v)
     c[..., LINEAR] += gravity
-    lower[..., groups.q_b] = turn @ chart.J
+    lower[..., groups.q_b] = _turned_columns(chart, turn)
