@@ -122,11 +122,13 @@ class ChunkJob:
         # Without joints M is the same everywhere.
         rigid = not self.linearizer.robot.n
         left: Rows = np.arange(1) if rigid else self._inertia.compiled(q, inverse)
-        try:
-            with _caught() as notes:
-                self._inertia.loop(q, inverse, left)
-        except FflinError as error:
-            raise _renumbered(error, start) from None
+        notes: list[warnings.WarningMessage] = []
+        if len(left):
+            try:
+                with _caught() as notes:
+                    self._inertia.loop(q, inverse, left)
+            except FflinError as error:
+                raise _renumbered(error, start) from None
         if rigid:
             inverse[1:] = inverse[0]
         if inverse is not out and not actuation.carried:

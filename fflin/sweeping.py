@@ -145,7 +145,8 @@ def sweep(
     task = SweepTask(job, points, v, u)
     parallel = executor is not None or workers is not None
     threads = threads or available_threads()
-    store = _store(task, path, chunk or _chunk_size(task, _SHARES if parallel else 4 * threads))
+    shares = (_SHARES, 1) if parallel else (4 * threads, threads)
+    store = _store(task, path, chunk or _chunk_size(task, *shares))
     size = store.chunk
     spans = [Span(at, min(at + size, task.count)) for at in range(0, task.count, size)]
     own = OwnWorkers(int(workers)) if workers else None
@@ -186,11 +187,13 @@ def _row_bytes(job: ChunkJob) -> int:
     return 8 * (job.linearizer.robot.nq + sum(map(math.prod, job.shapes.values())))
 
 
-def _chunk_size(task: SweepTask, shares: int) -> int:
+def _chunk_size(task: SweepTask, shares: int, threads: int) -> int:
+    """Return how many points a chunk has, so that all threads have as many chunks."""
     row = _row_bytes(task.job)
     size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * task.count // shares)) // row
     size = min(max(size, _LEAST_CHUNK), _LARGEST_CHUNK)
-    return size - size % _LEAST_CHUNK
+    chunks = math.ceil(math.ceil(task.count / size) / threads) * threads
+    return math.ceil(task.count / chunks / _LEAST_CHUNK) * _LEAST_CHUNK
 
 
 def output_path(out: str | Path) -> Path:
