@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from fflin.chart import Chart
 from fflin.errors import InputError
 from fflin.frames import find_frame
 from fflin.inputs import (
@@ -17,7 +18,7 @@ from fflin.inputs import (
     named_wheels,
 )
 from fflin.model import Robot
-from fflin.state import ANGULAR, LINEAR, Chart, StateMap
+from fflin.state import ANGULAR, LINEAR, StateMap
 from fflin.validation import Array
 from fflin.wheels import carrier
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from fflin.batch_inertia import FARTHEST, Rows
 from fflin.batch_motion import BatchRates, Points, Rates
 from fflin.batch_tree import LANES, batch_tree
+from fflin.chart import SMALLEST_Q0, Chart
 from fflin.frames import ROOT
 from fflin.inertia import Inertia
 from fflin.linearization import LARGEST, Linearizer
 from fflin.rotation import product_matrix, rotation_matrices
-from fflin.state import SMALLEST_Q0, Chart
 from fflin.state_equations import STANDING, Point, ride_along, state_equations, turned
 from fflin.validation import Array
 

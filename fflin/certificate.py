@@ -6,11 +6,12 @@ import numpy as np
 
 from fflin.aba import Aba
 from fflin.actuation import Actuation
+from fflin.chart import Chart
 from fflin.inertia import inverse_inertia
 from fflin.linear_model import Certificate, LinearModel
 from fflin.model import Robot
 from fflin.rotation import skew
-from fflin.state import ANGULAR, LINEAR, Chart, StateMap
+from fflin.state import ANGULAR, LINEAR, StateMap
 from fflin.validation import Array
 
 # Of terms that drop out exactly: their rounding, 1e-16 of them, is to be far below the tolerance.

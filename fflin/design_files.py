@@ -15,7 +15,7 @@ import numpy as np
 
 from fflin.design import Design
 from fflin.errors import FileError, InputError
-from fflin.files import as_path, write_whole
+from fflin.writing import as_path, write_whole
 
 FORMATS = (".npz", ".mat", ".json")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fflin.errors import FileError, MissingPackageError
-from fflin.files import as_path, write_whole
+from fflin.writing import as_path, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -222,7 +222,7 @@ class LinearBatch:
             If h5py is needed and not installed.
         """
         from fflin.batch_files import save_batch
-        from fflin.files import as_path
+        from fflin.writing import as_path
 
         save_batch(self, as_path(path))
 
@@ -246,7 +246,7 @@ class LinearBatch:
             If h5py is needed and not installed.
         """
         from fflin.batch_files import load_batch
-        from fflin.files import as_path
+        from fflin.writing import as_path
 
         return load_batch(as_path(path), robot)
 

@@ -296,7 +296,8 @@ class LinearModel:
         FileError
             If the ending is another or the file cannot be written.
         """
-        from fflin.files import as_path, save_model
+        from fflin.files import save_model
+        from fflin.writing import as_path
 
         save_model(self, as_path(path))
 
@@ -309,7 +310,8 @@ class LinearModel:
         FileError
             If the file cannot be read or is not such a model.
         """
-        from fflin.files import as_path, load_model
+        from fflin.files import load_model
+        from fflin.writing import as_path
 
         return load_model(as_path(path))
 

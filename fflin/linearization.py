@@ -13,6 +13,7 @@ import pinocchio as pin
 from fflin import __version__
 from fflin.actuation import Actuation
 from fflin.certificate import certify
+from fflin.chart import Chart
 from fflin.errors import InputError
 from fflin.frames import ROOT
 from fflin.inertia import inertia_matrix
@@ -22,7 +23,7 @@ from fflin.output_equations import output_equations
 from fflin.outputs import FullState
 from fflin.rates import Accelerations, Rates
 from fflin.rotation import skew
-from fflin.state import ANGULAR, LINEAR, Chart, Frame, StateMap
+from fflin.state import ANGULAR, LINEAR, Frame, StateMap
 from fflin.state_equations import STANDING, Point, at_rest, ride_along, state_equations
 from fflin.symmetry import ignorable_states
 from fflin.validation import Array, vector

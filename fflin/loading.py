@@ -121,7 +121,7 @@ def from_model(
 
 
 def _folders(package_dirs: Any) -> tuple[Path, ...]:
-    from fflin.files import as_path
+    from fflin.writing import as_path
 
     if isinstance(package_dirs, str | os.PathLike) or not isinstance(package_dirs, Sequence):
         raise InputError(f"package_dirs is {package_dirs!r}, expected a list of folders")

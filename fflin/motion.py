@@ -125,7 +125,7 @@ class Motion(Design):
         FileError
             If the ending is another or the file cannot be written.
         """
-        from fflin.files import as_path, write_whole
+        from fflin.writing import as_path, write_whole
 
         target = as_path(path)
         check_motion_format(target)

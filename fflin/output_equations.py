@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fflin.actuation import Actuation
+from fflin.chart import Chart
 from fflin.rates import Rates
 from fflin.rotation import skew
-from fflin.state import ANGULAR, LINEAR, Chart, StateMap
+from fflin.state import ANGULAR, LINEAR, StateMap
 from fflin.validation import Array
 
 if TYPE_CHECKING:

@@ -1,15 +1,14 @@
 """The state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, names, frames and chart."""
 
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.chart import SMALLEST_Q0, Chart
 from fflin.errors import ChartError, InputError
 from fflin.model import ROOT, Robot
-from fflin.rotation import conjugate, quaternion_product, rotation_matrix, skew
+from fflin.rotation import conjugate, quaternion_product, rotation_matrix
 from fflin.validation import Array, placement, vector
 
 Frame = Literal["hybrid", "local", "world"]
@@ -21,10 +20,6 @@ _IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
     "local": (False, False),
     "world": (True, True),
 }
-
-# Where q0 is below the square root of the rounding unit, sqrt(1 - |q_b|^2) has no correct digit.
-SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
-
 
 # Rows of the base's angular and linear part in any (6 + n) velocity or wrench of state order.
 ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
@@ -39,40 +34,6 @@ class Groups(NamedTuple):
     omega_b: slice
     v_b: slice
     qdot_m: slice
-
-
-@dataclass(frozen=True)
-class Chart:
-    """The attitude chart at one base attitude, relative to the reference, or at many.
-
-    Attributes
-    ----------
-    q_b : ndarray (.., 3)
-        Vector part of the quaternion of refMb.
-    q0 : float or ndarray (.., 1)
-        Its scalar part, positive.
-    R : ndarray (.., 3, 3)
-        refMb.rotation.
-    """
-
-    q_b: Array
-    q0: float | Array
-    R: Array
-
-    @cached_property
-    def Q(self) -> Array:
-        """Q (.., 3, 3) with ``d q_b/dt = Q omega / 2``, omega in base axes."""
-        return self._scalar + skew(self.q_b)
-
-    @cached_property
-    def J(self) -> Array:
-        """J = 2 Q^-1 (.., 3, 3) with ``d theta = J d q_b``, d theta in base axes."""
-        outer = self.q_b[..., :, None] * (self.q_b / self.q0)[..., None, :]
-        return 2.0 * (self._scalar - skew(self.q_b) + outer)
-
-    @property
-    def _scalar(self) -> Array:
-        return np.asarray(self.q0)[..., None] * np.eye(3)
 
 
 class StateMap:

@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fflin.actuation import Actuation
+from fflin.chart import Chart
 from fflin.rotation import skew
-from fflin.state import ANGULAR, LINEAR, Chart, StateMap
+from fflin.state import ANGULAR, LINEAR, StateMap
 from fflin.validation import Array
 
 

@@ -23,12 +23,12 @@ from fflin.batch_store import FileStore, MemoryStore
 from fflin.configurations import Configurations, GivenConfigurations
 from fflin.dispatching import Done, Span, dispatch
 from fflin.errors import FflinError, FflinWarning, FileError, InputError, SweepError, listed
-from fflin.files import as_path
 from fflin.kernel_code import available_threads
 from fflin.linear_batch import LinearBatch
 from fflin.model import Robot
 from fflin.own_workers import OwnWorkers
 from fflin.sweep_task import SweepTask, as_configurations
+from fflin.writing import as_path
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

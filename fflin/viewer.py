@@ -11,10 +11,10 @@ from warnings import warn
 
 from fflin.actuation import Actuation
 from fflin.errors import FflinWarning, FileError, InputError, unknown
-from fflin.files import as_path, write_whole
 from fflin.model import ROOT, Robot
 from fflin.state import StateMap
 from fflin.validation import Array, number
+from fflin.writing import as_path, write_whole
 
 if TYPE_CHECKING:
     from os import PathLike

@@ -6,7 +6,7 @@ import pytest
 from conftest import BUNDLED, FRAMES, random_point, random_pose, random_tree
 
 import fflin
-from fflin.state import Chart
+from fflin.chart import Chart
 
 
 def random_state(state, rng, degrees):

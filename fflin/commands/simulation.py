@@ -105,8 +105,8 @@ def add_commands(commands: Commands) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
-    from fflin.files import check_place
     from fflin.motion import check_motion_format
+    from fflin.writing import check_place
 
     if arguments.output_file:
         check_motion_format(arguments.output_file)
