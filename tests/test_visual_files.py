@@ -263,7 +263,13 @@ def test_the_browser_ends_with_the_one_who_films(tmp_path, sent, code):
     finally:
         process.kill()
         process.communicate()
-        shutil.rmtree(folder)
+        # What dies of a signal may still write for a moment.
+        wait_until(lambda: removed(folder), 15.0)
+
+
+def removed(folder):
+    shutil.rmtree(folder, ignore_errors=True)
+    return not folder.exists()
 
 
 def test_files_are_written_even_where_nobody_reads_what_is_said(tmp_path):
