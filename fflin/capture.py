@@ -8,9 +8,11 @@ import io
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -118,9 +120,13 @@ def _film(page: Path, times: Sequence[float], size: tuple[int, int], *, plain: b
         film = other.submit(lambda: asyncio.run(_browse(page, times, size, plain, started)))
         try:
             return film.result()
-        finally:
-            for process in started:  # at Ctrl-C it is still there, and would go on
-                process.terminate()
+        except BaseException:
+            # At Ctrl-C the browser is there or about to be, and the other thread would go on.
+            while not (started or film.done()):
+                time.sleep(0.01)
+            for process in started:
+                _end(process)
+            raise
 
 
 async def _browse(
@@ -144,23 +150,35 @@ async def _browse(
             # What it leaves behind goes with the folder, unless the path of its socket, which may
             # have some hundred letters, got too long by that.
             env={**os.environ, **({"TMPDIR": folder} if len(folder) < 56 else {})},
+            start_new_session=True,
         )
         started.append(process)
+        patience = 0.0  # with what was broken off, which may be busy with a picture for long
         try:
-            return await asyncio.wait_for(
+            pictures = await asyncio.wait_for(
                 _shoot(Path(folder, "DevToolsActivePort"), page, times, size, plain),
                 _PATIENCE + 3.0 * len(times),
             )
+            patience = 5.0
+            return pictures
         except (asyncio.TimeoutError, OSError, _BrowserError) as error:
             raise FileError(
                 f"{program} takes no picture of {page}: {str(error) or 'it does not answer'}"
             ) from None
         finally:
-            for end in (lambda: None, process.terminate, process.kill):
-                end()
-                with suppress(subprocess.TimeoutExpired):
-                    process.wait(5.0)
-                    break
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(patience)
+            _end(process)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End the browser and all that it started."""
+    if hasattr(os, "killpg"):
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    else:
+        process.kill()
+    process.wait()
 
 
 class _BrowserError(Exception):
@@ -234,10 +252,10 @@ class _Tab:
         if plain:
             await self.evaluate("fflin.plain(true)")
         pictures = []
-        for time in times:
+        for moment in times:
             # Two frames: one that draws, one after which it is on the screen.
             await self.evaluate(
-                f"fflin.seek({float(time)!r}); new Promise(done => requestAnimationFrame(() => "
+                f"fflin.seek({float(moment)!r}); new Promise(done => requestAnimationFrame(() => "
                 "requestAnimationFrame(() => done(1))))"
             )
             picture = await self.tell("Page.captureScreenshot", format="png")
