@@ -90,3 +90,5 @@ def test_bad_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
     assert not list(tmp_path.iterdir())
     code, _, err = run(capsys, "ets_vii", "-o", str(tmp_path / "k.csv"))
     assert code == 2 and "ends in '.csv'" in err
+    code, out, err = run(capsys, "ets_vii", "-o", str(tmp_path / "nowhere" / "k.npz"))
+    assert (code, out) == (2, "") and "cannot be written" in err

@@ -147,8 +147,9 @@ def _lqr(arguments: argparse.Namespace) -> int:
 
         lin = fflin.momentum_reduction(lin)
     gain = gain_of(lin, arguments)
-    print(gain)
     if arguments.output_file:
         gain.save(arguments.output_file)
+    print(gain)
+    if arguments.output_file:
         print(f"\nwrote {arguments.output_file}")
     return DONE
