@@ -13,6 +13,8 @@ from fflin.errors import InputError, unknown
 from fflin.linear_model import Certificate, LinearModel
 from fflin.mechanics import checked, conserved
 from fflin.model import ROOT, Robot
+from fflin.naming import undecided
+from fflin.ranks import Margin
 from fflin.state import ANGULAR, LINEAR, StateMap
 from fflin.validation import Array
 
@@ -37,12 +39,18 @@ class ReducedModel(LinearModel):
         Rows L1: what is conserved, and zero in the reduced model.
     coordinates : ndarray (k, nx)
         Rows L2: what drifts at the rate of L1, and is held at zero in the reduced model.
+    margin : Margin
+        Distance from doubt of the decision on what is conserved: far above 1, far below 1.
+    notes : tuple of str
+        What is undecided.
     """
 
     T: Array
     S: Array
     momenta: Array
     coordinates: Array
+    margin: Margin
+    notes: tuple[str, ...]
 
 
 def momentum_reduction(lin: LinearModel) -> ReducedModel:
@@ -110,9 +118,19 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
         "_drift": None if lin._drift is None else lin._drift[z],
         "_inertia": partial(_given, M),
     }
-    reduced = ReducedModel(**values, T=T, S=S, momenta=held.momenta, coordinates=held.coordinates)
-    certify = partial(_same_certificate, lin, reduced.fingerprint)
-    return replace(reduced, _certify=certify)
+    reduced = ReducedModel(
+        **values,
+        T=T,
+        S=S,
+        momenta=held.momenta,
+        coordinates=held.coordinates,
+        margin=held.margin,
+        notes=undecided(lin, held.margin, "kept by the reduction", len(z)),
+    )
+    fingerprint, source = reduced.fingerprint, lin.generator
+    certify = partial(_same_certificate, lin, fingerprint)
+    of = (fingerprint, momentum_reduction(source)) if lin.dt and source is not None else None
+    return replace(reduced, _certify=certify, _source=of)
 
 
 def generalized_inertia(lin: LinearModel) -> Array:
