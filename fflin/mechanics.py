@@ -49,6 +49,9 @@ def rounding(lin: LinearModel) -> float:
 # A defective pair of poles at zero moves by the square root of round-off.
 _DECAY = 1e-7
 
+# What is left of a motion after a sample where it is rounding.
+_DEAD = 1e4 * EPS
+
 
 @dataclass(frozen=True)
 class Conserved:
@@ -98,12 +101,14 @@ def second_order(lin: LinearModel) -> SecondOrder:
         Noisy(forces.values[:, part], forces.noise[:, part])
         for part in (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None))
     )
-    K, stiff = without_rounding(K @ -N, size, size)
-    D, drag = without_rounding(D @ -np.eye(nv), size, size)
     # Relative to the largest force of the same input.
     each = np.linalg.norm(S.values / size[:, None], axis=0)
-    S, pushed = without_rounding(S, size, np.where(each > 0.0, each, 1.0))
-    return SecondOrder(M, K, D, S, stiff & drag & pushed)
+    return SecondOrder(
+        M=M,
+        K=without_rounding(K @ -N, size, size),
+        D=without_rounding(D @ -np.eye(nv), size, size),
+        S=without_rounding(S, size, np.where(each > 0.0, each, 1.0)),
+    )
 
 
 def at_rest(lin: LinearModel) -> LinearModel | None:
@@ -138,7 +143,7 @@ def conserved(lin: LinearModel) -> Conserved:
     size = system.size
     pushes = stacked([[system.K.T], [system.D.T], [system.S.T]])
     free, margin = null_space(pushes @ np.diag(1.0 / size))
-    margin = margin.seen(1.0 / size, 2) & system.margin
+    margin = margin.seen(1.0 / size, 2)
     # Columns of W^T: unit vectors where a coordinate has its momentum to itself.
     basis, pivots = echelon(free / size[:, None], size)
     W = basis.T
@@ -230,17 +235,24 @@ def scaled(X: Array, M: Array, dt: float = 0.0) -> Scaled:
     )
 
 
-def fixed_poles(F: Array, rest: Array, pair: Scaled, dt: float) -> tuple[Any, bool, Margin]:
-    """Return the poles of dynamics F on `rest` of a pair, whether all decay, and the margin."""
-    rates = np.linalg.eigvals(F) if len(F) else np.zeros(0)
+def fixed_poles(F: Array, rest: Array, pair: Scaled, dt: float) -> tuple[Any, bool, Margin, Margin]:
+    """Return the poles of dynamics F on `rest` of a pair and whether all decay.
+
+    Also the margin of what has died out between samples, which cannot be told apart any more,
+    and that of the decay.
+    """
+    if not len(F):
+        return np.zeros(0), True, Margin(), Margin()
+    rates, vectors = np.linalg.eig(F)
+    shapes = pair.to_x @ rest @ vectors
     poles = 1.0 + dt * rates / pair.unit if dt else rates / pair.unit
     decay = 1.0 - np.abs(poles) if dt else -rates.real
-    if not len(F):
-        return poles, True, Margin()
-    least = int(decay.argmin())
-    shape = pair.to_x @ rest @ np.linalg.eig(F)[1][:, least]
-    settling = decided(max(float(decay[least]), 0.0) / _DECAY, shape).halved()
-    return poles, bool(decay[least] > _DECAY), settling
+    least, most = int(decay.argmin()), int(decay.argmax())
+    settling = decided(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least]).halved()
+    lost = Margin()
+    if dt and abs(poles[most]) < _DEAD:
+        lost = decided(1.0, shapes[:, most]).halved()
+    return poles, bool(decay[least] > _DECAY), lost, settling
 
 
 def _quarters(nv: int) -> list[tuple[slice, slice]]:

@@ -144,7 +144,7 @@ def _by_second_order(lin: LinearModel) -> _Part | None:
     size = np.tile(system.size, 2)
     each = np.linalg.norm(C / size, axis=1)
     noise = 4.0 * EPS * np.abs(C)
-    shown, _ = without_rounding(Noisy(C, noise), np.where(each > 0.0, each, 1.0), size)
+    shown = without_rounding(Noisy(C, noise), np.where(each > 0.0, each, 1.0), size)
     position, velocity = (
         Noisy(shown.values[:, half], shown.noise[:, half])
         for half in (slice(0, nv), slice(nv, None))
@@ -163,6 +163,6 @@ def _by_eigenvalues(lin: LinearModel) -> _Part:
     pair, nv = scaled(slopes(lin), lin.M, lin.dt), len(lin.M)
     seen = unit_columns((lin.C @ pair.to_x).T)
     _, rest, F, margin = reached_by(pair.A.T, seen, pair.tolerance)
-    poles, decays, settling = fixed_poles(F, rest, pair, lin.dt)
-    margin = margin.halved().seen(pair.to_x[nv:, nv:])
+    poles, decays, lost, settling = fixed_poles(F, rest, pair, lin.dt)
+    margin = margin.halved().seen(pair.to_x[nv:, nv:]) & lost
     return _Part(pair.to_x @ rest, poles, decays, "eigenvalues", margin, settling)

@@ -17,8 +17,9 @@ _CLEAN = 1e-10
 # near, is decided by singular values; the others are seen without doubt.
 _SUSPICIOUS = 1e-3
 
-# Singular values between these parts of their tolerance are within doubt.
-_CLEAR, _LOST = 30.0, 0.3
+# A tolerance is this many times the rounding, and singular values between these parts of it are
+# within doubt.
+SAFETY, CLEAR, LOST = 10.0, 30.0, 0.3
 
 # Eigenvalues nearer than this are one: a defective one moves by the root of round-off. The
 # Rayleigh quotient of the singular vector converges quadratically to it.
@@ -81,7 +82,7 @@ class Margin(NamedTuple):
         """
         kept = (self.kept, self.kept_at, -self.kept_count)
         dropped = (self.dropped, self.dropped_at, self.dropped_count)
-        return (kept,) * int(self.kept < _CLEAR) + (dropped,) * int(self.dropped > _LOST)
+        return (kept,) * int(self.kept < CLEAR) + (dropped,) * int(self.dropped > LOST)
 
 
 def decided(ratio: float, direction: Any, count: int = 1) -> Margin:
@@ -104,7 +105,7 @@ def null_space(matrix: tuple[Array, Array]) -> tuple[Array, Margin]:
     if not n or not len(rows):
         return np.eye(n), Margin()
     _, singular, right = np.linalg.svd(rows, full_matrices=len(rows) < n)
-    tolerance = 10.0 * max(n * EPS, float(np.linalg.norm(spread)))
+    tolerance = SAFETY * max(n * EPS, float(np.linalg.norm(spread)))
     rank = int((singular > tolerance).sum())
     margin = Margin()
     for index in {rank - 1, rank} & set(range(len(singular))):

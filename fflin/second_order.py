@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.ranks import EPS, Margin, decided, null_space
+from fflin.ranks import CLEAR, EPS, LOST, SAFETY, Margin, decided, null_space
 from fflin.validation import Array
 
 # A force this small beside the largest of its kind, per unit of energy, is taken for rounding.
-_FLOOR = 1e2 * EPS
+_FLOOR = 1e3 * EPS
 
 # Relative asymmetry of springs or dampers that is more than rounding.
 _SYMMETRIC = 1e-8
@@ -56,19 +56,17 @@ def stacked(rows: list[list[Noisy]]) -> Noisy:
     )
 
 
-def without_rounding(forces: Noisy, rows: Array, columns: Array) -> tuple[Noisy, Margin]:
+def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
     """Put to zero the entries that are rounding, also beside the largest, in units of energy.
 
-    The margin is that of whole columns; its directions are over the rows.
+    What may be rounding and may be not stays, with that much of noise.
     """
     units = rows[:, None] * columns
     size = np.abs(forces.values)
     least = np.maximum(forces.noise, _FLOOR * (size / units).max(initial=0.0) * units)
-    real, margin = size > least, Margin()
-    for ratio in (size / np.where(least > 0.0, least, 1.0)).T:
-        row = int(ratio.argmax())
-        margin &= decided(float(ratio[row]), np.eye(len(rows))[row], 2)
-    return Noisy(np.where(real, forces.values, 0.0), np.where(real, forces.noise, 0.0)), margin
+    real = size > LOST * least
+    noise = np.where(size < CLEAR * least, np.maximum(forces.noise, least / SAFETY), forces.noise)
+    return Noisy(np.where(real, forces.values, 0.0), np.where(real, noise, 0.0))
 
 
 @dataclass(frozen=True)
@@ -80,15 +78,12 @@ class SecondOrder:
     M : ndarray (nv, nv)
     K, D : Noisy (nv, nv)
     S : Noisy (nv, nu)
-    margin : Margin
-        Of what is a force and what is rounding.
     """
 
     M: Array
     K: Noisy
     D: Noisy
     S: Noisy
-    margin: Margin
 
     @cached_property
     def size(self) -> Array:
@@ -99,7 +94,7 @@ class SecondOrder:
         """Return the system of the motions R z; what holds them to it does no work."""
         M = R.T @ self.M @ R
         K, D = ((forces @ R).after(R.T) for forces in (self.K, self.D))
-        return SecondOrder(M, K, D, self.S.after(R.T), self.margin)
+        return SecondOrder(M, K, D, self.S.after(R.T))
 
     @cached_property
     def symmetric(self) -> bool:
@@ -263,7 +258,7 @@ def _at_pole(
         if not 4.0 * EPS < moved < _NEAR or (step and values[-1] > _SUSPICIOUS):
             break
         pole = refined
-    tolerance = 10.0 * max(
+    tolerance = SAFETY * max(
         len(M) * EPS, float(np.hypot(np.linalg.norm(spread), np.linalg.norm(noise / lengths)))
     )
     rank = int((values > tolerance).sum())

@@ -252,9 +252,9 @@ def _by_eigenvalues(lin: LinearModel, held: Conserved) -> _Part:
     drive = unit_columns(pair.from_x @ lin.B[z])
     reached, rest, F, margin = reached_by(pair.A, drive, pair.tolerance)
     rows, labels = _labels(lin, rest.T @ pair.from_x, held)
-    poles, decays, settling = fixed_poles(F, rest, pair, lin.dt)
-    margin = margin.halved().seen(rates @ pair.to_x[len(rates.T) :, len(rates.T) :])
-    settling = settling.seen(rates)
+    poles, decays, lost, settling = fixed_poles(F, rest, pair, lin.dt)
+    margin = margin.halved().seen(pair.to_x[len(rates.T) :, len(rates.T) :]) & lost
+    margin, settling = margin.seen(rates), settling.seen(rates)
     method = "eigenvalues"
     return _Part(pair.to_x @ reached, rows, labels, poles, decays, method, margin, settling)
 

@@ -26,7 +26,9 @@ def case(seed, robots):
     else:
         robot = random_tree(rng, int(rng.integers(1, 11)))
     at = {}
-    if rng.random() < 0.7:
+    # Stretched out, both ends of the long arm weigh the same: exact arithmetic of an inertia that
+    # is rounded does not see it, and it has a test of its own.
+    if rng.random() < 0.7 or robot.name == "canadarm2":
         at = {j: rng.uniform(-1.0, 1.0) for j in robot.joint_names}
     equal = rng.random() < 0.3
 
