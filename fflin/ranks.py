@@ -19,7 +19,7 @@ _SUSPICIOUS = 1e-3
 
 # A tolerance is this many times the rounding, and singular values between these parts of it are
 # within doubt.
-SAFETY, CLEAR, LOST = 10.0, 30.0, 0.3
+SAFETY, CLEAR, LOST = 10.0, 30.0, 0.01
 
 # Eigenvalues nearer than this are one: a defective one moves by the root of round-off. The
 # Rayleigh quotient of the singular vector converges quadratically to it.
@@ -92,20 +92,30 @@ def decided(ratio: float, direction: Any, count: int = 1) -> Margin:
     return Margin(dropped=ratio, dropped_at=direction, dropped_count=count)
 
 
+def even_rows(values: Any, noise: Array) -> tuple[Any, float]:
+    """Return rows of unit length, or shorter so that none has more rounding, and a tolerance.
+
+    None hides behind another, and none that is rounding itself hides the others.
+    """
+    least = values.shape[1] * EPS
+    sizes, spread = np.linalg.norm(values, axis=1), np.linalg.norm(noise, axis=1)
+    real = sizes > 0.0
+    sizes, spread = sizes[real], spread[real]
+    weights = 1.0 / np.maximum(sizes, spread / least)
+    tolerance = SAFETY * max(least, float(np.linalg.norm(spread * weights)))
+    return values[real] * weights[:, None], tolerance
+
+
 def null_space(matrix: tuple[Array, Array]) -> tuple[Array, Margin]:
     """Return the null space (n, k) of a matrix, orthonormal, with bounds of its entries' rounding.
 
-    Rows are scaled to unit length, so that none hides behind another.
+    Rows are scaled by `even_rows`.
     """
-    values, noise = matrix
-    n = values.shape[1]
-    sizes = np.linalg.norm(values, axis=1)
-    real = sizes > 0.0
-    rows, spread = values[real] / sizes[real, None], noise[real] / sizes[real, None]
+    n = matrix[0].shape[1]
+    rows, tolerance = even_rows(*matrix)
     if not n or not len(rows):
         return np.eye(n), Margin()
     _, singular, right = np.linalg.svd(rows, full_matrices=len(rows) < n)
-    tolerance = SAFETY * max(n * EPS, float(np.linalg.norm(spread)))
     rank = int((singular > tolerance).sum())
     margin = Margin()
     for index in {rank - 1, rank} & set(range(len(singular))):

@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.ranks import CLEAR, EPS, LOST, SAFETY, Margin, decided, null_space
+from fflin.ranks import CLEAR, EPS, SAFETY, Margin, decided, even_rows, null_space
 from fflin.validation import Array
 
-# A force this small beside the largest of its kind, per unit of energy, is taken for rounding.
-_FLOOR = 1e3 * EPS
+# A force this small beside the largest of its kind, per unit of energy, may be rounding; less
+# than this part of it is.
+_FLOOR, _ROUNDING = 1e3 * EPS, 0.3
 
 # Relative asymmetry of springs or dampers that is more than rounding.
 _SYMMETRIC = 1e-8
@@ -64,7 +65,7 @@ def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
     units = rows[:, None] * columns
     size = np.abs(forces.values)
     least = np.maximum(forces.noise, _FLOOR * (size / units).max(initial=0.0) * units)
-    real = size > LOST * least
+    real = size > _ROUNDING * least
     noise = np.where(size < CLEAR * least, np.maximum(forces.noise, least / SAFETY), forces.noise)
     return Noisy(np.where(real, forces.values, 0.0), np.where(real, noise, 0.0))
 
@@ -240,16 +241,13 @@ def _at_pole(
         weight = np.sqrt(
             size**2 * M.diagonal() + size * np.abs(D.diagonal()) + np.abs(K.diagonal())
         )
-        seen = position.values + s * velocity.values
+        units = np.outer(weight, weight)
+        spread = 4.0 * EPS * size**2 * np.outer(system.size, system.size)
+        spread = (spread + size * system.D.noise + system.K.noise) / units
         noise = (position.noise + size * velocity.noise) / weight
-        rows = seen / weight
-        lengths = np.linalg.norm(rows, axis=1)
-        rows, noise = rows[lengths > 0.0], noise[lengths > 0.0]
-        lengths = lengths[lengths > 0.0, None]
-        pencil = (s * s * M + s * D + K) / np.outer(weight, weight)
-        spread = size**2 * 4.0 * EPS * np.outer(system.size, system.size)
-        spread = (spread + size * system.D.noise + system.K.noise) / np.outer(weight, weight)
-        stack = np.vstack((pencil, rows / lengths))
+        pencil = (s * s * M + s * D + K) / units
+        seen = (position.values + s * velocity.values) / weight
+        stack, tolerance = even_rows(np.vstack((pencil, seen)), np.vstack((spread, noise)))
         stack = stack if stack.imag.any() else stack.real
         _, values, right = np.linalg.svd(stack, full_matrices=False)
         shape = right[-1].conj() / weight
@@ -258,9 +256,6 @@ def _at_pole(
         if not 4.0 * EPS < moved < _NEAR or (step and values[-1] > _SUSPICIOUS):
             break
         pole = refined
-    tolerance = SAFETY * max(
-        len(M) * EPS, float(np.hypot(np.linalg.norm(spread), np.linalg.norm(noise / lengths)))
-    )
     rank = int((values > tolerance).sum())
     shapes = right.conj().T / weight[:, None]
     count = 2 if pole.imag else 1
