@@ -12,19 +12,19 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from fflin import __version__
+from fflin.base.errors import FflinError, FflinWarning
 from fflin.commands import (
     BAD_INPUT,
     DONE,
     INTERRUPTED,
     analysis,
     models,
-    natural_modes,
+    modes,
     regulator,
     simulation,
     sweeps,
     visual,
 )
-from fflin.errors import FflinError, FflinWarning
 
 
 class _Parser(argparse.ArgumentParser):
@@ -88,7 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     models.add_commands(commands)
     analysis.add_commands(commands)
     regulator.add_commands(commands)
-    natural_modes.add_commands(commands)
+    modes.add_commands(commands)
     simulation.add_commands(commands)
     visual.add_commands(commands)
     sweeps.add_commands(commands)

@@ -10,13 +10,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from fflin.errors import ChartError, InputError
-from fflin.linear_model import LinearModel
-from fflin.model import Robot
-from fflin.nonlinear import Nonlinear
-from fflin.rotation import quaternion_product
-from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.base.errors import ChartError, InputError
+from fflin.base.rotation import quaternion_product
+from fflin.base.validation import Array
+from fflin.dynamics.state import StateMap
+from fflin.linear.model import LinearModel
+from fflin.linear.nonlinear import Nonlinear
+from fflin.robot.robot import Robot
 
 # A run has settled where its error is this share of the first, in the norm of its Lyapunov
 # function, and has diverged where it is this many times as large.

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from fflin.linear_model import LinearModel
-from fflin.mechanics import Conserved, Scaled, checked, conserved, scaled, slopes
-from fflin.naming import combination, grouped, momentum_names, with_rates
-from fflin.ranks import Margin, echelon, reached_by, split, unit_columns
-from fflin.tables import width
-from fflin.validation import Array
-from fflin.vibrations import undamped_modes, vibration_rows
+from fflin.analysis.mechanics import Conserved, Scaled, checked, conserved, scaled, slopes
+from fflin.analysis.names import combination, grouped, momentum_names, with_rates
+from fflin.analysis.ranks import Margin, echelon, reached_by, split, unit_columns
+from fflin.analysis.vibrations import undamped_modes, vibration_rows
+from fflin.base.tables import width
+from fflin.base.validation import Array
+from fflin.linear.model import LinearModel
 
 # A defective pair of poles at zero moves by the square root of round-off.
 _DECAY = 1e-7

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fflin.errors import InputError
-from fflin.linear_model import LinearModel
-from fflin.validation import Array, number
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, number
+from fflin.linear.model import LinearModel
 
 # Below this decay, relative to the fastest, a pole may be one at zero moved by rounding.
 _DECAY = 1e-7
@@ -114,7 +114,7 @@ def _finite(A: Array, Q: Array, dt: float, duration: float) -> Array:
         if not steps or abs(steps * dt - duration) > 1e-9 * duration:
             raise InputError(f"duration is {duration:g} s, expected a multiple of dt = {dt:g} s")
         return _summed(A, Q, steps)
-    from fflin.sampling import held_cost
+    from fflin.control.sampled_cost import held_cost
 
     return held_cost(A.T, Q, duration)
 

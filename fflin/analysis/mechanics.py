@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fflin.errors import InputError
-from fflin.linear_model import LinearModel
-from fflin.ranks import EPS, Margin, echelon, split
-from fflin.validation import Array
+from fflin.analysis.ranks import EPS, Margin, echelon, split
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.linear.model import LinearModel
 
 # A column that is not this many times its rounding is taken for zero.
 _ABOVE_ROUNDING = 1e3

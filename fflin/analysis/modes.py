@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.deflation import nonzero_eigenpairs
-from fflin.errors import InputError
-from fflin.linear_model import LinearModel
-from fflin.validation import Array
+from fflin.analysis.zero_eigenvalues import nonzero_eigenpairs
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -124,7 +124,7 @@ class Modes:
         return np.array(listed)
 
     def __str__(self) -> str:
-        from fflin.reports import modes_report
+        from fflin.commands.model_text import modes_report
 
         return modes_report(self)
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import InputError, unknown
-from fflin.linear_model import Certificate, LinearModel
-from fflin.mechanics import checked, conserved
-from fflin.model import ROOT, Robot
-from fflin.state import ANGULAR, LINEAR, StateMap
-from fflin.validation import Array
+from fflin.analysis.mechanics import checked, conserved
+from fflin.base.errors import InputError, unknown
+from fflin.base.validation import Array
+from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.linear.model import Certificate, LinearModel
+from fflin.robot.robot import ROOT, Robot
 
 # f0 outside of what the reduced state can follow, relative to f0.
 _DRIFT = 1e-9

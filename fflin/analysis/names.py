@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fflin.linear_model import LinearModel
-from fflin.mechanics import Conserved
-from fflin.validation import Array
+from fflin.analysis.mechanics import Conserved
+from fflin.base.validation import Array
+from fflin.linear.model import LinearModel
 
 _MOMENTUM = {"omega_b": "angular momentum {}", "v_b": "linear momentum {}"}
 _COORDINATE = {"omega_b": "base attitude {}", "v_b": "base position {}"}

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from fflin.linear_model import LinearModel
-from fflin.mechanics import checked, scaled, slopes
-from fflin.naming import combination, with_rates
-from fflin.ranks import EPS, Margin, echelon, reached_by, split, unit_columns
-from fflin.tables import width
-from fflin.validation import Array
+from fflin.analysis.mechanics import checked, scaled, slopes
+from fflin.analysis.names import combination, with_rates
+from fflin.analysis.ranks import EPS, Margin, echelon, reached_by, split, unit_columns
+from fflin.base.tables import width
+from fflin.base.validation import Array
+from fflin.linear.model import LinearModel
 
 # A defective pair of poles at zero moves by the square root of round-off.
 _DECAY = 1e-7

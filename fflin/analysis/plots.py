@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.errors import InputError
-from fflin.figures import COLORS, saved, styled, target_of
-from fflin.linear_model import LinearModel
-from fflin.validation import Array
+from fflin.base.errors import InputError
+from fflin.base.figures import COLORS, saved, styled, target_of
+from fflin.base.validation import Array
+from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from fflin.region import Validity
+    from fflin.analysis.validity import Validity
 
 
 def plot_poles(
@@ -134,7 +134,7 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     MissingPackageError, FileError
         As in `plot_motion`.
     """
-    from fflin.region import TRUSTED, Validity, shown
+    from fflin.analysis.validity import TRUSTED, Validity, shown
 
     if not isinstance(validity, Validity):
         raise InputError(

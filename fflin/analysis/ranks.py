@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.validation import Array
+from fflin.base.validation import Array
 
 EPS = float(np.finfo(float).eps)
 

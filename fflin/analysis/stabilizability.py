@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fflin.errors import DetectabilityError, InputError, StabilizabilityError, listed
-from fflin.validation import Array
+from fflin.base.errors import DetectabilityError, InputError, StabilizabilityError, listed
+from fflin.base.validation import Array
 
 if TYPE_CHECKING:
-    from fflin.linear_model import LinearModel
+    from fflin.linear.model import LinearModel
 
 # Of the smallest singular value of an equilibrated Popov-Belevitch-Hautus matrix: what computed
 # eigenvalues are off by where they are repeated.
@@ -20,9 +20,9 @@ _RANK = 1e-7
 
 def require_stabilizable(lin: LinearModel) -> None:
     """Raise `StabilizabilityError` that names what no input can hold."""
-    from fflin.mechanics import conserved
-    from fflin.naming import grouped
-    from fflin.structure import controllability
+    from fflin.analysis.controllability import controllability
+    from fflin.analysis.mechanics import conserved
+    from fflin.analysis.names import grouped
 
     found = controllability(lin)
     if not found.stabilizable:
@@ -42,8 +42,8 @@ def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
 
 def require_detectable(lin: LinearModel) -> None:
     """Raise `DetectabilityError` that names what no output shows and what does not settle."""
-    from fflin.naming import with_rates
-    from fflin.observation import observability
+    from fflin.analysis.names import with_rates
+    from fflin.analysis.observability import observability
 
     found = observability(lin)
     if not found.detectable:

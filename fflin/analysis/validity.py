@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from fflin.actuation import Actuation
-from fflin.closed_loop import SETTLED, Loop
-from fflin.errors import InputError
-from fflin.linear_model import LinearModel
-from fflin.model import Robot
-from fflin.tables import width
-from fflin.validation import Array, number
+from fflin.analysis.closed_loop import SETTLED, Loop
+from fflin.base.errors import InputError
+from fflin.base.tables import width
+from fflin.base.validation import Array, number
+from fflin.dynamics.actuation import Actuation
+from fflin.linear.model import LinearModel
+from fflin.robot.robot import Robot
 
 # Displacements, as shares of the largest, at which the prediction is measured, and directions.
 _LEVELS = 2.0 ** np.arange(-6.0, 1.0)

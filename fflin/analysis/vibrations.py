@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from fflin.naming import combination
-from fflin.ranks import EPS, Margin, split
-from fflin.validation import Array
+from fflin.analysis.names import combination
+from fflin.analysis.ranks import EPS, Margin, split
+from fflin.base.validation import Array
 
 # Squares of frequencies that differ by less than this many roundings are taken as equal; a
 # mode then mixes with the next group by at most 1e-4, which stays below the tolerance.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.validation import Array
+from fflin.base.validation import Array
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -34,7 +34,7 @@ class Design:
         FileError
             If the ending is another or the file cannot be written.
         """
-        from fflin.design_files import save_design
+        from fflin.base.design_files import save_design
 
         save_design(self, path)
 
@@ -47,6 +47,6 @@ class Design:
         FileError
             If the file cannot be read or is another thing.
         """
-        from fflin.design_files import load_design
+        from fflin.base.design_files import load_design
 
         return load_design(cls, path)

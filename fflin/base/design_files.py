@@ -13,9 +13,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from fflin.design import Design
-from fflin.errors import FileError, InputError
-from fflin.writing import as_path, write_whole
+from fflin.base.design import Design
+from fflin.base.errors import FileError, InputError
+from fflin.base.writing import as_path, write_whole
 
 FORMATS = (".npz", ".mat", ".json")
 

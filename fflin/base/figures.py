@@ -7,8 +7,8 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fflin.errors import FileError, MissingPackageError
-from fflin.writing import as_path, write_whole
+from fflin.base.errors import FileError, MissingPackageError
+from fflin.base.writing import as_path, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fflin.validation import Array
+from fflin.base.validation import Array
 
 # Row 3 i + j holds the entry (i, j) of [a]x as a linear function of a.
 _CROSS = np.zeros((9, 3))

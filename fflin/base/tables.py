@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from fflin.validation import Array
+    from fflin.base.validation import Array
 
 _GAP = "  "
 _EPS = sys.float_info.epsilon

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.errors import InputError
+from fflin.base.errors import InputError
 
 if TYPE_CHECKING:
     import pinocchio as pin

@@ -5,7 +5,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from fflin.errors import FileError, InputError
+from fflin.base.errors import FileError, InputError
 
 
 def as_path(path: Any) -> Path:

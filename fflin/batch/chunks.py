@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.batch_inertia import BatchInertia, Rows
-from fflin.errors import FflinError, FflinWarning
-from fflin.kernel_code import pays
-from fflin.linearization import Linearizer
-from fflin.model import Robot
-from fflin.validation import Array
+from fflin.base.errors import FflinError, FflinWarning
+from fflin.base.validation import Array
+from fflin.batch.inertia import BatchInertia, Rows
+from fflin.batch.kernel.compiled import pays
+from fflin.linear.linearization import Linearizer
+from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from fflin.batch_equations import BatchEquations
-    from fflin.state import Frame
+    from fflin.batch.equations import BatchEquations
+    from fflin.dynamics.state import Frame
 
 
 # Of a linear model, by the names that a batch has for them.
@@ -169,7 +169,7 @@ class ChunkJob:
 
     @cached_property
     def _equations(self) -> BatchEquations | None:
-        from fflin.batch_equations import BatchEquations
+        from fflin.batch.equations import BatchEquations
 
         if not (pays(self._count) and BatchEquations.possible(self.linearizer)):
             return None

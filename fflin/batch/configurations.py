@@ -13,10 +13,10 @@ from typing import Any, Protocol
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import InputError
-from fflin.joints import Joint
-from fflin.model import Robot, configuration
-from fflin.validation import Array, number
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, number
+from fflin.robot.joints import Joint
+from fflin.robot.robot import Robot, configuration
 
 # Random rows are drawn in blocks of this many, so that they do not depend on how they are read.
 _DRAWN = 4096

@@ -13,9 +13,9 @@ from concurrent.futures import (
 )
 from typing import NamedTuple
 
-from fflin.batch_chunks import Chunk, ChunkJob, Parcel, Points, packed, work
-from fflin.errors import FflinError
-from fflin.own_workers import NoWorkers, WorkerDied
+from fflin.base.errors import FflinError
+from fflin.batch.chunks import Chunk, ChunkJob, Parcel, Points, packed, work
+from fflin.batch.workers import NoWorkers, WorkerDied
 
 # A chunk whose worker dies is given to others; what kills this many is not.
 _ATTEMPTS = 3

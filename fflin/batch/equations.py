@@ -7,16 +7,16 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from fflin.batch_inertia import FARTHEST, Rows
-from fflin.batch_motion import BatchRates, Points, Rates
-from fflin.batch_tree import LANES, batch_tree
-from fflin.chart import SMALLEST_Q0, Chart
-from fflin.frames import ROOT
-from fflin.inertia import Inertia
-from fflin.linearization import LARGEST, Linearizer
-from fflin.rotation import product_matrix, rotation_matrices
-from fflin.state_equations import STANDING, Point, ride_along, state_equations, turned
-from fflin.validation import Array
+from fflin.base.rotation import product_matrix, rotation_matrices
+from fflin.base.validation import Array
+from fflin.batch.inertia import FARTHEST, Rows
+from fflin.batch.kernel.accelerations import BatchRates, Points, Rates
+from fflin.batch.kernel.tree import LANES, batch_tree
+from fflin.dynamics.chart import SMALLEST_Q0, Chart
+from fflin.dynamics.inertia import Inertia
+from fflin.linear.linearization import LARGEST, Linearizer
+from fflin.linear.state_equations import STANDING, Point, ride_along, state_equations, turned
+from fflin.robot.frames import ROOT
 
 # Points that are done at a time, so that what is computed on the way stays in the cache.
 _BLOCK = 256

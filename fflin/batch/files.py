@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.errors import FileError, InputError, MissingPackageError
-from fflin.linear_batch import LinearBatch, is_constant
-from fflin.validation import Array
+from fflin.base.errors import FileError, InputError, MissingPackageError
+from fflin.base.validation import Array
+from fflin.batch.linear_batch import LinearBatch, is_constant
 
 if TYPE_CHECKING:
-    from fflin.model import Robot
+    from fflin.robot.robot import Robot
 
 FORMATS = (".npz", ".h5")
 

@@ -8,21 +8,21 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.design import Design
-from fflin.errors import FflinError, InputError
-from fflin.joint_columns import joint_columns, positions
-from fflin.linear_batch import LinearBatch, is_constant
-from fflin.linear_model import LinearModel
-from fflin.policies import StateFeedback
-from fflin.regulator import lqr
-from fflin.riccati_batch import gains_at_rest
-from fflin.state import StateMap
-from fflin.validation import Array, vector
-from fflin.weights import weight
+from fflin.base.design import Design
+from fflin.base.errors import FflinError, InputError
+from fflin.base.validation import Array, vector
+from fflin.batch.joint_columns import joint_columns, positions
+from fflin.batch.linear_batch import LinearBatch, is_constant
+from fflin.batch.riccati import gains_at_rest
+from fflin.control.lqr import lqr
+from fflin.control.policies import StateFeedback
+from fflin.control.weights import weight
+from fflin.dynamics.state import StateMap
+from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
-    from fflin.model import Robot
-    from fflin.weights import Weight
+    from fflin.control.weights import Weight
+    from fflin.robot.robot import Robot
 
 # Models whose gains are computed at once; what that takes is small.
 _BLOCK = 256

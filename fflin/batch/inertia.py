@@ -7,13 +7,13 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from fflin.batch_tree import LANES, batch_tree
-from fflin.errors import SingularInertiaError
-from fflin.inertia import Inertia
-from fflin.kernel_code import kernel
-from fflin.model import Robot
-from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.base.errors import SingularInertiaError
+from fflin.base.validation import Array
+from fflin.batch.kernel.compiled import kernel
+from fflin.batch.kernel.tree import LANES, batch_tree
+from fflin.dynamics.inertia import Inertia
+from fflin.dynamics.state import StateMap
+from fflin.robot.robot import Robot
 
 # The kernel has sines of angles up to here [rad].
 FARTHEST = 1e6
@@ -72,7 +72,7 @@ class BatchInertia:
         space = np.empty(self._tree.size + LANES)
         # Its vectors are 64 bytes; where they begin at such an address it is faster.
         space = space[-(space.ctypes.data // 8) % LANES :]
-        kernel("batch_kernel", "invert")(self._tree, q, out.reshape(len(q), -1), couplings, space)
+        kernel("factor", "invert")(self._tree, q, out.reshape(len(q), -1), couplings, space)
         # Written so that NaN, from a pivot that is zero, is among them.
         good = (self._inertia.least_coupling < couplings) & (couplings < Inertia.warning_coupling)
         if not -FARTHEST < q.min() <= q.max() < FARTHEST:

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from fflin.validation import Array
+from fflin.base.validation import Array
 
 if TYPE_CHECKING:
-    from fflin.model import Robot
+    from fflin.robot.robot import Robot
 
 # Where a joint stands in q: (index, -1), or, where it is stored so, those of (cos, sin).
 Columns: TypeAlias = tuple[tuple[int, int], ...]

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any, NoReturn, overload
 
 import numpy as np
 
-from fflin.errors import InputError
-from fflin.joint_columns import away, positions
-from fflin.linear_model import LinearModel
-from fflin.validation import Array, number
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, number
+from fflin.batch.joint_columns import away, positions
+from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
-    from fflin.model import Robot
-    from fflin.state import Frame
+    from fflin.dynamics.state import Frame
+    from fflin.robot.robot import Robot
 
 # Two joint values are the same where they differ by no more than this [rad|m].
 _SAME = 1e-9
@@ -221,8 +221,8 @@ class LinearBatch:
         MissingPackageError
             If h5py is needed and not installed.
         """
-        from fflin.batch_files import save_batch
-        from fflin.writing import as_path
+        from fflin.base.writing import as_path
+        from fflin.batch.files import save_batch
 
         save_batch(self, as_path(path))
 
@@ -245,8 +245,8 @@ class LinearBatch:
         MissingPackageError
             If h5py is needed and not installed.
         """
-        from fflin.batch_files import load_batch
-        from fflin.writing import as_path
+        from fflin.base.writing import as_path
+        from fflin.batch.files import load_batch
 
         return load_batch(as_path(path), robot)
 
@@ -270,9 +270,9 @@ class LinearBatch:
         inertia: Any = partial(_no_robot, "inertia M", self.robot)
         ignorable: Any = partial(_given, self._ignorable)
         if self._system is not None:
-            from fflin.certificate import certify as certified
-            from fflin.inertia import inertia_matrix
-            from fflin.symmetry import ignorable_states
+            from fflin.dynamics.inertia import inertia_matrix
+            from fflin.linear.certificate import certify as certified
+            from fflin.linear.ignorable import ignorable_states
 
             ignorable = partial(ignorable_states, self._system)
 
@@ -300,7 +300,7 @@ class LinearBatch:
         return x0
 
     def _named(self, joints: Mapping[str, Any]) -> dict[int, Any]:
-        from fflin.errors import unknown
+        from fflin.base.errors import unknown
 
         if not isinstance(joints, Mapping) or not joints:
             raise InputError(f"joints is {joints!r}, expected {{joint: value}}")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fflin.validation import Array
+from fflin.base.validation import Array
 
 # Steps of Newton's method along the motions that the eigenproblem gave.
 _REFINEMENTS = 2

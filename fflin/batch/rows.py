@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from fflin.configurations import follow_rows
-from fflin.errors import FflinError, InputError
-from fflin.model import _ROUND_OFF, Robot
-from fflin.validation import NORM_TOLERANCE, Array
+from fflin.base.errors import FflinError, InputError
+from fflin.base.validation import NORM_TOLERANCE, Array
+from fflin.batch.configurations import follow_rows
+from fflin.robot.robot import _ROUND_OFF, Robot
 
 _BLOCK = 2048  # rows that are checked at once, so that what that takes is small
 

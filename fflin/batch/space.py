@@ -6,7 +6,7 @@ import os
 import shutil
 from pathlib import Path
 
-from fflin.errors import FileError, InputError
+from fflin.base.errors import FileError, InputError
 
 
 def check_room(count: int, size: int, path: Path | None) -> None:

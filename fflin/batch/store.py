@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from fflin.batch_files import CHECKED, hdf5
-from fflin.batch_room import part_of
-from fflin.errors import FileError
-from fflin.validation import Array
+from fflin.base.errors import FileError
+from fflin.base.validation import Array
+from fflin.batch.files import CHECKED, hdf5
+from fflin.batch.space import part_of
 
 
 class MemoryStore:

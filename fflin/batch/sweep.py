@@ -16,24 +16,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.batch_chunks import ChunkJob
-from fflin.batch_files import check_format, header, load_batch
-from fflin.batch_room import check_room
-from fflin.batch_store import FileStore, MemoryStore
-from fflin.configurations import Configurations, GivenConfigurations
-from fflin.dispatching import Done, Span, dispatch
-from fflin.errors import FflinError, FflinWarning, FileError, InputError, SweepError, listed
-from fflin.kernel_code import available_threads
-from fflin.linear_batch import LinearBatch
-from fflin.model import Robot
-from fflin.own_workers import OwnWorkers
-from fflin.sweep_task import SweepTask, as_configurations
-from fflin.writing import as_path
+from fflin.base.errors import FflinError, FflinWarning, FileError, InputError, SweepError, listed
+from fflin.base.writing import as_path
+from fflin.batch.chunks import ChunkJob
+from fflin.batch.configurations import Configurations, GivenConfigurations
+from fflin.batch.dispatch import Done, Span, dispatch
+from fflin.batch.files import check_format, header, load_batch
+from fflin.batch.kernel.compiled import available_threads
+from fflin.batch.linear_batch import LinearBatch
+from fflin.batch.space import check_room
+from fflin.batch.store import FileStore, MemoryStore
+from fflin.batch.task import SweepTask, as_configurations
+from fflin.batch.workers import OwnWorkers
+from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from fflin.state import Frame
+    from fflin.dynamics.state import Frame
 
 # A chunk's result is about this large, so that what it costs to send is small against it and a
 # handful of them fit in memory.

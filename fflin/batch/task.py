@@ -11,21 +11,21 @@ import numpy as np
 import pinocchio as pin
 
 from fflin import __version__
-from fflin.batch_chunks import ChunkJob, Points
-from fflin.batch_rows import checked_configurations, checked_inputs, checked_velocities
-from fflin.configurations import (
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.batch.chunks import ChunkJob, Points
+from fflin.batch.configurations import (
     Configurations,
     GivenConfigurations,
     Grid,
     RandomConfigurations,
 )
-from fflin.dispatching import Span
-from fflin.errors import InputError
-from fflin.frames import ROOT
-from fflin.joint_columns import joint_columns
-from fflin.linear_batch import LinearBatch
-from fflin.model import Robot
-from fflin.validation import Array
+from fflin.batch.dispatch import Span
+from fflin.batch.joint_columns import joint_columns
+from fflin.batch.linear_batch import LinearBatch
+from fflin.batch.rows import checked_configurations, checked_inputs, checked_velocities
+from fflin.robot.frames import ROOT
+from fflin.robot.robot import Robot
 
 
 class SweepTask:

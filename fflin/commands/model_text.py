@@ -7,14 +7,14 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-from fflin.tables import grid, matrix, width
+from fflin.base.tables import grid, matrix, width
 
 if TYPE_CHECKING:
-    from fflin.eigenmodes import Mode, Modes
-    from fflin.linear_model import LinearModel
-    from fflin.model import Robot
-    from fflin.validation import Array
-    from fflin.verification import Check, Row
+    from fflin.analysis.modes import Mode, Modes
+    from fflin.base.validation import Array
+    from fflin.linear.check import Check, Row
+    from fflin.linear.model import LinearModel
+    from fflin.robot.robot import Robot
 
 
 _LIMITS = "limits in rad, N m and rad/s; of a prismatic joint in m, N and m/s"
@@ -94,7 +94,7 @@ def linear_model(lin: LinearModel) -> str:
     """Show a linear model: its point, A, B, C, D and its certificate."""
     import numpy as np
 
-    from fflin.eigenmodes import modes
+    from fflin.analysis.modes import modes
 
     nx, nu = lin.B.shape
     stays, f0 = lin.is_equilibrium(), np.where(np.abs(lin.f0) > _MOVES, lin.f0, 0.0)

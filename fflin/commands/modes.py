@@ -22,7 +22,7 @@ def add_commands(commands: Commands) -> None:
 
 
 def _modes(arguments: argparse.Namespace) -> int:
-    from fflin.eigenmodes import modes
+    from fflin.analysis.modes import modes
 
     _, lin = linear_model(arguments)
     print(modes(lin))

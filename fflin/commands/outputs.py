@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from fflin.errors import InputError, unknown
-from fflin.outputs import (
+from fflin.base.errors import InputError, unknown
+from fflin.robot.outputs import (
     Accelerometer,
     BasePose,
     CenterOfMass,

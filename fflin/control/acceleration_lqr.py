@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.errors import InputError, StabilizabilityError
-from fflin.linear_model import LinearModel
-from fflin.regulator import Gain, make_gain, require_fixed_point
-from fflin.riccati import Riccati, Solution
-from fflin.stabilizability import require_stabilizable
-from fflin.validation import Array
-from fflin.weights import Weight, weight
+from fflin.analysis.stabilizability import require_stabilizable
+from fflin.base.errors import InputError, StabilizabilityError
+from fflin.base.validation import Array
+from fflin.control.lqr import Gain, make_gain, require_fixed_point
+from fflin.control.riccati import Riccati, Solution
+from fflin.control.weights import Weight, weight
+from fflin.linear.model import LinearModel
 
 _BEYOND = "the weights or dt are beyond what numbers hold: scale Qp, Qv and Ra nearer to each other"
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from fflin.actuation import Actuation
-from fflin.errors import InputError, unknown
-from fflin.validation import DOUBLE, Array, as_double, number
+from fflin.base.errors import InputError, unknown
+from fflin.base.validation import DOUBLE, Array, as_double, number
+from fflin.dynamics.actuation import Actuation
 
 
 def limits_of(actuation: Actuation, limits: Any) -> tuple[Array, Array]:

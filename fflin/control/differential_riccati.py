@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
-from fflin.validation import Array
+from fflin.base.validation import Array
 
 # Weights of the commutator-free method of order four, and its Gauss nodes.
 _HEAVY, _LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fflin.tables import grid, matrix, width
+from fflin.base.tables import grid, matrix, width
 
 if TYPE_CHECKING:
     from typing import Any
 
-    from fflin.regulator import Gain
+    from fflin.control.lqr import Gain
 
 # A gain of more entries, of more than three joints, is shown by the norms of its blocks.
 _LARGE = 9 * 18

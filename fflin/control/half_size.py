@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg.lapack import dgeev, dgeqrf, dpotrf, dtrtrs
 
-from fflin.modal import Modes, Spectrum
-from fflin.validation import Array
+from fflin.base.validation import Array
+from fflin.control.lyapunov import Modes, Spectrum
 
 
 class Loop(NamedTuple):

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.design import Design
-from fflin.errors import DetectabilityError, InputError, MissingPackageError
-from fflin.linear_model import LinearModel
-from fflin.regulator import Gain, require_fixed_point
-from fflin.validation import Array
-from fflin.weights import Weight, columns, weight
+from fflin.base.design import Design
+from fflin.base.errors import DetectabilityError, InputError, MissingPackageError
+from fflin.base.validation import Array
+from fflin.control.lqr import Gain, require_fixed_point
+from fflin.control.weights import Weight, columns, weight
+from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -186,8 +186,8 @@ def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -
     ----------
     R. E. Kalman and R. S. Bucy, J. Basic Engineering 83(1), 1961.
     """
-    from fflin.riccati import solve
-    from fflin.stabilizability import require_detectable, require_disturbed
+    from fflin.analysis.stabilizability import require_detectable, require_disturbed
+    from fflin.control.riccati import solve
 
     require_fixed_point(lin)
     W, V = _disturbance(lin, W, G), weight("V", V, lin.output_names, definite=True)

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.design import Design
-from fflin.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
-from fflin.linear_model import LinearModel
-from fflin.validation import Array
-from fflin.weights import Weight, cross_weight, require_semidefinite, weight
+from fflin.base.design import Design
+from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
+from fflin.base.validation import Array
+from fflin.control.weights import Weight, cross_weight, require_semidefinite, weight
+from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from fflin.margins import Margins
+    from fflin.control.margins import Margins
 
 _SHOWN_RESIDUALS = 6
 
@@ -91,7 +91,7 @@ class Gain(Design):
         )
 
     def __str__(self) -> str:
-        from fflin.gain_reports import gain_report
+        from fflin.control.gain_text import gain_report
 
         return gain_report(self)
 
@@ -104,7 +104,7 @@ class Gain(Design):
     @cached_property
     def margins(self) -> Margins:
         """Gain and phase that the inputs bear, computed when first asked for."""
-        from fflin.margins import input_margins
+        from fflin.control.margins import input_margins
 
         return input_margins(self.A, self.B, self.K, self.R, self.dt)
 
@@ -239,8 +239,8 @@ def _still(poles: Any, dt: float) -> bool:
 
 
 def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
-    from fflin.riccati import half_size, solve
-    from fflin.stabilizability import require_stabilizable, require_weighed
+    from fflin.analysis.stabilizability import require_stabilizable, require_weighed
+    from fflin.control.riccati import half_size, solve
 
     arguments = (lin.A, lin.B, Q, R, N, lin.dt)
     structured = half_size(*arguments)

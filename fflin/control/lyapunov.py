@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg.lapack import dgeev, dgetrf, dgetri
 
-from fflin.validation import Array
+from fflin.base.validation import Array
 
 
 class Spectrum:

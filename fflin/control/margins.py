@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.validation import Array
+from fflin.base.validation import Array
 
 _ACCURACY = 1e-5
 

@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fflin.aba import Aba
-from fflin.errors import InputError
-from fflin.estimation import Compensator
-from fflin.linear_model import LinearModel
-from fflin.measuring import Measuring
-from fflin.outputs import Accelerometer, FullState
-from fflin.sensing import Sensing
-from fflin.state import StateMap
-from fflin.validation import Array, vector
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, vector
+from fflin.control.kalman import Compensator
+from fflin.dynamics.aba import Aba
+from fflin.dynamics.output_values import Measuring
+from fflin.dynamics.outputs import Sensing
+from fflin.dynamics.state import StateMap
+from fflin.linear.model import LinearModel
+from fflin.robot.outputs import Accelerometer, FullState
 
 if TYPE_CHECKING:
-    from fflin.model import Robot
-    from fflin.policies import Policy
+    from fflin.control.policies import Policy
+    from fflin.robot.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class OutputFeedback:
         InputError
             If the model is not one of this robot with these outputs.
         """
-        from fflin.policies import require_same_robot
+        from fflin.control.policies import require_same_robot
 
         lin, by = self.lin, self.compensator
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)

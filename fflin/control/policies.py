@@ -10,19 +10,19 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from fflin.actuation import Actuation
-from fflin.control import Law
-from fflin.errors import InputError
-from fflin.linear_model import LinearModel
-from fflin.model import Robot
-from fflin.readout import readout
-from fflin.rotation import conjugate, quaternion_product, rotation_matrix
-from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.base.errors import InputError
+from fflin.base.rotation import conjugate, quaternion_product, rotation_matrix
+from fflin.base.validation import Array
+from fflin.control.channel import Law
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import readout
+from fflin.linear.model import LinearModel
+from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from fflin.schedules import GainSchedule
-    from fflin.trajectory import LinearTrajectory
+    from fflin.control.tvlqr import GainSchedule
+    from fflin.linear.trajectory import LinearTrajectory
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 

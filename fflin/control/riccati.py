@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
-from fflin.halfsize import second_order_loop
-from fflin.modal import Modes, eigenvalues
-from fflin.validation import Array
+from fflin.base.validation import Array
+from fflin.control.half_size import second_order_loop
+from fflin.control.lyapunov import Modes, eigenvalues
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 

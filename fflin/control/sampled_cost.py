@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from fflin.errors import InputError
-from fflin.linear_model import LinearModel
-from fflin.regulator import cost_weights
-from fflin.validation import Array, number
-from fflin.weights import Weight
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, number
+from fflin.control.lqr import cost_weights
+from fflin.control.weights import Weight
+from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from fflin.design import Design
-from fflin.errors import InputError
-from fflin.validation import Array, number
-from fflin.weights import Weight, weight
+from fflin.base.design import Design
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, number
+from fflin.control.weights import Weight, weight
 
 if TYPE_CHECKING:
-    from fflin.differential_riccati import Coefficients
-    from fflin.trajectory import LinearTrajectory
+    from fflin.control.differential_riccati import Coefficients
+    from fflin.linear.trajectory import LinearTrajectory
 
 # Between two knots P is a cubic; knots are put in until it holds to this, relative to P.
 _ACCURACY = 1e-7
@@ -142,7 +142,7 @@ def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSched
     E. Celledoni, A. Marthinsen and B. Owren, Commutator-free Lie group methods, Future Generation
     Computer Systems 19(3), 2003.
     """
-    from fflin.trajectory import LinearTrajectory
+    from fflin.linear.trajectory import LinearTrajectory
 
     if not isinstance(traj, LinearTrajectory):
         raise InputError(
@@ -183,7 +183,7 @@ def cubic(
 
 
 def _solve(traj: LinearTrajectory, Q: Array, R: Array, Qf: Array) -> tuple[Array, Array]:
-    from fflin.differential_riccati import Coefficients, step_back
+    from fflin.control.differential_riccati import Coefficients, step_back
 
     def at(t: float) -> Coefficients:
         A, B = traj.matrices(t)

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from fflin.errors import InputError, unknown
-from fflin.validation import Array, number, vector
+from fflin.base.errors import InputError, unknown
+from fflin.base.validation import Array, number, vector
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from fflin.linear_model import LinearModel
+    from fflin.linear.model import LinearModel
 
 Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
 

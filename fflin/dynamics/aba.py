@@ -6,11 +6,11 @@ The route by which linear models are checked, and nothing of the one by which th
 import numpy as np
 import pinocchio as pin
 
-from fflin.actuation import Actuation
-from fflin.frames import ROOT
-from fflin.rotation import skew
-from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.robot.frames import ROOT
 
 
 class Aba:

@@ -6,10 +6,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from fflin.chart import Chart
-from fflin.errors import InputError
-from fflin.frames import find_frame
-from fflin.inputs import (
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.dynamics.chart import Chart
+from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.robot.frames import find_frame
+from fflin.robot.inputs import (
     BaseForce,
     BaseTorque,
     JointTorque,
@@ -17,10 +19,8 @@ from fflin.inputs import (
     Thruster,
     named_wheels,
 )
-from fflin.model import Robot
-from fflin.state import ANGULAR, LINEAR, StateMap
-from fflin.validation import Array
-from fflin.wheels import carrier
+from fflin.robot.robot import Robot
+from fflin.robot.wheels import carrier
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 

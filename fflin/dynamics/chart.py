@@ -5,8 +5,8 @@ from functools import cached_property
 
 import numpy as np
 
-from fflin.rotation import skew
-from fflin.validation import Array
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
 
 # Where q0 is below the square root of the rounding unit, sqrt(1 - |q_b|^2) has no correct digit.
 SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))

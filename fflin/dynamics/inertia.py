@@ -5,12 +5,12 @@ import warnings
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import FflinWarning, SingularInertiaError, listed
-from fflin.inertia_bounds import STROKE
-from fflin.linear_model import LinearModel
-from fflin.model import Robot
-from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.base.errors import FflinWarning, SingularInertiaError, listed
+from fflin.base.validation import Array
+from fflin.dynamics.inertia_bounds import STROKE
+from fflin.dynamics.state import StateMap
+from fflin.linear.model import LinearModel
+from fflin.robot.robot import Robot
 
 # M_ii (M^-1)_ii is 1 for a decoupled coordinate, more for any other, and grows as a coordinate
 # loses inertia of its own; times the rounding unit it is the relative error of (M^-1)_ii. Of the

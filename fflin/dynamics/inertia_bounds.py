@@ -3,7 +3,7 @@
 import numpy as np
 import pinocchio as pin
 
-from fflin.validation import Array
+from fflin.base.validation import Array
 
 STROKE = 1.0  # [m] that a sliding joint is taken to be out at most
 

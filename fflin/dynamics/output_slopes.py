@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import pinocchio as pin
 
-from fflin.rotation import skew
-from fflin.validation import Array
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
 
 # Rows of Pinocchio's spatial vectors, and of the base in its v.
 LINEAR, ANGULAR = slice(0, 3), slice(3, 6)

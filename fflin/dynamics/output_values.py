@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.outputs import (
+from fflin.base.validation import Array
+from fflin.dynamics.outputs import Carried, carried, states_of
+from fflin.dynamics.state import StateMap
+from fflin.robot.outputs import (
     Accelerometer,
     CenterOfMass,
     FramePose,
@@ -17,9 +20,6 @@ from fflin.outputs import (
     Momentum,
     Output,
 )
-from fflin.sensing import Carried, carried, states_of
-from fflin.state import StateMap
-from fflin.validation import Array
 
 
 class Measuring:

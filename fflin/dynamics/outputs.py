@@ -5,9 +5,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import InputError
-from fflin.frames import ROOT, find_frame
-from fflin.measurements import (
+from fflin.base.errors import InputError
+from fflin.base.rotation import quaternion_product, rotation_matrix, skew
+from fflin.base.validation import Array
+from fflin.dynamics.output_slopes import (
     ANGULAR,
     LINEAR,
     Carried,
@@ -20,8 +21,9 @@ from fflin.measurements import (
     gyroscope,
     momentum,
 )
-from fflin.model import Robot
-from fflin.outputs import (
+from fflin.dynamics.state import StateMap
+from fflin.robot.frames import ROOT, find_frame
+from fflin.robot.outputs import (
     Accelerometer,
     BasePose,
     CenterOfMass,
@@ -34,9 +36,7 @@ from fflin.outputs import (
     Momentum,
     Output,
 )
-from fflin.rotation import quaternion_product, rotation_matrix, skew
-from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.robot.robot import Robot
 
 # What writes the rows of an output, and the (name, unit) of each of its vectors.
 _OF_ROBOT: dict[type, tuple[Callable[[Point, Sensed], None], list[tuple[str, str]]]] = {

@@ -4,12 +4,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fflin.actuation import Actuation
-from fflin.errors import unknown
-from fflin.inputs import named_wheels
-from fflin.model import Robot
-from fflin.state import StateMap
-from fflin.validation import Array, number
+from fflin.base.errors import unknown
+from fflin.base.validation import Array, number
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.robot.inputs import named_wheels
+from fflin.robot.robot import Robot
 
 
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:

@@ -5,12 +5,12 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.actuation import Actuation
-from fflin.frames import ROOT
-from fflin.inertia import Inertia
-from fflin.rotation import rotation_matrix, skew
-from fflin.state import LINEAR, StateMap
-from fflin.validation import Array
+from fflin.base.rotation import rotation_matrix, skew
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.inertia import Inertia
+from fflin.dynamics.state import LINEAR, StateMap
+from fflin.robot.frames import ROOT
 
 # Rows of the angular part of Pinocchio's spatial vectors.
 _TURNING = slice(3, 6)

@@ -5,11 +5,11 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 import pinocchio as pin
 
-from fflin.chart import SMALLEST_Q0, Chart
-from fflin.errors import ChartError, InputError
-from fflin.model import ROOT, Robot
-from fflin.rotation import conjugate, quaternion_product, rotation_matrix
-from fflin.validation import Array, placement, vector
+from fflin.base.errors import ChartError, InputError
+from fflin.base.rotation import conjugate, quaternion_product, rotation_matrix
+from fflin.base.validation import Array, placement, vector
+from fflin.dynamics.chart import SMALLEST_Q0, Chart
+from fflin.robot.robot import ROOT, Robot
 
 Frame = Literal["hybrid", "local", "world"]
 

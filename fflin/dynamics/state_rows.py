@@ -8,9 +8,9 @@ from typing import TypeAlias
 import numpy as np
 import pinocchio as pin
 
-from fflin.rotation import product_matrix
-from fflin.state import ANGULAR, LINEAR, StateMap
-from fflin.validation import Array
+from fflin.base.rotation import product_matrix
+from fflin.base.validation import Array
+from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
 
 Readout: TypeAlias = Callable[[Array, Array], Array]
 

@@ -4,15 +4,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.aba import Aba
-from fflin.actuation import Actuation
-from fflin.chart import Chart
-from fflin.inertia import inverse_inertia
-from fflin.linear_model import Certificate, LinearModel
-from fflin.model import Robot
-from fflin.rotation import skew
-from fflin.state import ANGULAR, LINEAR, StateMap
-from fflin.validation import Array
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.dynamics.aba import Aba
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.chart import Chart
+from fflin.dynamics.inertia import inverse_inertia
+from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.linear.model import Certificate, LinearModel
+from fflin.robot.robot import Robot
 
 # Of terms that drop out exactly: their rounding, 1e-16 of them, is to be far below the tolerance.
 _ROUNDING_SHARE = 1e-3

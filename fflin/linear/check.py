@@ -5,8 +5,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.actuation import Actuation
-from fflin.certificate import (
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.commands.model_text import check_report
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.inertia import inertia_matrix, inverse_inertia
+from fflin.dynamics.output_values import Measuring
+from fflin.dynamics.outputs import Sensing
+from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.linear.certificate import (
     aba_route,
     compare,
     inertia_residual,
@@ -14,17 +21,10 @@ from fflin.certificate import (
     motion,
     scaled_condition,
 )
-from fflin.errors import InputError
-from fflin.inertia import inertia_matrix, inverse_inertia
-from fflin.linear_model import LinearModel
-from fflin.measuring import Measuring
-from fflin.model import Robot
-from fflin.nonlinear import ErrorDynamics, Nonlinear, flow_error, jacobian
-from fflin.outputs import FullState
-from fflin.reports import check_report
-from fflin.sensing import Sensing
-from fflin.state import ANGULAR, LINEAR, StateMap
-from fflin.validation import Array
+from fflin.linear.model import LinearModel
+from fflin.linear.nonlinear import ErrorDynamics, Nonlinear, flow_error, jacobian
+from fflin.robot.outputs import FullState
+from fflin.robot.robot import Robot
 
 _EPS = float(np.finfo(float).eps)
 # Rounding of a difference of outputs: its weights add up to two ulp, each output brings a few.

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from fflin.actuation import Actuation
-from fflin.errors import EquilibriumError, listed
-from fflin.linearization import Linearizer
-from fflin.model import Robot
-from fflin.state import Frame, StateMap
-from fflin.validation import Array
+from fflin.base.errors import EquilibriumError, listed
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import Frame, StateMap
+from fflin.linear.linearization import Linearizer
+from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from fflin.linear_model import LinearModel
+    from fflin.linear.model import LinearModel
 
 _EPS = float(np.finfo(float).eps)
 
@@ -57,7 +57,7 @@ class Equilibrium:
         self.residual.setflags(write=False)
 
     def __str__(self) -> str:
-        from fflin.reports import signals
+        from fflin.commands.model_text import signals
 
         if not self.u.any():
             return "u: all zero"

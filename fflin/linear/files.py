@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from fflin.errors import FileError, InputError
-from fflin.linear_model import Certificate, LinearModel
-from fflin.writing import write_whole
+from fflin.base.errors import FileError, InputError
+from fflin.base.writing import write_whole
+from fflin.linear.model import Certificate, LinearModel
 
 _MATRICES = ("A", "B", "C", "D", "M")
 _VECTORS = ("f0", "x0", "u0", "y0", "q", "v", "reference")

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from fflin.joints import Joint
-from fflin.linear_model import LinearModel
-from fflin.model import Robot
-from fflin.rotation import skew
+from fflin.base.rotation import skew
+from fflin.linear.model import LinearModel
+from fflin.robot.joints import Joint
+from fflin.robot.robot import Robot
 
 # What the rounding of a URDF's own numbers leaves of an exact symmetry, relative.
 _ROUNDING = 1e-12

@@ -11,25 +11,25 @@ import numpy as np
 import pinocchio as pin
 
 from fflin import __version__
-from fflin.actuation import Actuation
-from fflin.certificate import certify
-from fflin.chart import Chart
-from fflin.errors import InputError
-from fflin.frames import ROOT
-from fflin.inertia import inertia_matrix
-from fflin.linear_model import LinearModel
-from fflin.model import Robot
-from fflin.output_equations import output_equations
-from fflin.outputs import FullState
-from fflin.rates import Accelerations, Rates
-from fflin.rotation import skew
-from fflin.state import ANGULAR, LINEAR, Frame, StateMap
-from fflin.state_equations import STANDING, Point, at_rest, ride_along, state_equations
-from fflin.symmetry import ignorable_states
-from fflin.validation import Array, vector
+from fflin.base.errors import InputError
+from fflin.base.rotation import skew
+from fflin.base.validation import Array, vector
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.chart import Chart
+from fflin.dynamics.inertia import inertia_matrix
+from fflin.dynamics.rnea import Accelerations, Rates
+from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap
+from fflin.linear.certificate import certify
+from fflin.linear.ignorable import ignorable_states
+from fflin.linear.model import LinearModel
+from fflin.linear.output_equations import output_equations
+from fflin.linear.state_equations import STANDING, Point, at_rest, ride_along, state_equations
+from fflin.robot.frames import ROOT
+from fflin.robot.outputs import FullState
+from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from fflin.sensing import Sensing
+    from fflin.dynamics.outputs import Sensing
 
 # Sum of squares beyond which a matrix counts as not finite: its eigenvalues would not be. Up to
 # velocities and inputs of the other size nothing overflows on the way to it.
@@ -103,7 +103,7 @@ class Linearizer:
         self._accelerations = Accelerations(self._map, self._actuation, self._data)
         self._sensing: Sensing | None = None
         if robot.outputs != (FullState(),):
-            from fflin.sensing import Sensing
+            from fflin.dynamics.outputs import Sensing
 
             self._sensing = Sensing(
                 self._map,

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.errors import InputError, MissingPackageError
-from fflin.validation import Array, number
+from fflin.base.errors import InputError, MissingPackageError
+from fflin.base.validation import Array, number
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
-    from fflin.state import Frame
+    from fflin.dynamics.state import Frame
 
 
 _new, _set = object.__new__, object.__setattr__
@@ -296,8 +296,8 @@ class LinearModel:
         FileError
             If the ending is another or the file cannot be written.
         """
-        from fflin.files import save_model
-        from fflin.writing import as_path
+        from fflin.base.writing import as_path
+        from fflin.linear.files import save_model
 
         save_model(self, as_path(path))
 
@@ -310,8 +310,8 @@ class LinearModel:
         FileError
             If the file cannot be read or is not such a model.
         """
-        from fflin.files import load_model
-        from fflin.writing import as_path
+        from fflin.base.writing import as_path
+        from fflin.linear.files import load_model
 
         return load_model(as_path(path))
 

@@ -6,12 +6,12 @@ from functools import partial
 import numpy as np
 import pinocchio as pin
 
-from fflin.aba import Aba
-from fflin.linear_model import LinearModel
-from fflin.model import ROOT, Robot
-from fflin.rotation import rotation_matrix
-from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.base.rotation import rotation_matrix
+from fflin.base.validation import Array
+from fflin.dynamics.aba import Aba
+from fflin.dynamics.state import StateMap
+from fflin.linear.model import LinearModel
+from fflin.robot.robot import ROOT, Robot
 
 # Where the base flies faster than this [m/s], the digits of its speed would drown the rest.
 _FAST = 100.0

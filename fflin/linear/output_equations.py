@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fflin.actuation import Actuation
-from fflin.chart import Chart
-from fflin.rates import Rates
-from fflin.rotation import skew
-from fflin.state import ANGULAR, LINEAR, StateMap
-from fflin.validation import Array
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.chart import Chart
+from fflin.dynamics.rnea import Rates
+from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
 
 if TYPE_CHECKING:
-    from fflin.measurements import Sensed
+    from fflin.dynamics.output_slopes import Sensed
 
 
 def output_equations(

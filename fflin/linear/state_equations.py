@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.actuation import Actuation
-from fflin.chart import Chart
-from fflin.rotation import skew
-from fflin.state import ANGULAR, LINEAR, StateMap
-from fflin.validation import Array
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.chart import Chart
+from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
 
 
 class Point(NamedTuple):

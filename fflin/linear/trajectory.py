@@ -8,14 +8,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from fflin.aba import Aba
-from fflin.errors import FflinWarning, InputError
-from fflin.linear_model import LinearModel
-from fflin.linearization import Linearizer
-from fflin.model import Robot
-from fflin.rotation import rotation_matrix
-from fflin.state import StateMap
-from fflin.validation import Array, number, vector
+from fflin.base.errors import FflinWarning, InputError
+from fflin.base.rotation import rotation_matrix
+from fflin.base.validation import Array, number, vector
+from fflin.dynamics.aba import Aba
+from fflin.dynamics.state import StateMap
+from fflin.linear.linearization import Linearizer
+from fflin.linear.model import LinearModel
+from fflin.robot.robot import Robot
 
 # Of the trapezoidal rule over an interval, relative to the largest rate of the motion: what
 # coarse knots leave, and what no motion of the robot leaves.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from fflin.errors import FileError, InputError, UrdfError, unknown
+from fflin.base.errors import FileError, InputError, UrdfError, unknown
 
 # example-robot-data's talos_legs is talos cut off at the torso, done in its loader's code.
 _PRUNED = {"talos_legs": ("torso_1_joint",)}
@@ -39,7 +39,7 @@ class RobotFile:
 @cache
 def bundled_directory() -> Path:
     """Folder of the bundled URDFs: inside an installed package, beside a source checkout's."""
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     installed = package / "bundled"
     return installed if installed.is_dir() else package.parent / "robots"
 

@@ -3,8 +3,9 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from fflin.errors import InputError, ModelError, unknown
-from fflin.inputs import (
+from fflin.base.errors import InputError, ModelError, unknown
+from fflin.base.validation import number
+from fflin.robot.inputs import (
     BaseForce,
     BaseTorque,
     Input,
@@ -13,9 +14,8 @@ from fflin.inputs import (
     named_wheels,
     three_numbers,
 )
-from fflin.joints import Joint
-from fflin.outputs import Output
-from fflin.validation import number
+from fflin.robot.joints import Joint
+from fflin.robot.outputs import Output
 
 FIELDS = ("inputs", "outputs", "stiffness", "damping", "rest", "gravity")
 

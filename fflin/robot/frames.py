@@ -2,7 +2,7 @@
 
 import pinocchio as pin
 
-from fflin.errors import unknown
+from fflin.base.errors import unknown
 
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 

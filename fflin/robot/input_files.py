@@ -7,10 +7,10 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-from fflin.errors import FflinError, InputError, UnknownNameError, unknown
-from fflin.inputs import BaseForce, BaseTorque, Input, JointTorque, ReactionWheel, Thruster
-from fflin.reader import read_file
-from fflin.robots import find_inputs
+from fflin.base.errors import FflinError, InputError, UnknownNameError, unknown
+from fflin.robot.catalog import find_inputs
+from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, ReactionWheel, Thruster
+from fflin.robot.urdf.reader import read_file
 
 if sys.version_info >= (3, 11):
     import tomllib

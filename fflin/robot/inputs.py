@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from fflin.errors import InputError
-from fflin.validation import number
+from fflin.base.errors import InputError
+from fflin.base.validation import number
 
 Vector3: TypeAlias = Sequence[float]
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.validation import Array
+from fflin.base.validation import Array
 
 
 class Joint(NamedTuple):

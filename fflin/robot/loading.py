@@ -9,14 +9,14 @@ from typing import Any
 
 import pinocchio as pin
 
-from fflin.errors import FflinWarning, InputError, ModelError, unknown
-from fflin.joints import Follower, Joint
-from fflin.model import ROOT, Robot
-from fflin.model_checks import check_model
-from fflin.reader import read_urdf
-from fflin.robots import find_robot
-from fflin.urdf_joints import Mimic
-from fflin.validation import number
+from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
+from fflin.base.validation import number
+from fflin.robot.catalog import find_robot
+from fflin.robot.joints import Follower, Joint
+from fflin.robot.model_checks import check_model
+from fflin.robot.robot import ROOT, Robot
+from fflin.robot.urdf.joints import Mimic
+from fflin.robot.urdf.reader import read_urdf
 
 Lock = Mapping[str, float | None] | Iterable[str]
 
@@ -121,7 +121,7 @@ def from_model(
 
 
 def _folders(package_dirs: Any) -> tuple[Path, ...]:
-    from fflin.writing import as_path
+    from fflin.base.writing import as_path
 
     if isinstance(package_dirs, str | os.PathLike) or not isinstance(package_dirs, Sequence):
         raise InputError(f"package_dirs is {package_dirs!r}, expected a list of folders")

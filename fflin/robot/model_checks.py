@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import ModelError
-from fflin.inertia_checks import is_impossible
-from fflin.validation import NORM_TOLERANCE
+from fflin.base.errors import ModelError
+from fflin.base.validation import NORM_TOLERANCE
+from fflin.robot.urdf.inertias import is_impossible
 
 
 def check_model(model: pin.Model, name: str) -> None:

@@ -6,7 +6,7 @@ Reference axes are those of the reference placement that the state is relative t
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from fflin.errors import InputError
+from fflin.base.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import InputError, ModelError, unknown
-from fflin.fields import validated_fields, validated_inputs
-from fflin.frames import ROOT, find_frame
-from fflin.inertia_bounds import bounds_of_inertia
-from fflin.inputs import Input, default_inputs, named_wheels
-from fflin.joints import Follower, Joint
-from fflin.outputs import FullState, Output
-from fflin.validation import DOUBLE, NORM_TOLERANCE, Array, number, placement, vector
-from fflin.wheels import stored_momentum, with_wheels
+from fflin.base.errors import InputError, ModelError, unknown
+from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, number, placement, vector
+from fflin.dynamics.inertia_bounds import bounds_of_inertia
+from fflin.robot.fields import validated_fields, validated_inputs
+from fflin.robot.frames import ROOT, find_frame
+from fflin.robot.inputs import Input, default_inputs, named_wheels
+from fflin.robot.joints import Follower, Joint
+from fflin.robot.outputs import FullState, Output
+from fflin.robot.wheels import stored_momentum, with_wheels
 
 _CONFIGURATION = "a configuration in Pinocchio's order"
 

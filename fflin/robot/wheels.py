@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import InputError
-from fflin.frames import ROOT, find_frame
-from fflin.inertia_checks import is_impossible
-from fflin.inputs import Input, ReactionWheel, named_wheels
-from fflin.joints import Follower, Joint
-from fflin.validation import Array
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.robot.frames import ROOT, find_frame
+from fflin.robot.inputs import Input, ReactionWheel, named_wheels
+from fflin.robot.joints import Follower, Joint
+from fflin.robot.urdf.inertias import is_impossible
 
 # What Pinocchio keeps of each degree of freedom, and of each entry of q, beside the joint itself.
 _OF_VELOCITY = (

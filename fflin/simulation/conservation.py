@@ -8,9 +8,9 @@ import numpy as np
 import pinocchio as pin
 from scipy.linalg.lapack import dposv
 
-from fflin.model import ROOT, Robot
-from fflin.rotation import skew
-from fflin.validation import Array
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.robot.robot import ROOT, Robot
 
 _crba = pin.crba
 _placement = pin.XYZQUATToSE3

@@ -12,8 +12,8 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import unknown
-from fflin.validation import Array
+from fflin.base.errors import unknown
+from fflin.base.validation import Array
 
 Acceleration: TypeAlias = Callable[[float, Array, Array], Array]
 

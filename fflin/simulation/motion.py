@@ -11,9 +11,9 @@ from typing import Any, ClassVar
 import numpy as np
 import pinocchio as pin
 
-from fflin.design import Design
-from fflin.errors import FileError, InputError
-from fflin.validation import Array
+from fflin.base.design import Design
+from fflin.base.errors import FileError, InputError
+from fflin.base.validation import Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,7 +125,7 @@ class Motion(Design):
         FileError
             If the ending is another or the file cannot be written.
         """
-        from fflin.writing import as_path, write_whole
+        from fflin.base.writing import as_path, write_whole
 
         target = as_path(path)
         check_motion_format(target)
@@ -142,14 +142,14 @@ class Motion(Design):
 
     def plot(self, path: str | Path | None = None, **options: Any) -> Any:
         """Draw the motion, see `plot_motion`; into a file where a path is given."""
-        from fflin.plots import plot_motion
+        from fflin.simulation.plots import plot_motion
 
         return plot_motion(self, path, **options)
 
 
 def check_motion_format(path: Path) -> None:
     """Raise `FileError` where a motion cannot be saved under that name."""
-    from fflin.design_files import FORMATS
+    from fflin.base.design_files import FORMATS
 
     if path.suffix not in (*FORMATS, ".csv"):
         expected = ", ".join((*FORMATS, ".csv"))

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fflin.tables import grid, width
+from fflin.base.tables import grid, width
 
 if TYPE_CHECKING:
-    from fflin.motion import Motion
+    from fflin.simulation.motion import Motion
 
 # Of an error relative to its largest, where a motion is taken to have settled.
 _SETTLED = 0.02

@@ -9,10 +9,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from fflin.aba import Aba
-from fflin.errors import InputError
-from fflin.state import StateMap
-from fflin.validation import Array, as_double
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, as_double
+from fflin.dynamics.aba import Aba
+from fflin.dynamics.state import StateMap
 
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 

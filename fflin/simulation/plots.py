@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from fflin.figures import COLORS, cycle, saved, styled, target_of
-from fflin.motion import Motion, require_motion
-from fflin.validation import Array
+from fflin.base.figures import COLORS, cycle, saved, styled, target_of
+from fflin.base.validation import Array
+from fflin.simulation.motion import Motion, require_motion
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fflin.control import Channel
-from fflin.linear_model import LinearModel
-from fflin.validation import Array
+from fflin.base.validation import Array
+from fflin.control.channel import Channel
+from fflin.linear.model import LinearModel
 
 
 def predict(

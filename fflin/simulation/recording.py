@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import InputError
-from fflin.linear_loop import predict
-from fflin.linear_model import LinearModel
-from fflin.motion import Motion
-from fflin.readout import states_of
-from fflin.validation import Array
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.dynamics.state_rows import states_of
+from fflin.linear.model import LinearModel
+from fflin.simulation.motion import Motion
+from fflin.simulation.prediction import predict
 
 if TYPE_CHECKING:
-    from fflin.run import Run
+    from fflin.simulation.run import Run
 
 
 def check_prediction(run: Run, linear: Any) -> None:

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.conservation import Conserved
-from fflin.control import Channel, Law, limits_of
-from fflin.dynamics import Disturbance, Dynamics
-from fflin.errors import InputError
-from fflin.integrators import integrator
-from fflin.linear_model import LinearModel
-from fflin.model import Robot
-from fflin.policies import Allocation, bound
-from fflin.progress import Progress
-from fflin.state import Frame, StateMap
-from fflin.symmetry import rotor_names
-from fflin.validation import Array, number
+from fflin.base.errors import InputError
+from fflin.base.progress import Progress
+from fflin.base.validation import Array, number
+from fflin.control.channel import Channel, Law, limits_of
+from fflin.control.policies import Allocation, bound
+from fflin.dynamics.state import Frame, StateMap
+from fflin.linear.ignorable import rotor_names
+from fflin.linear.model import LinearModel
+from fflin.robot.robot import Robot
+from fflin.simulation.conservation import Conserved
+from fflin.simulation.integrators import integrator
+from fflin.simulation.plant import Disturbance, Dynamics
 
 Event = Callable[[float, Array, Array], float]
 

@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from fflin.recording import check_prediction, motion_of
-from fflin.run import Run
+from fflin.simulation.recording import check_prediction, motion_of
+from fflin.simulation.run import Run
 
 if TYPE_CHECKING:
     import pinocchio as pin
     from numpy.typing import ArrayLike
 
-    from fflin.dynamics import Disturbance
-    from fflin.linear_model import LinearModel
-    from fflin.model import Robot
-    from fflin.motion import Motion
-    from fflin.policies import Policy, StateFeedback
-    from fflin.run import Event
-    from fflin.state import Frame
-    from fflin.validation import Array
+    from fflin.base.validation import Array
+    from fflin.control.policies import Policy, StateFeedback
+    from fflin.dynamics.state import Frame
+    from fflin.linear.model import LinearModel
+    from fflin.robot.robot import Robot
+    from fflin.simulation.motion import Motion
+    from fflin.simulation.plant import Disturbance
+    from fflin.simulation.run import Event
 
 
 def simulate(

@@ -10,8 +10,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from fflin.validation import Array
-from fflin.visuals import Color
+from fflin.base.validation import Array
+from fflin.view.shapes import Color
 
 Indices: TypeAlias = "np.ndarray[Any, np.dtype[np.integer[Any]]]"
 Part: TypeAlias = "tuple[Array, Indices, Color | None]"

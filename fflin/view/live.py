@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.film import corner_points, rounded, stage_info, subtitle, triads
-from fflin.model import Robot
-from fflin.page import build_page
-from fflin.playback import body_poses
-from fflin.recorder import Recorder
-from fflin.scene import Drawing, Visualizer, body_paths
-from fflin.serving import Server
-from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.base.validation import Array
+from fflin.dynamics.state import StateMap
+from fflin.robot.robot import Robot
+from fflin.view.motion_page import corner_points, rounded, stage_info, subtitle, triads
+from fflin.view.page import build_page
+from fflin.view.playback import body_poses
+from fflin.view.recorder import Recorder
+from fflin.view.scene import Drawing, Visualizer, body_paths
+from fflin.view.server import Server
 
 
 class Live:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fflin.collada import Indices, read_collada
-from fflin.validation import Array
-from fflin.visuals import Color
+from fflin.base.validation import Array
+from fflin.view.collada import Indices, read_collada
+from fflin.view.shapes import Color
 
 # Details smaller than this part of a mesh's extent are not drawn; it halves most CAD exports.
 _RESOLUTION = 1.0 / 400.0

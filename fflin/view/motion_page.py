@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pinocchio as pin
 
-from fflin.model import ROOT, Robot
-from fflin.page import build_page, packed
-from fflin.panel import panel
-from fflin.playback import Playback, body_poses, frame_indices, play_back, thrusters
-from fflin.recorder import Recorder
-from fflin.scene import Animation, Drawing, Visualizer, body_paths
-from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.base.validation import Array
+from fflin.dynamics.state import StateMap
+from fflin.robot.robot import ROOT, Robot
+from fflin.view.page import build_page, packed
+from fflin.view.panel import panel
+from fflin.view.playback import Playback, body_poses, frame_indices, play_back, thrusters
+from fflin.view.recorder import Recorder
+from fflin.view.scene import Animation, Drawing, Visualizer, body_paths
 
 if TYPE_CHECKING:
-    from fflin.motion import Motion
-    from fflin.state import Frame
+    from fflin.dynamics.state import Frame
+    from fflin.simulation.motion import Motion
 
 # Where one looks from, and where the sun stands, in world axes.
 VIEWS = {"space": (1.0, -0.62, 0.50), "lab": (1.0, -0.62, 0.36)}

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fflin.validation import Array
+from fflin.base.validation import Array
 
 _SCRIPTS = ("sky", "look", "stage", "marks", "plots", "player", "live", "main")
 
@@ -64,7 +64,7 @@ def _base64(content: bytes) -> str:
 
 @cache
 def _asset(name: str) -> str:
-    return files("fflin").joinpath("assets", name).read_text(encoding="utf-8")
+    return files("fflin.view").joinpath("assets", name).read_text(encoding="utf-8")
 
 
 @cache

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.actuation import Actuation
-from fflin.model import Robot
-from fflin.page import packed
-from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.robot.robot import Robot
+from fflin.view.page import packed
 
 _TITLES = {
     "tau_b": ("base torque", "N m"),

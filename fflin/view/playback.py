@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from fflin.actuation import Actuation
-from fflin.inputs import Thruster
-from fflin.model import ROOT, Robot
-from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.robot.inputs import Thruster
+from fflin.robot.robot import ROOT, Robot
 
 # More frames than this and a file grows for nothing that an eye could see.
 _MOST_FRAMES = 3000

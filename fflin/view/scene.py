@@ -12,12 +12,12 @@ import numpy as np
 import pinocchio as pin
 import umsgpack
 
-from fflin.collada import Indices
-from fflin.meshes import Mesh, load_mesh
-from fflin.model import ROOT, Robot
-from fflin.validation import Array
-from fflin.visuals import PLAIN, Shape, shapes
-from fflin.xml_tree import named
+from fflin.base.validation import Array
+from fflin.robot.robot import ROOT, Robot
+from fflin.robot.urdf.xml import named
+from fflin.view.collada import Indices
+from fflin.view.meshes import Mesh, load_mesh
+from fflin.view.shapes import PLAIN, Shape, shapes
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # of what meshcat imports, not of ours

@@ -15,7 +15,7 @@ from tornado.httpserver import HTTPServer
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
-from fflin.errors import FflinError, InputError
+from fflin.base.errors import FflinError, InputError
 
 _HOST = "127.0.0.1"
 

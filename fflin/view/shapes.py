@@ -11,11 +11,11 @@ from urllib.parse import unquote
 import numpy as np
 import pinocchio as pin
 
-from fflin.errors import FflinError
-from fflin.expansion import expand, first_xacro
-from fflin.model import ROOT, Robot
-from fflin.reader import read_file
-from fflin.xml_tree import Element, decimal, named, parse
+from fflin.base.errors import FflinError
+from fflin.robot.robot import ROOT, Robot
+from fflin.robot.urdf.reader import read_file
+from fflin.robot.urdf.xacro import expand, first_xacro
+from fflin.robot.urdf.xml import Element, decimal, named, parse
 
 Color = tuple[float, float, float, float]
 

@@ -9,18 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from warnings import warn
 
-from fflin.actuation import Actuation
-from fflin.errors import FflinWarning, FileError, InputError, unknown
-from fflin.model import ROOT, Robot
-from fflin.state import StateMap
-from fflin.validation import Array, number
-from fflin.writing import as_path, write_whole
+from fflin.base.errors import FflinWarning, FileError, InputError, unknown
+from fflin.base.validation import Array, number
+from fflin.base.writing import as_path, write_whole
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.robot.robot import ROOT, Robot
 
 if TYPE_CHECKING:
     from os import PathLike
 
-    from fflin.live import Live
-    from fflin.motion import Motion
+    from fflin.simulation.motion import Motion
+    from fflin.view.live import Live
 
 SCENES = ("space", "lab")
 
@@ -121,7 +121,7 @@ def visualize(
     if scene not in SCENES:
         raise InputError(f"scene is {scene!r}, expected one of {', '.join(SCENES)}")
     check_tool(robot, tool)
-    from fflin.playback import default_tool
+    from fflin.view.playback import default_tool
 
     tool = tool or default_tool(robot)
     if motion is None:
@@ -132,7 +132,7 @@ def visualize(
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif}, robot.urdf)
     _check_motion(robot, motion)
     fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
-    from fflin.film import chart_of, motion_page
+    from fflin.view.motion_page import chart_of, motion_page
 
     if target is None:
         target = chart_of(robot, motion).to_pinocchio(motion.target)[0]
@@ -174,7 +174,7 @@ def _live(
 ) -> Live:
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port < 2**16:
         raise InputError(f"port is {port!r}, expected 0 to 65535 (0: one that is free)")
-    from fflin.live import Live
+    from fflin.view.live import Live
 
     live = Live(
         robot, q, scene=scene, tool=tool, follow=follow, speed=_speed(speed, 1.0), port=port
@@ -206,7 +206,7 @@ def check_outputs(files: dict[str, Any], spare: Path | None = None) -> dict[str,
             raise FileError(f"{path} is the robot's own file; name another to write")
         outputs[ending] = path
     if ".png" in outputs or ".gif" in outputs:
-        from fflin.capture import find_chromium
+        from fflin.view.capture import find_chromium
 
         find_chromium()
     return outputs
@@ -236,7 +236,7 @@ def _speed(speed: float | None, default: float) -> float:
 
 
 def _check_motion(robot: Robot, motion: Motion) -> None:
-    from fflin.motion import require_motion
+    from fflin.simulation.motion import require_motion
 
     require_motion(motion)
     sizes = motion.q.shape[1], motion.u.shape[1]
@@ -272,7 +272,7 @@ def _pictures(
 ) -> dict[Path, bytes]:
     if ".png" not in outputs and ".gif" not in outputs:
         return {}
-    from fflin.capture import take_gif, take_png
+    from fflin.view.capture import take_gif, take_png
 
     start, end = float(motion.t[0]), float(motion.t[-1])
     if times is None:

@@ -2,14 +2,14 @@
 
 from dataclasses import replace
 
-import exact
 import numpy as np
 import pytest
-from conftest import BUNDLED, random_tree
 from scipy.linalg import null_space
 
 import fflin
 from fflin import BaseForce, BaseTorque, JointTorque
+from tests.support import exact
+from tests.support.robots import BUNDLED, random_tree
 
 
 def motors(robot, count=None):

@@ -3,13 +3,13 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import BUNDLED, FRAMES, random_point, random_pose
 from scipy.linalg import eigh
 from scipy.optimize import linear_sum_assignment
 
 import fflin
 from fflin import cli
-from fflin.reports import linear_model, modes_report
+from fflin.commands.model_text import linear_model, modes_report
+from tests.support.robots import BUNDLED, FRAMES, random_point, random_pose
 
 # Hub and panels of a published test case (AVSLab/basilisk, hinged rigid bodies): masses [kg],
 # moments of inertia about y [kg m^2], hinge and panel arms [m].

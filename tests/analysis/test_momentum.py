@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import BUNDLED, FRAMES, random_pose, random_tree
 
 import fflin
 from fflin import BaseForce, BaseTorque, JointTorque
+from tests.support.robots import BUNDLED, FRAMES, random_pose, random_tree
 
 ARMS = [name for name in BUNDLED if name != "cubesat"]
 

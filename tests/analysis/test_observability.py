@@ -1,13 +1,13 @@
 """Observability against exact arithmetic on the dual, and Gramians against their integrals."""
 
-import exact
 import numpy as np
 import pytest
-from conftest import BUNDLED
 from scipy.linalg import expm
 
 import fflin
 from fflin import BasePose, JointPositions, JointTorque, JointVelocities
+from tests.support import exact
+from tests.support.robots import BUNDLED
 
 ARMS = [name for name in BUNDLED if name != "cubesat"]
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import binomtest
-from test_cli import refused, run
 
 import fflin
-from fflin.closed_loop import Loop
-from fflin.region import _LEVELS, _clopper_pearson, _crossing, _slope
-from fflin.weights import default_weights
+from fflin.analysis.closed_loop import Loop
+from fflin.analysis.validity import _LEVELS, _clopper_pearson, _crossing, _slope
+from fflin.control.weights import default_weights
+from tests.commands.test_cli import refused, run
 
 
 def held(robot, dt=0.0, reduce=False):

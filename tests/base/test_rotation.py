@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from fflin.rotation import conjugate, quaternion_product, rotation_matrix, skew
+from fflin.base.rotation import conjugate, quaternion_product, rotation_matrix, skew
 
 
 def test_skew_is_the_cross_product():

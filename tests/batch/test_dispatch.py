@@ -9,11 +9,12 @@ from multiprocessing import get_context
 
 import numpy as np
 import pytest
-from test_sweeping import assert_same, points, singular_at
 
 import fflin
-from fflin import batch_chunks, dispatching
-from fflin.own_workers import OwnWorkers, WorkerDied
+from fflin.batch import chunks as batch_chunks
+from fflin.batch import dispatch as dispatching
+from fflin.batch.workers import OwnWorkers, WorkerDied
+from tests.batch.test_sweep import assert_same, points, singular_at
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +121,7 @@ def killing(monkeypatch, tmp_path):
     def set_up(times):
         marker.write_text(str(times))
         monkeypatch.setattr(KillingJob, "marker", marker)
-        monkeypatch.setattr("fflin.sweeping.ChunkJob", KillingJob)
+        monkeypatch.setattr("fflin.batch.sweep.ChunkJob", KillingJob)
 
     return set_up
 
@@ -186,7 +187,7 @@ def test_a_worker_that_is_killed_in_the_middle_of_its_result_harms_no_other():
 def test_no_worker_outlives_its_caller(task, end, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        "import os, signal, time\nfrom fflin.own_workers import OwnWorkers\n"
+        "import os, signal, time\nfrom fflin.batch.workers import OwnWorkers\n"
         "if __name__ == '__main__':\n"
         "    workers = OwnWorkers(2)\n"
         "    workers.submit(pow, 2, 3).result()\n"

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import BUNDLED, random_tree
-from test_inertia import LINKS, MIMIC
 
 import fflin
-from fflin.batch_equations import BatchEquations
+from fflin.batch.equations import BatchEquations
+from tests.dynamics.test_inertia import LINKS, MIMIC
+from tests.support.robots import BUNDLED, random_tree
 
 pytest.importorskip("numba")
 

@@ -9,10 +9,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from test_sweeping import assert_same, points
 
 import fflin
-from fflin.batch_store import FileStore
+from fflin.batch.store import FileStore
+from tests.batch.test_sweep import assert_same, points
 
 h5py = pytest.importorskip("h5py")
 
@@ -224,7 +224,7 @@ def test_a_killed_run_goes_on(robot, tmp_path):
 
 
 def test_a_failed_chunk_leaves_the_others_in_the_file(tmp_path):
-    from test_sweeping import singular_at
+    from tests.batch.test_sweep import singular_at
 
     robot = singular_at(0.5)
     configurations = fflin.grid(robot, {"slide": np.arange(64) / 64.0})

@@ -3,11 +3,11 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import BUNDLED, random_tree
 
 import fflin
-from fflin.batch_inertia import BatchInertia
-from fflin.inertia import inertia_matrix
+from fflin.batch.inertia import BatchInertia
+from fflin.dynamics.inertia import inertia_matrix
+from tests.support.robots import BUNDLED, random_tree
 
 numba = pytest.importorskip("numba")
 

@@ -7,9 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import BUNDLED, random_point, random_pose, random_tree
 
 import fflin
+from tests.support.robots import BUNDLED, random_point, random_pose, random_tree
 
 
 def points(robot, count, seed=0):

@@ -1,7 +1,8 @@
 """`fflin analyze` as a user runs it."""
 
 import pytest
-from test_cli import refused, run
+
+from tests.commands.test_cli import refused, run
 
 JOINTS = "\n".join(f'[[input]]\ntype = "joint_torque"\njoint = "joint_{i}"' for i in range(1, 7))
 

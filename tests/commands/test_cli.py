@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import BUNDLED
 
 import fflin
-from fflin.robots import bundled_directory
-from fflin.tables import matrix
+from fflin.base.tables import matrix
+from fflin.robot.catalog import bundled_directory
+from tests.support.robots import BUNDLED
 
 
 def run(*arguments, cwd=None, **environment):
@@ -278,7 +278,7 @@ def test_existing_output_survives_a_failure(tmp_path):
 
 def test_robots_own_file_is_never_the_output(tmp_path):
     robot = tmp_path / "robot.json"
-    robot.write_bytes((Path(__file__).parents[1] / "robots" / "cubesat.urdf").read_bytes())
+    robot.write_bytes((Path(__file__).parents[2] / "robots" / "cubesat.urdf").read_bytes())
     before = robot.read_bytes()
     assert "is the robot's own file" in refused("linearize", robot, "-o", robot)
     assert robot.read_bytes() == before
@@ -358,7 +358,8 @@ def test_check_exits_1_where_it_falls_short(monkeypatch, capsys):
     """The exit code of a model that does not hold, by planting a wrong one."""
     from dataclasses import replace
 
-    from fflin import cli, linearization
+    from fflin import cli
+    from fflin.linear import linearization
 
     right = linearization.linearize
     monkeypatch.setattr(

@@ -3,7 +3,7 @@
 import pytest
 
 import fflin
-from fflin.output_specs import parse_output
+from fflin.commands.outputs import parse_output
 
 SPECS = {
     "state": (fflin.FullState(),),

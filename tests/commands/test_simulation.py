@@ -6,9 +6,9 @@ import sys
 
 import numpy as np
 import pytest
-from test_cli import refused, run
 
 import fflin
+from tests.commands.test_cli import refused, run
 
 
 def test_a_loop_settles_is_saved_and_drawn(tmp_path):

@@ -10,9 +10,9 @@ import time
 import numpy as np
 import pinocchio as pin
 import pytest
-from test_cli import refused, run
 
 import fflin
+from tests.commands.test_cli import refused, run
 
 pytest.importorskip("h5py")
 

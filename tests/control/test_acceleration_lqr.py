@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from conftest import BUNDLED, random_point
 
 import fflin
-from fflin.riccati import solve
+from fflin.control.riccati import solve
+from tests.support.robots import BUNDLED, random_point
 
 # The spacecraft of Yang (2012), section 7 of the specification.
 J = np.array([0.01520407970002, 0.01462135261765, 0.0062377583131])

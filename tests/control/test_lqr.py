@@ -4,13 +4,13 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from conftest import BUNDLED, random_point
 from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
 import fflin
-from fflin.margins import _norm
-from fflin.sampling import held_cost
+from fflin.control.margins import _norm
+from fflin.control.sampled_cost import held_cost
+from tests.support.robots import BUNDLED, random_point
 
 
 @pytest.fixture(scope="module")

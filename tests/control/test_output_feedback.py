@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.weights import default_weights
+from fflin.control.weights import default_weights
 
 POSITIONS = (fflin.BasePose(), fflin.JointPositions())
 FELT = (*POSITIONS, fflin.Accelerometer("base"))

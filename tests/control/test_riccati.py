@@ -5,13 +5,13 @@ import warnings
 import numpy as np
 import pytest
 import scipy.linalg as sl
-from conftest import BUNDLED, random_point, random_tree
 
 import fflin
-from fflin import modal
-from fflin.halfsize import second_order_loop
-from fflin.modal import Modes
-from fflin.riccati import Riccati, _bilinear, _finished, _general, half_size, solve
+from fflin.control import lyapunov as modal
+from fflin.control.half_size import second_order_loop
+from fflin.control.lyapunov import Modes
+from fflin.control.riccati import Riccati, _bilinear, _finished, _general, half_size, solve
+from tests.support.robots import BUNDLED, random_point, random_tree
 
 
 def weightings(lin, rng):

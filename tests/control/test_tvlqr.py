@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from test_trajectory import motion
 
 import fflin
-from fflin.differential_riccati import Coefficients, step_back
+from fflin.control.differential_riccati import Coefficients, step_back
+from tests.linear.test_trajectory import motion
 
 
 @pytest.fixture(scope="module")

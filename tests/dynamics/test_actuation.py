@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import FRAMES, random_point, random_pose, random_tree
 
 import fflin
-from fflin.reports import linear_model
+from fflin.commands.model_text import linear_model
+from tests.support.robots import FRAMES, random_point, random_pose, random_tree
 
 THRUSTERS = (
     fflin.Thruster("base", (0.4, 0.1, -0.2), (1.0, 0.2, 0.0)),

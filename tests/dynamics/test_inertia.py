@@ -6,10 +6,10 @@ from fractions import Fraction
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import BUNDLED, random_tree
 
 import fflin
-from fflin.inertia_bounds import STROKE
+from fflin.dynamics.inertia_bounds import STROKE
+from tests.support.robots import BUNDLED, random_tree
 
 
 def chain(*inertias):

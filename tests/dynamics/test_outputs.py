@@ -3,10 +3,12 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import random_pose, random_tree
 
 import fflin
-from fflin.outputs import (
+from fflin.base.rotation import skew
+from fflin.dynamics.outputs import Sensing
+from fflin.dynamics.state import StateMap
+from fflin.robot.outputs import (
     Accelerometer,
     BasePose,
     CenterOfMass,
@@ -18,9 +20,7 @@ from fflin.outputs import (
     JointVelocities,
     Momentum,
 )
-from fflin.rotation import skew
-from fflin.sensing import Sensing
-from fflin.state import StateMap
+from tests.support.robots import random_pose, random_tree
 
 E, O = np.eye(3), np.zeros((3, 3))
 GRAVITY = np.array([0.7, -1.3, -9.6])

@@ -3,10 +3,10 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import BUNDLED, FRAMES, random_point, random_pose, random_tree
 
 import fflin
-from fflin.chart import Chart
+from fflin.dynamics.chart import Chart
+from tests.support.robots import BUNDLED, FRAMES, random_point, random_pose, random_tree
 
 
 def random_state(state, rng, degrees):

@@ -3,12 +3,12 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import BUNDLED, FRAMES, random_pose
 
 import fflin
-from fflin.integrators import integrator
-from fflin.readout import readout, states_of
-from fflin.weights import default_weights
+from fflin.control.weights import default_weights
+from fflin.dynamics.state_rows import readout, states_of
+from fflin.simulation.integrators import integrator
+from tests.support.robots import BUNDLED, FRAMES, random_pose
 
 
 def anywhere(robot, rng):

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import random_point
 
 import fflin
+from tests.support.robots import random_point
 
 GROUPS = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
 INPUTS = {"tau_b": slice(0, 3), "F_b": slice(3, 6), "tau_m": slice(6, None)}

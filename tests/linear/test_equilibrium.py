@@ -6,11 +6,11 @@ from itertools import combinations
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import BUNDLED, FRAMES, random_pose, random_tree
 
 import fflin
-from fflin.actuation import Actuation
-from fflin.state import StateMap
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from tests.support.robots import BUNDLED, FRAMES, random_pose, random_tree
 
 
 def sprung(name, rng, **fields):

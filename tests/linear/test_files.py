@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import random_point
 
 import fflin
+from tests.support.robots import random_point
 
 FORMATS = (".npz", ".mat", ".json", ".csv")
 KEYS = {

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import FRAMES, random_pose
 
 import fflin
-from fflin.rotation import skew
+from fflin.base.rotation import skew
+from tests.support.robots import FRAMES, random_pose
 
 WHEEL = np.diag([0.05, 0.05, 0.09])
 HOME = ("r_b.x", "r_b.y", "r_b.z")

@@ -8,10 +8,10 @@ from copy import deepcopy
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import BUNDLED, FRAMES, random_point, random_pose, random_tree
 
 import fflin
-from fflin.rotation import skew
+from fflin.base.rotation import skew
+from tests.support.robots import BUNDLED, FRAMES, random_point, random_pose, random_tree
 
 
 def blocks(lin, robot):

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import random_point
 from scipy.linalg import expm
 
 import fflin
+from tests.support.robots import random_point
 
 
 @pytest.fixture(scope="module")

@@ -3,10 +3,10 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import random_point
 
 import fflin
-from fflin.rotation import skew
+from fflin.base.rotation import skew
+from tests.support.robots import random_point
 
 
 @pytest.mark.parametrize("name", ["cubesat", "servicer_7dof", "ets_vii", "panda"])

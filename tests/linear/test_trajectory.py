@@ -5,11 +5,11 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import random_point
 from scipy.integrate import solve_ivp
 
 import fflin
-from fflin.aba import Aba
+from fflin.dynamics.aba import Aba
+from tests.support.robots import random_point
 
 
 def motion(robot, start=None, duration=0.4, knots=81):

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-ROBOTS = Path(__file__).parents[1] / "robots"
+ROBOTS = Path(__file__).parents[2] / "robots"
 
 # name: number of joints, total mass in kg, frames of tools or hands
 SUMMARY = {

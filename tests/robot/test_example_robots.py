@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from conftest import FRAMES, random_point
 
 import fflin
-from fflin.robots import find_robot
+from fflin.robot.catalog import find_robot
+from tests.support.robots import FRAMES, random_point
 
 # What does not give a model at neutral, and why.
 REFUSED = {

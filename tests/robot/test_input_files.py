@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import linprog
 
 import fflin
-from fflin.robots import bundled_directory
+from fflin.robot.catalog import bundled_directory
 
 WHOLE = """
 # every type, in an order of its own

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import FRAMES, random_point, random_pose
 
 import fflin
+from tests.support.robots import FRAMES, random_point, random_pose
 
 
 def watched(robot, frame):

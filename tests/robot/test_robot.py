@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import BUNDLED
 
 import fflin
-from fflin.robots import bundled_directory
+from fflin.robot.catalog import bundled_directory
+from tests.support.robots import BUNDLED
 
 
 def free_flyer(*joints):

@@ -6,12 +6,12 @@ from copy import deepcopy
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import FRAMES, random_point, random_pose, random_tree
 
 import fflin
 from fflin import ReactionWheel
-from fflin.reports import robot_info
-from fflin.rotation import skew
+from fflin.base.rotation import skew
+from fflin.commands.model_text import robot_info
+from tests.support.robots import FRAMES, random_point, random_pose, random_tree
 
 # Four in any axes, on the base and on links of the arm: (axis, frame, inertia, speed).
 FOUR = (

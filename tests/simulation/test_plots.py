@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.weights import default_weights
+from fflin.control.weights import default_weights
 
 pytest.importorskip("matplotlib")
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import BUNDLED
 
 import fflin
-from fflin.weights import default_weights
+from fflin.control.weights import default_weights
+from tests.support.robots import BUNDLED
 
 
 def free_body(inertia, name="body"):

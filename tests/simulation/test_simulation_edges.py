@@ -9,10 +9,10 @@ import math
 import numpy as np
 import pinocchio as pin
 import pytest
-from test_simulation import displaced, free_body, regulated
 
 import fflin
-from fflin.weights import default_weights
+from fflin.control.weights import default_weights
+from tests.simulation.test_simulate import displaced, free_body, regulated
 
 
 def finite(motion):

@@ -1,4 +1,4 @@
-"""Feed the reader mutated bytes for a while: ``python tests/fuzz_reader.py SECONDS SEED FOLDER``.
+"""Feed the reader mutated bytes for a while: ``python -m tests.support.fuzz_reader SECONDS SEED FOLDER``.
 
 Each document is written to FOLDER before it is read, so that the last one there is the one that
 a crash or a hang was on.
@@ -9,12 +9,11 @@ import sys
 import time
 from pathlib import Path
 
-from reader_corpus import CASES, REFUSE
+from fflin.base.errors import FflinError
+from fflin.robot.urdf.reader import Description, describe
+from tests.support.reader_corpus import CASES, REFUSE
 
-from fflin.errors import FflinError
-from fflin.reader import Description, describe
-
-ROBOTS = Path(__file__).parents[1] / "robots"
+ROBOTS = Path(__file__).parents[2] / "robots"
 
 TOKENS = [
     *(b"<", b">", b"/>", b"</", b'"', b"'", b"=", b"&", b"&amp;", b"&#0;", b"&#x10FFFF;", b"<!--"),

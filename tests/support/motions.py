@@ -4,8 +4,8 @@ import numpy as np
 import pinocchio as pin
 
 import fflin
-from fflin.actuation import Actuation
-from fflin.motion import Motion
+from fflin.dynamics.actuation import Actuation
+from fflin.simulation.motion import Motion
 
 HOME = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), np.array([0.2, 0.1, -0.3]))
 

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from motions import settling
 from PIL import Image
 
 import fflin
 from fflin.cli import main
-from fflin.playback import default_tool, frame_indices
+from fflin.view.playback import default_tool, frame_indices
+from tests.support.motions import settling
 
 needs_chromium = pytest.mark.skipif(not shutil.which("chromium"), reason="no chromium")
 
@@ -138,8 +138,8 @@ def test_a_chromium_that_does_not_answer_is_one_line(robots, motion, tmp_path, m
     program = tmp_path / "chromium"
     program.write_text("#!/bin/sh\nexec sleep 60\n")
     program.chmod(0o755)
-    monkeypatch.setattr("fflin.capture.find_chromium", lambda: str(program))
-    monkeypatch.setattr("fflin.capture._PATIENCE", 1.0)
+    monkeypatch.setattr("fflin.view.capture.find_chromium", lambda: str(program))
+    monkeypatch.setattr("fflin.view.capture._PATIENCE", 1.0)
     with pytest.raises(fflin.FileError, match="does not answer"):
         fflin.visualize(robots["planar_detumble"], motion, png=tmp_path / "m.png", times=[0.0])
     assert not (tmp_path / "m.png").exists()
@@ -173,7 +173,9 @@ def test_names_of_robots_and_links_do_no_harm(robots, motion, tmp_path):
 
 def test_view_on_the_command_line(capsys, monkeypatch):
     waited = []
-    monkeypatch.setattr("fflin.live.Live.wait", lambda self: (waited.append(self), self.close()))
+    monkeypatch.setattr(
+        "fflin.view.live.Live.wait", lambda self: (waited.append(self), self.close())
+    )
     code = main(["view", "cubesat", "--no-open", "--rpy", "10", "0", "0"])
     out, error = capsys.readouterr()
     assert (code, out) == (0, "") and waited[0].url in error
@@ -195,7 +197,9 @@ def test_simulate_on_the_command_line(capsys, tmp_path, monkeypatch):
     np.testing.assert_allclose(times, np.linspace(0, 5, 51), atol=6e-3)
     assert [entry["label"] for entry in data["legend"]][-2:] == ["target", "linear model"]
     # What cannot be written is told before anything is simulated.
-    monkeypatch.setattr("fflin.simulation.simulate", lambda *_, **__: pytest.fail("simulated"))
+    monkeypatch.setattr(
+        "fflin.simulation.simulate.simulate", lambda *_, **__: pytest.fail("simulated")
+    )
     assert main([*command, "--html", str(tmp_path / "no" / "m.html")]) == 2
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main([*command, "--png", str(tmp_path / "m.png")]) == 2

@@ -16,10 +16,10 @@ import urllib.request
 import numpy as np
 import pinocchio as pin
 import pytest
-from browser import Watched, chromium
 
 import fflin
-from fflin.model import ROOT
+from fflin.robot.robot import ROOT
+from tests.support.browser import Watched, chromium
 
 
 @pytest.fixture

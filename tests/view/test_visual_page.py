@@ -7,11 +7,11 @@ import re
 import numpy as np
 import pinocchio as pin
 import pytest
-from browser import Watched, chromium
-from motions import HOME, settling
 
 import fflin
-from fflin.model import ROOT
+from fflin.robot.robot import ROOT
+from tests.support.browser import Watched, chromium
+from tests.support.motions import HOME, settling
 
 # Positions travel as 32-bit floats, of metres.
 EXACT = 1e-5
@@ -72,7 +72,7 @@ def test_bodies_stand_where_forward_kinematics_puts_them(settled, watched):
 
 
 def test_pieces_stand_where_the_urdf_puts_them(settled, watched):
-    from fflin.visuals import shapes
+    from fflin.view.shapes import shapes
 
     robot, motion, _ = settled
     watched.do("fflin.seek(3)")

@@ -3,13 +3,13 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from conftest import random_point, random_pose
 
 import fflin
-from fflin.film import subtitle
-from fflin.model import ROOT
-from fflin.panel import errors, panel
-from fflin.playback import play_back, thrusters
+from fflin.robot.robot import ROOT
+from fflin.view.motion_page import subtitle
+from fflin.view.panel import errors, panel
+from fflin.view.playback import play_back, thrusters
+from tests.support.robots import random_point, random_pose
 
 FRAMES = ("hybrid", "local", "world")
 

@@ -9,10 +9,10 @@ import umsgpack
 from scipy.spatial import cKDTree
 
 import fflin
-from fflin.collada import read_collada
-from fflin.meshes import _triangles, load_mesh
-from fflin.robots import find_robot
-from fflin.visuals import find_mesh, shapes
+from fflin.robot.catalog import find_robot
+from fflin.view.collada import read_collada
+from fflin.view.meshes import _triangles, load_mesh
+from fflin.view.shapes import find_mesh, shapes
 
 URDF = """<robot name="r">
   <material name="red"><color rgba="1 0 0 0.5"/></material>
@@ -208,8 +208,8 @@ def test_welding_keeps_a_mesh_within_its_grid():
 
 
 def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
-    from fflin.recorder import Recorder
-    from fflin.scene import Drawing, Visualizer
+    from fflin.view.recorder import Recorder
+    from fflin.view.scene import Drawing, Visualizer
 
     tetrahedron(tmp_path / "t.stl")
     path = write(
@@ -235,8 +235,8 @@ def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
 
 
 def test_the_recorder_keeps_the_last_value_of_a_property_per_path():
-    from fflin.recorder import Recorder
-    from fflin.scene import Visualizer
+    from fflin.view.recorder import Recorder
+    from fflin.view.scene import Visualizer
 
     g = importlib.import_module("meshcat.geometry")  # after fflin.scene, which quiets it
 

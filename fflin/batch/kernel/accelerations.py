@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.actuation import Actuation
-from fflin.batch_tree import LANES, Tree, batch_tree
-from fflin.frames import ROOT
-from fflin.kernel_code import kernel
-from fflin.model import Robot
-from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.base.validation import Array
+from fflin.batch.kernel.compiled import kernel
+from fflin.batch.kernel.tree import LANES, Tree, batch_tree
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.robot.frames import ROOT
+from fflin.robot.robot import Robot
 
 
 class Layout(NamedTuple):
@@ -124,7 +124,7 @@ class BatchRates:
         # Its vectors are 64 bytes; where they begin at such an address it is faster.
         space = space[-(space.ctypes.data // 8) % LANES :]
         flat = out._replace(inverse=out.inverse.reshape(len(points.q), -1))
-        kernel("batch_rates", "linearise")(
+        kernel("linearise", "linearise")(
             self._tree, self._layout, self._loads, tuple(points), tuple(flat), space
         )
 
@@ -153,7 +153,7 @@ def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
 
 
 def _layout(tree: Tree, carried: int) -> Layout:
-    from fflin.batch_rnea import LOAD, MOTION
+    from fflin.batch.kernel.rnea import LOAD, MOTION
 
     size, bodies = len(tree.row), len(tree.parent)
     sizes = (

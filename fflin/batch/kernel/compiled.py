@@ -16,9 +16,6 @@ from typing import Any
 # this size does not win back but the next ones do: they are seldom alone.
 _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
 
-# Files of the kernel.
-_SOURCES = ("batch_*.py", "lane*.py")
-
 _log = logging.getLogger("fflin")
 _TURN = Lock()
 
@@ -45,7 +42,7 @@ def kernel(module: str, name: str) -> Any:
 
 @cache
 def _prepared(module: str, name: str) -> Any:
-    compiled = getattr(import_module(f"fflin.{module}"), name)
+    compiled = getattr(import_module(f"fflin.batch.kernel.{module}"), name)
     folder = Path(compiled.stats.cache_path)
     kept = list(folder.glob(f"{module}.{name}-*.nbi"))
     # numba looks at the file of the function alone, not at those that it calls.
@@ -59,4 +56,4 @@ def _prepared(module: str, name: str) -> Any:
 
 
 def _sources() -> list[Path]:
-    return [file for pattern in _SOURCES for file in Path(__file__).parent.glob(pattern)]
+    return list(Path(__file__).parent.glob("*.py"))

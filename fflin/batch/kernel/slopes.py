@@ -24,7 +24,8 @@ from __future__ import annotations
 
 import numba
 
-from fflin.batch_rnea import (
+from fflin.batch.kernel.lanes import splat, store
+from fflin.batch.kernel.rnea import (
     FORCE,
     LOAD,
     MOMENTS,
@@ -37,9 +38,8 @@ from fflin.batch_rnea import (
     joint_axis,
     weighed,
 )
-from fflin.batch_tree import INERTIA, LANES, PLACE
-from fflin.lane_vectors import add, add3, cross, dot, get3, minus, plus, times
-from fflin.lanes import splat, store
+from fflin.batch.kernel.tree import INERTIA, LANES, PLACE
+from fflin.batch.kernel.vectors import add, add3, cross, dot, get3, minus, plus, times
 
 
 @numba.njit(forceinline=True)

@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from fflin.frames import ROOT
-from fflin.model import Robot
-from fflin.validation import Array
+from fflin.base.validation import Array
+from fflin.robot.frames import ROOT
+from fflin.robot.robot import Robot
 
 LANES = 8  # configurations that the kernel does at once
 

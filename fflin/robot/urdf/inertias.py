@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import pinocchio as pin
 
-from fflin.urdf_links import Link
-from fflin.xml_tree import named, quoted
+from fflin.robot.urdf.links import Link
+from fflin.robot.urdf.xml import named, quoted
 
 # Rounding of the six numbers leaves a singular inertia with eigenvalues of about -1e-16 of the
 # largest when they are written in full; CAD programs write fewer digits.

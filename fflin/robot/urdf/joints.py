@@ -7,8 +7,8 @@ import re
 import sys
 from dataclasses import dataclass
 
-from fflin.urdf_links import Pose, bounded, read_pose, refuse_near_miss
-from fflin.xml_tree import Element, decimal, quoted
+from fflin.robot.urdf.links import Pose, bounded, read_pose, refuse_near_miss
+from fflin.robot.urdf.xml import Element, decimal, quoted
 
 # Degrees of freedom of the types of joint.
 FREEDOM = {

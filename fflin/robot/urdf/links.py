@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fflin.validation import Array
-from fflin.xml_tree import Element, quoted
+from fflin.base.validation import Array
+from fflin.robot.urdf.xml import Element, quoted
 
 # Beyond it nothing is physical, and products of two such numbers stay far from overflow.
 _ABSURD = 1e30

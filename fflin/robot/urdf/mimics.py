@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from fflin.errors import unknown
-from fflin.urdf_joints import JointElement, Mimic
-from fflin.urdf_links import bounded, bounded_length
-from fflin.xml_tree import enumerated, quoted
+from fflin.base.errors import unknown
+from fflin.robot.urdf.joints import JointElement, Mimic
+from fflin.robot.urdf.links import bounded, bounded_length
+from fflin.robot.urdf.xml import enumerated, quoted
 
 
 def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pinocchio as pin
 
-from fflin.errors import FileError, UrdfError
-from fflin.expansion import expand, first_xacro
-from fflin.inertia_checks import inertia_notes
-from fflin.mimics import counted_leaders, resolve_mimics
-from fflin.urdf import Urdf, read_description
-from fflin.urdf_joints import Mimic
-from fflin.urdf_writer import write_urdf
-from fflin.xml_tree import Element, named, parse, told
+from fflin.base.errors import FileError, UrdfError
+from fflin.robot.urdf.inertias import inertia_notes
+from fflin.robot.urdf.joints import Mimic
+from fflin.robot.urdf.mimics import counted_leaders, resolve_mimics
+from fflin.robot.urdf.tree import Urdf, read_description
+from fflin.robot.urdf.writer import write_urdf
+from fflin.robot.urdf.xacro import expand, first_xacro
+from fflin.robot.urdf.xml import Element, named, parse, told
 
 _SIZE_LIMIT = 64 * 2**20
 

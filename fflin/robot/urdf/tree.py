@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from fflin.errors import unknown
-from fflin.urdf_joints import JointElement, read_joint
-from fflin.urdf_links import Link, read_link, refuse_near_miss
-from fflin.xml_tree import Element, enumerated, named, quoted
+from fflin.base.errors import unknown
+from fflin.robot.urdf.joints import JointElement, read_joint
+from fflin.robot.urdf.links import Link, read_link, refuse_near_miss
+from fflin.robot.urdf.xml import Element, enumerated, named, quoted
 
 # urdfdom and Pinocchio's parser recurse along the tree, about 2.5 kB of stack for each link.
 _DEPTH_LIMIT = 1_000

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 
-from fflin.urdf import Urdf
-from fflin.urdf_joints import UNLIMITED, JointElement
-from fflin.urdf_links import Link, Pose
+from fflin.robot.urdf.joints import UNLIMITED, JointElement
+from fflin.robot.urdf.links import Link, Pose
+from fflin.robot.urdf.tree import Urdf
 
 
 def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:

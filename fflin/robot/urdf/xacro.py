@@ -7,8 +7,8 @@ import io
 import warnings
 from pathlib import Path
 
-from fflin.errors import MissingPackageError, UrdfError
-from fflin.xml_tree import Element
+from fflin.base.errors import MissingPackageError, UrdfError
+from fflin.robot.urdf.xml import Element
 
 # What lies below these does not reach the model, so a "${" there is no reason to expand.
 _IGNORED = frozenset(

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from xml.parsers import expat
 
-from fflin.errors import UrdfError, listed
+from fflin.base.errors import UrdfError, listed
 
 # URDFs nest some 10 elements and hold some 10,000; these only keep hostile input off.
 _DEPTH_LIMIT = 100

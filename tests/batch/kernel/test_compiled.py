@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from fflin import kernel_code
+from fflin.batch.kernel import compiled as kernel_code
 
 pytest.importorskip("numba")
 
@@ -15,7 +15,7 @@ pytest.importorskip("numba")
 @pytest.fixture
 def compiled(monkeypatch, tmp_path):
     """A function of the kernel that keeps its code in a folder of its own."""
-    from fflin import batch_kernel
+    from fflin.batch.kernel import factor as batch_kernel
 
     new = SimpleNamespace(stats=SimpleNamespace(cache_path=tmp_path))
     monkeypatch.setattr(batch_kernel, "invert", new)
@@ -29,7 +29,7 @@ def test_compilation_is_told_once_whatever_the_threads(compiled, caplog, tmp_pat
 
     def ask():
         ready.wait()
-        return kernel_code.kernel("batch_kernel", "invert")
+        return kernel_code.kernel("factor", "invert")
 
     with ThreadPoolExecutor(4) as threads:
         found = [threads.submit(ask) for _ in range(4)]
@@ -45,6 +45,6 @@ def test_code_that_is_older_than_any_source_is_not_taken(compiled, caplog, tmp_p
     kept.write_bytes(b"")
     newest = max(file.stat().st_mtime for file in kernel_code._sources())
     os.utime(kept, (newest, newest + (-1.0 if older else 1.0)))
-    kernel_code.kernel("batch_kernel", "invert")
+    kernel_code.kernel("factor", "invert")
     assert kept.exists() is not older
     assert bool(caplog.records) is older

@@ -9,12 +9,23 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from reader_corpus import AXIS, INERTIA, INERTIAL, LIMIT, arm, inertial, joint, link, robot, three
 
 import fflin
-from fflin.reader import describe, read_urdf
-from fflin.urdf_joints import Mimic
-from fflin.xml_tree import parse
+from fflin.robot.urdf.joints import Mimic
+from fflin.robot.urdf.reader import describe, read_urdf
+from fflin.robot.urdf.xml import parse
+from tests.support.reader_corpus import (
+    AXIS,
+    INERTIA,
+    INERTIAL,
+    LIMIT,
+    arm,
+    inertial,
+    joint,
+    link,
+    robot,
+    three,
+)
 
 
 def read(document, name="robot.urdf"):
@@ -255,7 +266,7 @@ def test_load_warns_and_keeps_the_notes(tmp_path):
 
 
 def test_info_lists_the_warnings(tmp_path):
-    from fflin.reports import robot_info
+    from fflin.commands.model_text import robot_info
 
     path = tmp_path / "r.urdf"
     path.write_text(arm(inside=AXIS + '<dynamics damping="1"/>'))
@@ -265,7 +276,7 @@ def test_info_lists_the_warnings(tmp_path):
 
 
 def test_info_lists_mimic_joints_and_what_hangs_on_them(tmp_path):
-    from fflin.reports import robot_info
+    from fflin.commands.model_text import robot_info
 
     path = tmp_path / "r.urdf"
     path.write_text(three("", '<mimic joint="j1" multiplier="0.5" offset="-2"/>'))

@@ -9,7 +9,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import pytest
-from reader_corpus import ACCEPT, CASES, REFUSE, WARN
+
+from tests.support.reader_corpus import ACCEPT, CASES, REFUSE, WARN
 
 TIME_LIMIT = 20  # [s]
 MEMORY_LIMIT = 4 * 2**20  # [KiB]

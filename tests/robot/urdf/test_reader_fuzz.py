@@ -10,18 +10,18 @@ from pathlib import Path
 def test_fuzz(tmp_path):
     seconds = float(os.environ.get("FFLIN_FUZZ_SECONDS", "6"))
     seed = os.environ.get("FFLIN_FUZZ_SEED", "1")
-    script = Path(__file__).with_name("fuzz_reader.py")
     result = subprocess.run(
         # In a process of its own, for a crash must not take the tests along.
         [
             *("sh", "-c", 'ulimit -v 4194304; exec "$@"', "sh"),
-            *(sys.executable, str(script), str(seconds), seed, str(tmp_path)),
+            *(sys.executable, "-m", "tests.support.fuzz_reader", str(seconds), seed, str(tmp_path)),
         ],
         capture_output=True,
         text=True,
         errors="replace",
         timeout=seconds + 30,
         check=False,
+        cwd=Path(__file__).parents[3],
         env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
     )
     last = tmp_path / "last.urdf"

@@ -12,10 +12,10 @@ import pytest
 from example_robot_data.robots_loader import getModelPath
 
 import fflin
-from fflin.errors import FflinError
-from fflin.reader import read_urdf
+from fflin.base.errors import FflinError
+from fflin.robot.urdf.reader import read_urdf
 
-BUNDLED = Path(__file__).parents[1] / "robots"
+BUNDLED = Path(__file__).parents[3] / "robots"
 EXAMPLES = Path(getModelPath("talos_data/robots/talos_reduced.urdf")).resolve()
 FILES = sorted(EXAMPLES.glob("**/*.urdf"))
 
@@ -100,7 +100,7 @@ def test_prune_of_an_unknown_joint_names_the_near_ones():
 CHAIN = """
 import sys, threading
 from pathlib import Path
-from fflin.reader import describe
+from fflin.robot.urdf.reader import describe
 link = '<link name="l{0}"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" \
 iyz="0" izz="1"/></inertial></link>'
 joint = '<joint name="j{0}" type="fixed"><parent link="l{0}"/><child link="l{1}"/></joint>'

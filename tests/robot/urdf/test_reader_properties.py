@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import fflin
 
-ROBOTS = Path(__file__).parents[1] / "robots"
+ROBOTS = Path(__file__).parents[3] / "robots"
 
 VALUES = (
     *("", " ", "nan", "inf", "-inf", "1e999", "2,0", "2kg", "0x2", "1e40", "-1", "0", "1e-300"),
