@@ -3,7 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from fflin.base.version import __version__
 
 # Public name -> module. Each is imported when it is first asked for, so that a command which
 # needs no dynamics does not pay for them.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,8 +115,6 @@ def _finite(A: Array, Q: Array, dt: float, duration: float) -> Array:
         if not steps or abs(steps * dt - duration) > 1e-9 * duration:
             raise InputError(f"duration is {duration:g} s, expected a multiple of dt = {dt:g} s")
         return _summed(A, Q, steps)
-    from fflin.control.sampled_cost import held_cost
-
     return held_cost(A.T, Q, duration)
 
 
@@ -135,3 +134,34 @@ def _summed(A: Array, Q: Array, steps: int) -> Array:
 
 def _symmetric(W: Array) -> Array:
     return (W + W.T) / 2.0
+
+
+def held_cost(F: Array, W: Array, h: float) -> Array:
+    """Return the integral of e^(F' t) W e^(F t) over [0, h].
+
+    W is taken as of the size of F: the exponential rounds relative to the larger.
+    """
+    square = F @ F
+    if not (square @ F).any():
+        total, step = np.zeros_like(W), np.float64(h)
+        terms = (np.eye(len(F)), F, 0.5 * square)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i, left in enumerate(terms):
+                for j, right in enumerate(terms):
+                    total += left.T @ W @ right * (step ** (i + j + 1) / (i + j + 1))
+            return 0.5 * (total + total.T)
+    from scipy.linalg import expm
+
+    n = len(F)
+    doublings = math.ceil(math.log2(max(2.0 * h * float(np.linalg.norm(F, 1)), 1.0)))
+    block = np.zeros((2 * n, 2 * n))
+    size = float(np.linalg.norm(W, 1)) / float(np.linalg.norm(F, 1)) or 1.0
+    block[:n, :n], block[:n, n:], block[n:, n:] = -F.T, W / size, F
+    with np.errstate(over="ignore", invalid="ignore"):
+        exponential = expm(block * (h / 2**doublings))
+        step = exponential[n:, n:]
+        total = step.T @ exponential[:n, n:]
+        for _ in range(doublings):
+            total = total + step.T @ total @ step
+            step = step @ step
+        return 0.5 * size * (total + total.T)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +12,7 @@ import numpy as np
 
 from fflin.analysis.zero_eigenvalues import nonzero_eigenpairs
 from fflin.base.errors import InputError
+from fflin.base.tables import counted, grid, width
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 
@@ -124,8 +128,6 @@ class Modes:
         return np.array(listed)
 
     def __str__(self) -> str:
-        from fflin.commands.model_text import modes_report
-
         return modes_report(self)
 
 
@@ -272,3 +274,57 @@ def _normalised(shape: Array) -> NDArray[np.complexfloating[Any]]:
     # Of equals, such as two panels in symmetry, the first.
     largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
     return np.asarray(shape / shape[largest], dtype=complex)
+
+
+def modes_report(found: Modes) -> str:
+    """Show natural modes: how many are rigid, and a table of the others with what moves most."""
+    vibrations, others = len(found.vibrations), len(found.modes) - len(found.vibrations)
+    head = (
+        f"{found.robot}: {counted(found.rigid_body, 'rigid-body mode')} "
+        f"({counted(found.zero_eigenvalues, 'eigenvalue')} at zero), "
+        f"{counted(vibrations, 'vibration')}"
+    )
+    head += f", {counted(others, 'real pole')}" if others else ""
+    if not found.equilibrium:
+        head += "; not an equilibrium, where eigenvalues are those of a frozen model"
+    parts = [textwrap.fill(head, width())]
+    if found.unstable:
+        poles = ", ".join(f"{mode.pole:.5g}" for mode in found.unstable)
+        parts.append(textwrap.fill(f"unstable: poles with a positive real part {poles}", width()))
+    rows = [["rad/s", "damping", "time [s]", "", "what moves"]]
+    rows += [
+        [
+            f"{mode.frequency:.6g}" if mode.oscillates else ".",
+            f"{mode.damping_ratio:.4g}" if mode.oscillates else ".",
+            f"{mode.time_constant:.4g}" if mode.pole.real else ".",
+            "unstable" if mode.unstable else "",
+            "",
+        ]
+        for mode in found.modes
+    ]
+    left = max(map(len, grid(rows, "rrrll").splitlines())) - len(rows[0][-1])
+    for row, mode in zip(rows[1:], found.modes, strict=True):
+        row[-1] = _moving_most(mode, found.state_names, width() - left)
+    if found.modes:
+        parts.append(grid(rows, "rrrll"))
+    return "\n\n".join(parts)
+
+
+def _moving_most(mode: Mode, names: Sequence[str], room: int) -> str:
+    """Name the positions that move most in a mode, as many as there is room for."""
+    shape = mode.shape[: len(names) // 2]
+    sizes = abs(shape)
+    text = ""
+    for i in (-sizes.round(9)).argsort(kind="stable").tolist():
+        value = complex(shape[i])
+        if abs(value) < 0.1:
+            break
+        amount = f"{value.real:.2g}"
+        if abs(value.imag) > 0.02 * abs(value):  # an angle of more than a degree
+            angle = math.degrees(math.atan2(value.imag, value.real))
+            amount = f"{abs(value):.2g} at {angle:.0f} deg"
+        longer = f"{text}, {names[i]} {amount}" if text else f"{names[i]} {amount}"
+        if text and len(longer) > room:
+            break
+        text = longer
+    return text

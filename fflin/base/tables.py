@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -89,3 +90,22 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
 
 def _number(x: float, rounding: float) -> str:
     return "." if x == 0.0 else "~0" if abs(x) < rounding else f"{x:.5g}"
+
+
+def counted(number: int, thing: str) -> str:
+    """Say how many there are of a thing."""
+    return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
+def signals(title: str, values: Array, names: Sequence[str], units: Sequence[str]) -> str:
+    """Show what is not zero of a state, an input or a force, with its unit."""
+    # A line is broken between entries alone, not at the spaces within them.
+    entries = [
+        f"{name}\xa0=\xa0{value:.6g}" + (f"\xa0{unit}" if unit != "1" else "")
+        for name, value, unit in zip(names, values.tolist(), units, strict=True)
+        if value
+    ]
+    text = textwrap.fill(
+        f"{title}: {', '.join(entries)}", width(), subsequent_indent=" " * (len(title) + 2)
+    )
+    return text.replace("\xa0", " ")

@@ -17,7 +17,7 @@ import pinocchio as pin
 from fflin.base.errors import FflinError, FflinWarning
 from fflin.base.validation import Array
 from fflin.batch.inertia import BatchInertia, Rows
-from fflin.batch.kernel.compiled import pays
+from fflin.kernel.compiled import pays
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
 

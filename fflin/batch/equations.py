@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from fflin.base.rotation import product_matrix, rotation_matrices
 from fflin.base.validation import Array
 from fflin.batch.inertia import FARTHEST, Rows
-from fflin.batch.kernel.accelerations import BatchRates, Points, Rates
-from fflin.batch.kernel.tree import LANES, batch_tree
 from fflin.dynamics.chart import SMALLEST_Q0, Chart
 from fflin.dynamics.inertia import Inertia
+from fflin.kernel.accelerations import BatchRates, Points, Rates
+from fflin.kernel.tree import LANES, batch_tree
 from fflin.linear.linearization import LARGEST, Linearizer
 from fflin.linear.state_equations import STANDING, Point, ride_along, state_equations, turned
 from fflin.robot.frames import ROOT

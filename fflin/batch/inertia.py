@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from fflin.base.errors import SingularInertiaError
 from fflin.base.validation import Array
-from fflin.batch.kernel.compiled import kernel
-from fflin.batch.kernel.tree import LANES, batch_tree
 from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.state import StateMap
+from fflin.kernel.compiled import kernel
+from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
 
 # The kernel has sines of angles up to here [rad].

@@ -270,8 +270,8 @@ class LinearBatch:
         inertia: Any = partial(_no_robot, "inertia M", self.robot)
         ignorable: Any = partial(_given, self._ignorable)
         if self._system is not None:
-            from fflin.dynamics.inertia import inertia_matrix
             from fflin.linear.certificate import certify as certified
+            from fflin.linear.certificate import inertia_matrix
             from fflin.linear.ignorable import ignorable_states
 
             ignorable = partial(ignorable_states, self._system)

@@ -22,12 +22,12 @@ from fflin.batch.chunks import ChunkJob
 from fflin.batch.configurations import Configurations, GivenConfigurations
 from fflin.batch.dispatch import Done, Span, dispatch
 from fflin.batch.files import check_format, header, load_batch
-from fflin.batch.kernel.compiled import available_threads
 from fflin.batch.linear_batch import LinearBatch
 from fflin.batch.space import check_room
 from fflin.batch.store import FileStore, MemoryStore
 from fflin.batch.task import SweepTask, as_configurations
 from fflin.batch.workers import OwnWorkers
+from fflin.kernel.compiled import available_threads
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:

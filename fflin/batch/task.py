@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin import __version__
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
+from fflin.base.version import __version__
 from fflin.batch.chunks import ChunkJob, Points
 from fflin.batch.configurations import (
     Configurations,

@@ -55,9 +55,9 @@ def add_commands(commands: Commands) -> None:
 
 
 def _robots(_: argparse.Namespace) -> int:
-    from fflin.commands.model_text import robot_list
     from fflin.robot.catalog import find_robot, list_robots
     from fflin.robot.loading import load
+    from fflin.robot.summary import robot_list
 
     entries: list[tuple[str, Robot | str, str]] = []
     for name in list_robots():
@@ -75,7 +75,7 @@ def _robots(_: argparse.Namespace) -> int:
 
 
 def _info(arguments: argparse.Namespace) -> int:
-    from fflin.commands.model_text import robot_info
+    from fflin.robot.summary import robot_info
 
     print(robot_info(load_robot(arguments)))
     return DONE
@@ -93,9 +93,9 @@ def _linearize(arguments: argparse.Namespace) -> int:
         save_model(lin, arguments.output_file, spare=robot.urdf)
         print(f"wrote {arguments.output_file}: {lin.B.shape[0]} states, {lin.B.shape[1]} inputs")
     else:
-        from fflin.commands import model_text as reports
+        from fflin.commands.model_text import model_report
 
-        print(reports.linear_model(lin))
+        print(model_report(lin))
     return DONE
 
 

@@ -7,10 +7,8 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, SingularInertiaError, listed
 from fflin.base.validation import Array
-from fflin.dynamics.inertia_bounds import STROKE
+from fflin.dynamics.inertia_bounds import STROKE, inertia_bounds
 from fflin.dynamics.state import StateMap
-from fflin.linear.model import LinearModel
-from fflin.robot.robot import Robot
 
 # M_ii (M^-1)_ii is 1 for a decoupled coordinate, more for any other, and grows as a coordinate
 # loses inertia of its own; times the rounding unit it is the relative error of (M^-1)_ii. Of the
@@ -65,7 +63,7 @@ class Inertia:
         self._inverse = data.Minv
         self._inverse_diagonal = self._inverse.diagonal()
         self._constrained = bool(state.robot.followers)
-        self._bounds = None if self._constrained else state.robot.inertia_bounds
+        self._bounds = None if self._constrained else inertia_bounds(state.robot)
         self._slides = [joint.idx_q for joint in state.robot.joints if joint.prismatic]
         # The base at the world's origin: M does not depend on where it is, but Pinocchio works in
         # world axes and would lose digits to a base far away.
@@ -124,28 +122,6 @@ def _invert_dense(M: Array, out: Array) -> None:
     upper = np.full_like(M, np.nan) if failed else dpotri(factor)[0]  # zero below its diagonal
     np.add(upper, upper.T, out=out)
     out.flat[:: len(M) + 1] *= 0.5
-
-
-def inertia_matrix(robot: Robot, lin: LinearModel) -> Array:
-    """Return M (6 + n, 6 + n) of a linear model, in state order and in the frame's axes."""
-    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    M = state.project(pin.crba(robot.model, robot.create_data(), lin.q).T)
-    chart = state.chart(lin.q)
-    state.to_frame(chart, M)
-    state.to_frame(chart, M.T)
-    M.setflags(write=False)
-    return M
-
-
-def inverse_inertia(state: StateMap, lin: LinearModel) -> Array:
-    """Return M^-1 (6 + n, 6 + n) as it stands in B of a linear model, in the frame's axes."""
-    nv = 6 + state.robot.n
-    inverse: Array = np.empty((nv, nv))
-    Inertia(state, state.robot.create_data()).invert(lin.q, inverse)
-    chart = state.chart(lin.q)
-    state.to_frame(chart, inverse)
-    state.to_frame(chart, inverse.T)
-    return inverse
 
 
 def _singular(state: StateMap, M: Array) -> SingularInertiaError:

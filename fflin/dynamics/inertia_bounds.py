@@ -1,11 +1,25 @@
 """How much rounding the inverse inertia can suffer, bounded for all configurations at once."""
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.validation import Array
+from fflin.robot.robot import Robot
 
 STROKE = 1.0  # [m] that a sliding joint is taken to be out at most
+
+
+# Of the robots that are alive, which do not change.
+_BOUNDS: WeakKeyDictionary[Robot, Array | None] = WeakKeyDictionary()
+
+
+def inertia_bounds(robot: Robot) -> Array | None:
+    """Bounds (nv,) of what each coordinate of a robot moves, see `bounds_of_inertia`."""
+    if robot not in _BOUNDS:
+        _BOUNDS[robot] = bounds_of_inertia(robot.model)
+    return _BOUNDS[robot]
 
 
 def bounds_of_inertia(model: pin.Model) -> Array | None:

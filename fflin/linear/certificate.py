@@ -3,13 +3,14 @@
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Chart
-from fflin.dynamics.inertia import inverse_inertia
+from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
 from fflin.linear.model import Certificate, LinearModel
 from fflin.robot.robot import Robot
@@ -224,3 +225,25 @@ def motion(state: StateMap, v: Array) -> tuple[Array, float, float]:
 
 def _largest(x: Array) -> float:
     return float(np.abs(x).max(initial=0.0))
+
+
+def inertia_matrix(robot: Robot, lin: LinearModel) -> Array:
+    """Return M (6 + n, 6 + n) of a linear model, in state order and in the frame's axes."""
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    M = state.project(pin.crba(robot.model, robot.create_data(), lin.q).T)
+    chart = state.chart(lin.q)
+    state.to_frame(chart, M)
+    state.to_frame(chart, M.T)
+    M.setflags(write=False)
+    return M
+
+
+def inverse_inertia(state: StateMap, lin: LinearModel) -> Array:
+    """Return M^-1 (6 + n, 6 + n) as it stands in B of a linear model, in the frame's axes."""
+    nv = 6 + state.robot.n
+    inverse: Array = np.empty((nv, nv))
+    Inertia(state, state.robot.create_data()).invert(lin.q, inverse)
+    chart = state.chart(lin.q)
+    state.to_frame(chart, inverse)
+    state.to_frame(chart, inverse.T)
+    return inverse

@@ -1,22 +1,24 @@
 """Whether A and B hold: against ABA derivatives and against differences of the nonlinear model."""
 
+import textwrap
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from fflin.base.errors import InputError
+from fflin.base.tables import grid, width
 from fflin.base.validation import Array
-from fflin.commands.model_text import check_report
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.inertia import inertia_matrix, inverse_inertia
 from fflin.dynamics.output_values import Measuring
 from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
 from fflin.linear.certificate import (
     aba_route,
     compare,
+    inertia_matrix,
     inertia_residual,
+    inverse_inertia,
     mobilities,
     motion,
     scaled_condition,
@@ -271,3 +273,42 @@ def _positive_definite(inverse: Array) -> list[tuple[str, float]]:
     asymmetry = float(np.abs(scaled - scaled.T).max())
     least = float(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0])
     return [("M^-1 symmetric", asymmetry), ("M^-1 positive", max(0.0, -least))]
+
+
+def check_report(check: Check) -> str:
+    """Show what a check found: a table a route, the single figures, the verdict."""
+    states = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
+    blocks = [row.block for row in check.rows]
+    inputs = dict.fromkeys(b[:-1].split(", ")[1] for b in blocks if b.startswith("B["))
+    parts = [f"check of {check.title}"]
+    for test in ("ABA derivatives", "differences"):
+        rows = {row.block: row for row in check.rows if row.test == test}
+        body = [
+            [
+                state,
+                *(_error(rows[f"A[{state}, {column}]"]) for column in states),
+                *(_error(rows[f"B[{state}, {column}]"]) for column in inputs),
+            ]
+            for state in states
+        ]
+        tolerance = next(iter(rows.values())).tolerance
+        parts.append(
+            f"A and B against {test}: relative error of each block, at most {tolerance:.1e}"
+        )
+        parts.append(grid([["", *states, *inputs], *body]))
+    single = [r for r in check.rows if r.test not in ("ABA derivatives", "differences")]
+    rest = [[f"{r.test}: {r.block}", _error(r), f"at most {r.tolerance:.1e}"] for r in single]
+    parts.append(grid(rest, "lrl"))
+    if check.ok:
+        verdict = f"OK: {len(check.rows)} figures hold; the largest error is {check.max_error:.1e}"
+    else:
+        names = [f"{row.block} ({row.test})" for row in check.failures[:6]]
+        names += ["..."] * (len(check.failures) > 6)
+        verdict = f"FAILED: {len(check.failures)} of {len(check.rows)} figures: {', '.join(names)}"
+    parts.append(textwrap.fill(verdict, width()))
+    return "\n\n".join(parts)
+
+
+def _error(row: Row) -> str:
+    text = "." if row.error == 0.0 else f"{row.error:.0e}"
+    return text if row.ok else f"{text}!"

@@ -57,7 +57,7 @@ class Equilibrium:
         self.residual.setflags(write=False)
 
     def __str__(self) -> str:
-        from fflin.commands.model_text import signals
+        from fflin.base.tables import signals
 
         if not self.u.any():
             return "u: all zero"

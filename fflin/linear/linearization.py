@@ -10,16 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from fflin import __version__
 from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, vector
+from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Chart
-from fflin.dynamics.inertia import inertia_matrix
 from fflin.dynamics.rnea import Accelerations, Rates
 from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap
-from fflin.linear.certificate import certify
+from fflin.linear.certificate import certify, inertia_matrix
 from fflin.linear.ignorable import ignorable_states
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations

@@ -14,7 +14,6 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, number, placement, vector
-from fflin.dynamics.inertia_bounds import bounds_of_inertia
 from fflin.robot.fields import validated_fields, validated_inputs
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.inputs import Input, default_inputs, named_wheels
@@ -189,11 +188,6 @@ class Robot:
     def nv(self) -> int:
         """Size of Pinocchio's velocity: 6 + n, and one for each mimic joint."""
         return int(self.model.nv)
-
-    @cached_property
-    def inertia_bounds(self) -> Array | None:
-        """Bounds (nv,) of what each coordinate moves, see `bounds_of_inertia`."""
-        return bounds_of_inertia(self.model)
 
     @property
     def mass(self) -> float:

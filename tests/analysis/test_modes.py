@@ -7,7 +7,7 @@ from scipy.linalg import eigh
 from scipy.optimize import linear_sum_assignment
 
 import fflin
-from fflin import cli
+from fflin.commands import cli
 from fflin.commands.model_text import linear_model, modes_report
 from tests.support.robots import BUNDLED, FRAMES, random_point, random_pose
 

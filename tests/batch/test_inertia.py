@@ -6,7 +6,7 @@ import pytest
 
 import fflin
 from fflin.batch.inertia import BatchInertia
-from fflin.dynamics.inertia import inertia_matrix
+from fflin.linear.certificate import inertia_matrix
 from tests.support.robots import BUNDLED, random_tree
 
 numba = pytest.importorskip("numba")

@@ -358,7 +358,7 @@ def test_check_exits_1_where_it_falls_short(monkeypatch, capsys):
     """The exit code of a model that does not hold, by planting a wrong one."""
     from dataclasses import replace
 
-    from fflin import cli
+    from fflin.commands import cli
     from fflin.linear import linearization
 
     right = linearization.linearize

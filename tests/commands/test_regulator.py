@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.cli import main
+from fflin.commands.cli import main
 
 
 def run(capsys, *arguments):

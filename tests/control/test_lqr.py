@@ -8,8 +8,8 @@ from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
 import fflin
+from fflin.analysis.gramians import held_cost
 from fflin.control.margins import _norm
-from fflin.control.sampled_cost import held_cost
 from tests.support.robots import BUNDLED, random_point
 
 

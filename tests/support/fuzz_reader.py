@@ -1,4 +1,4 @@
-"""Feed the reader mutated bytes for a while: ``python -m tests.support.fuzz_reader SECONDS SEED FOLDER``.
+"""Feed the reader mutated bytes: ``python -m tests.support.fuzz_reader SECONDS SEED FOLDER``.
 
 Each document is written to FOLDER before it is read, so that the last one there is the one that
 a crash or a hang was on.

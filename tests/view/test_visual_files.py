@@ -19,7 +19,7 @@ import pytest
 from PIL import Image
 
 import fflin
-from fflin.cli import main
+from fflin.commands.cli import main
 from fflin.view.playback import default_tool, frame_indices
 from tests.support.motions import settling
 

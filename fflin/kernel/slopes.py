@@ -24,8 +24,8 @@ from __future__ import annotations
 
 import numba
 
-from fflin.batch.kernel.lanes import splat, store
-from fflin.batch.kernel.rnea import (
+from fflin.kernel.lanes import splat, store
+from fflin.kernel.rnea import (
     FORCE,
     LOAD,
     MOMENTS,
@@ -38,8 +38,8 @@ from fflin.batch.kernel.rnea import (
     joint_axis,
     weighed,
 )
-from fflin.batch.kernel.tree import INERTIA, LANES, PLACE
-from fflin.batch.kernel.vectors import add, add3, cross, dot, get3, minus, plus, times
+from fflin.kernel.tree import INERTIA, LANES, PLACE
+from fflin.kernel.vectors import add, add3, cross, dot, get3, minus, plus, times
 
 
 @numba.njit(forceinline=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numba
 
-from fflin.batch.kernel.lanes import load, splat, store
-from fflin.batch.kernel.tree import LANES
+from fflin.kernel.lanes import load, splat, store
+from fflin.kernel.tree import LANES
 
 
 @numba.njit(forceinline=True)

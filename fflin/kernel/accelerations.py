@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fflin.base.validation import Array
-from fflin.batch.kernel.compiled import kernel
-from fflin.batch.kernel.tree import LANES, Tree, batch_tree
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
+from fflin.kernel.compiled import kernel
+from fflin.kernel.tree import LANES, Tree, batch_tree
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
@@ -153,7 +153,7 @@ def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
 
 
 def _layout(tree: Tree, carried: int) -> Layout:
-    from fflin.batch.kernel.rnea import LOAD, MOTION
+    from fflin.kernel.rnea import LOAD, MOTION
 
     size, bodies = len(tree.row), len(tree.parent)
     sizes = (

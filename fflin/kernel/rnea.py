@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import numba
 
-from fflin.batch.kernel.lanes import gather, load, splat, store
-from fflin.batch.kernel.tree import INERTIA, LANES, PLACE
-from fflin.batch.kernel.vectors import add, add3, cross, dot, get3, plus, put3, times, turned
+from fflin.kernel.lanes import gather, load, splat, store
+from fflin.kernel.tree import INERTIA, LANES, PLACE
+from fflin.kernel.vectors import add, add3, cross, dot, get3, plus, put3, times, turned
 
 # Of every body, in this order: velocity and Psi' (angular, linear); acceleration that forces and
 # motion cause without c, that of c alone; Psi''.

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numba
 
-from fflin.batch.kernel.crba import inwards, outwards
-from fflin.batch.kernel.lanes import load, scatter, splat, store, transpose
-from fflin.batch.kernel.tree import LANES
+from fflin.kernel.crba import inwards, outwards
+from fflin.kernel.lanes import load, scatter, splat, store, transpose
+from fflin.kernel.tree import LANES
 
 
 @numba.njit(forceinline=True)

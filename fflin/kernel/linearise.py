@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numba
 
-from fflin.batch.kernel.crba import inwards, outwards
-from fflin.batch.kernel.factor import factorise, multiply, unpack
-from fflin.batch.kernel.lanes import gather, load, splat, store
-from fflin.batch.kernel.rnea import accelerate_bodies, collect, load_bodies, move
-from fflin.batch.kernel.slopes import differentiate
-from fflin.batch.kernel.tree import LANES
+from fflin.kernel.crba import inwards, outwards
+from fflin.kernel.factor import factorise, multiply, unpack
+from fflin.kernel.lanes import gather, load, splat, store
+from fflin.kernel.rnea import accelerate_bodies, collect, load_bodies, move
+from fflin.kernel.slopes import differentiate
+from fflin.kernel.tree import LANES
 
 
 @numba.njit(forceinline=True)

@@ -42,7 +42,7 @@ def kernel(module: str, name: str) -> Any:
 
 @cache
 def _prepared(module: str, name: str) -> Any:
-    compiled = getattr(import_module(f"fflin.batch.kernel.{module}"), name)
+    compiled = getattr(import_module(f"fflin.kernel.{module}"), name)
     folder = Path(compiled.stats.cache_path)
     kept = list(folder.glob(f"{module}.{name}-*.nbi"))
     # numba looks at the file of the function alone, not at those that it calls.

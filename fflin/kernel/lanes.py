@@ -22,7 +22,7 @@ from numba.extending import (
     type_callable,
 )
 
-from fflin.batch.kernel.tree import LANES
+from fflin.kernel.tree import LANES
 
 _DOUBLE, _INT32 = ir.DoubleType(), ir.IntType(32)
 _VECTOR = ir.VectorType(_DOUBLE, LANES)

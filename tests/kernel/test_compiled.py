@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from fflin.batch.kernel import compiled as kernel_code
+from fflin.kernel import compiled as kernel_code
 
 pytest.importorskip("numba")
 
@@ -15,7 +15,7 @@ pytest.importorskip("numba")
 @pytest.fixture
 def compiled(monkeypatch, tmp_path):
     """A function of the kernel that keeps its code in a folder of its own."""
-    from fflin.batch.kernel import factor as batch_kernel
+    from fflin.kernel import factor as batch_kernel
 
     new = SimpleNamespace(stats=SimpleNamespace(cache_path=tmp_path))
     monkeypatch.setattr(batch_kernel, "invert", new)

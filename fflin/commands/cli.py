@@ -11,8 +11,8 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from fflin import __version__
 from fflin.base.errors import FflinError, FflinWarning
+from fflin.base.version import __version__
 from fflin.commands import (
     BAD_INPUT,
     DONE,

@@ -15,9 +15,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from fflin.batch.kernel.lanes import floor, gather, load, splat, store
-from fflin.batch.kernel.tree import INERTIA, LANES, PLACE
-from fflin.batch.kernel.vectors import add, add3, get3, put3
+from fflin.kernel.lanes import floor, gather, load, splat, store
+from fflin.kernel.tree import INERTIA, LANES, PLACE
+from fflin.kernel.vectors import add, add3, get3, put3
 
 
 @numba.njit(forceinline=True)
