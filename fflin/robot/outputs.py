@@ -11,6 +11,7 @@ from typing import ClassVar
 from fflin.base.errors import InputError, unknown
 
 
+@dataclass(frozen=True)
 class Output:
     """What every kind of output says of itself.
 
@@ -46,7 +47,7 @@ class FrameOutput(Output):
     @property
     def frames(self) -> tuple[str, ...]:
         """The frames of the model that it is of."""
-        return tuple(getattr(self, item.name) for item in fields(self))  # type: ignore[arg-type]
+        return tuple(getattr(self, item.name) for item in fields(self))
 
 
 @dataclass(frozen=True)
@@ -237,7 +238,7 @@ def parse_output(text: str) -> tuple[Output, ...]:
     kinds = {kind.WORD: (kind,) for kind in KINDS} | {"frame": (FramePose, FrameVelocity)}
     if word not in kinds:
         raise unknown("output", word, tuple(kinds))
-    wanted = [item.name for item in fields(kinds[word][0])]  # type: ignore[arg-type]
+    wanted = [item.name for item in fields(kinds[word][0])]
     if not issubclass(kinds[word][0], FrameOutput):
         if colon:
             raise InputError(f"output '{text}' is of the whole robot; write {word}")
