@@ -109,16 +109,18 @@ def controllability(lin: LinearModel) -> Controllability:
 
     About rest the momenta with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved, and with the
     coordinates :math:`W M N^{-1} x_1` that they drive they are split off exactly. Without
-    springs and dampers that is all: the dimension is 2 rank(B). With springs alone the rest is
-    decided frequency by frequency on the modes of :math:`(K, M)`, equal frequencies together:
-    :math:`2 \sum_g \mathrm{rank}(\Phi_g^T S)`. With dampers, off rest, or sampled with springs,
-    it is decided at each eigenvalue by singular values of :math:`[A - s E, B]`, in units of
-    energy (Popov, Belevitch, Hautus).
+    springs and dampers that is all: the dimension is 2 rank(B). With them the rest is decided on
+    :math:`M a + D v + K s = S u` itself, by the rank of :math:`[p^2 M + p D + K, S]` at each pole
+    p, where rounding is put to zero and every row is scaled by what stands in it. Off rest, and
+    where springs or dampers are not symmetric, it is decided by singular values of
+    :math:`[A - p E, B]` in units of energy (Popov, Belevitch, Hautus).
 
-    Every rank is that of a matrix scaled by M, with inputs of unit length; the tolerances are
-    small multiples of the rounding, and `margin` says how near the decisions came to them.
-    Frequencies whose squares differ by less than 1e4 roundings are taken as equal. A sampled
-    model is judged as it stands: sampling at a period of a vibration loses it.
+    A sampled model has the structure of the continuous one that it was made of, but for a
+    vibration that is lost where it is sampled at a period of it. Of a file, which holds the
+    samples alone, these are judged as they stand.
+
+    Every tolerance is a small multiple of the rounding; `margin` says how near the decisions came
+    to them, and `notes` where one is within rounding.
 
     Parameters
     ----------
@@ -138,8 +140,8 @@ def controllability(lin: LinearModel) -> Controllability:
     -----
     Inputs act in both directions: that a thruster only pushes is not considered. At a nonzero
     angular velocity the answer is that of the frozen model, which certifies nothing about the
-    motion. Where the fastest pole is more than about 1e8 times the slowest that is not zero, as
-    with a heavy damper on a light link, the slow ones are taken for rounding, as `margin` shows.
+    motion. Off rest, where the fastest pole is more
+    than about 1e8 times the slowest that is not zero, the slow ones are taken for rounding.
 
     References
     ----------
