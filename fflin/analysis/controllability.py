@@ -150,9 +150,10 @@ def controllability(lin: LinearModel) -> Controllability:
     """
     lin = checked(lin)
     held = conserved(lin)
-    z, nx = held.selected, len(lin.A)
     part = _split_kept(lin, held)
-    rows = np.vstack((held.momenta, held.coordinates, part.rows @ _selector(z, nx)))
+    others: Array = np.zeros((len(part.rows), len(lin.A)))
+    others[:, held.selected] = part.rows
+    rows = np.vstack((held.momenta, held.coordinates, others))
     names = (*momentum_names(lin, held), *part.names)
     size = _state_sizes(lin)
     spanned = held.T @ part.reached
@@ -270,24 +271,14 @@ def _labels(lin: LinearModel, rows: Array, held: Conserved) -> tuple[Array, tupl
     return echeloned, tuple(combination(row, names, size) for row in echeloned)
 
 
-def _selector(states: Array, nx: int) -> Array:
-    selector: Array = np.zeros((len(states), nx))
-    selector[np.arange(len(states)), states] = 1.0
-    return selector
-
-
 def _state_sizes(lin: LinearModel) -> Array:
-    """Weights (nx,) that make states comparable: what a unit of each moves, by its inertia."""
+    """Weights (nx,) that make states comparable, by their inertia."""
     return np.tile(np.sqrt(lin.M.diagonal()), 2)
 
 
 def _driven_states(lin: LinearModel) -> Array:
     """Return the states of coordinates that an input pushes on directly."""
-    force = np.abs(lin.M @ lin.B[len(lin.M) :])
-    rounding = (
-        1e3 * len(lin.M) * np.finfo(float).eps * (np.abs(lin.M) @ np.abs(lin.B[len(lin.M) :]))
-    )
-    return np.tile((force > rounding).any(axis=1), 2)
+    return np.tile(second_order(lin.generator or lin).S.values.any(axis=1), 2)
 
 
 def _reach(lin: LinearModel, weighted: Array) -> dict[str, int]:
