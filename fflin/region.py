@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, as_completed
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from fflin.actuation import Actuation
 from fflin.closed_loop import SETTLED, Loop
-from fflin.errors import InputError
+from fflin.errors import FflinError, InputError
 from fflin.linear_model import LinearModel
 from fflin.model import Robot
 from fflin.tables import width
@@ -134,6 +135,7 @@ def validity(
     seed: int = 0,
     confidence: float = 0.95,
     executor: Executor | None = None,
+    progress: Callable[[int, int], object] | None = None,
 ) -> Validity:
     """Measure how far from its point a linear model can be trusted, and its loop holds.
 
@@ -161,6 +163,8 @@ def validity(
         Of the intervals.
     executor : concurrent.futures.Executor, optional
         Runs them in parallel, such as a ProcessPoolExecutor.
+    progress : callable, optional
+        ``progress(done, total)`` is called with the number of runs, random or not, as they end.
 
     Returns
     -------
@@ -171,6 +175,8 @@ def validity(
     InputError
         If the linear loop is unstable, the point is no fixed point, or an argument has a wrong
         size or value.
+    FflinError
+        If a process of the executor died.
 
     References
     ----------
@@ -199,16 +205,23 @@ def validity(
     # Of each run its own stream, so that it does not matter who does which.
     streams = np.random.SeedSequence(seed).spawn(samples + _DIRECTIONS)
     levels = (np.arange(samples) + 0.5) / samples
-    each: Any = map
     if executor is not None and not isinstance(executor, Executor):
         raise InputError(
             f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
         )
-    if executor:
-        each = partial(executor.map, chunksize=1 + samples // 16)
-    errors = np.array(list(each(partial(_foreseen, loop, largest), streams[:_DIRECTIONS])))
-    outcomes = tuple(each(partial(_outcome, loop, largest), levels, streams[_DIRECTIONS:]))
-    worst = errors.max(axis=0)
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
+    runs: list[Callable[[], Any]] = [
+        *(partial(_foreseen, loop, largest, stream) for stream in streams[:_DIRECTIONS]),
+        *map(partial(partial, _outcome, loop, largest), levels, streams[_DIRECTIONS:]),
+    ]
+    found: list[Any] = [None] * len(runs)
+    for done, (index, result) in enumerate(_each(runs, executor), 1):
+        found[index] = result
+        if progress:
+            progress(done, len(runs))
+    worst = np.array(found[:_DIRECTIONS]).max(axis=0)
+    outcomes = tuple(found[_DIRECTIONS:])
     failed = [i for i, outcome in enumerate(outcomes) if outcome != "settled"]
     inside = failed[0] if failed else samples
     settled = outcomes.count("settled")
@@ -228,6 +241,22 @@ def validity(
         largest=largest,
         robot=lin.robot,
     )
+
+
+def _each(runs: list[Callable[[], Any]], executor: Executor | None) -> Iterator[tuple[int, Any]]:
+    """Yield the number and the result of each run as it ends."""
+    if executor is None:
+        yield from ((index, run()) for index, run in enumerate(runs))
+        return
+    futures = {executor.submit(run): index for index, run in enumerate(runs)}
+    try:
+        for future in as_completed(futures):
+            yield futures.pop(future), future.result()
+    except BrokenExecutor as error:
+        raise FflinError(f"a process that did the runs died: {error}") from None
+    finally:
+        for future in futures:
+            future.cancel()
 
 
 def _checked(robot: Robot, lin: LinearModel, gain: Any) -> Loop:

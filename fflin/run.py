@@ -195,7 +195,7 @@ class Run:
         self.follow = not self.dynamics.isolated(driven=self.channel is not None)
         continuous = self.channel is not None and self.channel.continuous
         self.asked = self.channel.ask if self.channel is not None and continuous else None
-        bar = Progress(self.steps, progress)
+        bar = Progress(progress)
         stopped, step = "", 0
         try:
             for step in range(self.steps):
@@ -209,7 +209,7 @@ class Run:
                 if stopped:
                     break
                 if step % _LOOK == 0:
-                    bar.update(step + 1)
+                    bar.update(step + 1, self.steps)
         except KeyboardInterrupt:
             if not self.count:
                 raise
