@@ -110,7 +110,7 @@ class _WorkPlace:
             return
         pool = self._workers if isinstance(self._workers, ProcessPoolExecutor) else None
         hung = False
-        while not (done := wait(self.running, pool and _GLANCE, FIRST_COMPLETED).done):
+        while not (done := wait(self.running, _GLANCE if pool else None, FIRST_COMPLETED).done):
             assert pool is not None
             if hung:
                 _break(pool)

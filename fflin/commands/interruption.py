@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import _thread
 import os
 import signal
 import sys
-import threading
-import time
 from types import FrameType
 from typing import Any, NoReturn
 
 from fflin.commands import INTERRUPTED
-
-# How long to wait where it cannot be raised [s].
-_AGAIN = 0.02
 
 
 def listen() -> None:
@@ -44,29 +38,36 @@ def leave(reason: KeyboardInterrupt) -> NoReturn:
 
 
 def _heard(_: int, frame: FrameType | None) -> None:
-    while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
-            _raise_later()
-            return
-        frame = frame.f_back
-    raise KeyboardInterrupt
+    importer = _importer(frame)
+    if importer is None:
+        raise KeyboardInterrupt
+    _raise_in(importer)
 
 
 def _passed_over(unraisable: Any) -> None:
     if issubclass(unraisable.exc_type, KeyboardInterrupt):
-        _raise_later()
+        frame = sys._getframe(1)
+        _raise_in(_importer(frame) or frame)
     else:
         sys.__unraisablehook__(unraisable)
 
 
-def _raise_later() -> None:
-    # Not a threading.Thread, whose locks the code that was interrupted may hold.
-    _thread.start_new_thread(_interrupt, ())
+def _importer(frame: FrameType | None) -> FrameType | None:
+    """Return the code whose import runs in a frame, the outermost where imports are nested."""
+    importer = None
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            importer = frame.f_back
+        frame = frame.f_back
+    return importer
 
 
-def _interrupt() -> None:
-    time.sleep(_AGAIN)
-    if hasattr(signal, "pthread_kill"):  # it ends a wait of the main thread, too
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-    else:
-        _thread.interrupt_main()
+def _raise_in(frame: FrameType) -> None:
+    """Raise it in a frame as this comes to its next line, or to its end."""
+
+    def interrupt(*_: object) -> None:
+        sys.settrace(None)
+        raise KeyboardInterrupt
+
+    frame.f_trace = interrupt
+    sys.settrace(lambda *_: None)
