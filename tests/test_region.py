@@ -276,20 +276,21 @@ def test_a_process_that_dies_is_one_line(robots, monkeypatch):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="no pseudo-terminal")
-def test_it_shows_a_bar_on_a_terminal():
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
     import pty
 
     ours, theirs = pty.openpty()
     with subprocess.Popen(
-        [sys.executable, "-m", "fflin", "validity", "ets_vii", "--samples", "9000"],
-        stdout=subprocess.PIPE,
+        [sys.executable, "-m", "fflin", "validity", "ets_vii", "--samples", "9000", "--jobs", jobs],
         stderr=theirs,
+        start_new_session=True,
     ) as process:
         os.close(theirs)
         said = b""
         while b"s left" not in said:
             said += os.read(ours, 4096)
-        process.send_signal(signal.SIGINT)
+        os.killpg(process.pid, signal.SIGINT)
         with contextlib.suppress(OSError):  # Linux tells the end so
             while more := os.read(ours, 4096):
                 said += more
