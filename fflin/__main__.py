@@ -10,7 +10,7 @@ def main() -> int:
     """Run the command line on the arguments of this process, and return its exit code."""
     listen()
     try:
-        from fflin import cli
+        from fflin.commands import cli
 
         code = cli.main()
     except KeyboardInterrupt as reason:
