@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from fflin.aba import Aba
 from fflin.errors import InputError
+from fflin.massless import require_inertia
 from fflin.state import StateMap
 from fflin.validation import Array, as_double
 
@@ -36,6 +37,7 @@ class Dynamics:
 
     def __init__(self, state: StateMap, disturbance: Disturbance | None = None) -> None:
         robot = state.robot
+        require_inertia(robot)
         self._state, self._robot = state, robot
         self._aba = Aba(state)
         self.actuation = self._aba.actuation

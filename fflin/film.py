@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pinocchio as pin
 
+from fflin.frames import find_frame
 from fflin.model import ROOT, Robot
 from fflin.page import build_page, packed
 from fflin.panel import panel
@@ -183,8 +184,8 @@ def triads(robot: Robot, tool: str | None, size: float) -> list[dict[str, Any]]:
     paths = body_paths(robot)
     found = [(paths[0], pin.SE3.Identity(), 0.3)]
     if tool:
-        frame = robot.model.frames[robot.model.getFrameId(tool)]
-        found.append((paths[frame.parentJoint - ROOT], frame.placement, 0.12))
+        joint, placement = find_frame(robot.model, tool)
+        found.append((paths[joint - ROOT], placement, 0.12))
     return [
         {
             "path": ["meshcat", "robot", path],

@@ -8,6 +8,7 @@ import pinocchio as pin
 from fflin.errors import FflinWarning, SingularInertiaError, listed
 from fflin.inertia_bounds import STROKE
 from fflin.linear_model import LinearModel
+from fflin.massless import coordinate_names
 from fflin.model import Robot
 from fflin.state import StateMap
 from fflin.validation import Array
@@ -149,29 +150,17 @@ def inverse_inertia(state: StateMap, lin: LinearModel) -> Array:
 
 
 def _singular(state: StateMap, M: Array) -> SingularInertiaError:
-    robot = state.robot
-    diagonal = M.diagonal()
-    massless = [_names(state)[i] for i in np.flatnonzero(~(diagonal > 0.0))]
-    if massless:
-        verb = "moves" if len(set(massless)) == 1 else "move"
-        return SingularInertiaError(
-            f"M of '{robot.name}' cannot be inverted: {listed(massless)} {verb} no mass; "
-            "give the links beyond an inertia, or lock what needs none"
-        )
     return SingularInertiaError(
-        f"M of '{robot.name}' is singular at this configuration: {_involved(state, M)} can move "
-        "together without moving mass; choose another configuration, give the links an inertia, "
+        f"M of '{state.robot.name}' is singular at this configuration: {_involved(state, M)} can "
+        "move together without moving mass; choose another configuration, give the links an inertia, "
         "or lock one of them"
     )
 
 
 def _involved(state: StateMap, M: Array) -> str:
     """Name the coordinates of the motion with the least inertia."""
-    scale = 1.0 / np.sqrt(M.diagonal())
+    diagonal = M.diagonal()
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     mode = np.linalg.eigh(scale[:, None] * M * scale)[1][:, 0]
-    names = _names(state)
+    names = coordinate_names(state.robot)
     return listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
-
-
-def _names(state: StateMap) -> list[str]:
-    return ["the base"] * 6 + [f"joint '{name}'" for name in state.robot.joint_names]

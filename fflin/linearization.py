@@ -18,6 +18,7 @@ from fflin.errors import InputError
 from fflin.frames import ROOT
 from fflin.inertia import inertia_matrix
 from fflin.linear_model import LinearModel
+from fflin.massless import require_inertia
 from fflin.model import Robot
 from fflin.output_equations import output_equations
 from fflin.outputs import FullState
@@ -70,8 +71,11 @@ class Linearizer:
     InputError
         If the frame is unknown, the reference is not a pin.SE3, or `moving` is asked for with a
         reference or with a frame other than "local".
+    SingularInertiaError
+        If M is singular at every configuration.
     ModelError
-        If Pinocchio's Data for the robot would pass 1 GiB.
+        If Pinocchio's Data for the robot would pass 1 GiB, or its model was changed after the
+        robot was made.
 
     References
     ----------
@@ -97,6 +101,7 @@ class Linearizer:
         self._moving = bool(moving)
         self._map = StateMap(robot, reference=reference, frame=frame)
         self._own_reference = reference is None
+        require_inertia(robot)
         self._data = robot.create_data()
         self._lock = Lock()  # of the work space
         self._actuation = Actuation(self._map)

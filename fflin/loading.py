@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,12 +12,13 @@ import pinocchio as pin
 
 from fflin.errors import FflinWarning, InputError, ModelError, unknown
 from fflin.joints import Follower, Joint
+from fflin.massless import massless_note
 from fflin.model import ROOT, Robot
 from fflin.model_checks import check_model
 from fflin.reader import read_urdf
 from fflin.robots import find_robot
 from fflin.urdf_joints import Mimic
-from fflin.validation import number
+from fflin.validation import Array, number
 
 Lock = Mapping[str, float | None] | Iterable[str]
 
@@ -68,13 +70,16 @@ def load(
     found = find_robot(robot)
     description = read_urdf(found.path, found.prune)
     loaded = _robot(description.model, found.name, lock, description.mimics)
-    for note in description.notes:
+    notes = description.notes
+    if loaded.idle:
+        notes = (*notes, massless_note(loaded))
+    for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
     loaded = replace(
         loaded,
         urdf=found.path,
         urdf_sha256=description.sha256,
-        notes=description.notes,
+        notes=notes,
         package_dirs=(*_folders(package_dirs), *found.package_dirs),
         urdf_damping=_independent_damping(loaded, description.damping),
     )
@@ -215,7 +220,26 @@ def _locked(
         if not model.existFrame(name, pin.FrameType.JOINT):
             model.addJointFrame(index)
     left = {name: mimic for name, mimic in mimics.items() if name not in values}
-    return pin.buildReducedModel(model, indices, q), left, tuple(locked)
+    return _reduced(model, indices, q), left, tuple(locked)
+
+
+def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
+    """Weld joints at q (nq,). Pinocchio looks frames up by name, which links and joints may share.
+
+    The joints' own frames keep their names, by which it finds them.
+    """
+    names = Counter(frame.name for frame in model.frames.tolist())
+    shared: dict[str, str] = {}
+    for index, frame in enumerate(model.frames):
+        if index and frame.type != pin.FrameType.JOINT and names[frame.name] > 1:
+            alias = f"{index}/{frame.name}"
+            while alias in names:
+                alias += "/"
+            shared[alias], frame.name = frame.name, alias
+    reduced = pin.buildReducedModel(model, indices, q)
+    for frame in reduced.frames:
+        frame.name = shared.get(frame.name, frame.name)
+    return reduced
 
 
 def _joint(model: pin.Model, index: int) -> Joint:

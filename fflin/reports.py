@@ -37,6 +37,8 @@ def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
 
 def robot_info(robot: Robot) -> str:
     """Show a robot's tree, masses and limits."""
+    from fflin.frames import ROOT
+
     model = robot.model
     source = str(robot.urdf) if robot.urdf else "a Pinocchio model"
     head = (
@@ -75,7 +77,7 @@ def robot_info(robot: Robot) -> str:
                 _limit(model.velocityLimit[joint.idx_v]),
             ]
         )
-    frames = [f.name for f in model.frames if f.name != "universe"]
+    frames = [frame.name for frame in model.frames.tolist() if frame.parentJoint >= ROOT]
     wrapped = textwrap.fill(
         ", ".join(dict.fromkeys(frames)), width(), initial_indent="  ", subsequent_indent="  "
     )

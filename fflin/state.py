@@ -69,6 +69,8 @@ class StateMap:
     ------
     InputError
         If the frame is unknown or the reference is not a pin.SE3.
+    ModelError
+        If the robot's model was changed after it was made.
     """
 
     def __repr__(self) -> str:
@@ -83,6 +85,7 @@ class StateMap:
             )
         if not isinstance(frame, str) or frame not in get_args(Frame):
             raise InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
+        robot.require_unchanged()
         n = robot.n
         self.robot = robot
         self.frame: Frame = frame

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 from warnings import warn
 
 from fflin.actuation import Actuation
-from fflin.errors import FflinWarning, FileError, InputError, unknown
-from fflin.model import ROOT, Robot
+from fflin.errors import FflinWarning, FileError, InputError
+from fflin.frames import find_frame
+from fflin.model import Robot
 from fflin.state import StateMap
 from fflin.validation import Array, number
 from fflin.writing import as_path, write_whole
@@ -214,9 +215,8 @@ def check_outputs(files: dict[str, Any], spare: Path | None = None) -> dict[str,
 
 def check_tool(robot: Robot, tool: str | None) -> None:
     """Raise UnknownNameError where there is no such frame."""
-    if tool is not None and not robot.model.existFrame(tool):
-        frames = [frame.name for frame in robot.model.frames.tolist() if frame.parentJoint >= ROOT]
-        raise unknown("frame", tool, frames)
+    if tool is not None:
+        find_frame(robot.model, tool)
 
 
 def check_rates(fps: float, speed: float | None, duration: float) -> tuple[float, float]:
