@@ -152,8 +152,8 @@ def inverse_inertia(state: StateMap, lin: LinearModel) -> Array:
 def _singular(state: StateMap, M: Array) -> SingularInertiaError:
     return SingularInertiaError(
         f"M of '{state.robot.name}' is singular at this configuration: {_involved(state, M)} can "
-        "move together without moving mass; choose another configuration, give the links an inertia, "
-        "or lock one of them"
+        "move together without moving mass; choose another configuration, give the links an "
+        "inertia, or lock one of them"
     )
 
 
