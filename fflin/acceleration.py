@@ -12,7 +12,7 @@ from fflin.linear_model import LinearModel
 from fflin.regulator import Gain, make_gain, require_fixed_point
 from fflin.riccati import Riccati, Solution
 from fflin.stabilizability import require_stabilizable
-from fflin.validation import Array
+from fflin.validation import Array, dimension
 from fflin.weights import Weight, weight
 
 _BEYOND = "the weights or dt are beyond what numbers hold: scale Qp, Qv and Ra nearer to each other"
@@ -151,7 +151,7 @@ def _integrators(lin: LinearModel) -> tuple[Array, Array]:
 
 
 def _diagonal(what: str, value: Weight, names: Sequence[str], *, definite: bool) -> Array:
-    if not isinstance(value, Mapping) and np.ndim(value) == 2:
+    if not isinstance(value, Mapping) and dimension(what, value) == 2:
         raise InputError(f"{what} is a matrix; the closed form needs its diagonal alone, use lqr")
     return weight(what, value, names, definite=definite).diagonal()
 

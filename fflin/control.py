@@ -11,7 +11,7 @@ import numpy as np
 
 from fflin.actuation import Actuation
 from fflin.errors import InputError, unknown
-from fflin.validation import DOUBLE, Array, as_double, number
+from fflin.validation import DOUBLE, Array, as_double, dimension, number
 
 
 def limits_of(actuation: Actuation, limits: Any) -> tuple[Array, Array]:
@@ -45,7 +45,7 @@ def limits_of(actuation: Actuation, limits: Any) -> tuple[Array, Array]:
             raise unknown("input", str(name), (*groups, *names))
         entries = [names.index(name)] if name in names else groups[name]
         value = given[name]
-        if np.ndim(value) == 1 and len(value) == 2:
+        if dimension(f"limit of '{name}'", value) == 1 and len(value) == 2:
             least, largest = (number(f"limit of '{name}'", x) for x in value)
         else:
             largest = number(f"limit of '{name}'", value)

@@ -19,7 +19,8 @@ def frame_index(model: pin.Model, name: str) -> int:
         If there is none on the robot.
     """
     frames = {i: f for i, f in enumerate(model.frames.tolist()) if f.parentJoint >= ROOT}
-    found = [i for i, frame in frames.items() if frame.name == name]
+    # The comparison with an array would be one.
+    found = [i for i, f in frames.items() if isinstance(name, str) and f.name == name]
     if not found:
         raise unknown("frame", str(name), [frame.name for frame in frames.values()])
     return next((i for i in found if frames[i].type == pin.FrameType.BODY), found[0])

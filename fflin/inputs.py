@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from fflin.errors import InputError
-from fflin.validation import number
+from fflin.validation import number, refuse_masked
 
 Vector3: TypeAlias = Sequence[float]
 
@@ -122,6 +122,7 @@ Input: TypeAlias = BaseTorque | BaseForce | JointTorque | Thruster | ReactionWhe
 
 def three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
     """Return three finite floats, or raise `InputError` that says what was given."""
+    refuse_masked(what, value)
     try:
         x, y, z = (float(entry) for entry in value)
     except (TypeError, ValueError, OverflowError):

@@ -24,10 +24,10 @@ from fflin.output_equations import output_equations
 from fflin.outputs import FullState
 from fflin.rates import Accelerations, Rates
 from fflin.rotation import skew
-from fflin.state import ANGULAR, LINEAR, Frame, StateMap
+from fflin.state import ANGULAR, LINEAR, Frame, StateMap, unknown_frame
 from fflin.state_equations import STANDING, Point, at_rest, ride_along, state_equations
 from fflin.symmetry import ignorable_states
-from fflin.validation import Array, vector
+from fflin.validation import Array, truth, vector
 
 if TYPE_CHECKING:
     from fflin.sensing import Sensing
@@ -92,13 +92,17 @@ class Linearizer:
         moving: bool = False,
     ) -> None:
         self.robot = robot
-        if moving and (reference is not None or frame not in (None, "local")):
+        moving = truth("moving", moving)
+        if frame is None:
+            frame = "local" if moving else "hybrid"
+        elif not isinstance(frame, str):  # nor one whose comparison below is an array
+            raise unknown_frame(frame)
+        if moving and (reference is not None or frame != "local"):
             raise InputError(
                 "moving=True takes the error in the moving base's own axes: leave out the "
                 "reference, and the frame or make it 'local'"
             )
-        frame = frame or ("local" if moving else "hybrid")
-        self._moving = bool(moving)
+        self._moving = moving
         self._map = StateMap(robot, reference=reference, frame=frame)
         self._own_reference = reference is None
         require_inertia(robot)
@@ -125,6 +129,8 @@ class Linearizer:
             and not any(values.any() for values in robot.passive)
         )
         self._plain = self._free and self._actuation.default
+        given = hypot(*robot.gravity, *np.concatenate(robot.passive).tolist())
+        self._moderate = given < _MODERATE
         nv, nx = 6 + robot.n, self._map.nx
         self._zero_v, self._zero_u, self._zero_x = (
             _frozen(np.zeros(size)) for size in (robot.nv, len(self._actuation.names), nx)
@@ -187,7 +193,7 @@ class Linearizer:
         v = self._zero_v if v is None else v
         u = self._zero_u if u is None else u
         with self._lock:
-            if hypot(*v.tolist(), *u.tolist()) < _MODERATE:
+            if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
                 return self._anywhere(q, v, u)
             # What overflows is refused, and not warned of. Every call of NumPy costs more here.
             with np.errstate(over="ignore", invalid="ignore"):

@@ -115,6 +115,8 @@ def from_model(
     """
     if not isinstance(model, pin.Model):
         raise ModelError(f"the model is a {type(model).__name__}, expected a pin.Model")
+    if name is not None and not isinstance(name, str):
+        raise InputError(f"name is a {type(name).__name__}, expected a word")
     copy = model.copy()
     copy.gravity.setZero()
     name = name or model.name or "model"
@@ -190,9 +192,7 @@ def _locked(
 
     Returns the smaller model, the mimics that are left, and "joint=value" of what was welded.
     """
-    if not isinstance(lock, Iterable):
-        raise InputError(f"lock is {lock!r}, expected {{joint: value}} or names of joints")
-    names = [lock] if isinstance(lock, str) else list(lock)
+    names = [lock] if isinstance(lock, str) else _listed(lock)
     given = lock if isinstance(lock, Mapping) else {}
     movable = list(model.names)[ROOT + 1 :]
     q = pin.neutral(model)
@@ -221,6 +221,18 @@ def _locked(
             model.addJointFrame(index)
     left = {name: mimic for name, mimic in mimics.items() if name not in values}
     return _reduced(model, indices, q), left, tuple(locked)
+
+
+def _listed(lock: Any) -> list[str]:
+    try:
+        names = list(lock)
+    except TypeError:
+        names = [None]
+    if not all(isinstance(name, str) for name in names):
+        raise InputError(
+            f"lock is a {type(lock).__name__}, expected {{joint: value}} or names of joints"
+        )
+    return names
 
 
 def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:

@@ -18,7 +18,7 @@ from fflin.model import Robot
 from fflin.readout import readout
 from fflin.rotation import conjugate, quaternion_product, rotation_matrix
 from fflin.state import StateMap
-from fflin.validation import Array
+from fflin.validation import Array, as_double
 
 if TYPE_CHECKING:
     from fflin.schedules import GainSchedule
@@ -234,10 +234,10 @@ def bound(policy: Any, robot: Robot) -> Policy:
 
 
 def _gain(K: ArrayLike, shape: tuple[int, ...]) -> Array:
-    gain = np.array(K, dtype=float) if np.shape(K) == shape else None
-    if gain is None or not np.isfinite(gain).all():
+    gain = as_double("K", K)
+    if gain.shape != shape or not np.isfinite(gain).all():
         raise InputError(
-            f"K has shape {np.shape(K)}, expected {shape} (nu, nx) and finite numbers; take the "
+            f"K has shape {gain.shape}, expected {shape} (nu, nx) and finite numbers; take the "
             "gain that was designed for this model"
         )
     gain.setflags(write=False)

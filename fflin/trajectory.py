@@ -15,7 +15,7 @@ from fflin.linearization import Linearizer
 from fflin.model import Robot
 from fflin.rotation import rotation_matrix
 from fflin.state import StateMap
-from fflin.validation import Array, number, vector
+from fflin.validation import Array, as_double, number, vector
 
 # Of the trapezoidal rule over an interval, relative to the largest rate of the motion: what
 # coarse knots leave, and what no motion of the robot leaves.
@@ -129,7 +129,8 @@ def linearize_trajectory(
     FflinWarning
         If the knots are so coarse that the motion between them is in doubt.
     """
-    times = vector("t", t, np.size(t), "times of the knots")
+    times = as_double("t", t)
+    times = vector("t", times, times.size, "times of the knots")
     if len(times) < 2 or (np.diff(times) <= 0.0).any():
         raise InputError("t must hold at least two times, each later than the one before")
     linearizer = Linearizer(robot, moving=True)

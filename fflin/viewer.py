@@ -14,7 +14,7 @@ from fflin.errors import FflinWarning, FileError, InputError
 from fflin.frames import find_frame
 from fflin.model import Robot
 from fflin.state import StateMap
-from fflin.validation import Array, number
+from fflin.validation import Array, number, truth
 from fflin.writing import as_path, write_whole
 
 if TYPE_CHECKING:
@@ -119,8 +119,9 @@ def visualize(
         )
     if scene is None:
         scene = "lab" if any(robot.gravity) else "space"
-    if scene not in SCENES:
+    if not isinstance(scene, str) or scene not in SCENES:
         raise InputError(f"scene is {scene!r}, expected one of {', '.join(SCENES)}")
+    opened = None if open is None else truth("open", open)
     check_tool(robot, tool)
     from fflin.playback import default_tool
 
@@ -129,7 +130,7 @@ def visualize(
         if any(file is not None for file in (html, png, gif)):
             raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
         start = robot.neutral() if q is None else _configuration(robot, "q", q)
-        return _live(robot, start, open is None or open, scene, tool, bool(follow), speed, port)
+        return _live(robot, start, opened is not False, scene, tool, bool(follow), speed, port)
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif}, robot.urdf)
     _check_motion(robot, motion)
     fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
@@ -156,7 +157,7 @@ def visualize(
         ) as file:
             file.write(page.encode())
         shown = Path(file.name)
-    if shown and (open if open is not None else not outputs):
+    if shown and (not outputs if opened is None else opened):
         import webbrowser
 
         webbrowser.open(shown.resolve().as_uri())
