@@ -10,10 +10,10 @@ import warnings
 
 import numpy as np
 import pytest
-from fuzz_public import ODD, sound
 
 import fflin
-from fflin.cli import main
+from fflin.commands.cli import main
+from tests.support.fuzz_public import ODD, sound
 
 # What a function of the caller's own raises is the caller's.
 CALLED = {"policy", "disturbance", "callback", "progress"}
@@ -91,7 +91,7 @@ OPTIONS = {
     "check": ("--stiffness", "--damping", "--rpy", "--position"),
     "lqr": ("--dt", "--stiffness"),
     "modes": ("--stiffness", "--damping"),
-    "simulate": ("--duration", "--step", "--delay", "--limit", "--rpy", "--q", "--r", "--dt"),
+    "simulate": ("--duration", "--step", "--delay", "--limit", "--rpy", "--q", "--dt"),
     "sweep": ("--random", "--seed", "--grid", "--range"),
 }
 NAMED = {"--limit": "tau_m=", "--q": "q_b=", "--r": "tau_b=", "--range": "joint_1=0:"}
@@ -178,7 +178,8 @@ def run(code, **environment):
 
 def test_a_backend_that_does_not_exist_is_named(tmp_path):
     code = (
-        "import sys; from fflin.cli import main; sys.exit(main(['simulate', 'planar_detumble', "
+        "import sys; from fflin.commands.cli import main; "
+        "sys.exit(main(['simulate', 'planar_detumble', "
         f"'--duration', '0.1', '--plot', {str(tmp_path / 'a.png')!r}]))"
     )
     done = run(code, MPLBACKEND="nosuch")
