@@ -15,7 +15,7 @@ import numpy as np
 from fflin.analysis.closed_loop import SETTLED, Loop
 from fflin.base.errors import FflinError, InputError
 from fflin.base.tables import width
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, as_double, number, whole
 from fflin.dynamics.actuation import Actuation
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -27,6 +27,9 @@ _DIRECTIONS = 4
 # Time constants of the slowest pole over which the prediction is measured, and of a run.
 _FORESIGHT, _PATIENCE = 3.0, 3.0
 _STEPS = 60
+
+# Random runs at most, and displacement [m], [rad].
+_MOST, _FARTHEST = 1_000_000, 1e6
 
 # Relative error of the integration, and prediction errors too small to be told from it.
 _PRECISION, _ROUNDING = 1e-9, 1e-7
@@ -186,7 +189,7 @@ def validity(
     loop = _checked(robot, lin, gain)
     largest = {"attitude": attitude, "position": position, "joint": joint}
     largest = {key: number(key, value) for key, value in largest.items()}
-    samples, seed = _count("samples", samples, 1), _count("seed", seed, 0)
+    samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = number("confidence", confidence)
     if not 0.0 < confidence < 1.0:
         raise InputError(f"confidence is {confidence:g}, expected a share between 0 and 1")
@@ -194,6 +197,11 @@ def validity(
         raise InputError(
             f"the displacements are {shown(largest)}; expected none negative, and an attitude "
             "below 175 deg, where the chart ends"
+        )
+    if max(largest.values()) > _FARTHEST:
+        raise InputError(
+            f"the displacements are {shown(largest)}; expected none beyond {_FARTHEST:g}, where no "
+            "loop settles"
         )
     there = {name.partition(".")[0] for name in lin.state_names}
     groups = {"attitude": "q_b", "position": "r_b", "joint": "q_m"}
@@ -262,10 +270,7 @@ def _each(runs: list[Callable[[], Any]], executor: Executor | None) -> Iterator[
 def _checked(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
         raise InputError("expected a fflin.Robot, its fflin.LinearModel and a gain")
-    try:
-        K = np.array(getattr(gain, "K", gain), dtype=float)
-    except (TypeError, ValueError):
-        raise InputError("gain is neither a fflin.Gain nor a matrix of numbers") from None
+    K = as_double("gain", getattr(gain, "K", gain))
     if K.shape != lin.B.T.shape or not np.isfinite(K).all():
         raise InputError(f"K has shape {K.shape}, expected {lin.B.T.shape} of finite numbers")
     loop = Loop(robot, lin, K)
@@ -281,12 +286,6 @@ def _checked(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
             "design the gain with fflin.lqr"
         )
     return loop
-
-
-def _count(name: str, value: Any, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise InputError(f"{name} is {value!r}, expected a whole number of at least {least}")
-    return int(value)
 
 
 def _times(loop: Loop, horizon: float) -> Array:
