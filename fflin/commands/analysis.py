@@ -106,7 +106,9 @@ def _momentum(lin: LinearModel) -> str:
             )
         elif not lin.is_equilibrium():
             text = "none can be split off: the model is one of a point that moves on"
-    return textwrap.fill(text, width())
+        text = "\n".join((text, *(f"note: {note}" for note in reduced.notes)))
+    lines = (textwrap.fill(line, width(), subsequent_indent="  ") for line in text.splitlines())
+    return "\n".join(lines)
 
 
 def _validity(arguments: argparse.Namespace) -> int:
