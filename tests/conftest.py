@@ -1,5 +1,11 @@
 """Robots and points that several test files share."""
 
+import os
+
+# Matrices are small and the tests run side by side: threads would only wait for one another.
+# Before NumPy is loaded, and for the processes that tests start.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import numpy as np
 import pinocchio as pin
 import pytest

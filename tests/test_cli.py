@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import BUNDLED
+from patience import PATIENCE
 
 import fflin
 from fflin.robots import bundled_directory
@@ -23,7 +24,7 @@ def run(*arguments, cwd=None, **environment):
         text=True,
         cwd=cwd,
         env={**os.environ, **environment},
-        timeout=60,
+        timeout=PATIENCE,
         check=False,
     )
     return done.returncode, done.stdout, without_warnings(done.stderr)

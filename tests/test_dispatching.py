@@ -9,6 +9,7 @@ from multiprocessing import get_context
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from test_sweeping import assert_same, points, singular_at
 
 import fflin
@@ -168,8 +169,8 @@ def test_a_worker_that_is_killed_in_the_middle_of_its_result_harms_no_other():
         lost = workers.submit(half_sent)
         kept = [workers.submit(pow, 2, each) for each in range(9)]
         with pytest.raises(WorkerDied):
-            lost.result(timeout=60)
-        assert [each.result(timeout=60) for each in kept] == [2**each for each in range(9)]
+            lost.result(timeout=PATIENCE)
+        assert [each.result(timeout=PATIENCE) for each in kept] == [2**each for each in range(9)]
     finally:
         workers.shutdown()
     with pytest.raises(RuntimeError):
@@ -180,7 +181,7 @@ def test_a_worker_that_is_killed_in_the_middle_of_its_result_harms_no_other():
     "task, end",
     [
         ("time.sleep, 3", "os.kill(os.getpid(), signal.SIGKILL)"),
-        ("time.sleep, 99", "workers.shutdown()"),
+        ("time.sleep, 9999", "workers.shutdown()"),
     ],
 )
 def test_no_worker_outlives_its_caller(task, end, tmp_path):
@@ -194,7 +195,7 @@ def test_no_worker_outlives_its_caller(task, end, tmp_path):
         f"    {end}\n"
     )
     # The workers have the same stdout, which ends with the last of them.
-    subprocess.run([sys.executable, script], stdout=subprocess.PIPE, timeout=30, check=False)
+    subprocess.run([sys.executable, script], stdout=subprocess.PIPE, timeout=PATIENCE, check=False)
 
 
 def test_workers_that_cannot_start_are_one_line(tmp_path):
@@ -208,7 +209,7 @@ def test_workers_that_cannot_start_are_one_line(tmp_path):
         "    raise SystemExit(3)\n"
     )
     command = [sys.executable, "-W", "ignore", script]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert done.returncode == 3
     assert 'call sweep under `if __name__ == "__main__":`' in done.stdout
 
@@ -268,9 +269,13 @@ def test_a_singular_configuration_is_named_by_processes_too(pool):
 def test_dask(robot, monkeypatch):
     """A local cluster of two processes, of which one is killed on the way."""
     distributed = pytest.importorskip("distributed")
+    import dask
+
+    waits = ("connect", "tcp")
     with (
+        dask.config.set({f"distributed.comm.timeouts.{each}": f"{PATIENCE} s" for each in waits}),
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
         ) as cluster,
         distributed.Client(cluster) as client,
     ):

@@ -9,9 +9,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import pytest
+from patience import PATIENCE
 from reader_corpus import ACCEPT, CASES, REFUSE, WARN
 
-TIME_LIMIT = 20  # [s]
+TIME_LIMIT = 20  # [s] of the processor
 MEMORY_LIMIT = 4 * 2**20  # [KiB]
 
 
@@ -36,11 +37,11 @@ def run(case, folder):
     else:
         command = ["check", str(path)]
     before = set(os.listdir(folder))
-    shell = ["sh", "-c", f'ulimit -v {MEMORY_LIMIT}; exec "$@"', "sh"]
+    shell = ["sh", "-c", f'ulimit -v {MEMORY_LIMIT} -t {TIME_LIMIT}; exec "$@"', "sh"]
     result = subprocess.run(
         [*shell, sys.executable, "-m", "fflin", *command],
         capture_output=True,
-        timeout=TIME_LIMIT,
+        timeout=PATIENCE,
         check=False,
         env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONWARNINGS": "default"},
         cwd=folder,

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from example_robot_data.robots_loader import getModelPath
+from patience import PATIENCE
 
 import fflin
 from fflin.errors import FflinError
@@ -119,7 +120,7 @@ thread.join()
 def test_deep_chain_in_a_thread_of_small_stack():
     # Pinocchio itself overruns such a stack between 200 and 400 links.
     result = subprocess.run(
-        [sys.executable, "-c", CHAIN], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", CHAIN], capture_output=True, text=True, timeout=PATIENCE, check=False
     )
     assert (result.stdout.strip(), result.stderr) == ("1000.0", "")
 
