@@ -9,9 +9,19 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import pinocchio as pin
 import pytest
+import scipy.linalg  # noqa: F401 - whose OpenBLAS is another than NumPy's
+from threadpoolctl import threadpool_info
 
 import fflin
 from fflin.robots import bundled_directory
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Say for which processor the linear algebra was made, where its last digits come from."""
+    pools = threadpool_info()
+    cores = sorted({pool["architecture"] for pool in pools if pool["internal_api"] == "openblas"})
+    terminalreporter.write_line(f"OpenBLAS ran its kernels for {', '.join(cores)}")
+
 
 BUNDLED = tuple(sorted(path.stem for path in bundled_directory().glob("*.urdf")))
 FRAMES = ("hybrid", "local", "world")
