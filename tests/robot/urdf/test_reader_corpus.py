@@ -38,7 +38,7 @@ def run(case, folder):
     else:
         command = ["check", str(path)]
     before = set(os.listdir(folder))
-    shell = ["sh", "-c", f'ulimit -v {MEMORY_LIMIT} -t {TIME_LIMIT}; exec "$@"', "sh"]
+    shell = ["sh", "-c", f'ulimit -v {MEMORY_LIMIT}; ulimit -t {TIME_LIMIT}; exec "$@"', "sh"]
     result = subprocess.run(
         [*shell, sys.executable, "-m", "fflin", *command],
         capture_output=True,
