@@ -1,10 +1,19 @@
 """Fixtures that several test files share."""
 
+import contextlib
+import getpass
 import os
+import tempfile
+from pathlib import Path
 
 # Matrices are small and the tests run side by side: threads would only wait for one another.
 # Before NumPy is loaded, and for the processes that tests start.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# What these packages keep stays in the checkout, and out of the home directory.
+_KEPT = Path(__file__).parents[1] / ".pytest_cache"
+os.environ.setdefault("MPLCONFIGDIR", str(_KEPT / "matplotlib"))
+os.environ.setdefault("DASK_CONFIG", str(_KEPT / "dask"))
 
 import pytest
 import scipy.linalg  # noqa: F401 - whose OpenBLAS is another than NumPy's
@@ -19,6 +28,13 @@ def pytest_terminal_summary(terminalreporter):
     pools = threadpool_info()
     cores = sorted({pool["architecture"] for pool in pools if pool["internal_api"] == "openblas"})
     terminalreporter.write_line(f"OpenBLAS ran its kernels for {', '.join(cores)}")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish():
+    """Remove the directory above those of the tests, unless one that failed is kept in it."""
+    with contextlib.suppress(OSError):
+        Path(tempfile.gettempdir(), f"pytest-of-{getpass.getuser()}").rmdir()
 
 
 @pytest.fixture(scope="session")
