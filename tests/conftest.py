@@ -11,9 +11,8 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # What these packages keep stays in the checkout, and out of the home directory.
-_KEPT = Path(__file__).parents[1] / ".pytest_cache"
-os.environ.setdefault("MPLCONFIGDIR", str(_KEPT / "matplotlib"))
-os.environ.setdefault("DASK_CONFIG", str(_KEPT / "dask"))
+os.environ.setdefault("MPLCONFIGDIR", str(Path(__file__).parents[1] / ".pytest_cache/matplotlib"))
+os.environ.setdefault("DASK_CONFIG", str(Path(__file__).parents[1] / ".pytest_cache/dask"))
 
 import pytest
 import scipy.linalg  # noqa: F401 - whose OpenBLAS is another than NumPy's
