@@ -13,6 +13,7 @@ import pytest
 import fflin
 from fflin.base.tables import matrix
 from fflin.robot.catalog import bundled_directory
+from tests.support.patience import PATIENCE
 from tests.support.robots import BUNDLED
 
 
@@ -24,7 +25,7 @@ def run(*arguments, cwd=None, **environment):
         text=True,
         cwd=cwd,
         env={**os.environ, **environment},
-        timeout=60,
+        timeout=PATIENCE,
         check=False,
     )
     return done.returncode, done.stdout, without_warnings(done.stderr)
