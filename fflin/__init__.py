@@ -91,7 +91,7 @@ _PUBLIC = {
     "momentum_reduction": "momentum",
     "observability": "observation",
     "plot_matrices": "model_plots",
-    "plot_motion": "plots",
+    "plot_motion": "motion",
     "plot_poles": "model_plots",
     "plot_validity": "model_plots",
     "random_configurations": "configurations",
@@ -144,7 +144,7 @@ if TYPE_CHECKING:
         generalized_jacobian,
         momentum_reduction,
     )
-    from fflin.motion import Motion
+    from fflin.motion import Motion, plot_motion
     from fflin.observation import Observability, observability
     from fflin.output_feedback import OutputFeedback
     from fflin.outputs import (
@@ -159,7 +159,6 @@ if TYPE_CHECKING:
         JointVelocities,
         Momentum,
     )
-    from fflin.plots import plot_motion
     from fflin.points import effort, velocity
     from fflin.policies import Allocation, StateFeedback, TrajectoryFeedback
     from fflin.region import Validity, validity

@@ -6,19 +6,12 @@ import numpy as np
 
 from fflin.control import Channel
 from fflin.linear_model import LinearModel
+from fflin.plan import Times
 from fflin.validation import Array
 
 
 def predict(
-    lin: LinearModel,
-    K: Array,
-    limits: tuple[Array, Array],
-    sample: int,
-    delay: int,
-    x: Array,
-    dt: float,
-    steps: int,
-    every: int,
+    lin: LinearModel, K: Array, limits: tuple[Array, Array], times: Times, x: Array, steps: int
 ) -> Array:
     """Return the states (rows, nx) of the linear model in closed loop.
 
@@ -28,15 +21,13 @@ def predict(
         Continuous, or sampled with the time of the samples.
     K : ndarray (nu, nx)
     limits : tuple of ndarray (nu,)
-    sample, delay : int
-        In steps, as `Channel` takes them.
+    times : Times
     x : ndarray (nx,)
         Where it begins.
-    dt : float
-        Step [s].
-    steps, every : int
-        Steps in all, and from one row to the next; the last step has a row in any case.
+    steps : int
+        That are taken; the last one has a row in any case.
     """
+    dt, _, every, sample, delay = times
     x0, u0 = lin.x0, lin.u0
 
     def law(e: Array) -> Array:

@@ -5,21 +5,29 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from fflin.recording import check_prediction, motion_of
-from fflin.run import Run
+import numpy as np
+import pinocchio as pin
+
+from fflin.conservation import Conserved
+from fflin.dynamics import Plant
+from fflin.errors import InputError
+from fflin.linear_loop import predict
+from fflin.linear_model import LinearModel
+from fflin.motion import Motion
+from fflin.plan import Plan, make_plan, start_of
+from fflin.readout import states_of
+from fflin.run import Record, go
+from fflin.state import StateMap
+from fflin.validation import Array
 
 if TYPE_CHECKING:
-    import pinocchio as pin
     from numpy.typing import ArrayLike
 
     from fflin.dynamics import Disturbance
-    from fflin.linear_model import LinearModel
     from fflin.model import Robot
-    from fflin.motion import Motion
+    from fflin.plan import Event
     from fflin.policies import Policy, StateFeedback
-    from fflin.run import Event
     from fflin.state import Frame
-    from fflin.validation import Array
 
 
 def simulate(
@@ -48,9 +56,10 @@ def simulate(
     r"""Simulate a robot under a policy.
 
     Steps of fixed size on the manifold, by default of the commutator-free method CF4 of order 4.
-    After each step the velocity of the base is set so that the momentum is what the impulse from
-    outside makes it, :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`, where H is integrated with
-    the weights of the method. Thrusters never pull: a negative thrust is cut to zero.
+    After each step the base is shifted so that the centre of mass is where momentum and impulse
+    take it, and its velocity is set so that the momentum is what the impulse from outside makes
+    it, :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`, where H is integrated with the weights of
+    the method. Thrusters never pull: a negative thrust is cut to zero.
 
     Parameters
     ----------
@@ -71,7 +80,7 @@ def simulate(
         Where the input is neither sampled nor late, it is made to divide the duration.
     method : {"cf4", "rkmk4", "semi_implicit_euler"}
     project : bool
-        Whether the momentum is kept as above.
+        Whether momentum and centre of mass are kept as above.
     sample : float, optional
         Time [s] between the samples of the policy, a multiple of dt, between which u is held; by
         default that of the policy's model where it is sampled, else the policy is asked at every
@@ -116,11 +125,97 @@ def simulate(
     ----------
     E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
     """
-    run = Run(robot, policy, frame, reference, disturbance)
-    check_prediction(run, linear)
-    run.begin(x0, q0, v0)
-    run.clock(duration, dt, every, sample, delay)
-    run.actuate(limits)
-    run.choose(method, project)
-    run.guard(events, callback)
-    return motion_of(run, run.go(progress), linear)
+    own = getattr(policy, "lin", None)
+    lin = own if isinstance(own, LinearModel) else None
+    if lin is not None:
+        if frame is not None or reference is not None:
+            raise InputError("frame and reference are those of the policy's model; leave out")
+        frame, reference = lin.frame, lin.reference
+    state = StateMap(robot, reference=reference, frame=frame or "hybrid")
+    plant = Plant(state, disturbance)
+    predictor = _predictor(plant, policy, lin, linear)
+    plan = make_plan(
+        *(plant, policy, lin, start_of(state, x0, q0, v0)),
+        duration=duration,
+        dt=dt,
+        every=every,
+        sample=sample,
+        delay=delay,
+        limits=limits,
+        method=method,
+        project=project,
+        events=events,
+        callback=callback,
+    )
+    conserved = Conserved(robot, plan.q)
+    record = go(plan, plant, conserved, progress)
+
+    target = None if lin is None else _target(state, lin)
+    near = target if x0 is None else np.asarray(x0, dtype=float)
+    x = states_of(state, record.q, record.v, near)
+    history = conserved.histories(record.q, record.v)
+    return Motion(
+        t=record.t,
+        q=record.q,
+        v=record.v,
+        x=x,
+        u=record.u,
+        target=x[0] if target is None else target,
+        prediction=_prediction(predictor, policy, plan, record, x),
+        energy=history.energy,
+        momentum=np.roll(history.momentum, 3, axis=1),
+        momentum_drift=conserved.drift(history, record.momentum),
+        com_drift=np.linalg.norm(history.center - record.center, axis=1),
+        placement=pin.SE3ToXYZQUAT(state.reference),
+        state_names=state.names,
+        input_names=plant.actuation.names,
+        state_units=state.units,
+        input_units=plant.actuation.units,
+        frame=state.frame,
+        robot=robot.name,
+        urdf_sha256=robot.urdf_sha256,
+        stopped=record.stopped,
+    )
+
+
+def _predictor(
+    plant: Plant, policy: Any, own: LinearModel | None, linear: Any
+) -> LinearModel | None:
+    """Return the model that predicts the run: the policy's own one, or the one that is given."""
+    if linear is None or isinstance(linear, bool | np.bool_):
+        fits = own is not None and own.state_names == plant.state.names
+        wanted = linear is None or bool(linear)
+        return own if wanted and fits and hasattr(policy, "K") else None
+    if not isinstance(linear, LinearModel):
+        raise InputError(
+            f"linear is a {type(linear).__name__}, expected a fflin.LinearModel, True or False"
+        )
+    names = (plant.state.names, plant.actuation.names, plant.state.frame)
+    if (linear.state_names, linear.input_names, linear.frame) != names or linear.moving:
+        raise InputError(
+            f"linear is a model of '{linear.robot}' that has not the states, inputs and frame of "
+            f"the run of '{plant.robot.name}'; linearise that robot in the policy's frame"
+        )
+    if not hasattr(policy, "K"):
+        raise InputError("linear predicts under a StateFeedback alone; leave it out")
+    return linear
+
+
+def _prediction(
+    lin: LinearModel | None, policy: Any, plan: Plan, record: Record, x: Array
+) -> Array:
+    """Return the states (N, nx) that the model predicts; no rows where it predicts none."""
+    none: Array = np.zeros((0, x.shape[1]))
+    if lin is None:
+        return none
+    # A prediction that overflows is none.
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = predict(lin, policy.K, plan.limits, plan.times, x[0], record.steps)[: len(x)]
+    return found if len(found) == len(x) and np.isfinite(found).all() else none
+
+
+def _target(state: StateMap, lin: LinearModel) -> Array:
+    """Return the state (nx,) that a feedback about a model's point steers to."""
+    target = state.read(lin.q, lin.v)
+    target[[state.names.index(name) for name in lin.state_names]] = lin.x0
+    return target
