@@ -2,6 +2,6 @@
 
 import sys
 
-from fflin.cli import main
+from fflin.commands.cli import main
 
 sys.exit(main())

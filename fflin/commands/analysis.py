@@ -8,15 +8,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fflin.base.errors import InputError
 from fflin.commands import DONE
 from fflin.commands.arguments import Commands, add_point, command, number
 from fflin.commands.points import linear_model
 from fflin.commands.regulator import add_weights, gain_of
 from fflin.commands.visual import check_figure
-from fflin.errors import InputError
 
 if TYPE_CHECKING:
-    from fflin.linear_model import LinearModel
+    from fflin.linear.model import LinearModel
 
 
 def add_commands(commands: Commands) -> None:
@@ -73,9 +73,9 @@ def add_commands(commands: Commands) -> None:
 
 
 def _analyze(arguments: argparse.Namespace) -> int:
-    from fflin.eigenmodes import modes
-    from fflin.observation import observability
-    from fflin.structure import controllability
+    from fflin.analysis.controllability import controllability
+    from fflin.analysis.modes import modes
+    from fflin.analysis.observability import observability
 
     _, lin = linear_model(arguments)
     parts = {
@@ -89,8 +89,8 @@ def _analyze(arguments: argparse.Namespace) -> int:
 
 
 def _momentum(lin: LinearModel) -> str:
-    from fflin.momentum import momentum_reduction
-    from fflin.tables import width
+    from fflin.analysis.momentum import momentum_reduction
+    from fflin.base.tables import width
 
     try:
         reduced = momentum_reduction(lin)
@@ -112,8 +112,8 @@ def _momentum(lin: LinearModel) -> str:
 def _validity(arguments: argparse.Namespace) -> int:
     from concurrent.futures import ProcessPoolExecutor
 
-    from fflin.momentum import momentum_reduction
-    from fflin.region import validity
+    from fflin.analysis.momentum import momentum_reduction
+    from fflin.analysis.validity import validity
 
     if arguments.jobs < 1:
         raise InputError(f"--jobs is {arguments.jobs}, expected at least 1")
@@ -141,7 +141,7 @@ def _validity(arguments: argparse.Namespace) -> int:
             found = measure(executor=executor)
     print(found)
     if arguments.plot:
-        from fflin.model_plots import plot_validity
+        from fflin.analysis.plots import plot_validity
 
         plot_validity(found, arguments.plot)
         print(f"wrote {arguments.plot}")

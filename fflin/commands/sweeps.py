@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fflin.base.errors import FileError, InputError, MissingPackageError
 from fflin.commands import DONE
 from fflin.commands.arguments import (
     Commands,
@@ -22,14 +23,13 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import configuration_of, load_robot, once, velocity_of
-from fflin.errors import FileError, InputError, MissingPackageError
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from fflin.configurations import Configurations
-    from fflin.model import Robot
-    from fflin.validation import Array
+    from fflin.base.validation import Array
+    from fflin.batch.configurations import Configurations
+    from fflin.robot.robot import Robot
 
 # Beyond this the user is asked whether it is meant.
 _LARGE = 10e9
@@ -149,10 +149,10 @@ def _count(text: str) -> int:
 def _sweep(arguments: argparse.Namespace) -> int:
     import pinocchio as pin
 
-    from fflin.batch_room import part_of
-    from fflin.points import effort
-    from fflin.progress import Progress
-    from fflin.sweeping import output_path, sweep
+    from fflin.base.progress import Progress
+    from fflin.batch.space import part_of
+    from fflin.batch.sweep import output_path, sweep
+    from fflin.dynamics.points import effort
 
     path = arguments.output_file
     if path is None:
@@ -205,8 +205,8 @@ class _Announcement:
         self._said = ""
 
     def __call__(self, count: int, *, at_rest: bool) -> None:
-        from fflin.batch_room import check_room, part_of, readable
-        from fflin.sweeping import planned_bytes
+        from fflin.batch.space import check_room, part_of, readable
+        from fflin.batch.sweep import planned_bytes
 
         size = planned_bytes(self._robot, count, at_rest=at_rest, **self._options)
         said = f"{count:,} points of '{self._robot.name}', {readable(size)}"
@@ -232,8 +232,8 @@ def _points(
     """Return q, v and u of the points."""
     import numpy as np
 
-    from fflin.configurations import grid, random_configurations
-    from fflin.sweep_task import as_configurations
+    from fflin.batch.configurations import grid, random_configurations
+    from fflin.batch.task import as_configurations
 
     kinds = [bool(arguments.grid), arguments.random is not None, bool(arguments.configurations)]
     if sum(kinds) != 1:

@@ -1,0 +1,221 @@
+"""Simulation of the nonlinear robot on the manifold, under any policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import states_of
+from fflin.linear.model import LinearModel
+from fflin.simulation.conservation import Conserved
+from fflin.simulation.motion import Motion
+from fflin.simulation.plan import Plan, make_plan, start_of
+from fflin.simulation.plant import Plant
+from fflin.simulation.prediction import predict
+from fflin.simulation.run import Record, go
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from fflin.control.policies import Policy, StateFeedback
+    from fflin.dynamics.state import Frame
+    from fflin.robot.robot import Robot
+    from fflin.simulation.plan import Event
+    from fflin.simulation.plant import Disturbance
+
+
+def simulate(
+    robot: Robot,
+    policy: Policy | StateFeedback | Any = None,
+    *,
+    x0: ArrayLike | None = None,
+    q0: ArrayLike | None = None,
+    v0: ArrayLike | None = None,
+    duration: float,
+    dt: float | None = None,
+    method: str = "cf4",
+    project: bool = True,
+    sample: float | None = None,
+    delay: float = 0.0,
+    limits: float | Mapping[str, Any] | None = None,
+    disturbance: Disturbance | None = None,
+    events: Sequence[Event] = (),
+    callback: Callable[[float, Array, Array, Array], None] | None = None,
+    linear: LinearModel | bool | None = None,
+    frame: Frame | None = None,
+    reference: pin.SE3 | None = None,
+    every: int = 1,
+    progress: bool | None = None,
+) -> Motion:
+    r"""Simulate a robot under a policy.
+
+    Steps of fixed size on the manifold, by default of the commutator-free method CF4 of order 4.
+    After each step the base is shifted so that the centre of mass is where momentum and impulse
+    take it, and its velocity is set so that the momentum is what the impulse from outside makes
+    it, :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`, where H is integrated with the weights of
+    the method. Thrusters never pull: a negative thrust is cut to zero.
+
+    Parameters
+    ----------
+    robot : Robot
+    policy : callable, optional
+        policy(t, q, v) -> u (nu,) over the robot's inputs, such as
+        ``StateFeedback(lin, gain.K)``; none acts by default.
+    x0 : array_like (nx,), optional
+        Initial state in the chart of the policy's model, or of `frame` and `reference`.
+    q0 : array_like (nq,), optional
+    v0 : array_like (nv,), optional
+        Initial configuration and velocity in Pinocchio's order, instead of `x0`; neutral and at
+        rest by default.
+    duration : float
+        [s]
+    dt : float, optional
+        Step [s]; by default 0.01, or less where the loop's fastest pole or the samples ask for it.
+        Where the input is neither sampled nor late, it is made to divide the duration.
+    method : {"cf4", "rkmk4", "semi_implicit_euler"}
+    project : bool
+        Whether momentum and centre of mass are kept as above.
+    sample : float, optional
+        Time [s] between the samples of the policy, a multiple of dt, between which u is held; by
+        default that of the policy's model where it is sampled, else the policy is asked at every
+        stage of every step.
+    delay : float
+        Time [s] from a sample to its effect, a multiple of dt; until then u0 of the policy's
+        model acts, or nothing. Where there is a delay and no `sample`, samples are dt apart.
+    limits : float or mapping, optional
+        Largest magnitude of all inputs, or {input or group: magnitude, or (least, largest)}.
+    disturbance : callable, optional
+        disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order.
+    events : sequence of callable
+        event(t, q, v) -> float; the run ends after the step in which one is no longer positive.
+    callback : callable, optional
+        callback(t, q, v, u), called at every recorded row.
+    linear : LinearModel or bool, optional
+        Predicts the motion under the same law; by default the policy's own model, False for none.
+        Sampled, it does so where every row is at a sample.
+    frame : {"hybrid", "local", "world"}, optional
+    reference : pin.SE3, optional
+        Chart of x and axes of u; the policy's model's by default, else hybrid and the identity.
+    every : int
+        Steps from one recorded row to the next.
+    progress : bool, optional
+        Whether a bar is shown on stderr; by default on a terminal, for runs that take long.
+
+    Returns
+    -------
+    Motion
+        Ended early, ``stopped`` says why: an event, an interrupt (Ctrl-C), or a loop that left
+        the chart or diverged.
+
+    Raises
+    ------
+    InputError
+        If an argument has a wrong size or value, a policy or disturbance returns what is no
+        input or force, or dt is too large for the loop.
+    UnknownNameError
+        If there is no such method or input.
+
+    References
+    ----------
+    E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
+    """
+    own = getattr(policy, "lin", None)
+    lin = own if isinstance(own, LinearModel) else None
+    if lin is not None:
+        if frame is not None or reference is not None:
+            raise InputError("frame and reference are those of the policy's model; leave out")
+        frame, reference = lin.frame, lin.reference
+    state = StateMap(robot, reference=reference, frame=frame or "hybrid")
+    plant = Plant(state, disturbance)
+    predictor = _predictor(plant, policy, lin, linear)
+    plan = make_plan(
+        *(plant, policy, lin, start_of(state, x0, q0, v0)),
+        duration=duration,
+        dt=dt,
+        every=every,
+        sample=sample,
+        delay=delay,
+        limits=limits,
+        method=method,
+        project=project,
+        events=events,
+        callback=callback,
+    )
+    conserved = Conserved(robot, plan.q)
+    record = go(plan, plant, conserved, progress)
+
+    target = None if lin is None else _target(state, lin)
+    near = target if x0 is None else np.asarray(x0, dtype=float)
+    x = states_of(state, record.q, record.v, near)
+    history = conserved.histories(record.q, record.v)
+    return Motion(
+        t=record.t,
+        q=record.q,
+        v=record.v,
+        x=x,
+        u=record.u,
+        target=x[0] if target is None else target,
+        prediction=_prediction(predictor, policy, plan, record, x),
+        energy=history.energy,
+        momentum=np.roll(history.momentum, 3, axis=1),
+        momentum_drift=conserved.drift(history, record.momentum),
+        com_drift=np.linalg.norm(history.center - record.center, axis=1),
+        placement=pin.SE3ToXYZQUAT(state.reference),
+        state_names=state.names,
+        input_names=plant.actuation.names,
+        state_units=state.units,
+        input_units=plant.actuation.units,
+        frame=state.frame,
+        robot=robot.name,
+        urdf_sha256=robot.urdf_sha256,
+        stopped=record.stopped,
+    )
+
+
+def _predictor(
+    plant: Plant, policy: Any, own: LinearModel | None, linear: Any
+) -> LinearModel | None:
+    """Return the model that predicts the run: the policy's own one, or the one that is given."""
+    if linear is None or isinstance(linear, bool | np.bool_):
+        fits = own is not None and own.state_names == plant.state.names
+        wanted = linear is None or bool(linear)
+        return own if wanted and fits and hasattr(policy, "K") else None
+    if not isinstance(linear, LinearModel):
+        raise InputError(
+            f"linear is a {type(linear).__name__}, expected a fflin.LinearModel, True or False"
+        )
+    names = (plant.state.names, plant.actuation.names, plant.state.frame)
+    if (linear.state_names, linear.input_names, linear.frame) != names or linear.moving:
+        raise InputError(
+            f"linear is a model of '{linear.robot}' that has not the states, inputs and frame of "
+            f"the run of '{plant.robot.name}'; linearise that robot in the policy's frame"
+        )
+    if not hasattr(policy, "K"):
+        raise InputError("linear predicts under a StateFeedback alone; leave it out")
+    return linear
+
+
+def _prediction(
+    lin: LinearModel | None, policy: Any, plan: Plan, record: Record, x: Array
+) -> Array:
+    """Return the states (N, nx) that the model predicts; no rows where it predicts none."""
+    none: Array = np.zeros((0, x.shape[1]))
+    if lin is None:
+        return none
+    # A prediction that overflows is none.
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = predict(lin, policy.K, plan.limits, plan.times, x[0], record.steps)[: len(x)]
+    return found if len(found) == len(x) and np.isfinite(found).all() else none
+
+
+def _target(state: StateMap, lin: LinearModel) -> Array:
+    """Return the state (nx,) that a feedback about a model's point steers to."""
+    target = state.read(lin.q, lin.v)
+    target[[state.names.index(name) for name in lin.state_names]] = lin.x0
+    return target
