@@ -60,11 +60,6 @@ class Conserved:
         self._free = self._root.isIdentity(0.0)
         self._stored = robot.stored_momentum
 
-    def momentum(self, q: Array, v: Array) -> Array:
-        """Return the momentum (6,) about the point."""
-        history = self.histories(q[None], v[None])
-        return self.about_point(history)[0]
-
     def about_point(self, history: Histories) -> Array:
         """Return the momentum (N, 6) about the point."""
         total = history.momentum.copy()
@@ -182,15 +177,6 @@ class Course:
     where w is summed with the weights of the integrator's stages, and p with those of its
     positions.
 
-    Parameters
-    ----------
-    conserved : Conserved
-    method : type of Integrator
-    dt : float
-        Step [s].
-    q, v : ndarray (nq,), (nv,)
-        Where the motion begins.
-
     Attributes
     ----------
     momentum : ndarray (6,)
@@ -200,10 +186,10 @@ class Course:
     """
 
     def __init__(
-        self, conserved: Conserved, method: type[Integrator], dt: float, q: Array, v: Array
+        self, conserved: Conserved, method: type[Integrator], h: float, q: Array, v: Array
     ) -> None:
         history = conserved.histories(q[None], v[None])
-        h, per_mass = dt, 1.0 / conserved.mass
+        per_mass = 1.0 / conserved.mass
         self.momentum: Array = conserved.about_point(history)[0]
         self._momentum, self._start = self.momentum, history.center[0]
         # The line that is followed while nothing pushes: place and velocity.

@@ -10,7 +10,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, number
-from fflin.control.channel import Channel, Law, limits_of
+from fflin.control.channel import Channel, Law
 from fflin.control.policies import Allocation, bound
 from fflin.dynamics.state import StateMap
 from fflin.linear.ignorable import rotor_names
@@ -29,25 +29,14 @@ _MOST_ENTRIES = 500_000_000
 
 
 class Times(NamedTuple):
-    """The step `dt` [s], and how many steps there are in all and between what happens.
-
-    Attributes
-    ----------
-    dt : float
-    steps : int
-    every : int
-        From one recorded row to the next.
-    sample : int
-        Between samples of the law; 0 where it is asked at every stage of every step.
-    delay : int
-        From a sample to its effect.
-    """
+    """The step `dt` [s], and how many steps there are in all and between what happens."""
 
     dt: float
     steps: int
-    every: int
-    sample: int
-    delay: int
+    every: int  # from one recorded row to the next
+    sample: int  # between samples of the law; 0 where it is asked at every stage of every step
+    delay: int  # from a sample to its effect
+    fastest: float  # magnitude of the loop's poles [1/s]; 0 where it is not known
 
     @property
     def rows(self) -> int:
@@ -62,40 +51,18 @@ class Times(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A simulation to be done, which nothing changes while it runs.
+    """A simulation to be done, which nothing changes while it runs: arrays and whole numbers."""
 
-    Attributes
-    ----------
-    q, v : ndarray (nq,), (nv,)
-        Where it begins.
-    times : Times
-    law : Law or None
-        Nothing but `initial` acts where there is none.
-    initial : ndarray (nu,)
-        What acts until the first command arrives.
-    limits : tuple of ndarray (nu,)
-        Least and largest value of each input.
-    method : type of Integrator
-    project : bool
-        Whether momentum and centre of mass are kept.
-    turning : ndarray of int
-        The velocities whose turn within a step has a bound.
-    chart : StateMap or None
-        The run ends where the base leaves it.
-    events : tuple of callable
-    callback : callable or None
-    """
-
-    q: Array
-    v: Array
+    q: Array  # (nq,)
+    v: Array  # (nv,)
     times: Times
-    law: Law | None
-    initial: Array
-    limits: tuple[Array, Array]
+    law: Law | None  # nothing but `initial` acts where there is none
+    initial: Array  # (nu,), what acts until the first command arrives
+    limits: tuple[Array, Array]  # least and largest value (nu,) of each input
     method: type[Integrator]
-    project: bool
-    turning: Array
-    chart: StateMap | None
+    project: bool  # whether momentum and centre of mass are kept
+    turning: Array  # the velocities whose turn within a step has a bound
+    chart: StateMap | None  # that ends the run where the base leaves it
     events: tuple[Event, ...]
     callback: Callback | None
 
@@ -104,56 +71,6 @@ class Plan:
         if self.law is None:
             return None
         return Channel(self.law, self.initial, *self.limits, self.times.sample, self.times.delay)
-
-
-def make_plan(
-    plant: Plant,
-    policy: Any,
-    lin: LinearModel | None,
-    start: tuple[Array, Array],
-    *,
-    duration: float,
-    dt: float | None,
-    every: int,
-    sample: float | None,
-    delay: float,
-    limits: Any,
-    method: str,
-    project: bool,
-    events: Sequence[Event],
-    callback: Callback | None,
-) -> Plan:
-    """Return the plan of a simulation; `simulate` says what its arguments mean.
-
-    `lin` is the policy's model, where it has one.
-    """
-    robot, names = plant.robot, plant.actuation.names
-    if sample is None:
-        sample = getattr(getattr(policy, "lin", None), "dt", None) or None
-    fastest = 0.0 if sample else _fastest_pole(policy, lin)
-    times = times_of(duration, dt, every, sample, delay, fastest=fastest)
-    if times.rows * (robot.nq + robot.nv + 2 * plant.state.nx) > _MOST_ENTRIES:
-        raise InputError(
-            f"{duration:g} s in steps of {times.dt:g} s are {times.rows:.3g} rows; take a larger "
-            "dt or `every`"
-        )
-    within = limits_of(plant.actuation, limits)
-    # The model's inputs are others where they are allocated to the robot's.
-    same = lin is not None and lin.input_names == names
-    decide = None if policy is None else bound(policy, robot)
-    return Plan(
-        *start,
-        times=times,
-        law=None if decide is None else Law(decide, names, within, times.slow),
-        initial=lin.u0 if lin is not None and same else np.zeros(len(names)),
-        limits=within,
-        method=method_of(method, times.dt, fastest),
-        project=bool(project),
-        turning=_turning(robot),
-        chart=None if lin is None else plant.state,
-        events=events_of(events, callback),
-        callback=callback,
-    )
 
 
 def start_of(state: StateMap, x0: Any, q0: Any, v0: Any) -> tuple[Array, Array]:
@@ -175,15 +92,18 @@ def start_of(state: StateMap, x0: Any, q0: Any, v0: Any) -> tuple[Array, Array]:
 
 
 def times_of(
+    policy: Any,
     duration: float,
     dt: float | None,
     every: int,
     sample: float | None,
     delay: float,
-    *,
-    fastest: float = 0.0,
+    width: int,
 ) -> Times:
-    """Return the times of a simulation whose fastest pole [1/s] is given, in steps."""
+    """Return the times of a simulation that records so many numbers in a row."""
+    if sample is None:
+        sample = getattr(getattr(policy, "lin", None), "dt", None) or None
+    fastest = 0.0 if sample else _fastest_pole(policy)
     if sample is not None:
         sample = _positive("sample", sample)
     duration, delay = _positive("duration", duration), number("delay", delay)
@@ -209,16 +129,23 @@ def times_of(
         raise InputError(f"every is {every!r}, expected a whole number of steps, 1 or more")
     if sample is None:
         sample = dt if delay else 0.0
-    return Times(dt, steps, int(every), *_whole(dt, sample=sample, delay=delay))
-
-
-def method_of(name: str, dt: float, fastest: float) -> type[Integrator]:
-    """Return the integrator of that name, stable at the fastest pole [1/s] of the loop."""
-    method = integrator(name)
-    if fastest * dt > method.reach:
+    if steps // every * width > _MOST_ENTRIES:
         raise InputError(
-            f"the step dt is {dt:g} s, too large for a loop whose fastest pole is at "
-            f"{fastest:.4g} 1/s; take at most {method.reach / fastest:.2g} s, or `sample`"
+            f"{duration:g} s in steps of {dt:g} s are {steps / every:.3g} rows; take a larger dt "
+            "or `every`"
+        )
+    samples, late = _whole(dt, sample=sample, delay=delay)
+    return Times(dt, steps, int(every), samples, late, fastest)
+
+
+def method_of(name: str, times: Times) -> type[Integrator]:
+    """Return the integrator of that name, stable at the fastest pole of the loop."""
+    method = integrator(name)
+    if times.fastest * times.dt > method.reach:
+        raise InputError(
+            f"the step dt is {times.dt:g} s, too large for a loop whose fastest pole is at "
+            f"{times.fastest:.4g} 1/s; take at most {method.reach / times.fastest:.2g} s, or "
+            "`sample`"
         )
     return method
 
@@ -235,16 +162,23 @@ def events_of(events: Any, callback: Any) -> tuple[Event, ...]:
     return tuple(events)
 
 
-def _fastest_pole(policy: Any, lin: LinearModel | None) -> float:
+def law_of(policy: Any, plant: Plant, limits: tuple[Array, Array], times: Times) -> Law | None:
+    """Return the policy bound to the robot, of which nothing but inputs is taken."""
+    if policy is None:
+        return None
+    return Law(bound(policy, plant.robot), plant.actuation.names, limits, times.slow)
+
+
+def _fastest_pole(policy: Any) -> float:
     """Return the largest magnitude [1/s] of the poles of a continuous loop, where it has any."""
     decides = policy.policy if isinstance(policy, Allocation) else policy
-    K = getattr(decides, "K", None)
-    if lin is None or K is None or lin.dt:
+    lin, K = getattr(policy, "lin", None), getattr(decides, "K", None)
+    if not isinstance(lin, LinearModel) or K is None or lin.dt:
         return 0.0
     return float(np.abs(np.linalg.eigvals(lin.A - lin.B @ K)).max())
 
 
-def _turning(robot: Robot) -> Array:
+def turning(robot: Robot) -> Array:
     """Return where angular velocities stand, less those of rotors.
 
     A rotor may spin as fast as it will: nothing depends on its angle.

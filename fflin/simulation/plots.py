@@ -59,20 +59,7 @@ def draw(
     title: str,
     path: str | Path | None = None,
 ) -> Figure:
-    """Draw states, those of the linear model dashed, inputs and drifts over time.
-
-    Parameters
-    ----------
-    t : ndarray (N,)
-    states, inputs : Signals
-    linear : ndarray (N, nx) or None
-        With it, each group of states has its difference from it below.
-    drifts : mapping
-        {label: (N,)}; one without rows is left out.
-    title : str
-    path : str or Path, optional
-        .png, .pdf or .svg to save to.
-    """
+    """Draw states, those of the linear model dashed, inputs and {label: drift} over time."""
     target = target_of(path)
     with styled() as figure_class:
         both = linear is not None

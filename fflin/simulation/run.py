@@ -23,51 +23,39 @@ _LOOK = 16  # steps between looks at the clock
 
 
 class Record(NamedTuple):
-    """What a run went through: rows of time (N,), motion, inputs and what is conserved.
-
-    Attributes
-    ----------
-    t, q, v, u : ndarray (N, ...)
-    momentum : ndarray (N, 6)
-        As the impulse from outside makes it, see `Conserved`.
-    center : ndarray (N, 3)
-        Of mass, where that momentum takes it.
-    steps : int
-        Steps that were begun.
-    stopped : str
-        Why it ended before its time, if it did.
-    """
+    """What a run went through: rows of time (N,), motion, inputs and what is conserved."""
 
     t: Array
     q: Array
     v: Array
     u: Array
-    momentum: Array
-    center: Array
-    steps: int
-    stopped: str
+    momentum: Array  # (N, 6), as the impulse from outside makes it, see `Conserved`
+    center: Array  # (N, 3), of mass, where that momentum takes it
+    steps: int  # that were begun
+    stopped: str  # why it ended before its time, if it did
 
 
 # A motion that diverges overflows before it is stopped.
 @np.errstate(over="ignore", invalid="ignore")
 def go(plan: Plan, plant: Plant, conserved: Conserved, progress: bool | None = None) -> Record:
-    """Run a plan to its end.
-
-    Parameters
-    ----------
-    plan : Plan
-    plant : Plant
-        The robot that moves.
-    conserved : Conserved
-        Of that robot.
-    progress : bool, optional
-        Whether a bar is shown; see `simulate`.
-    """
+    """Run a plan to its end; `plant` and `conserved` are of the robot that moves."""
     times, q, v = plan.times, plan.q, plan.v
     dt, slow, channel = times.dt, times.slow, plan.channel()
     course = Course(conserved, plan.method, dt, q, v)
     advance = _advance(plan, plant, conserved, course, channel)
-    recorder = _Recorder(plan, course)
+    t_of = np.empty(times.rows)
+    rows = tuple(np.empty((times.rows, size)) for size in (len(q), len(v), len(plan.initial), 6, 3))
+    count = 0
+
+    def record(t: float, u: Array) -> None:
+        nonlocal count
+        t_of[count] = t
+        for row, values in zip(rows, (q, v, u, course.momentum, course.center(t)), strict=True):
+            row[count] = values
+        count += 1
+        if plan.callback is not None:
+            plan.callback(t, q.copy(), v.copy(), u.copy())
+
     step, stopped, project = 0, "", plan.project
     ending, watched = _ending(plan), bool(plan.chart or plan.events)
     bar = Progress(times.steps, progress)
@@ -76,7 +64,7 @@ def go(plan: Plan, plant: Plant, conserved: Conserved, progress: bool | None = N
             t = step * dt
             u = plan.initial if channel is None else channel.begin(step, t, q, v)
             if step % times.every == 0:
-                recorder.add(t, q, v, u)
+                record(t, u)
             q, v = advance(t, q, v, u)
             t = (step + 1) * dt
             if project:
@@ -89,37 +77,15 @@ def go(plan: Plan, plant: Plant, conserved: Conserved, progress: bool | None = N
             if step % _LOOK == 0:
                 bar.update(step + 1)
     except KeyboardInterrupt:
-        if not recorder.count:
+        if not count:
             raise
         stopped = f"interrupted at t = {step * dt:g} s"
     finally:
         bar.close()
     if not stopped.startswith(("diverged", "interrupted")):
-        recorder.add(t, q, v, u)
-    return recorder.record(step + 1, stopped)
-
-
-class _Recorder:
-    """Rows that fill, and the callback that is told of them."""
-
-    def __init__(self, plan: Plan, course: Course) -> None:
-        self._course, self._callback, self.count = course, plan.callback, 0
-        sizes = (len(plan.q), len(plan.v), len(plan.initial), 6, 3)
-        self._t = np.empty(plan.times.rows)
-        self._rows = tuple(np.empty((plan.times.rows, size)) for size in sizes)
-
-    def add(self, t: float, q: Array, v: Array, u: Array) -> None:
-        row, course = self.count, self._course
-        q_of, v_of, u_of, momentum, center = self._rows
-        self._t[row], q_of[row], v_of[row], u_of[row] = t, q, v, u
-        momentum[row], center[row] = course.momentum, course.center(t)
-        self.count += 1
-        if self._callback is not None:
-            self._callback(t, q.copy(), v.copy(), u.copy())
-
-    def record(self, steps: int, stopped: str) -> Record:
-        q, v, u, momentum, center = (rows[: self.count] for rows in self._rows)
-        return Record(self._t[: self.count], q, v, u, momentum, center, steps, stopped)
+        record(t, u)
+    q_of, v_of, u_of, momentum, center = (row[:count] for row in rows)
+    return Record(t_of[:count], q_of, v_of, u_of, momentum, center, step + 1, stopped)
 
 
 def _advance(

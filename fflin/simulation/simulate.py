@@ -10,15 +10,24 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
+from fflin.control.channel import limits_of
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import states_of
 from fflin.linear.model import LinearModel
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.motion import Motion
-from fflin.simulation.plan import Plan, make_plan, start_of
+from fflin.simulation.plan import (
+    Plan,
+    events_of,
+    law_of,
+    method_of,
+    start_of,
+    times_of,
+    turning,
+)
 from fflin.simulation.plant import Plant
 from fflin.simulation.prediction import predict
-from fflin.simulation.run import Record, go
+from fflin.simulation.run import go
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -125,7 +134,8 @@ def simulate(
     ----------
     E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
     """
-    own = getattr(policy, "lin", None)
+    own: Any = getattr(policy, "lin", None)
+    K: Any = getattr(policy, "K", None)
     lin = own if isinstance(own, LinearModel) else None
     if lin is not None:
         if frame is not None or reference is not None:
@@ -133,18 +143,25 @@ def simulate(
         frame, reference = lin.frame, lin.reference
     state = StateMap(robot, reference=reference, frame=frame or "hybrid")
     plant = Plant(state, disturbance)
-    predictor = _predictor(plant, policy, lin, linear)
-    plan = make_plan(
-        *(plant, policy, lin, start_of(state, x0, q0, v0)),
-        duration=duration,
-        dt=dt,
-        every=every,
-        sample=sample,
-        delay=delay,
-        limits=limits,
-        method=method,
-        project=project,
-        events=events,
+    predictor = _predictor(plant, K, lin, linear)
+    q, v = start_of(state, x0, q0, v0)
+    width = robot.nq + robot.nv + 2 * state.nx
+    times = times_of(policy, duration, dt, every, sample, delay, width)
+    within = limits_of(plant.actuation, limits)
+    # The model's inputs are others where they are allocated to the robot's.
+    same = lin is not None and lin.input_names == plant.actuation.names
+    plan = Plan(
+        q=q,
+        v=v,
+        times=times,
+        law=law_of(policy, plant, within, times),
+        initial=lin.u0 if lin is not None and same else np.zeros(len(within[0])),
+        limits=within,
+        method=method_of(method, times),
+        project=bool(project),
+        turning=turning(robot),
+        chart=None if lin is None else state,
+        events=events_of(events, callback),
         callback=callback,
     )
     conserved = Conserved(robot, plan.q)
@@ -161,7 +178,7 @@ def simulate(
         x=x,
         u=record.u,
         target=x[0] if target is None else target,
-        prediction=_prediction(predictor, policy, plan, record, x),
+        prediction=x[:0] if predictor is None else predict(predictor, K, plan, x, record.steps),
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
         momentum_drift=conserved.drift(history, record.momentum),
@@ -179,13 +196,13 @@ def simulate(
 
 
 def _predictor(
-    plant: Plant, policy: Any, own: LinearModel | None, linear: Any
+    plant: Plant, K: Array | None, own: LinearModel | None, linear: Any
 ) -> LinearModel | None:
     """Return the model that predicts the run: the policy's own one, or the one that is given."""
     if linear is None or isinstance(linear, bool | np.bool_):
         fits = own is not None and own.state_names == plant.state.names
         wanted = linear is None or bool(linear)
-        return own if wanted and fits and hasattr(policy, "K") else None
+        return own if wanted and fits and K is not None else None
     if not isinstance(linear, LinearModel):
         raise InputError(
             f"linear is a {type(linear).__name__}, expected a fflin.LinearModel, True or False"
@@ -196,22 +213,9 @@ def _predictor(
             f"linear is a model of '{linear.robot}' that has not the states, inputs and frame of "
             f"the run of '{plant.robot.name}'; linearise that robot in the policy's frame"
         )
-    if not hasattr(policy, "K"):
+    if K is None:
         raise InputError("linear predicts under a StateFeedback alone; leave it out")
     return linear
-
-
-def _prediction(
-    lin: LinearModel | None, policy: Any, plan: Plan, record: Record, x: Array
-) -> Array:
-    """Return the states (N, nx) that the model predicts; no rows where it predicts none."""
-    none: Array = np.zeros((0, x.shape[1]))
-    if lin is None:
-        return none
-    # A prediction that overflows is none.
-    with np.errstate(over="ignore", invalid="ignore"):
-        found = predict(lin, policy.K, plan.limits, plan.times, x[0], record.steps)[: len(x)]
-    return found if len(found) == len(x) and np.isfinite(found).all() else none
 
 
 def _target(state: StateMap, lin: LinearModel) -> Array:
