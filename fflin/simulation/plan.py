@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, number, whole
 from fflin.control.channel import Channel, Law
 from fflin.control.policies import Allocation, bound
 from fflin.dynamics.state import StateMap
@@ -25,7 +25,8 @@ Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
 LARGEST_TURN = 1.0  # within one step [rad], beyond which no integrator follows
 _STEP = 0.01  # [s]
-_MOST_ENTRIES = 500_000_000
+_MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
+_LONGEST = 1e100  # [s]; the square of its inverse is still a number
 
 
 class Times(NamedTuple):
@@ -107,8 +108,9 @@ def times_of(
     if sample is not None:
         sample = _positive("sample", sample)
     duration, delay = _positive("duration", duration), number("delay", delay)
-    if delay < 0.0:
-        raise InputError(f"delay is {delay:g} s, expected 0 or more")
+    if not 0.0 <= delay <= _LONGEST:
+        raise InputError(f"delay is {delay:g} s, expected 0 to {_LONGEST:g} s")
+    every, chosen = whole("every", every, 1), dt is None
     if dt is None:
         dt = _STEP
         if fastest * dt > 1.0:
@@ -125,17 +127,18 @@ def times_of(
             )
         steps = int(np.ceil(duration / dt))
         dt = duration / steps
-    if not isinstance(every, int | np.integer) or every < 1:
-        raise InputError(f"every is {every!r}, expected a whole number of steps, 1 or more")
     if sample is None:
         sample = dt if delay else 0.0
-    if steps // every * width > _MOST_ENTRIES:
+    rows = steps // every + 2
+    if rows * width > _MOST_ENTRIES or steps > _MOST_STEPS:
+        asked = f", which the loop's fastest pole at {fastest:.3g} 1/s asks for,"
         raise InputError(
-            f"{duration:g} s in steps of {dt:g} s are {steps / every:.3g} rows; take a larger dt "
-            "or `every`"
+            f"{duration:g} s in steps of {dt:g} s"
+            f"{asked if chosen and dt < _STEP and fastest else ''} are {steps:.3g} steps and "
+            f"{rows:.3g} rows; take a larger dt or `every`"
         )
     samples, late = _whole(dt, sample=sample, delay=delay)
-    return Times(dt, steps, int(every), samples, late, fastest)
+    return Times(dt, steps, every, samples, late, fastest)
 
 
 def method_of(name: str, times: Times) -> type[Integrator]:
@@ -211,6 +214,6 @@ def _part_of(sample: float, largest: float, *times: float) -> float:
 
 def _positive(name: str, value: Any) -> float:
     time = number(name, value)
-    if time <= 1e-100:  # its inverse is squared
-        raise InputError(f"{name} is {time:g} s, expected more than 0")
+    if not 1.0 / _LONGEST < time <= _LONGEST:
+        raise InputError(f"{name} is {time:g} s, expected more than 0 and at most {_LONGEST:g} s")
     return time

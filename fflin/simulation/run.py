@@ -58,7 +58,7 @@ def go(plan: Plan, plant: Plant, conserved: Conserved, progress: bool | None = N
 
     step, stopped, project = 0, "", plan.project
     ending, watched = _ending(plan), bool(plan.chart or plan.events)
-    bar = Progress(times.steps, progress)
+    bar = Progress(progress)
     try:
         for step in range(times.steps):
             t = step * dt
@@ -75,7 +75,7 @@ def go(plan: Plan, plant: Plant, conserved: Conserved, progress: bool | None = N
                 if stopped:
                     break
             if step % _LOOK == 0:
-                bar.update(step + 1)
+                bar.update(step + 1, times.steps)
     except KeyboardInterrupt:
         if not count:
             raise

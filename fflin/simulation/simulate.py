@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, truth
 from fflin.control.channel import limits_of
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import states_of
@@ -141,7 +141,7 @@ def simulate(
         if frame is not None or reference is not None:
             raise InputError("frame and reference are those of the policy's model; leave out")
         frame, reference = lin.frame, lin.reference
-    state = StateMap(robot, reference=reference, frame=frame or "hybrid")
+    state = StateMap(robot, reference=reference, frame="hybrid" if frame is None else frame)
     plant = Plant(state, disturbance)
     predictor = _predictor(plant, K, lin, linear)
     q, v = start_of(state, x0, q0, v0)
@@ -158,17 +158,37 @@ def simulate(
         initial=lin.u0 if lin is not None and same else np.zeros(len(within[0])),
         limits=within,
         method=method_of(method, times),
-        project=bool(project),
+        project=truth("project", project),
         turning=turning(robot),
         chart=None if lin is None else state,
         events=events_of(events, callback),
         callback=callback,
     )
+    target = None if lin is None else _target(state, lin)
+    near = target if x0 is None else np.asarray(x0, dtype=float)
+    try:
+        return _motion(plant, plan, progress, target, near, predictor, K)
+    except MemoryError:
+        raise InputError(
+            f"{times.steps // times.every} rows of '{robot.name}' do not fit into the memory; take "
+            "a larger dt or `every`"
+        ) from None
+
+
+def _motion(
+    plant: Plant,
+    plan: Plan,
+    progress: bool | None,
+    target: Array | None,
+    near: Array | None,
+    predictor: LinearModel | None,
+    K: Any,
+) -> Motion:
+    """Return the motion that a plan leads to."""
+    state, robot = plant.state, plant.robot
     conserved = Conserved(robot, plan.q)
     record = go(plan, plant, conserved, progress)
 
-    target = None if lin is None else _target(state, lin)
-    near = target if x0 is None else np.asarray(x0, dtype=float)
     x = states_of(state, record.q, record.v, near)
     history = conserved.histories(record.q, record.v)
     return Motion(

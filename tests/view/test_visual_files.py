@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +21,7 @@ import fflin
 from fflin.commands.cli import main
 from fflin.view.playback import default_tool, frame_indices
 from tests.support.motions import settling
+from tests.support.patience import PATIENCE, wait_until
 
 needs_chromium = pytest.mark.skipif(not shutil.which("chromium"), reason="no chromium")
 
@@ -257,19 +257,19 @@ def test_the_browser_ends_with_the_one_who_films(tmp_path, sent, code):
     )
     browsing = f"--user-data-dir={folder}".encode()
     try:
-        wait_until(lambda: list(folder.glob("*/DevToolsActivePort")), 60.0)
+        wait_until(lambda: list(folder.glob("*/DevToolsActivePort")))
         assert running(browsing)
         process.send_signal(sent)
-        _, error = process.communicate(timeout=60.0)
+        _, error = process.communicate(timeout=PATIENCE)
         assert process.returncode == code and "Traceback" not in error
-        wait_until(lambda: not running(browsing), 60.0)
+        wait_until(lambda: not running(browsing))
         assert not (tmp_path / "m.gif").exists()
         assert sent == signal.SIGKILL or not list(folder.iterdir())
     finally:
         process.kill()
         process.communicate()
         # What dies of a signal may still write for a moment.
-        wait_until(lambda: removed(folder), 60.0)
+        wait_until(lambda: removed(folder))
 
 
 def removed(folder):
@@ -299,13 +299,6 @@ def running(argument):
             if any(each.startswith(argument) for each in file.read_bytes().split(b"\0")):
                 return True
     return False
-
-
-def wait_until(done, seconds):
-    end = time.monotonic() + seconds
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.1)
 
 
 def test_a_name_that_is_no_files_name_does_no_harm(robots, monkeypatch):
