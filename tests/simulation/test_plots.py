@@ -145,7 +145,7 @@ def test_bad_figures_are_refused(loop, tmp_path, monkeypatch):
         motion.plot(tmp_path / "loop.bmp")
     with pytest.raises(fflin.InputError, match="expected a Motion"):
         fflin.plot_motion(3)
-    with pytest.raises(fflin.InputError, match="expected numbers or a Gain"):
+    with pytest.raises(fflin.InputError, match="expected finite numbers or a Gain"):
         fflin.plot_poles("stable")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(fflin.MissingPackageError, match=r"pip install 'fflin\[plot\]'"):
