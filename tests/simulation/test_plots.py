@@ -1,6 +1,7 @@
 """Figures: what they show and are named by, and the files they are saved to."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -147,7 +148,7 @@ def test_bad_figures_are_refused(loop, tmp_path, monkeypatch):
         fflin.plot_motion(3)
     with pytest.raises(fflin.InputError, match="expected finite numbers or a Gain"):
         fflin.plot_poles("stable")
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(fflin.MissingPackageError, match=r"pip install 'fflin\[plot\]'"):
         motion.plot()
     assert not list(tmp_path.iterdir())
