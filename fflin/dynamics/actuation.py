@@ -101,6 +101,7 @@ class Actuation:
             for kind in dict.fromkeys(kinds)
         }
         self.held = tuple(held)
+        self._held = tuple(vector.columns for vector in held)
         self._fixed = np.column_stack(columns) if columns else np.zeros((nv, 0))
         self.default = self._fixed.shape == (nv, nv) and bool((self._fixed == identity).all())
         self._carried = [
@@ -142,12 +143,12 @@ class Actuation:
 
     def in_base_axes(self, chart: Chart, u: Array) -> Array:
         """Return u (.., nu) with what is held in reference axes in base axes."""
-        if not self.held:
-            return u
-        u = u.copy()
-        for held in self.held:
-            u[..., held.columns] = (chart.R.mT @ u[..., held.columns, None])[..., 0]
-        return u
+        in_base: Array = chart.to_base(u[..., None], self._held)[..., 0]
+        return in_base
+
+    def over_inputs(self, chart: Chart, by_u: Array) -> Array:
+        """Return slopes (.., k, nu) over `in_base_axes` as slopes over u: F_u^T of (4.7)."""
+        return chart.to_reference(by_u.mT, self._held).mT
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
         """Return the wrench of thrusters and wheels on every joint, in its frame, if there is any.

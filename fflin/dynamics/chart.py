@@ -1,4 +1,4 @@
-"""The attitude chart: the vector part of the base's quaternion."""
+"""The attitude chart: the vector part of the base's quaternion, its kinematics, and the turn R."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +16,8 @@ SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
 class Chart:
     """The attitude chart at one base attitude, relative to the reference, or at many.
 
+    Numbers of equations are those of docs/derivation.md.
+
     Attributes
     ----------
     q_b : ndarray (.., 3)
@@ -32,15 +34,80 @@ class Chart:
 
     @cached_property
     def Q(self) -> Array:
-        """Q (.., 3, 3) with ``d q_b/dt = Q omega / 2``, omega in base axes."""
+        """Q (.., 3, 3) of the quaternion kinematics (1.2): d q_b/dt = Q omega / 2."""
         return self._scalar + skew(self.q_b)
 
     @cached_property
     def J(self) -> Array:
-        """J = 2 Q^-1 (.., 3, 3) with ``d theta = J d q_b``, d theta in base axes."""
-        outer = self.q_b[..., :, None] * (self.q_b / self.q0)[..., None, :]
-        return 2.0 * (self._scalar - skew(self.q_b) + outer)
+        """J = 2 Q^-1 (.., 3, 3) with ``d theta = J d q_b``, d theta in base axes (1.3)."""
+        return 2.0 * (self._scalar - skew(self.q_b) + self.over_q0(self.q_b))
 
     @property
     def _scalar(self) -> Array:
         return np.asarray(self.q0)[..., None] * np.eye(3)
+
+    def rate(self, omega: Array) -> Array:
+        """Return d q_b/dt = Q omega / 2 (.., 3), omega in base axes (1.2)."""
+        return 0.5 * rotated(self.Q, omega)
+
+    def over_q0(self, omega: Array) -> Array:
+        """Return omega q_b^T / q0 (.., 3, 3), since d q0 = -q_b^T d q_b / q0."""
+        return omega[..., :, None] * (self.q_b / self.q0)[..., None, :]
+
+    def over_q_b(self, by_turn: Array) -> Array:
+        """Return slopes (.., k, 3) over turns of the base in its axes as slopes over q_b (1.3)."""
+        return by_turn @ self.J
+
+    def to_reference(self, x: Array, parts: tuple[slice, ...]) -> Array:
+        """Return x (.., m, k) with some parts, three rows each, turned to reference axes by R."""
+        return _turned(self.R, x, parts)
+
+    def to_base(self, x: Array, parts: tuple[slice, ...]) -> Array:
+        """Return x (.., m, k) with some parts, three rows each, turned to base axes by R^T."""
+        return _turned(self.R.mT, x, parts)
+
+
+class Standing(Chart):
+    """That of a base, or many, that stand at the reference: R = Q = E and J = 2 E cost nothing."""
+
+    def __init__(self) -> None:
+        super().__init__(np.zeros(3), 1.0, np.eye(3))
+
+    def rate(self, omega: Array) -> Array:
+        """Return omega / 2."""
+        return 0.5 * omega
+
+    def over_q0(self, omega: Array) -> Array:
+        """Return zeros (3, 3)."""
+        return _NONE
+
+    def over_q_b(self, by_turn: Array) -> Array:
+        """Return twice the slopes."""
+        return 2.0 * by_turn
+
+    def to_reference(self, x: Array, parts: tuple[slice, ...]) -> Array:
+        """Return x itself."""
+        return x
+
+    def to_base(self, x: Array, parts: tuple[slice, ...]) -> Array:
+        """Return x itself."""
+        return x
+
+
+STANDING = Standing()
+_NONE = np.zeros((3, 3))
+
+
+def rotated(matrices: Array, vectors: Array) -> Array:
+    """Return matrices (.., 3, 3) times vectors (.., 3)."""
+    product: Array = (matrices @ vectors[..., None])[..., 0]
+    return product
+
+
+def _turned(R: Array, x: Array, parts: tuple[slice, ...]) -> Array:
+    if not parts:
+        return x
+    turned = x.copy("K")
+    for rows in parts:
+        turned[..., rows, :] = R @ x[..., rows, :]
+    return turned

@@ -1,5 +1,6 @@
 """The state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, names, frames and chart."""
 
+from itertools import compress
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -87,6 +88,7 @@ class StateMap:
         self.robot = robot
         self.frame: Frame = frame
         self.axes = _IN_REFERENCE_AXES[frame]
+        self._held = tuple(compress((ANGULAR, LINEAR), self.axes))
         self.nx = 12 + 2 * n
         self.groups = Groups(
             slice(0, 3),
@@ -212,18 +214,20 @@ class StateMap:
 
     def read(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
         """Do as `to_state` for arguments that are valid."""
-        chart = self.chart(q)
         x = np.empty(self.nx)
-        g = self.groups
-        x[g.q_b] = chart.q_b
-        x[g.r_b] = self.positions(q)
-        x[g.q_m] = self.joint_positions(q)
+        nu, q_m = self.velocities(v), self.joint_positions(q)
+        self.write(self.chart(q), self.positions(q), q_m, nu, x)
         if near is not None:
             self._unwrap(x, near)
-        nu = self.velocities(v)
-        self.to_frame(chart, nu)
-        x[6 + self.robot.n :] = nu
         return x
+
+    def write(self, chart: Chart, r_b: Array, q_m: Array, nu: Array, out: Array) -> None:
+        """Write states (.., nx) of their parts, velocities nu (.., 6 + n) in base axes."""
+        g = self.groups
+        out[..., g.q_b] = chart.q_b
+        out[..., g.r_b] = r_b
+        out[..., g.q_m] = q_m
+        out[..., self.nx // 2 :] = self.to_frame(chart, nu[..., None])[..., 0]
 
     def to_pinocchio(self, x: Array) -> tuple[Array, Array]:
         """Convert a state to a Pinocchio configuration and velocity.
@@ -262,9 +266,8 @@ class StateMap:
         q[self._cos] = np.cos(angles[self._unbounded])
         q[self._sin] = np.sin(angles[self._unbounded])
         self.robot.follow(q)
-        nu = x[6 + self.robot.n :].copy()
-        self.to_base(Chart(q_b, float(relative[3]), rotation_matrix(relative)), nu)
-        return q, self.spread(nu)
+        chart = Chart(q_b, float(relative[3]), rotation_matrix(relative))
+        return q, self.spread(self.to_base(chart, x[6 + self.robot.n :, None])[:, 0])
 
     def velocities(self, v: Array) -> Array:
         """Return (omega_b, v_b, qdot_m) (.., 6 + n) in base axes of Pinocchio's v (.., nv)."""
@@ -299,17 +302,13 @@ class StateMap:
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
         return matrix.take(self._flat, out=out, mode="clip")
 
-    def to_frame(self, chart: Chart, vectors: Array) -> None:
-        """Turn velocities or wrenches (6 + n, ...) in place from base axes to the frame's."""
-        for rows, turned in zip((ANGULAR, LINEAR), self.axes, strict=True):
-            if turned:
-                vectors[rows] = chart.R @ vectors[rows]
+    def to_frame(self, chart: Chart, vectors: Array) -> Array:
+        """Turn velocities or wrenches (.., 6 + n, k) from base axes to the frame's: F of (4.6)."""
+        return chart.to_reference(vectors, self._held)
 
-    def to_base(self, chart: Chart, vectors: Array) -> None:
-        """Turn velocities or wrenches (6 + n, ...) in place from the frame's axes to the base's."""
-        for rows, turned in zip((ANGULAR, LINEAR), self.axes, strict=True):
-            if turned:
-                vectors[rows] = chart.R.T @ vectors[rows]
+    def to_base(self, chart: Chart, vectors: Array) -> Array:
+        """Turn velocities or wrenches (.., 6 + n, k) from the frame's axes to the base's: F^T."""
+        return chart.to_base(vectors, self._held)
 
     def joint_positions(self, q: Array) -> Array:
         """Return q_m (.., n), one angle or length a joint, of valid configurations (.., nq)."""

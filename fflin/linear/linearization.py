@@ -15,14 +15,14 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array, vector
 from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.chart import Chart
+from fflin.dynamics.chart import STANDING, Chart
 from fflin.dynamics.rnea import Accelerations, Rates
 from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap
 from fflin.linear.certificate import certify, inertia_matrix
 from fflin.linear.ignorable import ignorable_states
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
-from fflin.linear.state_equations import STANDING, Point, at_rest, ride_along, state_equations
+from fflin.linear.state_equations import assemble, at_rest, drift
 from fflin.robot.frames import ROOT
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
@@ -123,6 +123,7 @@ class Linearizer:
         self._zero_v, self._zero_u, self._zero_x = (
             _frozen(np.zeros(size)) for size in (robot.nv, len(self._actuation.names), nx)
         )
+        self._zero_r = np.zeros(3)
         self._A_rest = _frozen(at_rest(self._map))
         self._nu = len(self._actuation.names)
         self._shape_B, self._lower = (nx, self._nu), slice(nv, nx)
@@ -199,24 +200,19 @@ class Linearizer:
         return LinearModel._from_fields(self._at_rest_fields | {"B": B, "q": q})
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
-        state, groups = self._map, self._map.groups
-        chart = STANDING if self._own_reference else state.chart(q)
+        state = self._map
+        chart, r_b = STANDING, self._zero_r
+        if not self._own_reference:
+            chart, r_b = state.chart(q), state.positions(q)
         nu, q_m = state.velocities(v), state.joint_positions(q)
-        u_base = u if chart is STANDING else self._actuation.in_base_axes(chart, u)
+        u_base = self._actuation.in_base_axes(chart, u)
         rates = self._accelerations.rates(q, v, nu, q_m, u_base)
-        A, B = self._A_rest.copy(), np.zeros(self._shape_B)
-        A[self._lower, groups.q_m] = rates.by_q_m
-        A[self._lower, self._lower] = rates.by_nu
-        B[self._lower] = rates.by_u
-        point = Point(nu, u_base, rates.c, rates.gravity)
-        f0 = state_equations(state, self._actuation, chart, point, A, B[self._lower])
-        x0: Array = np.zeros(state.nx)
-        if chart is STANDING:
-            x0[groups.q_m] = q_m
-            x0[self._lower] = nu
-        else:
-            x0 = state.to_state(q, v)
-        drift = ride_along(state, point, A, f0) if self._moving else None
+        A, B, x0 = self._A_rest.copy(), np.zeros(self._shape_B), np.empty(state.nx)
+        f0 = assemble(
+            *(state, self._actuation, chart, nu, u_base, rates, A, B[self._lower]),
+            moving=self._moving,
+        )
+        state.write(chart, r_b, q_m, nu, x0)
         C, D, y0 = self._seen(chart, rates, q, v, u_base, x0)
         for array in (A, B, f0) if self._sensing is None else (A, B, f0, C, D, y0):
             flat = array.ravel()
@@ -227,8 +223,8 @@ class Linearizer:
         fields = {"A": A, "B": B, "C": C, "D": D, "f0": f0}
         fields |= {"x0": x0, "y0": y0, "u0": u, "q": q, "v": v}
         fields["_reference"] = self._reference_of(q)
-        if drift is not None:
-            fields["_drift"] = _frozen(drift)
+        if self._moving:
+            fields |= {"f0": self._zero_x, "_drift": _frozen(drift(state, f0, rates.gravity))}
         return LinearModel._from_fields(self._common | fields)
 
     def _seen(
