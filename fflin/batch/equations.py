@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fflin.base.rotation import product_matrix, rotation_matrices
 from fflin.base.validation import Array
 from fflin.batch.inertia import FARTHEST, Rows
-from fflin.dynamics.chart import SMALLEST_Q0, STANDING, Chart
+from fflin.dynamics.chart import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.rnea import Rates
 from fflin.kernel.accelerations import BatchRates, Points, Written
@@ -91,7 +91,7 @@ class BatchEquations:
         if moving:
             out["_drift"][:] = drift(state, f0, rates.gravity)
         out["f0"][:] = 0.0 if moving else f0
-        state.write(chart, r_b, q_m, nu, out["_x0"])
+        out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
         good = within & (np.abs(q[:, 7:]) < FARTHEST).all(axis=1)
         good &= self._least_coupling < written.couplings
         good &= written.couplings < Inertia.warning_coupling
@@ -133,7 +133,8 @@ class BatchEquations:
     def _place(self, q: Array) -> tuple[Chart, Array, NDArray[np.bool_]]:
         """Return the chart and the base's position, and where the chart reaches."""
         if self._linearizer._own_reference:
-            return STANDING, np.zeros(3), np.ones(len(q), dtype=bool)
+            chart: Chart = Standing(len(q))
+            return chart, chart.q_b, np.ones(len(q), dtype=bool)
         quaternions = q[:, 3:7] @ product_matrix(self._state.origin_quaternion).T
         quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
         quaternions[quaternions[:, 3] < 0.0] *= -1.0

@@ -38,73 +38,96 @@ class Chart:
         return self._scalar + skew(self.q_b)
 
     @cached_property
+    def N(self) -> Array:
+        """N = Q / 2 (.., 3, 3)."""
+        return 0.5 * self.Q
+
+    @cached_property
     def J(self) -> Array:
         """J = 2 Q^-1 (.., 3, 3) with ``d theta = J d q_b``, d theta in base axes (1.3)."""
-        return 2.0 * (self._scalar - skew(self.q_b) + self.over_q0(self.q_b))
+        return 2.0 * (self._scalar - skew(self.q_b) + self._over_q0(self.q_b))
 
     @property
     def _scalar(self) -> Array:
         return np.asarray(self.q0)[..., None] * np.eye(3)
 
     def rate(self, omega: Array) -> Array:
-        """Return d q_b/dt = Q omega / 2 (.., 3), omega in base axes (1.2)."""
-        return 0.5 * rotated(self.Q, omega)
+        """Return d q_b/dt = N omega (.., 3), omega in base axes (1.2)."""
+        return times(self.N, omega)
 
-    def over_q0(self, omega: Array) -> Array:
-        """Return omega q_b^T / q0 (.., 3, 3), since d q0 = -q_b^T d q_b / q0."""
+    def rotated(self, vectors: Array) -> Array:
+        """Return vectors (.., 3) in base axes in reference axes."""
+        return times(self.R, vectors)
+
+    def rate_over_q_b(self, omega: Array) -> Array:
+        """Return the slope (.., 3, 3) of `rate` over q_b, omega held in base axes (4.2).
+
+        From d q0 = -q_b^T d q_b / q0.
+        """
+        return -0.5 * (skew(omega) + self._over_q0(omega))
+
+    def _over_q0(self, omega: Array) -> Array:
         return omega[..., :, None] * (self.q_b / self.q0)[..., None, :]
 
     def over_q_b(self, by_turn: Array) -> Array:
         """Return slopes (.., k, 3) over turns of the base in its axes as slopes over q_b (1.3)."""
         return by_turn @ self.J
 
-    def to_reference(self, x: Array, parts: tuple[slice, ...]) -> Array:
+    def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some parts, three rows each, turned to reference axes by R."""
-        return _turned(self.R, x, parts)
+        return _turned(self.R, parts, x)
 
-    def to_base(self, x: Array, parts: tuple[slice, ...]) -> Array:
+    def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some parts, three rows each, turned to base axes by R^T."""
-        return _turned(self.R.mT, x, parts)
+        return _turned(self.R.mT, parts, x)
 
 
 class Standing(Chart):
-    """That of a base, or many, that stand at the reference: R = Q = E and J = 2 E cost nothing."""
+    """That of a base that stands at the reference, or of many: R = Q = E and J = 2 E cost nothing.
 
-    def __init__(self) -> None:
-        super().__init__(np.zeros(3), 1.0, np.eye(3))
+    Parameters
+    ----------
+    count : int, optional
+        Of many.
+    """
+
+    N = 0.5 * np.eye(3)
+
+    def __init__(self, *count: int) -> None:
+        super().__init__(np.zeros((*count, 3)), 1.0, np.eye(3))
 
     def rate(self, omega: Array) -> Array:
         """Return omega / 2."""
         return 0.5 * omega
 
-    def over_q0(self, omega: Array) -> Array:
-        """Return zeros (3, 3)."""
-        return _NONE
+    def rotated(self, vectors: Array) -> Array:
+        """Return the vectors themselves."""
+        return vectors
+
+    def rate_over_q_b(self, omega: Array) -> Array:
+        """Return -[omega]x / 2."""
+        return -0.5 * skew(omega)
 
     def over_q_b(self, by_turn: Array) -> Array:
         """Return twice the slopes."""
         return 2.0 * by_turn
 
-    def to_reference(self, x: Array, parts: tuple[slice, ...]) -> Array:
+    def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x itself."""
         return x
 
-    def to_base(self, x: Array, parts: tuple[slice, ...]) -> Array:
+    def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x itself."""
         return x
 
 
-STANDING = Standing()
-_NONE = np.zeros((3, 3))
-
-
-def rotated(matrices: Array, vectors: Array) -> Array:
+def times(matrices: Array, vectors: Array) -> Array:
     """Return matrices (.., 3, 3) times vectors (.., 3)."""
     product: Array = (matrices @ vectors[..., None])[..., 0]
     return product
 
 
-def _turned(R: Array, x: Array, parts: tuple[slice, ...]) -> Array:
+def _turned(R: Array, parts: tuple[slice, ...], x: Array) -> Array:
     if not parts:
         return x
     turned = x.copy("K")

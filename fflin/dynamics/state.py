@@ -63,6 +63,8 @@ class StateMap:
         Slices of q_b, r_b, q_m, omega_b, v_b, qdot_m in the state.
     axes : tuple of bool
         Whether (omega_b, v_b) stand in reference axes.
+    in_reference : tuple of slice
+        Rows of those that do, in any (6 + n) velocity or wrench.
     S : ndarray (nv, 6 + n) or None
         With v = S nu, where joints mimic others; None where v is nu in another order.
 
@@ -88,7 +90,7 @@ class StateMap:
         self.robot = robot
         self.frame: Frame = frame
         self.axes = _IN_REFERENCE_AXES[frame]
-        self._held = tuple(compress((ANGULAR, LINEAR), self.axes))
+        self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
         self.nx = 12 + 2 * n
         self.groups = Groups(
             slice(0, 3),
@@ -116,6 +118,9 @@ class StateMap:
         )
         # Index in Pinocchio's v of each velocity of the state, and in a flat (nv, nv) array.
         self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
+        # And back; what a joint that mimics another has is written after.
+        self._place = np.zeros(robot.nv, dtype=np.intp)
+        self._place[self._order] = np.arange(6 + n)
         self._flat = self._order[:, None] * robot.nv + self._order
         # v = S nu; where no joint mimics another S is the permutation above.
         self.S: Array | None = None
@@ -214,20 +219,16 @@ class StateMap:
 
     def read(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
         """Do as `to_state` for arguments that are valid."""
-        x = np.empty(self.nx)
-        nu, q_m = self.velocities(v), self.joint_positions(q)
-        self.write(self.chart(q), self.positions(q), q_m, nu, x)
+        q_m, nu = self.joint_positions(q), self.velocities(v)
+        x = self.compose(self.chart(q), self.positions(q), q_m, nu)
         if near is not None:
             self._unwrap(x, near)
         return x
 
-    def write(self, chart: Chart, r_b: Array, q_m: Array, nu: Array, out: Array) -> None:
-        """Write states (.., nx) of their parts, velocities nu (.., 6 + n) in base axes."""
-        g = self.groups
-        out[..., g.q_b] = chart.q_b
-        out[..., g.r_b] = r_b
-        out[..., g.q_m] = q_m
-        out[..., self.nx // 2 :] = self.to_frame(chart, nu[..., None])[..., 0]
+    def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
+        """Return the state (.., nx) of its parts, velocities nu (.., 6 + n) in base axes."""
+        in_frame = self.to_frame(chart, nu[..., None])[..., 0]
+        return np.concatenate((chart.q_b, r_b, q_m, in_frame), -1)
 
     def to_pinocchio(self, x: Array) -> tuple[Array, Array]:
         """Convert a state to a Pinocchio configuration and velocity.
@@ -275,8 +276,7 @@ class StateMap:
 
     def spread(self, nu: Array) -> Array:
         """Return Pinocchio's v (nv,) of (omega_b, v_b, qdot_m) in base axes: v = S nu."""
-        v = np.empty(self.robot.nv)
-        v[self._order] = nu
+        v = nu.take(self._place)
         for joint, leader, multiplier, _ in self.robot.followers:
             v[joint.idx_v] = multiplier * v[leader.idx_v]
         return v
@@ -304,11 +304,11 @@ class StateMap:
 
     def to_frame(self, chart: Chart, vectors: Array) -> Array:
         """Turn velocities or wrenches (.., 6 + n, k) from base axes to the frame's: F of (4.6)."""
-        return chart.to_reference(vectors, self._held)
+        return chart.to_reference(self.in_reference, vectors)
 
     def to_base(self, chart: Chart, vectors: Array) -> Array:
         """Turn velocities or wrenches (.., 6 + n, k) from the frame's axes to the base's: F^T."""
-        return chart.to_base(vectors, self._held)
+        return chart.to_base(self.in_reference, vectors)
 
     def joint_positions(self, q: Array) -> Array:
         """Return q_m (.., n), one angle or length a joint, of valid configurations (.., nq)."""

@@ -15,7 +15,7 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array, vector
 from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.chart import STANDING, Chart
+from fflin.dynamics.chart import Chart, Standing
 from fflin.dynamics.rnea import Accelerations, Rates
 from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap
 from fflin.linear.certificate import certify, inertia_matrix
@@ -123,7 +123,7 @@ class Linearizer:
         self._zero_v, self._zero_u, self._zero_x = (
             _frozen(np.zeros(size)) for size in (robot.nv, len(self._actuation.names), nx)
         )
-        self._zero_r = np.zeros(3)
+        self._standing: Chart = Standing()
         self._A_rest = _frozen(at_rest(self._map))
         self._nu = len(self._actuation.names)
         self._shape_B, self._lower = (nx, self._nu), slice(nv, nx)
@@ -201,18 +201,18 @@ class Linearizer:
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
         state = self._map
-        chart, r_b = STANDING, self._zero_r
+        chart, r_b = self._standing, self._standing.q_b
         if not self._own_reference:
             chart, r_b = state.chart(q), state.positions(q)
         nu, q_m = state.velocities(v), state.joint_positions(q)
         u_base = self._actuation.in_base_axes(chart, u)
         rates = self._accelerations.rates(q, v, nu, q_m, u_base)
-        A, B, x0 = self._A_rest.copy(), np.zeros(self._shape_B), np.empty(state.nx)
+        A, B = self._A_rest.copy(), np.zeros(self._shape_B)
         f0 = assemble(
             *(state, self._actuation, chart, nu, u_base, rates, A, B[self._lower]),
             moving=self._moving,
         )
-        state.write(chart, r_b, q_m, nu, x0)
+        x0 = state.compose(chart, r_b, q_m, nu)
         C, D, y0 = self._seen(chart, rates, q, v, u_base, x0)
         for array in (A, B, f0) if self._sensing is None else (A, B, f0, C, D, y0):
             flat = array.ravel()
@@ -220,12 +220,11 @@ class Linearizer:
                 raise InputError("q, v or u is so large that the model is not finite")
             array.setflags(write=False)
         x0.setflags(write=False)
-        fields = {"A": A, "B": B, "C": C, "D": D, "f0": f0}
-        fields |= {"x0": x0, "y0": y0, "u0": u, "q": q, "v": v}
-        fields["_reference"] = self._reference_of(q)
+        values = {"A": A, "B": B, "C": C, "D": D, "f0": f0, "x0": x0, "u0": u, "y0": y0}
+        fields = {**self._common, **values, "q": q, "v": v, "_reference": self._reference_of(q)}
         if self._moving:
             fields |= {"f0": self._zero_x, "_drift": _frozen(drift(state, f0, rates.gravity))}
-        return LinearModel._from_fields(self._common | fields)
+        return LinearModel._from_fields(fields)
 
     def _seen(
         self, chart: Chart, rates: Rates, q: Array, v: Array, u: Array, x0: Array

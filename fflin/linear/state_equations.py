@@ -3,12 +3,14 @@
 Numbers of equations are those of docs/derivation.md.
 """
 
+from functools import partial
+
 import numpy as np
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.chart import Chart, rotated
+from fflin.dynamics.chart import Chart, times
 from fflin.dynamics.rnea import Rates
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
 
@@ -57,41 +59,37 @@ def assemble(
     g, dot = state.groups, slice(state.nx // 2, state.nx)
     omega_in_reference, v_in_reference = state.axes
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
-    W, a = skew(w), rates.c.copy()
     by_turn = _over_turns(state, actuation, nu, u, rates)
+    F = partial(chart.to_reference, state.in_reference)
 
     # Attitude and position.
-    A[..., g.q_b, g.omega_b] = 0.5 * (
-        chart.Q @ chart.R.mT if omega_in_reference else chart.Q
-    )  # 4.1
-    A[..., g.q_b, g.q_b] = -0.5 * (W + chart.over_q0(w))  # (4.2)
+    A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N  # (4.1)
+    by_q_b = chart.rate_over_q_b(w)
     if omega_in_reference:
-        A[..., g.q_b, g.q_b] += 0.5 * chart.over_q_b(chart.Q @ W)
+        by_q_b += chart.over_q_b(chart.N @ skew(w))
+    A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
     if not v_in_reference:
-        A[..., g.r_b, g.v_b] = chart.R  # (4.3)
-        A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.R @ skew(v))
+        W, V = skew(w), skew(v)
+        A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.R @ V)  # (4.3)
+        A[..., g.r_b, g.v_b] = chart.R
     if moving:
         A[..., g.q_b, g.q_b] = -W  # (5.2)
         A[..., g.r_b, g.r_b] = -W  # (5.3)
 
     # Accelerations.
-    A[..., dot, g.q_b] = state.to_frame(chart, chart.over_q_b(by_turn))  # (4.6)
-    A[..., dot, g.q_m] = state.to_frame(chart, rates.by_q_m)
-    A[..., dot, dot] = state.to_frame(chart, state.to_frame(chart, rates.by_nu).mT).mT
-    B_lower[...] = state.to_frame(chart, actuation.over_inputs(chart, rates.by_u))  # (4.7)
+    A[..., dot, g.q_b] = F(chart.over_q_b(by_turn))  # (4.6)
+    A[..., dot, g.q_m] = F(rates.by_q_m)
+    A[..., dot, dot] = F(F(rates.by_nu).mT).mT
+    B_lower[...] = F(actuation.over_inputs(chart, rates.by_u))  # (4.7)
+    a = rates.c.copy()
     a[..., LINEAR] += rates.gravity
     if not v_in_reference:
-        A[..., g.v_b, g.omega_b] += skew(v)  # (4.5)
+        A[..., g.v_b, g.omega_b] += V  # (4.5)
         A[..., g.v_b, g.v_b] -= W
-        a[..., LINEAR] -= rotated(W, v)  # (3.2)
+        a[..., LINEAR] -= times(W, v)  # (3.2)
 
-    f0 = (
-        chart.rate(w),
-        rotated(chart.R, v),
-        nu[..., 6:],
-        state.to_frame(chart, a[..., None])[..., 0],
-    )
-    return np.concatenate(f0, axis=-1)  # (4.8)
+    f0 = chart.rate(w), chart.rotated(v), nu[..., 6:], F(a[..., None])[..., 0]  # (4.8)
+    return np.concatenate(f0, -1)
 
 
 def _over_turns(state: StateMap, actuation: Actuation, nu: Array, u: Array, rates: Rates) -> Array:
