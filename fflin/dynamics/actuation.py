@@ -147,9 +147,9 @@ class Actuation:
         in_base: Array = chart.to_base(self._held, u[..., None])[..., 0]
         return in_base
 
-    def over_inputs(self, chart: Chart, by_u: Array) -> Array:
+    def over_inputs(self, chart: Chart, by_u: Array, *, out: Array | None = None) -> Array:
         """Return slopes (.., k, nu) over `in_base_axes` as slopes over u: F_u^T of (4.7)."""
-        return chart.to_reference(self._held, by_u.mT).mT
+        return chart.to_reference(self._held, by_u.mT, out=None if out is None else out.mT).mT
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
         """Return the wrench of thrusters and wheels on every joint, in its frame, if there is any.

@@ -59,12 +59,12 @@ class Chart:
         """Return vectors (.., 3) in base axes in reference axes."""
         return times(self.R, vectors)
 
-    def rate_over_q_b(self, omega: Array) -> Array:
+    def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
         """Return the slope (.., 3, 3) of `rate` over q_b, omega held in base axes (4.2).
 
-        From d q0 = -q_b^T d q_b / q0.
+        `crossed` is [omega]x. From d q0 = -q_b^T d q_b / q0.
         """
-        return -0.5 * (skew(omega) + self._over_q0(omega))
+        return -0.5 * (crossed + self._over_q0(omega))
 
     def _over_q0(self, omega: Array) -> Array:
         return omega[..., :, None] * (self.q_b / self.q0)[..., None, :]
@@ -73,13 +73,18 @@ class Chart:
         """Return slopes (.., k, 3) over turns of the base in its axes as slopes over q_b (1.3)."""
         return by_turn @ self.J
 
-    def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x (.., m, k) with some parts, three rows each, turned to reference axes by R."""
-        return _turned(self.R, parts, x)
+    def to_reference(
+        self, parts: tuple[slice, ...], x: Array, *, out: Array | None = None
+    ) -> Array:
+        """Return x (.., m, k) with some parts, three rows each, turned to reference axes by R.
+
+        With `out`, which may be x, it is written there.
+        """
+        return _turned(self.R, parts, x, out)
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x (.., m, k) with some parts, three rows each, turned to base axes by R^T."""
-        return _turned(self.R.mT, parts, x)
+        return _turned(self.R.mT, parts, x, None)
 
 
 class Standing(Chart):
@@ -104,17 +109,22 @@ class Standing(Chart):
         """Return the vectors themselves."""
         return vectors
 
-    def rate_over_q_b(self, omega: Array) -> Array:
+    def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
         """Return -[omega]x / 2."""
-        return -0.5 * skew(omega)
+        return -0.5 * crossed
 
     def over_q_b(self, by_turn: Array) -> Array:
         """Return twice the slopes."""
         return 2.0 * by_turn
 
-    def to_reference(self, parts: tuple[slice, ...], x: Array) -> Array:
-        """Return x itself."""
-        return x
+    def to_reference(
+        self, parts: tuple[slice, ...], x: Array, *, out: Array | None = None
+    ) -> Array:
+        """Return x itself, or write it to `out`."""
+        if out is None:
+            return x
+        out[...] = x
+        return out
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x itself."""
@@ -127,10 +137,11 @@ def times(matrices: Array, vectors: Array) -> Array:
     return product
 
 
-def _turned(R: Array, parts: tuple[slice, ...], x: Array) -> Array:
-    if not parts:
-        return x
-    turned = x.copy("K")
+def _turned(R: Array, parts: tuple[slice, ...], x: Array, out: Array | None) -> Array:
+    if out is None:
+        out = x.copy("K") if parts else x
+    else:
+        out[...] = x
     for rows in parts:
-        turned[..., rows, :] = R @ x[..., rows, :]
-    return turned
+        out[..., rows, :] = R @ x[..., rows, :]
+    return out

@@ -59,17 +59,18 @@ def assemble(
     g, dot = state.groups, slice(state.nx // 2, state.nx)
     omega_in_reference, v_in_reference = state.axes
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
+    W = skew(w)
     by_turn = _over_turns(state, actuation, nu, u, rates)
     F = partial(chart.to_reference, state.in_reference)
 
     # Attitude and position.
     A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N  # (4.1)
-    by_q_b = chart.rate_over_q_b(w)
+    by_q_b = chart.rate_over_q_b(w, W)
     if omega_in_reference:
-        by_q_b += chart.over_q_b(chart.N @ skew(w))
+        by_q_b += chart.over_q_b(chart.N @ W)
     A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
     if not v_in_reference:
-        W, V = skew(w), skew(v)
+        V = skew(v)
         A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.R @ V)  # (4.3)
         A[..., g.r_b, g.v_b] = chart.R
     if moving:
@@ -77,10 +78,10 @@ def assemble(
         A[..., g.r_b, g.r_b] = -W  # (5.3)
 
     # Accelerations.
-    A[..., dot, g.q_b] = F(chart.over_q_b(by_turn))  # (4.6)
-    A[..., dot, g.q_m] = F(rates.by_q_m)
-    A[..., dot, dot] = F(F(rates.by_nu).mT).mT
-    B_lower[...] = F(actuation.over_inputs(chart, rates.by_u))  # (4.7)
+    F(chart.over_q_b(by_turn), out=A[..., dot, g.q_b])  # (4.6)
+    F(rates.by_q_m, out=A[..., dot, g.q_m])
+    F(F(rates.by_nu.mT, out=A[..., dot, dot].mT).mT, out=A[..., dot, dot])
+    F(actuation.over_inputs(chart, rates.by_u, out=B_lower), out=B_lower)  # (4.7)
     a = rates.c.copy()
     a[..., LINEAR] += rates.gravity
     if not v_in_reference:
