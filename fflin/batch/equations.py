@@ -33,8 +33,8 @@ class BatchEquations:
     """
 
     def __init__(self, linearizer: Linearizer) -> None:
-        self._linearizer = linearizer
-        self._state, self._actuation = linearizer._map, linearizer._actuation
+        self._prepared = linearizer.prepared
+        self._state, self._actuation = self._prepared.map, self._prepared.actuation
         self._rates = BatchRates(self._state, self._actuation)
         robot = linearizer.robot
         self._root = robot.model.jointPlacements[ROOT].rotation
@@ -43,7 +43,7 @@ class BatchEquations:
     @staticmethod
     def possible(linearizer: Linearizer) -> bool:
         """Whether the kernel knows the robot's joints, and no output is to be differentiated."""
-        return linearizer._sensing is None and batch_tree(linearizer.robot) is not None
+        return linearizer.prepared.sensing is None and batch_tree(linearizer.robot) is not None
 
     def write(self, q: Array, v: Array | None, u: Array | None, out: Mapping[str, Array]) -> Rows:
         """Write what differs from point to point, and return the rows that are left.
@@ -81,12 +81,12 @@ class BatchEquations:
         forces = u_base @ self._actuation.fixed.T
         forces[:, 6:] -= stiffness * (q_m - rest) + damping * nu[:, 6:]
         A, B = out["A"], out["B_lower"]
-        A[:] = self._linearizer._A_rest
+        A[:] = self._prepared.rest["A"]
         written = self._evaluate(Points(q, nu, forces, u_base), A)
         self._set_inputs(written, B)
         lower = A[:, nv:]
         rates = Rates(written.c, lower[..., groups.q_m], lower[..., nv:], B, self._gravity(q))
-        moving = self._linearizer._moving
+        moving = self._prepared.moving
         f0 = assemble(state, self._actuation, chart, nu, u_base, rates, A, B, moving=moving)
         if moving:
             out["_drift"][:] = drift(state, f0, rates.gravity)
@@ -132,7 +132,7 @@ class BatchEquations:
 
     def _place(self, q: Array) -> tuple[Chart, Array, NDArray[np.bool_]]:
         """Return the chart and the base's position, and where the chart reaches."""
-        if self._linearizer._own_reference:
+        if self._prepared.own_reference:
             chart: Chart = Standing(len(q))
             return chart, chart.q_b, np.ones(len(q), dtype=bool)
         quaternions = q[:, 3:7] @ product_matrix(self._state.origin_quaternion).T
