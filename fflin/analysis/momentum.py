@@ -10,11 +10,12 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.analysis.mechanics import checked, conserved
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
 from fflin.linear.model import Certificate, LinearModel
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.frames import frame_index
+from fflin.robot.robot import Robot
 
 # f0 outside of what the reduced state can follow, relative to f0.
 _DRIFT = 1e-9
@@ -180,15 +181,7 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
     state = StateMap(robot)
     q = robot.neutral() if q is None else robot.checked_configuration(q)
     model, data = robot.model, robot.create_data()
-    known = [item.name for item in model.frames.tolist() if item.parentJoint >= ROOT]
-    if frame not in known:
-        raise unknown("frame", str(frame), known)
-    axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-    index = next(
-        i
-        for i, item in enumerate(model.frames.tolist())
-        if item.name == frame and item.parentJoint >= ROOT
-    )
+    index, axes = frame_index(model, frame), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     full = pin.computeFrameJacobian(model, data, q, index, axes)
     J = state.columns(np.vstack((full[LINEAR], full[ANGULAR])))
     M = state.project(pin.crba(model, data, q).T)

@@ -5,7 +5,10 @@ from typing import Any
 
 
 class FflinError(Exception):
-    """Base of every error that a public call of fflin raises on purpose."""
+    """Base of every error that a public call of fflin raises on purpose; reads as one line."""
+
+    def __str__(self) -> str:
+        return " ".join(line.strip() for line in super().__str__().splitlines())
 
 
 class InputError(FflinError, ValueError):

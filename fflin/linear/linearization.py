@@ -62,8 +62,11 @@ class Linearizer:
     InputError
         If the frame is unknown, the reference is not a pin.SE3, or `moving` is asked for with a
         reference or with a frame other than "local".
+    SingularInertiaError
+        If M is singular at every configuration.
     ModelError
-        If Pinocchio's Data for the robot would pass 1 GiB.
+        If Pinocchio's Data for the robot would pass 1 GiB, or its model was changed after the
+        robot was made.
 
     Attributes
     ----------
@@ -93,6 +96,8 @@ class Linearizer:
         self._standing: Chart = Standing()
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
+        given = hypot(*robot.gravity, *np.concatenate(robot.passive).tolist())
+        self._moderate = given < _MODERATE
         # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
         self._known = ready.free and ready.own_reference and ready.actuation.default
         self._at_rest_fields = {
@@ -145,7 +150,7 @@ class Linearizer:
         v = self.prepared.rest["v"] if v is None else v
         u = self.prepared.rest["u0"] if u is None else u
         with self._lock:
-            if hypot(*v.tolist(), *u.tolist()) < _MODERATE:
+            if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
                 return self._anywhere(q, v, u)
             # What overflows is refused, and not warned of. Every call of NumPy costs more here.
             with np.errstate(over="ignore", invalid="ignore"):

@@ -249,17 +249,19 @@ class LinearModel:
             raise InputError(f"the model is sampled already, at dt = {self.dt:g} s")
         nx, nu = self.B.shape
         driven = np.column_stack((self.B, self.f0))
-        if not (self.A @ self.A).any():
-            Ad = np.eye(nx) + self.A * dt
-            held = driven * dt + self.A @ driven * (dt * dt / 2.0)
-        else:
-            from scipy.linalg import expm
+        # What overflows is refused below, and not warned of.
+        with np.errstate(over="ignore", invalid="ignore"):
+            if not (self.A @ self.A).any():
+                Ad = np.eye(nx) + self.A * dt
+                held = driven * dt + self.A @ driven * (dt * dt / 2.0)
+            else:
+                from scipy.linalg import expm
 
-            block = np.zeros((nx + nu + 1, nx + nu + 1))
-            block[:nx, :nx] = self.A
-            block[:nx, nx:] = driven
-            exponential = expm(block * dt)
-            Ad, held = exponential[:nx, :nx], exponential[:nx, nx:]
+                block = np.zeros((nx + nu + 1, nx + nu + 1))
+                block[:nx, :nx] = self.A
+                block[:nx, nx:] = driven
+                exponential = expm(block * dt)
+                Ad, held = exponential[:nx, :nx], exponential[:nx, nx:]
         if not (np.isfinite(Ad).all() and np.isfinite(held).all()):
             raise InputError(f"dt is {dt:g} s, over which the model grows beyond all numbers")
         sampled = replace(

@@ -11,13 +11,14 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, truth
 from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state import Frame, StateMap, unknown_frame
 from fflin.linear.certificate import certify, inertia_matrix
 from fflin.linear.ignorable import ignorable_states
 from fflin.linear.state_equations import at_rest
+from fflin.robot.massless import require_inertia
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
@@ -69,13 +70,18 @@ def prepare(
     robot: Robot, *, frame: Frame | None, reference: pin.SE3 | None, moving: bool
 ) -> Prepared:
     """Prepare a robot; arguments and errors are those of `Linearizer`."""
-    if moving and (reference is not None or frame not in (None, "local")):
+    moving = truth("moving", moving)
+    if frame is None:
+        frame = "local" if moving else "hybrid"
+    elif not isinstance(frame, str):  # nor one whose comparison below is an array
+        raise unknown_frame(frame)
+    if moving and (reference is not None or frame != "local"):
         raise InputError(
             "moving=True takes the error in the moving base's own axes: leave out the "
             "reference, and the frame or make it 'local'"
         )
-    frame = frame or ("local" if moving else "hybrid")
     state = StateMap(robot, reference=reference, frame=frame)
+    require_inertia(robot)
     actuation = Actuation(state)
     sensing = None
     if robot.outputs != (FullState(),):
@@ -92,7 +98,7 @@ def prepare(
         map=state,
         actuation=actuation,
         sensing=sensing,
-        moving=bool(moving),
+        moving=moving,
         own_reference=reference is None,
         reference=frozen(pin.SE3ToXYZQUAT(state.reference)),
         free=sensing is None and not moving and not acts,
@@ -107,7 +113,7 @@ def prepare(
             "input_units": actuation.units,
             "output_units": seen.units,
             "frame": state.frame,
-            "moving": bool(moving),
+            "moving": moving,
             "robot": robot.name,
             "urdf_sha256": robot.urdf_sha256,
             "locked": robot.locked,
