@@ -14,7 +14,8 @@ import fflin
 from fflin.batch import chunks as batch_chunks
 from fflin.batch import dispatch as dispatching
 from fflin.batch.workers import OwnWorkers, WorkerDied
-from tests.batch.test_sweep import assert_same, points, singular_at
+from tests.support.robots import singular_at
+from tests.support.sweeps import assert_same, points
 
 
 @pytest.fixture(scope="module")

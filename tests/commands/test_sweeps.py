@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from tests.commands.test_cli import refused, run
+from tests.support.commands import refused, run
 
 pytest.importorskip("h5py")
 

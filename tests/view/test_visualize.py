@@ -317,5 +317,5 @@ def test_a_name_that_is_no_files_name_does_no_harm(robots, monkeypatch):
 
 
 def test_assets_are_part_of_the_package():
-    names = {path.name for path in Path(fflin.__file__).parent.joinpath("assets").iterdir()}
+    names = {path.name for path in Path(fflin.__file__).parent.joinpath("view", "assets").iterdir()}
     assert {"page.html", "style.css", "main.js", "sky.js"} <= names
