@@ -19,7 +19,6 @@ from fflin.commands import (
     INTERRUPTED,
     analysis,
     models,
-    modes,
     regulator,
     simulation,
     sweeps,
@@ -88,7 +87,6 @@ def _parser() -> argparse.ArgumentParser:
     models.add_commands(commands)
     analysis.add_commands(commands)
     regulator.add_commands(commands)
-    modes.add_commands(commands)
     simulation.add_commands(commands)
     visual.add_commands(commands)
     sweeps.add_commands(commands)

@@ -15,8 +15,7 @@ import umsgpack
 from fflin.base.validation import Array
 from fflin.robot.robot import ROOT, Robot
 from fflin.robot.urdf.xml import named
-from fflin.view.collada import Indices
-from fflin.view.meshes import Mesh, load_mesh
+from fflin.view.meshes import Indices, Mesh, load_mesh
 from fflin.view.shapes import PLAIN, Shape, shapes
 
 with warnings.catch_warnings():

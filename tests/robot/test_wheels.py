@@ -10,7 +10,7 @@ import pytest
 import fflin
 from fflin import ReactionWheel
 from fflin.base.rotation import skew
-from fflin.commands.model_text import robot_info
+from fflin.robot.summary import robot_info
 from tests.support.robots import FRAMES, random_point, random_pose, random_tree
 
 # Four in any axes, on the base and on links of the arm: (axis, frame, inertia, speed).

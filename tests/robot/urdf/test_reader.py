@@ -266,7 +266,7 @@ def test_load_warns_and_keeps_the_notes(tmp_path):
 
 
 def test_info_lists_the_warnings(tmp_path):
-    from fflin.commands.model_text import robot_info
+    from fflin.robot.summary import robot_info
 
     path = tmp_path / "r.urdf"
     path.write_text(arm(inside=AXIS + '<dynamics damping="1"/>'))
@@ -276,7 +276,7 @@ def test_info_lists_the_warnings(tmp_path):
 
 
 def test_info_lists_mimic_joints_and_what_hangs_on_them(tmp_path):
-    from fflin.commands.model_text import robot_info
+    from fflin.robot.summary import robot_info
 
     path = tmp_path / "r.urdf"
     path.write_text(three("", '<mimic joint="j1" multiplier="0.5" offset="-2"/>'))
