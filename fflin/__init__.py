@@ -69,7 +69,7 @@ _PUBLIC = {
     "acceleration_lqr": "control.acceleration_lqr",
     "bryson": "control.weights",
     "check": "linear.check",
-    "configuration": "robot.robot",
+    "configuration": "dynamics.points",
     "controllability": "analysis.controllability",
     "effort": "dynamics.points",
     "equilibrium": "linear.equilibrium",
@@ -147,7 +147,7 @@ if TYPE_CHECKING:
     from fflin.control.sampled_cost import sampled_cost
     from fflin.control.tvlqr import GainSchedule, tvlqr
     from fflin.control.weights import bryson
-    from fflin.dynamics.points import effort, velocity
+    from fflin.dynamics.points import configuration, effort, velocity
     from fflin.dynamics.state import StateMap
     from fflin.linear.check import Check, check
     from fflin.linear.equilibrium import Equilibrium, equilibrium
@@ -170,7 +170,7 @@ if TYPE_CHECKING:
         JointVelocities,
         Momentum,
     )
-    from fflin.robot.robot import Robot, configuration
+    from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion
     from fflin.simulation.plots import plot_motion
     from fflin.simulation.simulate import simulate
