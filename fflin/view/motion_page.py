@@ -104,11 +104,9 @@ def subtitle(robot: Robot) -> str:
     return ", ".join([*parts, f"{robot.mass:.4g} kg"])
 
 
-def frame_points(
-    drawing: Drawing, film: Playback, size: float, *, follow: bool = False, most: int = 24
-) -> Array:
+def frame_points(drawing: Drawing, film: Playback, size: float, *, follow: bool = False) -> Array:
     """Return corners of all that moves and tips of forces (M, 3) at some frames, for a camera."""
-    chosen = np.unique(np.linspace(0, len(film.t) - 1, most).astype(int))
+    chosen = np.unique(np.linspace(0, len(film.t) - 1, 24).astype(int))
     strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []
     for index in chosen:
