@@ -53,6 +53,7 @@ _PUBLIC = {
     "OutputFeedback": "control.output_feedback",
     "RandomConfigurations": "batch.configurations",
     "ReactionWheel": "robot.inputs",
+    "RelativePose": "robot.outputs",
     "ReducedModel": "analysis.momentum",
     "Robot": "robot.robot",
     "ScheduledFeedback": "batch.gains",
@@ -169,6 +170,7 @@ if TYPE_CHECKING:
         JointPositions,
         JointVelocities,
         Momentum,
+        RelativePose,
     )
     from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion

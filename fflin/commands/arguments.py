@@ -173,7 +173,8 @@ def add_system(command: argparse.ArgumentParser) -> None:
         command,
         "--output",
         "what is watched: state (default), base, joints, rates, com, momentum, frame:NAME (pose "
-        "and velocity), pose:NAME, velocity:NAME, gyroscope:NAME or accelerometer:NAME",
+        "and velocity), pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME; "
+        "relative:NAME:TO, as another frame sees it",
         metavar="SPEC",
         read=str,
     )

@@ -40,7 +40,7 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
         except FflinError as error:  # a name or an inertia that does not suit this robot
             raise type(error)(f"{arguments.inputs}: {error}") from None
     if getattr(arguments, "output", []):
-        from fflin.commands.outputs import parse_output
+        from fflin.robot.outputs import parse_output
 
         fields["outputs"] = [output for text in arguments.output for output in parse_output(text)]
     return robot.replace(**fields) if fields else robot

@@ -17,7 +17,7 @@ from fflin.dynamics.output_values import Measuring
 from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
-from fflin.robot.outputs import Accelerometer, FullState
+from fflin.robot.outputs import FullState
 
 if TYPE_CHECKING:
     from fflin.control.policies import Policy
@@ -89,7 +89,7 @@ class OutputFeedback:
                 f"'{robot.name}' as it is given; linearise this robot"
             )
         measure = Measuring(state, lin.q)
-        aba = Aba(state) if any(isinstance(o, Accelerometer) for o in robot.outputs) else None
+        aba = Aba(state) if any(output.FEELS_ACCELERATION for output in robot.outputs) else None
         near = state.read(lin.q, lin.v)
         z: Array = np.zeros(len(by.A))
         asked = -np.inf

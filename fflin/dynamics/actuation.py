@@ -10,17 +10,16 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
-from fflin.robot.frames import find_frame
+from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.inputs import (
     BaseForce,
     BaseTorque,
     JointTorque,
     ReactionWheel,
-    Thruster,
+    WrenchInput,
     named_wheels,
 )
 from fflin.robot.robot import Robot
-from fflin.robot.wheels import carrier
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 
@@ -63,32 +62,29 @@ class Actuation:
         identity = np.eye(nv)
         for item in robot.inputs:
             at = len(names)
+            kind, unit = item.GROUP, item.UNIT
             if isinstance(item, BaseTorque | BaseForce):
                 torque = isinstance(item, BaseTorque)
-                kind, unit, rows = ("tau_b", "N m", ANGULAR) if torque else ("F_b", "N", LINEAR)
+                rows = ANGULAR if torque else LINEAR
                 names += [f"{kind}.{axis}" for axis in "xyz"]
                 columns += list(identity[rows])
                 if state.axes[0 if torque else 1]:
                     held.append(Held(slice(at, at + 3), rows))
             elif isinstance(item, JointTorque):
                 index = robot.joints.index(robot.joint(item.joint))
-                kind, unit = "tau_m", "N" if robot.joints[index].prismatic else "N m"
-                names.append(f"tau_m.{item.joint}")
+                unit = "N" if robot.joints[index].prismatic else unit
+                names.append(f"{kind}.{item.joint}")
                 columns.append(identity[6 + index])
-            elif isinstance(item, ReactionWheel):
-                kind, unit = "wheel", "N m"
+            elif isinstance(item, ReactionWheel) and item.inertia:
                 names.append(next(wheel_names))
-                if item.inertia:
-                    columns.append(identity[6 + robot.joint_names.index(names[-1])])
-                else:
-                    joint_index, wrench = _couple(robot, item)
-                    carried.setdefault(joint_index, []).append((at, wrench))
-                    columns.append(np.zeros(nv))
+                columns.append(identity[6 + robot.joint_names.index(names[-1])])
             else:
-                kind, unit = "thrust", "N"
-                names.append(item.name or f"thruster_{1 + kinds.count(kind)}")
-                joint_index, wrench = _push(robot, item)
-                carried.setdefault(joint_index, []).append((at, wrench))
+                assert isinstance(item, WrenchInput)
+                wheel = isinstance(item, ReactionWheel)
+                own = getattr(item, "name", None) or f"{item.KEY}_{1 + kinds.count(kind)}"
+                names.append(next(wheel_names) if wheel else own)
+                joint, wrench = _carried(robot, item)
+                carried.setdefault(joint, []).append((at, wrench))
                 columns.append(np.zeros(nv))
             units += [unit] * (len(names) - at)
             kinds += [kind] * (len(names) - at)
@@ -166,15 +162,9 @@ class Actuation:
         return self._fixed @ u
 
 
-def _push(robot: Robot, thruster: Thruster) -> tuple[int, Array]:
-    """Return the joint that carries a thruster and its wrench (6,) per newton in that frame."""
-    joint, placement = find_frame(robot.model, thruster.frame)
-    force = placement.rotation @ np.array(thruster.direction)
-    point = placement.act(np.array(thruster.position))
-    return joint, np.concatenate((force, np.cross(point, force)))
-
-
-def _couple(robot: Robot, wheel: ReactionWheel) -> tuple[int, Array]:
-    """Return the joint that carries a wheel and its wrench (6,) per newton metre of the motor."""
-    joint, axis = carrier(robot.model, wheel)
-    return joint, np.concatenate((np.zeros(3), -axis))
+def _carried(robot: Robot, item: WrenchInput) -> tuple[int, Array]:
+    """Return the joint that carries an input and its wrench (6,) per unit in that joint's frame."""
+    joint, placement = ROOT, pin.SE3.Identity()
+    if item.frame is not None:
+        joint, placement = find_frame(robot.model, item.frame)
+    return joint, np.array(placement.act(pin.Force(item.wrench)).vector)

@@ -1,6 +1,6 @@
 """The outputs of a robot, prepared: their names and units, and their evaluation at a point."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -8,47 +8,17 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product, rotation_matrix, skew
 from fflin.base.validation import Array
-from fflin.dynamics.output_slopes import (
-    ANGULAR,
-    LINEAR,
-    Carried,
-    Point,
-    Sensed,
-    accelerometer,
-    center_of_mass,
-    frame_pose,
-    frame_velocity,
-    gyroscope,
-    momentum,
-)
+from fflin.dynamics.output_kinds import ANGULAR, KINDS, LINEAR, Carried, Point, Sensed, Slopes
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.outputs import (
-    Accelerometer,
     BasePose,
-    CenterOfMass,
-    FramePose,
-    FrameVelocity,
     FullState,
-    Gyroscope,
     JointPositions,
     JointVelocities,
-    Momentum,
     Output,
 )
 from fflin.robot.robot import Robot
-
-# What writes the rows of an output, and the (name, unit) of each of its vectors.
-_OF_ROBOT: dict[type, tuple[Callable[[Point, Sensed], None], list[tuple[str, str]]]] = {
-    CenterOfMass: (center_of_mass, [("com", "m")]),
-    Momentum: (momentum, [("momentum.angular", "N m s"), ("momentum.linear", "N s")]),
-}
-_OF_FRAME: dict[type, tuple[Callable[[Point, Carried, Sensed], None], list[tuple[str, str]]]] = {
-    FramePose: (frame_pose, [("position", "m"), ("rotation", "rad")]),
-    FrameVelocity: (frame_velocity, [("angular_velocity", "rad/s"), ("velocity", "m/s")]),
-    Gyroscope: (gyroscope, [("gyroscope", "rad/s")]),
-    Accelerometer: (accelerometer, [("acceleration", "m/s^2")]),
-}
 
 # Rotation and position of the base relative to itself.
 _STANDING: tuple[Array, Array] = (np.eye(3), np.zeros(3))
@@ -111,30 +81,26 @@ class Sensing:
         self._rotation = rotation_matrix(self._quaternion)
 
         self.states: list[tuple[int, int]] = []
-        self._of_robot: list[tuple[slice, Callable[[Point, Sensed], None]]] = []
-        self._of_frames: list[tuple[slice, Callable[[Point, Carried, Sensed], None], Carried]] = []
+        self._kinds: list[tuple[slice, Slopes, tuple[Carried, ...]]] = []
         signals: list[tuple[str, str]] = []
         for output in outputs:
             at = len(signals)
-            if isinstance(output, CenterOfMass | Momentum):
-                of_robot, vectors = _OF_ROBOT[type(output)]
-                signals += _components(vectors)
-                self._of_robot.append((slice(at, len(signals)), of_robot))
-            elif isinstance(output, FramePose | FrameVelocity | Gyroscope | Accelerometer):
-                of_frame, vectors = _OF_FRAME[type(output)]
-                name, frame = output.frame, carried(robot, output.frame)
-                signals += _components([(f"{name}.{vector}", unit) for vector, unit in vectors])
-                self._of_frames.append((slice(at, len(signals)), of_frame, frame))
+            if type(output) in KINDS:
+                frames = tuple(carried(robot, name) for name in output.frames)
+                signals += output.signals
+                self._kinds.append((slice(at, len(signals)), KINDS[type(output)][0], frames))
             else:
                 indices = states_of(state, output)
                 self.states += enumerate(indices, start=at)
                 signals += [(state.names[index], state.units[index]) for index in indices]
+        # Those of frames last: the others overwrite what these read.
+        self._kinds.sort(key=lambda kind: bool(kind[2]))
         self.names = tuple(name for name, _ in signals)
         self.units = tuple(unit for _, unit in signals)
         twice = [name for index, name in enumerate(self.names) if name in self.names[:index]]
         if twice:
             raise InputError(f"output '{twice[0]}' is asked for twice; leave one of them out")
-        self.needs_acceleration = any(isinstance(output, Accelerometer) for output in outputs)
+        self.needs_acceleration = any(output.FEELS_ACCELERATION for output in outputs)
 
     def evaluate(self, data: pin.Data, q: Array, v: Array, a: Array) -> Sensed:
         """Return the outputs and their derivatives at a point.
@@ -161,17 +127,21 @@ class Sensing:
         if len(self.states) == ny:
             return sensed
         at = self._point(data, q, v)
-        for rows, of_robot in self._of_robot:
-            of_robot(at, sensed.part(rows))
-        if self.needs_acceleration:
-            felt = a.copy()
-            felt[LINEAR] += skew(v[ANGULAR]).dot(at.v_b) - at.g
-            pin.computeForwardKinematicsDerivatives(self._model, data, at.q, at.v, felt)
-        elif self._of_frames:
-            pin.computeForwardKinematicsDerivatives(self._model, data, at.q, at.v)
-        for rows, of_frame, frame in self._of_frames:
-            of_frame(at, frame, sensed.part(rows))
+        derived = False
+        for rows, slopes, frames in self._kinds:
+            if frames and not derived:
+                self._derive(data, at, v, a)
+                derived = True
+            slopes(at, frames, sensed.part(rows))
         return sensed
+
+    def _derive(self, data: pin.Data, at: Point, v: Array, a: Array) -> None:
+        felt: tuple[Array, ...] = ()
+        if self.needs_acceleration:
+            rate = a.copy()
+            rate[LINEAR] += skew(v[ANGULAR]).dot(at.v_b) - at.g
+            felt = (rate,)
+        pin.computeForwardKinematicsDerivatives(self._model, data, at.q, at.v, *felt)
 
     def _point(self, data: pin.Data, q: Array, v: Array) -> Point:
         still_q, still_v = q.copy(), v.copy()
@@ -205,7 +175,3 @@ def states_of(state: StateMap, output: Output) -> list[int]:
 def carried(robot: Robot, name: str) -> Carried:
     """Return where a frame is; a link's before a joint's of the same name."""
     return Carried(*find_frame(robot.model, name))
-
-
-def _components(vectors: list[tuple[str, str]]) -> list[tuple[str, str]]:
-    return [(f"{name}.{axis}", unit) for name, unit in vectors for axis in "xyz"]

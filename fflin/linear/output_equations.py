@@ -14,7 +14,7 @@ from fflin.dynamics.rnea import Rates
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
 
 if TYPE_CHECKING:
-    from fflin.dynamics.output_slopes import Sensed
+    from fflin.dynamics.output_kinds import Sensed
 
 
 def output_equations(

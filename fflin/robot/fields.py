@@ -6,6 +6,7 @@ from typing import Any
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.validation import number
 from fflin.robot.inputs import (
+    KINDS,
     BaseForce,
     BaseTorque,
     Input,
@@ -74,8 +75,7 @@ def validated_inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, .
     for item in value:
         if not isinstance(item, Input):
             raise InputError(
-                f"{item!r} is not an input; expected BaseTorque, BaseForce, JointTorque, "
-                "Thruster or ReactionWheel"
+                f"{item!r} is not an input; expected {', '.join(kind.__name__ for kind in KINDS)}"
             )
         if isinstance(item, JointTorque):
             find(item.joint)

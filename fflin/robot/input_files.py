@@ -9,7 +9,7 @@ from typing import Any
 
 from fflin.base.errors import FflinError, InputError, UnknownNameError, unknown
 from fflin.robot.catalog import find_inputs
-from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, ReactionWheel, Thruster
+from fflin.robot.inputs import KINDS, Input
 from fflin.robot.urdf.reader import read_file
 
 if sys.version_info >= (3, 11):
@@ -17,13 +17,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-_TYPES: dict[str, type[Input]] = {
-    "base_torque": BaseTorque,
-    "base_force": BaseForce,
-    "joint_torque": JointTorque,
-    "thruster": Thruster,
-    "reaction_wheel": ReactionWheel,
-}
+_TYPES = {kind.KEY: kind for kind in KINDS}
 _VECTORS, _NUMBERS = ("position", "direction", "axis"), ("inertia", "momentum")
 
 # Some 1,000 inputs.
@@ -103,7 +97,7 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     seen: dict[Input | str | None, int] = {}
     for index, table in enumerate(document.tables):
         item = _input(document, index, table)
-        what = item.name if isinstance(item, Thruster | ReactionWheel) else item
+        what = getattr(item, "name", item)
         if what is not None and what in seen:
             shown = f"the name '{what}'" if isinstance(what, str) else what
             message = f"{shown} stands in line {document.line(seen[what])} already; take one out"

@@ -1,28 +1,70 @@
 """What acts on a robot: the inputs u of the linear model, in any mix and order."""
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
+
+import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import number
+from fflin.base.validation import Array, number
 
 Vector3: TypeAlias = Sequence[float]
 
 
 @dataclass(frozen=True)
-class BaseTorque:
+class Input:
+    """What every kind of input says of itself.
+
+    Attributes
+    ----------
+    KEY : str
+        Its type in a TOML file; what has no name of its own is KEY_1, KEY_2, ...
+    GROUP : str
+        What its inputs are called together, in weights and limits.
+    UNIT : str
+    """
+
+    KEY: ClassVar[str]
+    GROUP: ClassVar[str]
+    UNIT: ClassVar[str] = "N m"
+
+
+class WrenchInput(Input, ABC):
+    """An input that pushes or turns a link by a wrench that is constant in a frame.
+
+    Attributes
+    ----------
+    frame : str or None
+        Frame of the model, on the base or on any link; None is the base's root frame.
+    """
+
+    frame: str | None
+
+    @property
+    @abstractmethod
+    def wrench(self) -> Array:
+        """Force [N] and torque [N m] about the frame's origin (6,) of a unit, in the frame."""
+
+
+@dataclass(frozen=True)
+class BaseTorque(Input):
     """Torque tau_b (3) [N m] on the base, in the axes that the velocity frame says."""
 
+    KEY, GROUP = "base_torque", "tau_b"
+
 
 @dataclass(frozen=True)
-class BaseForce:
+class BaseForce(Input):
     """Force F_b (3) [N] at the base origin, in the axes that the velocity frame says."""
 
+    KEY, GROUP, UNIT = "base_force", "F_b", "N"
+
 
 @dataclass(frozen=True)
-class JointTorque:
+class JointTorque(Input):
     """Torque [N m], or force [N], of the motor of one joint.
 
     Parameters
@@ -31,11 +73,12 @@ class JointTorque:
         An independent joint. What mimics it is driven with it.
     """
 
+    KEY, GROUP = "joint_torque", "tau_m"
     joint: str
 
 
 @dataclass(frozen=True)
-class Thruster:
+class Thruster(WrenchInput):
     """Force [N] along a direction that is fixed in a frame, at a point fixed in that frame.
 
     Parameters
@@ -50,6 +93,7 @@ class Thruster:
         Name of the input; thruster_1, thruster_2, ... by default.
     """
 
+    KEY, GROUP, UNIT = "thruster", "thrust", "N"
     frame: str
     position: Vector3
     direction: Vector3
@@ -61,9 +105,14 @@ class Thruster:
         direction = _unit("thruster direction", self.direction, "where it pushes")
         object.__setattr__(self, "direction", direction)
 
+    @property
+    def wrench(self) -> Array:
+        """Force [N] and torque [N m] about the frame's origin (6,) of a unit, in the frame."""
+        return np.concatenate((self.direction, np.cross(self.position, self.direction)))
+
 
 @dataclass(frozen=True)
-class ReactionWheel:
+class ReactionWheel(WrenchInput):
     r"""Motor torque [N m] of a balanced wheel that turns about an axis fixed on a link.
 
     The torque u acts on the wheel along the axis a, and -u on the link that carries it: its power
@@ -92,6 +141,7 @@ class ReactionWheel:
         h [N m s] along the axis, relative to the carrier; of a wheel without inertia.
     """
 
+    KEY, GROUP = "reaction_wheel", "wheel"
     axis: Vector3
     frame: str | None = None
     inertia: float | None = None
@@ -116,8 +166,13 @@ class ReactionWheel:
             )
         object.__setattr__(self, "inertia", inertia)
 
+    @property
+    def wrench(self) -> Array:
+        """Force [N] and torque [N m] about the frame's origin (6,) of a unit, in the frame."""
+        return np.concatenate((np.zeros(3), -np.array(self.axis)))
 
-Input: TypeAlias = BaseTorque | BaseForce | JointTorque | Thruster | ReactionWheel
+
+KINDS: tuple[type[Input], ...] = (BaseTorque, BaseForce, JointTorque, Thruster, ReactionWheel)
 
 
 def three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.commands.model_text import linear_model
+from fflin.commands.model_text import model_report
 from tests.support.robots import FRAMES, random_point, random_pose, random_tree
 
 THRUSTERS = (
@@ -168,7 +168,7 @@ def test_null_space_thrust_is_a_fixed_point_and_can_be_unstable():
         assert lin.is_equilibrium() and lin.u0.all()
         assert fflin.check(robot, lin).ok
         poles[sign] = [p for p in np.linalg.eigvals(lin.A) if abs(p) > 0.1]
-        assert ("unstable" in linear_model(lin)) == (sign < 0)
+        assert ("unstable" in model_report(lin)) == (sign < 0)
     assert np.sort(np.imag(poles[1.0])) == pytest.approx(np.sort(np.real(poles[-1.0])), rel=1e-9)
     assert np.abs(np.real(poles[1.0])).max() < 1e-9 < np.real(poles[-1.0]).max()
 

@@ -19,6 +19,7 @@ from fflin.robot.outputs import (
     JointPositions,
     JointVelocities,
     Momentum,
+    RelativePose,
 )
 from tests.support.robots import random_pose, random_tree
 
@@ -92,6 +93,8 @@ def all_measured(robot, frame="imu"):
         FramePose(last),
         FrameVelocity(last),
         Accelerometer(last),
+        RelativePose(frame, last),
+        RelativePose(last, frame),
     ]
 
 
@@ -124,7 +127,12 @@ def measure(robot, outputs, reference, gravity, q, v, a, q_star):
         velocity = frame.placement.actInv(data.v[frame.parentJoint])
         rate = frame.placement.actInv(data.a[frame.parentJoint])
         w, v_f = velocity.angular, velocity.linear
-        if isinstance(output, FramePose):
+        if isinstance(output, RelativePose):
+            seeing = next(i for i, frame in enumerate(model.frames) if frame.name == output.to)
+            relative = data.oMf[seeing].inverse() * oMf
+            before = was[seeing].T @ was[index]
+            y += [relative.translation, pin.log3(before.T @ relative.rotation)]
+        elif isinstance(output, FramePose):
             y += [reference.actInv(oMf.translation), pin.log3(was[index].T @ oMf.rotation)]
         elif isinstance(output, FrameVelocity):
             y += [w, to_reference @ oMf.rotation @ v_f]
@@ -351,7 +359,8 @@ def test_orbit_costs_no_digits(name):
         rows, kind = slice(row, row + 3), sensing.names[row].split(".")[-2]
         y, by_q, by_v = here.y[rows].copy(), here.by_q[rows].copy(), here.by_v[rows].copy()
         scale = 1.0
-        if kind in shift:
+        relative = "/" in sensing.names[row]
+        if kind in shift and not relative:
             y += shift[kind]
             scale = ORBIT
         elif kind in drift:
@@ -469,3 +478,38 @@ def test_what_cannot_be_is_refused(outputs, error, message):
 def test_joints_are_a_tuple_of_names():
     with pytest.raises(fflin.InputError, match=r"expected a tuple of names, \('joint_1',\)"):
         JointVelocities("joint_1")
+
+
+def test_relative_pose_of_a_planar_arm_in_closed_form():
+    """A joint about y, seen from the one before it."""
+    robot = fflin.load("planar_detumble")
+    robot = robot.replace(outputs=[RelativePose(robot.joint_names[1], robot.joint_names[0])])
+    joint = robot.joint(robot.joint_names[1])
+    arm = robot.model.jointPlacements[robot.model.getJointId(joint.name)].translation
+    angle = 0.7
+    q = fflin.configuration(
+        robot, {joint.name: angle}, random_pose(np.random.default_rng(4), 100.0)
+    )
+    lin = fflin.linearize(robot, q)
+    assert np.abs(lin.y0 - [*arm, 0.0, 0.0, 0.0]).max() < 1e-15
+    expected = np.zeros((6, len(lin.A)))
+    # A joint's own frame turns with it and stays where it is.
+    expected[3:, lin.state_names.index(f"q_m.{joint.name}")] = [0.0, 1.0, 0.0]
+    assert np.abs(lin.C - expected).max() < 1e-15
+    assert fflin.check(robot, lin).ok
+
+
+@pytest.mark.parametrize("degrees", [0.0, 170.0])
+def test_relative_pose_does_not_see_the_base(degrees):
+    robot = fflin.load("dual_arm")
+    frames = robot.joint_names[-1], robot.joint_names[2]
+    robot = robot.replace(outputs=[RelativePose(*frames)])
+    rng = np.random.default_rng(5)
+    q, v, _ = point(robot, rng, degrees)
+    lin = fflin.linearize(robot, q, v)
+    groups = StateMap(robot).groups
+    assert not lin.C[:, groups.q_b].any() and not lin.C[:, groups.r_b].any()
+    assert fflin.check(robot, lin).ok
+    # The other way round it is the inverse: p' = -R^T p.
+    back = fflin.linearize(robot.replace(outputs=[RelativePose(*frames[::-1])]), q, v)
+    assert np.linalg.norm(back.y0[:3]) == pytest.approx(np.linalg.norm(lin.y0[:3]), rel=1e-13)

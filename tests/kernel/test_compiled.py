@@ -41,7 +41,7 @@ def test_compilation_is_told_once_whatever_the_threads(compiled, caplog, tmp_pat
 
 @pytest.mark.parametrize("older", [False, True])
 def test_code_that_is_older_than_any_source_is_not_taken(compiled, caplog, tmp_path, older):
-    kept = tmp_path / "batch_kernel.invert-1.nbi"
+    kept = tmp_path / "factor.invert-1.nbi"
     kept.write_bytes(b"")
     newest = max(file.stat().st_mtime for file in kernel_code._sources())
     os.utime(kept, (newest, newest + (-1.0 if older else 1.0)))

@@ -3,7 +3,7 @@
 import pytest
 
 import fflin
-from fflin.commands.outputs import parse_output
+from fflin.robot.outputs import parse_output
 
 SPECS = {
     "state": (fflin.FullState(),),
@@ -15,6 +15,7 @@ SPECS = {
     "frame:tool": (fflin.FramePose("tool"), fflin.FrameVelocity("tool")),
     "pose:a:b": (fflin.FramePose("a:b"),),
     "velocity:tool": (fflin.FrameVelocity("tool"),),
+    "relative:tool:base": (fflin.RelativePose("tool", "base"),),
     "gyroscope:tool": (fflin.Gyroscope("tool"),),
     "accelerometer:tool": (fflin.Accelerometer("tool"),),
 }
@@ -28,6 +29,9 @@ def test_every_spec(text, outputs):
 def test_mistakes_say_what_to_write():
     for text in ("frame", "frame:"):
         with pytest.raises(fflin.InputError, match="is of no frame; write frame:NAME"):
+            parse_output(text)
+    for text in ("relative", "relative:tool", "relative::base", "relative:tool:"):
+        with pytest.raises(fflin.InputError, match="fewer than two frames; write relative:NAME:TO"):
             parse_output(text)
     with pytest.raises(fflin.InputError, match="'base:tool' is of the whole robot; write base"):
         parse_output("base:tool")
