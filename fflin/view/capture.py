@@ -148,7 +148,7 @@ def _shots(
 def _browser(program: str, patience: float) -> Iterator[_Browser]:
     """Run a browser, for so many seconds at the most, and leave nothing of it behind."""
     with tempfile.TemporaryDirectory(prefix="fflin-", ignore_cleanup_errors=True) as folder:
-        root = ["--no-sandbox"] if os.geteuid() == 0 else []
+        root = ["--no-sandbox"] if getattr(os, "geteuid", lambda: 1)() == 0 else []
         command = [program, *_ARGUMENTS, *root, f"--user-data-dir={folder}", "about:blank"]
         process = subprocess.Popen(
             ["sh", "-c", _WITH_PIPES, *command],
@@ -168,9 +168,8 @@ def _browser(program: str, patience: float) -> Iterator[_Browser]:
                 timer.start()
                 browser = _Browser(process)
                 yield browser
-                # Told to go it clears up behind itself, which it does not when it is ended.
                 with suppress(_BrowserError, subprocess.TimeoutExpired):
-                    browser.tell("Browser.close")
+                    browser.quit()
                     process.wait(5.0)
             finally:
                 timer.cancel()
@@ -179,7 +178,7 @@ def _browser(program: str, patience: float) -> Iterator[_Browser]:
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
     """End the browser and all that it started."""
-    with suppress(ProcessLookupError):
+    with suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)
 
 
@@ -225,6 +224,11 @@ class _Browser:
         target = self.tell("Target.createTarget", url="about:blank")
         attached = self.tell("Target.attachToTarget", targetId=target["targetId"], flatten=True)
         self._session = {"sessionId": attached["sessionId"]}
+
+    def quit(self) -> None:
+        """Tell it to go: then it clears up behind itself, which it does not when it is ended."""
+        self._session = {}
+        self.tell("Browser.close")
 
     def evaluate(self, expression: str) -> Any:
         """Return the value of an expression of JavaScript, or of its promise."""
