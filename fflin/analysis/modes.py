@@ -229,6 +229,7 @@ def _free_free(A: Array, M: Array, inertia: Array) -> _Found | None:
     M_star = unit[np.ix_(felt, felt)] - across.T @ np.linalg.solve(unit[np.ix_(free, free)], across)
     K = -M_star @ by_s[np.ix_(felt, felt)]
     squares, vectors = eigh((K + K.T) / 2.0, (M_star + M_star.T) / 2.0)
+    squares, vectors = _polished(by_s[np.ix_(felt, felt)], squares, vectors)
     found: list[tuple[complex, Any, bool]] = []
     for square, vector in zip(squares.tolist(), vectors.T, strict=True):
         if abs(square) <= _NO_STIFFNESS * len(felt) * float(np.abs(squares).max()):
@@ -241,6 +242,19 @@ def _free_free(A: Array, M: Array, inertia: Array) -> _Found | None:
             found.append((pole, shape, pole.real > 0.0))
     counted = sum(2 if pole.imag else 1 for pole, *_ in found)
     return found, nv - counted // 2, 2 * nv - counted
+
+
+def _polished(by_s: Array, squares: Array, vectors: Array) -> tuple[Array, Array]:
+    """Return the pairs of -by_s, after one Newton step from those of its symmetric pencil.
+
+    The Schur complement rounds by the conditioning of M, A itself is right to the last digits.
+    """
+    defect = -np.linalg.solve(vectors, by_s @ vectors) - np.diag(squares)
+    gaps = squares - squares[:, None]
+    # Equal ones stay as they are: any of their combinations will do.
+    apart = np.abs(defect) < 1e-3 * np.abs(gaps)
+    mixed = np.divide(defect, gaps, out=np.zeros_like(defect), where=apart)
+    return squares + defect.diagonal(), vectors + vectors @ mixed
 
 
 def _scales(A: Array, inertia: Array) -> tuple[Array, float]:

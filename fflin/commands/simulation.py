@@ -114,6 +114,8 @@ def _simulate(arguments: argparse.Namespace) -> int:
         lines += show_motion(robot, motion, arguments)
     finally:
         print("\n".join(lines))
+    if motion.stopped.startswith("interrupted"):
+        raise KeyboardInterrupt(motion.stopped)
     return FELL_SHORT if motion.stopped else DONE
 
 

@@ -13,6 +13,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, as_double
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.state import StateMap
+from fflin.robot.massless import require_inertia
 
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
@@ -36,6 +37,7 @@ class Dynamics:
 
     def __init__(self, state: StateMap, disturbance: Disturbance | None = None) -> None:
         robot = state.robot
+        require_inertia(robot)
         self._state, self._robot = state, robot
         self._aba = Aba(state)
         self.actuation = self._aba.actuation

@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.progress import Progress
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, number, truth, whole
 from fflin.control.channel import Channel, Law, limits_of
 from fflin.control.policies import Allocation, bound
 from fflin.dynamics.state import Frame, StateMap
@@ -29,7 +29,8 @@ _LARGEST_TURN = 1.0
 _LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
 _STEP = 0.01  # [s]
 _LOOK = 16  # steps between looks at the clock
-_ROWS_LIMIT = 10_000_000
+_ROWS_LIMIT, _STEPS_LIMIT = 10_000_000, 10_000_000_000
+_LONGEST = 1e100  # [s]; the square of its inverse is still a number
 
 
 class Run:
@@ -51,7 +52,9 @@ class Run:
             frame, reference = self.lin.frame, self.lin.reference
         self.robot = robot
         self.policy = policy
-        self.state = StateMap(robot, reference=reference, frame=frame or "hybrid")
+        self.state = StateMap(
+            robot, reference=reference, frame="hybrid" if frame is None else frame
+        )
         self.dynamics = Dynamics(self.state, disturbance)
         self._law = None if policy is None else bound(policy, robot)
 
@@ -84,9 +87,11 @@ class Run:
         if sample is not None:
             sample = _positive("sample", sample)
         duration, delayed = _positive("duration", duration), number("delay", delay)
-        if delayed < 0.0:
-            raise InputError(f"delay is {delayed:g} s, expected 0 or more")
+        if not 0.0 <= delayed <= _LONGEST:
+            raise InputError(f"delay is {delayed:g} s, expected 0 to {_LONGEST:g} s")
+        every = whole("every", every, 1)
         self.fastest = 0.0 if sample else self._fastest_pole()
+        chosen = dt is None
         if dt is None:
             dt = _STEP
             if self.fastest * dt > 1.0:
@@ -103,14 +108,15 @@ class Run:
                 )
             self.steps = int(np.ceil(duration / self.dt))
             self.dt = duration / self.steps
-        if not isinstance(every, int | np.integer) or every < 1:
-            raise InputError(f"every is {every!r}, expected a whole number of steps, 1 or more")
-        self.every = int(every)
+        self.every = every
         rows = self.steps // every + 2
-        if rows * (self.robot.nq + self.robot.nv + 2 * self.state.nx) > 50 * _ROWS_LIMIT:
+        wide = rows * (self.robot.nq + self.robot.nv + 2 * self.state.nx) > 50 * _ROWS_LIMIT
+        if wide or self.steps > _STEPS_LIMIT:
+            asked = f", which the loop's fastest pole at {self.fastest:.3g} 1/s asks for,"
             raise InputError(
-                f"{duration:g} s in steps of {self.dt:g} s are {rows:.3g} rows; take a larger "
-                "dt or `every`"
+                f"{duration:g} s in steps of {self.dt:g} s"
+                f"{asked if chosen and self.dt < _STEP and self.fastest else ''} are "
+                f"{self.steps:.3g} steps and {rows:.3g} rows; take a larger dt or `every`"
             )
         if sample is None and delayed:
             sample = self.dt
@@ -142,7 +148,7 @@ class Run:
     def choose(self, method: str, project: bool) -> None:
         """Set the integrator."""
         kind = integrator(method)
-        self.project = bool(project)
+        self.project = truth("project", project)
         if self.fastest * self.dt > kind.reach:
             raise InputError(
                 f"the step dt is {self.dt:g} s, too large for a loop whose fastest pole is at "
@@ -195,7 +201,7 @@ class Run:
         self.follow = not self.dynamics.isolated(driven=self.channel is not None)
         continuous = self.channel is not None and self.channel.continuous
         self.asked = self.channel.ask if self.channel is not None and continuous else None
-        bar = Progress(self.steps, progress)
+        bar = Progress(progress)
         stopped, step = "", 0
         try:
             for step in range(self.steps):
@@ -209,7 +215,7 @@ class Run:
                 if stopped:
                     break
                 if step % _LOOK == 0:
-                    bar.update(step + 1)
+                    bar.update(step + 1, self.steps)
         except KeyboardInterrupt:
             if not self.count:
                 raise
@@ -316,6 +322,6 @@ def _part_of(sample: float, largest: float, *times: float) -> float:
 
 def _positive(name: str, value: Any) -> float:
     time = number(name, value)
-    if time <= 1e-100:  # its inverse is squared
-        raise InputError(f"{name} is {time:g} s, expected more than 0")
+    if not 1.0 / _LONGEST < time <= _LONGEST:
+        raise InputError(f"{name} is {time:g} s, expected more than 0 and at most {_LONGEST:g} s")
     return time

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from fflin.base.errors import InputError
 from fflin.simulation.recording import check_prediction, motion_of
 from fflin.simulation.run import Run
 
@@ -123,4 +124,10 @@ def simulate(
     run.actuate(limits)
     run.choose(method, project)
     run.guard(events, callback)
-    return motion_of(run, run.go(progress), linear)
+    try:
+        return motion_of(run, run.go(progress), linear)
+    except MemoryError:
+        raise InputError(
+            f"{run.steps // run.every} rows of '{run.robot.name}' do not fit into the memory; take "
+            "a larger dt or `every`"
+        ) from None

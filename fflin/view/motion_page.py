@@ -11,6 +11,7 @@ import pinocchio as pin
 from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.state import StateMap
+from fflin.robot.frames import find_frame
 from fflin.robot.robot import ROOT, Robot
 from fflin.view.page import build_page, packed
 from fflin.view.panel import panel
@@ -172,8 +173,8 @@ def triads(robot: Robot, tool: str | None, size: float) -> list[dict[str, Any]]:
     paths = body_paths(robot)
     found = [(paths[0], pin.SE3.Identity(), 0.3)]
     if tool:
-        frame = robot.model.frames[robot.model.getFrameId(tool)]
-        found.append((paths[frame.parentJoint - ROOT], frame.placement, 0.12))
+        joint, placement = find_frame(robot.model, tool)
+        found.append((paths[joint - ROOT], placement, 0.12))
     return [
         {
             "path": ["meshcat", "robot", path],

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from warnings import warn
 
-from fflin.base.errors import FflinWarning, FileError, InputError, unknown
-from fflin.base.validation import Array, number
+from fflin.base.errors import FflinWarning, FileError, InputError
+from fflin.base.validation import Array, number, truth
 from fflin.base.writing import as_path, write_whole
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.frames import find_frame
+from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -118,8 +119,9 @@ def visualize(
         )
     if scene is None:
         scene = "lab" if any(robot.gravity) else "space"
-    if scene not in SCENES:
+    if not isinstance(scene, str) or scene not in SCENES:
         raise InputError(f"scene is {scene!r}, expected one of {', '.join(SCENES)}")
+    opened = None if open is None else truth("open", open)
     check_tool(robot, tool)
     from fflin.view.playback import default_tool
 
@@ -137,7 +139,7 @@ def visualize(
         )
         for note in live.notes:
             warn(note, FflinWarning, stacklevel=2)
-        if open or open is None:
+        if opened is not False:
             live.open()
         return live
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif}, robot.urdf)
@@ -166,7 +168,7 @@ def visualize(
         ) as file:
             file.write(page.encode())
         shown = Path(file.name)
-    if shown and (open if open is not None else not outputs):
+    if shown and (not outputs if opened is None else opened):
         import webbrowser
 
         webbrowser.open(shown.resolve().as_uri())
@@ -206,9 +208,8 @@ def check_outputs(files: dict[str, Any], spare: Path | None = None) -> dict[str,
 
 def check_tool(robot: Robot, tool: str | None) -> None:
     """Raise UnknownNameError where there is no such frame."""
-    if tool is not None and not robot.model.existFrame(tool):
-        frames = [frame.name for frame in robot.model.frames.tolist() if frame.parentJoint >= ROOT]
-        raise unknown("frame", tool, frames)
+    if tool is not None:
+        find_frame(robot.model, tool)
 
 
 def check_rates(fps: float, speed: float | None, duration: float) -> tuple[float, float]:

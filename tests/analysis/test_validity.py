@@ -1,7 +1,13 @@
 """How far the linear model and its loop reach."""
 
+import contextlib
+import os
+import signal
+import subprocess
+import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -10,6 +16,7 @@ from scipy.stats import binomtest
 import fflin
 from fflin.analysis.closed_loop import Loop
 from fflin.analysis.validity import _LEVELS, _clopper_pearson, _crossing, _slope
+from fflin.batch.workers import OwnWorkers
 from fflin.control.weights import default_weights
 from tests.support.commands import refused, run
 
@@ -31,7 +38,7 @@ def arm(robots):
 def test_prediction_error_is_of_second_order(robots, arm):
     for robot, dt in ((arm, 0.0), (robots["cubesat"], 0.2)):
         lin, gain = held(robot, dt)
-        found = fflin.validity(robot, lin, gain, samples=2)
+        found = fflin.validity(robot, lin, gain, samples=1)
         assert found.slope == pytest.approx(2.0, abs=0.1)
         assert (np.diff(found.prediction_error[:5]) > 0.0).all()
         assert found.trusted["attitude"] > 0.0
@@ -138,8 +145,8 @@ def test_what_the_counts_say(robots):
     assert found.holds == {"attitude": 174.0 * level, "position": 0.5 * level, "joint": level}
     assert found.inside_rate == pytest.approx(0.05 ** (1.0 / found.inside))
     assert f"{found.inside} of {found.inside} runs" in " ".join(str(found).split())
-    near = fflin.validity(robot, lin, gain, attitude=30.0, position=0.5, joint=0.3, samples=8)
-    assert near.settled == 8
+    near = fflin.validity(robot, lin, gain, attitude=30.0, position=0.5, joint=0.3, samples=4)
+    assert near.settled == 4
 
 
 def test_interval_is_clopper_and_pearsons():
@@ -163,14 +170,14 @@ def test_what_cannot_be_told_is_not(robots, arm):
     robot = robots["cubesat"]
     lin, gain = held(robot)
     # A body that is only moved away comes back as the linear model says, to the last digit.
-    found = fflin.validity(robot, lin, gain, attitude=0.0, samples=2)
+    found = fflin.validity(robot, lin, gain, attitude=0.0, samples=1)
     assert np.isnan(found.slope) and found.trusted == found.largest
     assert found.largest == {"attitude": 0.0, "position": 0.5, "joint": 0.0}
     said = " ".join(str(found).split())
     assert "up to 0.5 m and beyond; no order of the error can be told" in said
     # One that is hurled away is nowhere foreseen.
     lin, gain = held(arm)
-    found = fflin.validity(arm, lin, gain, attitude=170.0, position=1e6, samples=2)
+    found = fflin.validity(arm, lin, gain, attitude=170.0, position=1e6, samples=1)
     assert np.isnan(found.slope) and found.inside == 0
     assert set(found.trusted.values()) == {0.0}
     said = " ".join(str(found).split())
@@ -222,3 +229,72 @@ def test_command_line():
     assert "4 of 4 runs" in out and max(map(len, out.splitlines())) <= 80
     assert "--jobs is 0" in refused("validity", "cubesat", "--jobs", "0")
     assert "below 175 deg" in refused("validity", "cubesat", "--attitude", "200")
+
+
+def test_jobs_are_at_most_one_for_each_core():
+    code, out, _ = run("validity", "cubesat", "--samples", "2", "--jobs", "10" + "0" * 30)
+    assert code == 0 and "of 2 runs settled" in " ".join(out.split())
+    done = subprocess.run(
+        [sys.executable, "-m", "fflin", "validity", "cubesat", "--samples", "2", "--jobs", "99999"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "99999 processes are more than there are cores" in done.stderr
+
+
+def test_progress_is_told_of_every_run(robots):
+    robot = robots["cubesat"]
+    lin, gain = held(robot)
+    for executor in (None, ThreadPoolExecutor(2)):
+        told = []
+        fflin.validity(
+            robot,
+            lin,
+            gain,
+            samples=3,
+            executor=executor,
+            progress=lambda *each, told=told: told.append(each),
+        )
+        assert told == [(done, 7) for done in range(1, 8)]
+    with pytest.raises(fflin.InputError, match="progress is 3"):
+        fflin.validity(robot, lin, gain, progress=3)
+
+
+def die(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_process_that_dies_is_one_line(robots, monkeypatch):
+    robot = robots["cubesat"]
+    lin, gain = held(robot)
+    monkeypatch.setattr(Loop, "__reduce__", lambda loop: (die, ()))
+    workers = OwnWorkers(1)
+    for executor in (workers, ProcessPoolExecutor(1, mp_context=get_context("spawn"))):
+        with executor, pytest.raises(fflin.FflinError, match="a process that did the runs died"):
+            fflin.validity(robot, lin, gain, samples=2, executor=executor)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no pseudo-terminal")
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
+    import pty
+
+    ours, theirs = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-m", "fflin", "validity", "ets_vii", "--samples", "9000", "--jobs", jobs],
+        stderr=theirs,
+        start_new_session=True,
+    ) as process:
+        os.close(theirs)
+        said = b""
+        while b"s left" not in said:
+            said += os.read(ours, 4096)
+        os.killpg(process.pid, signal.SIGINT)
+        with contextlib.suppress(OSError):  # Linux tells the end so
+            while more := os.read(ours, 4096):
+                said += more
+    os.close(ours)
+    assert process.returncode == 130
+    # The bar is taken away before the line.
+    assert said.endswith(b"\r\x1b[2Kfflin: stopped\r\n")

@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+from tests.support.patience import PATIENCE
+
 
 def run(*arguments, cwd=None, **environment):
     """Run fflin; return exit code, stdout, and stderr without its warnings, a line each."""
@@ -13,7 +15,7 @@ def run(*arguments, cwd=None, **environment):
         text=True,
         cwd=cwd,
         env={**os.environ, **environment},
-        timeout=60,
+        timeout=PATIENCE,
         check=False,
     )
     return done.returncode, done.stdout, without_warnings(done.stderr)

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import pytest
 from PIL import Image
 
 import fflin
+from tests.support.patience import PATIENCE, wait_until
 
 needs_chromium = pytest.mark.skipif(not shutil.which("chromium"), reason="no chromium")
 
@@ -89,19 +89,19 @@ def test_the_browser_ends_with_the_one_who_films(tmp_path, sent, code):
     )
     browsing = f"--user-data-dir={folder}".encode()
     try:
-        wait_until(lambda: list(folder.glob("*/Default")), 60.0)
+        wait_until(lambda: list(folder.glob("*/Default")))
         assert running(browsing)
         process.send_signal(sent)
-        _, error = process.communicate(timeout=60.0)
+        _, error = process.communicate(timeout=PATIENCE)
         assert process.returncode == code and "Traceback" not in error
-        wait_until(lambda: not running(browsing), 60.0)
+        wait_until(lambda: not running(browsing))
         assert not (tmp_path / "m.gif").exists()
         assert sent == signal.SIGKILL or not list(folder.iterdir())
     finally:
         process.kill()
         process.communicate()
         # What dies of a signal may still write for a moment.
-        wait_until(lambda: removed(folder), 60.0)
+        wait_until(lambda: removed(folder))
 
 
 def removed(folder):
@@ -116,10 +116,3 @@ def running(argument):
             if any(each.startswith(argument) for each in file.read_bytes().split(b"\0")):
                 return True
     return False
-
-
-def wait_until(done, seconds):
-    end = time.monotonic() + seconds
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.1)
