@@ -18,7 +18,6 @@ from fflin.robot.fields import validated_fields, validated_inputs
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.inputs import Input, default_inputs, named_wheels
 from fflin.robot.joints import Follower, Joint, check_followers_rates, followed
-from fflin.robot.massless import idle_coordinates
 from fflin.robot.model_checks import change_in
 from fflin.robot.outputs import FullState, Output
 from fflin.robot.wheels import stored_momentum, with_wheels
@@ -195,11 +194,6 @@ class Robot:
     def nv(self) -> int:
         """Size of Pinocchio's velocity: 6 + n, and one for each mimic joint."""
         return int(self.model.nv)
-
-    @cached_property
-    def idle(self) -> tuple[str, ...]:
-        """What can move together without moving mass, so that M is singular everywhere."""
-        return idle_coordinates(self)
 
     @property
     def mass(self) -> float:
