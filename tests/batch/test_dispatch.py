@@ -15,8 +15,9 @@ from fflin.batch import chunks as batch_chunks
 from fflin.batch import dispatch as dispatching
 from fflin.batch.workers import OwnWorkers, WorkerDied
 from fflin.kernel import compiled
-from tests.batch.test_sweep import assert_same, points, singular_at
 from tests.support.patience import PATIENCE
+from tests.support.robots import singular_at
+from tests.support.sweeps import assert_same, points
 
 
 @pytest.fixture(scope="module")
