@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.design import Design
 from fflin.errors import DetectabilityError, InputError, MissingPackageError
 from fflin.linear_model import LinearModel
+from fflin.record import Design
 from fflin.regulator import Gain, require_fixed_point
 from fflin.validation import Array
 from fflin.weights import Weight, columns, weight

@@ -7,8 +7,8 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fflin.errors import FileError, MissingPackageError
-from fflin.writing import as_path, write_whole
+from fflin.errors import MissingPackageError
+from fflin.writing import as_path, check_ending, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,18 +69,12 @@ def require_matplotlib() -> None:
         )
 
 
-def check_figure_format(path: Path) -> None:
-    """Raise `FileError` where the ending of a figure's name is no known one."""
-    if path.suffix not in FORMATS:
-        raise FileError(f"'{path}' ends in '{path.suffix}', expected one of {', '.join(FORMATS)}")
-
-
 def target_of(path: str | Path | None) -> Path | None:
     """Return the path of a figure, checked, or None."""
     if path is None:
         return None
     target = as_path(path)
-    check_figure_format(target)
+    check_ending(target, FORMATS)
     return target
 
 

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.design import Design
+from fflin.batch_files import is_constant
 from fflin.errors import FflinError, InputError
 from fflin.joint_columns import joint_columns, positions
-from fflin.linear_batch import LinearBatch, is_constant
+from fflin.linear_batch import LinearBatch
 from fflin.linear_model import LinearModel
 from fflin.policies import StateFeedback
+from fflin.record import Design
 from fflin.regulator import lqr
 from fflin.riccati_batch import gains_at_rest
 from fflin.state import StateMap

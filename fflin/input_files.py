@@ -9,8 +9,8 @@ from typing import Any
 
 from fflin.errors import FflinError, InputError, UnknownNameError, unknown
 from fflin.inputs import BaseForce, BaseTorque, Input, JointTorque, ReactionWheel, Thruster
-from fflin.reader import read_file
 from fflin.robots import find_inputs
+from fflin.writing import read_input
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -118,7 +118,7 @@ class _Document:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        content = read_file(path, "TOML", _SIZE_LIMIT)
+        content = read_input(path, "TOML", _SIZE_LIMIT)
         try:
             text = content.decode("utf-8-sig").replace("\r\n", "\n")
         except UnicodeDecodeError as error:

@@ -11,9 +11,13 @@ from typing import Any, ClassVar
 import numpy as np
 import pinocchio as pin
 
-from fflin.design import Design
-from fflin.errors import FileError, InputError
+from fflin import record
+from fflin.errors import InputError
+from fflin.record import Design
 from fflin.validation import Array
+from fflin.writing import as_path, check_ending, write_whole
+
+FORMATS = (*record.FORMATS, ".csv")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,15 +129,12 @@ class Motion(Design):
         FileError
             If the ending is another or the file cannot be written.
         """
-        from fflin.writing import as_path, write_whole
-
         target = as_path(path)
-        check_motion_format(target)
+        check_ending(target, FORMATS)
         if target.suffix != ".csv":
             super().save(target)
             return
-        if not all(np.isfinite(each).all() for each in (self.t, self.x, self.u)):
-            raise InputError("the motion has entries that are not finite; it is not saved")
+        record.require_finite({"t": self.t, "x": self.x, "u": self.u})
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(["t", *self.state_names, *(f"u.{name}" for name in self.input_names)])
@@ -145,15 +146,6 @@ class Motion(Design):
         from fflin.plots import plot_motion
 
         return plot_motion(self, path, **options)
-
-
-def check_motion_format(path: Path) -> None:
-    """Raise `FileError` where a motion cannot be saved under that name."""
-    from fflin.design_files import FORMATS
-
-    if path.suffix not in (*FORMATS, ".csv"):
-        expected = ", ".join((*FORMATS, ".csv"))
-        raise FileError(f"'{path}' ends in '{path.suffix}', expected one of {expected}")
 
 
 def require_motion(motion: Any) -> Motion:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import stat
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -12,13 +10,14 @@ from pathlib import Path
 
 import pinocchio as pin
 
-from fflin.errors import FileError, UrdfError
+from fflin.errors import UrdfError
 from fflin.expansion import expand, first_xacro
 from fflin.inertia_checks import inertia_notes
 from fflin.mimics import counted_leaders, resolve_mimics
 from fflin.urdf import Urdf, read_description
 from fflin.urdf_joints import Mimic
 from fflin.urdf_writer import write_urdf
+from fflin.writing import read_input
 from fflin.xml_tree import Element, named, parse, told
 
 _SIZE_LIMIT = 64 * 2**20
@@ -82,7 +81,7 @@ def read_urdf(path: Path, prune: Sequence[str] = ()) -> Description:
     UnknownNameError
         If there is no such joint to prune.
     """
-    return describe(read_file(path), path, prune)
+    return describe(read_document(path), path, prune)
 
 
 def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Description:
@@ -119,26 +118,9 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     )
 
 
-def read_file(path: Path, kind: str = "URDF", limit: int = _SIZE_LIMIT) -> bytes:
-    """Return what a regular file of at most `limit` bytes holds, or raise `FileError`."""
-    try:
-        # Without O_NONBLOCK, opening a pipe would wait for somebody to write into it.
-        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-        if path.is_dir():
-            raise FileError(f"{path}: is a folder; give the path of a {kind} file")
-        with open(os.open(path, flags | getattr(os, "O_CLOEXEC", 0)), "rb") as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise FileError(f"{path}: is not a regular file; give the path of a {kind} file")
-            document = file.read(limit + 1)
-    except FileError:
-        raise
-    except (OSError, ValueError) as error:
-        what = error.strerror if isinstance(error, OSError) else str(error)
-        raise FileError(f"{path}: cannot be read: {what}") from None
-    if len(document) > limit:
-        size = f"{limit >> 20} MiB" if limit >> 20 else f"{limit >> 10} KiB"
-        raise FileError(f"{path}: is larger than {size}, too large for a {kind} file")
-    return document
+def read_document(path: Path) -> bytes:
+    """Return what the file of a URDF holds, or raise `FileError`."""
+    return read_input(path, "URDF", _SIZE_LIMIT)
 
 
 def _check_expanded(root: Element) -> None:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.design import Design
 from fflin.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.linear_model import LinearModel
+from fflin.record import Design
 from fflin.validation import Array
 from fflin.weights import Weight, cross_weight, require_semidefinite, weight
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from fflin.design import Design
 from fflin.errors import InputError
+from fflin.record import Design
 from fflin.validation import Array, number
 from fflin.weights import Weight, weight
 

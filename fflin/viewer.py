@@ -14,7 +14,7 @@ from fflin.errors import FflinWarning, FileError, InputError, unknown
 from fflin.model import ROOT, Robot
 from fflin.state import StateMap
 from fflin.validation import Array, number
-from fflin.writing import as_path, write_whole
+from fflin.writing import as_path, check_place, write_whole
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -129,7 +129,7 @@ def visualize(
             raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
         start = robot.neutral() if q is None else _configuration(robot, "q", q)
         return _live(robot, start, open is None or open, scene, tool, bool(follow), speed, port)
-    outputs = check_outputs({".html": html, ".png": png, ".gif": gif}, robot.urdf)
+    outputs = check_outputs({".html": html, ".png": png, ".gif": gif})
     _check_motion(robot, motion)
     fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
     from fflin.film import chart_of, motion_page
@@ -186,11 +186,8 @@ def _live(
     return live
 
 
-def check_outputs(files: dict[str, Any], spare: Path | None = None) -> dict[str, Path]:
-    """Return {ending: path} of the files that are named, or raise where one cannot be written.
-
-    `spare` is a file that must not be overwritten, such as the robot's own.
-    """
+def check_outputs(files: dict[str, Any]) -> dict[str, Path]:
+    """Return {ending: path} of the files that are named, or raise where one cannot be written."""
     outputs = {}
     for ending, file in files.items():
         if file is None:
@@ -198,12 +195,7 @@ def check_outputs(files: dict[str, Any], spare: Path | None = None) -> dict[str,
         path = as_path(file)
         if path.suffix.lower() != ending:
             raise FileError(f"'{path}' ends in '{path.suffix}', expected {ending}")
-        if not path.absolute().parent.is_dir():
-            raise FileError(f"{path}: cannot be written: there is no folder {path.parent}")
-        if path.is_dir():
-            raise FileError(f"{path}: is a folder; give the name of a file")
-        if spare and path.resolve() == spare.resolve():
-            raise FileError(f"{path} is the robot's own file; name another to write")
+        check_place(path)
         outputs[ending] = path
     if ".png" in outputs or ".gif" in outputs:
         from fflin.capture import find_chromium

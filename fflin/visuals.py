@@ -14,7 +14,7 @@ import pinocchio as pin
 from fflin.errors import FflinError
 from fflin.expansion import expand, first_xacro
 from fflin.model import ROOT, Robot
-from fflin.reader import read_file
+from fflin.reader import read_document
 from fflin.xml_tree import Element, decimal, named, parse
 
 Color = tuple[float, float, float, float]
@@ -126,7 +126,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
 
 
 def _document(path: Path) -> Element:
-    document = read_file(path)
+    document = read_document(path)
     root = parse(document, str(path))
     first = first_xacro(root)
     if path.suffix == ".xacro" or first:

@@ -137,11 +137,12 @@ def _weights(lin: LinearModel, arguments: argparse.Namespace) -> tuple[Array, Ar
 
 
 def _lqr(arguments: argparse.Namespace) -> int:
-    if arguments.output_file:
-        from fflin.design_files import check_design_format
-
-        check_design_format(arguments.output_file)
     _, lin = linear_model(arguments)
+    if arguments.output_file:
+        from fflin.record import FORMATS
+        from fflin.writing import check_place
+
+        check_place(arguments.output_file, FORMATS)
     if arguments.reduce:
         import fflin
 

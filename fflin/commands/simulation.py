@@ -105,15 +105,14 @@ def add_commands(commands: Commands) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
-    from fflin.motion import check_motion_format
-    from fflin.writing import check_place
-
+    robot = load_robot(arguments)
     if arguments.output_file:
-        check_motion_format(arguments.output_file)
-        check_place(arguments.output_file)
+        from fflin.motion import FORMATS
+        from fflin.writing import check_place
+
+        check_place(arguments.output_file, FORMATS)
     if arguments.plot:
         check_figure(arguments.plot)
-    robot = load_robot(arguments)
     check_pictures(robot, arguments)
     motion = simulated(robot, arguments)
     from fflin.motion_reports import motion_report
