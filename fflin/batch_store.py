@@ -111,10 +111,14 @@ class FileStore:
                 raise FileError(f"{self.part} is in use by another run; wait for it") from None
             hint = "; remove it to begin anew" * self.resumed
             raise FileError(f"{self.part}: cannot be opened: {reason(error)}{hint}") from None
-        try:
-            if self.resumed:
+        if self.resumed:
+            try:
                 self._go_on(request)
-                return
+            except BaseException:
+                self.close()
+                raise
+            return
+        try:
             for key, shape in shapes.items():
                 _fixed(h5py, self._file, key, (count, *shape), np.float64)
             for key, value in constants.items():
@@ -127,14 +131,19 @@ class FileStore:
         except OSError as error:
             self.discard()
             raise FileError(f"{self.part}: cannot be written: {reason(error)}") from None
-        except BaseException:
-            self.close()
-            raise
 
     def _go_on(self, request: str) -> None:
         with self._readable():
             found = self._file.attrs.get("request")
             self.chunk = int(self._file.attrs.get("chunk", self.chunk))
+            if found == request:
+                for key, value in self._constants.items():
+                    if not np.array_equal(self._file[key][()], value):
+                        raise ValueError(f"{key} is another")
+                if any(self._file.attrs[key] != value for key, value in self._texts.items()):
+                    raise ValueError("its names are others")
+                if self._file[SEAL].shape != (32,):
+                    raise ValueError("its digest is none")
         if found != request:
             raise FileError(
                 f"{self.part} is what another sweep left behind; remove it, or choose another name"

@@ -82,6 +82,8 @@ class Motion(Design):
             len(self.t),
         ):
             raise InputError("the rows of the motion are not as many as its times")
+        if not len(self.prediction):  # of json, which knows no empty matrices
+            object.__setattr__(self, "prediction", np.zeros((0, self.x.shape[1])))
         super().__post_init__()
 
     def __repr__(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from fflin.errors import FflinError
 from fflin.expansion import expand, first_xacro
 from fflin.model import ROOT, Robot
 from fflin.reader import read_document
+from fflin.writing import shown
 from fflin.xml_tree import Element, decimal, named, parse
 
 Color = tuple[float, float, float, float]
@@ -111,7 +113,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
             if mesh is not None:
                 file = find_mesh(mesh, path, robot.package_dirs)
                 if file is None:
-                    missing.append(mesh)
+                    missing.append(shown(mesh))
                     continue
             yield Shape(frame.parentJoint, kind, size, placement, color, finish, file)
     if missing:
@@ -205,7 +207,8 @@ def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None
         candidates = [folder / rest for folder in (*package_dirs, *urdf.resolve().parents)]
         # A package's own folder may have been given, or be called otherwise.
         candidates += [folder / inside for folder in (*package_dirs, *urdf.resolve().parents)]
-    return next((path for path in candidates if path.is_file()), None)
+    # Unlike Path.is_file, this takes a name that is too long for one that does not exist.
+    return next((path for path in candidates if os.path.isfile(path)), None)
 
 
 def _inertia_boxes(robot: Robot) -> Iterator[Shape]:

@@ -155,7 +155,7 @@ def reason(error: Exception) -> str:
     return " ".join(said.split())
 
 
-def shown(path: Path) -> str:
+def shown(path: str | Path) -> str:
     """Show a path in an error; one that is too long for a file by its ends."""
     text = str(path)
     return text if len(text) < 500 else f"{text[:60]} ... {text[-60:]}"

@@ -207,8 +207,9 @@ class _Announcement:
 
     def __call__(self, count: int, *, at_rest: bool) -> None:
         from fflin.batch_room import check_room, part_of, readable
-        from fflin.sweeping import planned_bytes
+        from fflin.sweeping import output_path, planned_bytes
 
+        output_path(self._path)  # once more, when the inputs are known
         size = planned_bytes(self._robot, count, at_rest=at_rest, **self._options)
         said = f"{count:,} points of '{self._robot.name}', {readable(size)}"
         if size > _LARGE and not self._agreed:
