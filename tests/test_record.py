@@ -28,7 +28,7 @@ def made(kind):
     if kind == "schedule":
         rows = [np.tile(x, (3, 1)) for x in (lin.q, lin.v, lin.u0)]
         trajectory = fflin.linearize_trajectory(robot, [0.0, 0.1, 0.2], *rows)
-        return fflin.tvlqr(trajectory, 1.0, 1.0, 1.0)
+        return fflin.tvlqr(trajectory, 1e-3, 1e3, 1e-3)
     if kind in ("batch", "gains"):
         batch = fflin.sweep(robot, fflin.random_configurations(robot, 6, seed=1))
         return batch if kind == "batch" else fflin.lqr_batch(batch, 1.0, 1.0)
