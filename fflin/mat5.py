@@ -6,6 +6,7 @@ and nothing worse. Format: "MAT-File Format", The MathWorks, R2023b, chapter 1.
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4"}
 _TYPES |= {9: "f8", 12: "i8", 13: "u8"}
 _TEXTS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
 _MATRIX, _COMPRESSED = 14, 15
+_TAG = {order: struct.Struct(f"{order}II") for order in "<>"}
 
 # Classes of arrays.
 _CELL, _STRUCT, _CHAR, _NUMBERS = 1, 2, 4, range(6, 16)
@@ -63,11 +65,11 @@ def _unpacked(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
 
 def _elements(data: bytes, order: str) -> Iterator[tuple[int, bytes]]:
     """Yield the type and the bytes of each element."""
-    at = 0
+    at, unpack = 0, _TAG[order].unpack_from
     while at < len(data):
         if at + 8 > len(data):
             raise ValueError("it ends within an element")
-        kind, size = struct.unpack_from(f"{order}II", data, at)
+        kind, size = unpack(data, at)
         if kind >> 16:  # a small one, which stands in its own tag
             kind, size, start, step = kind & 0xFFFF, kind >> 16, at + 4, 8
         else:
@@ -87,21 +89,19 @@ def _matrix(data: bytes, order: str, depth: int) -> tuple[str, Any]:
         return "", np.zeros((0, 0))
     parts = _elements(data, order)
     try:
-        flags = int(_numbers(*next(parts), order)[0])
+        flags = _integers(*next(parts), order)[0]
         kind = flags & 0xFF
         if kind not in (_CELL, _STRUCT, _CHAR, *_NUMBERS):
             return "", None
-        shape = tuple(int(size) for size in _numbers(*next(parts), order))
+        shape = _integers(*next(parts), order)
         name = _text(*next(parts), order)
-        count = 1
-        for size in shape:
-            count *= size
+        count = math.prod(shape)
         if len(shape) < 2 or min(shape) < 0 or count > 2**40:
             raise ValueError(f"{name} has shape {shape}")
         if kind == _CELL:
             return name, _cells(parts, count, order, depth)
         if kind == _STRUCT:
-            width = int(_numbers(*next(parts), order)[0])
+            width = _integers(*next(parts), order)[0]
             names = _text(*next(parts), order)
             keys = [
                 names[i : i + width].partition("\0")[0] for i in range(0, len(names), width or 1)
@@ -136,6 +136,13 @@ def _rows(text: str, shape: tuple[int, ...]) -> str | list[str]:
     if shape[0] <= 1:
         return text
     return [text[row :: shape[0]].rstrip() for row in range(shape[0])]
+
+
+def _integers(kind: int, data: bytes, order: str) -> tuple[int, ...]:
+    """Return what stands before the figures, 32 bits each."""
+    if kind not in (5, 6) or len(data) % 4 or not data:
+        raise ValueError(f"its integers have the type {kind}")
+    return struct.unpack(f"{order}{len(data) // 4}i", data)
 
 
 def _numbers(kind: int, data: bytes, order: str) -> Any:
