@@ -3,115 +3,124 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from fflin.base.version import __version__
 
 # Public name -> module. Each is imported when it is first asked for, so that a command which
 # needs no dynamics does not pay for them.
 _PUBLIC = {
-    "Accelerometer": "outputs",
-    "Allocation": "policies",
-    "BaseForce": "inputs",
-    "BasePose": "outputs",
-    "BaseTorque": "inputs",
-    "CenterOfMass": "outputs",
-    "Certificate": "linear_model",
-    "ChartError": "errors",
-    "Check": "verification",
-    "Compensator": "estimation",
-    "Controllability": "structure",
-    "DetectabilityError": "errors",
-    "Equilibrium": "balance",
-    "EquilibriumError": "errors",
-    "Estimator": "estimation",
-    "FflinError": "errors",
-    "FflinWarning": "errors",
-    "FileError": "errors",
-    "FramePose": "outputs",
-    "FrameVelocity": "outputs",
-    "FullState": "outputs",
-    "Gain": "regulator",
-    "GainBatch": "gain_batches",
-    "GainSchedule": "schedules",
-    "Gramians": "gramian",
-    "Grid": "configurations",
-    "Gyroscope": "outputs",
-    "InputError": "errors",
-    "JointPositions": "outputs",
-    "JointTorque": "inputs",
-    "JointVelocities": "outputs",
-    "LinearBatch": "linear_batch",
-    "LinearModel": "linear_model",
-    "LinearTrajectory": "trajectory",
-    "Linearizer": "linearization",
-    "MissingPackageError": "errors",
-    "Mode": "eigenmodes",
-    "ModelError": "errors",
-    "Modes": "eigenmodes",
-    "Momentum": "outputs",
-    "Motion": "motion",
-    "Observability": "observation",
-    "OutputFeedback": "output_feedback",
-    "RandomConfigurations": "configurations",
-    "ReactionWheel": "inputs",
-    "ReducedModel": "momentum",
-    "Robot": "model",
-    "ScheduledFeedback": "gain_batches",
-    "SingularInertiaError": "errors",
-    "StabilizabilityError": "errors",
-    "StateFeedback": "policies",
-    "StateMap": "state",
-    "SweepError": "errors",
-    "Thruster": "inputs",
-    "TrajectoryFeedback": "policies",
-    "UnknownNameError": "errors",
-    "UrdfError": "errors",
-    "Validity": "region",
-    "acceleration_lqr": "acceleration",
-    "bryson": "weights",
-    "check": "verification",
-    "configuration": "model",
-    "controllability": "structure",
-    "effort": "points",
-    "equilibrium": "balance",
-    "from_model": "loading",
-    "generalized_inertia": "momentum",
-    "generalized_jacobian": "momentum",
-    "gramians": "gramian",
-    "grid": "configurations",
-    "kalman": "estimation",
-    "linearize": "linearization",
-    "linearize_trajectory": "trajectory",
-    "list_robots": "robots",
-    "load": "loading",
-    "load_inputs": "input_files",
-    "lqg": "estimation",
-    "lqr": "regulator",
-    "lqr_batch": "gain_batches",
-    "modes": "eigenmodes",
-    "momentum_reduction": "momentum",
-    "observability": "observation",
-    "plot_matrices": "model_plots",
-    "plot_motion": "plots",
-    "plot_poles": "model_plots",
-    "plot_validity": "model_plots",
-    "random_configurations": "configurations",
-    "sampled_cost": "sampling",
-    "simulate": "simulation",
-    "sweep": "sweeping",
-    "tvlqr": "schedules",
-    "validity": "region",
-    "velocity": "points",
-    "visualize": "viewer",
+    "Accelerometer": "robot.outputs",
+    "Allocation": "control.policies",
+    "BaseForce": "robot.inputs",
+    "BasePose": "robot.outputs",
+    "BaseTorque": "robot.inputs",
+    "CenterOfMass": "robot.outputs",
+    "Certificate": "linear.model",
+    "ChartError": "base.errors",
+    "Check": "linear.check",
+    "Compensator": "control.kalman",
+    "Controllability": "analysis.controllability",
+    "DetectabilityError": "base.errors",
+    "Equilibrium": "linear.equilibrium",
+    "EquilibriumError": "base.errors",
+    "Estimator": "control.kalman",
+    "FflinError": "base.errors",
+    "FflinWarning": "base.errors",
+    "FileError": "base.errors",
+    "FramePose": "robot.outputs",
+    "FrameVelocity": "robot.outputs",
+    "FullState": "robot.outputs",
+    "Gain": "control.lqr",
+    "GainBatch": "batch.gains",
+    "GainSchedule": "control.tvlqr",
+    "Gramians": "analysis.gramians",
+    "Grid": "batch.configurations",
+    "Gyroscope": "robot.outputs",
+    "InputError": "base.errors",
+    "JointPositions": "robot.outputs",
+    "JointTorque": "robot.inputs",
+    "JointVelocities": "robot.outputs",
+    "LinearBatch": "batch.linear_batch",
+    "LinearModel": "linear.model",
+    "LinearTrajectory": "linear.trajectory",
+    "Linearizer": "linear.linearization",
+    "MissingPackageError": "base.errors",
+    "Mode": "analysis.modes",
+    "ModelError": "base.errors",
+    "Modes": "analysis.modes",
+    "Momentum": "robot.outputs",
+    "Motion": "simulation.motion",
+    "Observability": "analysis.observability",
+    "OutputFeedback": "control.output_feedback",
+    "RandomConfigurations": "batch.configurations",
+    "ReactionWheel": "robot.inputs",
+    "RelativePose": "robot.outputs",
+    "ReducedModel": "analysis.momentum",
+    "Robot": "robot.robot",
+    "ScheduledFeedback": "batch.gains",
+    "SingularInertiaError": "base.errors",
+    "StabilizabilityError": "base.errors",
+    "StateFeedback": "control.policies",
+    "StateMap": "dynamics.state",
+    "SweepError": "base.errors",
+    "Thruster": "robot.inputs",
+    "TrajectoryFeedback": "control.policies",
+    "UnknownNameError": "base.errors",
+    "UrdfError": "base.errors",
+    "Validity": "analysis.validity",
+    "acceleration_lqr": "control.acceleration_lqr",
+    "bryson": "control.weights",
+    "check": "linear.check",
+    "configuration": "robot.robot",
+    "controllability": "analysis.controllability",
+    "effort": "dynamics.points",
+    "equilibrium": "linear.equilibrium",
+    "from_model": "robot.loading",
+    "generalized_inertia": "analysis.momentum",
+    "generalized_jacobian": "analysis.momentum",
+    "gramians": "analysis.gramians",
+    "grid": "batch.configurations",
+    "kalman": "control.kalman",
+    "linearize": "linear.linearization",
+    "linearize_trajectory": "linear.trajectory",
+    "list_robots": "robot.catalog",
+    "load": "robot.loading",
+    "load_inputs": "robot.input_files",
+    "lqg": "control.kalman",
+    "lqr": "control.lqr",
+    "lqr_batch": "batch.gains",
+    "modes": "analysis.modes",
+    "momentum_reduction": "analysis.momentum",
+    "observability": "analysis.observability",
+    "plot_matrices": "analysis.plots",
+    "plot_motion": "simulation.plots",
+    "plot_poles": "analysis.plots",
+    "plot_validity": "analysis.plots",
+    "random_configurations": "batch.configurations",
+    "sampled_cost": "control.sampled_cost",
+    "simulate": "simulation.simulate",
+    "sweep": "batch.sweep",
+    "tvlqr": "control.tvlqr",
+    "validity": "analysis.validity",
+    "velocity": "dynamics.points",
+    "visualize": "view.visualize",
 }
 
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
 
 if TYPE_CHECKING:
-    from fflin.acceleration import acceleration_lqr
-    from fflin.balance import Equilibrium, equilibrium
-    from fflin.configurations import Grid, RandomConfigurations, grid, random_configurations
-    from fflin.eigenmodes import Mode, Modes, modes
-    from fflin.errors import (
+    from fflin.analysis.controllability import Controllability, controllability
+    from fflin.analysis.gramians import Gramians, gramians
+    from fflin.analysis.modes import Mode, Modes, modes
+    from fflin.analysis.momentum import (
+        ReducedModel,
+        generalized_inertia,
+        generalized_jacobian,
+        momentum_reduction,
+    )
+    from fflin.analysis.observability import Observability, observability
+    from fflin.analysis.plots import plot_matrices, plot_poles, plot_validity
+    from fflin.analysis.validity import Validity, validity
+    from fflin.base.errors import (
         ChartError,
         DetectabilityError,
         EquilibriumError,
@@ -127,27 +136,30 @@ if TYPE_CHECKING:
         UnknownNameError,
         UrdfError,
     )
-    from fflin.estimation import Compensator, Estimator, kalman, lqg
-    from fflin.gain_batches import GainBatch, ScheduledFeedback, lqr_batch
-    from fflin.gramian import Gramians, gramians
-    from fflin.input_files import load_inputs
-    from fflin.inputs import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
-    from fflin.linear_batch import LinearBatch
-    from fflin.linear_model import Certificate, LinearModel
-    from fflin.linearization import Linearizer, linearize
-    from fflin.loading import from_model, load
-    from fflin.model import Robot, configuration
-    from fflin.model_plots import plot_matrices, plot_poles, plot_validity
-    from fflin.momentum import (
-        ReducedModel,
-        generalized_inertia,
-        generalized_jacobian,
-        momentum_reduction,
-    )
-    from fflin.motion import Motion
-    from fflin.observation import Observability, observability
-    from fflin.output_feedback import OutputFeedback
-    from fflin.outputs import (
+    from fflin.batch.configurations import Grid, RandomConfigurations, grid, random_configurations
+    from fflin.batch.gains import GainBatch, ScheduledFeedback, lqr_batch
+    from fflin.batch.linear_batch import LinearBatch
+    from fflin.batch.sweep import sweep
+    from fflin.control.acceleration_lqr import acceleration_lqr
+    from fflin.control.kalman import Compensator, Estimator, kalman, lqg
+    from fflin.control.lqr import Gain, lqr
+    from fflin.control.output_feedback import OutputFeedback
+    from fflin.control.policies import Allocation, StateFeedback, TrajectoryFeedback
+    from fflin.control.sampled_cost import sampled_cost
+    from fflin.control.tvlqr import GainSchedule, tvlqr
+    from fflin.control.weights import bryson
+    from fflin.dynamics.points import effort, velocity
+    from fflin.dynamics.state import StateMap
+    from fflin.linear.check import Check, check
+    from fflin.linear.equilibrium import Equilibrium, equilibrium
+    from fflin.linear.linearization import Linearizer, linearize
+    from fflin.linear.model import Certificate, LinearModel
+    from fflin.linear.trajectory import LinearTrajectory, linearize_trajectory
+    from fflin.robot.catalog import list_robots
+    from fflin.robot.input_files import load_inputs
+    from fflin.robot.inputs import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
+    from fflin.robot.loading import from_model, load
+    from fflin.robot.outputs import (
         Accelerometer,
         BasePose,
         CenterOfMass,
@@ -158,23 +170,13 @@ if TYPE_CHECKING:
         JointPositions,
         JointVelocities,
         Momentum,
+        RelativePose,
     )
-    from fflin.plots import plot_motion
-    from fflin.points import effort, velocity
-    from fflin.policies import Allocation, StateFeedback, TrajectoryFeedback
-    from fflin.region import Validity, validity
-    from fflin.regulator import Gain, lqr
-    from fflin.robots import list_robots
-    from fflin.sampling import sampled_cost
-    from fflin.schedules import GainSchedule, tvlqr
-    from fflin.simulation import simulate
-    from fflin.state import StateMap
-    from fflin.structure import Controllability, controllability
-    from fflin.sweeping import sweep
-    from fflin.trajectory import LinearTrajectory, linearize_trajectory
-    from fflin.verification import Check, check
-    from fflin.viewer import visualize
-    from fflin.weights import bryson
+    from fflin.robot.robot import Robot, configuration
+    from fflin.simulation.motion import Motion
+    from fflin.simulation.plots import plot_motion
+    from fflin.simulation.simulate import simulate
+    from fflin.view.visualize import visualize
 
 
 def __getattr__(name: str) -> Any:

@@ -34,5 +34,7 @@ def test_import_pays_for_nothing_heavy():
     assert not imported_by("import fflin") & (heavy | {"numpy", "pinocchio"})
     main_job = "import fflin; fflin.check(r := fflin.load('ets_vii'), fflin.linearize(r))"
     assert not imported_by(main_job) & heavy
-    help_text = "from fflin.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass"
+    help_text = (
+        "from fflin.commands.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass"
+    )
     assert not imported_by(help_text) & (heavy | {"numpy", "pinocchio"})

@@ -117,7 +117,7 @@ def test_two_commands_set_up_from_nothing():
 
 
 def test_every_bundled_robot_is_named():
-    from fflin.robots import find_robot
+    from fflin.robot.catalog import find_robot
 
     for name in fflin.list_robots():
         if find_robot(name).origin == "fflin":

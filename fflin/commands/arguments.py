@@ -179,8 +179,8 @@ def add_system(command: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         help="what is watched (repeatable): state (default), base, joints, rates, com, momentum, "
-        "frame:NAME (pose and velocity), pose:NAME, velocity:NAME, gyroscope:NAME or "
-        "accelerometer:NAME",
+        "frame:NAME (pose and velocity), pose:NAME, velocity:NAME, gyroscope:NAME, "
+        "accelerometer:NAME; relative:NAME:TO, as another frame sees it",
     )
     command.add_argument(
         "--frame",

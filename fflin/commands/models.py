@@ -7,6 +7,7 @@ import os
 import warnings
 from typing import TYPE_CHECKING
 
+from fflin.base.errors import FflinError, FflinWarning
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
@@ -17,10 +18,9 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import linear_model, load_robot
-from fflin.errors import FflinError, FflinWarning
 
 if TYPE_CHECKING:
-    from fflin.model import Robot
+    from fflin.robot.robot import Robot
 
 
 def add_commands(commands: Commands) -> None:
@@ -55,9 +55,9 @@ def add_commands(commands: Commands) -> None:
 
 
 def _robots(_: argparse.Namespace) -> int:
-    from fflin.loading import load
-    from fflin.reports import robot_list
-    from fflin.robots import find_robot, list_robots
+    from fflin.robot.catalog import find_robot, list_robots
+    from fflin.robot.loading import load
+    from fflin.robot.summary import robot_list
 
     entries: list[tuple[str, Robot | str, str]] = []
     for name in list_robots():
@@ -75,7 +75,7 @@ def _robots(_: argparse.Namespace) -> int:
 
 
 def _info(arguments: argparse.Namespace) -> int:
-    from fflin.reports import robot_info
+    from fflin.robot.summary import robot_info
 
     print(robot_info(load_robot(arguments)))
     return DONE
@@ -83,8 +83,8 @@ def _info(arguments: argparse.Namespace) -> int:
 
 def _linearize(arguments: argparse.Namespace) -> int:
     if arguments.output_file:
-        from fflin.files import FORMATS
-        from fflin.writing import check_place
+        from fflin.base.writing import check_place
+        from fflin.linear.files import FORMATS
 
         check_place(arguments.output_file, FORMATS)
     _, lin = linear_model(arguments)
@@ -94,14 +94,14 @@ def _linearize(arguments: argparse.Namespace) -> int:
         lin.save(arguments.output_file)
         print(f"wrote {arguments.output_file}: {lin.B.shape[0]} states, {lin.B.shape[1]} inputs")
     else:
-        from fflin import reports
+        from fflin.commands.model_text import model_report
 
-        print(reports.linear_model(lin))
+        print(model_report(lin))
     return DONE
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    from fflin.verification import check
+    from fflin.linear.check import check
 
     robot, lin = linear_model(arguments)
     found = check(robot, lin)

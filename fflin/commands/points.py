@@ -7,20 +7,20 @@ import math
 import warnings
 from typing import TYPE_CHECKING, Any
 
-from fflin.errors import FflinError, FflinWarning, InputError
+from fflin.base.errors import FflinError, FflinWarning, InputError
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
-    from fflin.inputs import Input
-    from fflin.linear_model import LinearModel
-    from fflin.model import Robot
-    from fflin.validation import Array
+    from fflin.base.validation import Array
+    from fflin.linear.model import LinearModel
+    from fflin.robot.inputs import Input
+    from fflin.robot.robot import Robot
 
 
 def load_robot(arguments: argparse.Namespace) -> Robot:
     """Load the robot with the passive joints, inputs, outputs and gravity that are given."""
-    from fflin.loading import load
+    from fflin.robot.loading import load
 
     robot = load(arguments.robot, lock=once("--lock", arguments.lock))
     fields: dict[str, Any] = {}
@@ -40,14 +40,14 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
         except FflinError as error:  # a name or an inertia that does not suit this robot
             raise type(error)(f"{arguments.inputs}: {error}") from None
     if getattr(arguments, "output", []):
-        from fflin.output_specs import parse_output
+        from fflin.robot.outputs import parse_output
 
         fields["outputs"] = [output for text in arguments.output for output in parse_output(text)]
     return robot.replace(**fields) if fields else robot
 
 
 def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:
-    from fflin.inputs import BaseForce, BaseTorque, JointTorque
+    from fflin.robot.inputs import BaseForce, BaseTorque, JointTorque
 
     if name == "joints":
         if not robot.n:
@@ -55,7 +55,7 @@ def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:
         return tuple(JointTorque(joint) for joint in robot.joint_names)
     if name == "base":
         return BaseTorque(), BaseForce()
-    from fflin.input_files import load_inputs
+    from fflin.robot.input_files import load_inputs
 
     return load_inputs(name)
 
@@ -83,7 +83,7 @@ def placed(
     robot: Robot, option: str, pairs: list[tuple[str, Any]], base: pin.SE3 | None = None
 ) -> Array:
     """Return the configuration (nq,) with the joints that an option says; warn beyond limits."""
-    from fflin.model import configuration
+    from fflin.robot.robot import configuration
 
     joints = once(option, pairs)
     q = configuration(robot, joints, base)
@@ -110,7 +110,7 @@ def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
     """Return the robot, and its linear model about the point that is given."""
     import pinocchio as pin
 
-    from fflin.linearization import linearize
+    from fflin.linear.linearization import linearize
 
     robot = load_robot(arguments)
     q = configuration_of(robot, arguments)
@@ -122,7 +122,7 @@ def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
 
 def velocity_of(robot: Robot, arguments: argparse.Namespace) -> Array | None:
     """Return the velocity (nv,) that --velocity says."""
-    from fflin.points import velocity
+    from fflin.dynamics.points import velocity
 
     return velocity(robot, once("--velocity", arguments.velocity)) if arguments.velocity else None
 
@@ -136,11 +136,11 @@ def inputs_at(
 ) -> Array | None:
     """Return the inputs (nu,) that --effort or --equilibrium say."""
     if not arguments.equilibrium:
-        from fflin.points import effort
+        from fflin.dynamics.points import effort
 
         return effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
     if arguments.effort:
         raise InputError("--effort and --equilibrium both say the inputs at the point; give either")
-    from fflin.balance import equilibrium
+    from fflin.linear.equilibrium import equilibrium
 
     return equilibrium(robot, q, v=v, frame=arguments.frame, reference=reference).u

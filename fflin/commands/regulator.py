@@ -6,6 +6,7 @@ import argparse
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError, unknown
 from fflin.commands import DONE
 from fflin.commands.arguments import (
     Commands,
@@ -16,12 +17,11 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import linear_model, once
-from fflin.errors import EquilibriumError, InputError, StabilizabilityError, unknown
 
 if TYPE_CHECKING:
-    from fflin.linear_model import LinearModel
-    from fflin.regulator import Gain
-    from fflin.validation import Array
+    from fflin.base.validation import Array
+    from fflin.control.lqr import Gain
+    from fflin.linear.model import LinearModel
 
 
 def add_commands(commands: Commands) -> None:
@@ -86,9 +86,9 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     Without any, a model of double integrators, as a driven robot at rest is, gets the cost on
     accelerations: its poles are of the order of 1/s whatever the robot weighs.
     """
-    from fflin.acceleration import acceleration_lqr
-    from fflin.regulator import lqr, require_fixed_point
-    from fflin.sampling import sampled_cost
+    from fflin.control.acceleration_lqr import acceleration_lqr
+    from fflin.control.lqr import lqr, require_fixed_point
+    from fflin.control.sampled_cost import sampled_cost
 
     try:
         require_fixed_point(lin)
@@ -111,7 +111,7 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
 
 def _weights(lin: LinearModel, arguments: argparse.Namespace) -> tuple[Array, Array]:
     """Return the diagonals of Q and R."""
-    from fflin.weights import default_weights, inverse_square, named_weights
+    from fflin.control.weights import default_weights, inverse_square, named_weights
 
     values = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
     squares = {}
@@ -139,8 +139,8 @@ def _weights(lin: LinearModel, arguments: argparse.Namespace) -> tuple[Array, Ar
 def _lqr(arguments: argparse.Namespace) -> int:
     _, lin = linear_model(arguments)
     if arguments.output_file:
-        from fflin.record import FORMATS
-        from fflin.writing import check_place
+        from fflin.base.record import FORMATS
+        from fflin.base.writing import check_place
 
         check_place(arguments.output_file, FORMATS)
     if arguments.reduce:

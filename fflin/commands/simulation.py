@@ -7,6 +7,7 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fflin.base.errors import FflinWarning, InputError
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
@@ -22,13 +23,12 @@ from fflin.commands.arguments import (
 from fflin.commands.points import configuration_of, inputs_at, load_robot, once, placed, velocity_of
 from fflin.commands.regulator import add_weights, gain_of
 from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
-from fflin.errors import FflinWarning, InputError
 
 if TYPE_CHECKING:
-    from fflin.linear_model import LinearModel
-    from fflin.model import Robot
-    from fflin.motion import Motion
-    from fflin.policies import StateFeedback
+    from fflin.control.policies import StateFeedback
+    from fflin.linear.model import LinearModel
+    from fflin.robot.robot import Robot
+    from fflin.simulation.motion import Motion
 
 
 def add_commands(commands: Commands) -> None:
@@ -107,15 +107,15 @@ def add_commands(commands: Commands) -> None:
 def _simulate(arguments: argparse.Namespace) -> int:
     robot = load_robot(arguments)
     if arguments.output_file:
-        from fflin.motion import FORMATS
-        from fflin.writing import check_place
+        from fflin.base.writing import check_place
+        from fflin.simulation.motion import FORMATS
 
         check_place(arguments.output_file, FORMATS)
     if arguments.plot:
         check_figure(arguments.plot)
     check_pictures(robot, arguments)
     motion = simulated(robot, arguments)
-    from fflin.motion_reports import motion_report
+    from fflin.simulation.motion_text import motion_report
 
     # Said when the files are there, which they are then even where nobody reads it to its end.
     lines = [motion_report(motion, controlled=not arguments.free)]
@@ -129,12 +129,14 @@ def _simulate(arguments: argparse.Namespace) -> int:
         lines += show_motion(robot, motion, arguments)
     finally:
         print("\n".join(lines))
+    if motion.stopped.startswith("interrupted"):
+        raise KeyboardInterrupt(motion.stopped)
     return FELL_SHORT if motion.stopped else DONE
 
 
 def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     """Return the motion that the arguments ask for."""
-    from fflin.simulation import simulate
+    from fflin.simulation.simulate import simulate
 
     options: dict[str, Any] = {
         "q0": configuration_of(robot, arguments),
@@ -154,7 +156,7 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
                 "--free has no regulator to give weights, a target or thrusters; leave one out"
             )
         return simulate(robot, frame=arguments.frame, **options)
-    from fflin.policies import Allocation, StateFeedback
+    from fflin.control.policies import Allocation, StateFeedback
 
     design = _without_thrusters(robot) if arguments.allocate else robot
     lin = _about_target(design, arguments)
@@ -172,8 +174,8 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
 
 
 def _warn_of_cut_thrust(robot: Robot, motion: Motion, policy: StateFeedback) -> None:
-    from fflin.actuation import Actuation
-    from fflin.state import StateMap
+    from fflin.dynamics.actuation import Actuation
+    from fflin.dynamics.state import StateMap
 
     groups = Actuation(StateMap(robot)).groups
     if "thrust" not in groups:
@@ -193,7 +195,7 @@ def _warn_of_cut_thrust(robot: Robot, motion: Motion, policy: StateFeedback) -> 
 
 
 def _without_thrusters(robot: Robot) -> Robot:
-    from fflin.inputs import BaseForce, BaseTorque, Thruster
+    from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
 
     others = tuple(each for each in robot.inputs if not isinstance(each, Thruster))
     if len(others) == len(robot.inputs):
@@ -203,13 +205,13 @@ def _without_thrusters(robot: Robot) -> Robot:
 
 
 def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
-    from fflin.linearization import linearize
+    from fflin.linear.linearization import linearize
 
     q = placed(robot, "--target-joint", arguments.target_joint)
     u = inputs_at(robot, q, None, arguments)
     lin = linearize(robot, q, None, u, frame=arguments.frame)
     if arguments.reduce:
-        from fflin.momentum import momentum_reduction
+        from fflin.analysis.momentum import momentum_reduction
 
         lin = momentum_reduction(lin)
     return lin

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fflin.base.errors import FileError, InputError, MissingPackageError
 from fflin.commands import DONE
 from fflin.commands.arguments import (
     Commands,
@@ -22,15 +23,13 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import configuration_of, load_robot, once, velocity_of
-from fflin.errors import FileError, InputError, MissingPackageError
-from fflin.writing import read_input, reason
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from fflin.configurations import Configurations
-    from fflin.model import Robot
-    from fflin.validation import Array
+    from fflin.base.validation import Array
+    from fflin.batch.configurations import Configurations
+    from fflin.robot.robot import Robot
 
 # Beyond this the user is asked whether it is meant.
 _LARGE = 10e9
@@ -97,7 +96,10 @@ def add_commands(commands: Commands) -> None:
         "or the world",
     )
     sweep.add_argument(
-        "--workers", metavar="N", type=_count, help="share the work among N processes"
+        "--workers",
+        metavar="N",
+        type=_count,
+        help="share the work among N processes, at most one for each core",
     )
     sweep.add_argument(
         "--dask", metavar="ADDRESS", help="share it among the workers of a dask scheduler"
@@ -150,10 +152,10 @@ def _count(text: str) -> int:
 def _sweep(arguments: argparse.Namespace) -> int:
     import pinocchio as pin
 
-    from fflin.batch_room import part_of
-    from fflin.points import effort
-    from fflin.progress import Progress
-    from fflin.sweeping import output_path, sweep
+    from fflin.base.progress import Progress
+    from fflin.batch.space import part_of
+    from fflin.batch.sweep import output_path, sweep
+    from fflin.dynamics.points import effort
 
     path = arguments.output_file
     if path is None:
@@ -168,7 +170,7 @@ def _sweep(arguments: argparse.Namespace) -> int:
     options: dict[str, Any] = {"frame": arguments.frame, "reference": reference}
     announce = _Announcement(robot, path, options, arguments.yes)
     q, v, u = _points(robot, arguments, v, u, announce)
-    bar = Progress(len(q))
+    bar = Progress()
     with _executor(arguments.dask) as executor:
         announce.say()
         try:
@@ -180,16 +182,14 @@ def _sweep(arguments: argparse.Namespace) -> int:
                 **options,
                 executor=executor,
                 workers=arguments.workers,
-                progress=lambda done, _: bar.update(done),
+                progress=bar.update,
                 out=path,
             )
         except KeyboardInterrupt:
-            bar.close()
             if part_of(path).exists():
-                print(
-                    f"fflin: stopped; the same command goes on from {part_of(path)}",
-                    file=sys.stderr,
-                )
+                raise KeyboardInterrupt(
+                    f"stopped; the same command goes on from {part_of(path)}"
+                ) from None
             raise
         finally:
             bar.close()
@@ -206,8 +206,8 @@ class _Announcement:
         self._said = ""
 
     def __call__(self, count: int, *, at_rest: bool) -> None:
-        from fflin.batch_room import check_room, part_of, readable
-        from fflin.sweeping import output_path, planned_bytes
+        from fflin.batch.space import check_room, part_of, readable
+        from fflin.batch.sweep import output_path, planned_bytes
 
         output_path(self._path)  # once more, when the inputs are known
         size = planned_bytes(self._robot, count, at_rest=at_rest, **self._options)
@@ -234,8 +234,8 @@ def _points(
     """Return q, v and u of the points."""
     import numpy as np
 
-    from fflin.configurations import grid, random_configurations
-    from fflin.sweep_task import as_configurations
+    from fflin.batch.configurations import grid, random_configurations
+    from fflin.batch.task import as_configurations
 
     kinds = [bool(arguments.grid), arguments.random is not None, bool(arguments.configurations)]
     if sum(kinds) != 1:
@@ -289,6 +289,8 @@ def _given(path: Path) -> dict[str, Array]:
     import warnings
 
     import numpy as np
+
+    from fflin.base.writing import read_input, reason
 
     content = io.BytesIO(read_input(path, ".npz"))
     try:

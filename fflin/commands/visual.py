@@ -12,8 +12,8 @@ from fflin.commands.arguments import Commands, add_pose, add_robot, command, num
 from fflin.commands.points import configuration_of, load_robot
 
 if TYPE_CHECKING:
-    from fflin.model import Robot
-    from fflin.motion import Motion
+    from fflin.robot.robot import Robot
+    from fflin.simulation.motion import Motion
 
 _FILES = ("html", "png", "gif")
 
@@ -80,8 +80,8 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
 
 def check_figure(path: Path) -> None:
     """Refuse a figure that cannot be drawn or written, before anything is done for it."""
-    from fflin.figures import FORMATS, require_matplotlib
-    from fflin.writing import check_place
+    from fflin.base.figures import FORMATS, require_matplotlib
+    from fflin.base.writing import check_place
 
     check_place(path, FORMATS)
     require_matplotlib()
@@ -89,7 +89,7 @@ def check_figure(path: Path) -> None:
 
 def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
     """Refuse what `show_motion` would, before a motion is made for it."""
-    from fflin.viewer import check_outputs, check_rates, check_times, check_tool
+    from fflin.view.visualize import check_outputs, check_rates, check_times, check_tool
 
     if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
         return
@@ -104,7 +104,7 @@ def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> 
     files = {name: path for name in _FILES if (path := getattr(arguments, name))}
     if not files:
         return []
-    from fflin.viewer import visualize
+    from fflin.view.visualize import visualize
 
     visualize(
         robot,
@@ -121,8 +121,8 @@ def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> 
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    from fflin.live import Live
-    from fflin.viewer import visualize
+    from fflin.view.live import Live
+    from fflin.view.visualize import visualize
 
     robot = load_robot(arguments)
     live = visualize(

@@ -1,0 +1,4 @@
+"""What a linear model tells: reach, modes, momenta, how far it can be trusted.
+
+Imports `base`, `robot`, `dynamics` and `linear`.
+"""

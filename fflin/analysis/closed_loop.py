@@ -1,0 +1,233 @@
+"""The nonlinear robot under a state feedback, in the chart, beside what the linear model says."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from fflin.base.errors import ChartError, InputError
+from fflin.base.rotation import quaternion_product
+from fflin.base.validation import Array
+from fflin.dynamics.state import StateMap
+from fflin.linear.model import LinearModel
+from fflin.linear.nonlinear import Nonlinear
+from fflin.robot.robot import Robot
+
+# A run has settled where its error is this share of the first, in the norm of its Lyapunov
+# function, and has diverged where it is this many times as large.
+SETTLED, DIVERGED = 1e-3, 1e3
+
+# 1 - |q_b|^2 where a run is taken to have left the chart: 4 degrees before its end.
+_EDGE = 1e-3
+
+# Evaluations of the dynamics that a run may take; a loop that settles takes a tenth.
+_MOST_EVALUATIONS = 60_000
+
+
+class _TooLongError(Exception):
+    """A run took more evaluations than it may."""
+
+
+class _Dynamics:
+    """The nonlinear model of one run, which has a work space of its own and may not take long."""
+
+    def __init__(self, loop: Loop) -> None:
+        self._model = Nonlinear(loop.state, loop.lin)
+        self._left = _MOST_EVALUATIONS
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        self._left -= 1
+        if self._left < 0:
+            raise _TooLongError
+        return self._model(x, u)
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A robot, its linear model, and the feedback ``u = u0 - K (z - z0)`` on the model's states.
+
+    Attributes
+    ----------
+    robot : Robot
+    lin : LinearModel
+        Whole or reduced; sampled if its input is held.
+    K : ndarray (nu, nz)
+    """
+
+    robot: Robot
+    lin: LinearModel
+    K: Array
+
+    @cached_property
+    def state(self) -> StateMap:
+        """The whole state of the robot, in the model's axes."""
+        return StateMap(self.robot, reference=self.lin.reference, frame=self.lin.frame)
+
+    @cached_property
+    def watched(self) -> Array:
+        """Which of its entries are the model's states."""
+        names = self.state.names
+        if not set(self.lin.state_names) <= set(names):
+            raise InputError(f"the model of '{self.lin.robot}' is not one of '{self.robot.name}'")
+        return np.array([names.index(name) for name in self.lin.state_names], dtype=np.intp)
+
+    @cached_property
+    def rate(self) -> Array:
+        """A - B K."""
+        closed: Array = self.lin.A - self.lin.B @ self.K
+        return closed
+
+    @cached_property
+    def decay(self) -> float:
+        """The slowest decay of the linear loop [1/s]; not positive where it is unstable."""
+        poles = np.linalg.eigvals(self.rate)
+        if self.lin.dt:
+            return -math.log(max(float(np.abs(poles).max()), 1e-300)) / self.lin.dt
+        return -float(poles.real.max())
+
+    @cached_property
+    def weight(self) -> Array:
+        """P of the Lyapunov function of the linear loop that decays as its energy does."""
+        from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
+
+        size = np.sqrt(self.lin.M.diagonal())
+        Q = np.diag(np.concatenate((self.decay * size, size)) ** 2)
+        solve = solve_discrete_lyapunov if self.lin.dt else solve_continuous_lyapunov
+        P: Array = solve(self.rate.T, Q if self.lin.dt else -Q)
+        return (P + P.T) / 2.0
+
+    def size(self, error: Array) -> float:
+        """Return the norm of a deviation (nz,) of the model's states."""
+        return math.sqrt(max(float(error @ self.weight @ error), 0.0))
+
+    def displaced(
+        self, rng: np.random.Generator, attitude: float, position: float, joint: float
+    ) -> Array:
+        """Return a state (nx,) at the point's velocity, displaced in a random direction.
+
+        The base is turned by `attitude` [deg] and moved by `position` [m], the joint that is
+        displaced most by `joint` [rad|m]; what is not among the model's states stays.
+        """
+        state, lin = self.state, self.lin
+        g = state.groups
+        x = state.to_state(lin.q, lin.v)
+        axis, along = _direction(rng, 3), _direction(rng, 3)
+        turn = np.radians(attitude) / 2.0
+        q0 = np.sqrt(1.0 - float(x[g.q_b] @ x[g.q_b]))
+        relative = np.array((*(np.sin(turn) * axis), np.cos(turn)))
+        turned = quaternion_product(np.array((*x[g.q_b], q0)), relative)
+        moved = x.copy()
+        moved[g.q_b] = turned[:3] * np.copysign(1.0, turned[3])
+        moved[g.r_b] += position * along
+        spread = rng.uniform(-1.0, 1.0, size=self.robot.n)
+        moved[g.q_m] += joint * spread / np.abs(spread).max(initial=1e-300)
+        x[self.watched] = moved[self.watched]
+        return x
+
+    def run(self, x: Array, times: Array, precision: float) -> tuple[str, Array]:
+        """Follow the nonlinear loop from a state.
+
+        Returns
+        -------
+        outcome : str
+            "settled", "slow" where it was on its way at the last time, "chart" where the base
+            came near a turn of 180 degrees, or "diverged".
+        motion : ndarray (<= len(times), nz)
+            Deviations of the model's states, at the times that were reached.
+        """
+        follow = self._sampled if self.lin.dt else self._continuous
+        motion = [x[self.watched] - self.lin.x0]
+        try:
+            # What overflows is told as a divergence.
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                outcome = follow(x, times, precision, motion)
+        except ChartError:
+            outcome = "chart"
+        except (InputError, _TooLongError):  # not finite, or spinning ever faster
+            outcome = "diverged"
+        return outcome, np.array(motion)
+
+    def _continuous(self, x: Array, times: Array, precision: float, motion: list[Array]) -> str:
+        from scipy.integrate import solve_ivp
+
+        first, dynamics = self.size(motion[0]), _Dynamics(self)
+
+        def rate(_: float, x: Array) -> Array:
+            return dynamics(x, self._input(x))
+
+        def ended(_: float, x: Array) -> float:
+            return float(self._outcome(x, first) == "slow") - 0.5
+
+        ended.terminal = True  # type: ignore[attr-defined]
+        # Fast poles of the loop make it stiff; LSODA switches by itself.
+        found = solve_ivp(
+            rate,
+            (times[0], times[-1]),
+            x,
+            method="LSODA",
+            t_eval=times,
+            events=ended,
+            rtol=precision,
+            atol=1e-3 * precision * (1.0 + np.abs(x)),
+        )
+        motion += [column[self.watched] - self.lin.x0 for column in found.y.T[1:]]
+        if found.t_events[0].size:
+            return self._outcome(found.y_events[0][-1], first, slack=1e-3)
+        return "slow" if found.success else "diverged"
+
+    def _sampled(self, x: Array, times: Array, precision: float, motion: list[Array]) -> str:
+        from scipy.integrate import solve_ivp
+
+        first, dynamics = self.size(motion[0]), _Dynamics(self)
+        for start, end in pairwise(times.tolist()):
+            held = self._input(x)
+            found = solve_ivp(
+                lambda _, x, held=held: dynamics(x, held),
+                (start, end),
+                x,
+                method="DOP853",
+                rtol=precision,
+                atol=1e-3 * precision * (1.0 + np.abs(x)),
+            )
+            if not found.success:
+                return "diverged"
+            x = found.y[:, -1]
+            motion.append(x[self.watched] - self.lin.x0)
+            outcome = self._outcome(x, first)
+            if outcome != "slow":
+                return outcome
+        return "slow"
+
+    def _input(self, x: Array) -> Array:
+        u: Array = self.lin.u0 - self.K @ (x[self.watched] - self.lin.x0)
+        return u
+
+    def _outcome(self, x: Array, first: float, slack: float = 0.0) -> str:
+        """Return how a run that has come to x ends, or "slow"; `slack` of an event's rounding."""
+        now = self.size(x[self.watched] - self.lin.x0)
+        if now <= (1.0 + slack) * SETTLED * first:
+            return "settled"
+        if 1.0 - float(x[:3] @ x[:3]) < (1.0 + slack) * _EDGE:
+            return "chart"
+        return "slow" if now < (1.0 - slack) * DIVERGED * first else "diverged"
+
+    def linear(self, error: Array, times: Array) -> Array:
+        """Return the deviations (len(times), nz) that the linear model foresees."""
+        from scipy.linalg import expm
+
+        step = self.rate if self.lin.dt else expm(self.rate * (times[1] - times[0]))
+        motion = [error]
+        for _ in times[1:]:
+            motion.append(step @ motion[-1])
+        return np.array(motion)
+
+
+def _direction(rng: np.random.Generator, size: int) -> Array:
+    vector = rng.normal(size=size)
+    return vector / np.linalg.norm(vector)

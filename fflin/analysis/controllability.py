@@ -1,0 +1,312 @@
+"""Which states the inputs of a linear model can move, and the names of those that they cannot."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fflin.analysis.mechanics import (
+    Conserved,
+    at_rest,
+    checked,
+    conserved,
+    fixed_poles,
+    rates_of_positions,
+    scaled,
+    second_order,
+    slopes,
+)
+from fflin.analysis.names import (
+    combination,
+    grouped,
+    momentum_names,
+    undecided,
+    unsettled,
+    with_rates,
+)
+from fflin.analysis.ranks import Margin, echelon, null_space, reached_by, split, unit_columns
+from fflin.analysis.second_order import Noisy, SecondOrder, aliased, hidden
+from fflin.analysis.vibrations import vibration_rows
+from fflin.base.tables import width
+from fflin.base.validation import Array
+from fflin.linear.model import LinearModel
+
+_LOOPS = (
+    "closed loops of the joints still turn the base of the nonlinear robot (a loop of amplitude "
+    "e by O(e^2)); a linear model cannot show it"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Controllability:
+    """What the inputs of a linear model can move; prints in words.
+
+    Attributes
+    ----------
+    dimension : int
+        Of the controllable subspace.
+    controllable : tuple of str
+        ``dimension`` states that can be put anywhere; the others follow by `basis`.
+    uncontrollable : tuple of str
+        Names of the combinations of states that no input acts on.
+    rows : ndarray (nx - dimension, nx)
+        Those combinations: the controllable subspace is ``rows @ x = 0``.
+    basis : ndarray (nx, dimension)
+        Spans the controllable subspace; column i moves state ``controllable[i]`` by 1 and the
+        other controllable ones not.
+    fixed_poles : ndarray (nx - dimension,)
+        Poles that no feedback can move [1/s], or of the sampled model.
+    stabilizable : bool
+        Whether all of these decay.
+    reach : dict
+        {"base attitude", "base position", "joints": directions in which it can be put anywhere
+        while the others follow as they must}.
+    method : str
+        "closed form", "modes" or "eigenvalues": how the dimension was found.
+    margin : Margin
+        Distance of the rank decisions from doubt: far above 1, far below 1.
+    notes : tuple of str
+        What to know beside it.
+    """
+
+    dimension: int
+    controllable: tuple[str, ...]
+    uncontrollable: tuple[str, ...]
+    rows: Array
+    basis: Array
+    fixed_poles: Any
+    stabilizable: bool
+    reach: dict[str, int]
+    method: str
+    margin: Margin
+    notes: tuple[str, ...]
+    robot: str
+
+    def __post_init__(self) -> None:
+        for array in (self.rows, self.basis, self.fixed_poles):
+            array.setflags(write=False)
+
+    def __str__(self) -> str:
+        nx = len(self.basis)
+        lines = [
+            f"{self.robot}: {self.dimension} of {nx} states are controllable ({self.method}); "
+            f"{'' if self.stabilizable else 'not '}stabilizable"
+        ]
+        if self.uncontrollable:
+            lines.append(f"controllable: {with_rates(self.controllable)}")
+            lines.append(f"uncontrollable: {', '.join(grouped(self.uncontrollable))}")
+            placed = [f"{what} in {count}" for what, count in self.reach.items()]
+            lines.append(f"directions that the inputs move: {', '.join(placed)}")
+        lines += [f"note: {note}" for note in self.notes]
+        return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
+
+
+def controllability(lin: LinearModel) -> Controllability:
+    r"""Find what the inputs can move, from the structure of the model.
+
+    About rest the momenta with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved, and with the
+    coordinates :math:`W M N^{-1} x_1` that they drive they are split off exactly. Without
+    springs and dampers that is all: the dimension is 2 rank(B). With springs alone the rest is
+    decided frequency by frequency on the modes of :math:`(K, M)`, equal frequencies together:
+    :math:`2 \sum_g \mathrm{rank}(\Phi_g^T S)`. With dampers, off rest, or sampled with springs,
+    it is decided at each eigenvalue by singular values of :math:`[A - s E, B]`, in units of
+    energy (Popov, Belevitch, Hautus).
+
+    Every rank is that of a matrix scaled by M, with inputs of unit length; the tolerances are
+    small multiples of the rounding, and `margin` says how near the decisions came to them.
+    Frequencies whose squares differ by less than 1e4 roundings are taken as equal. A sampled
+    model is judged as it stands: sampling at a period of a vibration loses it.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        Continuous or sampled, fresh, reduced, or loaded from a file.
+
+    Returns
+    -------
+    Controllability
+
+    Raises
+    ------
+    InputError
+        If `lin` is no linear model of positions and their rates.
+
+    Notes
+    -----
+    Inputs act in both directions: that a thruster only pushes is not considered. At a nonzero
+    angular velocity the answer is that of the frozen model, which certifies nothing about the
+    motion. Where the fastest pole is more than about 1e8 times the slowest that is not zero, as
+    with a heavy damper on a light link, the slow ones are taken for rounding, as `margin` shows.
+
+    References
+    ----------
+    P. C. Hughes and R. E. Skelton, Controllability and observability of linear matrix
+    second-order systems, J. Applied Mechanics 47(2), 1980.
+    """
+    lin = checked(lin)
+    held = conserved(lin)
+    z, nx = held.selected, len(lin.A)
+    part = _split_kept(lin, held)
+    rows = np.vstack((held.momenta, held.coordinates, part.rows @ _selector(z, nx)))
+    names = (*momentum_names(lin, held), *part.names)
+    size = _state_sizes(lin)
+    spanned = held.T @ part.reached
+    basis, pivots = echelon(spanned, size, _driven_states(lin))
+    zero = np.full(2 * len(held.weights), 1.0 if lin.dt else 0.0)
+    margin = held.margin & part.margin
+    notes = (*_notes(lin, held), *undecided(lin, margin, "controllable", basis.shape[1]))
+    if not len(zero):
+        notes += unsettled(lin, part.settling, "stabilizable")
+    return Controllability(
+        dimension=basis.shape[1],
+        controllable=tuple(lin.state_names[i] for i in pivots),
+        uncontrollable=names,
+        rows=rows,
+        basis=basis,
+        fixed_poles=np.concatenate((zero, part.poles)),
+        stabilizable=not len(zero) and part.decays,
+        reach=_reach(lin, basis * size[:, None]),
+        method=part.method,
+        margin=margin,
+        notes=notes,
+        robot=lin.robot,
+    )
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The split of what is left without the conserved momenta, in its own coordinates."""
+
+    reached: Array
+    rows: Array
+    names: tuple[str, ...]
+    poles: Any
+    decays: bool
+    method: str
+    margin: Margin
+    settling: Margin
+
+
+def _split_kept(lin: LinearModel, held: Conserved) -> _Part:
+    source = at_rest(lin)
+    if source is not None:
+        r, nv = len(held.kept), len(lin.M)
+        R = held.T[nv:, r:]
+        system = second_order(source).restricted(R)
+        to_s = np.linalg.inv((rates_of_positions(slopes(source)) @ R)[held.kept])
+        part = _by_second_order(lin, system, to_s, held)
+        if part is not None:
+            return part
+    return _by_eigenvalues(lin, held)
+
+
+def _by_second_order(
+    lin: LinearModel, system: SecondOrder, to_s: Array, held: Conserved
+) -> _Part | None:
+    r, names = len(system.M), tuple(np.array(lin.state_names)[held.selected])
+    acting = system.K.values.any() or system.D.values.any()
+    idle, margin = null_space(system.S.T @ np.diag(1.0 / system.size))
+    margin = margin.seen(held.T[len(lin.M) :, r:] / system.size)
+    everything = np.eye(2 * r)
+    if not acting or (not idle.shape[1] and not lin.dt):
+        # What is not conserved is pushed.
+        return _Part(
+            everything, everything[:0], (), np.zeros(0), True, "closed form", margin, Margin()
+        )
+    if not system.symmetric or (lin.dt and aliased(system.poles[0], lin.dt)):
+        return None
+    found = hidden(system, system.S.T, Noisy(*np.zeros_like(system.S.T)))
+    if not found.simple:
+        return None
+    # By symmetry a motion (s, v) that S^T s does not show is a row that no input moves.
+    s, v = np.split(found.motions, 2)
+    pushed = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
+    reached = _across(pushed / np.tile(system.size, 2)) / np.tile(system.size, 2)[:, None]
+    reached[:r] = np.linalg.solve(to_s, reached[:r])
+    if system.D.values.any():
+        rows, labels = _labels(lin, np.hstack((pushed[:, :r] @ to_s, pushed[:, r:])), held)
+        method = "eigenvalues"
+    else:
+        rows, labels = vibration_rows(found, system.M, to_s, names)
+        method = "modes"
+    R = held.T[len(lin.M) :, r:]
+    margin, settling = found.margin.seen(R), found.settling.seen(R)
+    poles = np.exp(found.poles * lin.dt) if lin.dt else found.poles
+    return _Part(reached, rows, labels, poles, found.decays, method, margin, settling)
+
+
+def _across(rows: Array) -> Array:
+    """Return an orthonormal basis of what is orthogonal to independent rows (k, n)."""
+    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    basis: Array = np.linalg.qr(rows.T, mode="complete")[0][:, len(rows) :]
+    return basis
+
+
+def _by_eigenvalues(lin: LinearModel, held: Conserved) -> _Part:
+    z, nv = held.selected, len(lin.M)
+    rates = held.T[nv:, len(held.kept) :]
+    pair = scaled(slopes(lin)[z] @ held.T, rates.T @ lin.M @ rates, lin.dt)
+    drive = unit_columns(pair.from_x @ lin.B[z])
+    reached, rest, F, margin = reached_by(pair.A, drive, pair.tolerance)
+    rows, labels = _labels(lin, rest.T @ pair.from_x, held)
+    poles, decays, lost, settling = fixed_poles(F, rest, pair, lin.dt)
+    margin = margin.halved().seen(pair.to_x[len(rates.T) :, len(rates.T) :]) & lost
+    margin, settling = margin.seen(rates), settling.seen(rates)
+    method = "eigenvalues"
+    return _Part(pair.to_x @ reached, rows, labels, poles, decays, method, margin, settling)
+
+
+def _labels(lin: LinearModel, rows: Array, held: Conserved) -> tuple[Array, tuple[str, ...]]:
+    if not len(rows):
+        return rows, ()
+    names = tuple(np.array(lin.state_names)[held.selected])
+    size = 1.0 / _state_sizes(lin)[held.selected]
+    echeloned = echelon(rows.T, size)[0].T
+    return echeloned, tuple(combination(row, names, size) for row in echeloned)
+
+
+def _selector(states: Array, nx: int) -> Array:
+    selector: Array = np.zeros((len(states), nx))
+    selector[np.arange(len(states)), states] = 1.0
+    return selector
+
+
+def _state_sizes(lin: LinearModel) -> Array:
+    """Weights (nx,) that make states comparable: what a unit of each moves, by its inertia."""
+    return np.tile(np.sqrt(lin.M.diagonal()), 2)
+
+
+def _driven_states(lin: LinearModel) -> Array:
+    """Return the states of coordinates that an input pushes on directly."""
+    force = np.abs(lin.M @ lin.B[len(lin.M) :])
+    rounding = (
+        1e3 * len(lin.M) * np.finfo(float).eps * (np.abs(lin.M) @ np.abs(lin.B[len(lin.M) :]))
+    )
+    return np.tile((force > rounding).any(axis=1), 2)
+
+
+def _reach(lin: LinearModel, weighted: Array) -> dict[str, int]:
+    nv = len(lin.M)
+    groups = [name.split(".", 1)[0] for name in lin.state_names[:nv]]
+    titles = {"q_b": "base attitude", "r_b": "base position", "q_m": "joints"}
+    reach = {}
+    for group, title in titles.items():
+        rows = [i for i, other in enumerate(groups) if other == group]
+        if rows:
+            reach[title] = split(unit_columns(weighted[rows]), 1e-8)[0].shape[1]
+    return reach
+
+
+def _notes(lin: LinearModel, held: Conserved) -> tuple[str, ...]:
+    notes = []
+    turned = any("angular momentum" in name for name in momentum_names(lin, held))
+    if turned and any(lin.state_names[i].startswith("q_m.") for i in held.kept):
+        notes.append(_LOOPS)
+    if len(held.weights):
+        notes.append("conserved momenta are split off by fflin.momentum_reduction")
+    if not lin.is_equilibrium():
+        notes.append("the point is not a fixed point: this speaks of the frozen A and B")
+    return tuple(notes)

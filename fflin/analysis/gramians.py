@@ -1,0 +1,167 @@
+"""Gramians: the energy that it takes to reach a state, and that a state shows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, number
+from fflin.linear.model import LinearModel
+
+# Below this decay, relative to the fastest, a pole may be one at zero moved by rounding.
+_DECAY = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Gramians:
+    """Gramians of a linear model.
+
+    Attributes
+    ----------
+    controllability : ndarray (nx, nx)
+        W; the least input energy that reaches x is ``x^T W^-1 x``.
+    observability : ndarray (nx, nx)
+        The output energy that x leaves behind is ``x^T W x``.
+    duration : float
+        The horizon [s]; infinite where the model is asymptotically stable and none was given.
+    """
+
+    controllability: Array
+    observability: Array
+    duration: float
+
+    def __post_init__(self) -> None:
+        for array in (self.controllability, self.observability):
+            array.setflags(write=False)
+
+
+def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
+    r"""Compute the Gramians, over all time or over a horizon.
+
+    .. math::
+        W_c = \int_0^T e^{A t} B B^T e^{A^T t}\,dt, \quad
+        W_o = \int_0^T e^{A^T t} C^T C e^{A t}\,dt,
+
+    or the sums over the samples of a sampled model. Over all time they solve Lyapunov's
+    equations. Over a horizon they are polynomials of it at rest, where :math:`A^2 = 0`, and
+    elsewhere built by doubling a short step,
+    :math:`W(2 t) = W(t) + e^{A t} W(t) e^{A^T t}`.
+
+    Parameters
+    ----------
+    lin : LinearModel
+    duration : float, optional
+        The horizon T [s]; a multiple of dt for a sampled model. Over all time by default, for
+        which the model must be asymptotically stable: a free base never is.
+
+    Returns
+    -------
+    Gramians
+
+    Raises
+    ------
+    InputError
+        If `duration` is not positive, no multiple of dt, or left out for a model that is not
+        asymptotically stable.
+
+    References
+    ----------
+    C. Van Loan, Computing integrals involving the matrix exponential, IEEE Trans. Automatic
+    Control 23(3), 1978.
+    """
+    if not isinstance(lin, LinearModel):
+        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    pairs = ((lin.A, lin.B), (lin.A.T, lin.C.T))
+    if duration is None:
+        _require_decay(lin)
+        reach, show = (_symmetric(_endless(A, B @ B.T, lin.dt)) for A, B in pairs)
+        return Gramians(reach, show, np.inf)
+    duration = number("duration", duration)
+    if duration <= 0.0:
+        raise InputError(f"duration is {duration:g} s, expected a positive horizon")
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = [_finite(A, B @ B.T, lin.dt, duration) for A, B in pairs]
+    if not all(np.isfinite(W).all() for W in found):
+        raise InputError(f"duration is {duration:g} s, over which the model grows beyond numbers")
+    reach, show = map(_symmetric, found)
+    return Gramians(reach, show, duration)
+
+
+def _require_decay(lin: LinearModel) -> None:
+    poles = np.linalg.eigvals(lin.A)
+    size = float(np.abs(poles).max())
+    growth = float(np.abs(poles).max()) - 1.0 if lin.dt else float(poles.real.max())
+    if growth >= -_DECAY * (1.0 if lin.dt else size):
+        slow = f"a pole of modulus {1.0 + growth:.6g}" if lin.dt else f"a pole at {growth:.3g} 1/s"
+        raise InputError(
+            f"the model is not asymptotically stable ({slow}), so its Gramians grow without end; "
+            "give a duration"
+        )
+
+
+def _endless(A: Array, Q: Array, dt: float) -> Array:
+    from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
+
+    W: Array = solve_discrete_lyapunov(A, Q) if dt else solve_continuous_lyapunov(A, -Q)
+    return W
+
+
+def _finite(A: Array, Q: Array, dt: float, duration: float) -> Array:
+    if dt:
+        steps = round(duration / dt)
+        if not steps or abs(steps * dt - duration) > 1e-9 * duration:
+            raise InputError(f"duration is {duration:g} s, expected a multiple of dt = {dt:g} s")
+        return _summed(A, Q, steps)
+    return held_cost(A.T, Q, duration)
+
+
+def _summed(A: Array, Q: Array, steps: int) -> Array:
+    """Return the sum of A^k Q A^kT over k < steps, by the binary digits of their number."""
+    W, power = np.zeros_like(Q), np.eye(len(A))
+    block, leap = Q, A
+    while steps:
+        if steps & 1:
+            W = W + power @ block @ power.T
+            power = power @ leap
+        block = block + leap @ block @ leap.T
+        leap = leap @ leap
+        steps >>= 1
+    return W
+
+
+def _symmetric(W: Array) -> Array:
+    return (W + W.T) / 2.0
+
+
+def held_cost(F: Array, W: Array, h: float) -> Array:
+    """Return the integral of e^(F' t) W e^(F t) over [0, h].
+
+    W is taken as of the size of F: the exponential rounds relative to the larger.
+    """
+    square = F @ F
+    if not (square @ F).any():
+        total, step = np.zeros_like(W), np.float64(h)
+        terms = (np.eye(len(F)), F, 0.5 * square)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i, left in enumerate(terms):
+                for j, right in enumerate(terms):
+                    total += left.T @ W @ right * (step ** (i + j + 1) / (i + j + 1))
+            return 0.5 * (total + total.T)
+    from scipy.linalg import expm
+
+    n = len(F)
+    doublings = math.ceil(math.log2(max(2.0 * h * float(np.linalg.norm(F, 1)), 1.0)))
+    block = np.zeros((2 * n, 2 * n))
+    size = float(np.linalg.norm(W, 1)) / float(np.linalg.norm(F, 1)) or 1.0
+    block[:n, :n], block[:n, n:], block[n:, n:] = -F.T, W / size, F
+    with np.errstate(over="ignore", invalid="ignore"):
+        exponential = expm(block * (h / 2**doublings))
+        step = exponential[n:, n:]
+        total = step.T @ exponential[:n, n:]
+        for _ in range(doublings):
+            total = total + step.T @ total @ step
+            step = step @ step
+        return 0.5 * size * (total + total.T)

@@ -1,0 +1,260 @@
+"""A linear model as a mechanical system: its slopes, its energy scale, what it conserves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fflin.analysis.ranks import EPS, Margin, decided, echelon, null_space
+from fflin.analysis.second_order import Noisy, SecondOrder, stacked, without_rounding
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.linear.model import LinearModel
+
+# Relative residual beyond which a momentum is not the rate of a coordinate: off rest.
+_CONSISTENT = 1e-8
+
+
+def checked(lin: LinearModel) -> LinearModel:
+    """Return a model whose state is positions and their rates, or raise `InputError`."""
+    if not isinstance(lin, LinearModel):
+        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    nx = len(lin.A)
+    if lin.M.shape != (nx // 2, nx // 2) or nx % 2:
+        raise InputError(
+            f"the model has {nx} states and an inertia of shape {lin.M.shape}, expected half as "
+            "many rows as states; make it with linearize or momentum_reduction"
+        )
+    for name in "ABCD":
+        if not np.isfinite(getattr(lin, name)).all():
+            raise InputError(f"{name} of the model has entries that are not finite")
+    return lin
+
+
+def slopes(lin: LinearModel) -> Array:
+    """Return A, or (A - E)/dt of a sampled model, which has the same invariant subspaces."""
+    return (lin.A - np.eye(len(lin.A))) / lin.dt if lin.dt else lin.A
+
+
+def rounding(lin: LinearModel) -> float:
+    """Return what each entry of the slopes of a sampled model is worth; 0 in continuous time.
+
+    An exponential has the rounding of its largest entry in all of them.
+    """
+    return EPS * float(np.abs(lin.A).max()) / lin.dt if lin.dt else 0.0
+
+
+# A defective pair of poles at zero moves by the square root of round-off.
+_DECAY = 1e-7
+
+# What is left of a motion after a sample where it is rounding.
+_DEAD = 1e4 * EPS
+
+
+@dataclass(frozen=True)
+class Conserved:
+    """The momenta that no input, spring or damper changes, and what follows from them.
+
+    Attributes
+    ----------
+    weights : ndarray (k, nv)
+        W with ``W M nu`` conserved, in echelon form: a row that is a unit vector is the
+        momentum of that coordinate.
+    momenta, coordinates : ndarray (k, nx)
+        L1 and L2 with ``L1 A = 0``, ``L2 A = L1``, ``L B = 0`` (sampled: of (A - E)/dt).
+    kept : ndarray (r,) of int
+        Coordinates that, with their rates, say the rest where L1 x = L2 x = 0.
+    T : ndarray (nx, 2 r)
+        The states with L1 x = L2 x = 0 of those coordinates and rates.
+    margin : Margin
+        Of the decision on r.
+    """
+
+    weights: Array
+    momenta: Array
+    coordinates: Array
+    kept: Array
+    T: Array
+    margin: Margin
+
+    @property
+    def selected(self) -> Array:
+        """The states (2 r,) of the kept coordinates and their rates."""
+        return np.concatenate((self.kept, self.kept + len(self.T) // 2))
+
+
+def second_order(lin: LinearModel) -> SecondOrder:
+    """Return the forces of a continuous model, or those that a sampled one shows as it stands.
+
+    What the product with M leaves of a slope or an input that is none is put to zero: one floor
+    for springs and one for dampers, per unit of energy, and one for each input.
+    """
+    nv, M, X = len(lin.M), lin.M, slopes(lin)
+    size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
+    rates = np.hstack((X[nv:], lin.B[nv:]))
+    spread = 4.0 * nv * EPS * np.abs(rates)
+    spread[:, : 2 * nv] += 4.0 * nv * rounding(lin) * (rates[:, : 2 * nv] != 0.0)
+    forces = Noisy(M @ rates, np.abs(M) @ spread)
+    K, D, S = (
+        Noisy(forces.values[:, part], forces.noise[:, part])
+        for part in (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None))
+    )
+    # Relative to the largest force of the same input.
+    each = np.linalg.norm(S.values / size[:, None], axis=0)
+    return SecondOrder(
+        M=M,
+        K=without_rounding(K @ -N, size, size),
+        D=without_rounding(D @ -np.eye(nv), size, size),
+        S=without_rounding(S, size, np.where(each > 0.0, each, 1.0)),
+    )
+
+
+def at_rest(lin: LinearModel) -> LinearModel | None:
+    """Return a model with the second-order structure of the given one, None where it has none.
+
+    That is the continuous one where positions change at the rates of velocities alone, which
+    also tells the structure of what was sampled from it; or a sampled one without forces.
+    """
+    source, nv = lin.generator or lin, len(lin.M)
+    X = slopes(source)
+    if X[:nv, :nv].any() or (source.dt and X[nv:].any()):
+        return None
+    return source
+
+
+def rates_of_positions(X: Array) -> Array:
+    """Return N (nv, nv) with dp/dt = N nu; of a model sampled at a period of its own, identity."""
+    nv = len(X) // 2
+    N = X[:nv, nv:]
+    return N if np.linalg.cond(N) < 1e6 else np.eye(nv)
+
+
+def conserved(lin: LinearModel) -> Conserved:
+    r"""Find the conserved momenta: :math:`W M [A_{21}, A_{22}, B_2] = 0`.
+
+    The generalised forces of states and inputs are compared in units of
+    :math:`\sqrt{M_{ii}}` and each is scaled to unit length, so that neither newton against
+    newton metre nor a weak thruster plays a part.
+    """
+    lin = _judged(lin)
+    nv, X, system = len(lin.M), slopes(lin), second_order(lin)
+    size = system.size
+    pushes = stacked([[system.K.T], [system.D.T], [system.S.T]])
+    free, margin = null_space(pushes @ np.diag(1.0 / size))
+    margin = margin.seen(1.0 / size, 2)
+    # Columns of W^T: unit vectors where a coordinate has its momentum to itself.
+    basis, pivots = echelon(free / size[:, None], size)
+    W = basis.T
+    momenta = W @ lin.M
+    coordinates = _driven(X, momenta)
+    if coordinates is None:
+        pivots, W = pivots[:0], W[:0]
+        momenta = coordinates = np.zeros((0, nv))
+    kept = np.setdiff1d(np.arange(nv), pivots)
+    r, k = len(kept), len(pivots)
+    T = np.zeros((2 * nv, 2 * r))
+    T[kept, np.arange(r)] = T[nv + kept, r + np.arange(r)] = 1.0
+    if k:
+        T[pivots, :r] = -np.linalg.solve(coordinates[:, pivots], coordinates[:, kept])
+        T[nv + pivots, r:] = -np.linalg.solve(momenta[:, pivots], momenta[:, kept])
+    zero = np.zeros((k, nv))
+    L1, L2 = np.hstack((zero, momenta)), np.hstack((coordinates, zero))
+    return Conserved(W, L1, L2, kept, T, margin)
+
+
+def _judged(lin: LinearModel) -> LinearModel:
+    """Return the model that a sampled one is made of, which conserves the same, where known."""
+    return lin.generator or lin
+
+
+def _driven(X: Array, momenta: Array) -> Array | None:
+    """Return the coordinates (k, nv) over the positions whose rates are the momenta, if any."""
+    nv = len(X) // 2
+    X11, X12 = X[:nv, :nv], X[:nv, nv:]
+    if not X11.any():
+        found = np.linalg.solve(X12.T, momenta.T).T
+    else:
+        wanted = np.hstack((momenta, np.zeros_like(momenta)))
+        found = np.linalg.lstsq(np.hstack((X12, X11)).T, wanted.T, rcond=None)[0].T
+    error = np.abs(found @ X12 - momenta).max(initial=0.0)
+    error = max(error, np.abs(found @ X11).max(initial=0.0))
+    return found if error <= _CONSISTENT * np.abs(momenta).max(initial=0.0) else None
+
+
+@dataclass(frozen=True)
+class Scaled:
+    """A pair in coordinates of energy: ``x = to_x @ xi``, time in units of `unit` seconds.
+
+    Velocities are L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy, positions
+    likewise over the time unit. A is of size about 1.
+    """
+
+    A: Array
+    to_x: Array
+    from_x: Array
+    unit: float
+    tolerance: float
+
+
+def scaled(X: Array, M: Array, dt: float = 0.0) -> Scaled:
+    """Scale slopes to units of energy, and of time so that A is of size 1.
+
+    The tolerance is twenty times the rounding of M^-1, or that of the exponential which the
+    slopes of a sampled model are a difference of.
+    """
+    nv = len(M)
+    L = np.linalg.cholesky(M)
+    N = rates_of_positions(X)
+    to_velocity = np.linalg.inv(L.T)
+    to_position = N @ to_velocity
+    to_x = np.block([[to_position, np.zeros((nv, nv))], [np.zeros((nv, nv)), to_velocity]])
+    back = np.block([[L.T @ np.linalg.inv(N), np.zeros((nv, nv))], [np.zeros((nv, nv)), L.T]])
+    A = back @ X @ to_x
+    sizes = [np.linalg.norm(A[i, j], 2) for i, j in _quarters(nv)]
+    rate = max(sizes[0], sizes[3], np.sqrt(sizes[2]))
+    # Where nothing but inertia acts, any unit will do.
+    unit = 1.0 / rate if rate > 0.0 else 1.0
+    if dt:
+        # Sampled at a period of its only vibration, all but inertia is rounding.
+        unit = min(unit, 100.0 * dt)
+    # Positions change by 1/unit where velocities change by 1.
+    stretch = np.repeat((unit, 1.0), nv)
+    to_x, back = to_x * stretch, back / stretch[:, None]
+    root = np.sqrt(M.diagonal())
+    condition = float(np.linalg.cond(M / np.outer(root, root)))
+    A = unit * A * stretch / stretch[:, None]
+    noise = EPS * (unit / dt + float(np.linalg.norm(A, 2))) if dt else 0.0
+    return Scaled(
+        A=A,
+        to_x=to_x,
+        from_x=back,
+        unit=unit,
+        tolerance=20.0 * max(len(X) * EPS * condition, noise),
+    )
+
+
+def fixed_poles(F: Array, rest: Array, pair: Scaled, dt: float) -> tuple[Any, bool, Margin, Margin]:
+    """Return the poles of dynamics F on `rest` of a pair and whether all decay.
+
+    Also the margin of what has died out between samples, which cannot be told apart any more,
+    and that of the decay.
+    """
+    if not len(F):
+        return np.zeros(0), True, Margin(), Margin()
+    rates, vectors = np.linalg.eig(F)
+    shapes = pair.to_x @ rest @ vectors
+    poles = 1.0 + dt * rates / pair.unit if dt else rates / pair.unit
+    decay = 1.0 - np.abs(poles) if dt else -rates.real
+    least, most = int(decay.argmin()), int(decay.argmax())
+    settling = decided(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least]).halved()
+    lost = Margin()
+    if dt and abs(poles[most]) < _DEAD:
+        lost = decided(1.0, shapes[:, most]).halved()
+    return poles, bool(decay[least] > _DECAY), lost, settling
+
+
+def _quarters(nv: int) -> list[tuple[slice, slice]]:
+    halves = (slice(0, nv), slice(nv, 2 * nv))
+    return [(i, j) for i in halves for j in halves]

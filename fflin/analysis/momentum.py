@@ -1,0 +1,226 @@
+"""The model without the momenta that it conserves, and what the free base makes of the arm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.analysis.mechanics import checked, conserved
+from fflin.analysis.names import undecided
+from fflin.analysis.ranks import Margin
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.linear.model import Certificate, LinearModel
+from fflin.robot.frames import frame_index
+from fflin.robot.robot import Robot
+
+# f0 outside of what the reduced state can follow, relative to f0.
+_DRIFT = 1e-9
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class ReducedModel(LinearModel):
+    """A linear model in the coordinates that its inputs, springs and dampers act on.
+
+    With z the reduced state and x that of the whole, ``x - x0 = T (z - z0)`` on the motions with
+    zero conserved momenta, and always ``z = S x``. Files hold the model without these maps.
+
+    Attributes
+    ----------
+    T : ndarray (nx, nz)
+        From the reduced state to the whole.
+    S : ndarray (nz, nx)
+        From the whole state to the reduced: it picks the states of the same names.
+    momenta : ndarray (k, nx)
+        Rows L1: what is conserved, and zero in the reduced model.
+    coordinates : ndarray (k, nx)
+        Rows L2: what drifts at the rate of L1, and is held at zero in the reduced model.
+    margin : Margin
+        Distance from doubt of the decision on what is conserved: far above 1, far below 1.
+    notes : tuple of str
+        What is undecided.
+    """
+
+    T: Array
+    S: Array
+    momenta: Array
+    coordinates: Array
+    margin: Margin
+    notes: tuple[str, ...]
+
+
+def momentum_reduction(lin: LinearModel) -> ReducedModel:
+    r"""Reduce a model to the part without its conserved momenta, exactly.
+
+    A momentum :math:`W M \nu` that no input, spring or damper changes is zero for all time
+    where it starts at zero; with the coordinate that it drives it is left out. For an
+    unactuated base these are its six, and with :math:`G = -M_{bb}^{-1} M_{bm}`
+
+    .. math::
+        \nu_b = G \dot q_m, \quad M^* \ddot q_m = \tau_m - K q_m - D \dot q_m, \quad
+        M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}.
+
+    Where attitude or position is actuated as well, its states are kept and the others left out.
+    Without springs the result is minimal; a vibration that no input drives stays in it. From
+    inputs to joint states it has the transfer function of the whole model.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        About rest, continuous or sampled.
+
+    Returns
+    -------
+    ReducedModel
+        A `LinearModel` of 2 r states, r being nv less the number of conserved momenta, with
+        the maps ``T`` and ``S``. Its ``M`` is that of the kept coordinates with the others
+        free to follow, and its outputs are those of `lin`. All states are kept where nothing is
+        conserved.
+
+    Raises
+    ------
+    InputError
+        If the point drifts in a direction that is left out, or `lin` is no linear model.
+
+    References
+    ----------
+    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
+    """
+    lin = checked(lin)
+    held = conserved(lin)
+    z, T = held.selected, held.T
+    judged = [name not in lin.ignorable for name in lin.state_names]
+    drift = float(np.abs(lin.f0 - T @ lin.f0[z])[judged].max(initial=0.0))
+    if drift > _DRIFT * float(np.abs(lin.f0).max()):
+        raise InputError(
+            f"the point is no fixed point: |f0| is {np.abs(lin.f0).max():.3g} and changes what "
+            "the reduction leaves out; linearise at rest"
+        )
+    S = np.zeros((len(z), len(T)))
+    S[np.arange(len(z)), z] = 1.0
+    rates = T[len(lin.M) :, len(held.kept) :]
+    M = rates.T @ lin.M @ rates
+    M.setflags(write=False)
+    values = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
+    values |= {
+        "A": lin.A[z] @ T,
+        "B": lin.B[z],
+        "C": lin.C @ T,
+        "f0": lin.f0[z],
+        "x0": lin.x0[z],
+        "state_names": tuple(lin.state_names[i] for i in z),
+        "state_units": tuple(lin.state_units[i] for i in z),
+        "_ignorable": partial(_given, tuple(lin.state_names[i] for i in z if not judged[i])),
+        "_drift": None if lin._drift is None else lin._drift[z],
+        "_inertia": partial(_given, M),
+    }
+    reduced = ReducedModel(
+        **values,
+        T=T,
+        S=S,
+        momenta=held.momenta,
+        coordinates=held.coordinates,
+        margin=held.margin,
+        notes=undecided(lin, held.margin, "kept by the reduction", len(z)),
+    )
+    fingerprint, source = reduced.fingerprint, lin.generator
+    certify = partial(_same_certificate, lin, fingerprint)
+    of = (fingerprint, momentum_reduction(source)) if lin.dt and source is not None else None
+    return replace(reduced, _certify=certify, _source=of)
+
+
+def generalized_inertia(lin: LinearModel) -> Array:
+    r"""Return the inertia of the joints with the base free to follow.
+
+    .. math:: M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}
+
+    Parameters
+    ----------
+    lin : LinearModel
+        Of the whole robot, at any velocity.
+
+    Returns
+    -------
+    ndarray (n, n)
+        ``(M^-1)_mm = M*^-1``.
+
+    Raises
+    ------
+    InputError
+        If the base is not among the states.
+
+    References
+    ----------
+    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
+    """
+    lin = checked(lin)
+    if len(lin.A) != 12 + 2 * _joints(lin):
+        raise InputError("the base is not among the states; take the model before its reduction")
+    M = lin.M
+    inertia: Array = M[6:, 6:] + M[6:, :6] @ _following(M)
+    return (inertia + inertia.T) / 2.0
+
+
+def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") -> Array:
+    r"""Return the velocity of a frame per joint rate, with the momentum of the robot zero.
+
+    .. math:: J^* = J_m + J_b G, \qquad G = -M_{bb}^{-1} M_{bm}
+
+    Parameters
+    ----------
+    robot : Robot
+    q : array_like (nq,), optional
+        Configuration; neutral by default.
+    frame : str
+        A frame of the model.
+
+    Returns
+    -------
+    ndarray (6, n)
+        Angular velocity [rad/s], then velocity of the frame's origin [m/s], both in Pinocchio's
+        world axes, over the joint rates.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such frame.
+    InputError
+        If `q` is no configuration of the robot.
+
+    References
+    ----------
+    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
+    """
+    state = StateMap(robot)
+    q = robot.neutral() if q is None else robot.checked_configuration(q)
+    model, data = robot.model, robot.create_data()
+    index, axes = frame_index(model, frame), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    full = pin.computeFrameJacobian(model, data, q, index, axes)
+    J = state.columns(np.vstack((full[LINEAR], full[ANGULAR])))
+    M = state.project(pin.crba(model, data, q).T)
+    result: Array = J[:, 6:] + J[:, :6] @ _following(M)
+    return result
+
+
+def _following(M: Array) -> Array:
+    """Return G (6, n), what the free base does when the joints move."""
+    G: Array = -np.linalg.solve(M[:6, :6], M[:6, 6:])
+    return G
+
+
+def _joints(lin: LinearModel) -> int:
+    return sum(name.startswith("q_m.") for name in lin.state_names)
+
+
+def _given(value: Any, _: LinearModel) -> Any:
+    return value
+
+
+def _same_certificate(whole: LinearModel, fingerprint: str, lin: LinearModel) -> Certificate:
+    lin.require(fingerprint)
+    return whole.certificate

@@ -1,0 +1,115 @@
+"""Names of combinations of states: momenta, what they drive, and sums of the largest terms."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fflin.analysis.mechanics import Conserved
+from fflin.analysis.ranks import Margin
+from fflin.base.validation import Array
+from fflin.linear.model import LinearModel
+
+_MOMENTUM = {"omega_b": "angular momentum {}", "v_b": "linear momentum {}"}
+_COORDINATE = {"omega_b": "base attitude {}", "v_b": "base position {}"}
+
+
+def momentum_names(lin: LinearModel, held: Conserved) -> tuple[str, ...]:
+    """Name the conserved momenta, and then the coordinates that they drive."""
+    nv = len(lin.M)
+    size = 1.0 / np.sqrt(lin.M.diagonal())
+    rates = [name.split(".", 1) for name in lin.state_names[nv:]]
+    momenta = tuple(
+        _MOMENTUM.get(group, "momentum of {}").format(member) for group, member in rates
+    )
+    driven = tuple(
+        _COORDINATE.get(group, "position of {}").format(member) for group, member in rates
+    )
+    # What the coordinates are counted from: without it every one of them can be moved.
+    only_joints = all(rates[i][0] == "qdot_m" for i in held.kept)
+    of_base = all(not row[i] for row in held.weights for i in range(nv) if rates[i][0] == "qdot_m")
+    rest = "the joints" if only_joints and of_base else "the rest"
+    return (
+        *(combination(row, momenta, 1.0 / size) for row in held.weights),
+        *(f"{combination(row, driven, 1.0 / size)} with {rest} held" for row in held.weights),
+    )
+
+
+def grouped(names: tuple[str, ...]) -> list[str]:
+    """Join names that differ in their axis alone: "angular momentum x, y, z" is one."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for name in names:
+        words = name.split(" ")
+        axes = [i for i, word in enumerate(words) if word in ("x", "y", "z")]
+        if len(axes) == 1:
+            i = axes[0]
+            key = (" ".join(words[:i]), " ".join(words[i + 1 :]))
+            groups.setdefault(key, []).append(words[i])
+        else:
+            groups[name, ""] = []
+    return [
+        " ".join(part for part in (head, "/".join(axes), tail) if part)
+        for (head, tail), axes in groups.items()
+    ]
+
+
+_RATES = {"q_b": "omega_b", "r_b": "v_b", "q_m": "qdot_m"}
+
+
+def with_rates(names: tuple[str, ...]) -> str:
+    """List names in a sentence; rates that come with their positions are said once."""
+    pairs = {}
+    for name in names:
+        group, _, member = name.partition(".")
+        if group in _RATES and f"{_RATES[group]}.{member}" in names:
+            pairs[name] = f"{_RATES[group]}.{member}"
+    if not pairs:
+        return ", ".join(names) or "none"
+    alone = [name for name in names if name not in pairs and name not in pairs.values()]
+    rates = "its rate" if len(pairs) == 1 else "their rates"
+    return "; ".join((f"{', '.join(pairs)} and {rates}", *alone))
+
+
+def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int = 3) -> str:
+    """Show a linear combination by its largest terms; `sizes` makes the weights comparable."""
+    order = [i for i in np.argsort(-np.abs(weights) * sizes) if weights[i]]
+    largest = abs(weights[order[0]]) * sizes[order[0]]
+    shown = [i for i in order if abs(weights[i]) * sizes[i] > 1e-6 * largest]
+    terms = [_term(float(weights[i]), names[i], first=i == shown[0]) for i in shown[:most]]
+    if len(shown) > most:
+        terms.append("+ ...")
+    return " ".join(terms)
+
+
+def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[str, ...]:
+    """Say what is decided within rounding, and the two answers: `count` states, or others."""
+    notes = []
+    for ratio, at, change in margin.doubts:
+        verb = "counts" if change < 0 else "does not count"
+        notes.append(
+            f"undecided: {shape(lin, at)} {verb} as {what}, by {ratio:.1g} times its rounding; "
+            f"{count} or {count + change} of {len(lin.A)} states"
+        )
+    return tuple(notes)
+
+
+def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
+    """Say where it hangs on rounding whether the slowest motion decays."""
+    return tuple(
+        f"undecided: whether {shape(lin, at)} settles by itself, at {ratio:.1g} times its "
+        f"rounding; {what} or not {what}"
+        for ratio, at, _ in settling.doubts
+    )
+
+
+def shape(lin: LinearModel, at: Array) -> str:
+    """Name the coordinates that rates (nv,) move, real or complex, by the largest."""
+    size = np.sqrt(lin.M.diagonal())
+    largest = at[int(np.abs(at * size).argmax())]
+    names = tuple(name.partition(".")[2] or name for name in lin.state_names[len(lin.M) :])
+    return combination(np.real(at / largest), names, size)
+
+
+def _term(weight: float, name: str, *, first: bool) -> str:
+    sign = ("-" if weight < 0.0 else "") if first else ("- " if weight < 0.0 else "+ ")
+    size = f"{abs(weight):.3g}"
+    return sign + (name if size == "1" else f"{size} {name}")

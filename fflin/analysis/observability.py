@@ -1,0 +1,168 @@
+"""Which states the outputs of a linear model show."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fflin.analysis.mechanics import (
+    at_rest,
+    checked,
+    fixed_poles,
+    rates_of_positions,
+    scaled,
+    second_order,
+    slopes,
+)
+from fflin.analysis.names import combination, undecided, unsettled, with_rates
+from fflin.analysis.ranks import EPS, Margin, echelon, reached_by, unit_columns
+from fflin.analysis.second_order import Noisy, aliased, hidden, without_rounding
+from fflin.base.tables import width
+from fflin.base.validation import Array
+from fflin.linear.model import LinearModel
+
+
+@dataclass(frozen=True, eq=False)
+class Observability:
+    """What the outputs of a linear model show; prints in words.
+
+    Attributes
+    ----------
+    dimension : int
+        nx less the dimension of the unobservable subspace.
+    unobservable : tuple of str
+        Names of the motions that leave no trace in the outputs: a state, or several together.
+    basis : ndarray (nx, nx - dimension)
+        Those motions, a column each.
+    rows : ndarray (dimension, nx)
+        What can be told from the outputs: the unobservable subspace is ``rows @ x = 0``.
+    fixed_poles : ndarray (nx - dimension,)
+        Poles of the error that no observer can move [1/s], or of the sampled model.
+    detectable : bool
+        Whether all of these decay.
+    method : str
+        "closed form" or "eigenvalues": how the dimension was found.
+    margin : Margin
+        Distance of the rank decisions from doubt: far above 1, far below 1.
+    notes : tuple of str
+        What is undecided.
+    """
+
+    dimension: int
+    unobservable: tuple[str, ...]
+    basis: Array
+    rows: Array
+    fixed_poles: Any
+    detectable: bool
+    method: str
+    margin: Margin
+    notes: tuple[str, ...]
+    robot: str
+
+    def __post_init__(self) -> None:
+        for array in (self.basis, self.rows, self.fixed_poles):
+            array.setflags(write=False)
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.robot}: {self.dimension} of {len(self.basis)} states are observable "
+            f"({self.method}); {'' if self.detectable else 'not '}detectable"
+        ]
+        if self.unobservable:
+            lines.append(f"unobservable: {with_rates(self.unobservable)}")
+        lines += [f"note: {note}" for note in self.notes]
+        return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
+
+
+def observability(lin: LinearModel) -> Observability:
+    r"""Find what the outputs show, from C and the structure of A.
+
+    About rest without springs and dampers :math:`A^2 = 0`, and the unobservable subspace is the
+    kernel of :math:`[C; C A]`, which is one decision. Elsewhere it is the orthogonal complement
+    of what the dual pair :math:`(A^T, C^T)` reaches, found eigenvalue by eigenvalue in units of
+    energy, as in `controllability`.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        Continuous or sampled, fresh, reduced, or loaded from a file.
+
+    Returns
+    -------
+    Observability
+
+    Raises
+    ------
+    InputError
+        If `lin` is no linear model of positions and their rates.
+    """
+    lin = checked(lin)
+    part = _by_second_order(lin) or _by_eigenvalues(lin)
+    size = np.tile(np.sqrt(lin.M.diagonal()), 2)
+    basis, _ = echelon(part.motions, size)
+    scaled_basis = np.linalg.qr(basis * size[:, None], mode="complete")[0]
+    return Observability(
+        dimension=len(basis) - basis.shape[1],
+        unobservable=tuple(combination(column, lin.state_names, size) for column in basis.T),
+        basis=basis,
+        rows=scaled_basis[:, basis.shape[1] :].T * size,
+        fixed_poles=part.poles,
+        detectable=part.decays,
+        method=part.method,
+        margin=part.margin,
+        notes=(
+            *undecided(lin, part.margin, "observable", len(basis) - basis.shape[1]),
+            *unsettled(lin, part.settling, "detectable"),
+        ),
+        robot=lin.robot,
+    )
+
+
+class _Part(NamedTuple):
+    """The motions (nx, k) that the outputs do not show."""
+
+    motions: Array
+    poles: Any
+    decays: bool
+    method: str
+    margin: Margin
+    settling: Margin
+
+
+def _by_second_order(lin: LinearModel) -> _Part | None:
+    source = at_rest(lin)
+    if source is None:
+        return None
+    system, nv = second_order(source), len(lin.M)
+    if not system.symmetric or (lin.dt and aliased(system.poles[0], lin.dt)):
+        return None
+    N = rates_of_positions(slopes(source))
+    C = np.hstack((lin.C[:, :nv] @ N, lin.C[:, nv:]))
+    size = np.tile(system.size, 2)
+    each = np.linalg.norm(C / size, axis=1)
+    noise = 4.0 * EPS * np.abs(C)
+    shown = without_rounding(Noisy(C, noise), np.where(each > 0.0, each, 1.0), size)
+    position, velocity = (
+        Noisy(shown.values[:, half], shown.noise[:, half])
+        for half in (slice(0, nv), slice(nv, None))
+    )
+    found = hidden(system, position, velocity)
+    if not found.simple:
+        return None
+    acting = system.K.values.any() or system.D.values.any()
+    motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
+    poles = np.exp(found.poles * lin.dt) if lin.dt else found.poles
+    method = "eigenvalues" if acting else "closed form"
+    return _Part(motions, poles, found.decays, method, found.margin, found.settling)
+
+
+def _by_eigenvalues(lin: LinearModel) -> _Part:
+    pair, nv = scaled(slopes(lin), lin.M, lin.dt), len(lin.M)
+    seen = unit_columns((lin.C @ pair.to_x).T)
+    _, rest, F, margin = reached_by(pair.A.T, seen, pair.tolerance)
+    poles, decays, lost, settling = fixed_poles(F, rest, pair, lin.dt)
+    margin = margin.halved().seen(pair.to_x[nv:, nv:]) & lost
+    return _Part(pair.to_x @ rest, poles, decays, "eigenvalues", margin, settling)

@@ -1,0 +1,364 @@
+"""How far from its point a linear model can be trusted, and its loop holds."""
+
+from __future__ import annotations
+
+import textwrap
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, as_completed
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from fflin.analysis.closed_loop import SETTLED, Loop
+from fflin.base.errors import FflinError, InputError
+from fflin.base.tables import width
+from fflin.base.validation import Array, as_double, number, whole
+from fflin.dynamics.actuation import Actuation
+from fflin.linear.model import LinearModel
+from fflin.robot.robot import Robot
+
+# Displacements, as shares of the largest, at which the prediction is measured, and directions.
+_LEVELS = 2.0 ** np.arange(-6.0, 1.0)
+_DIRECTIONS = 4
+
+# Time constants of the slowest pole over which the prediction is measured, and of a run.
+_FORESIGHT, _PATIENCE = 3.0, 3.0
+_STEPS = 60
+
+# Random runs at most, and displacement [m], [rad].
+_MOST, _FARTHEST = 1_000_000, 1e6
+
+# Relative error of the integration, and prediction errors too small to be told from it.
+_PRECISION, _ROUNDING = 1e-9, 1e-7
+
+# Relative prediction error up to which the linear model is called trusted.
+TRUSTED = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Validity:
+    """How far a linear model and its loop reach; prints in words.
+
+    A level is a share of the largest displacement: base attitude, base position and joints
+    together, in a random direction.
+
+    Attributes
+    ----------
+    levels : ndarray (k,)
+        At which the prediction was measured.
+    prediction_error : ndarray (k,)
+        Largest error of the linear closed loop over three of its time constants, relative to the
+        displacement, in the norm of its Lyapunov function; NaN where a run left the chart.
+    slope : float
+        Order of the error itself in the displacement, over the four smallest levels: 2. NaN where
+        one of these is of the size of the integration's errors, or left the chart.
+    trusted : dict
+        {"attitude" [deg], "position" [m], "joint" [rad|m]} where `prediction_error` reaches 10 %.
+    sampled : ndarray (N,)
+        Levels of the random runs, ascending.
+    outcomes : tuple of str
+        Of each: "settled", "slow", "chart" or "diverged".
+    holds : dict
+        The displacement like `trusted` below which every run settled.
+    inside : int
+        Runs up to there.
+    inside_rate : float
+        At least this share of displacements up to there settles, with `confidence`.
+    rate : tuple of float
+        Interval (Clopper and Pearson) of the share of all displacements that settles.
+    confidence : float
+    """
+
+    levels: Array
+    prediction_error: Array
+    slope: float
+    trusted: dict[str, float]
+    sampled: Array
+    outcomes: tuple[str, ...]
+    holds: dict[str, float]
+    inside: int
+    inside_rate: float
+    rate: tuple[float, float]
+    confidence: float
+    largest: dict[str, float]
+    robot: str
+
+    def __post_init__(self) -> None:
+        for array in (self.levels, self.prediction_error, self.sampled):
+            array.setflags(write=False)
+
+    @property
+    def settled(self) -> int:
+        """Number of runs that settled."""
+        return self.outcomes.count("settled")
+
+    def __str__(self) -> str:
+        count, sure = len(self.outcomes), f"{100.0 * self.confidence:g} %"
+        low, high = self.rate
+        ends = Counter(self.outcomes)
+        failures = ", ".join(f"{ends[key]} {words}" for key, words in _ENDS.items() if ends[key])
+        order = "no order of the error can be told"
+        if np.isfinite(self.slope):
+            order = f"the error grows with the displacement to the power {self.slope:.3f}"
+        beyond = " and beyond" if self.trusted == self.largest else ""
+        first = {key: value * self.sampled[0] for key, value in self.largest.items()}
+        lines = [
+            f"{self.robot}: the linear loop foresees the nonlinear one within "
+            f"{100.0 * TRUSTED:g} % up to {shown(self.trusted)}{beyond}; {order}",
+            f"every loop settled up to {shown(self.holds)}: {self.inside} of {self.inside} runs, "
+            f"so that at least {100.0 * self.inside_rate:.1f} % do ({sure} confidence)"
+            if self.inside
+            else f"even from the smallest displacement tried, {shown(first)}, it did not settle",
+            f"of displacements up to {shown(self.largest)} {self.settled} of {count} runs settled: "
+            f"between {100.0 * low:.1f} and {100.0 * high:.1f} % do ({sure} confidence)"
+            + (f"; {failures}" if failures else ""),
+        ]
+        return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
+
+
+_ENDS = {
+    "slow": "were still on their way",
+    "chart": "came near a turn of 180 deg",
+    "diverged": "diverged",
+}
+
+
+def validity(
+    robot: Robot,
+    lin: LinearModel,
+    gain: Any,
+    *,
+    attitude: float = 90.0,
+    position: float = 0.5,
+    joint: float = 1.0,
+    samples: int = 100,
+    seed: int = 0,
+    confidence: float = 0.95,
+    executor: Executor | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> Validity:
+    """Measure how far from its point a linear model can be trusted, and its loop holds.
+
+    The nonlinear robot under ``u = u0 - K (x - x0)``, held between samples where the model is
+    sampled, is followed from displacements at the point's velocity: from growing ones beside the
+    linear prediction, and from random ones until the error is a thousandth of the first. A run
+    that takes three times as long as the slowest pole needs has not settled.
+
+    Parameters
+    ----------
+    robot : Robot
+        Of the model, with the same inputs.
+    lin : LinearModel
+        About a fixed point, whole or reduced, continuous or sampled.
+    gain : Gain or array_like (nu, nx)
+        K, which makes the linear loop stable.
+    attitude, position, joint : float
+        Largest displacement of the base [deg], [m], and of the joint displaced most [rad|m]. What
+        is not among the states of a reduced model is not displaced, and told as 0.
+    samples : int
+        Number of random runs.
+    seed : int
+        The same seed gives the same result whatever the executor.
+    confidence : float
+        Of the intervals.
+    executor : concurrent.futures.Executor, optional
+        Runs them in parallel, such as a ProcessPoolExecutor.
+    progress : callable, optional
+        ``progress(done, total)`` is called with the number of runs, random or not, as they end.
+
+    Returns
+    -------
+    Validity
+
+    Raises
+    ------
+    InputError
+        If the linear loop is unstable, the point is no fixed point, or an argument has a wrong
+        size or value.
+    FflinError
+        If a process of the executor died.
+
+    References
+    ----------
+    C. J. Clopper and E. S. Pearson, The use of confidence or fiducial limits illustrated in the
+    case of the binomial, Biometrika 26(4), 1934.
+    """
+    loop = _checked(robot, lin, gain)
+    largest = {"attitude": attitude, "position": position, "joint": joint}
+    largest = {key: number(key, value) for key, value in largest.items()}
+    samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
+    confidence = number("confidence", confidence)
+    if not 0.0 < confidence < 1.0:
+        raise InputError(f"confidence is {confidence:g}, expected a share between 0 and 1")
+    if not 0.0 <= largest["attitude"] < 175.0 or min(largest.values()) < 0.0:
+        raise InputError(
+            f"the displacements are {shown(largest)}; expected none negative, and an attitude "
+            "below 175 deg, where the chart ends"
+        )
+    if max(largest.values()) > _FARTHEST:
+        raise InputError(
+            f"the displacements are {shown(largest)}; expected none beyond {_FARTHEST:g}, where no "
+            "loop settles"
+        )
+    there = {name.partition(".")[0] for name in lin.state_names}
+    groups = {"attitude": "q_b", "position": "r_b", "joint": "q_m"}
+    largest = {key: largest[key] if groups[key] in there else 0.0 for key in groups}
+    if not any(largest.values()):
+        raise InputError(
+            "the model has none of the coordinates that are displaced; give others than 0"
+        )
+    # Of each run its own stream, so that it does not matter who does which.
+    streams = np.random.SeedSequence(seed).spawn(samples + _DIRECTIONS)
+    levels = (np.arange(samples) + 0.5) / samples
+    if executor is not None and not isinstance(executor, Executor):
+        raise InputError(
+            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
+        )
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
+    runs: list[Callable[[], Any]] = [
+        *(partial(_foreseen, loop, largest, stream) for stream in streams[:_DIRECTIONS]),
+        *map(partial(partial, _outcome, loop, largest), levels, streams[_DIRECTIONS:]),
+    ]
+    found: list[Any] = [None] * len(runs)
+    for done, (index, result) in enumerate(_each(runs, executor), 1):
+        found[index] = result
+        if progress:
+            progress(done, len(runs))
+    worst = np.array(found[:_DIRECTIONS]).max(axis=0)
+    outcomes = tuple(found[_DIRECTIONS:])
+    failed = [i for i, outcome in enumerate(outcomes) if outcome != "settled"]
+    inside = failed[0] if failed else samples
+    settled = outcomes.count("settled")
+    reach = float(levels[inside - 1]) if inside else 0.0
+    return Validity(
+        levels=_LEVELS,
+        prediction_error=worst,
+        slope=_slope(worst),
+        trusted=_scaled(largest, _crossing(worst)),
+        sampled=levels,
+        outcomes=outcomes,
+        holds=_scaled(largest, reach),
+        inside=inside,
+        inside_rate=(1.0 - confidence) ** (1.0 / inside) if inside else 0.0,
+        rate=_clopper_pearson(settled, samples, confidence),
+        confidence=confidence,
+        largest=largest,
+        robot=lin.robot,
+    )
+
+
+def _each(runs: list[Callable[[], Any]], executor: Executor | None) -> Iterator[tuple[int, Any]]:
+    """Yield the number and the result of each run as it ends."""
+    if executor is None:
+        yield from ((index, run()) for index, run in enumerate(runs))
+        return
+    futures = {executor.submit(run): index for index, run in enumerate(runs)}
+    try:
+        for future in as_completed(futures):
+            yield futures.pop(future), future.result()
+    except BrokenExecutor as error:
+        raise FflinError(f"a process that did the runs died: {error}") from None
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _checked(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
+    if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
+        raise InputError("expected a fflin.Robot, its fflin.LinearModel and a gain")
+    K = as_double("gain", getattr(gain, "K", gain))
+    if K.shape != lin.B.T.shape or not np.isfinite(K).all():
+        raise InputError(f"K has shape {K.shape}, expected {lin.B.T.shape} of finite numbers")
+    loop = Loop(robot, lin, K)
+    if Actuation(loop.state).names != lin.input_names or not len(loop.watched):
+        raise InputError(
+            f"the model's inputs are not those of '{robot.name}'; give the robot with its inputs"
+        )
+    if lin.moving or not lin.is_equilibrium() or lin.v.any():
+        raise InputError("the point is no fixed point at rest; its loop cannot settle there")
+    if not loop.decay > 0.0:
+        raise InputError(
+            f"the linear loop is not stable: its slowest pole grows with {-loop.decay:.3g} 1/s; "
+            "design the gain with fflin.lqr"
+        )
+    return loop
+
+
+def _times(loop: Loop, horizon: float) -> Array:
+    """Return the times of a run: its samples, or even steps."""
+    if loop.lin.dt:
+        return loop.lin.dt * np.arange(1.0 + np.ceil(horizon / loop.lin.dt))
+    return np.linspace(0.0, horizon, _STEPS + 1)
+
+
+def _foreseen(loop: Loop, largest: dict[str, float], stream: np.random.SeedSequence) -> Array:
+    """Return the relative prediction error at each level along one direction."""
+    times = _times(loop, _FORESIGHT / loop.decay)
+    errors = []
+    for level in _LEVELS:
+        x = loop.displaced(np.random.default_rng(stream), **_scaled(largest, float(level)))
+        _, motion = loop.run(x, times, _PRECISION)
+        foreseen = loop.linear(motion[0], times)[: len(motion)]
+        worst = max(loop.size(one - two) for one, two in zip(motion, foreseen, strict=True))
+        complete = len(motion) == len(times) or loop.size(motion[-1]) <= SETTLED * loop.size(
+            motion[0]
+        )
+        errors.append(worst / loop.size(motion[0]) if complete else np.nan)
+    return np.array(errors)
+
+
+def _outcome(
+    loop: Loop, largest: dict[str, float], level: float, stream: np.random.SeedSequence
+) -> str:
+    rng = np.random.default_rng(stream)
+    x = loop.displaced(rng, **_scaled(largest, level))
+    horizon = _PATIENCE * np.log(1.0 / SETTLED) / loop.decay
+    return loop.run(x, _times(loop, horizon), 1e-6)[0]
+
+
+def _scaled(largest: dict[str, float], level: float) -> dict[str, float]:
+    return {key: level * value for key, value in largest.items()}
+
+
+def _slope(errors: Array) -> float:
+    """Return the order of the error itself, one more than that of the relative error."""
+    if not errors[:4].min() > _ROUNDING:
+        return np.nan
+    return 1.0 + float(np.polyfit(np.log(_LEVELS[:4]), np.log(errors[:4]), 1)[0])
+
+
+def _crossing(errors: Array) -> float:
+    """Return the level at which the relative error reaches what is trusted, between levels."""
+    beyond = np.flatnonzero(~(errors <= TRUSTED))
+    if not len(beyond):
+        return 1.0
+    first = int(beyond[0])
+    if first == 0 or not np.isfinite(errors[first]):
+        # Below the first level the error is proportional to it.
+        if not np.isfinite(errors[0]):
+            return 0.0
+        at = max(first - 1, 0)
+        return float(min(_LEVELS[at] * TRUSTED / errors[at], _LEVELS[first]))
+    pair = slice(first - 1, first + 1)
+    return float(np.exp(np.interp(np.log(TRUSTED), np.log(errors[pair]), np.log(_LEVELS[pair]))))
+
+
+def _clopper_pearson(successes: int, count: int, confidence: float) -> tuple[float, float]:
+    from scipy.special import betaincinv
+
+    tail = (1.0 - confidence) / 2.0
+    failures = count - successes
+    low = betaincinv(successes, failures + 1, tail) if successes else 0.0
+    high = betaincinv(successes + 1, failures, 1.0 - tail) if failures else 1.0
+    return float(low), float(high)
+
+
+def shown(displacement: dict[str, float]) -> str:
+    """Say in words what of a displacement is not zero."""
+    units = {"attitude": "deg", "position": "m", "joint": "rad|m"}
+    words = [f"{displacement[key]:.3g} {unit}" for key, unit in units.items() if displacement[key]]
+    return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:]))) or "0"

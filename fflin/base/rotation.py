@@ -1,0 +1,61 @@
+"""Rotations: cross-product matrices and Hamilton quaternions stored x, y, z, w."""
+
+import math
+
+import numpy as np
+
+from fflin.base.validation import Array
+
+# Row 3 i + j holds the entry (i, j) of [a]x as a linear function of a.
+_CROSS = np.zeros((9, 3))
+_CROSS[[7, 2, 3], [0, 1, 2]] = 1.0
+_CROSS[[5, 6, 1], [0, 1, 2]] = -1.0
+
+
+def skew(a: Array) -> Array:
+    """Return [a]x (..., 3, 3) of vectors (..., 3), with ``[a]x b = a x b``."""
+    if a.ndim == 1:
+        return _CROSS.dot(a).reshape(3, 3)
+    return (a @ _CROSS.T).reshape(*a.shape, 3)
+
+
+def quaternion_product(a: Array, b: Array) -> Array:
+    """Return the Hamilton product a b, (4,) in x, y, z, w, scaled to unit length."""
+    ax, ay, az, aw = a.tolist()
+    bx, by, bz, bw = b.tolist()
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by - ax * bz + ay * bw + az * bx
+    z = aw * bz + ax * by - ay * bx + az * bw
+    w = aw * bw - ax * bx - ay * by - az * bz
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    return np.array((x / norm, y / norm, z / norm, w / norm))
+
+
+def product_matrix(a: Array) -> Array:
+    """Return the matrix (4, 4) that takes a quaternion b to the product a b."""
+    x, y, z, w = a.tolist()
+    return np.array(((w, -z, y, x), (z, w, -x, y), (-y, x, w, z), (-x, -y, -z, w)))
+
+
+def conjugate(a: Array) -> Array:
+    """Return the inverse of a unit quaternion."""
+    x, y, z, w = a.tolist()
+    return np.array((-x, -y, -z, w))
+
+
+def rotation_matrix(a: Array) -> Array:
+    """Return the rotation (3, 3) of a unit quaternion."""
+    x, y, z, w = a.tolist()
+    return np.array(
+        (
+            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+            (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+            (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+        )
+    )
+
+
+def rotation_matrices(a: Array) -> Array:
+    """Return the rotations (N, 3, 3) of unit quaternions (N, 4)."""
+    crossed = skew(a[:, :3])
+    return np.eye(3) + 2.0 * (a[:, 3, None, None] * crossed + crossed @ crossed)

@@ -1,0 +1,111 @@
+"""Text tables: aligned, folded to the terminal's width, plain where it is not a terminal."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import textwrap
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fflin.base.validation import Array
+
+_GAP = "  "
+_EPS = sys.float_info.epsilon
+
+
+def width() -> int:
+    """Columns to fill: the terminal's, or 80 where the output goes elsewhere."""
+    return shutil.get_terminal_size((80, 24)).columns if _on_terminal() else 80
+
+
+def dim(text: str) -> str:
+    """Text that stands back on a terminal that shows colours."""
+    if _on_terminal() and "NO_COLOR" not in os.environ and os.environ.get("TERM") != "dumb":
+        return f"\x1b[2m{text}\x1b[0m"
+    return text
+
+
+def _on_terminal() -> bool:
+    return sys.stdout is not None and sys.stdout.isatty()
+
+
+def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
+    """Align cells in columns.
+
+    Parameters
+    ----------
+    rows : sequence of sequence of str
+        Of equal length; a cell "." is dimmed.
+    align : str
+        "l" or "r" for each column; those beyond its end are aligned to the right.
+    """
+    sizes = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    align = align.ljust(len(sizes), "r")
+    lines = []
+    for row in rows:
+        cells = [
+            cell.ljust(size) if side == "l" else cell.rjust(size)
+            for cell, size, side in zip(row, sizes, align, strict=True)
+        ]
+        cells[-1] = cells[-1].rstrip()
+        lines.append(_GAP.join(dim(c) if c.strip() == "." else c for c in cells).rstrip())
+    return "\n".join(lines)
+
+
+def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
+    """Show a matrix with its names; zeros are dots, rows and columns of zeros are left out.
+
+    What is below the rounding of both its row's and its column's largest entry is shown as "~0".
+    What is too wide is folded: the next columns follow below, under the rows that they need.
+    """
+    sizes = abs(values)
+    rounding = _EPS * sizes.max(axis=1, initial=0.0)[:, None]
+    rounding = rounding.clip(max=_EPS * sizes.max(axis=0, initial=0.0))
+    text = [
+        [_number(x, below) for x, below in zip(row, limits, strict=True)]
+        for row, limits in zip(values.tolist(), rounding.tolist(), strict=True)
+    ]
+    label = max(map(len, rows))
+    folds: list[list[int]] = []
+    used = 0
+    for j, name in enumerate(columns):
+        if not values[:, j].any():
+            continue
+        size = len(_GAP) + max(len(name), *(len(row[j]) for row in text))
+        if not folds or used + size > width():
+            folds.append([])
+            used = label
+        folds[-1].append(j)
+        used += size
+    blocks = []
+    for fold in folds:
+        shown = [i for i in range(len(rows)) if values[i, fold].any()]
+        body = [[rows[i], *(text[i][j] for j in fold)] for i in shown]
+        blocks.append(grid([["", *(columns[j] for j in fold)], *body]))
+    return "\n\n".join(blocks)
+
+
+def _number(x: float, rounding: float) -> str:
+    return "." if x == 0.0 else "~0" if abs(x) < rounding else f"{x:.5g}"
+
+
+def counted(number: int, thing: str) -> str:
+    """Say how many there are of a thing."""
+    return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
+def signals(title: str, values: Array, names: Sequence[str], units: Sequence[str]) -> str:
+    """Show what is not zero of a state, an input or a force, with its unit."""
+    # A line is broken between entries alone, not at the spaces within them.
+    entries = [
+        f"{name}\xa0=\xa0{value:.6g}" + (f"\xa0{unit}" if unit != "1" else "")
+        for name, value, unit in zip(names, values.tolist(), units, strict=True)
+        if value
+    ]
+    text = textwrap.fill(
+        f"{title}: {', '.join(entries)}", width(), subsequent_indent=" " * (len(title) + 2)
+    )
+    return text.replace("\xa0", " ")

@@ -1,0 +1,143 @@
+"""Checks of what callers pass in, made once at the public door."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fflin.base.errors import InputError
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+    from numpy.typing import ArrayLike, NDArray
+
+    Array = NDArray[np.floating[Any]]
+else:
+    Array = np.ndarray  # numpy.typing takes a tenth of the command line's start
+
+# A quaternion or a (cos, sin) pair this far from unit length is renormalised without a word;
+# farther off it is taken for a mistake.
+NORM_TOLERANCE = 1e-6
+
+# Native double precision; NumPy makes one such object, so that identity tells it.
+DOUBLE = np.dtype(np.float64)
+
+
+def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
+    """Return a float vector of the given size.
+
+    Parameters
+    ----------
+    name : str
+        What to call it in an error.
+    value : array_like
+        What the caller gave; never modified.
+    size : int
+        Expected number of entries.
+    of_what : str
+        What the entries stand for, in an error.
+
+    Returns
+    -------
+    ndarray (size,)
+        The caller's own array where it already is a native float vector.
+
+    Raises
+    ------
+    InputError
+        If the shape is another, an entry is masked, complex or not finite.
+    """
+    if type(value) is np.ndarray and value.dtype is DOUBLE:
+        array: Array = value
+    else:
+        array = as_double(name, value)
+    if array.shape != (size,):
+        raise InputError(f"{name} has shape {array.shape}, expected ({size},): {of_what}")
+    # Python's sum is quicker than NumPy's here, and overflows without a warning.
+    if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
+        index = int(np.flatnonzero(~np.isfinite(array))[0])
+        raise InputError(f"{name}[{index}] is {array[index]}; every entry must be finite")
+    return array
+
+
+def number(name: str, value: Any) -> float:
+    """Return a finite float, or raise `InputError` that says what was given."""
+    refuse_masked(name, value)
+    try:
+        result = float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{name} is {value!r}, expected a number") from None
+    if not math.isfinite(result):
+        raise InputError(f"{name} is {result}, expected a finite number")
+    return result
+
+
+def refuse_masked(name: str, value: Any) -> None:
+    """Raise `InputError` where an entry is masked, which NumPy makes NaN or takes as it is."""
+    if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
+        raise InputError(f"{name} has masked entries; fill them first")
+
+
+def truth(name: str, value: Any) -> bool:
+    """Return whether a switch is on, or raise `InputError` where it is no True or False."""
+    if not isinstance(value, bool | np.bool_ | int):
+        raise InputError(f"{name} is a {type(value).__name__}, expected True or False")
+    return bool(value)
+
+
+def whole(name: str, value: Any, least: int, largest: int = 2**63 - 1) -> int:
+    """Return a whole number within limits, or raise `InputError` that says what was given."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
+        raise InputError(f"{name} is {value!r}, expected a whole number from {least} on")
+    if not least <= value <= largest:
+        bound = f"from {least} on" if value < least else f"of at most {largest:,}"
+        raise InputError(f"{name} is {value}, expected a whole number {bound}")
+    return int(value)
+
+
+def by_name(name: str, value: Any, of_what: str) -> Mapping[str, Any]:
+    """Return a mapping whose keys are names, or raise `InputError`."""
+    if not isinstance(value, Mapping):
+        raise InputError(f"{name} is a {type(value).__name__}, expected {{{of_what}: value}}")
+    return value
+
+
+def dimension(name: str, value: Any) -> int:
+    """Return how many indices an array has, or raise `InputError` where it is none."""
+    try:
+        return np.ndim(value)
+    except ValueError:
+        raise InputError(f"{name} is not an array: its rows differ in length") from None
+
+
+def placement(name: str, value: Any) -> pin.SE3:
+    """Return a copy of a rigid placement, or raise `InputError`.
+
+    Its rotation is renormalised where it is one within 1e-6.
+    """
+    import pinocchio as pin
+
+    if not isinstance(value, pin.SE3):
+        raise InputError(f"{name} is a {type(value).__name__}, expected a pin.SE3 (placement)")
+    if not np.isfinite(value.homogeneous).all():
+        raise InputError(f"{name} has entries that are not finite")
+    rotation = value.rotation
+    skewed = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if skewed > NORM_TOLERANCE or np.linalg.det(rotation) < 0.0:
+        raise InputError(f"the rotation of {name} is not one: R^T R and det R must be 1")
+    return pin.SE3(pin.Quaternion(rotation).normalized().matrix(), value.translation)
+
+
+def as_double(name: str, value: ArrayLike) -> Array:
+    """Return a new array of native floats, or raise `InputError` where it is none of numbers."""
+    refuse_masked(name, value)
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        raise InputError(f"{name} is not an array: its rows differ in length") from None
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{name} holds {array.dtype} values, expected real numbers")
+    return array.astype(np.float64)

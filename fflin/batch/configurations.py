@@ -1,0 +1,317 @@
+"""Many configurations: given, on a grid, or random; made as they are needed."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import sha256
+from typing import Any, Protocol
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, number
+from fflin.robot.joints import Joint
+from fflin.robot.robot import Robot, configuration
+
+# Random rows are drawn in blocks of this many, so that they do not depend on how they are read.
+_DRAWN = 4096
+
+# More than these cannot even be counted.
+_MOST = sys.maxsize
+
+# A joint that turns without limits is drawn from one turn.
+_TURN = (-math.pi, math.pi)
+
+
+class Configurations(Protocol):
+    """What `sweep` takes in place of an array: rows that are made when they are asked for."""
+
+    def __len__(self) -> int: ...
+
+    def rows(self, start: int, stop: int) -> Array:
+        """Return the configurations (stop - start, nq), valid ones."""
+        ...
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of all rows."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """All combinations of joint values, the last joint's varying fastest; see `grid`.
+
+    Attributes
+    ----------
+    robot : Robot
+    axes : mapping
+        {joint: values (k,) [rad|m]}.
+    start : ndarray (nq,)
+        What the base and the other joints are at.
+    """
+
+    robot: Robot
+    axes: Mapping[str, Array]
+    start: Array
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of values of each joint."""
+        return tuple(len(values) for values in self.axes.values())
+
+    def __len__(self) -> int:
+        return math.prod(self.shape)
+
+    def rows(self, start: int, stop: int) -> Array:
+        """Return the configurations (stop - start, nq)."""
+        picks = np.unravel_index(np.arange(start, stop), self.shape)
+        values = {
+            name: axis[pick] for (name, axis), pick in zip(self.axes.items(), picks, strict=True)
+        }
+        return _placed(self.robot, self.start, stop - start, values)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash of all rows."""
+        digest = sha256(self.start.tobytes())
+        for name, values in self.axes.items():
+            digest.update(name.encode() + b"\0" + values.tobytes())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class RandomConfigurations:
+    """Joint values drawn evenly from ranges; see `random_configurations`.
+
+    Attributes
+    ----------
+    robot : Robot
+    count, seed : int
+    ranges : mapping
+        {joint: (low, high) [rad|m]}.
+    start : ndarray (nq,)
+        What the base is at.
+    """
+
+    robot: Robot
+    count: int
+    seed: int
+    ranges: Mapping[str, tuple[float, float]]
+    start: Array
+
+    def __len__(self) -> int:
+        return self.count
+
+    def rows(self, start: int, stop: int) -> Array:
+        """Return the configurations (stop - start, nq)."""
+        low, high = np.array(list(self.ranges.values())).reshape(-1, 2).T
+        blocks = []
+        for block in range(start // _DRAWN, -(-stop // _DRAWN)):
+            drawn = np.random.default_rng([self.seed, block]).uniform(low, high, (_DRAWN, len(low)))
+            first = block * _DRAWN
+            blocks.append(drawn[max(start - first, 0) : stop - first])
+        drawn = np.concatenate(blocks) if blocks else np.empty((0, len(low)))
+        values = dict(zip(self.ranges, drawn.T, strict=True))
+        return _placed(self.robot, self.start, stop - start, values)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash of all rows."""
+        drawn = f"{self.count} {self.seed} {dict(self.ranges)!r}"
+        return sha256(drawn.encode() + self.start.tobytes()).hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class GivenConfigurations:
+    """An array of configurations.
+
+    Attributes
+    ----------
+    q : ndarray (N, nq)
+        Valid ones.
+    """
+
+    q: Array
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def rows(self, start: int, stop: int) -> Array:
+        """Return the configurations (stop - start, nq)."""
+        return self.q[start:stop]
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash of all rows."""
+        return sha256(self.q.tobytes()).hexdigest()
+
+
+def grid(
+    robot: Robot,
+    axes: Mapping[str, Any],
+    *,
+    joints: Mapping[str, float] | None = None,
+    base: pin.SE3 | None = None,
+) -> Grid:
+    """Lay a grid over joint values.
+
+    Parameters
+    ----------
+    robot : Robot
+    axes : mapping
+        {joint: increasing values (k,) [rad|m]}, the last varying fastest.
+    joints, base : optional
+        Of the other joints and the base, as `configuration` takes them.
+
+    Returns
+    -------
+    Grid
+        For `sweep`.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such joint.
+    InputError
+        If there is no axis, or its values are none, not finite or do not increase.
+    """
+    start = configuration(robot, joints, base)
+    if not isinstance(axes, Mapping) or not axes:
+        raise InputError(f"the axes of the grid are {axes!r}, expected {{joint: values}}")
+    checked: dict[str, Array] = {}
+    for name, values in axes.items():
+        robot.joint(name)
+        if joints and name in joints:
+            raise InputError(f"joint '{name}' is on the grid and in joints; give either")
+        try:
+            axis = np.array(values, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError(f"grid of joint '{name}' is {values!r}, expected numbers") from None
+        if axis.ndim != 1 or not axis.size:
+            raise InputError(f"grid of joint '{name}' has shape {axis.shape}, expected (k,), k > 0")
+        if not np.isfinite(axis).all() or (np.diff(axis) <= 0.0).any():
+            raise InputError(f"grid of joint '{name}' must be finite numbers that increase")
+        axis.setflags(write=False)
+        checked[name] = axis
+    _countable(math.prod(len(axis) for axis in checked.values()))
+    start.setflags(write=False)
+    return Grid(robot, checked, start)
+
+
+def random_configurations(
+    robot: Robot,
+    count: int,
+    *,
+    seed: int = 0,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    base: pin.SE3 | None = None,
+) -> RandomConfigurations:
+    """Draw configurations evenly from the joints' limits.
+
+    Parameters
+    ----------
+    robot : Robot
+    count : int
+        How many.
+    seed : int
+        The same seed gives the same configurations.
+    ranges : mapping, optional
+        {joint: (low, high) [rad|m]} in place of its limits. What turns without limits is drawn
+        from one turn.
+    base : pin.SE3, optional
+        Placement of the base; the identity by default.
+
+    Returns
+    -------
+    RandomConfigurations
+        For `sweep`.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such joint.
+    InputError
+        If the count or seed is no whole number, a range is empty, or a joint that slides has no
+        limits and no range.
+    """
+    for what, value, least in (("count", count, 1), ("seed", seed, 0)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+            raise InputError(f"{what} is {value!r}, expected a whole number from {least} on")
+    _countable(int(count))
+    start = configuration(robot, base=base)
+    if not (ranges is None or isinstance(ranges, Mapping)):
+        raise InputError(f"ranges is {ranges!r}, expected {{joint: (low, high)}}")
+    given = dict(ranges or {})
+    for name in given:
+        robot.joint(name)
+    checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
+    start.setflags(write=False)
+    return RandomConfigurations(robot, int(count), int(seed), checked, start)
+
+
+def _countable(count: int) -> None:
+    if count > _MOST:
+        raise InputError(f"{count:,} points are too many; choose fewer")
+
+
+def _range(robot: Robot, joint: Joint, given: Any) -> tuple[float, float]:
+    if given is not None:
+        try:
+            low, high = given
+        except (TypeError, ValueError):
+            raise InputError(
+                f"range of '{joint.name}' is {given!r}, expected (low, high)"
+            ) from None
+        low, high = number(f"range of '{joint.name}'", low), number("its end", high)
+        if not low <= high:
+            raise InputError(
+                f"range of '{joint.name}' is {low:g} to {high:g}, expected low to high"
+            )
+        return low, high
+    if joint.unbounded:
+        return _TURN
+    low = float(robot.model.lowerPositionLimit[joint.idx_q])
+    high = float(robot.model.upperPositionLimit[joint.idx_q])
+    if not joint.prismatic:
+        low, high = max(low, 2 * _TURN[0]), min(high, 2 * _TURN[1])
+        return (low, high) if low <= high and high - low < 4 * math.pi else _TURN
+    if not (low <= high and abs(low) < 1e6 and abs(high) < 1e6):
+        raise InputError(f"joint '{joint.name}' slides without limits; give it a range")
+    return low, high
+
+
+def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array]) -> Array:
+    """Return rows (count, nq) that differ from `start` in the joints that are named."""
+    q = np.empty((count, robot.nq))
+    q[:] = start
+    for name, column in values.items():
+        _place(robot.joint(name), q, column)
+    follow_rows(robot, q)
+    return q
+
+
+def follow_rows(robot: Robot, q: Array) -> None:
+    """Put the mimic joints of configurations (N, nq) where their leaders say."""
+    for joint, leader, multiplier, offset in robot.followers:
+        _place(joint, q, multiplier * joint_values(leader, q) + offset)
+
+
+def joint_values(joint: Joint, q: Array) -> Array:
+    """Return a joint's angle or length (N,) of configurations (N, nq)."""
+    if joint.unbounded:
+        angles: Array = np.arctan2(q[:, joint.idx_q + 1], q[:, joint.idx_q])
+        return angles
+    return q[:, joint.idx_q]
+
+
+def _place(joint: Joint, q: Array, values: Array) -> None:
+    if joint.unbounded:
+        q[:, joint.idx_q], q[:, joint.idx_q + 1] = np.cos(values), np.sin(values)
+    else:
+        q[:, joint.idx_q] = values

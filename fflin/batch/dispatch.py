@@ -1,0 +1,203 @@
+"""Chunks of a sweep on the workers of an executor, of which some may die."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from typing import Any, NamedTuple
+
+from fflin.base.errors import FflinError
+from fflin.batch.chunks import Chunk, ChunkJob, Parcel, Points, packed, work
+from fflin.batch.workers import NoWorkers, WorkerDied
+
+# A chunk whose worker dies is given to others; what kills this many is not.
+_ATTEMPTS = 3
+
+# Chunks that wait at each worker, so that none stands idle.
+_QUEUED = 2
+
+# How long nothing is finished before the workers are looked at [s].
+_GLANCE = 1.0
+
+# Of an executor that does not say how many workers it has.
+_UNKNOWN_WORKERS = 16
+
+
+class Span(NamedTuple):
+    """The points of a chunk, start up to but not including stop."""
+
+    start: int
+    stop: int
+
+
+class Done(NamedTuple):
+    """A chunk that came to an end: its result, or why there is none."""
+
+    span: Span
+    chunk: Chunk | None
+    reason: str
+
+
+def dispatch(
+    job: ChunkJob,
+    spans: Sequence[Span],
+    points: Callable[[Span], Points],
+    workers: Executor,
+) -> Iterator[Done]:
+    """Do chunks on workers and yield them as they are finished.
+
+    The job is sent with the first chunks only, and again to a worker that says it has none.
+
+    Parameters
+    ----------
+    job : ChunkJob
+    spans : sequence of Span
+    points : callable
+        Makes the points of a span.
+    workers : Executor
+
+    Yields
+    ------
+    Done
+        Each span once.
+    """
+    work_place = _WorkPlace(packed(job), spans, points, workers)
+    try:
+        while work_place.waiting or work_place.running:
+            work_place.begin()
+            yield from work_place.finished()
+            if work_place.broken is not None:
+                yield from work_place.lost()
+    finally:
+        for future in work_place.running:
+            future.cancel()
+
+
+class _WorkPlace:
+    """The chunks that wait and those that run, how often each was begun, and the workers."""
+
+    def __init__(
+        self,
+        parcel: Parcel,
+        spans: Sequence[Span],
+        points: Callable[[Span], Points],
+        workers: Executor,
+    ) -> None:
+        self.waiting = list(reversed(spans))
+        self.running: dict[Future[Chunk | None], Span] = {}
+        self.broken: BaseException | None = None
+        self._attempts: dict[Span, int] = {}
+        self._parcel, self._points, self._workers = parcel, points, workers
+        self._ahead = _QUEUED * _count(workers)
+        self._known = False
+
+    def begin(self) -> None:
+        """Give the workers what they have room for."""
+        while self.waiting and len(self.running) < self._ahead and self.broken is None:
+            self._submit(self.waiting.pop(), None if self._known else self._parcel.content)
+
+    def finished(self) -> Iterator[Done]:
+        """Wait for a chunk and yield what is finished."""
+        if not self.running:
+            return
+        pool = self._workers if isinstance(self._workers, ProcessPoolExecutor) else None
+        hung = False
+        while not (done := wait(self.running, _GLANCE if pool else None, FIRST_COMPLETED).done):
+            assert pool is not None
+            if hung:
+                _break(pool)
+            hung = _lost_a_worker(pool)
+        for future in done:
+            span = self.running.pop(future)
+            try:
+                chunk = future.result()
+            except FflinError as error:
+                yield Done(span, None, str(error))
+            except WorkerDied as error:
+                yield from self._lost(span, str(error))
+            except (BrokenExecutor, CancelledError) as error:
+                self.broken = self.broken or error
+                self.waiting.append(span)
+            except Exception as error:
+                # Of the executor's own, such as a scheduler that gave up on a worker.
+                yield from self._lost(span, f"{type(error).__name__}: {error}")
+            else:
+                if chunk is None:
+                    self._attempts[span] -= 1
+                    self._submit(span, self._parcel.content)
+                else:
+                    self._known = True
+                    yield Done(span, chunk, "")
+
+    def lost(self) -> Iterator[Done]:
+        """Yield what is lost with an executor that died."""
+        error, self.broken = self.broken, None
+        running, self.running = self.running, {}
+        reason = f"the executor died: {type(error).__name__}: {error}".rstrip(": ")
+        if isinstance(error, NoWorkers):
+            reason = str(error)
+        for future, span in running.items():
+            # Some are finished and not lost with it.
+            good = future.done() and not future.cancelled() and future.exception() is None
+            chunk = future.result() if good else None
+            yield Done(span, chunk, "" if chunk is not None else reason)
+        waiting, self.waiting = self.waiting, []
+        for span in reversed(waiting):
+            yield Done(span, None, reason)
+
+    def _submit(self, span: Span, content: bytes | None) -> None:
+        """Begin a chunk, or put it back where the executor is dead."""
+        arguments = Parcel(self._parcel.key, content), self._points(span), span.start
+        try:
+            future = self._workers.submit(work, *arguments)
+        except Exception as error:  # broken, shut down, or of its own
+            self.waiting.append(span)
+            self.broken = error
+        else:
+            self._attempts[span] = self._attempts.get(span, 0) + 1
+            self.running[future] = span
+
+    def _lost(self, span: Span, reason: str) -> Iterator[Done]:
+        """Put a chunk back whose worker died, or give it up."""
+        if self._attempts[span] < _ATTEMPTS:
+            self.waiting.append(span)
+        else:
+            yield Done(span, None, reason)
+
+
+def _count(executor: Executor) -> int:
+    """How many workers an executor has, as far as it tells."""
+    for name in ("_max_workers", "num_workers"):
+        count = getattr(executor, name, None)
+        if isinstance(count, int) and count > 0:
+            return count
+    client = getattr(executor, "_client", None)
+    if client is not None and hasattr(client, "nthreads"):
+        return max(1, sum(client.nthreads().values()))
+    return _UNKNOWN_WORKERS
+
+
+def _lost_a_worker(pool: ProcessPoolExecutor) -> bool:
+    """Whether a process of a pool was killed."""
+    processes = list((pool._processes or {}).values())
+    return any(process.exitcode not in (None, 0) for process in processes)
+
+
+def _break(pool: ProcessPoolExecutor) -> None:
+    """End a pool that waits for the rest of a result whose worker was killed as it sent it.
+
+    It waits as long as anybody could still write to the pipe that all workers and this process
+    share. Where nobody can, it finds itself broken, and its futures with it.
+    """
+    for process in list((pool._processes or {}).values()):
+        process.kill()
+    channel: Any = pool._result_queue
+    channel._writer.close()

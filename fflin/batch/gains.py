@@ -1,0 +1,255 @@
+"""Linear quadratic regulators about many points at once, and the gains between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from fflin.base.errors import FflinError, InputError
+from fflin.base.record import Design
+from fflin.base.validation import Array, vector
+from fflin.batch.files import is_constant
+from fflin.batch.joint_columns import joint_columns, positions
+from fflin.batch.linear_batch import LinearBatch
+from fflin.batch.riccati import gains_at_rest
+from fflin.control.lqr import lqr
+from fflin.control.policies import StateFeedback
+from fflin.control.weights import weight
+from fflin.dynamics.state import StateMap
+from fflin.linear.model import LinearModel
+
+if TYPE_CHECKING:
+    from fflin.control.weights import Weight
+    from fflin.robot.robot import Robot
+
+# Models whose gains are computed at once; what that takes is small.
+_BLOCK = 256
+
+# Of a Riccati equation, relative; a gain beyond is computed again alone, and refined.
+_SOUND = 1e-11
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GainBatch(Design):
+    """State feedbacks ``u = u0 - K (x - x0)`` about N points, as `lqr_batch` makes them.
+
+    Attributes
+    ----------
+    K : ndarray (N, nu, nx)
+    residual : ndarray (N,)
+        Of each Riccati equation, see `Gain`.
+    margin : ndarray (N,)
+        Slowest decay [1/s] of each closed loop.
+    joint_positions : ndarray (N, n)
+        The points [rad|m].
+    joint_names, state_names, input_names : tuple of str
+    frame, robot : str
+    """
+
+    VECTORS: ClassVar = ("residual", "margin")
+
+    K: Array
+    residual: Array
+    margin: Array
+    joint_positions: Array
+    joint_names: tuple[str, ...]
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    frame: str
+    robot: str
+
+    def __len__(self) -> int:
+        return len(self.K)
+
+    def __repr__(self) -> str:
+        _, nu, nx = self.K.shape
+        return (
+            f"GainBatch('{self.robot}', {len(self)} points, nx={nx}, nu={nu}, "
+            f"margin={self.margin.min():.3g}, residual={self.residual.max():.1e})"
+        )
+
+    @property
+    def grid(self) -> dict[str, Array]:
+        """The joints that differ between the points and their values.
+
+        Raises
+        ------
+        InputError
+            If the points are not on a grid, or none of them differ.
+        """
+        return dict(self._axes)
+
+    def gain(self, joints: Array) -> Array:
+        """Return K (nu, nx) at joint positions (n,) by linear interpolation.
+
+        Beyond the grid it is that at its edge.
+
+        Raises
+        ------
+        InputError
+            If the points are not on a grid, or the positions are not n finite numbers.
+        """
+        return self._between(vector("joints", joints, len(self.joint_names), "the joint positions"))
+
+    def _between(self, joints: Array) -> Array:
+        point = [
+            min(max(joints[self.joint_names.index(name)], values[0]), values[-1])
+            for name, values in self._axes.items()
+        ]
+        K: Array = self._interpolator(point)[0]
+        return K
+
+    @cached_property
+    def _axes(self) -> dict[str, Array]:
+        axes = {
+            name: np.unique(column)
+            for name, column in zip(self.joint_names, self.joint_positions.T, strict=True)
+            if np.ptp(column) > 0.0
+        }
+        if not axes:
+            raise InputError("all points of the batch are the same; lay a grid with fflin.grid")
+        if np.prod([len(values) for values in axes.values()]) != len(self):
+            raise InputError(
+                f"the {len(self)} points are not on a grid over {', '.join(axes)}; gains are "
+                "interpolated on a grid that fflin.grid lays"
+            )
+        return axes
+
+    @cached_property
+    def _interpolator(self) -> Any:
+        from scipy.interpolate import RegularGridInterpolator
+
+        at = [
+            np.searchsorted(values, self.joint_positions[:, self.joint_names.index(name)])
+            for name, values in self._axes.items()
+        ]
+        shape = tuple(len(values) for values in self._axes.values())
+        order = np.ravel_multi_index(at, shape)
+        if len(np.unique(order)) != len(self):
+            raise InputError(f"the points are not on a grid over {', '.join(self._axes)}")
+        K = np.empty_like(self.K)
+        K[order] = self.K
+        return RegularGridInterpolator(
+            tuple(self._axes.values()), K.reshape(*shape, *K.shape[1:]), method="linear"
+        )
+
+
+def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
+    r"""Return the linear quadratic regulator about every point of a batch.
+
+    At rest and fully actuated the gains are computed many at a time: with
+    :math:`L R^{-1} L^T = L_s L_s^T`, L the lower half of B, and the weight Q in the coordinates
+    :math:`(p, \dot p)` in which the weight on :math:`\ddot p` is the identity, the closed loop's
+    poles and motions are those of an eigenproblem of half the Hamiltonian's size (see `lqr`), and
+    :math:`K = -u\,x^{-1}` of these motions. Each is refined by Newton's method and put back into
+    its Riccati equation. Any other model, and what falls short, is left to `lqr`.
+
+    Parameters
+    ----------
+    batch : LinearBatch
+    Q, R : array_like, float or mapping
+        The same for all points; as `lqr` takes them.
+
+    Returns
+    -------
+    GainBatch
+
+    Raises
+    ------
+    InputError
+        If a weight is of a wrong size or sign.
+    EquilibriumError, StabilizabilityError
+        If there is no regulator about a point; it is named.
+    """
+    if not isinstance(batch, LinearBatch):
+        raise InputError(f"batch is a {type(batch).__name__}, expected a LinearBatch of sweep")
+    if not len(batch):
+        raise InputError("the batch has no points")
+    Q = weight("Q", Q, batch.state_names)
+    R = weight("R", R, batch.input_names, definite=True)
+    nv, nu = batch.B_lower.shape[1:]
+    K: Array = np.empty((len(batch), nu, 2 * nv))
+    residual, margin = np.full((2, len(batch)), np.inf)
+    at_rest = is_constant(batch.A) and is_constant(batch.f0) and not batch.f0[0].any()
+    if at_rest and nu >= nv:
+        rates = batch.A[0][:nv, nv:].diagonal()
+        for start in range(0, len(batch), _BLOCK):
+            rows = slice(start, start + _BLOCK)
+            with np.errstate(all="ignore"):
+                K[rows], residual[rows], margin[rows] = gains_at_rest(
+                    rates, batch.B_lower[rows], Q, R
+                )
+    # Written so that NaN is among them.
+    for index in np.flatnonzero(~(residual <= _SOUND)).tolist():
+        try:
+            gain = lqr(batch[index], Q, R)
+        except FflinError as error:
+            raise type(error)(f"point {index}: {error}") from None
+        K[index], residual[index], margin[index] = gain.K, gain.residual, gain.margin
+    return GainBatch(
+        K=K,
+        residual=residual,
+        margin=margin,
+        joint_positions=batch.joint_positions,
+        joint_names=batch.joint_names,
+        state_names=batch.state_names,
+        input_names=batch.input_names,
+        frame=batch.frame,
+        robot=batch.robot,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ScheduledFeedback:
+    """The feedback ``u = u0 - K(q_m) (x - x0)`` toward a target, its gain from a grid.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        About the target.
+    gains : GainBatch
+        On a grid of the same robot, inputs and frame.
+
+    Raises
+    ------
+    InputError
+        If they are of different states, inputs or frames, or the gains are not on a grid.
+    """
+
+    lin: LinearModel
+    gains: GainBatch
+
+    def __post_init__(self) -> None:
+        for name, kind in (("lin", LinearModel), ("gains", GainBatch)):
+            if not isinstance(value := getattr(self, name), kind):
+                raise InputError(f"{name} is a {type(value).__name__}, expected a {kind.__name__}")
+        for key in ("state_names", "input_names", "frame"):
+            if getattr(self.lin, key) != getattr(self.gains, key):
+                raise InputError(f"the {key} of the model and of the gains differ")
+        _ = self.gains.grid
+
+    def bind(self, robot: Robot) -> Any:
+        """Return policy(t, q, v) -> u for a robot.
+
+        Raises
+        ------
+        InputError
+            If the model is not one of this robot.
+        """
+        lin, gains = self.lin, self.gains
+        # Refuses another robot.
+        StateFeedback(lin, np.zeros(lin.B.T.shape)).bind(robot)
+        state, columns = (
+            StateMap(robot, reference=lin.reference, frame=lin.frame),
+            joint_columns(robot),
+        )
+
+        def policy(_: float, q: Array, v: Array) -> Array:
+            K = gains._between(positions(q[None], columns)[0])
+            u: Array = lin.u0 - K.dot(state.to_state(q, v, near=lin.x0) - lin.x0)
+            return u
+
+        return policy

@@ -1,0 +1,353 @@
+"""Linear models of one robot about many points, what they share held once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, overload
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.record import NOT_VERIFIED
+from fflin.base.validation import Array, number
+from fflin.base.writing import as_path
+from fflin.batch.files import header, is_constant, read_batch, write_batch
+from fflin.batch.joint_columns import away, positions
+from fflin.linear.model import LinearModel
+
+if TYPE_CHECKING:
+    from fflin.dynamics.state import Frame
+    from fflin.robot.robot import Robot
+
+# Two joint values are the same where they differ by no more than this [rad|m].
+_SAME = 1e-9
+
+_NOWHERE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearBatch:
+    r"""Linear models about N points, ``dx/dt = f0 + A (x - x0) + B (u - u0)``; made by `sweep`.
+
+    ``batch[i]`` is the `LinearModel` about point i, ``batch[2:9]`` or ``batch[mask]`` a batch.
+    Every array has N rows; one that is the same about all points, such as A at rest, is held once
+    (its stride over the points is zero). The upper half of B is zero and is not held. Arrays are
+    read-only; those of a batch that stands in an HDF5 file are read as they are used.
+
+    Attributes
+    ----------
+    A : ndarray (N, nx, nx)
+    B_lower : ndarray (N, 6 + n, nu)
+        The velocity rows of B, at rest with the default inputs the inverse inertia.
+    C : ndarray (N, ny, nx)
+    D : ndarray (N, ny, nu)
+    f0 : ndarray (N, nx)
+    u0 : ndarray (N, nu)
+    q : ndarray (N, nq)
+    v : ndarray (N, nv)
+        The points in Pinocchio's order.
+    state_names, input_names, output_names : tuple of str
+    state_units, input_units, output_units : tuple of str
+    frame : str
+    moving : bool
+        See `LinearModel`.
+    robot : str
+        Name of the robot.
+    urdf_sha256, fflin_version, pinocchio_version : str
+    locked : tuple of str
+    verified : bool
+        Whether it is as it was made; False of a file that has no digest to tell damage by, or
+        that was not held against it.
+    """
+
+    A: Array
+    B_lower: Array
+    C: Array
+    D: Array
+    f0: Array
+    u0: Array
+    q: Array
+    v: Array
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+    frame: Frame
+    moving: bool
+    robot: str
+    urdf_sha256: str
+    locked: tuple[str, ...]
+    fflin_version: str
+    pinocchio_version: str
+    # At rest x0 is told by q; elsewhere y0 is x0 where the outputs are the full state.
+    _x0: Array | None
+    _y0: Array | None
+    # None where it is the base's own at each point; the free-flyer joint stands at the root.
+    _reference: Array | None
+    _root: Array
+    _drift: Array | None
+    # Of a file; else found on the robot when it is asked for.
+    _ignorable: tuple[str, ...] | None
+    _columns: tuple[tuple[int, int], ...]
+    _system: Robot | None
+    verified: bool = True
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                value = value.view()
+                value.setflags(write=False)
+                object.__setattr__(self, item.name, value)
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def __repr__(self) -> str:
+        _, nv, nu = self.B_lower.shape
+        return (
+            f"LinearBatch('{self.robot}', {len(self)} points, nx={2 * nv}, nu={nu}, "
+            f"frame='{self.frame}')"
+        )
+
+    def __str__(self) -> str:
+        return repr(self) if self.verified else f"{self!r}\n{NOT_VERIFIED}"
+
+    @overload
+    def __getitem__(self, index: int) -> LinearModel: ...
+    @overload
+    def __getitem__(self, index: slice | Sequence[int] | Array) -> LinearBatch: ...
+
+    def __getitem__(self, index: Any) -> LinearModel | LinearBatch:
+        if isinstance(index, int | np.integer):
+            if not -len(self) <= index < len(self):
+                raise IndexError(f"point {index} of a batch of {len(self)}")
+            return self._model(int(index) % len(self))
+        if not isinstance(index, slice):
+            index = np.asarray(index)
+            if index.dtype.kind not in "iub" or index.ndim != 1:
+                raise InputError("a batch is indexed by a number, a slice, numbers or a mask")
+        count = len(np.empty(len(self), dtype=bool)[index])
+        rows: dict[str, Any] = {
+            key: np.broadcast_to(value[0], (count, *value.shape[1:]))
+            if is_constant(value)
+            else value[index]
+            for key, value in self._arrays().items()
+        }
+        return replace(self, **rows)
+
+    def __iter__(self) -> Iterator[LinearModel]:
+        return map(self._model, range(len(self)))
+
+    @property
+    def B(self) -> Array:
+        """All of B (N, nx, nu), its upper half zero; made anew at each call."""
+        count, nv, nu = self.B_lower.shape
+        B = np.zeros((count, 2 * nv, nu))
+        B[:, nv:] = self.B_lower
+        B.setflags(write=False)
+        return B
+
+    @property
+    def x0(self) -> Array:
+        """States at the points (N, nx); at rest made anew at each call."""
+        return self._rest_states(slice(None)) if self._x0 is None else self._x0
+
+    @property
+    def y0(self) -> Array:
+        """Outputs at the points (N, ny)."""
+        return self.x0 if self._y0 is None else self._y0
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the n independent joints in state order."""
+        return tuple(
+            name.removeprefix("q_m.") for name in self.state_names if name.startswith("q_m.")
+        )
+
+    @property
+    def joint_positions(self) -> Array:
+        """Angles, in (-pi, pi] of continuous joints, and lengths (N, n) of the joints."""
+        return positions(self.q, self._columns)
+
+    def nearest(self, joints: Mapping[str, float]) -> LinearModel:
+        """Return the model whose joints are nearest to the values [rad|m], the others left out.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such joint.
+        InputError
+            If a value is not a finite number, or none is given.
+        """
+        distance = np.zeros(len(self))
+        for index, value in self._named(joints).items():
+            target = number(f"joint '{self.joint_names[index]}'", value)
+            distance += away(self.q, self._columns[index], target) ** 2
+        return self[int(distance.argmin())]
+
+    def select(self, joints: Mapping[str, float | tuple[float, float]]) -> LinearBatch:
+        """Return the models whose joints are at a value [rad|m], or in a range (low, high).
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such joint.
+        InputError
+            If a value is neither, or no model is there.
+        """
+        mask = np.ones(len(self), dtype=bool)
+        for index, value in self._named(joints).items():
+            what = f"joint '{self.joint_names[index]}'"
+            if isinstance(value, tuple | list):
+                if len(value) != 2:
+                    raise InputError(f"{what} is {value!r}, expected a value or (low, high)")
+                low, high = (number(what, end) for end in value)
+                at = positions(self.q, self._columns[index : index + 1])[:, 0]
+                mask &= (at >= low - _SAME) & (at <= high + _SAME)
+            else:
+                mask &= away(self.q, self._columns[index], number(what, value)) <= _SAME
+        if not mask.any():
+            raise InputError(f"no point of the batch has {dict(joints)}; `nearest` finds the next")
+        return self[mask]
+
+    def save(self, path: str | Path) -> None:
+        """Write the batch, whole or not at all.
+
+        Parameters
+        ----------
+        path : str or Path
+            Ends in .npz, or .h5 (HDF5, which need not fit in memory to be read).
+
+        Raises
+        ------
+        FileError
+            If the ending is another or the file cannot be written.
+        MissingPackageError
+            If h5py is needed and not installed.
+        """
+        if not len(self):
+            raise InputError("the batch has no points; there is nothing to save")
+        write_batch(as_path(path), self._arrays(), header(self, len(self)))
+
+    @staticmethod
+    def load(path: str | Path, robot: Robot | None = None, *, verify: bool = True) -> LinearBatch:
+        """Read a batch that `save` or `sweep` wrote; every figure is the same to the last bit.
+
+        Parameters
+        ----------
+        path : str or Path
+        robot : Robot, optional
+            Whose it is, which the inertia M and the certificate of its models need.
+        verify : bool
+            Whether the rows are held against their SHA-256, for which all of them are read. If
+            not, a file of HDF5 is there at once, and the batch is not `verified`.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read, is damaged or is no such batch.
+        InputError
+            If the robot is another.
+        MissingPackageError
+            If h5py is needed and not installed.
+        """
+        batch = LinearBatch(**read_batch(as_path(path), verify=verify), _system=robot)
+        if robot is not None and (robot.urdf_sha256, robot.locked, robot.joint_names) != (
+            batch.urdf_sha256,
+            batch.locked,
+            batch.joint_names,
+        ):
+            raise InputError(f"'{robot.name}' is not the robot that the batch is of")
+        return batch
+
+    def _arrays(self) -> dict[str, Array]:
+        """Return the arrays that are held, all with N rows, by the fields' names."""
+        values = ((item.name, getattr(self, item.name)) for item in fields(self))
+        return {name: value for name, value in values if isinstance(value, np.ndarray)}
+
+    def _model(self, index: int) -> LinearModel:
+        rows = {key: _row(value, index) for key, value in self._arrays().items()}
+        lower = rows.pop("B_lower")
+        B = np.zeros((2 * len(lower), lower.shape[1]))
+        B[len(lower) :] = lower
+        if "_x0" not in rows:
+            rows["_x0"] = self._rest_states(slice(index, index + 1))[0]
+        x0, y0 = rows.pop("_x0"), rows.pop("_y0", None)
+        root = rows.pop("_root")
+        if "_reference" not in rows:
+            rows["_reference"] = _carried(root, rows["q"][:7])
+        certify: Any = partial(_no_robot, "certificate", self.robot)
+        inertia: Any = partial(_no_robot, "inertia M", self.robot)
+        ignorable: Any = partial(_given, self._ignorable)
+        if self._system is not None:
+            from fflin.linear.certificate import certify as certified
+            from fflin.linear.certificate import inertia_matrix
+            from fflin.linear.ignorable import ignorable_states
+
+            ignorable = partial(ignorable_states, self._system)
+
+            certify = partial(certified, self._system)
+            inertia = partial(inertia_matrix, self._system)
+        B.setflags(write=False)
+        names = {
+            item.name: getattr(self, item.name)
+            for item in fields(self)
+            if not item.name.startswith("_") and item.name not in rows and item.name != "B_lower"
+        }
+        return LinearModel._from_fields(
+            rows
+            | names
+            | {"B": B, "x0": x0, "y0": x0 if y0 is None else y0, "dt": 0.0}
+            | {"_inertia": inertia, "_certify": certify, "_drift": rows.get("_drift")}
+            | {"_ignorable": ignorable}
+        )
+
+    def _rest_states(self, rows: slice) -> Array:
+        q_m = positions(self.q[rows], self._columns)
+        x0 = np.zeros((len(q_m), len(self.state_names)))
+        x0[:, 6 : 6 + q_m.shape[1]] = q_m
+        x0.setflags(write=False)
+        return x0
+
+    def _named(self, joints: Mapping[str, Any]) -> dict[int, Any]:
+        from fflin.base.errors import unknown
+
+        if not isinstance(joints, Mapping) or not joints:
+            raise InputError(f"joints is {joints!r}, expected {{joint: value}}")
+        for name in joints:
+            if name not in self.joint_names:
+                raise unknown("joint", name, self.joint_names)
+        return {self.joint_names.index(name): value for name, value in joints.items()}
+
+
+def _carried(root: Array, base: Array) -> Array:
+    """Return the placement (7,) of a base that is placed relative to the root."""
+    import pinocchio as pin
+
+    if (root == _NOWHERE).all():
+        return base
+    placement = pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(root) * pin.XYZQUATToSE3(base))
+    placement.setflags(write=False)
+    return placement
+
+
+def _row(array: Array, index: int) -> Array:
+    # A row of a file is read here; a plain array's keeps no file open.
+    return np.asarray(array[index])
+
+
+def _given(value: Any, _: LinearModel) -> Any:
+    return value
+
+
+def _no_robot(what: str, name: str, _: LinearModel) -> NoReturn:
+    raise InputError(
+        f"the {what} needs the robot: load the batch with LinearBatch.load(path, robot) where "
+        f"robot is '{name}' as it was"
+    )

@@ -1,0 +1,331 @@
+"""Linear models about many points."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
+from fflin.base.writing import as_path, check_place
+from fflin.batch.chunks import ChunkJob
+from fflin.batch.configurations import Configurations, GivenConfigurations
+from fflin.batch.dispatch import Done, Span, dispatch
+from fflin.batch.files import check_format, header
+from fflin.batch.linear_batch import LinearBatch
+from fflin.batch.space import check_room, part_of
+from fflin.batch.store import FileStore, MemoryStore
+from fflin.batch.task import SweepTask, as_configurations
+from fflin.batch.workers import OwnWorkers
+from fflin.kernel.compiled import available_cores
+from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from fflin.dynamics.state import Frame
+
+# A chunk's result is about this large, so that what it costs to send is small against it and a
+# handful of them fit in memory.
+_CHUNK_BYTES, _LEAST_CHUNK_BYTES = 4 * 2**20, 2**21
+_LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
+
+# So many chunks where workers share them, so that all end at about the same time.
+_SHARES = 32
+
+_log = logging.getLogger("fflin")
+
+Progress = Callable[[int, int], object]
+
+
+def sweep(
+    robot: Robot,
+    q: ArrayLike | Configurations,
+    v: ArrayLike | None = None,
+    u: ArrayLike | None = None,
+    *,
+    frame: Frame | None = None,
+    reference: pin.SE3 | None = None,
+    moving: bool = False,
+    executor: Executor | None = None,
+    workers: int | None = None,
+    threads: int | None = None,
+    chunk: int | None = None,
+    progress: Progress | None = None,
+    out: str | Path | None = None,
+) -> LinearBatch:
+    r"""Linearise a robot about many points.
+
+    With numba installed (``pip install 'fflin[fast]'``) a compiled kernel does eight points at a
+    time, on all threads: at rest, where M depends on the joints only and
+    :math:`B = [0;\, M^{-1}]`, and at operating points. Without it, and where the robot has other
+    outputs than its state, each point is linearised by a `Linearizer`, which processes share.
+
+    Parameters
+    ----------
+    robot : Robot
+    q : array_like (N, nq), Grid or RandomConfigurations
+        Configurations in Pinocchio's order; see `grid` and `random_configurations`.
+    v : array_like (N, nv) or (nv,), optional
+        Velocities in Pinocchio's order; at rest by default.
+    u : array_like (N, nu) or (nu,), optional
+        Over the robot's inputs; zero by default.
+    frame, reference, moving : optional
+        See `Linearizer`. The reference is the base's own at each point by default.
+    executor : concurrent.futures.Executor, optional
+        Whose workers do the chunks: processes, dask (``Client.get_executor()``), mpi4py.futures.
+        The robot is sent to each worker once. It is not shut down.
+    workers : int, optional
+        Do it on so many processes of our own, at most one for each core; one that dies is
+        replaced. Call `sweep` under ``if __name__ == "__main__":`` then.
+    threads : int, optional
+        Threads of the kernel in this process; all cores that it may use by default.
+    chunk : int, optional
+        Points in a chunk; by default so many that a chunk's result is about 4 MB, or
+        as in the unfinished file.
+    progress : callable, optional
+        ``progress(done, total)`` is called with the number of points after every chunk.
+    out : str or Path, optional
+        File to write, .h5 or .npz. It grows as NAME.part, chunk by chunk; the same call made again
+        after a crash goes on from the chunks that are there and intact.
+
+    Returns
+    -------
+    LinearBatch
+        In the order of q. Where `out` is an .h5 file, it is read from it as it is used.
+
+    Raises
+    ------
+    InputError
+        If a size or value is wrong; a row is named.
+    SweepError
+        If there is no model about a point or a worker dies again and again; the chunk is named, and
+        `SweepError.batch` or the file has the others.
+    FileError, MissingPackageError
+        If the file cannot be written.
+
+    Warns
+    -----
+    FflinWarning
+        Where M is ill-conditioned: once, with the number of points.
+    """
+    if executor is not None and workers is not None:
+        raise InputError("executor and workers are both given; give either")
+    if executor is not None and not hasattr(executor, "submit"):
+        raise InputError(
+            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
+        )
+    for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
+        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        if value is not None and (not whole or value < 1):
+            raise InputError(f"{name} is {value!r}, expected a whole number from 1 on")
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
+    path = None if out is None else output_path(out)
+    points = as_configurations(robot, q)
+    job = ChunkJob(
+        robot,
+        frame=frame,
+        reference=reference,
+        moving=moving,
+        at_rest=v is None and u is None,
+        count=len(points),
+    )
+    check_room(len(points), len(points) * _row_bytes(job), path)
+    task = SweepTask(job, points, v, u)
+    parallel = executor is not None or workers is not None
+    threads = threads or available_cores()
+    shares = (_SHARES, 1) if parallel else (4 * threads, threads)
+    store = _store(task, path, chunk or _chunk_size(task, *shares))
+    size = store.chunk
+    spans = [Span(at, min(at + size, task.count)) for at in range(0, task.count, size)]
+    own = OwnWorkers(int(workers)) if workers else None
+    others = own or executor
+    try:
+        left = [span for span in spans if not store.finished(*span)]
+        done: Iterable[Done] = (
+            _here(task, left, store, threads)
+            if others is None
+            else dispatch(job, left, task.points, others)
+        )
+        failed = _collect(task, done, store, (len(spans) - len(left)) * size, progress)
+        if failed:
+            raise _failure(task, store, failed, len(spans))
+        return _finish(task, store, path)
+    finally:
+        store.close()
+        if own is not None:
+            own.shutdown()
+
+
+def planned_bytes(
+    robot: Robot,
+    count: int,
+    *,
+    at_rest: bool,
+    frame: Frame | None = None,
+    reference: pin.SE3 | None = None,
+) -> int:
+    """Return how large the result of a sweep over so many points is [bytes]."""
+    job = ChunkJob(
+        robot, frame=frame, reference=reference, moving=False, at_rest=at_rest, count=count
+    )
+    return count * _row_bytes(job)
+
+
+def _row_bytes(job: ChunkJob) -> int:
+    return 8 * (job.linearizer.robot.nq + sum(map(math.prod, job.shapes.values())))
+
+
+def _chunk_size(task: SweepTask, shares: int, threads: int) -> int:
+    """Return how many points a chunk has, so that all threads have as many chunks."""
+    row = _row_bytes(task.job)
+    size = min(_CHUNK_BYTES, max(_LEAST_CHUNK_BYTES, row * task.count // shares)) // row
+    size = min(max(size, _LEAST_CHUNK), _LARGEST_CHUNK)
+    chunks = math.ceil(math.ceil(task.count / size) / threads) * threads
+    return math.ceil(task.count / chunks / _LEAST_CHUNK) * _LEAST_CHUNK
+
+
+def output_path(out: str | Path) -> Path:
+    """Return where a batch can be written, or raise `FileError` or `MissingPackageError`."""
+    path = as_path(out)
+    check_format(path)
+    check_place(path)
+    check_place(part_of(path))
+    return path
+
+
+def _store(task: SweepTask, path: Path | None, size: int) -> FileStore | MemoryStore:
+    shapes = dict(task.job.shapes)
+    if path is None or (path.suffix == ".npz" and find_spec("h5py") is None):
+        if not isinstance(task.configurations, GivenConfigurations):
+            shapes["q"] = (task.robot.nq,)
+        return MemoryStore(task.count, size, shapes)
+    shapes |= {"q": (task.robot.nq,)}
+    shapes |= {key: rows.shape[1:] for key, rows in task.varying().items()}
+    constants = task.constants(shapes)
+    one = task.points(Span(0, 1)).q
+    example = task.batch(
+        {"q": one} | {key: np.empty((1, *s)) for key, s in task.job.shapes.items()}
+    )
+    texts = {"header": header(example, task.count), "constant": json.dumps(list(constants))}
+    store = FileStore(path, task.request, task.count, size, shapes, constants, texts)
+    if store.resumed:
+        _log.info("going on with %s", store.part)
+    return store
+
+
+def _here(
+    task: SweepTask, spans: Sequence[Span], store: FileStore | MemoryStore, threads: int
+) -> Iterator[Done]:
+    """Do chunks in this process, several at a time where the kernel does them."""
+
+    def run(span: Span) -> Done:
+        place = store.place(*span)
+        out = place and {key: place[key] for key in task.job.shapes}
+        try:
+            return Done(span, task.job.run(task.points(span), span.start, out), "")
+        except FflinError as error:
+            return Done(span, None, str(error))
+
+    if threads == 1 or len(spans) == 1 or not task.job.parallel:
+        yield from map(run, spans)
+        return
+    pool, begun = ThreadPoolExecutor(threads), deque[Future[Done]]()
+    try:
+        for span in spans:
+            begun.append(pool.submit(run, span))
+            # Not far ahead of what takes the results, which would fill the memory.
+            if len(begun) > threads:
+                yield begun.popleft().result()
+        while begun:
+            yield begun.popleft().result()
+    finally:
+        # Ctrl-C does not wait for what they compile.
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _collect(
+    task: SweepTask,
+    done: Iterable[Done],
+    store: FileStore | MemoryStore,
+    count: int,
+    progress: Progress | None,
+) -> list[Done]:
+    """Keep what is finished and return what failed."""
+    failed: list[Done] = []
+    notes: list[str] = []
+    if progress and count:
+        progress(min(count, task.count), task.count)
+    for result in done:
+        if result.chunk is None:
+            failed.append(result)
+        else:
+            points = task.points(result.span)
+            rows: dict[str, Any] = {"q": points.q, "v": points.v, "u0": points.u}
+            arrays = {
+                key: rows[key] if key in rows else result.chunk.arrays[key] for key in store.names
+            }
+            store.write(*result.span, arrays)
+            notes += result.chunk.notes
+        count += result.span.stop - result.span.start
+        if progress:
+            progress(min(count, task.count), task.count)
+    if notes:
+        more = f" (and {len(notes) - 1} more such)" if len(notes) > 1 else ""
+        warnings.warn(notes[0] + more, FflinWarning, stacklevel=3)
+    return sorted(failed)
+
+
+def _failure(
+    task: SweepTask, store: FileStore | MemoryStore, failed: list[Done], chunks: int
+) -> SweepError:
+    spans = listed(f"{start} to {stop - 1}" for (start, stop), *_ in failed)
+    verb = "has" if len(failed) == 1 else "have"
+    said = (
+        f"{len(failed)} of {chunks} chunks {verb} no result, configurations {spans}: "
+        f"{failed[0].reason}"
+    )
+    batch = None
+    if isinstance(store, FileStore):
+        if len(failed) == chunks:
+            store.discard()
+            return SweepError(said, tuple((*span, reason) for span, _, reason in failed), None)
+        said += f"; the others are in {store.part}, and the same call goes on from them"
+    elif len(failed) < chunks:
+        kept = np.ones(task.count, dtype=bool)
+        for (start, stop), *_ in failed:
+            kept[start:stop] = False
+        batch = task.batch(task.varying() | store.arrays)[kept]
+        said += "; the others are in the `batch` of this error"
+    return SweepError(said, tuple((*span, reason) for span, _, reason in failed), batch)
+
+
+def _finish(task: SweepTask, store: FileStore | MemoryStore, path: Path | None) -> LinearBatch:
+    if isinstance(store, MemoryStore):
+        batch = task.batch(task.varying() | store.arrays)
+        if path is not None:
+            batch.save(path)
+        return batch
+    assert path is not None
+    store.complete(keep_name=path.suffix != ".h5")
+    if path.suffix == ".npz":
+        _written(store.part, task).save(path)
+        store.part.unlink()
+    return _written(path, task)
+
+
+def _written(path: Path, task: SweepTask) -> LinearBatch:
+    """Read what was written here, which need not be held against its hashes."""
+    return replace(LinearBatch.load(path, task.robot, verify=False), verified=True)

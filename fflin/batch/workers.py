@@ -1,0 +1,167 @@
+"""Processes of our own, each with a pipe of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection
+from threading import Lock, Thread, local
+from typing import Any
+
+from fflin.base.errors import FflinWarning
+from fflin.kernel.compiled import available_cores
+
+# How long a process is given to end when it is told to [s].
+_PATIENCE = 5.0
+
+
+class WorkerDied(BrokenExecutor):
+    """The process that did a task is gone; the others are not."""
+
+
+class NoWorkers(BrokenExecutor):
+    """No process can be started."""
+
+
+class OwnWorkers(Executor):
+    """Processes of our own; one that dies is replaced and harms no task but its own.
+
+    Those of `concurrent.futures.ProcessPoolExecutor` share one pipe for their results: where one
+    is killed in the middle of a large result, all wait for the rest of it for ever. They also
+    outlive a caller that is killed; these end with it.
+
+    Parameters
+    ----------
+    count : int
+        Processes, at most one for each core.
+
+    Warns
+    -----
+    FflinWarning
+        Where there are fewer cores.
+    """
+
+    def __init__(self, count: int) -> None:
+        cores = available_cores()
+        if count > cores:
+            said = f"{count} processes are more than there are cores; {cores} do the work"
+            warnings.warn(said, FflinWarning, stacklevel=3)
+            count = cores
+        self._max_workers = count
+        # A fork would take a copy of locks that other threads hold.
+        self._context = get_context("spawn")
+        self._threads = ThreadPoolExecutor(count)
+        self._mine = local()
+        self._lock, self._closed = Lock(), False
+        self._processes: dict[Any, Connection] = {}
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Have a process call a function; see `concurrent.futures.Executor.submit`.
+
+        The future raises `WorkerDied` where the process dies of it.
+        """
+        return self._threads.submit(self._do, (fn, args, kwargs))
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the processes, whatever they are doing."""
+        with self._lock:
+            self._closed = True
+            for process in self._processes:
+                process.terminate()
+        self._threads.shutdown(wait=wait, cancel_futures=True)
+        for process in list(self._processes):
+            self._bury(process)
+
+    def _do(self, task: Any) -> Any:
+        process = getattr(self._mine, "process", None) or self._hire()
+        pipe = self._processes[process]
+        try:
+            pipe.send(task)
+            error, result = pipe.recv()
+        except (EOFError, OSError):
+            self._mine.process = None
+            self._bury(process)
+            raise WorkerDied("its worker died each time") from None
+        if error is not None:
+            raise error
+        return result
+
+    def _hire(self) -> Any:
+        """Start a process for this thread and wait until it is there."""
+        ours, theirs = self._context.Pipe()
+        process = self._context.Process(target=_serve, args=(theirs,), daemon=True)
+        with self._lock:
+            if self._closed:
+                raise NoWorkers("the workers are shut down")
+            try:
+                with _deaf():
+                    process.start()
+            except OSError as error:
+                raise NoWorkers(f"no worker can be started: {error}") from None
+            self._processes[process] = ours
+        theirs.close()
+        try:
+            ours.recv()
+        except (EOFError, OSError):
+            self._bury(process)
+            raise NoWorkers(
+                'a worker did not start; call sweep under `if __name__ == "__main__":`'
+            ) from None
+        self._mine.process = process
+        return process
+
+    def _bury(self, process: Any) -> None:
+        self._processes.pop(process).close()
+        process.join(_PATIENCE)
+        if process.is_alive():
+            process.kill()
+            process.join()
+        process.close()
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Let what is started now not hear Ctrl-C, which is the caller's, who then ends it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    # Where it starts with a process, it takes the mask away.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _serve(pipe: Connection) -> None:
+    """Do tasks until the pipe ends, with the caller or at its word."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_the_caller, daemon=True).start()
+    try:
+        pipe.send(None)
+        while True:
+            function, args, kwargs = pipe.recv()
+            answer: tuple[Exception | None, Any]
+            try:
+                answer = None, function(*args, **kwargs)
+            except Exception as error:
+                answer = error, None
+            pipe.send(answer)
+    except (EOFError, OSError):
+        return
+
+
+def _end_with_the_caller() -> None:
+    """End this process with the one that started it, in the middle of a task too."""
+    caller = parent_process()
+    assert caller is not None
+    caller.join()
+    os._exit(1)

@@ -1,0 +1,102 @@
+"""The command line: parses, runs a command, and turns errors into lines and exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import re
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from fflin.base.errors import FflinError, FflinWarning
+from fflin.base.version import __version__
+from fflin.commands import (
+    BAD_INPUT,
+    DONE,
+    analysis,
+    models,
+    modes,
+    regulator,
+    simulation,
+    sweeps,
+    visual,
+)
+
+
+class _Parser(argparse.ArgumentParser):
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        # What is a negative number and no option; by default -1e-3 is taken for one.
+        self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f"fflin: error: {message} (see {self.prog} --help)\n")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Returns
+    -------
+    int
+        0 done; 1 a check fell short; 2 bad input.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        On Ctrl-C.
+    """
+    # What other packages warn of is shown at the end of what went well: an error says why.
+    held: list[str] = []
+
+    def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+        text = " ".join(str(message).split())
+        if issubclass(category, FflinWarning):
+            print(f"fflin: warning: {text}", file=sys.stderr)
+        else:
+            held.append(f"fflin: {category.__name__}: {text}")
+
+    warnings.showwarning = show
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # Names may hold what the terminal cannot show.
+        sys.stdout.reconfigure(errors="backslashreplace")
+    arguments = _parser().parse_args(argv)
+    try:
+        code: int = arguments.run(arguments)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        for line in held:
+            print(line, file=sys.stderr)
+        return code
+    except (FflinError, FflinWarning) as error:  # a warning where Python is told to raise them
+        print(f"fflin: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return BAD_INPUT
+    except BrokenPipeError:
+        # The reader, such as head, has what it wanted; the interpreter must not complain either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except OSError as error:
+        print(f"fflin: error: the output cannot be written: {error.strerror}", file=sys.stderr)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BAD_INPUT
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="fflin",
+        description="Linear models of free-floating robots from URDF.",
+        epilog="example: fflin linearize ets_vii -o ets_vii.mat",
+    )
+    parser.add_argument("--version", action="version", version=f"fflin {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    models.add_commands(commands)
+    analysis.add_commands(commands)
+    regulator.add_commands(commands)
+    modes.add_commands(commands)
+    simulation.add_commands(commands)
+    visual.add_commands(commands)
+    sweeps.add_commands(commands)
+    return parser

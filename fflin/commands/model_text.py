@@ -1,0 +1,104 @@
+"""What the command line shows of robots, linear models and checks."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from fflin.base.tables import matrix, signals, width
+
+if TYPE_CHECKING:
+    from fflin.base.validation import Array
+    from fflin.linear.model import LinearModel
+
+
+# Below this rate [SI] nothing moves to speak of.
+_MOVES = 1e-9
+
+
+def model_report(lin: LinearModel) -> str:
+    """Show a linear model: its point, A, B, C, D and its certificate."""
+    import numpy as np
+
+    from fflin.analysis.modes import modes
+
+    nx, nu = lin.B.shape
+    stays, f0 = lin.is_equilibrium(), np.where(np.abs(lin.f0) > _MOVES, lin.f0, 0.0)
+    point = "a fixed point" if stays else "not a fixed point"
+    if stays and (lin.moving or f0.any()):
+        point = "a relative equilibrium"
+    head = f"{lin.robot}: {nx} states, {nu} inputs, frame {lin.frame}, {point}"
+    if lin.dt:
+        head += f", sampled every {lin.dt:g} s"
+    parts = [f"{textwrap.fill(head, width(), subsequent_indent='  ')}\n{_units(lin)}"]
+    rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
+    # Elsewhere the poles of a frozen model say nothing about stability.
+    growing = modes(lin).unstable if stays and not lin.dt else []
+    if growing:
+        shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
+        parts.append(textwrap.fill(f"unstable: poles with a positive real part {shown}", width()))
+    moved = [
+        signals(title, values, names, units)
+        for title, values, names, units in (
+            ("x0", lin.x0, lin.state_names, lin.state_units),
+            ("u0", lin.u0, lin.input_names, lin.input_units),
+            ("f0", f0, lin.state_names, rates),
+        )
+        if values.any()
+    ]
+    if moved:
+        parts.append("\n".join(moved))
+    parts.append(_named_matrix("A", lin.A, lin.state_names, lin.state_names))
+    parts.append(_named_matrix("B", lin.B, lin.state_names, lin.input_names))
+    if lin.output_names == lin.state_names and not lin.D.any():
+        parts.append("C = E, D = 0: the output is the state")
+    else:
+        parts.append(_named_matrix("C", lin.C, lin.output_names, lin.state_names))
+        parts.append(_named_matrix("D", lin.D, lin.output_names, lin.input_names))
+    c = lin.certificate
+    parts.append(
+        f"A and B against ABA derivatives: {c.route_A:.1e} and {c.route_B:.1e}; M M^-1 - E: "
+        f"{c.inertia_residual:.1e};\ncond(M): {c.condition:.1e}; |f0|: {c.f0:.1e}"
+    )
+    return "\n\n".join(parts)
+
+
+def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
+    size = f"{title} ({values.shape[0]} x {values.shape[1]})"
+    if not values.any():
+        return f"{size} is zero"
+    return f"{size}; rows and columns of zeros are not shown\n\n{matrix(values, rows, columns)}"
+
+
+def _units(lin: LinearModel) -> str:
+    """Say the units of states, inputs and outputs, once for each group of them."""
+    lines = [("x", lin.state_names, lin.state_units), ("u", lin.input_names, lin.input_units)]
+    if lin.output_names != lin.state_names:
+        lines.append(("y", lin.output_names, lin.output_units))
+    return "\n".join(
+        textwrap.fill(f"{title}: {_grouped(names, units)}", width(), subsequent_indent="   ")
+        for title, names, units in lines
+    )
+
+
+def _grouped(names: Sequence[str], units: Sequence[str]) -> str:
+    # Names without a group, such as a thruster's, stand together as long as their unit is one.
+    groups: list[tuple[str, list[str], list[str]]] = []
+    for name, unit in zip(names, units, strict=True):
+        group = name.partition(".")[0] if name.count(".") == 1 else name.rpartition(".")[0]
+        last = groups[-1] if groups else None
+        if last and last[0] == group and (group or unit in last[2]):
+            last[1].append(name)
+            last[2].append(unit)
+        else:
+            groups.append((group, [name], [unit]))
+    return ", ".join(
+        f"{group or ' ... '.join(dict.fromkeys((members[0], members[-1])))} "
+        f"[{'|'.join(dict.fromkeys(of))}]"
+        for group, members, of in groups
+    )
+
+
+def _rate(unit: str) -> str:
+    return "1/s" if unit == "1" else f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"

@@ -1,0 +1,199 @@
+"""The regulator with its cost on accelerations, in closed form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fflin.analysis.stabilizability import require_stabilizable
+from fflin.base.errors import InputError, StabilizabilityError
+from fflin.base.validation import Array, dimension
+from fflin.control.lqr import Gain, make_gain, require_fixed_point
+from fflin.control.riccati import Riccati, Solution
+from fflin.control.weights import Weight, weight
+from fflin.linear.model import LinearModel
+
+_BEYOND = "the weights or dt are beyond what numbers hold: scale Qp, Qv and Ra nearer to each other"
+
+
+class _Channel(NamedTuple):
+    """Gains, blocks of P and poles of every double integrator, an entry each."""
+
+    kp: Array
+    kd: Array
+    p11: Array
+    p12: Array
+    p22: Array
+    poles: Array
+
+
+def acceleration_lqr(
+    lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight, *, dt: float | None = None
+) -> Gain:
+    r"""Return the regulator that weighs accelerations, in closed form.
+
+    With the accelerations :math:`a = L u` as inputs, where L is the lower block of B, a model at
+    rest is one double integrator a coordinate, :math:`\ddot q_i = s_i a_i` with s = 1/2 for
+    attitude and 1 else. Diagonal weights then decouple, and for continuous time
+
+    .. math:: k_p = \sqrt{q_p/r_a},\quad k_d = \sqrt{q_v/r_a + 2 s k_p},\quad
+              u = u_0 - L^{-1} [\operatorname{diag} k_p, \operatorname{diag} k_d]\,(x - x_0),
+
+    the poles those of :math:`\lambda^2 + k_d \lambda + s k_p`. Under an exact hold the channels
+    stay apart, and each has a closed form too. The weight on u is :math:`L^T R_a L`, of which no
+    number is formed for the gain, so that an ill-conditioned inertia costs no digits.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        At rest, without gravity, springs and dampers, every coordinate actuated; sampled or not.
+    Qp, Qv, Ra : array_like (6 + n,) or float, or mapping
+        Diagonal weights on the positions (q_b, r_b, q_m), the velocities and their
+        accelerations: {name: weight} with names of states, those of velocities for `Qv` and `Ra`.
+    dt : float, optional
+        Samples a continuous model first.
+
+    Returns
+    -------
+    Gain
+        Its residual is that of the Riccati equation in the model's own variables.
+
+    Raises
+    ------
+    EquilibriumError
+        If the point is not a fixed point.
+    StabilizabilityError
+        If a coordinate is not actuated.
+    InputError
+        If the model is not of double integrators, or a weight is not a diagonal, negative, or zero
+        where it must not be: Qp and Ra are positive.
+
+    References
+    ----------
+    Y. Yang, Analytic LQR design for spacecraft control system based on quaternion model, J.
+    Aerospace Engineering 25(3), 2012: its attitude regulator is the weight Ra = J R J.
+    """
+    require_fixed_point(lin)
+    if dt is not None:
+        lin = lin.discretize(dt)
+    rates, L = _integrators(lin)
+    m = len(rates)
+    positions, velocities = lin.state_names[:m], lin.state_names[m:]
+    qp, qv, ra = (
+        _diagonal(name, value, names, definite=name != "Qv")
+        for name, value, names in (
+            ("Qp", Qp, positions),
+            ("Qv", Qv, velocities),
+            ("Ra", Ra, velocities),
+        )
+    )
+    with np.errstate(all="ignore"):
+        channel = _sampled(rates, qp, qv, ra, lin.dt) if lin.dt else _continuous(rates, qp, qv, ra)
+    _require_sound(channel, lin.dt)
+    inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
+    K = inverse @ np.hstack((np.diag(channel.kp), np.diag(channel.kd)))
+    P = np.block(
+        [
+            [np.diag(channel.p11), np.diag(channel.p12)],
+            [np.diag(channel.p12), np.diag(channel.p22)],
+        ]
+    )
+    Q = np.diag(np.concatenate((qp, qv)))
+    # The same equation with the accelerations as inputs.
+    hold = np.vstack((np.diag(0.5 * lin.dt**2 * rates), lin.dt * np.eye(m)))
+    by_acceleration = hold if lin.dt else np.vstack((np.zeros((m, m)), np.eye(m)))
+    equation = Riccati(lin.A, by_acceleration, Q, np.diag(ra), None, lin.dt)
+    R = L.T @ (ra[:, None] * L)
+    try:
+        with np.errstate(all="ignore"):
+            residual = equation.trial(P).residual
+    except np.linalg.LinAlgError:
+        raise InputError(_BEYOND) from None
+    solution = Solution(P, K, channel.poles, residual, "closed form")
+    return make_gain(lin, solution, Q, 0.5 * (R + R.T), None)
+
+
+def _require_sound(channel: _Channel, dt: float) -> None:
+    poles = channel.poles
+    stable = np.abs(poles) < 1.0 if dt else poles.real < 0.0
+    if not stable.all() or not all(np.isfinite(part).all() for part in channel):
+        raise InputError(_BEYOND)
+
+
+def _integrators(lin: LinearModel) -> tuple[Array, Array]:
+    """Return s (m,) and L (m, nu) of a model of double integrators."""
+    nx = len(lin.A)
+    m = nx // 2
+    h = lin.dt or 1.0
+    slope = (lin.A - np.eye(nx)) / h if lin.dt else lin.A
+    s = slope[:m, m:].diagonal().copy()
+    L = lin.B[m:] / h
+    expected = np.zeros((nx, nx))
+    expected[:m, m:] = np.diag(s)
+    top = 0.5 * lin.dt * s[:, None] * L
+    # Division by the sampling time rounds.
+    if (
+        nx != 2 * m
+        or not np.allclose(slope, expected, rtol=1e-12, atol=0.0)
+        or not np.allclose(lin.B[:m], h * top, rtol=1e-12, atol=0.0)
+    ):
+        raise InputError(
+            "the model is not of double integrators alone, as one at rest without gravity, "
+            "springs and dampers is; use lqr"
+        )
+    sizes = np.abs(L).max(axis=1, keepdims=True)
+    if not sizes.all() or np.linalg.matrix_rank(L / sizes, tol=1e-10) < m:
+        require_stabilizable(lin)
+        raise StabilizabilityError("the inputs do not accelerate every coordinate; use lqr")
+    return s, L
+
+
+def _diagonal(what: str, value: Weight, names: Sequence[str], *, definite: bool) -> Array:
+    if not isinstance(value, Mapping) and dimension(what, value) == 2:
+        raise InputError(f"{what} is a matrix; the closed form needs its diagonal alone, use lqr")
+    return weight(what, value, names, definite=definite).diagonal()
+
+
+def _continuous(s: Array, qp: Array, qv: Array, ra: Array) -> _Channel:
+    kp = np.sqrt(qp / ra)
+    kd = np.sqrt(qv / ra + 2.0 * s * kp)
+    root = np.sqrt((kd * kd - 4.0 * s * kp).astype(complex))
+    fast = -0.5 * (kd + root)
+    p22 = ra * kd
+    return _Channel(kp, kd, kp * p22 / s, ra * kp, p22, np.concatenate((fast, s * kp / fast)))
+
+
+def _sampled(s: Array, qp: Array, qv: Array, ra: Array, h: float) -> _Channel:
+    r"""Solve the channels under a hold of length h.
+
+    With :math:`\sigma = (z - 1)(1/z - 1)` the spectral factor of a channel is of second degree,
+
+    .. math:: r_a \sigma^2 + (q_v - q_p s^2 h^2/4) h^2 \sigma + q_p s^2 h^4 = 0,
+
+    and with :math:`\delta = 1 - z` each root gives :math:`\delta^2 - \sigma \delta + \sigma = 0`.
+    """
+    step = s * h
+    middle = (qv - 0.25 * qp * step**2) * h**2
+    last = qp * step**2 * h**2
+    root = np.sqrt((middle**2 - 4.0 * ra * last).astype(complex))
+    larger = -0.5 * (middle + np.where(middle < 0.0, -root, root))
+    first, second = (_decaying(sigma) for sigma in (larger / ra, last / larger))
+    product, total = (first * second).real, (first + second).real
+    kp = product / (step * h)
+    kd = (total - 0.5 * product) / h
+    spent = qp / kp**2  # r_a + b' P b
+    p11 = spent * kp * kd / step
+    p12 = spent * kp / h - 0.5 * step * p11
+    p22 = (spent * (kd - kp * step) - 0.5 * step * h * p12) / h
+    return _Channel(kp, kd, p11, p12, p22, 1.0 - np.concatenate((first, second)))
+
+
+def _decaying(sigma: Any) -> Any:
+    """Return the root of d^2 - sigma d + sigma = 0 with |1 - d| < 1, without cancellation."""
+    root = np.sqrt(sigma * sigma - 4.0 * sigma)
+    root = np.where(np.abs(sigma + root) >= np.abs(sigma - root), root, -root)
+    larger = 0.5 * (sigma + root)
+    smaller = sigma / larger
+    return np.where(np.abs(1.0 - larger) < 1.0, larger, smaller)

@@ -1,0 +1,106 @@
+"""The differential Riccati equation backwards in time, by maps that keep P positive."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, expm
+
+from fflin.base.validation import Array
+
+# Weights of the commutator-free method of order four, and its Gauss nodes.
+_HEAVY, _LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0
+_NODES = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
+
+
+class Coefficients(NamedTuple):
+    """A, S = B R^-1 B' and Q of -dP/dt = A' P + P A - P S P + Q."""
+
+    A: Array
+    S: Array
+    Q: Array
+
+    def rate(self, P: Array) -> Array:
+        """Return dP/dt."""
+        drift = P @ self.A
+        return P @ self.S @ P - drift - drift.T - self.Q
+
+
+class _Passage(NamedTuple):
+    r"""An interval: x1 = T x0 - G l1 and l0 = W x0 + T' l1, with G and W positive semidefinite."""
+
+    T: Array
+    G: Array
+    W: Array
+
+    def doubled(self) -> _Passage:
+        """Return the passage through two such intervals."""
+        T, G, W = self
+        inner = np.linalg.solve(np.eye(len(T)) + G @ W, np.hstack((T, G @ T.T)))
+        forward, back = inner[:, : len(T)], inner[:, len(T) :]
+        return _Passage(T @ forward, _symmetric(G + T @ back), _symmetric(W + T.T @ W @ forward))
+
+    def back(self, P: Array) -> Array:
+        """Return W + T' P (E + G P)^-1 T, a sum of squares, for a P that is positive."""
+        values, directions = np.linalg.eigh(P)
+        root = directions * np.sqrt(values.clip(min=0.0))
+        middle = np.eye(len(P)) + root.T @ self.G @ root
+        seen = root.T @ self.T
+        return _symmetric(self.W + seen.T @ cho_solve(cho_factor(_symmetric(middle)), seen))
+
+
+def _passage(coefficients: Coefficients, h: float) -> _Passage:
+    """Return an interval of constant coefficients: a short exponential, doubled."""
+    A, S, Q = coefficients
+    n = len(A)
+    # Costates in units in which the equations of both halves are of one size.
+    unit = math.sqrt(max(_size(Q), 1e-300) / max(_size(S), 1e-300))
+    H = np.block([[A, -S * unit], [-Q / unit, -A.T]])
+    doublings = max(0, math.ceil(math.log2(max(4.0 * h * _size(H), 1.0))))
+    theta = expm(H * (h / 2**doublings))
+    inverse = np.linalg.inv(theta[n:, n:])
+    passage = _Passage(
+        inverse.T,
+        _symmetric(-theta[:n, n:] @ inverse) / unit,
+        _symmetric(-inverse @ theta[n:, :n]) * unit,
+    )
+    for _ in range(doublings):
+        passage = passage.doubled()
+    return passage
+
+
+def step_back(start: Coefficients, end: Coefficients, S: Array, P: Array, h: float) -> Array:
+    """Return P at the start of an interval of its value at the end, of order four.
+
+    Parameters
+    ----------
+    start, end : Coefficients
+        A and Q are linear in between.
+    S : ndarray (2, nx, nx)
+        B R^-1 B' at the two Gauss nodes.
+    P : ndarray (nx, nx)
+    h : float
+    """
+    if np.array_equal(start.A, end.A) and np.array_equal(start.S, end.S):
+        return _passage(end, h).back(P)
+    early, late = (
+        Coefficients(*((1.0 - c) * a + c * b for a, b in zip(start, end, strict=True)))._replace(
+            S=at_node
+        )
+        for c, at_node in zip(_NODES, S, strict=True)
+    )
+    for first, second in ((late, early), (early, late)):
+        mixed = Coefficients(*(_HEAVY * a + _LIGHT * b for a, b in zip(first, second, strict=True)))
+        P = _passage(mixed, 0.5 * h).back(P)
+    return P
+
+
+def _symmetric(matrix: Array) -> Array:
+    half: Array = 0.5 * (matrix + matrix.T)
+    return half
+
+
+def _size(matrix: Array) -> float:
+    return float(np.abs(matrix).sum(axis=0).max())

@@ -1,0 +1,281 @@
+"""The steady Kalman filter of a linear model, and the compensator of filter and gain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from fflin.base.errors import DetectabilityError, InputError, MissingPackageError
+from fflin.base.record import Design
+from fflin.base.validation import Array
+from fflin.control.lqr import Gain, require_fixed_point
+from fflin.control.weights import Weight, columns, weight
+from fflin.linear.model import LinearModel
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Estimator(Design):
+    r"""A steady Kalman filter of the deviations from the point.
+
+    For continuous time ``d(xh)/dt = A xh + B u + L (y - C xh - D u)``; sampled, the left side is
+    the prediction of the next sample, and ``xh + L_update (y - C xh - D u)`` the estimate that
+    has seen the present one.
+
+    Attributes
+    ----------
+    L : ndarray (nx, ny)
+    L_update : ndarray (nx, ny)
+        ``L = A L_update`` of a sampled model; L itself for continuous time.
+    P : ndarray (nx, nx)
+        Covariance of the error of xh.
+    poles : ndarray (nx,) of complex
+        Eigenvalues of ``A - L C`` [1/s]; of a sampled model those of the step.
+    residual : float
+        Of the Riccati equation, relative to the sum of the norms of its terms.
+    margin : float
+        Distance of the poles to the boundary of stability, as in `Gain`.
+    A, B, C, D : ndarray
+        The model.
+    W, V : ndarray
+        Covariances of the disturbance of the state and of the noise of the outputs.
+    x0, u0, y0 : ndarray
+    dt : float
+        Sampling time [s]; 0 for continuous time.
+    state_names, input_names, output_names : tuple of str
+    robot : str
+    """
+
+    VECTORS: ClassVar = ("poles", "x0", "u0", "y0")
+
+    L: Array
+    L_update: Array
+    P: Array
+    poles: Any
+    residual: float
+    margin: float
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    W: Array
+    V: Array
+    x0: Array
+    u0: Array
+    y0: Array
+    dt: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    robot: str
+
+    def __repr__(self) -> str:
+        nx, ny = self.L.shape
+        time = f"dt={self.dt:g} s" if self.dt else "continuous"
+        return (
+            f"Estimator('{self.robot}', nx={nx}, ny={ny}, {time}, margin={self.margin:.3g}, "
+            f"residual={self.residual:.1e})"
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Compensator(Design):
+    r"""A dynamic feedback from y - y0 to u - u0: ``d(z)/dt = A z + B (y - y0)``, ``u - u0 = C z``.
+
+    Sampled, the left side is the next sample's z. Its state z is the estimate of x - x0.
+
+    Attributes
+    ----------
+    A : ndarray (nx, nx)
+    B : ndarray (nx, ny)
+    C : ndarray (nu, nx)
+    poles : ndarray (2 nx,) of complex
+        Of the loop that it closes around the model: those of the gain and of the estimator.
+    y0, u0 : ndarray
+    dt : float
+    state_names, input_names, output_names : tuple of str
+        Its inputs are the outputs of the model.
+    robot : str
+    """
+
+    VECTORS: ClassVar = ("poles", "y0", "u0")
+
+    A: Array
+    B: Array
+    C: Array
+    poles: Any
+    y0: Array
+    u0: Array
+    dt: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    robot: str
+
+    def __repr__(self) -> str:
+        nx, ny = self.B.shape
+        time = f"dt={self.dt:g} s" if self.dt else "continuous"
+        return f"Compensator('{self.robot}', nx={nx}, ny={ny}, nu={len(self.C)}, {time})"
+
+    def to_control(self) -> Any:
+        """Return a `control.StateSpace` from y - y0 to u - u0, with signal names.
+
+        Raises
+        ------
+        MissingPackageError
+            If python-control is not installed.
+        """
+        try:
+            import control
+        except ImportError:
+            raise MissingPackageError(
+                "to_control needs python-control; install it with: pip install 'fflin[control]'"
+            ) from None
+        D = np.zeros((len(self.C), self.B.shape[1]))
+        return control.ss(
+            *(self.A, self.B, self.C, D, self.dt),
+            states=[name.replace(".", "_") for name in self.state_names],
+            inputs=[name.replace(".", "_") for name in self.input_names],
+            outputs=[name.replace(".", "_") for name in self.output_names],
+        )
+
+
+def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -> Estimator:
+    r"""Return the steady Kalman filter of a model about a fixed point.
+
+    The model is disturbed by white noises, ``dx/dt = ... + w`` and ``y = ... + n`` of intensities
+    W and V; of a sampled model they are covariances of each sample's. P solves
+
+    .. math:: A P + P A^T - P C^T V^{-1} C P + W = 0,\qquad L = P C^T V^{-1}
+
+    or its sampled counterpart, by SciPy's solver and Newton's method, see `lqr`.
+
+    Parameters
+    ----------
+    lin : LinearModel
+    W : array_like (nx, nx) or (nx,), float, or mapping
+        Positive semidefinite: a matrix, its diagonal, or {name: intensity} with names of states
+        or of their groups.
+    V : array_like (ny, ny) or (ny,), float, or mapping
+        Positive definite; likewise with names of outputs.
+    G : array_like (nx, nw), optional
+        The disturbance acts through G and W is (nw, nw): ``G=lin.B`` for noisy inputs, whose
+        names W then takes.
+
+    Returns
+    -------
+    Estimator
+
+    Raises
+    ------
+    DetectabilityError
+        If the outputs do not show a mode that does not settle by itself; it is named.
+    EquilibriumError
+        If the point is not a fixed point.
+    InputError
+        If a size or value is wrong, or no disturbance reaches a mode that does not settle by
+        itself, so that a filter would stop correcting it.
+    UnknownNameError
+        If a name does not exist.
+
+    References
+    ----------
+    R. E. Kalman and R. S. Bucy, J. Basic Engineering 83(1), 1961.
+    """
+    from fflin.analysis.stabilizability import require_detectable, require_disturbed
+    from fflin.control.riccati import solve
+
+    require_fixed_point(lin)
+    W, V = _disturbance(lin, W, G), weight("V", V, lin.output_names, definite=True)
+    require_detectable(lin)
+    require_disturbed(lin, W)
+    C = np.ascontiguousarray(lin.C)
+    try:
+        solution = solve(lin.A.T.copy(), C.T.copy(), W, V, None, lin.dt)
+    except np.linalg.LinAlgError as error:
+        raise DetectabilityError(
+            f"no stable filter was found ({error}); scale W and V, or add outputs"
+        ) from None
+    L: Array = solution.K.T
+    if lin.dt:
+        innovation = C @ solution.P @ C.T + V
+        L_update = np.linalg.solve(innovation, C @ solution.P).T
+    else:
+        L_update = L
+    poles = solution.poles[np.lexsort((solution.poles.imag, solution.poles.real))]
+    return Estimator(
+        L,
+        L_update,
+        solution.P,
+        poles,
+        solution.residual,
+        float(1.0 - np.abs(poles).max() if lin.dt else -poles.real.max()),
+        W=W,
+        V=V,
+        **{key: getattr(lin, key) for key in _FROM_MODEL},
+    )
+
+
+def lqg(gain: Gain, estimator: Estimator) -> Compensator:
+    r"""Return the compensator that feeds an estimate back, u - u0 = -K xh.
+
+    .. math:: \dot z = (A - B K - L C + L D K) z + L (y - y_0),\qquad u - u_0 = -K z
+
+    Sampled, the estimate is the prediction from the samples before, so that a sample of time is
+    left for computing.
+
+    Parameters
+    ----------
+    gain : Gain
+    estimator : Estimator
+        Of the same model.
+
+    Returns
+    -------
+    Compensator
+
+    Raises
+    ------
+    InputError
+        If the two are of different models.
+    """
+    if not isinstance(gain, Gain) or not isinstance(estimator, Estimator):
+        raise InputError("lqg takes a Gain, as lqr returns it, and an Estimator, as kalman does")
+    e = estimator
+    if gain.dt != e.dt or not (np.array_equal(gain.A, e.A) and np.array_equal(gain.B, e.B)):
+        raise InputError("the gain and the estimator are of different models; use one for both")
+    return Compensator(
+        A=e.A - e.B @ gain.K - e.L @ (e.C - e.D @ gain.K),
+        B=e.L,
+        C=-gain.K,
+        poles=np.concatenate((gain.poles, e.poles)),
+        y0=e.y0,
+        u0=e.u0,
+        dt=e.dt,
+        state_names=e.state_names,
+        input_names=e.output_names,
+        output_names=e.input_names,
+        robot=e.robot,
+    )
+
+
+_FROM_MODEL = (
+    *("A", "B", "C", "D", "x0", "u0", "y0", "dt", "robot"),
+    *("state_names", "input_names", "output_names"),
+)
+
+
+def _disturbance(lin: LinearModel, W: Weight, G: ArrayLike | None) -> Array:
+    if G is None:
+        return weight("W", W, lin.state_names)
+    through = columns("G", G, len(lin.A))
+    count = through.shape[1]
+    same = np.array_equal(through, lin.B)
+    names = lin.input_names if same else [f"w_{i + 1}" for i in range(count)]
+    spread = through @ weight("W", W, names) @ through.T
+    half: Array = 0.5 * (spread + spread.T)
+    return half

@@ -1,0 +1,274 @@
+"""The linear quadratic regulator of a linear model."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
+from fflin.base.record import Design
+from fflin.base.validation import Array
+from fflin.control.weights import Weight, cross_weight, require_semidefinite, weight
+from fflin.linear.model import LinearModel
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from fflin.control.margins import Margins
+
+_SHOWN_RESIDUALS = 6
+
+# Relative residuals that a user should know of, and beyond which a gain means nothing.
+_COARSE, _USELESS = 1e-8, 1e-3
+
+# A pole this near to the boundary of stability, relative to the others, may be one that Q leaves
+# on it, moved by rounding.
+_STILL = 1e-6
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Gain(Design):
+    r"""A state feedback ``u = u0 - K (x - x0)`` with the figures that prove it.
+
+    Attributes
+    ----------
+    K : ndarray (nu, nx)
+    P : ndarray (nx, nx)
+        The cost from x on is ``(x - x0)' P (x - x0)``.
+    poles : ndarray (nx,) of complex
+        Eigenvalues of ``A - B K`` [1/s]; of a sampled model those of the step.
+    residual : float
+        Of the Riccati equation: its norm relative to the sum of the norms of its terms.
+    margin : float
+        Distance of the poles to the boundary of stability: the slowest decay [1/s]; of a sampled
+        model 1 less the largest modulus.
+    method : str
+        "structured" (half-size), "general" (SciPy) or "closed form".
+    A, B, Q, R, N : ndarray
+        The model and the weights on deviations; N is zero where there was none.
+    x0 : ndarray (nx,)
+    u0 : ndarray (nu,)
+    dt : float
+        Sampling time [s]; 0 for continuous time.
+    state_names, input_names, state_units, input_units : tuple of str
+    frame, robot : str
+        Of the model.
+    """
+
+    VECTORS: ClassVar = ("poles", "x0", "u0")
+
+    K: Array
+    P: Array
+    poles: Any
+    residual: float
+    margin: float
+    method: str
+    A: Array
+    B: Array
+    Q: Array
+    R: Array
+    N: Array
+    x0: Array
+    u0: Array
+    dt: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_units: tuple[str, ...]
+    frame: str
+    robot: str
+
+    def __repr__(self) -> str:
+        nu, nx = self.K.shape
+        time = f"dt={self.dt:g} s" if self.dt else "continuous"
+        return (
+            f"Gain('{self.robot}', nx={nx}, nu={nu}, {time}, margin={self.margin:.3g}, "
+            f"residual={self.residual:.1e})"
+        )
+
+    def __str__(self) -> str:
+        from fflin.control.gain_text import gain_report
+
+        return gain_report(self)
+
+    @property
+    def closed_loop(self) -> Array:
+        """A - B K (nx, nx)."""
+        loop: Array = self.A - self.B @ self.K
+        return loop
+
+    @cached_property
+    def margins(self) -> Margins:
+        """Gain and phase that the inputs bear, computed when first asked for."""
+        from fflin.control.margins import input_margins
+
+        return input_margins(self.A, self.B, self.K, self.R, self.dt)
+
+
+def lqr(lin: LinearModel, Q: Weight, R: Weight, N: ArrayLike | None = None) -> Gain:
+    r"""Return the linear quadratic regulator of a model about a fixed point.
+
+    For a continuous model u = u0 - K (x - x0) minimises
+
+    .. math:: \int_0^\infty \delta x^T Q\,\delta x + 2\,\delta x^T N\,\delta u
+              + \delta u^T R\,\delta u\;dt,
+
+    for a sampled one the same sum over its samples; `sampled_cost` takes the weights of the
+    integral to those of the sum. The Riccati equation of a fully actuated model is solved by
+    half its usual size, any other by SciPy's solver; either is refined by Newton's method, and
+    the residual in the model's own variables comes with the result. A weight that is formed with
+    the inertia, such as M^-1 R_a M^-1 on accelerations, has lost what the inertia's condition
+    takes before any solver sees it: `acceleration_lqr` does without.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        About a fixed point, or about a steady motion with ``moving=True``.
+    Q : array_like (nx, nx) or (nx,), float, or mapping
+        Weight on the state, positive semidefinite: a matrix, its diagonal, or {name: weight}
+        with names of states or of their groups, such as ``q_b``; what is not named costs nothing.
+    R : array_like (nu, nu) or (nu,), float, or mapping
+        Weight on the inputs, positive definite; likewise.
+    N : array_like (nx, nu), optional
+        Cross weight, with which Q - N R^-1 N' is positive semidefinite.
+
+    Returns
+    -------
+    Gain
+
+    Raises
+    ------
+    EquilibriumError
+        If the point is not a fixed point; with the rows of f0 that are not zero.
+    StabilizabilityError
+        If the inputs cannot hold a mode that does not settle by itself; it is named.
+    InputError
+        If a weight is of a wrong size, not positive (semi)definite, or leaves out a mode that does
+        not settle by itself.
+    UnknownNameError
+        If a name does not exist.
+
+    Warns
+    -----
+    FflinWarning
+        If the weights are so badly scaled that the equation is solved to less than 1e-8.
+
+    References
+    ----------
+    B. D. O. Anderson and J. B. Moore, Optimal Control: Linear Quadratic Methods, 1990.
+    """
+    require_fixed_point(lin)
+    Q, R, cross = cost_weights(lin, Q, R, N)
+    solution = _solve(lin, Q, R, cross)
+    return make_gain(lin, solution, Q, R, cross)
+
+
+def cost_weights(
+    lin: LinearModel, Q: Weight, R: Weight, N: ArrayLike | None
+) -> tuple[Array, Array, Array | None]:
+    """Return the weights as matrices, checked."""
+    nx, nu = lin.B.shape
+    Q = weight("Q", Q, lin.state_names)
+    R = weight("R", R, lin.input_names, definite=True)
+    if N is None:
+        return Q, R, None
+    cross = cross_weight("N", N, nx, nu)
+    require_semidefinite("Q - N R^-1 N'", Q - cross @ np.linalg.solve(R, cross.T), lin.state_names)
+    return Q, R, cross
+
+
+def require_fixed_point(lin: LinearModel) -> None:
+    """Raise `EquilibriumError` with what of f0 is not zero."""
+    if not isinstance(lin, LinearModel):
+        raise InputError(
+            f"lin is a {type(lin).__name__}, expected a LinearModel; fflin.linearize makes one"
+        )
+    if lin.is_equilibrium():
+        return
+    rate = lin.f0 if lin._drift is None else lin._drift
+    judged = [name not in lin.ignorable for name in lin.state_names]
+    rows = [i for i in np.argsort(-np.abs(rate)) if judged[i] and abs(rate[i]) > 1e-9]
+    shown = ", ".join(
+        f"d {lin.state_names[i]}/dt = {rate[i] / (lin.dt or 1.0):.6g}"
+        for i in rows[:_SHOWN_RESIDUALS]
+    )
+    more = f" and {len(rows) - _SHOWN_RESIDUALS} more" if len(rows) > _SHOWN_RESIDUALS else ""
+    raise EquilibriumError(
+        f"the point is not a fixed point: {shown}{more}; linearise about one, with the inputs of "
+        "fflin.equilibrium, or about a steady motion with moving=True"
+    )
+
+
+def make_gain(lin: LinearModel, solution: Any, Q: Array, R: Array, N: Array | None) -> Gain:
+    """Return a gain of a solution (P, K, poles, residual, method)."""
+    poles = solution.poles[np.lexsort((solution.poles.imag, solution.poles.real))]
+    margin = 1.0 - np.abs(poles).max() if lin.dt else -poles.real.max()
+    return Gain(
+        **{key: getattr(solution, key) for key in ("K", "P", "residual", "method")},
+        **{key: getattr(lin, key) for key in _FROM_MODEL},
+        poles=poles,
+        margin=float(margin),
+        Q=Q,
+        R=R,
+        N=np.zeros(lin.B.shape) if N is None else N,
+    )
+
+
+_FROM_MODEL = (
+    *("A", "B", "x0", "u0", "dt", "frame", "robot"),
+    *("state_names", "input_names", "state_units", "input_units"),
+)
+
+
+def _difference(a: Array, b: Array, c: Array) -> Array:
+    """Return a - b c with zeros for what is rounding."""
+    rounding = 1e3 * np.finfo(float).eps * (np.abs(a) + np.abs(b) @ np.abs(c))
+    difference = a - b @ c
+    return np.where(np.abs(difference) > rounding, difference, 0.0)
+
+
+def _still(poles: Any, dt: float) -> bool:
+    """Whether a pole of a stable loop hardly moves."""
+    decay = 1.0 - np.abs(poles) if dt else -poles.real
+    still: bool = decay.min() < _STILL * np.abs(poles - 1.0 if dt else poles).max()
+    return still
+
+
+def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
+    from fflin.analysis.stabilizability import require_stabilizable, require_weighed
+    from fflin.control.riccati import half_size, solve
+
+    arguments = (lin.A, lin.B, Q, R, N, lin.dt)
+    structured = half_size(*arguments)
+    if structured is not None and not _still(structured.poles, lin.dt):
+        return structured
+    # Before a general solver fails without a word.
+    require_stabilizable(lin)
+    free, A = Q, lin.A
+    if N is not None:
+        toward = np.linalg.solve(R, N.T)
+        free, A = _difference(Q, N, toward), _difference(A, lin.B, toward)
+    require_weighed(lin, A, free)
+    if structured is not None:
+        return structured
+    try:
+        solution = solve(*arguments)
+        if solution.residual > _USELESS:
+            raise np.linalg.LinAlgError("the weights are too badly scaled")
+    except np.linalg.LinAlgError as error:
+        raise StabilizabilityError(
+            f"no stabilising solution of the Riccati equation was found: {error}; scale the "
+            "weights, with bryson, or use acceleration_lqr"
+        ) from None
+    if solution.residual > _COARSE:
+        warnings.warn(
+            f"the Riccati equation is solved to {solution.residual:.0e} only: the weights are "
+            "badly scaled; scale them, with bryson",
+            FflinWarning,
+            stacklevel=3,
+        )
+    return solution

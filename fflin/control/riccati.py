@@ -1,0 +1,273 @@
+"""Algebraic Riccati equations: a solution with its residual, by half the size where it goes."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtrs
+
+from fflin.base.validation import Array
+from fflin.control.half_size import second_order_loop
+from fflin.control.lyapunov import Modes, eigenvalues
+
+_EPS, _TINY = float(np.finfo(float).eps), 1e-300
+
+# A residual at which nothing is wrong with the solution but rounding.
+_SOUND = 1e-11
+_STEPS = 25
+
+# Of a residual: where what a step does not lower is rounding, and where Newton's method lowers it
+# at every step.
+_ROUNDED = 1e-12
+_NEAR = 1e-3
+
+
+class Solution(NamedTuple):
+    """P and K, the poles of A - B K, the relative residual, and what found them."""
+
+    P: Array
+    K: Array
+    poles: Any
+    residual: float
+    method: str
+
+
+class _Trial(NamedTuple):
+    P: Array
+    defect: Array
+    residual: float
+
+
+class Riccati:
+    r"""The Riccati equation of a continuous or sampled system and a cost with a cross term.
+
+    .. math:: A^T P + P A - (P B + N) R^{-1} (P B + N)^T + Q = 0
+
+    for dt = 0, and else with :math:`W = R + B^T P B`
+
+    .. math:: A^T P A - P - (A^T P B + N) W^{-1} (A^T P B + N)^T + Q = 0.
+
+    Parameters
+    ----------
+    A, B, Q, R, N : ndarray
+        Q and R symmetric, R positive definite.
+    dt : float
+    """
+
+    def __init__(self, A: Array, B: Array, Q: Array, R: Array, N: Array | None, dt: float) -> None:
+        self.A, self.B, self.Q, self.R, self.N = A, B, Q, R, N
+        self.discrete = bool(dt)
+        # Of a sampled system only what A differs by from the identity counts.
+        self.rate = A - np.eye(len(A)) if dt else A
+        self.R_factor, indefinite = dpotrf(R, lower=1)
+        self.definite = not indefinite
+        if not dt:
+            self._inputs = dtrtrs(self.R_factor, B.T, lower=1)[0]
+            self.cross = None if N is None else dtrtrs(self.R_factor, N.T, lower=1)[0]
+
+    def gain(self, P: Array) -> Array:
+        """Return K (nu, nx), u = -K x."""
+        factor, Y = self._factored(P)
+        K: Array = dtrtrs(factor, Y, lower=1, trans=1)[0]
+        return K
+
+    def trial(self, P: Array) -> _Trial:
+        """Return P with its defect, and that relative to the sum of the norms of its terms."""
+        _, Y = self._factored(P)
+        change = P @ self.rate
+        spent = Y.T @ Y
+        defect = change + change.T - spent + self.Q
+        size = 2.0 * _norm(change) + _norm(spent) + _norm(self.Q)
+        if self.discrete:
+            second = self.rate.T @ change
+            defect += 0.5 * (second + second.T)
+            size += _norm(second)
+        residual = _norm(defect) / max(size, _TINY)
+        if not math.isfinite(residual + size):
+            raise np.linalg.LinAlgError("the weights or the model are beyond all numbers")
+        return _Trial(P, defect, residual)
+
+    def closed_loop(self, P: Array) -> Array:
+        """Return A - B K (nx, nx)."""
+        F: Array = self.A - self.B @ self.gain(P)
+        return F
+
+    def _factored(self, P: Array) -> tuple[Array, Array]:
+        """Return the lower factor of W and Y with K = W^-T Y, so that the gain costs Y' Y."""
+        if not self.discrete:
+            Y = self._inputs @ P
+            return self.R_factor, Y if self.cross is None else Y + self.cross
+        PB = P @ self.B
+        W = self.R + self.B.T @ PB
+        factor, indefinite = dpotrf(0.5 * (W + W.T), lower=1)
+        if indefinite:
+            raise np.linalg.LinAlgError("R + B' P B is not positive definite")
+        right = PB.T @ self.A
+        return factor, dtrtrs(factor, right if self.N is None else right + self.N.T, lower=1)[0]
+
+
+def solve(
+    A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
+) -> Solution:
+    """Solve a Riccati equation for the stabilising P.
+
+    A fully actuated second-order system is solved by its own half-size method, any other and
+    where that falls short by SciPy's. Newton's method (Kleinman) refines either, step by step as
+    long as it lowers the residual, which is measured in the variables given.
+
+    Parameters
+    ----------
+    A : ndarray (nx, nx)
+    B : ndarray (nx, nu)
+    Q : ndarray (nx, nx)
+        Symmetric.
+    R : ndarray (nu, nu)
+        Symmetric positive definite.
+    N : ndarray (nx, nu), optional
+    dt : float
+        Sampling time; 0 for continuous time.
+
+    Returns
+    -------
+    Solution
+        The method is "structured" or "general".
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If there is no stabilising solution, or none is found.
+
+    References
+    ----------
+    D. L. Kleinman, IEEE Trans. Automatic Control 13(1), 1968.
+    """
+    equation = Riccati(A, B, Q, R, N, dt)
+    start = _attempt(equation)
+    if start is not None and start.residual <= _SOUND:
+        return start
+    found = [] if start is None else [start]
+    for unit in (False, True):
+        # SciPy raises either where a pencil cannot be reordered.
+        with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
+            refined = _refined(equation, _general(equation, unit), None)
+            if (general := _finished(equation, *refined, "general")) is not None:
+                found.append(general)
+                if general.residual <= _SOUND:
+                    break
+    if not found:
+        raise np.linalg.LinAlgError("the weights or the model are too badly scaled")
+    return min(found, key=lambda solution: solution.residual)
+
+
+def half_size(
+    A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
+) -> Solution | None:
+    """Solve as `solve` does by the half-size method; None where it falls short."""
+    solution = _attempt(Riccati(A, B, Q, R, N, dt))
+    return solution if solution is not None and solution.residual <= _SOUND else None
+
+
+def _attempt(equation: Riccati) -> Solution | None:
+    with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
+        return _half_size(equation)
+    return None
+
+
+def _half_size(equation: Riccati) -> Solution | None:
+    source = _bilinear(equation) if equation.discrete else equation
+    if source is None:
+        return None
+    A, Q, cross = source.A, source.Q, source.cross
+    if cross is not None:
+        # The input is counted from -R^-1 N' x, from where the cost has no cross term.
+        A = A - source.B @ dtrtrs(source.R_factor, cross, lower=1, trans=1)[0]
+        Q = Q - cross.T @ cross
+    loop = second_order_loop(A, source.B, Q, source.R_factor)
+    if loop is None:
+        return None
+    P = loop.modes.lyapunov_modal(loop.cost)
+    modes = None if equation.discrete else loop.modes
+    return _finished(equation, *_refined(equation, P, modes), "structured")
+
+
+def _bilinear(equation: Riccati) -> Riccati | None:
+    r"""Return the continuous equation that has the same P.
+
+    With :math:`\bar x = (x_{k+1} + x_k)/\sqrt 2` and :math:`\dot{\bar x} = (x_{k+1} - x_k)/\sqrt 2`
+    the step of :math:`x^T P x` is :math:`2 \dot{\bar x}^T P \bar x`. Under an exact hold of a
+    double integrator this is one again, driven in its velocities alone.
+    """
+    A, B, Q = equation.A, equation.B, equation.Q
+    N = np.zeros_like(B) if equation.N is None else equation.N
+    F = np.linalg.inv(A + np.eye(len(A)))
+    FB = F @ B
+    R = equation.R - N.T @ FB - FB.T @ N + FB.T @ Q @ FB
+    Bc = 2.0**0.5 * FB
+    # What rounding leaves of the zeros at most; Newton's method works on the true ones.
+    Bc[np.abs(Bc).max(axis=1) <= 1e-12 * np.abs(Bc).max()] = 0.0
+    N = 2.0**0.5 * F.T @ (N - Q @ FB)
+    continuous = Riccati(F @ equation.rate, Bc, 2.0 * F.T @ Q @ F, R, N, 0.0)
+    return continuous if continuous.definite else None
+
+
+def _finished(
+    equation: Riccati, trial: _Trial, modes: Modes | None, method: str
+) -> Solution | None:
+    K = equation.gain(trial.P)
+    F = equation.A - equation.B @ K
+    poles = modes.poles(F) if modes else eigenvalues(F)
+    stable = np.abs(poles).max() < 1.0 if equation.discrete else poles.real.max() < 0.0
+    return Solution(trial.P, K, poles, trial.residual, method) if stable else None
+
+
+def _refined(equation: Riccati, P: Array, modes: Modes | None) -> tuple[_Trial, Modes | None]:
+    """Apply Newton steps; `modes` are those of a closed loop near that of P, where known."""
+    enough = 0.5 * _EPS * len(P) ** 0.5
+    trial = best = equation.trial(P)
+    fresh = False
+    for _ in range(_STEPS):
+        if best.residual <= enough:
+            break
+        if modes is None:
+            modes, fresh = Modes.of(equation.closed_loop(trial.P), equation.discrete), True
+        better = equation.trial(trial.P + modes.lyapunov(trial.defect))
+        gain = trial.residual / max(better.residual, _TINY)
+        # From afar the first steps may raise the residual; what they do to P is for the better.
+        if gain > 1.0 or (fresh and trial.residual > _NEAR):
+            trial = better
+        if trial.residual < best.residual:
+            best = trial
+        if trial.residual < _ROUNDED:
+            if gain < 2.0:
+                break
+        elif gain < 10.0:
+            # These modes are those of another loop.
+            if fresh and trial is not better:
+                break
+            modes = None
+    return best, modes
+
+
+def _general(equation: Riccati, unit: bool) -> Array:
+    """Solve by SciPy, which takes an R badly scaled for singular; `unit`: inputs that cost 1."""
+    from scipy.linalg import solve_continuous_are, solve_discrete_are
+
+    solver = solve_discrete_are if equation.discrete else solve_continuous_are
+    B, R, N = equation.B, equation.R, equation.N
+    if unit:
+        B = dtrtrs(equation.R_factor, B.T, lower=1)[0].T
+        N = None if N is None else dtrtrs(equation.R_factor, N.T, lower=1)[0].T
+        R = np.eye(len(R))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of ill-conditioning: the residual is measured
+        P: Array = solver(equation.A, B, equation.Q, R, s=N)
+    return 0.5 * (P + P.T)
+
+
+def _norm(matrix: Array) -> float:
+    flat = matrix.ravel()
+    return float(np.sqrt(flat.dot(flat)))

@@ -1,0 +1,229 @@
+"""Weights of a quadratic cost: from matrices, diagonals, numbers and names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from fflin.base.errors import InputError, unknown
+from fflin.base.validation import Array, dimension, number, vector
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from fflin.linear.model import LinearModel
+
+Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
+
+# What rounding may leave of symmetry and of semidefiniteness, relative to the largest entry.
+_ROUNDING = 1e-9
+
+
+def bryson(lin: LinearModel, largest: Mapping[str, float]) -> Array:
+    r"""Return the diagonal of a weight by Bryson's rule, :math:`1/\text{largest}^2` each.
+
+    A deviation as large as is acceptable then costs 1, whatever its unit.
+
+    Parameters
+    ----------
+    lin : LinearModel
+    largest : mapping
+        {name: largest acceptable value}, of states or of inputs. A name is one of
+        ``lin.state_names`` or ``lin.input_names``, or that of a group such as ``q_b``, ``r_b``,
+        ``q_m``, ``omega_b``, ``v_b``, ``qdot_m``, ``tau_b``, ``F_b``, ``tau_m``; a single name
+        goes before its group's. States that are not named cost nothing; inputs must all be named.
+
+    Returns
+    -------
+    ndarray (nx,) or (nu,)
+        For states or for inputs, as `lqr` takes it.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such name.
+    InputError
+        If a value is not positive, or states and inputs are named together.
+
+    References
+    ----------
+    A. E. Bryson and Y.-C. Ho, Applied Optimal Control, 1975, section 5.2.
+
+    Examples
+    --------
+    >>> Q = bryson(lin, {"q_b": 0.05, "r_b": 0.1, "q_m": 0.1})  # doctest: +SKIP
+    >>> R = bryson(lin, {"tau_b": 1.0, "F_b": 5.0, "tau_m": 2.0})  # doctest: +SKIP
+    """
+    if not (hasattr(lin, "state_names") and hasattr(lin, "input_names")):
+        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    if not isinstance(largest, Mapping) or not largest:
+        raise InputError(f"largest is {largest!r}, expected {{name: largest acceptable value}}")
+    known = {*lin.input_names, *map(_group, lin.input_names)}
+    of_inputs = [name for name in largest if name in known]
+    if of_inputs and len(of_inputs) < len(largest):
+        other = next(name for name in largest if name not in known)
+        if other in {*lin.state_names, *map(_group, lin.state_names)}:
+            raise InputError(
+                f"'{of_inputs[0]}' is an input and '{other}' a state; ask for one weight of each"
+            )
+    names = lin.input_names if of_inputs else lin.state_names
+    values = {}
+    for name, value in largest.items():
+        size = number(f"largest value of '{name}'", value)
+        values[name] = inverse_square(f"largest value of '{name}'", size)
+    if not of_inputs:
+        for name in values:
+            if name not in {*names, *map(_group, names)}:
+                raise unknown("state or input", name, (*names, *lin.input_names))
+    return _diagonal("largest", values, names, complete=bool(of_inputs))
+
+
+def inverse_square(what: str, size: float) -> float:
+    """Return 1/size^2, or raise `InputError` where that is no positive number."""
+    if size <= 0.0:
+        raise InputError(f"{what} is {size:g}, expected a positive number")
+    if not 1e-150 <= size <= 1e150:
+        raise InputError(f"{what} is {size:g}, expected one between 1e-150 and 1e150")
+    return size**-2
+
+
+def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = False) -> Array:
+    """Return a weight as a symmetric matrix.
+
+    Parameters
+    ----------
+    what : str
+        What to call it in an error.
+    value : array_like (k, k) or (k,), float, or mapping
+        The matrix, its diagonal, a number for the whole diagonal, or {name: number} with the
+        names of entries or of their groups.
+    names : sequence of str (k,)
+    definite : bool
+        Whether every direction must cost something; else none may be negative.
+
+    Returns
+    -------
+    ndarray (k, k)
+
+    Raises
+    ------
+    InputError
+        If a size or value is wrong, or the matrix is not symmetric or not positive
+        (semi)definite.
+    UnknownNameError
+        If a name does not exist.
+    """
+    size = len(names)
+    if isinstance(value, Mapping):
+        diagonal = _diagonal(what, value, names, complete=definite)
+    elif (indices := dimension(what, value)) == 0:
+        diagonal = np.full(size, number(what, value))
+    elif indices == 1:
+        diagonal = vector(what, value, size, f"its diagonal, {names[0]} to {names[-1]}")
+    else:
+        return _checked_matrix(what, value, names, definite)
+    lowest = int(diagonal.argmin())
+    if diagonal[lowest] < 0.0 or (definite and diagonal[lowest] == 0.0):
+        raise _negative(what, float(diagonal[lowest]), names[lowest], definite)
+    return np.diag(diagonal)
+
+
+def cross_weight(what: str, value: ArrayLike, rows: int, columns: int) -> Array:
+    """Return a matrix (rows, columns)."""
+    if dimension(what, value) != 2 or np.shape(value) != (rows, columns):
+        raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, {columns})")
+    return vector(what, np.ravel(value), rows * columns, "its entries").reshape(rows, columns)
+
+
+def columns(what: str, value: ArrayLike, rows: int) -> Array:
+    """Return a matrix (rows, k) with k >= 1."""
+    shape = np.shape(value) if dimension(what, value) == 2 else ()
+    if not shape or not shape[1]:
+        raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, k) with k >= 1")
+    return cross_weight(what, value, rows, shape[1])
+
+
+def require_semidefinite(what: str, matrix: Array, names: Sequence[str]) -> None:
+    """Raise `InputError` with the lowest eigenvalue where a symmetric matrix is not so."""
+    size = np.abs(matrix).max(initial=0.0)
+    values, directions = np.linalg.eigh(matrix)
+    if values[0] < -_ROUNDING * size:
+        where = names[int(np.abs(directions[:, 0]).argmax())]
+        raise _negative(what, float(values[0]), where, definite=False)
+
+
+def _checked_matrix(what: str, value: Any, names: Sequence[str], definite: bool) -> Array:
+    size = len(names)
+    matrix = cross_weight(what, value, size, size)
+    skew = np.abs(matrix - matrix.T)
+    if skew.max() > _ROUNDING * np.abs(matrix).max():
+        i, j = np.unravel_index(int(skew.argmax()), skew.shape)
+        raise InputError(
+            f"{what} is not symmetric: {what}[{i}, {j}] is {matrix[i, j]:g} and {what}[{j}, {i}] "
+            f"is {matrix[j, i]:g}"
+        )
+    matrix = 0.5 * (matrix + matrix.T)
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        if definite:
+            values, directions = np.linalg.eigh(matrix)
+            where = names[int(np.abs(directions[:, 0]).argmax())]
+            raise _negative(what, float(values[0]), where, definite) from None
+        require_semidefinite(what, matrix, names)
+    return matrix
+
+
+def default_weights(lin: LinearModel) -> tuple[Array, Array]:
+    """Return diagonals that suit a robot of any size: 1 on every state, and on each input.
+
+    An input costs the squares of the accelerations that a unit of it gives the coordinates, each
+    taken alone with its inertia on the diagonal of M.
+    """
+    nx, nu = lin.B.shape
+    if lin.M.shape != (nx - nx // 2,) * 2:
+        return np.ones(nx), np.ones(nu)
+    forces = lin.M @ lin.B[nx // 2 :] / (lin.dt or 1.0)
+    return np.ones(nx), ((forces / lin.M.diagonal()[:, None]) ** 2).sum(axis=0)
+
+
+def named_weights(
+    what: str, values: Mapping[str, float], names: Sequence[str], others: Array
+) -> Array:
+    """Return a diagonal (k,) of {name of an entry or of a group: value} and of the `others`."""
+    groups: dict[str, list[int]] = {}
+    for index, name in enumerate(names):
+        groups.setdefault(_group(name), []).append(index)
+    diagonal = others.astype(float)
+    # A single name goes before its group's, whichever stands first.
+    for name, value in sorted(values.items(), key=lambda item: item[0] in names):
+        if name not in names and name not in groups:
+            raise unknown(what, name, (*groups, *names))
+        entries = [names.index(name)] if name in names else groups[name]
+        diagonal[entries] = number(f"weight of '{name}'", value)
+    return diagonal
+
+
+def _diagonal(
+    what: str, values: Mapping[str, float], names: Sequence[str], *, complete: bool
+) -> Array:
+    others = np.full(len(names), np.nan if complete else 0.0)
+    diagonal = named_weights(f"entry of {what}", values, names, others)
+    missing = np.flatnonzero(np.isnan(diagonal))
+    if missing.size:
+        raise InputError(f"{what} has no value for {names[missing[0]]}; each needs one")
+    return diagonal
+
+
+def _group(name: str) -> str:
+    return name.partition(".")[0]
+
+
+def _negative(what: str, value: float, where: str, definite: bool) -> InputError:
+    kind = "definite" if definite else "semidefinite"
+    return InputError(
+        f"{what} is not positive {kind}: its eigenvalue {value:.6g} has its direction mostly "
+        f"along {where}"
+    )

@@ -1,0 +1,161 @@
+"""Accelerations and their slopes by Pinocchio's articulated-body algorithm.
+
+The route by which linear models are checked, and nothing of the one by which they are made.
+"""
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.robot.frames import ROOT
+
+
+class Aba:
+    """The nonlinear dynamics of a robot with all that acts on it, in base axes.
+
+    Parameters
+    ----------
+    state : StateMap
+
+    Attributes
+    ----------
+    inverse : ndarray (6 + n, 6 + n)
+        M^-1 in base axes as ABA has it, of the last slopes.
+    """
+
+    def __init__(self, state: StateMap) -> None:
+        robot = state.robot
+        self.state = state
+        self.actuation = Actuation(state)
+        self._data = robot.create_data()
+        self._weightless = robot.model
+        self._model = robot.model.copy()
+        self._model.gravity.linear = np.array(robot.gravity)
+        self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
+        self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
+
+    def acceleration(self, q: Array, v: Array, u: Array, tau: Array | None = None) -> Array:
+        """Return dv/dt (nv,) in Pinocchio's order; `u` (nu,) in base axes.
+
+        `tau` (nv,), in Pinocchio's order, is a force besides.
+        """
+        forces = self.actuation.torques(u) + self._passive_force(q, v)
+        if tau is not None:
+            forces += self.state.forces(tau)
+        return self._accelerate(self._model, q, v, forces, self._wrenches(q, v, u))
+
+    def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Return d(nudot)/d(tangent of q, nu, u) in state order, (6 + n, ...); `u` in base axes.
+
+        The wrenches of thrusters are constant in the frames of their links, so that the first
+        holds d(B u)/dq too. B comes from the accelerations of unit inputs at rest.
+        """
+        state = self.state
+        stiffness, damping, _ = state.robot.passive
+        tau = state.lift(self.actuation.torques(u) + self._passive_force(q, v))
+        external = self._wrenches(q, v, u)
+        if state.S is None:
+            slopes = pin.computeABADerivatives(self._model, self._data, q, v, tau, external)
+            by_q, by_v, by_force = (state.project(slope) for slope in slopes)
+        else:
+            by_q, by_v, by_force = self._constrained_slopes(q, v, external, tau, state.S)
+        self.inverse = by_force
+        for joint, momentum in state.robot.stored_momentum:
+            jacobian, turning = self._turning(joint, q, v)
+            torque = by_force @ state.forces(jacobian.T) @ skew(momentum)
+            by_q += torque @ state.columns(turning)
+            by_v += torque @ state.columns(jacobian)
+        by_q[:, 6:] -= by_force[:, 6:] * stiffness
+        by_v[:, 6:] -= by_force[:, 6:] * damping
+        at_rest = np.zeros_like(v)
+        by_u = [
+            state.velocities(
+                self._accelerate(
+                    self._weightless,
+                    q,
+                    at_rest,
+                    self.actuation.torques(unit),
+                    self._wrenches(q, at_rest, unit),
+                )
+            )
+            for unit in np.eye(len(u))
+        ]
+        return by_q, by_v, np.column_stack(by_u)
+
+    def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
+        """Return what acts on the links, stored momentum turned with them included."""
+        stored = self.state.robot.stored_momentum
+        wrenches = self.actuation.wrenches(u) or self._none
+        if not stored:
+            return wrenches
+        total = pin.StdVec_Force(wrenches)
+        pin.forwardKinematics(self._model, self._data, q, v)
+        for joint, momentum in stored:
+            torque = -np.cross(self._data.v[joint].angular, momentum)
+            total[joint] = wrenches[joint] + pin.Force(np.zeros(3), torque)
+        return total
+
+    def _turning(self, joint: int, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return the slopes (3, nv) over v and q of the angular velocity of a link in its axes.
+
+        A turn of a joint l that carries it, about s in its axes, changes it by omega_p x s, with
+        omega_p the angular velocity of what carries l; a turn of the base changes nothing.
+        """
+        model, data = self._model, self._data
+        pin.forwardKinematics(model, data, q, v)
+        pin.computeJointJacobians(model, data, q)
+        local = pin.ReferenceFrame.LOCAL
+        jacobian = pin.getJointJacobian(model, data, joint, local)[3:]
+        turning = np.zeros_like(jacobian)
+        for support in model.supports[joint].tolist()[ROOT + 1 :]:
+            column, parent = model.idx_vs[support], model.parents[support]
+            relative = data.oMi[joint].rotation.T @ data.oMi[parent].rotation
+            about = relative @ data.v[parent].angular
+            turning[:, column] = np.cross(about, jacobian[:, column])
+        return jacobian, turning
+
+    def _passive_force(self, q: Array, v: Array) -> Array:
+        stiffness, damping, rest = self.state.robot.passive
+        force = np.zeros(6 + self.state.robot.n)
+        force[6:] -= stiffness * (self.state.joint_positions(q) - rest)
+        force[6:] -= damping * self.state.velocities(v)[6:]
+        return force
+
+    def _accelerate(
+        self, model: pin.Model, q: Array, v: Array, forces: Array, external: pin.StdVec_Force
+    ) -> Array:
+        state = self.state
+        if state.S is None:
+            return pin.aba(model, self._data, q, v, state.lift(forces), external)
+        # Mimic joints: S^T M S nudot = S^T (tau - b), with M from CRBA.
+        M = state.project(pin.crba(model, self._data, q))
+        bias = pin.rnea(model, self._data, q, v, np.zeros(model.nv), external)
+        return state.spread(np.linalg.solve(M, forces - state.forces(bias)))
+
+    def _constrained_slopes(
+        self, q: Array, v: Array, external: pin.StdVec_Force, tau: Array, S: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return the slopes where joints mimic others: S^T M a = S^T (tau - b).
+
+        The forces that keep them in step drop out of it. ABA wants M regular, which it need not
+        be where one of the joints carries no mass: they get a rotor's inertia as large as the
+        inertia that they share, in M' = M + rotor, whose part in S^T M' S is taken out again.
+        """
+        state, data = self.state, self._data
+        shared = S @ state.project(pin.crba(self._model, data, q)).diagonal()
+        model = self._model.copy()
+        rotor = np.zeros(model.nv)
+        for joint, leader, *_ in state.robot.followers:
+            rotor[[joint.idx_v, leader.idx_v]] = shared[leader.idx_v]
+        model.armature = model.armature + rotor
+        upper = pin.computeMinverse(model, data, q)
+        with_rotor = np.linalg.inv(np.triu(upper) + np.triu(upper, 1).T)
+        by_force = np.linalg.inv(S.T @ with_rotor @ S - (S.T * rotor) @ S)
+        to_independent = by_force @ S.T @ with_rotor
+        free = pin.aba(model, data, q, v, tau, external)
+        in_step = tau + with_rotor @ (S @ (to_independent @ free) - free)
+        by_q, by_v, _ = pin.computeABADerivatives(model, data, q, v, in_step, external)
+        return to_independent @ by_q @ S, to_independent @ by_v @ S, by_force

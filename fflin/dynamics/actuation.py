@@ -1,0 +1,170 @@
+"""How inputs act: the columns that take u to generalised forces, and the wrenches on links."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.dynamics.chart import Chart
+from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.robot.frames import ROOT, find_frame
+from fflin.robot.inputs import (
+    BaseForce,
+    BaseTorque,
+    JointTorque,
+    ReactionWheel,
+    WrenchInput,
+    named_wheels,
+)
+from fflin.robot.robot import Robot
+
+_LOCAL = pin.ReferenceFrame.LOCAL
+
+
+class Held(NamedTuple):
+    """Three inputs that are a vector on the base, held in reference axes."""
+
+    columns: slice
+    rows: slice
+
+
+class Actuation:
+    """The inputs of a robot, prepared.
+
+    Attributes
+    ----------
+    names, units : tuple of str
+        Of the nu inputs.
+    groups : dict
+        {name: indices} of the inputs by kind: tau_b, F_b, tau_m, thrust, wheel, in order of
+        appearance.
+    default : bool
+        Whether they are tau_b, F_b and every joint's, so that the columns are the identity.
+    held : tuple of Held
+        What the frame holds in reference axes.
+    """
+
+    def __init__(self, state: StateMap) -> None:
+        self._state, robot, nv = state, state.robot, 6 + state.robot.n
+        self._model = robot.model
+        names: list[str] = []
+        units: list[str] = []
+        kinds: list[str] = []
+        columns: list[Array] = []
+        held: list[Held] = []
+        wheel_names = iter([name for name, _ in named_wheels(robot.inputs)])
+        # Thrusters and wheels that are no joints, by the Pinocchio joint that carries them:
+        # (input, wrench in its frame).
+        carried: dict[int, list[tuple[int, Array]]] = {}
+        identity = np.eye(nv)
+        for item in robot.inputs:
+            at = len(names)
+            kind, unit = item.GROUP, item.UNIT
+            if isinstance(item, BaseTorque | BaseForce):
+                torque = isinstance(item, BaseTorque)
+                rows = ANGULAR if torque else LINEAR
+                names += [f"{kind}.{axis}" for axis in "xyz"]
+                columns += list(identity[rows])
+                if state.axes[0 if torque else 1]:
+                    held.append(Held(slice(at, at + 3), rows))
+            elif isinstance(item, JointTorque):
+                index = robot.joints.index(robot.joint(item.joint))
+                unit = "N" if robot.joints[index].prismatic else unit
+                names.append(f"{kind}.{item.joint}")
+                columns.append(identity[6 + index])
+            elif isinstance(item, ReactionWheel) and item.inertia:
+                names.append(next(wheel_names))
+                columns.append(identity[6 + robot.joint_names.index(names[-1])])
+            else:
+                assert isinstance(item, WrenchInput)
+                wheel = isinstance(item, ReactionWheel)
+                own = getattr(item, "name", None) or f"{item.KEY}_{1 + kinds.count(kind)}"
+                names.append(next(wheel_names) if wheel else own)
+                joint, wrench = _carried(robot, item)
+                carried.setdefault(joint, []).append((at, wrench))
+                columns.append(np.zeros(nv))
+            units += [unit] * (len(names) - at)
+            kinds += [kind] * (len(names) - at)
+        twice = [name for index, name in enumerate(names) if name in names[:index]]
+        if twice:
+            raise InputError(f"two inputs are named '{twice[0]}'; give one of them another name")
+        self.names, self.units = tuple(names), tuple(units)
+        self.groups = {
+            kind: np.flatnonzero([kind == other for other in kinds])
+            for kind in dict.fromkeys(kinds)
+        }
+        self.held = tuple(held)
+        self._fixed = np.column_stack(columns) if columns else np.zeros((nv, 0))
+        self.default = self._fixed.shape == (nv, nv) and bool((self._fixed == identity).all())
+        self._carried = [
+            (joint, np.array([at for at, _ in items]), np.column_stack([w for _, w in items]))
+            for joint, items in carried.items()
+        ]
+        self._of_carried = [at for items in carried.values() for at, _ in items]
+
+    @property
+    def fixed(self) -> Array:
+        """Generalised force (6 + n, nu) of the inputs that the configuration does not change."""
+        return self._fixed
+
+    @property
+    def wrench_columns(self) -> list[tuple[int, NDArray[np.intp], Array]]:
+        """By joint: the inputs that it carries, and their wrenches (6, ..) in its frame."""
+        return self._carried
+
+    @property
+    def carried(self) -> bool:
+        """Whether an input's column depends on the configuration."""
+        return bool(self._carried)
+
+    def columns(self, data: pin.Data, q: Array) -> Array:
+        """Return the generalised force (6 + n, nu), in base axes, of a unit of each input.
+
+        Inputs that are held in reference axes are counted as if they were held in base axes.
+        """
+        if not self._carried:
+            return self._fixed
+        columns = self._fixed.copy()
+        pin.computeJointJacobians(self._model, data, q)
+        forces = [
+            pin.getJointJacobian(self._model, data, joint, _LOCAL).T.dot(wrenches)
+            for joint, _, wrenches in self._carried
+        ]
+        columns[:, self._of_carried] = self._state.forces(np.concatenate(forces, axis=1))
+        return columns
+
+    def in_base_axes(self, chart: Chart, u: Array) -> Array:
+        """Return u (.., nu) with what is held in reference axes in base axes."""
+        if not self.held:
+            return u
+        u = u.copy()
+        for held in self.held:
+            u[..., held.columns] = (chart.R.mT @ u[..., held.columns, None])[..., 0]
+        return u
+
+    def wrenches(self, u: Array) -> pin.StdVec_Force | None:
+        """Return the wrench of thrusters and wheels on every joint, in its frame, if there is any.
+
+        It is constant there. Wheels that are joints, and stored momentum, have no part in it.
+        """
+        if not self._carried:
+            return None
+        external = pin.StdVec_Force(self._model.njoints, pin.Force.Zero())
+        for joint, inputs, wrenches in self._carried:
+            external[joint] = pin.Force(wrenches.dot(u.take(inputs)))
+        return external
+
+    def torques(self, u: Array) -> Array:
+        """Return the generalised forces (6 + n,) in base axes of all but those `wrenches`."""
+        return self._fixed @ u
+
+
+def _carried(robot: Robot, item: WrenchInput) -> tuple[int, Array]:
+    """Return the joint that carries an input and its wrench (6,) per unit in that joint's frame."""
+    joint, placement = ROOT, pin.SE3.Identity()
+    if item.frame is not None:
+        joint, placement = find_frame(robot.model, item.frame)
+    return joint, np.array(placement.act(pin.Force(item.wrench)).vector)

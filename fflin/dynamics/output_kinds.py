@@ -1,0 +1,274 @@
+"""What each kind of output measures: its value, and its exact derivatives.
+
+Two routes that share nothing: the derivatives, with respect to q, v and dv/dt, come of Pinocchio's
+and make C and D; the values come out of elementary kinematics in the world and check them.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.robot.outputs import (
+    Accelerometer,
+    CenterOfMass,
+    FramePose,
+    FrameVelocity,
+    Gyroscope,
+    Momentum,
+    Output,
+    RelativePose,
+)
+
+# Rows of Pinocchio's spatial vectors, and of the base in its v.
+LINEAR, ANGULAR = slice(0, 3), slice(3, 6)
+
+_LOCAL = pin.ReferenceFrame.LOCAL
+
+
+class Sensed(NamedTuple):
+    """Outputs and their derivatives at a point.
+
+    Attributes
+    ----------
+    y : ndarray (ny,)
+        The outputs; zero where they are states.
+    by_q, by_v, by_a : ndarray (ny, nv)
+        Derivatives with respect to the tangent of q that pin.integrate moves along, v and a;
+        rows of states are zero. None for by_a where no output depends on a.
+    """
+
+    y: Array
+    by_q: Array
+    by_v: Array
+    by_a: Array | None
+
+    def part(self, rows: slice) -> "Sensed":
+        """Return views of the rows of one output."""
+        y, by_q, by_v, by_a = self
+        return Sensed(y[rows], by_q[rows], by_v[rows], None if by_a is None else by_a[rows])
+
+
+class Point(NamedTuple):
+    """The robot with its base at the origin, and what was left out of it.
+
+    Attributes
+    ----------
+    q, v : ndarray (nq,), (nv,)
+        Configuration with the base at the world's origin in its axes, and velocity without the
+        linear one of the base.
+    R, r_b : ndarray (3, 3), (3,)
+        Rotation and position of the base relative to the reference.
+    v_b, g : ndarray (3,)
+        Velocity of the base's origin and gravity, in base axes.
+    stored : tuple of (int, ndarray (3,))
+        Momentum of wheels that are no joints: the joint that carries it, and it in its axes.
+    """
+
+    model: pin.Model
+    data: pin.Data
+    q: Array
+    v: Array
+    R: Array
+    r_b: Array
+    v_b: Array
+    g: Array
+    stored: tuple[tuple[int, Array], ...] = ()
+
+
+class Carried(NamedTuple):
+    """Where a frame is: the joint that carries it, and its placement on that joint."""
+
+    joint: int
+    placement: pin.SE3
+
+
+class World(NamedTuple):
+    """The robot where it is, after Pinocchio's forward kinematics of second order.
+
+    Attributes
+    ----------
+    reference : pin.SE3
+        What positions and axes are relative to.
+    gravity : ndarray (3,)
+    stored : tuple of (int, ndarray (3,))
+        As in `Point`.
+    """
+
+    model: pin.Model
+    data: pin.Data
+    reference: pin.SE3
+    gravity: Array
+    stored: tuple[tuple[int, Array], ...]
+
+    def placement(self, frame: Carried) -> pin.SE3:
+        """Return where a frame is in the world."""
+        return self.data.oMi[frame.joint] * frame.placement
+
+    def velocity(self, frame: Carried) -> pin.Motion:
+        """Return the twist of a frame in its own axes."""
+        return frame.placement.actInv(self.data.v[frame.joint])
+
+
+# Those of the whole robot call all of Pinocchio's that they need; those of frames expect its
+# computeForwardKinematicsDerivatives.
+Slopes: TypeAlias = Callable[[Point, Sequence[Carried], Sensed], None]
+
+# The last argument has the attitudes of the frames at the point of linearisation.
+Value: TypeAlias = Callable[[World, Sequence[Carried], Sequence[Array]], Array]
+
+
+def _center_of_mass_slopes(at: Point, _: Sequence[Carried], to: Sensed) -> None:
+    jacobian = pin.jacobianCenterOfMass(at.model, at.data, at.q, False)
+    to.y[:] = at.r_b + at.R.dot(at.data.com[0])
+    to.by_q[:] = at.R.dot(jacobian)
+
+
+def _center_of_mass(world: World, *_: object) -> Array:
+    return np.asarray(world.reference.actInv(_center(world)))
+
+
+def _center(world: World) -> Array:
+    model, data = world.model, world.data
+    bodies = [(model.inertias[i], data.oMi[i]) for i in range(1, model.njoints)]
+    moments = [inertia.mass * placement.act(inertia.lever) for inertia, placement in bodies]
+    return np.asarray(sum(moments) / sum(inertia.mass for inertia, _ in bodies))
+
+
+def _momentum_slopes(at: Point, _: Sequence[Carried], to: Sensed) -> None:
+    # Its rate, which this differentiates too, is of no interest: any acceleration will do.
+    by_q, _, _, by_v = pin.computeCentroidalDynamicsDerivatives(at.model, at.data, at.q, at.v, at.v)
+    mass, still = pin.computeTotalMass(at.model), at.data.hg
+    to.y[:3] = at.R.dot(still.angular)
+    to.y[3:] = at.R.dot(still.linear + mass * at.v_b)
+    for part, rows in (slice(0, 3), ANGULAR), (slice(3, 6), LINEAR):
+        to.by_q[part] = at.R.dot(by_q[rows])
+        to.by_v[part] = at.R.dot(by_v[rows])
+    to.by_q[3:, ANGULAR] -= at.R.dot(skew(mass * at.v_b))
+    for joint, stored in at.stored:
+        jacobian = pin.getJointJacobian(at.model, at.data, joint, _LOCAL)
+        R = at.R.dot(at.data.oMi[joint].rotation)
+        to.y[:3] += R.dot(stored)
+        to.by_q[:3] -= R.dot(skew(stored)).dot(jacobian[ANGULAR])
+
+
+def _momentum(world: World, *_: object) -> Array:
+    model, data, turned = world.model, world.data, world.reference.rotation.T
+    momenta = [data.oMi[i].act(model.inertias[i] * data.v[i]) for i in range(1, model.njoints)]
+    linear = sum(h.linear for h in momenta)
+    angular = sum(h.angular for h in momenta) - np.cross(_center(world), linear)
+    for joint, stored in world.stored:
+        angular += data.oMi[joint].rotation @ stored
+    return np.concatenate((turned @ angular, turned @ linear))
+
+
+def _frame_pose_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> None:
+    (frame,) = frames
+    placement = at.data.oMi[frame.joint] * frame.placement
+    _, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
+    to.y[:3] = at.r_b + at.R.dot(placement.translation)
+    to.by_q[:3] = at.R.dot(placement.rotation).dot(jacobian[LINEAR])
+    to.by_q[3:] = jacobian[ANGULAR]
+
+
+def _frame_pose(world: World, frames: Sequence[Carried], before: Sequence[Array]) -> Array:
+    placement = world.placement(frames[0])
+    turned = pin.log3(before[0].T @ placement.rotation)
+    return np.concatenate((world.reference.actInv(placement.translation), turned))
+
+
+def _frame_velocity_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> None:
+    (frame,) = frames
+    by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
+    velocity = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL)
+    R = at.R.dot((at.data.oMi[frame.joint] * frame.placement).rotation)
+    to.y[:3] = velocity.angular
+    to.by_q[:3] = by_q[ANGULAR]
+    to.by_v[:3] = jacobian[ANGULAR]
+    # A velocity held in axes that turn turns with them: the frame's, and the base's.
+    to.y[3:] = R.dot(velocity.linear) + at.R.dot(at.v_b)
+    to.by_q[3:] = R.dot(by_q[LINEAR] - skew(velocity.linear).dot(jacobian[ANGULAR]))
+    to.by_q[3:, ANGULAR] -= at.R.dot(skew(at.v_b))
+    to.by_v[3:] = R.dot(jacobian[LINEAR])
+
+
+def _frame_velocity(world: World, frames: Sequence[Carried], _: Sequence[Array]) -> Array:
+    velocity = world.velocity(frames[0])
+    R = world.reference.rotation.T @ world.placement(frames[0]).rotation
+    return np.concatenate((velocity.angular, R @ velocity.linear))
+
+
+def _relative_pose_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> None:
+    (place, other), (jacobian, seeing) = zip(
+        *(
+            (
+                at.data.oMi[frame.joint] * frame.placement,
+                pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)[1],
+            )
+            for frame in frames
+        ),
+        strict=True,
+    )
+    relative = other.actInv(place)
+    R, p = relative.rotation, relative.translation
+    to.y[:3] = p
+    to.by_q[:3] = R.dot(jacobian[LINEAR]) - seeing[LINEAR] + skew(p).dot(seeing[ANGULAR])
+    to.by_q[3:] = jacobian[ANGULAR] - R.T.dot(seeing[ANGULAR])
+    to.by_q[:, :6] = 0.0  # the base carries both
+
+
+def _relative_pose(world: World, frames: Sequence[Carried], before: Sequence[Array]) -> Array:
+    place, other = (world.placement(frame) for frame in frames)
+    turned = pin.log3((before[1].T @ before[0]).T @ other.rotation.T @ place.rotation)
+    seen = other.rotation.T @ (place.translation - other.translation)
+    return np.concatenate((seen, turned))
+
+
+def _gyroscope_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> None:
+    (frame,) = frames
+    by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
+    to.y[:] = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL).angular
+    to.by_q[:] = by_q[ANGULAR]
+    to.by_v[:] = jacobian[ANGULAR]
+
+
+def _gyroscope(world: World, frames: Sequence[Carried], _: Sequence[Array]) -> Array:
+    return np.asarray(world.velocity(frames[0]).angular)
+
+
+def _accelerometer_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> None:
+    # Pinocchio was given dv_b/dt + omega_b x v_b - g, in base axes, for the base's acceleration.
+    (frame,) = frames
+    _, by_q, by_v, by_a = pin.getPointClassicAccelerationDerivatives(
+        at.model, at.data, *frame, _LOCAL
+    )
+    to.y[:] = pin.getFrameClassicalAcceleration(at.model, at.data, *frame, _LOCAL).linear
+    assert to.by_a is not None
+    to.by_q[:], to.by_v[:], to.by_a[:] = by_q, by_v, by_a
+    # The terms of that sum; gravity turns against the base.
+    of_base = by_a[:, LINEAR]
+    to.by_q[:, ANGULAR] -= of_base.dot(skew(at.g))
+    to.by_v[:, ANGULAR] -= of_base.dot(skew(at.v_b))
+
+
+def _accelerometer(world: World, frames: Sequence[Carried], _: Sequence[Array]) -> Array:
+    (frame,) = frames
+    velocity = world.velocity(frame)
+    rate = frame.placement.actInv(world.data.a[frame.joint]).linear
+    felt = rate + np.cross(velocity.angular, velocity.linear)
+    return np.asarray(felt - world.placement(frame).rotation.T @ world.gravity)
+
+
+# What is not here is made of states.
+KINDS: dict[type[Output], tuple[Slopes, Value]] = {
+    CenterOfMass: (_center_of_mass_slopes, _center_of_mass),
+    Momentum: (_momentum_slopes, _momentum),
+    FramePose: (_frame_pose_slopes, _frame_pose),
+    FrameVelocity: (_frame_velocity_slopes, _frame_velocity),
+    RelativePose: (_relative_pose_slopes, _relative_pose),
+    Gyroscope: (_gyroscope_slopes, _gyroscope),
+    Accelerometer: (_accelerometer_slopes, _accelerometer),
+}

@@ -1,0 +1,178 @@
+"""The accelerations at a point and their slopes, from CRBA's M and the derivatives of RNEA."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.rotation import rotation_matrix, skew
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.inertia import Inertia
+from fflin.dynamics.state import LINEAR, StateMap
+from fflin.robot.frames import ROOT
+
+# Rows of the angular part of Pinocchio's spatial vectors.
+_TURNING = slice(3, 6)
+
+
+class Rates(NamedTuple):
+    r"""The acceleration of the base origin and the joints, in base axes, and what it depends on.
+
+    Attributes
+    ----------
+    c : ndarray (6 + n,)
+        Without gravity and :math:`\omega \times v_b`.
+    by_q_m : ndarray (6 + n, n)
+    by_nu : ndarray (6 + n, 6 + n)
+        Without the base's linear velocity, on which it does not depend.
+    by_u : ndarray (6 + n, nu)
+        `u` held in base axes.
+    gravity : ndarray (3,)
+        In base axes.
+    """
+
+    c: Array
+    by_q_m: Array
+    by_nu: Array
+    by_u: Array
+    gravity: Array
+
+
+class Gyroscopic(NamedTuple):
+    r"""The torques :math:`-\omega \times h` of stored momentum, and their slopes.
+
+    Attributes
+    ----------
+    wrenches : pin.StdVec_Force
+        On every joint, in its frame.
+    force : ndarray (nv,)
+        What they are as a generalised force.
+    by_q, by_v : ndarray (nv, nv)
+        Its slopes, that over q with the Jacobian held: RNEA's derivatives with the wrenches have
+        the rest.
+    """
+
+    wrenches: pin.StdVec_Force
+    force: Array
+    by_q: Array
+    by_v: Array
+
+
+class Accelerations:
+    r"""``M nudot + b = B u`` of a robot, solved and differentiated in base axes.
+
+    The slopes of :math:`\dot\nu = M^{-1}(B u - b(q, \nu))` are those of RNEA at the acceleration,
+    :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`.
+
+    Parameters
+    ----------
+    state : StateMap
+    actuation : Actuation
+    data : pin.Data
+        Work space, overwritten at each call.
+    """
+
+    def __init__(self, state: StateMap, actuation: Actuation, data: pin.Data) -> None:
+        robot = state.robot
+        self._state, self._actuation, self._data = state, actuation, data
+        self._model, self._nv = robot.model, 6 + robot.n
+        self._inertia = Inertia(state, data)
+        self._passive = robot.passive
+        self._resists = any(values.any() for values in robot.passive)
+        self._joints = np.arange(6, self._nv)
+        self._gravity, self._falls = np.array(robot.gravity), any(robot.gravity)
+        self._root = robot.model.jointPlacements[ROOT].rotation
+        self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
+
+    def invert(self, q: Array, out: Array) -> None:
+        """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
+        self._inertia.invert(q, out, quick=True)
+
+    def rates(self, q: Array, v: Array, nu: Array, q_m: Array, u: Array) -> Rates:
+        """Return the accelerations and their slopes.
+
+        Parameters
+        ----------
+        q, v : ndarray (nq,), (nv,)
+            The point, in Pinocchio's order.
+        nu, q_m : ndarray (6 + n,), (n,)
+            The same velocity in state order and base axes, and the joints' positions.
+        u : ndarray (nu,)
+            Over the inputs, in base axes.
+        """
+        model, data, state = self._model, self._data, self._state
+        # Without the base's position and linear velocity: nothing here depends on them, and
+        # Pinocchio's derivatives lose digits to both. Nor does it depend on gravity, which
+        # accelerates the base origin and nothing against it (equivalence).
+        q_still, v_still = q.copy(), v.copy()
+        q_still[:3] = v_still[:3] = 0.0
+        inverse = np.empty((self._nv, self._nv))
+        self._inertia.invert(q_still, inverse)
+        columns = self._actuation.columns(data, q_still)
+        bias = pin.nonLinearEffects(model, data, q_still, v_still)
+        gyroscopic = self._gyroscopic(q_still, v_still, u) if self._stored else None
+        if gyroscopic:
+            bias = bias - gyroscopic.force
+        force = (u if self._actuation.default else columns.dot(u)) - state.forces(bias)
+        if self._resists:
+            stiffness, damping, rest = self._passive
+            force[6:] -= stiffness * (q_m - rest) + damping * nu[6:]
+        c = inverse.dot(force)
+        by_q, by_v = self._bias_slopes(q_still, v_still, c, u, gyroscopic)
+        negative = -inverse
+        by_nu = negative.dot(by_v)
+        by_nu[:, LINEAR] = 0.0
+        by_u = inverse if self._actuation.default else inverse.dot(columns)
+        gravity = self._gravity
+        if self._falls:
+            gravity = rotation_matrix(q[3:7]).T @ (self._root.T @ gravity)
+        return Rates(c, negative.dot(by_q), by_nu, by_u, gravity)
+
+    def _bias_slopes(
+        self, q: Array, v: Array, c: Array, u: Array, gyroscopic: Gyroscopic | None
+    ) -> tuple[Array, Array]:
+        """Return the slopes of M a + b - B u + passive forces over q_m (.., n) and nu, a held.
+
+        The wrenches of thrusters are constant in the frames of their links, so that RNEA's
+        derivatives with them hold -d(B u)/dq.
+        """
+        model, data, state = self._model, self._data, self._state
+        wrenches = gyroscopic.wrenches if gyroscopic else self._actuation.wrenches(u)
+        external = () if wrenches is None else (wrenches,)
+        full_q, full_v, _ = pin.computeRNEADerivatives(
+            model, data, q, v, state.spread(c), *external
+        )
+        if gyroscopic:
+            full_q, full_v = full_q - gyroscopic.by_q, full_v - gyroscopic.by_v
+        by_q, by_v = state.project(full_q)[:, 6:], state.project(full_v)
+        if self._resists:
+            by_q[self._joints, self._joints - 6] += self._passive.stiffness
+            by_v[self._joints, self._joints] += self._passive.damping
+        return by_q, by_v
+
+    def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:
+        """Return the torques of stored momentum, their wrenches with those of the inputs.
+
+        With the angular Jacobian J of a link in its own axes, omega = J v, the torque
+        h x omega is the generalised force J^T [h]x J v.
+        """
+        model, data, nv = self._model, self._data, len(v)
+        wrenches = self._actuation.wrenches(u)
+        if wrenches is None:
+            wrenches = pin.StdVec_Force(model.njoints, pin.Force.Zero())
+        force, by_q, by_v = np.zeros(nv), np.zeros((nv, nv)), np.zeros((nv, nv))
+        pin.computeForwardKinematicsDerivatives(model, data, q, v, np.zeros(nv))
+        for joint, momentum in self._stored:
+            turned, jacobian = (
+                part[_TURNING]
+                for part in pin.getJointVelocityDerivatives(
+                    model, data, joint, pin.ReferenceFrame.LOCAL
+                )
+            )
+            torque = momentum @ data.v[joint].angular
+            wrenches[joint] += pin.Force(np.zeros(3), torque)
+            force += jacobian.T @ torque
+            by_q += jacobian.T @ momentum @ turned
+            by_v += jacobian.T @ momentum @ jacobian
+        return Gyroscopic(wrenches, force, by_q, by_v)

@@ -1,0 +1,342 @@
+"""The state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, names, frames and chart."""
+
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import ChartError, InputError
+from fflin.base.rotation import conjugate, quaternion_product, rotation_matrix
+from fflin.base.validation import Array, placement, vector
+from fflin.dynamics.chart import SMALLEST_Q0, Chart
+from fflin.robot.robot import ROOT, Robot
+
+Frame = Literal["hybrid", "local", "world"]
+
+# Which base velocities (omega_b, v_b), and wrenches (tau_b, F_b) with them, stand in the axes
+# of the reference instead of the base's.
+_IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
+    "hybrid": (False, True),
+    "local": (False, False),
+    "world": (True, True),
+}
+
+# Rows of the base's angular and linear part in any (6 + n) velocity or wrench of state order.
+ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
+
+
+def unknown_frame(frame: object) -> InputError:
+    """Build the error for what is no frame of velocities."""
+    return InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
+
+
+class Groups(NamedTuple):
+    """Slices of the six groups of the state."""
+
+    q_b: slice
+    r_b: slice
+    q_m: slice
+    omega_b: slice
+    v_b: slice
+    qdot_m: slice
+
+
+class StateMap:
+    r"""Map between Pinocchio's (q, v) and the state of the linear model.
+
+    The state is :math:`X = (q_b, r_b, q_m, \omega_b, v_b, \dot q_m)` of dimension 12 + 2n:
+    with :math:`{}^{ref}M_b = {}^oM_{ref}^{-1}\,{}^oM_b`, q_b is the vector part of its quaternion,
+    taken so that the scalar part is not negative, and r_b its translation.
+
+    Parameters
+    ----------
+    robot : Robot
+    reference : pin.SE3, optional
+        Placement oMref that the attitude and position are relative to; identity by default.
+    frame : {"hybrid", "local", "world"}
+        Axes of the velocities. hybrid: omega_b in base axes, v_b = d r_b/dt in reference axes.
+        local: both in base axes. world: both in reference axes. All at the base origin.
+
+    Attributes
+    ----------
+    nx : int
+        12 + 2n.
+    names, units : tuple of str
+        Of the nx states.
+    groups : Groups
+        Slices of q_b, r_b, q_m, omega_b, v_b, qdot_m in the state.
+    axes : tuple of bool
+        Whether (omega_b, v_b) stand in reference axes.
+    S : ndarray (nv, 6 + n) or None
+        With v = S nu, where joints mimic others; None where v is nu in another order.
+
+    Raises
+    ------
+    InputError
+        If the frame is unknown or the reference is not a pin.SE3.
+    ModelError
+        If the robot's model was changed after it was made.
+    """
+
+    def __repr__(self) -> str:
+        return f"StateMap('{self.robot.name}', nx={self.nx}, frame='{self.frame}')"
+
+    def __init__(
+        self, robot: Robot, *, reference: pin.SE3 | None = None, frame: Frame = "hybrid"
+    ) -> None:
+        if not isinstance(robot, Robot):
+            raise InputError(
+                f"robot is a {type(robot).__name__}, expected a fflin.Robot; fflin.load makes one"
+            )
+        if not isinstance(frame, str) or frame not in get_args(Frame):
+            raise unknown_frame(frame)
+        robot.require_unchanged()
+        n = robot.n
+        self.robot = robot
+        self.frame: Frame = frame
+        self.axes = _IN_REFERENCE_AXES[frame]
+        self.nx = 12 + 2 * n
+        self.groups = Groups(
+            slice(0, 3),
+            slice(3, 6),
+            slice(6, 6 + n),
+            slice(6 + n, 9 + n),
+            slice(9 + n, 12 + n),
+            slice(12 + n, 12 + 2 * n),
+        )
+        joints = robot.joints
+        length = ["m" if joint.prismatic else "rad" for joint in joints]
+        self.names = (
+            *_named("q_b", "xyz"),
+            *_named("r_b", "xyz"),
+            *_named("q_m", robot.joint_names),
+            *_named("omega_b", "xyz"),
+            *_named("v_b", "xyz"),
+            *_named("qdot_m", robot.joint_names),
+        )
+        self.units = (
+            *("1", "1", "1", "m", "m", "m"),
+            *length,
+            *("rad/s", "rad/s", "rad/s", "m/s", "m/s", "m/s"),
+            *(f"{unit}/s" for unit in length),
+        )
+        # Index in Pinocchio's v of each velocity of the state, and in a flat (nv, nv) array.
+        self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
+        self._flat = self._order[:, None] * robot.nv + self._order
+        # v = S nu; where no joint mimics another S is the permutation above.
+        self.S: Array | None = None
+        if robot.followers:
+            self.S = np.column_stack([self.spread(e) for e in np.eye(6 + n)])
+        self._idx_q = np.array([joint.idx_q for joint in joints], dtype=np.intp)
+        self._unbounded = np.flatnonzero([joint.unbounded for joint in joints])
+        self._cos = self._idx_q[self._unbounded]
+        self._sin = self._cos + 1
+        # The free-flyer joint may itself stand somewhere in the world.
+        oMref = pin.SE3.Identity() if reference is None else placement("reference", reference)
+        self._reference = oMref
+        # Composed as quaternions: their entries survive to the last digit near a turn of pi.
+        offset = pin.SE3ToXYZQUAT(oMref.actInv(robot.model.jointPlacements[ROOT]))
+        self._position, self._quaternion = offset[:3], offset[3:]
+        self._rotation = rotation_matrix(self._quaternion)
+        self._aligned = bool((self._rotation == np.eye(3)).all())
+
+    @property
+    def reference(self) -> pin.SE3:
+        """The placement oMref, a copy."""
+        return pin.SE3(self._reference)
+
+    @property
+    def origin_quaternion(self) -> Array:
+        """Attitude (4,) of `origin`."""
+        return self._quaternion
+
+    @property
+    def origin(self) -> pin.SE3:
+        """Where the base is, seen from the reference, at q[:7] = 0, 0, 0, 0, 0, 0, 1."""
+        return pin.XYZQUATToSE3(np.concatenate((self._position, self._quaternion)))
+
+    def chart(self, q: Array) -> Chart:
+        """Return the attitude chart at a configuration.
+
+        Parameters
+        ----------
+        q : ndarray (nq,)
+            A valid configuration.
+
+        Raises
+        ------
+        ChartError
+            If the base is turned by pi from the reference.
+        """
+        quaternion = quaternion_product(self._quaternion, q[3:7])
+        if quaternion[3] < 0.0:
+            quaternion = -quaternion
+        q0 = float(quaternion[3])
+        if q0 < SMALLEST_Q0:
+            raise ChartError(
+                "the base is turned by 180 deg from the reference, where the attitude chart "
+                "(quaternion vector part) is singular; give a reference nearer to the base"
+            )
+        return Chart(quaternion[:3], q0, rotation_matrix(quaternion))
+
+    def rotation(self, q: Array) -> Array:
+        """Return refMb.rotation (3, 3) at a valid configuration, at any turn."""
+        turned: Array = pin.XYZQUATToSE3(q[:7]).rotation
+        return turned if self._aligned else self._rotation.dot(turned)
+
+    def scalar(self, q: Array) -> float:
+        """Return q0 at a valid configuration, with the sign of the quaternion in q."""
+        return float(quaternion_product(self._quaternion, q[3:7])[3])
+
+    def to_state(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
+        """Convert a Pinocchio configuration and velocity to a state.
+
+        Parameters
+        ----------
+        q : array_like (nq,)
+            Configuration.
+        v : array_like (nv,)
+            Velocity in Pinocchio's order: base linear and angular in base axes, then joints.
+        near : array_like (nx,), optional
+            A state; the angle of each continuous joint is taken on the turn nearest to it.
+            By default it lies in (-pi, pi].
+
+        Returns
+        -------
+        ndarray (nx,)
+
+        Raises
+        ------
+        ChartError
+            If the base is turned by pi from the reference.
+        InputError
+            If a size is wrong or an entry is not finite.
+        """
+        q = self.robot.checked_configuration(q)
+        v = self.robot.checked_velocity(v)
+        if near is not None:
+            near = vector("near", near, self.nx, "a state (12 + 2n)")
+        return self.read(q, v, near=near)
+
+    def read(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
+        """Do as `to_state` for arguments that are valid."""
+        chart = self.chart(q)
+        x = np.empty(self.nx)
+        g = self.groups
+        x[g.q_b] = chart.q_b
+        x[g.r_b] = self.positions(q)
+        x[g.q_m] = self.joint_positions(q)
+        if near is not None:
+            self._unwrap(x, near)
+        nu = self.velocities(v)
+        self.to_frame(chart, nu)
+        x[6 + self.robot.n :] = nu
+        return x
+
+    def to_pinocchio(self, x: Array) -> tuple[Array, Array]:
+        """Convert a state to a Pinocchio configuration and velocity.
+
+        Parameters
+        ----------
+        x : array_like (nx,)
+
+        Returns
+        -------
+        q : ndarray (nq,)
+        v : ndarray (nv,)
+
+        Raises
+        ------
+        ChartError
+            If q_b is as long as 1 or longer: a turn of pi and no attitude beyond it.
+        InputError
+            If the size is wrong or an entry is not finite.
+        """
+        x = vector("x", x, self.nx, "a state (12 + 2n)")
+        g = self.groups
+        q_b = x[g.q_b]
+        square = 1.0 - float(q_b @ q_b)
+        if square < SMALLEST_Q0**2:
+            raise ChartError(
+                f"|q_b| is {np.sqrt(1.0 - square):.9g}, expected less than 1: at 1 the base is "
+                "turned by 180 deg from the reference, where the attitude chart is singular"
+            )
+        relative = np.array((*q_b, np.sqrt(square)))
+        q = np.empty(self.robot.nq)
+        q[:3] = self._rotation.T @ (x[g.r_b] - self._position)
+        q[3:7] = quaternion_product(conjugate(self._quaternion), relative)
+        angles = x[g.q_m]
+        q[self._idx_q] = angles
+        q[self._cos] = np.cos(angles[self._unbounded])
+        q[self._sin] = np.sin(angles[self._unbounded])
+        self.robot.follow(q)
+        nu = x[6 + self.robot.n :].copy()
+        self.to_base(Chart(q_b, float(relative[3]), rotation_matrix(relative)), nu)
+        return q, self.spread(nu)
+
+    def velocities(self, v: Array) -> Array:
+        """Return (omega_b, v_b, qdot_m) (.., 6 + n) in base axes of Pinocchio's v (.., nv)."""
+        return v.take(self._order, axis=-1)
+
+    def spread(self, nu: Array) -> Array:
+        """Return Pinocchio's v (nv,) of (omega_b, v_b, qdot_m) in base axes: v = S nu."""
+        v = np.empty(self.robot.nv)
+        v[self._order] = nu
+        for joint, leader, multiplier, _ in self.robot.followers:
+            v[joint.idx_v] = multiplier * v[leader.idx_v]
+        return v
+
+    def lift(self, forces: Array) -> Array:
+        """Return a tau (nv, ...) whose generalised forces (6 + n, ...) in base axes are given."""
+        tau = np.zeros((self.robot.nv, *forces.shape[1:]))
+        tau[self._order] = forces
+        return tau
+
+    def forces(self, tau: Array) -> Array:
+        """Return the generalised forces (6 + n, ...) in base axes of tau (nv, ...): S^T tau."""
+        return tau.take(self._order, axis=0) if self.S is None else self.S.T @ tau
+
+    def columns(self, matrix: Array) -> Array:
+        """Take the columns (..., nv) over Pinocchio's v to state order: matrix S."""
+        return matrix.take(self._order, axis=1) if self.S is None else matrix @ self.S
+
+    def project(self, matrix: Array, out: Array | None = None) -> Array:
+        """Take a matrix (nv, nv) over Pinocchio's v to state order: S^T matrix S."""
+        if self.S is not None:
+            return np.matmul(self.S.T @ matrix, self.S, out=out)
+        # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
+        return matrix.take(self._flat, out=out, mode="clip")
+
+    def to_frame(self, chart: Chart, vectors: Array) -> None:
+        """Turn velocities or wrenches (6 + n, ...) in place from base axes to the frame's."""
+        for rows, turned in zip((ANGULAR, LINEAR), self.axes, strict=True):
+            if turned:
+                vectors[rows] = chart.R @ vectors[rows]
+
+    def to_base(self, chart: Chart, vectors: Array) -> None:
+        """Turn velocities or wrenches (6 + n, ...) in place from the frame's axes to the base's."""
+        for rows, turned in zip((ANGULAR, LINEAR), self.axes, strict=True):
+            if turned:
+                vectors[rows] = chart.R.T @ vectors[rows]
+
+    def joint_positions(self, q: Array) -> Array:
+        """Return q_m (.., n), one angle or length a joint, of valid configurations (.., nq)."""
+        angles = q.take(self._idx_q, axis=-1)
+        if self._cos.size:
+            sines, cosines = q.take(self._sin, axis=-1), q.take(self._cos, axis=-1)
+            angles[..., self._unbounded] = np.arctan2(sines, cosines)
+        return angles
+
+    def positions(self, q: Array) -> Array:
+        """Return r_b (.., 3) at valid configurations (.., nq)."""
+        return self._position + q[..., :3] @ self._rotation.T
+
+    def _unwrap(self, x: Array, near: Array) -> None:
+        if not self._unbounded.size:
+            return
+        index = 6 + self._unbounded
+        x[index] += 2.0 * np.pi * np.round((near[index] - x[index]) / (2.0 * np.pi))
+
+
+def _named(group: str, members: str | tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(f"{group}.{member}" for member in members)

@@ -1,0 +1,163 @@
+"""Accelerations and their slopes at many points, by the compiled kernel."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.kernel.compiled import kernel
+from fflin.kernel.tree import LANES, Tree, batch_tree
+from fflin.robot.frames import ROOT
+from fflin.robot.robot import Robot
+
+
+class Layout(NamedTuple):
+    """Where the parts of the kernel's work space begin, beyond those of the tree; its size."""
+
+    motion: int
+    load: int
+    bias: int
+    c: int
+    columns: int
+    lower: int
+    held: int
+    size: int
+
+
+class Loads(NamedTuple):
+    """What acts on the bodies and joints of a robot.
+
+    Attributes
+    ----------
+    body, wrench, input : ndarray (k,), (k, 6), (k,)
+        Of every input that is carried: its body, the moment and force of a unit about the joint's
+        origin, in the body's axes, and its number.
+    stored_body, stored : ndarray (s,), (s, 3)
+        Angular momentum that bodies store, in their axes.
+    stiffness, damping : ndarray (n,)
+    """
+
+    body: Any
+    wrench: Any
+    input: Any
+    stored_body: Any
+    stored: Any
+    stiffness: Any
+    damping: Any
+
+
+class Points(NamedTuple):
+    """What the kernel reads of every point, each with a row for it.
+
+    Attributes
+    ----------
+    q : ndarray (N, nq)
+        Configurations.
+    nu : ndarray (N, 6 + n)
+        Velocities in state order and base axes.
+    forces : ndarray (N, 6 + n)
+        Those of inputs that are fixed to base and joints, of springs and of dampers.
+    u : ndarray (N, nu)
+        Inputs.
+    """
+
+    q: Array
+    nu: Array
+    forces: Array
+    u: Array
+
+
+class Rates(NamedTuple):
+    """What the kernel writes of every point, each with a row for it; all in base axes.
+
+    Attributes
+    ----------
+    inverse : ndarray (N, 6 + n, 6 + n)
+        M^-1.
+    c : ndarray (N, 6 + n)
+        Acceleration of the base origin and the joints, without gravity and omega x v_b.
+    A : ndarray (N, ..)
+        Its last entries are the slopes of c, the lower half of A (6 + n, 12 + 2 n).
+    columns : ndarray (N, (6 + n) k)
+        Generalised force of a unit of each of the k inputs that are carried.
+    couplings : ndarray (N,)
+        Sums of M_ii (M^-1)_ii, which tell how singular M is.
+    """
+
+    inverse: Array
+    c: Array
+    A: Array
+    columns: Array
+    couplings: Array
+
+
+class BatchRates:
+    """The accelerations of a robot and their slopes, at eight points at a time.
+
+    Parameters
+    ----------
+    state : StateMap
+    actuation : Actuation
+
+    Raises
+    ------
+    ValueError
+        If the robot has a joint that the kernel does not know; see `batch_tree`.
+    """
+
+    def __init__(self, state: StateMap, actuation: Actuation) -> None:
+        robot = state.robot
+        tree = batch_tree(robot)
+        if tree is None:
+            raise ValueError(f"'{robot.name}' has a joint that is not a screw about a fixed axis")
+        self._tree, self._loads = tree, _loads(robot, actuation, tree)
+        self.carried = self._loads.input
+        self._layout = _layout(tree, len(self.carried))
+
+    def evaluate(self, points: Points, out: Rates) -> None:
+        """Write the rates of all points, of which there are as many as lanes at least."""
+        space = np.empty(self._layout.size + LANES)
+        # Its vectors are 64 bytes; where they begin at such an address it is faster.
+        space = space[-(space.ctypes.data // 8) % LANES :]
+        flat = out._replace(inverse=out.inverse.reshape(len(points.q), -1))
+        kernel("linearise", "linearise")(
+            self._tree, self._layout, self._loads, tuple(points), tuple(flat), space
+        )
+
+
+def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
+    body: list[int] = []
+    inputs: list[int] = []
+    wrenches: list[Array] = []
+    for joint, numbers, columns in actuation.wrench_columns:
+        turned = tree.axes[joint - ROOT].T
+        for number, column in zip(numbers.tolist(), columns.T, strict=True):
+            body.append(joint - ROOT)
+            inputs.append(number)
+            # Pinocchio has the force first.
+            wrenches.append(np.concatenate((turned @ column[3:], turned @ column[:3])))
+    stored = [(joint - ROOT, momentum) for joint, momentum in robot.stored_momentum]
+    return Loads(
+        np.array(body, dtype=np.intp),
+        np.array(wrenches).reshape(-1, 6),
+        np.array(inputs, dtype=np.intp),
+        np.array([index for index, _ in stored], dtype=np.intp),
+        np.array([tree.axes[index].T @ h for index, h in stored]).reshape(-1, 3),
+        np.array(robot.passive.stiffness),
+        np.array(robot.passive.damping),
+    )
+
+
+def _layout(tree: Tree, carried: int) -> Layout:
+    from fflin.kernel.rnea import LOAD, MOTION
+
+    size, bodies = len(tree.row), len(tree.parent)
+    sizes = (
+        *(bodies * MOTION, bodies * LOAD, size, size, size * carried),
+        *(size * 2 * size, size * 8),
+    )
+    return Layout(*(tree.size + int(x) * LANES for x in np.cumsum([0, *sizes])))

@@ -1,0 +1,228 @@
+"""The joint-space inertia M of eight configurations at once, by composite rigid bodies.
+
+All vectors stand in base axes, so that none is turned from joint to joint; moments are about the
+joints, since about the base origin those of a light tool at the end of a long arm would lose their
+digits. Row i of the packed M holds what is not zero left of the diagonal: the coordinates on the
+path from the base to i, of which those of any coordinate on the path are the beginning.
+
+References
+----------
+R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, sections 6.2 and 6.5.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from fflin.kernel.lanes import floor, gather, load, splat, store
+from fflin.kernel.tree import INERTIA, LANES, PLACE
+from fflin.kernel.vectors import add, add3, get3, put3
+
+
+@numba.njit(forceinline=True)
+def _turned(ax, ay, az, bx, by, bz, cx, cy, cz, x, y, z):
+    """Return the columns a, b, c of a rotation, times the constants x, y, z."""
+    x, y, z = splat(x), splat(y), splat(z)
+    return ax * x + bx * y + cx * z, ay * x + by * y + cy * z, az * x + bz * y + cz * z
+
+
+@numba.njit(forceinline=True)
+def _cosine_and_sine(x):
+    """Return both of |x| < 1e6: taken to one octant in three steps, and there by polynomials.
+
+    The numbers are those of fdlibm (Sun Microsystems, 1993), exact to a unit in the last place.
+    """
+    turns = floor(x * splat(2.0 / np.pi) + splat(0.5))
+    x = x - turns * splat(1.57079632673412561417e00)
+    x = x - turns * splat(6.07710050630396597660e-11)
+    x = x - turns * splat(2.02226624879595063154e-21)
+    z = x * x
+    p = splat(-2.50507602534068634195e-08) + z * splat(1.58969099521155010221e-10)
+    p = splat(2.75573137070700676789e-06) + z * p
+    p = splat(-1.98412698298579493134e-04) + z * p
+    p = splat(8.33333333332248946124e-03) + z * p
+    p = splat(-1.66666666666666324348e-01) + z * p
+    sine = x + x * z * p
+    p = splat(2.08757232129817482790e-09) + z * splat(-1.13596475577881948265e-11)
+    p = splat(-2.75573143513906633035e-07) + z * p
+    p = splat(2.48015872894767294178e-05) + z * p
+    p = splat(-1.38888888888741095749e-03) + z * p
+    p = splat(4.16666666666666019037e-02) + z * p
+    one = splat(1.0)
+    cosine = (one - splat(0.5) * z) + z * z * p
+    # By quarter turns back: (1, 0), (0, 1), (-1, 0), (0, -1).
+    half = floor(turns * splat(0.5))
+    odd = turns - half - half
+    sign = one - splat(2.0) * (half - splat(2.0) * floor(half * splat(0.5)))
+    even, odd = sign * (one - odd), sign * odd
+    return even * cosine - odd * sine, odd * cosine + even * sine
+
+
+@numba.njit(forceinline=True)
+def _place(work, at, parent, fixed, cosine, sine, shift):
+    """Write the place of a body into `work` at `at`, that of its parent being at `parent`."""
+    ax, ay, az = get3(work, parent)
+    bx, by, bz = get3(work, parent + 3 * LANES)
+    cx, cy, cz = get3(work, parent + 6 * LANES)
+    ux, uy, uz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[0], fixed[3], fixed[6])
+    vx, vy, vz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[1], fixed[4], fixed[7])
+    zx, zy, zz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[2], fixed[5], fixed[8])
+    dx, dy, dz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[9], fixed[10], fixed[11])
+    x = cosine * ux + sine * vx, cosine * uy + sine * vy, cosine * uz + sine * vz
+    y = cosine * vx - sine * ux, cosine * vy - sine * uy, cosine * vz - sine * uz
+    put3(work, at, *x)
+    put3(work, at + 3 * LANES, *y)
+    put3(work, at + 6 * LANES, zx, zy, zz)
+    put3(work, at + 9 * LANES, dx + shift * zx, dy + shift * zy, dz + shift * zz)
+
+
+@numba.njit(forceinline=True)
+def _inertia(work, at, place, body):
+    """Write a body's inertia about its joint: m, m c, and R I R^T by way of the columns of R I."""
+    ax, ay, az = get3(work, place)
+    bx, by, bz = get3(work, place + 3 * LANES)
+    cx, cy, cz = get3(work, place + 6 * LANES)
+    hx, hy, hz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[1], body[2], body[3])
+    store(work, at, splat(body[0]))
+    put3(work, at + LANES, hx, hy, hz)
+    ux, uy, uz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[4], body[5], body[6])
+    vx, vy, vz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[5], body[7], body[8])
+    wx, wy, wz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[6], body[8], body[9])
+    xx, xy, xz = (
+        ux * ax + vx * bx + wx * cx,
+        ux * ay + vx * by + wx * cy,
+        ux * az + vx * bz + wx * cz,
+    )
+    yy, yz = uy * ay + vy * by + wy * cy, uy * az + vy * bz + wy * cz
+    zz = uz * az + vz * bz + wz * cz
+    put3(work, at + 4 * LANES, xx, xy, xz)
+    put3(work, at + 7 * LANES, yy, yz, zz)
+
+
+@numba.njit(forceinline=True)
+def _carry(work, at, above, place):
+    """Add a composite inertia, seen from the parent's joint, to the parent's."""
+    m = load(work, at)
+    hx, hy, hz = get3(work, at + LANES)
+    xx, xy, xz = get3(work, at + 4 * LANES)
+    yy, yz, zz = get3(work, at + 7 * LANES)
+    dx, dy, dz = get3(work, place + 9 * LANES)
+    ex, ey, ez = hx + m * dx, hy + m * dy, hz + m * dz
+    px, py, pz = dx * (hx + ex), dy * (hy + ey), dz * (hz + ez)
+    add(work, above, m)
+    add3(work, above + LANES, ex, ey, ez)
+    xx, xy, xz = xx + (py + pz), xy - (dx * ey + hx * dy), xz - (dx * ez + hx * dz)
+    add3(work, above + 4 * LANES, xx, xy, xz)
+    add3(work, above + 7 * LANES, yy + (px + pz), yz - (dy * ez + hy * dz), zz + (px + py))
+
+
+@numba.njit(forceinline=True)
+def momentum(work, at, x, y, z, turns, slides):
+    """Return the momentum (angular, linear) about its joint of an inertia that the joint moves."""
+    m = load(work, at)
+    hx, hy, hz = get3(work, at + LANES)
+    xx, xy, xz = get3(work, at + 4 * LANES)
+    yy, yz, zz = get3(work, at + 7 * LANES)
+    w, v = splat(turns), splat(slides)
+    kx, ky, kz = hy * z - hz * y, hz * x - hx * z, hx * y - hy * x
+    return (
+        w * (xx * x + xy * y + xz * z) + v * kx,
+        w * (xy * x + yy * y + yz * z) + v * ky,
+        w * (xz * x + yz * y + zz * z) + v * kz,
+        v * (m * x) - w * kx,
+        v * (m * y) - w * ky,
+        v * (m * z) - w * kz,
+    )
+
+
+@numba.njit(forceinline=True)
+def outwards(work, tree, q, first, stride):
+    """Write the places of all bodies and their own inertias, outwards."""
+    bodies = len(tree.parent)
+    places, inertias = tree.places, tree.inertias
+    one, zero = splat(1.0), splat(0.0)
+    put3(work, places, one, zero, zero)
+    put3(work, places + 3 * LANES, zero, one, zero)
+    put3(work, places + 6 * LANES, zero, zero, one)
+    _inertia(work, inertias, places, tree.bodies[0])
+    for body in range(1, bodies):
+        at = places + body * PLACE * LANES
+        start = first + tree.index[body]
+        value = gather(q, start, stride)
+        if tree.unbounded[body]:
+            cosine, sine = value, gather(q, start + 1, stride)
+        elif tree.turns[body] != 0.0:
+            cosine, sine = _cosine_and_sine(splat(tree.turns[body]) * value)
+        else:
+            cosine, sine = one, zero
+        shift = splat(tree.slides[body]) * value
+        above = places + tree.parent[body] * PLACE * LANES
+        _place(work, at, above, tree.fixed[body], cosine, sine, shift)
+        _inertia(work, inertias + body * INERTIA * LANES, at, tree.bodies[body])
+
+
+@numba.njit(forceinline=True)
+def inwards(work, tree):
+    """Write the packed M, and turn the inertias into composite ones, inwards."""
+    bodies = len(tree.parent)
+    places, inertias, packed = tree.places, tree.inertias, tree.packed
+    zero = splat(0.0)
+    for index in range(tree.entries):
+        store(work, packed + index * LANES, zero)
+    pair = 0
+    for body in range(bodies - 1, 0, -1):
+        at = inertias + body * INERTIA * LANES
+        place = places + body * PLACE * LANES
+        x, y, z = get3(work, place + 6 * LANES)
+        nx, ny, nz, fx, fy, fz = momentum(work, at, x, y, z, tree.turns[body], tree.slides[body])
+        _carry(work, at, inertias + tree.parent[body] * INERTIA * LANES, place)
+        above = body
+        while above > 0:
+            place = places + above * PLACE * LANES
+            x, y, z = get3(work, place + 6 * LANES)
+            value = splat(tree.turns[above]) * (x * nx + y * ny + z * nz)
+            value = value + splat(tree.slides[above]) * (x * fx + y * fy + z * fz)
+            add(work, packed + tree.target[pair] * LANES, splat(tree.share[pair]) * value)
+            pair += 1
+            # From here on about the joint of the parent.
+            dx, dy, dz = get3(work, place + 9 * LANES)
+            nx = nx + (dy * fz - dz * fy)
+            ny = ny + (dz * fx - dx * fz)
+            nz = nz + (dx * fy - dy * fx)
+            above = tree.parent[above]
+        start, share = packed + tree.target[pair] * LANES, splat(tree.share[pair])
+        pair += 1
+        add3(work, start, share * nx, share * ny, share * nz)
+        add3(work, start + 3 * LANES, share * fx, share * fy, share * fz)
+    # Of the base: I, [m c]x, m, in the rows of a chain of six.
+    m = load(work, inertias)
+    hx, hy, hz = get3(work, inertias + LANES)
+    rows = (
+        load(work, inertias + 4 * LANES),
+        load(work, inertias + 5 * LANES),
+        load(work, inertias + 7 * LANES),
+        load(work, inertias + 6 * LANES),
+        load(work, inertias + 8 * LANES),
+        load(work, inertias + 9 * LANES),
+        zero,
+        hz,
+        zero - hy,
+        m,
+        zero - hz,
+        zero,
+        hx,
+        zero,
+        m,
+        hy,
+        zero - hx,
+        zero,
+        zero,
+        zero,
+        m,
+    )
+    for index in range(21):
+        store(work, packed + index * LANES, rows[index])
+    for index in range(len(tree.row)):
+        at = packed + (tree.row[index] + tree.depth[index]) * LANES
+        add(work, at, splat(tree.armature[index]))

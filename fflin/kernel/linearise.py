@@ -1,0 +1,125 @@
+"""M^-1 and the accelerations with their slopes, of eight points at once."""
+
+from __future__ import annotations
+
+import numba
+
+from fflin.kernel.crba import inwards, outwards
+from fflin.kernel.factor import factorise, multiply, unpack
+from fflin.kernel.lanes import gather, load, splat, store
+from fflin.kernel.rnea import accelerate_bodies, collect, load_bodies, move
+from fflin.kernel.slopes import differentiate
+from fflin.kernel.tree import LANES
+
+
+@numba.njit(forceinline=True)
+def solve_accelerations(work, tree, layout, forces, first):
+    """Write c = M^-1 (forces - bias)."""
+    size = len(tree.row)
+    flat, start = forces.reshape(-1), first * size
+    for index in range(size):
+        at = layout.bias + index * LANES
+        store(work, at, gather(flat, start + index, size) - load(work, at))
+    for row in range(size):
+        total = load(work, tree.square + row * size * LANES) * load(work, layout.bias)
+        for index in range(1, size):
+            entry = load(work, tree.square + (row * size + index) * LANES)
+            total = total + entry * load(work, layout.bias + index * LANES)
+        store(work, layout.c + row * LANES, total)
+
+
+@numba.njit(forceinline=True)
+def _load4(work, at):
+    return (
+        load(work, at),
+        load(work, at + LANES),
+        load(work, at + 2 * LANES),
+        load(work, at + 3 * LANES),
+    )
+
+
+@numba.njit(forceinline=True)
+def _subtract4(total, entry, values):
+    return (
+        total[0] - entry * values[0],
+        total[1] - entry * values[1],
+        total[2] - entry * values[2],
+        total[3] - entry * values[3],
+    )
+
+
+@numba.njit(forceinline=True)
+def _store4(work, at, values):
+    for index in range(4):
+        store(work, at + index * LANES, values[index])
+
+
+@numba.njit(forceinline=True)
+def solve_slopes(work, tree, layout):
+    """Turn the slopes, rows of the lower half of A, into -M^-1 slopes, eight columns at a time."""
+    size = len(tree.row)
+    width = 2 * size
+    zero = splat(0.0)
+    none = zero, zero, zero, zero
+    # The first columns, of q_b and r_b, are zeros that need no product.
+    for column in range(width % 8, width, 8):
+        slopes = layout.lower + column * LANES
+        for k in range(size):
+            at, to = slopes + k * width * LANES, layout.held + k * 8 * LANES
+            _store4(work, to, _load4(work, at))
+            _store4(work, to + 4 * LANES, _load4(work, at + 4 * LANES))
+        for row in range(size):
+            left, right = none, none
+            for k in range(size):
+                entry = load(work, tree.square + (row * size + k) * LANES)
+                at = layout.held + k * 8 * LANES
+                left = _subtract4(left, entry, _load4(work, at))
+                right = _subtract4(right, entry, _load4(work, at + 4 * LANES))
+            at = slopes + row * width * LANES
+            _store4(work, at, left)
+            _store4(work, at + 4 * LANES, right)
+
+
+@numba.njit(nogil=True, cache=True, boundscheck=False)
+def linearise(tree, layout, loads, points, out, work):
+    """Write M^-1, c, the lower half of A, and the columns of the carried inputs, of each point.
+
+    Parameters
+    ----------
+    tree : Tree
+    layout : Layout
+    loads : Loads
+    points : tuple of ndarray
+        q (count, nq), nu (count, 6 + n), forces (count, 6 + n), u (count, nu); the forces are
+        those of the inputs that are not carried, and of springs and dampers. As many as there are
+        lanes at least.
+    out : tuple of ndarray
+        M^-1 (count, size * size), c (count, size), lower half of A (count, stride) of which the
+        last size * 2 size entries, columns (count, size * carried), and couplings (count,), the
+        sums of M_ii (M^-1)_ii.
+    work : ndarray
+    """
+    q, nu, forces, u = points
+    inverse, c, A, columns, couplings = out
+    count, stride = q.shape
+    flat = q.reshape(-1)
+    size = len(tree.row)
+    lower = 2 * size * size
+    for block in range(0, count, LANES):
+        # The last are the last there are, some of them for the second time.
+        first = min(block, count - LANES)
+        outwards(work, tree, flat, first * stride, stride)
+        move(work, tree, layout, nu, first)
+        load_bodies(work, tree, layout, loads, u, first)
+        inwards(work, tree)
+        collect(work, tree, layout)
+        factorise(work, tree)
+        multiply(work, tree, couplings, first)
+        solve_accelerations(work, tree, layout, forces, first)
+        accelerate_bodies(work, tree, layout)
+        differentiate(work, tree, layout, loads)
+        solve_slopes(work, tree, layout)
+        unpack(work, tree.square, size * size, inverse, first, 0)
+        unpack(work, layout.c, size, c, first, 0)
+        unpack(work, layout.lower, lower, A, first, A.shape[1] - lower)
+        unpack(work, layout.columns, columns.shape[1], columns, first, 0)

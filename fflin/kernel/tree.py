@@ -1,0 +1,238 @@
+"""A robot's tree as the arrays that the batch kernel reads."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from fflin.base.validation import Array
+from fflin.robot.frames import ROOT
+from fflin.robot.robot import Robot
+
+LANES = 8  # configurations that the kernel does at once
+
+# Doubles of a body's place: x, y, z axes, and where it is from its parent; and of its inertia: m,
+# m c, I (xx xy xz yy yz zz).
+PLACE, INERTIA = 12, 10
+
+
+class Tree(NamedTuple):
+    """Bodies in Pinocchio's order, 0 the base; coordinates in state order, 0 to 5 the base's.
+
+    Attributes
+    ----------
+    parent : ndarray (bodies,)
+        Body that carries each.
+    fixed : ndarray (bodies, 12)
+        Rotation, row by row, and origin of each joint in its parent, z along the joint's axis.
+    index : ndarray (bodies,)
+        Entry of q of each joint: its angle, length or cosine.
+    unbounded : ndarray (bodies,) of bool
+        Whether it is stored as (cos, sin).
+    turns, slides : ndarray (bodies,)
+        Turn and displacement along z for a unit of the joint's coordinate.
+    bodies : ndarray (bodies, 10)
+        Mass, times centre, and inertia about the joint's origin (xx xy xz yy yz zz).
+    axes : ndarray (bodies, 3, 3)
+        Rotation of the frame in which all this stands, z along the joint's axis, in Pinocchio's.
+    coordinate, factor : ndarray (bodies,)
+        The coordinate that moves each, and how far it moves for a unit of it.
+    armature : ndarray (6 + n,)
+        Inertia of rotors, which the diagonal of M has besides.
+    target, share : ndarray (pairs,)
+        For every body, and for every body from it inwards: the entry of the packed M that it adds
+        to, and how often; last, of the base, the first of six entries.
+    row, depth : ndarray (6 + n,)
+        Where a row of the packed M begins, and how many coordinates are before its own.
+    path : ndarray (entries,)
+        The coordinate of every packed entry.
+    common : ndarray (6 + n, 6 + n)
+        How many coordinates two rows have in common.
+    entries, places, inertias, packed, scaled, diagonal, square, size : int
+        Entries of the packed M; where the parts of the work space begin; its size.
+    """
+
+    parent: Any
+    fixed: Any
+    index: Any
+    unbounded: Any
+    turns: Any
+    slides: Any
+    bodies: Any
+    axes: Any
+    coordinate: Any
+    factor: Any
+    armature: Any
+    target: Any
+    share: Any
+    row: Any
+    depth: Any
+    path: Any
+    common: Any
+    entries: int
+    places: int
+    inertias: int
+    packed: int
+    scaled: int
+    diagonal: int
+    square: int
+    size: int
+
+
+# Trees of the robots that are alive, which do not change.
+_TREES: WeakKeyDictionary[Robot, Tree | None] = WeakKeyDictionary()
+
+
+def batch_tree(robot: Robot) -> Tree | None:
+    """Return a robot's tree, or None where a joint is not a screw about a fixed axis."""
+    if robot not in _TREES:
+        _TREES[robot] = _tree(robot)
+    return _TREES[robot]
+
+
+def _tree(robot: Robot) -> Tree | None:
+    model = robot.model
+    places, turns, slides = _screws(model)
+    if places is None:
+        return None
+    bodies = model.njoints - ROOT
+    parent = np.array([max(0, model.parents[ROOT + body] - ROOT) for body in range(bodies)])
+    fixed, inertias = np.zeros((bodies, 12)), np.zeros((bodies, 10))
+    for body in range(bodies):
+        if body:
+            before = places[parent[body]].inverse()
+            placement = before * model.jointPlacements[ROOT + body] * places[body]
+            fixed[body] = np.concatenate((placement.rotation.ravel(), placement.translation))
+        inertia = places[body].actInv(model.inertias[ROOT + body])
+        inertias[body, 0] = inertia.mass
+        inertias[body, 1:4] = inertia.mass * inertia.lever
+        inertias[body, 4:] = inertia.matrix()[3:, 3:][np.triu_indices(3)]
+    coordinate, factor = _coordinates(robot)
+    paths = _paths(6 + robot.n, parent, coordinate)
+    row = np.cumsum([0, *map(len, paths[:-1])])
+    target, share = [], []
+    for body in range(bodies - 1, 0, -1):
+        above = body
+        while above > 0:
+            low, high = sorted((coordinate[body], coordinate[above]))
+            target.append(row[high] + paths[high].index(low))
+            twice = 2.0 if low == high and above != body else 1.0
+            share.append(twice * factor[body] * factor[above])
+            above = parent[above]
+        target.append(row[coordinate[body]])
+        share.append(factor[body])
+    size = 6 + robot.n
+    common = _common(paths)
+    entries = int(sum(map(len, paths)))
+    sizes = (bodies * PLACE, bodies * INERTIA, entries, entries, size, size * size)
+    starts = [int(x) for x in np.cumsum([0, *sizes]) * LANES]
+    joints = model.joints.tolist()[ROOT:]
+    return Tree(
+        parent,
+        fixed,
+        np.array([joint.idx_q for joint in joints]),
+        np.array([joint.nq == 2 for joint in joints]),
+        turns,
+        slides,
+        inertias,
+        np.array([place.rotation for place in places]),
+        np.array(coordinate),
+        np.array(factor),
+        _armature(model, coordinate, factor),
+        np.array(target, dtype=np.intp),
+        np.array(share, dtype=float),
+        row,
+        np.array([len(path) - 1 for path in paths]),
+        np.array([index for path in paths for index in path]),
+        common,
+        entries,
+        *starts,
+    )
+
+
+def _screws(model: pin.Model) -> tuple[list[pin.SE3] | None, Array, Array]:
+    """Return, for every body, the frame whose z is its joint's axis, and what a unit does."""
+    places = [pin.SE3.Identity()]
+    turns, slides = [0.0], [0.0]
+    for joint in model.joints.tolist()[ROOT + 1 :]:
+        data = joint.createData()
+        q = pin.neutral(model)
+        v = np.zeros(model.nv)
+        joint.calc(data, q)
+        subspace = np.asarray(data.S).reshape(6)
+        v[joint.idx_v] = 0.7
+        joint.calc(data, pin.integrate(model, q, v))
+        if not data.M.isApprox(pin.exp6(0.7 * subspace), 1e-12):
+            return None, np.empty(0), np.empty(0)
+        linear, angular = subspace[:3], subspace[3:]
+        turn = float(np.linalg.norm(angular))
+        axis = angular / turn if turn else linear / np.linalg.norm(linear)
+        slide = float(linear @ axis)
+        # A joint off its frame's origin is none that Pinocchio has.
+        if np.abs(linear - slide * axis).max() > 1e-12:
+            return None, np.empty(0), np.empty(0)
+        rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis)
+        places.append(pin.SE3(rotation.normalized().matrix(), np.zeros(3)))
+        turns.append(turn)
+        slides.append(slide)
+    return places, np.array(turns), np.array(slides)
+
+
+def _coordinates(robot: Robot) -> tuple[list[int], list[float]]:
+    """Return the coordinate that moves each body, and how far it moves it for a unit."""
+    at = {joint.idx_v: (6 + index, 1.0) for index, joint in enumerate(robot.joints)}
+    for joint, leader, multiplier, _ in robot.followers:
+        at[joint.idx_v] = (at[leader.idx_v][0], multiplier)
+    moved = [at[joint.idx_v] for joint in robot.model.joints.tolist()[ROOT + 1 :]]
+    return [5, *(index for index, _ in moved)], [1.0, *(factor for _, factor in moved)]
+
+
+def _armature(model: pin.Model, coordinate: list[int], factor: list[float]) -> Array:
+    """Return what the rotors of all joints that move with each coordinate add to M."""
+    of_joints = model.armature
+    armature = np.zeros(1 + max(coordinate))
+    armature[:3], armature[3:6] = of_joints[3:6], of_joints[:3]
+    joints = model.joints.tolist()[ROOT + 1 :]
+    for joint, index, share in zip(joints, coordinate[1:], factor[1:], strict=True):
+        armature[index] += share**2 * of_joints[joint.idx_v]
+    return armature
+
+
+def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
+    """Return, for every coordinate, those that its row of the factor reaches, and itself.
+
+    Each joins the coordinates inwards of all bodies that it moves. Where joints mimic others these
+    need not be on one path, and the factor fills them up to one: the elimination tree of Liu.
+    """
+    reached: list[set[int]] = [set(range(index)) if index < 6 else set() for index in range(size)]
+    for body in range(1, len(parent)):
+        above = body
+        while above > 0:
+            low, high = sorted((coordinate[body], coordinate[above]))
+            if low < high:
+                reached[high].add(low)
+            above = parent[above]
+        reached[coordinate[body]].update(range(6))
+    paths: list[list[int]] = [[] for _ in range(size)]
+    for index in range(size - 1, 0, -1):
+        if reached[index]:
+            nearest = max(reached[index])
+            reached[nearest] |= reached[index] - {nearest}
+    for index in range(size):
+        paths[index] = [*sorted(reached[index]), index]
+    return paths
+
+
+def _common(paths: list[list[int]]) -> NDArray[np.intp]:
+    """Return how many coordinates the paths of any two have in common."""
+    common = np.zeros((len(paths), len(paths)), dtype=np.intp)
+    for index, path in enumerate(paths):
+        if len(path) > 1:
+            # No path of an earlier one has this one in it.
+            common[index, :index] = common[:index, index] = common[path[-2], :index]
+        common[index, index] = len(path)
+    return common

@@ -1,0 +1,5 @@
+"""A, B, C, D about a point or along a motion, and the figures that prove them.
+
+`linearization` assembles, `certificate` and `check` reach the same matrices by other routes.
+Imports `base`, `robot` and `dynamics`.
+"""

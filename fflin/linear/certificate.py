@@ -1,0 +1,249 @@
+"""A second route to A and B, by Pinocchio's ABA derivatives, and how far two routes differ."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.dynamics.aba import Aba
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.chart import Chart
+from fflin.dynamics.inertia import Inertia
+from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.linear.model import Certificate, LinearModel
+from fflin.robot.robot import Robot
+
+# Of terms that drop out exactly: their rounding, 1e-16 of them, is to be far below the tolerance.
+_ROUNDING_SHARE = 1e-3
+
+
+class Block(NamedTuple):
+    """Difference of two routes to one block of A or B.
+
+    Attributes
+    ----------
+    matrix : str
+        "A" or "B".
+    row, column : str
+        Groups of the state or input, such as "omega_b" and "q_m".
+    error : float
+        Largest difference relative to the block.
+    """
+
+    matrix: str
+    row: str
+    column: str
+    error: float
+
+
+def certify(robot: Robot, lin: LinearModel) -> Certificate:
+    """Compute the figures that prove a continuous-time model of this robot."""
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    A, B, _ = aba_route(state, lin.q, lin.v, lin.u0, moving=lin.moving)
+    blocks = compare(state, lin, lin.M, A, B)
+    return Certificate(
+        condition=scaled_condition(lin.M),
+        inertia_residual=inertia_residual(lin.M, inverse_inertia(state, lin)),
+        route_A=max(block.error for block in blocks if block.matrix == "A"),
+        route_B=max(block.error for block in blocks if block.matrix == "B"),
+        f0=float(np.abs(lin.f0).max()),
+    )
+
+
+def scaled_condition(M: Array) -> float:
+    """Condition number of M scaled to a unit diagonal."""
+    scale = 1.0 / np.sqrt(M.diagonal())
+    return float(np.linalg.cond(scale[:, None] * M * scale))
+
+
+def inertia_residual(M: Array, inverse: Array) -> float:
+    """Largest entry of ``M M^-1 - E`` with M scaled to a unit diagonal."""
+    scale = np.sqrt(M.diagonal())
+    residual = M @ inverse - np.eye(len(M))
+    return float(np.abs(residual * scale / scale[:, None]).max())
+
+
+def aba_route(
+    state: StateMap, q: Array, v: Array, u: Array, *, moving: bool = False
+) -> tuple[Array, Array, Array]:
+    r"""Build A and B from the derivatives of ABA.
+
+    They are built in base axes and carried to the frame by the change of coordinates
+    :math:`x_f = T x_l`: :math:`A_f = (T A_l + \dot T) T^{-1}`, :math:`B_f = T B_l`, to which the
+    turning of a force held in reference axes is added.
+
+    Returns
+    -------
+    A : ndarray (nx, nx)
+    B : ndarray (nx, nu)
+    inverse : ndarray (6 + n, 6 + n)
+        M^-1 in base axes as ABA has it, which tells how much its route is worth.
+    """
+    aba = Aba(state)
+    chart, g, nv = state.chart(q), state.groups, 6 + state.robot.n
+    nu, u = state.velocities(v), aba.actuation.in_base_axes(chart, u)
+    # Pinocchio differentiates in world axes at the world's origin, where a distant base costs
+    # digits; nothing depends on where the base is.
+    at_origin = q.copy()
+    at_origin[:3] = 0.0
+    by_q, by_v, by_u = aba.slopes(at_origin, v, u)
+    acceleration = state.velocities(aba.acceleration(at_origin, v, u))
+
+    J, R = chart.J, chart.R
+    A: Array = np.zeros((state.nx, state.nx))
+    B: Array = np.zeros((state.nx, len(u)))
+    w, linear = nu[ANGULAR], nu[LINEAR]
+    A[g.q_b, g.q_b] = -0.5 * (np.outer(w, chart.q_b) / chart.q0 + skew(w))
+    A[g.q_b, g.omega_b] = 0.5 * chart.Q
+    A[g.r_b, g.q_b] = -R @ skew(linear) @ J
+    A[g.r_b, g.v_b] = R
+    A[g.q_m, g.qdot_m] = np.eye(state.robot.n)
+    if moving:
+        # The reference, turning with w, carries the axes of the error with it.
+        A[g.q_b, g.q_b] -= 0.5 * skew(w)
+        A[g.r_b, g.r_b] -= skew(w)
+    A[-nv:, g.q_b] = by_q[:, ANGULAR] @ J
+    A[-nv:, g.r_b] = by_q[:, LINEAR] @ R.T
+    A[-nv:, g.q_m] = by_q[:, 6:]
+    A[-nv:, -nv:] = by_v
+    B[-nv:] = by_u
+
+    T, T_rate = _change_of_coordinates(state, chart, nu, acceleration)
+    B = T @ B
+    A[:] = (T @ A + T_rate) @ np.linalg.inv(T)
+    for columns, _ in aba.actuation.held:
+        A[:, g.q_b] += B[:, columns] @ skew(u[columns]) @ J
+        B[:, columns] = B[:, columns] @ R.T
+    return A, B, aba.inverse
+
+
+def _change_of_coordinates(
+    state: StateMap, chart: Chart, nu: Array, acceleration: Array
+) -> tuple[Array, Array]:
+    """Return T (nx, nx) with x_frame = T x_local for deviations, and its time derivative."""
+    g = state.groups
+    T, T_rate = np.eye(state.nx), np.zeros((state.nx, state.nx))
+    J, R, w = chart.J, chart.R, nu[ANGULAR]
+    q_b_rate = 0.5 * chart.Q @ w
+    q0_rate = -0.5 * float(chart.q_b @ w)
+    J_rate = -0.5 * J @ (q0_rate * np.eye(3) + skew(q_b_rate)) @ J
+    for turned, rows, group in zip(state.axes, (ANGULAR, LINEAR), (g.omega_b, g.v_b), strict=True):
+        if turned:
+            s, s_rate = skew(nu[rows]), skew(acceleration[rows])
+            T[group, group] = R
+            T[group, g.q_b] = -R @ s @ J
+            T_rate[group, group] = R @ skew(w)
+            T_rate[group, g.q_b] = -R @ (skew(w) @ s + s_rate) @ J - R @ s @ J_rate
+    return T, T_rate
+
+
+def compare(state: StateMap, lin: LinearModel, M: Array, A: Array, B: Array) -> list[Block]:
+    """Compare a model's A and B with those of another route, block by block.
+
+    `M` is the robot's, for the scales.
+
+    A difference is relative to the largest entry of its block, rows of accelerations being
+    scaled by the mobility sqrt((M^-1)_ii), so that a light joint does not hide a heavy one.
+    Where a block vanishes because large terms cancel in it, it is relative to those terms.
+    An entry of B is relative to the mobilities of its row and of its input, which bound it.
+    """
+    nv = len(M)
+    mobility, input_mobility = mobilities(M, B)
+    row_scale = np.concatenate((np.ones(state.nx - nv), mobility))[:, None]
+    difference_A, scaled_A = np.abs(lin.A - A) / row_scale, np.abs(lin.A) / row_scale
+    column_scale = np.where(np.arange(state.nx)[:, None] < state.nx - nv, 1.0, input_mobility)
+    difference_B = np.abs(lin.B - B) / row_scale / column_scale
+    inputs = Actuation(state).groups
+
+    groups = state.groups._asdict()
+    blocks = []
+    for row, rows in groups.items():
+        for column, columns in groups.items():
+            cancelling = _cancelling_terms(state, lin, (mobility, input_mobility), row, column)
+            scale = max(_largest(scaled_A[rows, columns]), cancelling) or 1.0
+            error = _largest(difference_A[rows, columns]) / scale
+            blocks.append(Block("A", row, column, error))
+        for column, columns in inputs.items():
+            blocks.append(Block("B", row, column, _largest(difference_B[rows, columns])))
+    return blocks
+
+
+def mobilities(M: Array, B: Array) -> tuple[Array, Array]:
+    """Return sqrt((M^-1)_ii) (6 + n,) and sqrt(b^T M^-1 b) (nu,) of every input's column b."""
+    own = np.sqrt(np.linalg.inv(M).diagonal())
+    lower = B[-len(M) :]
+    inputs = np.sqrt(np.einsum("ik,ij,jk->k", lower, M, lower))
+    return own, np.where(inputs > 0.0, inputs, 1.0)
+
+
+def _cancelling_terms(
+    state: StateMap, lin: LinearModel, scales: tuple[Array, Array], row: str, column: str
+) -> float:
+    """Size of the terms that may cancel in a block of A, in its scaled units.
+
+    The base's own velocity has no influence but in its own axes, and counts for what its
+    rounding can do to Pinocchio's derivatives only.
+    """
+    mobility, input_mobility = scales
+    chart = state.chart(lin.q)
+    steepness = _largest(chart.J) if column == "q_b" else 1.0
+    speed, rate, momentum = motion(state, lin.v)
+    # What the momentum of wheels does to a turning link, in the units of the rows.
+    spin = momentum * _largest(mobility[np.r_[ANGULAR, 6 : len(mobility)]])
+    still = speed.copy()
+    still[LINEAR] *= _ROUNDING_SHARE
+    moving = {"omega_b", "v_b", "qdot_m"}
+    if row not in moving:
+        return 0.0 if column in moving else _largest(speed[:6]) * steepness
+    if column in moving:
+        # A unit of this velocity under the motion, and, where it turns, of the base's speed.
+        nu = state.groups._asdict()[column]
+        turning = rate * _largest(1.0 / mobility[nu.start - state.nx : nu.stop - state.nx or None])
+        turning += spin * (column != "v_b")
+        return max(turning, _largest(still[LINEAR] / mobility[LINEAR]) * (column != "v_b"))
+    accelerations = np.abs(lin.f0[-len(mobility) :]) / mobility
+    forces = np.abs(lin.u0) * input_mobility
+    return steepness * (
+        _largest(accelerations) + _largest(forces) + rate * (_largest(still / mobility) + spin)
+    )
+
+
+def motion(state: StateMap, v: Array) -> tuple[Array, float, float]:
+    """Return speeds (6 + n,) without those of wheels, the largest rate, and wheels' momentum.
+
+    A wheel's speed matters as the momentum [N m s] that it carries, however fast it is.
+    """
+    speed, robot = np.abs(state.velocities(v)), state.robot
+    inertia = np.array([robot.wheels.get(name, 0.0) for name in robot.joint_names])
+    momentum = float(inertia @ speed[6:])
+    momentum += sum(float(np.linalg.norm(stored)) for _, stored in robot.stored_momentum)
+    speed[6:][inertia > 0.0] = 0.0
+    return speed, max(_largest(speed[ANGULAR]), _largest(speed[6:])), momentum
+
+
+def _largest(x: Array) -> float:
+    return float(np.abs(x).max(initial=0.0))
+
+
+def inertia_matrix(robot: Robot, lin: LinearModel) -> Array:
+    """Return M (6 + n, 6 + n) of a linear model, in state order and in the frame's axes."""
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    M = state.project(pin.crba(robot.model, robot.create_data(), lin.q).T)
+    chart = state.chart(lin.q)
+    state.to_frame(chart, M)
+    state.to_frame(chart, M.T)
+    M.setflags(write=False)
+    return M
+
+
+def inverse_inertia(state: StateMap, lin: LinearModel) -> Array:
+    """Return M^-1 (6 + n, 6 + n) as it stands in B of a linear model, in the frame's axes."""
+    nv = 6 + state.robot.n
+    inverse: Array = np.empty((nv, nv))
+    Inertia(state, state.robot.create_data()).invert(lin.q, inverse)
+    chart = state.chart(lin.q)
+    state.to_frame(chart, inverse)
+    state.to_frame(chart, inverse.T)
+    return inverse

@@ -1,0 +1,314 @@
+"""Whether A and B hold: against ABA derivatives and against differences of the nonlinear model."""
+
+import textwrap
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.tables import grid, width
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.output_values import Measuring
+from fflin.dynamics.outputs import Sensing
+from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.linear.certificate import (
+    aba_route,
+    compare,
+    inertia_matrix,
+    inertia_residual,
+    inverse_inertia,
+    mobilities,
+    motion,
+    scaled_condition,
+)
+from fflin.linear.model import LinearModel
+from fflin.linear.nonlinear import ErrorDynamics, Nonlinear, flow_error, jacobian
+from fflin.robot.outputs import FullState
+from fflin.robot.robot import Robot
+
+_EPS = float(np.finfo(float).eps)
+# Rounding of a difference of outputs: its weights add up to two ulp, each output brings a few.
+_ULPS = 8.0
+
+# Relative to its block an analytic route agrees to round-off times the conditioning of M, with
+# room for the longer chain of operations; for a well-conditioned M, to this.
+_ROUTE_TOLERANCE, _ROUTE_ROUNDING = 1e-9, 1e2 * _EPS
+# Differences of sixth order lose about four digits more to their step.
+_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING = 1e-8, 1e4 * _EPS
+
+# From the residual of an inverse to the error of what it multiplies.
+_ROUTE_SAFETY = 10.0
+
+# Beyond two digits nothing is confirmed, however badly M is conditioned.
+_LOOSEST = 1e-2
+
+
+class Row(NamedTuple):
+    """One figure of a check.
+
+    Attributes
+    ----------
+    test : str
+        What was compared.
+    block : str
+        The block of A or B, or what else was compared.
+    error : float
+        Relative error.
+    tolerance : float
+        What it must not exceed.
+    """
+
+    test: str
+    block: str
+    error: float
+    tolerance: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether the error, which must be a number, is within the tolerance."""
+        return self.error <= self.tolerance
+
+
+@dataclass(frozen=True)
+class Check:
+    """What a check of a linear model found; prints as tables.
+
+    Attributes
+    ----------
+    rows : tuple of Row
+        Every figure.
+    title : str
+        What was checked.
+    """
+
+    rows: tuple[Row, ...]
+    title: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether every figure is within its tolerance."""
+        return all(row.ok for row in self.rows)
+
+    @property
+    def max_error(self) -> float:
+        """The largest relative error."""
+        return float(np.max([row.error for row in self.rows]))
+
+    @property
+    def failures(self) -> tuple[Row, ...]:
+        """The figures that are not within their tolerance."""
+        return tuple(row for row in self.rows if not row.ok)
+
+    def __str__(self) -> str:
+        return check_report(self)
+
+
+def check(robot: Robot, lin: LinearModel) -> Check:
+    r"""Check a linear model by routes other than the one that made it.
+
+    A and B are compared, block by block, with Pinocchio's ABA derivatives mapped into the chart
+    (1e-9 relative), and with sixth-order central differences of the nonlinear model
+    :math:`\dot x = f(x, u)` in the same chart (1e-8), f itself being held against the flow
+    that it must generate. A tolerance grows with the conditioning of M, as round-off does.
+
+    Parameters
+    ----------
+    robot : Robot
+        The robot that the model claims to describe.
+    lin : LinearModel
+        In continuous time; fresh, loaded from a file, or of another make.
+
+    Returns
+    -------
+    Check
+        ``ok``, ``max_error``, ``rows``; printable.
+
+    Raises
+    ------
+    InputError
+        If the model is sampled or has other states and inputs than this robot's.
+    """
+    if not isinstance(lin, LinearModel):
+        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    if lin.dt:
+        raise InputError(f"the model is sampled at dt = {lin.dt:g} s; check the continuous one")
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    if lin.state_names != state.names:
+        raise InputError(
+            f"the model has {len(lin.state_names)} states of '{lin.robot}', which are not the "
+            f"{state.nx} states of '{robot.name}'; check it against its own robot"
+        )
+    actuation = Actuation(state)
+    if (lin.input_names, lin.input_units) != (actuation.names, actuation.units):
+        raise InputError(
+            f"the model has {len(lin.input_names)} inputs, which are not the "
+            f"{len(actuation.names)} of '{robot.name}'; give the robot the same (Robot.replace)"
+        )
+    q, v = robot.checked_configuration(lin.q), robot.checked_velocity(lin.v)
+    M = inertia_matrix(robot, lin)
+    condition = scaled_condition(M)
+    route = min(max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition), _LOOSEST)
+    difference = min(max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition), _LOOSEST)
+    model = (ErrorDynamics if lin.moving else Nonlinear)(state, lin)
+    A, B, inverse = aba_route(state, q, v, lin.u0, moving=lin.moving)
+    # Links far apart cost ABA digits that M keeps; what its inverse of M lacks, its route lacks.
+    own_error = inertia_residual(_in_base_axes(state, M, q), inverse)
+    by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
+    rows = [
+        Row("ABA derivatives", f"{b.matrix}[{b.row}, {b.column}]", b.error, by_aba)
+        for b in compare(state, lin, M, A, B)
+    ]
+    rows += [
+        Row("differences", f"{b.matrix}[{b.row}, {b.column}]", b.error, difference)
+        for b in compare(state, lin, M, *_differences(model, lin, M))
+    ]
+    rows += _output_rows(model, lin, M, difference)
+    rows.append(Row("flow", "f", flow_error(robot, lin), difference))
+    rows += [Row("point", name, error, route) for name, error in _point_errors(model, lin, M, q, v)]
+    rows.append(Row("inertia", "M", _relative(lin.M, M, floor=0.0), route))
+    inverse = inverse_inertia(state, lin)
+    if model.aba.actuation.default:
+        inverse = lin.B[-len(M) :]  # which is all of it
+    rows.append(Row("inertia", "M M^-1 = E", inertia_residual(M, inverse), route))
+    rows += [Row("inertia", name, error, 1e-12) for name, error in _positive_definite(inverse)]
+    return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, cond(M) {condition:.1e}")
+
+
+def _in_base_axes(state: StateMap, M: Array, q: Array) -> Array:
+    chart, M = state.chart(q), M.copy()
+    state.to_base(chart, M)
+    state.to_base(chart, M.T)
+    return M
+
+
+def _point_errors(
+    model: Nonlinear, lin: LinearModel, M: Array, q: Array, v: Array
+) -> list[tuple[str, float]]:
+    """Errors of x0 and f0, and of f0's groups relative to the terms that may cancel in them."""
+    state = model.state
+    mobility, input_mobility = mobilities(M, lin.B)
+    rate = model(lin.x0, lin.u0)
+    _, rate_of_turn, momentum = motion(state, v)
+    push = float((np.abs(lin.u0) * input_mobility).max(initial=0.0))
+    push += rate_of_turn**2 * float((1.0 / mobility).max())
+    push += rate_of_turn * momentum * float(mobility.max())
+    natural = np.concatenate((np.ones(len(M)), mobility * push))
+    errors = [("x0", _relative(lin.x0, state.to_state(q, v, near=lin.x0)))]
+    for name, rows in state.groups._asdict().items():
+        floor = float(natural[rows].max(initial=0.0)) or float(np.abs(rate[rows]).max(initial=1.0))
+        errors.append((f"f0[{name}]", _relative(lin.f0[rows], rate[rows], floor=floor or 1.0)))
+    return errors
+
+
+def _differences(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
+    """Return A and B by central differences of the nonlinear model."""
+    step, push = _steps(model, lin, M)
+    A = jacobian(lambda x: model(x, lin.u0), lin.x0, step)
+    B = jacobian(lambda u: model(lin.x0, u), lin.u0, push)
+    return A, B
+
+
+def _steps(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
+    """Return the steps of differences in x and u."""
+    groups = model.state.groups
+    nv = len(M)
+    # Small against the angles over which accelerations change where light links line up.
+    step = np.full(model.state.nx, 2e-4)
+    # Well inside the chart, whose edge |q_b| = 1 the model feels long before.
+    step[groups.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[groups.q_b]))
+    # f is quadratic in the velocities and linear in the input: no truncation at any step.
+    speed = np.abs(lin.x0[-nv:])
+    step[-nv:] = 0.1 * max(1.0, float(speed[ANGULAR].max()), float(speed[6:].max(initial=0.0)))
+    step[groups.v_b] = 0.1 * max(1.0, float(speed[LINEAR].max()))
+    mobility, input_mobility = mobilities(M, lin.B)
+    push = max(1.0, float(np.abs(lin.f0[-nv:] / mobility).max())) / input_mobility
+    return step, push
+
+
+def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float) -> list[Row]:
+    """Rows of C, D and y0 against differences of what the nonlinear model measures."""
+    state = model.state
+    names, units = state.names, state.units
+    if state.robot.outputs != (FullState(),):
+        sensing = Sensing(state, state.robot.outputs)
+        names, units = sensing.names, sensing.units
+    if (lin.output_names, lin.output_units) != (names, units):
+        raise InputError(
+            f"the model has {len(lin.output_names)} outputs, which are not the {len(names)} of "
+            f"'{state.robot.name}'; give the robot the same (Robot.replace)"
+        )
+    measuring = Measuring(state, lin.q)
+
+    def y(x: Array, u: Array) -> Array:
+        return measuring(x, *model.acceleration(x, u))
+
+    step_x, step_u = _steps(model, lin, M)
+    here = y(lin.x0, lin.u0)
+    C = jacobian(lambda x: y(x, lin.u0), lin.x0, step_x)
+    D = jacobian(lambda u: y(lin.x0, u), lin.u0, step_u)
+    # What cannot be told from the rounding of y in its step is not compared any closer.
+    scale = _ULPS * np.maximum(1.0, np.abs(here))[:, None]
+    rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]
+    for name, given, expected, step in (("C", lin.C, C, step_x), ("D", lin.D, D, step_u)):
+        size = np.maximum(
+            np.abs(expected).max(axis=1, initial=0.0)[:, None], _EPS * scale / step / tolerance
+        )
+        error = float((np.abs(given - expected) / size).max(initial=0.0))
+        rows.append(Row("outputs", name, error, tolerance))
+    return rows
+
+
+def _relative(given: Array, expected: Array, floor: float = 1.0) -> float:
+    if not given.size:
+        return 0.0
+    return float(np.abs(given - expected).max() / max(floor, float(np.abs(expected).max())))
+
+
+def _positive_definite(inverse: Array) -> list[tuple[str, float]]:
+    """Asymmetry of M^-1, and how far its least eigenvalue is below zero."""
+    scale = 1.0 / np.sqrt(np.abs(inverse.diagonal()))
+    scaled = scale[:, None] * inverse * scale
+    asymmetry = float(np.abs(scaled - scaled.T).max())
+    least = float(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0])
+    return [("M^-1 symmetric", asymmetry), ("M^-1 positive", max(0.0, -least))]
+
+
+def check_report(check: Check) -> str:
+    """Show what a check found: a table a route, the single figures, the verdict."""
+    states = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
+    blocks = [row.block for row in check.rows]
+    inputs = dict.fromkeys(b[:-1].split(", ")[1] for b in blocks if b.startswith("B["))
+    parts = [f"check of {check.title}"]
+    for test in ("ABA derivatives", "differences"):
+        rows = {row.block: row for row in check.rows if row.test == test}
+        body = [
+            [
+                state,
+                *(_error(rows[f"A[{state}, {column}]"]) for column in states),
+                *(_error(rows[f"B[{state}, {column}]"]) for column in inputs),
+            ]
+            for state in states
+        ]
+        tolerance = next(iter(rows.values())).tolerance
+        parts.append(
+            f"A and B against {test}: relative error of each block, at most {tolerance:.1e}"
+        )
+        parts.append(grid([["", *states, *inputs], *body]))
+    single = [r for r in check.rows if r.test not in ("ABA derivatives", "differences")]
+    rest = [[f"{r.test}: {r.block}", _error(r), f"at most {r.tolerance:.1e}"] for r in single]
+    parts.append(grid(rest, "lrl"))
+    if check.ok:
+        verdict = f"OK: {len(check.rows)} figures hold; the largest error is {check.max_error:.1e}"
+    else:
+        names = [f"{row.block} ({row.test})" for row in check.failures[:6]]
+        names += ["..."] * (len(check.failures) > 6)
+        verdict = f"FAILED: {len(check.failures)} of {len(check.rows)} figures: {', '.join(names)}"
+    parts.append(textwrap.fill(verdict, width()))
+    return "\n\n".join(parts)
+
+
+def _error(row: Row) -> str:
+    text = "." if row.error == 0.0 else f"{row.error:.0e}"
+    return text if row.ok else f"{text}!"

@@ -1,0 +1,360 @@
+"""The linear model: matrices, names, units, and the figures that prove it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, partial
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fflin.base.errors import InputError, MissingPackageError
+from fflin.base.validation import Array, number
+
+if TYPE_CHECKING:
+    import pinocchio as pin
+
+    from fflin.dynamics.state import Frame
+
+
+_new, _set = object.__new__, object.__setattr__
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The figures that prove a linear model; all are relative and of the order of round-off.
+
+    Attributes
+    ----------
+    condition : float
+        Condition number of M scaled to a unit diagonal; round-off times this is what to expect.
+    inertia_residual : float
+        Largest entry of ``M M^-1 - E``, scaled likewise.
+    route_A, route_B : float
+        Largest difference to A and B built from Pinocchio's ABA derivatives, relative to the
+        block it stands in.
+    f0 : float
+        Largest entry of the state derivative at the point; 0 at a fixed point.
+    """
+
+    condition: float
+    inertia_residual: float
+    route_A: float
+    route_B: float
+    f0: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearModel:
+    r"""A linear model about a point, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
+
+    The output is ``y = y0 + C (x - x0) + D (u - u0)``. For ``dt > 0`` the left side is the next
+    sample's ``x - x0`` instead and f0 what is added at each step. Arrays are read-only.
+
+    Attributes
+    ----------
+    A : ndarray (nx, nx)
+    B : ndarray (nx, nu)
+    C : ndarray (ny, nx)
+    D : ndarray (ny, nu)
+    f0 : ndarray (nx,)
+        Nonlinear right-hand side at the point; zero exactly at a fixed point.
+    x0, u0, y0 : ndarray
+        State, input and output at the point.
+    dt : float
+        Sampling time [s]; 0 for continuous time.
+    state_names, input_names, output_names : tuple of str
+    state_units, input_units, output_units : tuple of str
+    frame : str
+        "hybrid", "local" or "world": axes of velocities and wrenches.
+    moving : bool
+        Whether the state is the error from a reference that moves through the point.
+    q : ndarray (nq,)
+        Configuration of the point in Pinocchio's order.
+    v : ndarray (nv,)
+        Velocity of the point in Pinocchio's order.
+    robot : str
+        Name of the robot.
+    urdf_sha256 : str
+        Hash of the URDF as it was read; empty where there was none.
+    locked : tuple of str
+        "joint=value" [rad|m] of the joints that are welded in it.
+    fflin_version, pinocchio_version : str
+        What made the model.
+    verified : bool
+        Whether it is as it was made; False of a file that has no digest to tell damage by.
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    f0: Array
+    x0: Array
+    u0: Array
+    y0: Array
+    dt: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+    frame: Frame
+    moving: bool
+    q: Array
+    v: Array
+    robot: str
+    urdf_sha256: str
+    locked: tuple[str, ...]
+    fflin_version: str
+    pinocchio_version: str
+    _reference: Array = field()
+    _inertia: Callable[[LinearModel], Array] = field()
+    _certify: Callable[[LinearModel], Certificate] = field()
+    _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
+    # Of a moving reference, whose f0 is zero by construction: its own rate (nx,), that of its
+    # attitude without turns about gravity. None otherwise.
+    _drift: Array | None = None
+    # Of a sampled model: its own fingerprint and the continuous model that it was made of, whose
+    # structure no exponential has blurred.
+    _source: tuple[str, LinearModel] | None = None
+    verified: bool = True
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                value = value.copy()
+                value.setflags(write=False)
+                object.__setattr__(self, item.name, value)
+
+    @classmethod
+    def _from_fields(cls, values: dict[str, Any]) -> LinearModel:
+        # The generated __init__ sets two dozen frozen fields one by one, which costs as much
+        # as the dynamics of a small robot. The caller passes read-only arrays of its own.
+        lin = _new(cls)
+        _set(lin, "__dict__", values)
+        return lin
+
+    def __getattr__(self, name: str) -> Any:
+        # Of a model at rest: what costs as much as its dynamics is made when it is asked for.
+        make = vars(self).get("_when_asked", {}).get(name)
+        if make is None:
+            raise AttributeError(f"'LinearModel' object has no attribute '{name}'")
+        return vars(self).setdefault(name, make(self.q))
+
+    def __repr__(self) -> str:
+        nx, nu = self.B.shape
+        time = f"dt={self.dt:g} s" if self.dt else "continuous"
+        return f"LinearModel('{self.robot}', nx={nx}, nu={nu}, frame='{self.frame}', {time})"
+
+    def __str__(self) -> str:
+        from fflin.base.record import NOT_VERIFIED
+
+        return repr(self) if self.verified else f"{self!r}\n{NOT_VERIFIED}"
+
+    @property
+    def reference(self) -> pin.SE3:
+        """Placement oMref that attitude and position are relative to."""
+        import pinocchio as pin
+
+        return pin.XYZQUATToSE3(self._reference)
+
+    @cached_property
+    def M(self) -> Array:
+        """Joint-space inertia (6 + n, 6 + n) in state order, angular first, and frame's axes."""
+        return self._inertia(self)
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of A, B and f0, which a certificate is about."""
+        digest = sha256()
+        for array in (self.A, self.B, self.f0):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+    def require(self, fingerprint: str) -> None:
+        """Raise `InputError` where the matrices are not those that were certified."""
+        if self.fingerprint != fingerprint:
+            raise InputError(
+                "A, B or f0 were changed after they were certified; hold them against the robot "
+                "with fflin.check"
+            )
+
+    @property
+    def generator(self) -> LinearModel | None:
+        """The continuous model that this is sampled from, or itself.
+
+        None where that is not known: of a file, or of matrices that were changed.
+        """
+        if not self.dt:
+            return self
+        known = self._source is not None and self._source[0] == self.fingerprint
+        return self._source[1] if self._source and known else None
+
+    @cached_property
+    def certificate(self) -> Certificate:
+        """The figures that prove the model, computed when first asked for."""
+        return self._certify(self)
+
+    @cached_property
+    def ignorable(self) -> tuple[str, ...]:
+        """The states that nothing in the model depends on, found on the robot.
+
+        Where the base is, and the angles of rotors; with `moving`, without gravity, the attitude
+        too. A rotor is symmetric about its axis and has nothing fixed on it.
+        """
+        return () if self._ignorable is None else self._ignorable(self)
+
+    def is_equilibrium(self, tol: float = 1e-9) -> bool:
+        """Whether the point is a fixed point or a relative equilibrium, so that A and B stay.
+
+        At a relative equilibrium only ignorable coordinates move, at constant rates: a rotor
+        spins, or the base flies along. With ``moving=True`` the motion of the reference is
+        judged, not f0: its velocities in base axes must be constant, its joints stand but for
+        rotors, and under gravity it may turn about the vertical only.
+
+        Parameters
+        ----------
+        tol : float
+            What no rate may exceed, in SI units; those of ignorable coordinates may.
+        """
+        rate = self.f0 if self._drift is None else self._drift
+        judged = [name not in self.ignorable for name in self.state_names]
+        return bool(np.abs(rate[judged]).max(initial=0.0) <= number("tol", tol))
+
+    def discretize(self, dt: float) -> LinearModel:
+        r"""Sample the model with its input held constant between samples.
+
+        .. math::
+            A_d = e^{A h}, \quad [B_d, f_d] = \int_0^h e^{A s}\,ds\,[B, f_0]
+
+        At rest A^2 = 0, and the series ends: :math:`A_d = E + A h`, :math:`B_d = B h + A B h^2/2`.
+
+        Parameters
+        ----------
+        dt : float
+            Sampling time h [s], positive.
+
+        Returns
+        -------
+        LinearModel
+            With ``dt`` set; its certificate is the continuous model's.
+
+        Raises
+        ------
+        InputError
+            If `dt` is not positive or the model is sampled already.
+        """
+        dt = number("dt", dt)
+        if dt <= 0.0:
+            raise InputError(f"dt is {dt:g} s, expected a positive sampling time")
+        if self.dt:
+            raise InputError(f"the model is sampled already, at dt = {self.dt:g} s")
+        nx, nu = self.B.shape
+        driven = np.column_stack((self.B, self.f0))
+        # What overflows is refused below, and not warned of.
+        with np.errstate(over="ignore", invalid="ignore"):
+            if not (self.A @ self.A).any():
+                Ad = np.eye(nx) + self.A * dt
+                held = driven * dt + self.A @ driven * (dt * dt / 2.0)
+            else:
+                from scipy.linalg import expm
+
+                block = np.zeros((nx + nu + 1, nx + nu + 1))
+                block[:nx, :nx] = self.A
+                block[:nx, nx:] = driven
+                exponential = expm(block * dt)
+                Ad, held = exponential[:nx, :nx], exponential[:nx, nx:]
+        if not (np.isfinite(Ad).all() and np.isfinite(held).all()):
+            raise InputError(f"dt is {dt:g} s, over which the model grows beyond all numbers")
+        sampled = replace(
+            self, A=Ad, B=held[:, :nu], f0=held[:, nu], dt=dt, _inertia=partial(_same_M, self)
+        )
+        certify = partial(_same_certificate, self, sampled.fingerprint)
+        return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))
+
+    def to_scipy(self) -> Any:
+        """Return a `scipy.signal.StateSpace` of the deviations; names and f0 are lost."""
+        from scipy.signal import StateSpace
+
+        matrices = (self.A, self.B, self.C, self.D)
+        return StateSpace(*matrices, dt=self.dt) if self.dt else StateSpace(*matrices)
+
+    def to_control(self) -> Any:
+        """Return a `control.StateSpace` of the deviations, with signal names; f0 is lost.
+
+        Raises
+        ------
+        MissingPackageError
+            If python-control is not installed.
+        """
+        try:
+            import control
+        except ImportError:
+            raise MissingPackageError(
+                "to_control needs python-control; install it with: pip install 'fflin[control]'"
+            ) from None
+        # python-control reserves dots in signal names for its own system.signal syntax.
+        return control.ss(
+            *(self.A, self.B, self.C, self.D, self.dt),
+            states=[name.replace(".", "_") for name in self.state_names],
+            inputs=[name.replace(".", "_") for name in self.input_names],
+            outputs=[name.replace(".", "_") for name in self.output_names],
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the model and its certificate, whole or not at all.
+
+        Parameters
+        ----------
+        path : str or Path
+            Ends in .npz, .mat, .json, or .csv (then one file per matrix, NAME.A.csv and so on).
+
+        Raises
+        ------
+        FileError
+            If the ending is another or the file cannot be written.
+        InputError
+            If a figure is not finite.
+        """
+        from fflin.base.writing import as_path
+        from fflin.linear.files import record_of, write_model
+
+        write_model(as_path(path), record_of(self))
+
+    @staticmethod
+    def load(path: str | Path) -> LinearModel:
+        """Read a model that `save` wrote; every figure is the same to the last bit.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read, is damaged or is not such a model.
+        """
+        from fflin.base.writing import as_path
+        from fflin.linear.files import read_model
+
+        values, certificate = read_model(as_path(path))
+        given: Any = partial(_given, Certificate(**certificate))
+        lin = LinearModel(**values, _certify=given)
+        return replace(lin, _certify=partial(_same_certificate, lin, lin.fingerprint))
+
+
+def _given(certificate: Certificate, _: LinearModel) -> Certificate:
+    return certificate
+
+
+def _same_M(continuous: LinearModel, _: LinearModel) -> Array:
+    return continuous.M
+
+
+def _same_certificate(
+    continuous: LinearModel, fingerprint: str, sampled: LinearModel
+) -> Certificate:
+    sampled.require(fingerprint)
+    return continuous.certificate

@@ -1,0 +1,159 @@
+"""The nonlinear model in the chart, its slopes by differences, and the flow that it must follow."""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.rotation import rotation_matrix
+from fflin.base.validation import Array
+from fflin.dynamics.aba import Aba
+from fflin.dynamics.state import StateMap
+from fflin.linear.model import LinearModel
+from fflin.robot.robot import ROOT, Robot
+
+# Where the base flies faster than this [m/s], the digits of its speed would drown the rest.
+_FAST = 100.0
+
+# Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. Its error is
+# h^6 f^(7) / 140.
+_WEIGHTS = (45.0 / 60.0, -9.0 / 60.0, 1.0 / 60.0)
+
+
+class Nonlinear:
+    """The nonlinear model in the chart, by ABA: ``xdot = f(x, u)``.
+
+    Where the base is fast, accelerations are taken by an observer who flies with the point at
+    constant velocity: they are the same, v_b's rate but for the turning of the base's axes.
+    """
+
+    def __init__(self, state: StateMap, lin: LinearModel) -> None:
+        self.state = state
+        self.aba = Aba(state)
+        observer = rotation_matrix(lin.q[3:7]) @ lin.v[:3]
+        self._observer = observer if np.linalg.norm(observer) > _FAST else np.zeros(3)
+
+    def acceleration(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
+        """Return (q, v, a) in Pinocchio's order."""
+        q, v = self.state.to_pinocchio(x)
+        u = self.aba.actuation.in_base_axes(self.state.chart(q), u)
+        seen, observer = v.copy(), rotation_matrix(q[3:7]).T @ self._observer
+        seen[:3] -= observer
+        a = self.aba.acceleration(q, seen, u).copy()
+        a[:3] -= np.cross(v[3:6], observer)
+        return q, v, a
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        """Return dx/dt (nx,)."""
+        state = self.state
+        q, v, a = self.acceleration(x, u)
+        chart = state.chart(q)
+        linear, angular = v[:3], v[3:6]
+        rate = state.velocities(a)
+        if state.axes[1]:
+            rate[3:6] += np.cross(angular, linear)  # of the velocity's reference-axis components
+        state.to_frame(chart, rate)
+        return np.concatenate(
+            (
+                0.5 * (chart.q0 * angular + np.cross(chart.q_b, angular)),
+                chart.R @ linear,
+                state.velocities(v)[6:],
+                rate,
+            )
+        )
+
+
+class ErrorDynamics(Nonlinear):
+    """The dynamics of the error from a reference that moves through the point: ``f(x0, u0) = 0``.
+
+    With the error quaternion (e, e0) = q*^-1 q: edot = (e0 (w - w*) + e x (w + w*)) / 2, and
+    with r = R*^T (p - p*): rdot = R_e v - v* - w* x r.
+    """
+
+    def __init__(self, state: StateMap, lin: LinearModel) -> None:
+        super().__init__(state, lin)
+        self._v = lin.v
+        self._a = state.velocities(self.acceleration(lin.x0, lin.u0)[2])
+
+    def __call__(self, x: Array, u: Array) -> Array:
+        """Return the rate of the error (nx,)."""
+        state, g = self.state, self.state.groups
+        q, v, a = self.acceleration(x, u)
+        chart = state.chart(q)
+        (linear, angular), (at_linear, at_angular) = (w[:6].reshape(2, 3) for w in (v, self._v))
+        turning = chart.q0 * (angular - at_angular) + np.cross(chart.q_b, angular + at_angular)
+        flying = chart.R @ linear - at_linear - np.cross(at_angular, x[g.r_b])
+        rates = state.velocities(v)[6:] - state.velocities(self._v)[6:]
+        return np.concatenate((0.5 * turning, flying, rates, state.velocities(a) - self._a))
+
+
+def jacobian(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:
+    """Return the slopes of f at a point by sixth-order central differences of the given steps."""
+    columns = []
+    for along, step in zip(np.diag(steps), steps, strict=True):
+        columns.append(_derivative(partial(_along, f, point, along)) / step)
+    return np.column_stack(columns)
+
+
+def _along(f: Callable[[Array], Array], point: Array, along: Array, t: float) -> Array:
+    return f(point + t * along)
+
+
+def _derivative(f: Callable[[float], Array]) -> Array:
+    """Return df/dt at 0 by differences at t = -3 ... 3."""
+    differences = [f(k) - f(-k) for k in range(1, 1 + len(_WEIGHTS))]
+    return np.tensordot(_WEIGHTS, differences, axes=1)
+
+
+def flow_error(robot: Robot, lin: LinearModel) -> float:
+    """How far f is from the rate of the state along motions of the robot.
+
+    The motions pass the point with its own velocity and with a unit of each base velocity added.
+    They pass it at the origin, since a step would drown in the digits of a distant place.
+    """
+    turned = pin.SE3(lin.reference.rotation, np.zeros(3))
+    state = StateMap(robot, reference=turned, frame=lin.frame)
+    model = (ErrorDynamics if lin.moving else Nonlinear)(state, lin)
+    worst = 0.0
+    for unit in (None, *range(6)):
+        x = lin.x0.copy()
+        x[state.groups.r_b] = 0.0
+        if unit is not None:
+            x[6 + robot.n + unit] += 1.0
+        q, v, a = model.acceleration(x, lin.u0)
+        h = 1e-2 * state.chart(q).q0 / (1.0 + float(np.abs(v[3:]).max()))
+        rate = _derivative(partial(_moved, state, x, q, h * v, v, h * a)) / h
+        if lin.moving:
+            q_star = lin.q.copy()
+            q_star[:3] = 0.0
+            back = partial(_moved_error, robot, q_star, h * lin.v, q, h * v)
+            rate[:6] = _derivative(back) / h
+            rate[6:] -= _motion_of_reference(model, lin)
+        floor = 1.0 + float(np.abs(v).max())
+        expected = model(x, lin.u0)
+        scale = max(floor, float(np.abs(expected).max()))
+        worst = max(worst, float(np.abs(expected - rate).max()) / scale)
+    return worst
+
+
+def _moved(
+    state: StateMap, near: Array, q: Array, dq: Array, v: Array, dv: Array, t: float
+) -> Array:
+    return state.to_state(pin.integrate(state.robot.model, q, t * dq), v + t * dv, near=near)
+
+
+def _moved_error(robot: Robot, q: Array, dq: Array, q1: Array, dq1: Array, t: float) -> Array:
+    """Return (q_b, r_b) of the error when reference and robot have both moved on."""
+    reference = pin.integrate(robot.model, q, t * dq)
+    root = robot.model.jointPlacements[ROOT]
+    moved = StateMap(robot, reference=root * pin.XYZQUATToSE3(reference[:7]), frame="local")
+    now = pin.integrate(robot.model, q1, t * dq1)
+    return moved.to_state(now, np.zeros(robot.nv))[:6]
+
+
+def _motion_of_reference(model: Nonlinear, lin: LinearModel) -> Array:
+    """Return d(q_m, omega_b, v_b, qdot_m)/dt of the reference itself."""
+    state = model.state
+    _, v, a = model.acceleration(lin.x0, lin.u0)
+    return np.concatenate((state.velocities(v)[6:], state.velocities(a)))

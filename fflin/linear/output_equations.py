@@ -1,0 +1,62 @@
+"""C and D: the derivatives of the outputs carried into the chart, the frame and the inputs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.chart import Chart
+from fflin.dynamics.rnea import Rates
+from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+
+if TYPE_CHECKING:
+    from fflin.dynamics.output_kinds import Sensed
+
+
+def output_equations(
+    state: StateMap,
+    actuation: Actuation,
+    chart: Chart,
+    sensed: Sensed,
+    rates: Rates,
+    nu: Array,
+    u: Array,
+) -> tuple[Array, Array]:
+    r"""Return C (ny, nx) and D (ny, nu) of the outputs that are not states.
+
+    What is measured is a function of pose, velocity and the rate of the LOCAL velocity, whose
+    linear part is :math:`c + g - \omega \times v_b`. `nu` (6 + n,) and `u` (nu,) are in base axes.
+    A turn :math:`\delta\theta` of the base under a vector s held in reference axes changes its
+    base components by :math:`[s]_\times \delta\theta`.
+    """
+    g = state.groups
+    by_q, by_nu = state.columns(sensed.by_q), state.columns(sensed.by_v)
+    turn, by_q_m = by_q[:, ANGULAR].copy(), by_q[:, 6:]
+    D = np.zeros((len(by_q), len(u)))
+    if sensed.by_a is not None:
+        by_rate = state.columns(sensed.by_a)
+        rate_by_nu = rates.by_nu.copy()
+        rate_by_nu[LINEAR, ANGULAR] += skew(nu[LINEAR])
+        rate_by_nu[LINEAR, LINEAR] -= skew(nu[ANGULAR])
+        by_nu += by_rate.dot(rate_by_nu)
+        by_q_m = by_q_m + by_rate.dot(rates.by_q_m)
+        turn += by_rate[:, LINEAR].dot(skew(rates.gravity))
+        D = by_rate.dot(rates.by_u)
+        for columns, _ in actuation.held:
+            turn += D[:, columns].dot(skew(u[columns]))
+            D[:, columns] = D[:, columns].dot(chart.R.T)
+    for turned, part in zip(state.axes, (ANGULAR, LINEAR), strict=True):
+        if turned:
+            turn += by_nu[:, part].dot(skew(nu[part]))
+
+    C = np.zeros((len(by_q), state.nx))
+    C[:, g.q_b] = turn.dot(chart.J)
+    C[:, g.r_b] = by_q[:, LINEAR].dot(chart.R.T)
+    C[:, g.q_m] = by_q_m
+    C[:, -len(nu) :] = by_nu
+    state.to_frame(chart, C[:, -len(nu) :].T)
+    return C, D

@@ -1,0 +1,154 @@
+"""Where robots are found: the bundled ones, those of example-robot-data, and any path."""
+
+import os
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from fflin.base.errors import FileError, InputError, UrdfError, unknown
+
+# example-robot-data's talos_legs is talos cut off at the torso, done in its loader's code.
+_PRUNED = {"talos_legs": ("torso_1_joint",)}
+
+
+@dataclass(frozen=True)
+class RobotFile:
+    """Where a robot's description lies.
+
+    Attributes
+    ----------
+    name : str
+        Name that `load` takes.
+    path : Path
+        The URDF.
+    origin : str
+        "fflin", "example-robot-data" or "file".
+    package_dirs : tuple of Path
+        Folders in which ``package://`` paths of meshes are looked up.
+    prune : tuple of str
+        Joints that are cut off with all that hangs on them.
+    """
+
+    name: str
+    path: Path
+    origin: str
+    package_dirs: tuple[Path, ...] = ()
+    prune: tuple[str, ...] = ()
+
+
+@cache
+def bundled_directory() -> Path:
+    """Folder of the bundled URDFs: inside an installed package, beside a source checkout's."""
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "bundled"
+    return installed if installed.is_dir() else package.parent / "robots"
+
+
+@cache
+def _bundled() -> dict[str, RobotFile]:
+    paths = sorted(bundled_directory().glob("*.urdf"))
+    return {path.stem: RobotFile(path.stem, path, "fflin") for path in paths}
+
+
+@cache
+def _example_robot_data() -> dict[str, RobotFile]:
+    # Only class attributes are read: making a loader would load its meshes.
+    from example_robot_data.robots_loader import ROBOTS, getModelPath
+
+    found = {}
+    for name, loader in ROBOTS.items():
+        if not loader.urdf_filename:
+            continue
+        inner = Path(loader.path, loader.urdf_subpath, loader.urdf_filename)
+        root = Path(getModelPath(str(inner))).resolve()
+        found[name] = RobotFile(
+            name,
+            root / inner,
+            "example-robot-data",
+            (root.parents[1], root.parent),
+            _PRUNED.get(name, ()),
+        )
+    return found
+
+
+def list_robots() -> tuple[str, ...]:
+    """Every robot name that `load` takes: the bundled ones first, then example-robot-data's.
+
+    Returns
+    -------
+    tuple of str
+    """
+    return tuple({**_bundled(), **_example_robot_data()})
+
+
+def find_robot(robot: str | Path) -> RobotFile:
+    """Find the description of a robot by its name or by the path of its URDF.
+
+    A bundled name comes first, then a path that exists, then a name of example-robot-data.
+
+    Parameters
+    ----------
+    robot : str or Path
+        Name or path.
+
+    Returns
+    -------
+    RobotFile
+
+    Raises
+    ------
+    UnknownNameError
+        If it is neither a known name nor looks like a path.
+    FileError
+        If it looks like a path and nothing is there.
+    UrdfError
+        If the robot is known but has no URDF.
+    """
+    if not isinstance(robot, str | os.PathLike):
+        raise InputError(f"robot is a {type(robot).__name__}, expected a name or a path")
+    if isinstance(robot, str) and robot in _bundled():
+        return _bundled()[robot]
+    path = Path(robot)
+    text = str(robot)
+    # Unlike Path.exists, this takes a name that is too long for one that does not exist.
+    if os.path.exists(robot) and not (path.is_dir() and text in _example_robot_data()):
+        # The name of a file need not be text.
+        name = path.stem.encode(errors="backslashreplace").decode()
+        return RobotFile(name, path, "file", (path.resolve().parent,))
+    if isinstance(robot, Path) or path.suffix or len(path.parts) != 1:
+        raise FileError(f"no file at '{robot}'; give a URDF's path or a name of `fflin robots`")
+    if text == "cassie":
+        raise UrdfError("'cassie' comes as SDF only, which Pinocchio's wheels cannot read")
+    if text not in _example_robot_data():
+        raise unknown("robot", text, list_robots())
+    return _example_robot_data()[text]
+
+
+def find_inputs(inputs: str | Path) -> Path:
+    """Find a file of inputs by its path, or the bundled one by its robot's name.
+
+    Parameters
+    ----------
+    inputs : str or Path
+        Name or path; a bundled name comes first.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError
+        If it is no path.
+    UnknownNameError
+        If it is a bare name, neither of a bundled file nor of one that exists.
+    """
+    if not isinstance(inputs, str | os.PathLike) or "\0" in str(inputs):
+        raise InputError(f"{inputs!r} is not the path of a file of inputs")
+    bundled = {path.stem: path for path in bundled_directory().glob("*.toml")}
+    path = Path(inputs)
+    if str(inputs) in bundled:
+        return bundled[str(inputs)]
+    if path.name == str(inputs) and not path.suffix and not os.path.lexists(path):
+        raise unknown("file or bundled set of inputs", str(inputs), sorted(bundled))
+    return path

@@ -1,0 +1,113 @@
+"""What of a robot its user may set: inputs, passive joints, gravity; checked once."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from fflin.base.errors import InputError, ModelError, unknown
+from fflin.base.validation import number
+from fflin.robot.inputs import (
+    KINDS,
+    BaseForce,
+    BaseTorque,
+    Input,
+    JointTorque,
+    Thruster,
+    named_wheels,
+    three_numbers,
+)
+from fflin.robot.joints import Joint
+from fflin.robot.outputs import Output
+
+FIELDS = ("inputs", "outputs", "stiffness", "damping", "rest", "gravity")
+
+
+def validated_fields(
+    fields: Mapping[str, Any],
+    find: Callable[[str], Joint],
+    joints: Sequence[str],
+    urdf_damping: Mapping[str, float],
+) -> dict[str, Any]:
+    """Return the fields as a robot holds them.
+
+    Parameters
+    ----------
+    fields : mapping
+        As `Robot.replace` takes them, but for inputs.
+    find : callable
+        Returns the joint of a name or raises.
+    joints : sequence of str
+        What one value for all stands for.
+    urdf_damping : mapping
+        What damping="urdf" stands for.
+
+    Returns
+    -------
+    dict
+    """
+    checked: dict[str, Any] = {}
+    for name, value in fields.items():
+        if name == "friction":
+            raise ModelError(
+                "dry friction is not differentiable at rest, so that no linear model has it; use "
+                "damping, or simulate with it"
+            )
+        if name not in FIELDS:
+            raise unknown("field of a robot", name, FIELDS)
+        if name == "outputs":
+            checked[name] = _outputs(value)
+        elif name == "gravity":
+            checked[name] = three_numbers("gravity", value)
+        elif name == "damping" and isinstance(value, str):
+            if value != "urdf":
+                raise InputError(f"damping is '{value}', expected 'urdf', a number or a mapping")
+            checked[name] = dict(urdf_damping)
+        else:
+            checked[name] = _by_joint(name, value, find, joints)
+    return checked
+
+
+def validated_inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, ...]:
+    """Return the inputs as a robot holds them; `find` returns the joint of a name or raises."""
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise InputError(f"inputs is a {type(value).__name__}, expected a sequence of inputs")
+    if not value:
+        raise InputError("inputs is empty; a model needs at least one")
+    for item in value:
+        if not isinstance(item, Input):
+            raise InputError(
+                f"{item!r} is not an input; expected {', '.join(kind.__name__ for kind in KINDS)}"
+            )
+        if isinstance(item, JointTorque):
+            find(item.joint)
+    names = [item.name for item in value if isinstance(item, Thruster) and item.name]
+    names += [name for name, _ in named_wheels(value)]
+    plain = [item for item in value if isinstance(item, BaseTorque | BaseForce | JointTorque)]
+    twice = [str(x) for x in (*names, *plain) if (*names, *plain).count(x) > 1]
+    if twice:
+        raise InputError(f"input {twice[0]} stands there twice")
+    return tuple(value)
+
+
+def _outputs(value: Any) -> tuple[Output, ...]:
+    if isinstance(value, str) or not isinstance(value, Sequence) or not value:
+        raise InputError(f"outputs is {value!r}, expected a sequence of at least one output")
+    for item in value:
+        if not isinstance(item, Output):
+            raise InputError(f"{item!r} is not an output, as FramePose('tool') would be")
+    return tuple(value)
+
+
+def _by_joint(
+    what: str, value: Any, find: Callable[[str], Joint], joints: Sequence[str]
+) -> dict[str, float]:
+    if not isinstance(value, Mapping):
+        if what == "rest":
+            raise InputError(f"rest is {value!r}, expected a mapping {{joint: position}}")
+        value = dict.fromkeys(joints, value)
+    result = {}
+    for name, entry in value.items():
+        find(name)
+        result[name] = number(f"{what} of joint '{name}'", entry)
+        if what != "rest" and result[name] < 0.0:
+            raise InputError(f"{what} of joint '{name}' is {result[name]:g}, expected 0 or more")
+    return result

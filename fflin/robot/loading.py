@@ -1,0 +1,271 @@
+"""Making robots: from a file or from a model that was built by other means."""
+
+import os
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pinocchio as pin
+
+from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
+from fflin.base.validation import Array, number
+from fflin.robot.catalog import find_robot
+from fflin.robot.joints import Follower, Joint
+from fflin.robot.massless import massless_note
+from fflin.robot.model_checks import check_model
+from fflin.robot.robot import ROOT, Robot
+from fflin.robot.urdf.joints import Mimic
+from fflin.robot.urdf.reader import read_urdf
+
+Lock = Mapping[str, float | None] | Iterable[str]
+
+
+def load(
+    robot: str | Path,
+    *,
+    lock: Lock | None = None,
+    package_dirs: Sequence[str | Path] = (),
+    **fields: Any,
+) -> Robot:
+    """Load a robot as a free flyer, by default in zero gravity.
+
+    Parameters
+    ----------
+    robot : str or Path
+        Bundled name, example-robot-data name, or path to a URDF. No mesh is loaded.
+    lock : mapping or iterable of str, optional
+        {joint: value [rad|m]} welded at that value (None: at neutral), or names. What mimics a
+        locked joint is welded with it.
+    package_dirs : sequence of path
+        Folders in which ``package://`` paths of meshes are looked up when the robot is drawn,
+        before those that the URDF lies in.
+    **fields
+        inputs, stiffness, damping, rest, gravity: see `Robot.replace`.
+
+    Returns
+    -------
+    Robot
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such robot, joint, frame or field.
+    InputError
+        If a field has a wrong value.
+    FileError, UrdfError
+        If the file cannot be read or is malformed.
+    MissingPackageError
+        If it is a xacro and the package that expands it is not installed.
+    ModelError
+        If a joint has more than one degree of freedom.
+
+    Warns
+    -----
+    FflinWarning
+        Of what the file holds and the model does not, and of what cannot be quite right in it.
+    """
+    found = find_robot(robot)
+    description = read_urdf(found.path, found.prune)
+    loaded = _robot(description.model, found.name, lock, description.mimics)
+    notes = description.notes
+    if loaded.idle:
+        notes = (*notes, massless_note(loaded))
+    for note in notes:
+        warnings.warn(note, FflinWarning, stacklevel=2)
+    loaded = replace(
+        loaded,
+        urdf=found.path,
+        urdf_sha256=description.sha256,
+        notes=notes,
+        package_dirs=(*_folders(package_dirs), *found.package_dirs),
+        urdf_damping=_independent_damping(loaded, description.damping),
+    )
+    return loaded.replace(**fields) if fields else loaded
+
+
+def from_model(
+    model: pin.Model, *, name: str | None = None, lock: Lock | None = None, **fields: Any
+) -> Robot:
+    """Take a Pinocchio model built by other means (MJCF, SDF, code).
+
+    Parameters
+    ----------
+    model : pin.Model
+        Model whose one root joint is a free-flyer. It is copied; gravity of the copy is zero.
+    name : str, optional
+        Name of the robot; the model's own by default.
+    lock : mapping or iterable of str, optional
+        As in `load`.
+    **fields
+        As in `load`. Of damping="urdf" the model's own ``damping`` is taken.
+
+    Returns
+    -------
+    Robot
+
+    Raises
+    ------
+    ModelError
+        If the root is not one free-flyer, a joint has more than one degree of freedom, the
+        joints are not in depth-first order, in which CRBA would be silently wrong, or a
+        placement, a body or an armature is not physical.
+    """
+    if not isinstance(model, pin.Model):
+        raise ModelError(f"the model is a {type(model).__name__}, expected a pin.Model")
+    if name is not None and not isinstance(name, str):
+        raise InputError(f"name is a {type(name).__name__}, expected a word")
+    copy = model.copy()
+    copy.gravity.setZero()
+    name = name or model.name or "model"
+    check_model(copy, name)
+    robot = _robot(copy, name, lock, {})
+    own = {joint.name: float(robot.model.damping[joint.idx_v]) for joint in robot.joints}
+    robot = replace(robot, urdf_damping=own)
+    return robot.replace(**fields) if fields else robot
+
+
+def _folders(package_dirs: Any) -> tuple[Path, ...]:
+    from fflin.base.writing import as_path
+
+    if isinstance(package_dirs, str | os.PathLike) or not isinstance(package_dirs, Sequence):
+        raise InputError(f"package_dirs is {package_dirs!r}, expected a list of folders")
+    return tuple(as_path(folder) for folder in package_dirs)
+
+
+def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, Mimic]) -> Robot:
+    _check_root(model, name)
+    locked: tuple[str, ...] = ()
+    if lock is not None:
+        model, mimics, locked = _locked(model, lock, mimics)
+    all_joints = [_joint(model, index) for index in range(ROOT + 1, model.njoints)]
+    by_name = {joint.name: joint for joint in all_joints}
+    robot = Robot(
+        model,
+        name,
+        None,
+        "",
+        tuple(joint for joint in all_joints if joint.name not in mimics),
+        tuple(
+            Follower(by_name[joint], by_name[mimic.leader], mimic.multiplier, mimic.offset)
+            for joint, mimic in mimics.items()
+        ),
+        locked=locked,
+    )
+    if not model.check(robot.create_data()):
+        raise ModelError(
+            f"'{name}': the joints are not in depth-first order, in which Pinocchio's CRBA is "
+            "wrong; add the joints of one branch before those of the next"
+        )
+    return robot
+
+
+def _independent_damping(robot: Robot, damping: Mapping[str, float]) -> dict[str, float]:
+    """Count the damping of mimic joints with that of their leaders: the power is the same."""
+    result = {name: damping.get(name, 0.0) for name in robot.joint_names}
+    for joint, leader, multiplier, _ in robot.followers:
+        result[leader.name] += multiplier**2 * damping.get(joint.name, 0.0)
+    return result
+
+
+def _check_root(model: pin.Model, name: str) -> None:
+    root = model.joints[ROOT].shortname() if model.njoints > ROOT else "none"
+    if root != "JointModelFreeFlyer":
+        raise ModelError(
+            f"'{name}': the root joint is {root}, expected JointModelFreeFlyer; build the model "
+            "with pin.JointModelFreeFlyer() as its root joint"
+        )
+    fixed = [model.names[i] for i in range(ROOT + 1, model.njoints) if model.parents[i] == 0]
+    if fixed:
+        raise ModelError(
+            f"'{name}': joint '{fixed[0]}' hangs on the world beside the free-flyer; "
+            "everything that moves must hang on one base"
+        )
+
+
+def _locked(
+    model: pin.Model, lock: Lock, mimics: Mapping[str, Mimic]
+) -> tuple[pin.Model, dict[str, Mimic], tuple[str, ...]]:
+    """Weld joints, and what mimics them.
+
+    Returns the smaller model, the mimics that are left, and "joint=value" of what was welded.
+    """
+    names = [lock] if isinstance(lock, str) else _listed(lock)
+    given = lock if isinstance(lock, Mapping) else {}
+    movable = list(model.names)[ROOT + 1 :]
+    q = pin.neutral(model)
+    for name in names:
+        if name not in movable:
+            raise unknown("joint to lock", name, movable)
+    values = {
+        name: None if given.get(name) is None else number(f"lock '{name}'", given[name])
+        for name in names
+    }
+    for name, mimic in mimics.items():
+        leader_value = values.get(mimic.leader, 0.0) or 0.0
+        if mimic.leader in values or values.get(name, 0.0) is None:
+            values.setdefault(name, None)
+            if values[name] is None:
+                values[name] = mimic.multiplier * leader_value + mimic.offset
+    indices, locked = [], []
+    for name, value in values.items():
+        index = model.getJointId(name)
+        indices.append(index)
+        locked.append(f"{name}={0.0 if value is None else value!r}")
+        if value is not None:
+            _joint(model, index).place(q, value)
+        # Without a frame for the joint, which models built in code may lack, Pinocchio crashes.
+        if not model.existFrame(name, pin.FrameType.JOINT):
+            model.addJointFrame(index)
+    left = {name: mimic for name, mimic in mimics.items() if name not in values}
+    return _reduced(model, indices, q), left, tuple(locked)
+
+
+def _listed(lock: Any) -> list[str]:
+    try:
+        names = list(lock)
+    except TypeError:
+        names = [None]
+    if not all(isinstance(name, str) for name in names):
+        raise InputError(
+            f"lock is a {type(lock).__name__}, expected {{joint: value}} or names of joints"
+        )
+    return names
+
+
+def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
+    """Weld joints at q (nq,). Pinocchio looks frames up by name, which links and joints may share.
+
+    The joints' own frames keep their names, by which it finds them.
+    """
+    names = Counter(frame.name for frame in model.frames.tolist())
+    shared: dict[str, str] = {}
+    for index, frame in enumerate(model.frames):
+        if index and frame.type != pin.FrameType.JOINT and names[frame.name] > 1:
+            alias = f"{index}/{frame.name}"
+            while alias in names:
+                alias += "/"
+            shared[alias], frame.name = frame.name, alias
+    reduced = pin.buildReducedModel(model, indices, q)
+    for frame in reduced.frames:
+        frame.name = shared.get(frame.name, frame.name)
+    return reduced
+
+
+def _joint(model: pin.Model, index: int) -> Joint:
+    joint = model.joints[index]
+    kind = joint.shortname()
+    name = model.names[index]
+    if kind == "JointModelMimic":
+        raise ModelError(
+            f"joint '{name}' is a JointModelMimic, for which Pinocchio has no derivatives; load "
+            "the URDF with fflin.load, or build the model with mimic=False"
+        )
+    if joint.nv != 1 or joint.nq not in (1, 2):
+        raise ModelError(
+            f"joint '{name}' is a {kind.removeprefix('JointModel')} of {joint.nv} "
+            f"degrees of freedom, expected one; lock it (lock=['{name}'])"
+        )
+    return Joint(name, joint.idx_q, joint.idx_v, joint.nq == 2, kind.startswith("JointModelP"))

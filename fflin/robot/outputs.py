@@ -1,0 +1,257 @@
+"""What is watched of a robot: the outputs y of the linear model, in any mix and order.
+
+Reference axes are those of the reference placement that the state is relative to. What a kind
+measures, and its slopes, stand in `fflin.dynamics.output_kinds`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+from fflin.base.errors import InputError, unknown
+
+
+@dataclass(frozen=True)
+class Output:
+    """What every kind of output says of itself.
+
+    Attributes
+    ----------
+    WORD : str
+        What it is called on a command line.
+    VECTORS : tuple of (str, str)
+        (name, unit) of each vector of three that it measures; empty where it is of states.
+    FEELS_ACCELERATION : bool
+        Whether it depends on the accelerations, and so on the inputs.
+    """
+
+    WORD: ClassVar[str]
+    VECTORS: ClassVar[tuple[tuple[str, str], ...]] = ()
+    FEELS_ACCELERATION: ClassVar[bool] = False
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The frames of the model that it is of."""
+        return ()
+
+    @property
+    def signals(self) -> list[tuple[str, str]]:
+        """(name, unit) of each component, without those that are states."""
+        prefix = "/".join(self.frames) + "." * bool(self.frames)
+        return [(f"{prefix}{name}.{axis}", unit) for name, unit in self.VECTORS for axis in "xyz"]
+
+
+class FrameOutput(Output):
+    """An output of frames of the model, on the base or on any link: its fields name them."""
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The frames of the model that it is of."""
+        return tuple(getattr(self, item.name) for item in fields(self))
+
+
+@dataclass(frozen=True)
+class FullState(Output):
+    """Every state, under its own name, in the order and axes of the state."""
+
+    WORD = "state"
+
+
+@dataclass(frozen=True)
+class BasePose(Output):
+    """Attitude q_b (3) [1] and position r_b (3) [m] of the base, the states."""
+
+    WORD = "base"
+
+
+@dataclass(frozen=True)
+class JointPositions(Output):
+    """Angles [rad] or lengths [m] of joints, the states.
+
+    Parameters
+    ----------
+    joints : tuple of str, optional
+        Independent joints, in the order wanted; all of them, in state order, by default.
+    """
+
+    WORD = "joints"
+    joints: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        _check_joints(self.joints)
+
+
+@dataclass(frozen=True)
+class JointVelocities(Output):
+    """Rates [rad/s] or [m/s] of joints, the states.
+
+    Parameters
+    ----------
+    joints : tuple of str, optional
+        Independent joints, in the order wanted; all of them, in state order, by default.
+    """
+
+    WORD = "rates"
+    joints: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        _check_joints(self.joints)
+
+
+@dataclass(frozen=True)
+class FramePose(FrameOutput):
+    """Pose of a frame of the model, on the base or on any link.
+
+    Position (3) [m] of its origin relative to the reference, in reference axes, and rotation
+    vector (3) [rad] from its attitude R* at the point of linearisation, log(R*^T R), in the
+    frame's own axes: zero at the point.
+
+    Parameters
+    ----------
+    frame : str
+    """
+
+    WORD = "pose"
+    VECTORS = (("position", "m"), ("rotation", "rad"))
+    frame: str
+
+
+@dataclass(frozen=True)
+class FrameVelocity(FrameOutput):
+    """Velocity of a frame of the model, with the axes of the hybrid velocity of the base.
+
+    Angular velocity (3) [rad/s] in the frame's own axes, and velocity (3) [m/s] of its origin,
+    in reference axes: the rates of `FramePose` at the point, whatever the frame of the state.
+
+    Parameters
+    ----------
+    frame : str
+    """
+
+    WORD = "velocity"
+    VECTORS = (("angular_velocity", "rad/s"), ("velocity", "m/s"))
+    frame: str
+
+
+@dataclass(frozen=True)
+class RelativePose(FrameOutput):
+    """Pose of a frame as seen from another, wherever the base is.
+
+    Position (3) [m] of its origin from that of the other, in the other's axes, and rotation vector
+    (3) [rad] of the relative attitude from that at the point of linearisation, log(R*^T R), in
+    the frame's own axes: zero at the point.
+
+    Parameters
+    ----------
+    frame : str
+    to : str
+        The frame that sees it.
+    """
+
+    WORD = "relative"
+    VECTORS = (("position", "m"), ("rotation", "rad"))
+    frame: str
+    to: str
+
+
+@dataclass(frozen=True)
+class CenterOfMass(Output):
+    """Position (3) [m] of the centre of mass relative to the reference, in reference axes."""
+
+    WORD = "com"
+    VECTORS = (("com", "m"),)
+
+
+@dataclass(frozen=True)
+class Momentum(Output):
+    """Momentum of the whole robot, in reference axes.
+
+    Angular momentum (3) [N m s] about the centre of mass, that of every wheel included, and
+    linear momentum (3) [N s].
+    """
+
+    WORD = "momentum"
+    VECTORS = (("momentum.angular", "N m s"), ("momentum.linear", "N s"))
+
+
+@dataclass(frozen=True)
+class Gyroscope(FrameOutput):
+    """What a gyroscope measures: angular velocity (3) [rad/s] of a frame, in its own axes.
+
+    Parameters
+    ----------
+    frame : str
+    """
+
+    WORD = "gyroscope"
+    VECTORS = (("gyroscope", "rad/s"),)
+    frame: str
+
+
+@dataclass(frozen=True)
+class Accelerometer(FrameOutput):
+    """What an accelerometer measures: specific force (3) [m/s^2], in its own axes.
+
+    The acceleration of the frame's origin less gravity: zero in free fall where nothing turns
+    or pushes, and +g upwards where it stands still.
+
+    Parameters
+    ----------
+    frame : str
+    """
+
+    WORD = "accelerometer"
+    VECTORS = (("acceleration", "m/s^2"),)
+    FEELS_ACCELERATION = True
+    frame: str
+
+
+# In the order in which a command line lists them.
+KINDS: tuple[type[Output], ...] = (
+    *(FullState, BasePose, JointPositions, JointVelocities, CenterOfMass, Momentum),
+    *(FramePose, FrameVelocity, RelativePose, Gyroscope, Accelerometer),
+)
+
+
+def parse_output(text: str) -> tuple[Output, ...]:
+    """Read one output as it is written on a command line.
+
+    Parameters
+    ----------
+    text : str
+        ``state``, ``base``, ``joints``, ``rates``, ``com`` or ``momentum``; or of a frame
+        ``pose:NAME``, ``velocity:NAME``, both as ``frame:NAME``, ``gyroscope:NAME``,
+        ``accelerometer:NAME``; or of two ``relative:NAME:TO``.
+
+    Returns
+    -------
+    tuple of Output
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such output.
+    InputError
+        If a frame is missing, or one is given where none belongs.
+    """
+    word, colon, rest = text.partition(":")
+    kinds = {kind.WORD: (kind,) for kind in KINDS} | {"frame": (FramePose, FrameVelocity)}
+    if word not in kinds:
+        raise unknown("output", word, tuple(kinds))
+    wanted = [item.name for item in fields(kinds[word][0])]
+    if not issubclass(kinds[word][0], FrameOutput):
+        if colon:
+            raise InputError(f"output '{text}' is of the whole robot; write {word}")
+        return (kinds[word][0](),)
+    names = rest.split(":", len(wanted) - 1)
+    if len(names) != len(wanted) or not all(names):
+        form = ":".join((word, "NAME", *(name.upper() for name in wanted[1:])))
+        missing = "no frame" if len(wanted) == 1 else "fewer than two frames"
+        raise InputError(f"output '{text}' is of {missing}; write {form}")
+    return tuple(kind(*names) for kind in kinds[word])
+
+
+def _check_joints(joints: Sequence[str] | None) -> None:
+    # A string is a sequence of names of one letter each.
+    if isinstance(joints, str):
+        raise InputError(f"joints is {joints!r}, expected a tuple of names, ({joints!r},)")

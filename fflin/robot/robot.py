@@ -1,0 +1,425 @@
+"""The robot that every other call speaks of: a free-flyer root and n one-degree joints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import InputError, ModelError, unknown
+from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, number, placement, vector
+from fflin.robot.fields import validated_fields, validated_inputs
+from fflin.robot.frames import ROOT, find_frame
+from fflin.robot.inputs import Input, default_inputs, named_wheels
+from fflin.robot.joints import Follower, Joint
+from fflin.robot.massless import idle_coordinates
+from fflin.robot.model_checks import change_in
+from fflin.robot.outputs import FullState, Output
+from fflin.robot.wheels import stored_momentum, with_wheels
+
+_CONFIGURATION = "a configuration in Pinocchio's order"
+
+# What renormalising a unit quaternion leaves: two ulp of unity.
+_ROUND_OFF = 2.0 * float(np.finfo(float).eps)
+
+# Data holds a third-order tensor of nv^3 entries among others: about 32 nv^3 bytes in all.
+_DATA_BYTES_PER_NV3 = 32
+_DATA_LIMIT = 2**30
+
+
+class Passive(NamedTuple):
+    """What passive joints do: -stiffness (q_m - rest) - damping qdot_m, each (n,)."""
+
+    stiffness: Array
+    damping: Array
+    rest: Array
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Robot:
+    """A robot floating free; made by `load` or `from_model`.
+
+    Attributes
+    ----------
+    model : pin.Model
+        Free-flyer root joint, zero gravity; its mimic joints are joints like the others, and so
+        are the wheels with an inertia among the inputs. To be read: a robot whose model was
+        changed is refused, see `from_model`.
+    name : str
+        Name or file stem it was loaded by.
+    urdf : Path or None
+        The file it was read from.
+    urdf_sha256 : str
+        Hash of that file; empty where there is none.
+    joints : tuple of Joint
+        The n independent joints in state order, which is Pinocchio's.
+    followers : tuple of Follower
+        The mimic joints, each with the independent joint that it follows.
+    notes : tuple of str
+        What was warned of when it was read.
+    locked : tuple of str
+        "joint=value" [rad|m] of the joints that were welded.
+    urdf_damping : mapping
+        {joint: viscous damping [N m s/rad | N s/m]} as its file says, what follows a joint
+        counted with it; part of the model only if `damping` is "urdf".
+    inputs : tuple of Input
+        What acts on it; the base's torque and force and every joint's by default.
+    outputs : tuple of Output
+        What is watched of it; the full state by default.
+    stiffness, damping : mapping
+        {joint: value [N m/rad | N/m], [N m s/rad | N s/m]} of passive joints.
+    rest : mapping
+        {joint: position [rad|m]} where a spring is relaxed; 0 where not named.
+    gravity : tuple of float (3,)
+        Uniform acceleration [m/s^2] in Pinocchio's world axes. `model` itself has none.
+    package_dirs : tuple of Path
+        Folders in which ``package://`` paths of meshes are looked up when it is drawn.
+    """
+
+    model: pin.Model
+    name: str
+    urdf: Path | None
+    urdf_sha256: str
+    joints: tuple[Joint, ...]
+    followers: tuple[Follower, ...] = ()
+    notes: tuple[str, ...] = ()
+    locked: tuple[str, ...] = ()
+    urdf_damping: Mapping[str, float] = field(default_factory=dict)
+    inputs: tuple[Input, ...] = ()
+    outputs: tuple[Output, ...] = (FullState(),)
+    stiffness: Mapping[str, float] = field(default_factory=dict)
+    damping: Mapping[str, float] = field(default_factory=dict)
+    rest: Mapping[str, float] = field(default_factory=dict)
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    package_dirs: tuple[Path, ...] = ()
+    # Where some of its joints are wheels: the same robot without them.
+    _wheelless: Robot | None = None
+    # What the model was when the robot was made.
+    _as_made: pin.Model = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_as_made", self.model.copy())
+        if not self.inputs:
+            object.__setattr__(self, "inputs", default_inputs(self.joint_names))
+
+    def replace(self, **fields: Any) -> Robot:
+        """Return the same robot with other inputs, passive joints or gravity.
+
+        Parameters
+        ----------
+        inputs : sequence of Input
+            What acts on it, in the order of u. Wheels with an inertia among them become joints
+            of the robot; those that it had before and that are not among them go.
+        outputs : sequence of Output
+            What is watched of it, in the order of y.
+        stiffness : mapping or float
+            {joint: K [N m/rad | N/m]}, or one for all joints but wheels.
+        damping : mapping, float or "urdf"
+            {joint: D [N m s/rad | N s/m]}, one for all joints but wheels, or what the URDF
+            says.
+        rest : mapping
+            {joint: position [rad|m]} where its spring is relaxed.
+        gravity : sequence of float (3,)
+            Uniform acceleration [m/s^2] in Pinocchio's world axes.
+
+        Returns
+        -------
+        Robot
+
+        Raises
+        ------
+        InputError
+            If a value is negative or not a number, a field is not one of these, or a wheel has
+            more inertia than what carries it.
+        UnknownNameError
+            If there is no such joint, or no such frame for an input or output.
+        ModelError
+            If dry friction is asked for, which is not differentiable at rest, or the robot's
+            model was changed after it was made.
+        """
+        self.require_unchanged()
+        robot = self
+        if "inputs" in fields:
+            robot = self._with_inputs(fields.pop("inputs"))
+        own = (robot._wheelless or robot).joint_names
+        robot = replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
+        for item in (*robot.inputs, *robot.outputs):
+            frame = getattr(item, "frame", None)
+            if frame is not None:
+                find_frame(robot.model, frame)
+        return robot
+
+    @cached_property
+    def wheels(self) -> dict[str, float]:
+        """{name: inertia [kg m^2]} of the wheels among its joints."""
+        wheels = named_wheels(self.inputs)
+        return {name: wheel.inertia for name, wheel in wheels if wheel.inertia}
+
+    @cached_property
+    def stored_momentum(self) -> tuple[tuple[int, Array], ...]:
+        """Of wheels without inertia: (Pinocchio joint, momentum (3,) [N m s] in its axes)."""
+        return stored_momentum(self.model, self.inputs)
+
+    @cached_property
+    def passive(self) -> Passive:
+        """Stiffness, damping and rest positions (n,) in state order."""
+        return Passive(
+            *(
+                np.array([values.get(name, 0.0) for name in self.joint_names])
+                for values in (self.stiffness, self.damping, self.rest)
+            )
+        )
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the n independent joints in state order."""
+        return tuple(joint.name for joint in self.joints)
+
+    @property
+    def n(self) -> int:
+        """Number of independent joints."""
+        return len(self.joints)
+
+    @cached_property
+    def nq(self) -> int:
+        """Size of Pinocchio's configuration."""
+        return int(self.model.nq)
+
+    @cached_property
+    def nv(self) -> int:
+        """Size of Pinocchio's velocity: 6 + n, and one for each mimic joint."""
+        return int(self.model.nv)
+
+    @cached_property
+    def idle(self) -> tuple[str, ...]:
+        """What can move together without moving mass, so that M is singular everywhere."""
+        return idle_coordinates(self)
+
+    @property
+    def mass(self) -> float:
+        """Total mass in kg."""
+        return float(sum(inertia.mass for inertia in self.model.inertias.tolist()[ROOT:]))
+
+    def __repr__(self) -> str:
+        return f"Robot('{self.name}', n={self.n}, mass={self.mass:.6g} kg)"
+
+    def joint(self, name: str) -> Joint:
+        """Return the independent joint of that name.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is none; the message has the near names, or the leader of a mimic joint.
+        """
+        for joint in self.joints:
+            if joint.name == name:
+                return joint
+        for follower in self.followers:
+            if follower.joint.name == name:
+                raise InputError(
+                    f"joint '{name}' mimics '{follower.leader.name}'; place that one instead"
+                )
+        if name in (wheel for wheel, _ in named_wheels(self.inputs)):
+            raise InputError(
+                f"wheel '{name}' has no inertia, so that it is no joint and has no speed; give it "
+                "one, or its momentum"
+            )
+        if any(locked.rpartition("=")[0] == name for locked in self.locked):
+            raise InputError(f"joint '{name}' is locked; lock it at another value instead")
+        raise unknown("joint", name, self.joint_names)
+
+    def neutral(self) -> Array:
+        """Return the neutral configuration (nq,): mimic joints where their leaders put them."""
+        q = pin.neutral(self.model)
+        self.follow(q)
+        return q
+
+    def follow(self, q: Array) -> None:
+        """Put the mimic joints of a configuration where their leaders say."""
+        for joint, leader, multiplier, offset in self.followers:
+            joint.place(q, multiplier * leader.value(q) + offset)
+
+    def checked_configuration(self, q: Array) -> Array:
+        """Return `q` as a valid configuration of this robot.
+
+        Parameters
+        ----------
+        q : array_like (nq,)
+            Configuration in Pinocchio's order. Its quaternion, the (cos, sin) of every continuous
+            joint and the mimic joints are put right where they are within 1e-6.
+
+        Returns
+        -------
+        ndarray (nq,)
+            `q` itself where nothing was to be done, never modified.
+
+        Raises
+        ------
+        InputError
+            If the size is wrong, an entry is not finite, a part is not of unit length, or a mimic
+            joint is not where its leader puts it.
+        """
+        if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != self._shape:
+            q = vector("q", q, self.nq, _CONFIGURATION)
+        entries = q.tolist()
+        if not math.isfinite(sum(entries)):
+            vector("q", q, self.nq, _CONFIGURATION)  # says which entry it is
+        x, y, z, w = entries[3:7]
+        worst = abs(x * x + y * y + z * z + w * w - 1.0)
+        if worst > NORM_TOLERANCE:
+            raise InputError(
+                f"the base quaternion q[3:7] has length {np.linalg.norm(q[3:7]):.9g}, expected 1; "
+                "normalise it (x, y, z, w)"
+            )
+        for index in self._unbounded:
+            c, s = entries[index], entries[index + 1]
+            excess = abs(c * c + s * s - 1.0)
+            if excess > worst:
+                worst = excess
+                if excess > NORM_TOLERANCE:
+                    raise InputError(
+                        f"(cos, sin) of continuous joint '{self._unbounded[index]}', "
+                        f"q[{index}:{index + 2}], has length {np.hypot(c, s):.9g}, expected 1"
+                    )
+        if worst > _ROUND_OFF:
+            q = pin.normalize(self.model, q)
+        return self._followed(q) if self.followers else q
+
+    def checked_velocity(self, v: Array) -> Array:
+        """Return `v` as a valid velocity (nv,), never modified.
+
+        Raises
+        ------
+        InputError
+            If the size is wrong, an entry is not finite, or a mimic joint does not move as its
+            leader makes it.
+        """
+        v = vector("v", v, self.nv, "a velocity in Pinocchio's order")
+        for joint, leader, multiplier, _ in self.followers:
+            expected = multiplier * v[leader.idx_v]
+            if abs(v[joint.idx_v] - expected) > NORM_TOLERANCE * max(1.0, abs(expected)):
+                raise InputError(
+                    f"v[{joint.idx_v}] of joint '{joint.name}' is {v[joint.idx_v]:.9g}, but it "
+                    f"mimics '{leader.name}', which makes it {expected:.9g}"
+                )
+        return v
+
+    def _with_inputs(self, inputs: Any) -> Robot:
+        """Return the robot with other inputs, and with the wheels among them as joints."""
+        bare = self._wheelless or self
+        checked = validated_inputs(inputs, bare.joint)
+        wheels = [(name, wheel) for name, wheel in named_wheels(checked) if wheel.inertia]
+        model, joints, followers = with_wheels(bare.model, bare.joints, bare.followers, wheels)
+        names = {joint.name for joint in joints}
+        stiffness, damping, rest = (
+            {name: x for name, x in values.items() if name in names}
+            for values in (self.stiffness, self.damping, self.rest)
+        )
+        return replace(
+            self,
+            model=model,
+            joints=joints,
+            followers=followers,
+            inputs=checked,
+            stiffness=stiffness,
+            damping=damping,
+            rest=rest,
+            _wheelless=bare if wheels else None,
+        )
+
+    def require_unchanged(self) -> None:
+        """Raise `ModelError` where the model was changed in place after the robot was made.
+
+        Results prepared before the change would be of another robot than those made after it.
+        """
+        # Tells in a microsecond that nothing at all was changed.
+        if self.model != self._as_made and (change := change_in(self.model, self._as_made)):
+            raise ModelError(
+                f"the model of '{self.name}' was changed after the robot was made: {change}; make "
+                "a robot of it with fflin.from_model(model)"
+            )
+
+    def create_data(self) -> pin.Data:
+        """Make Pinocchio's work space for this robot.
+
+        Raises
+        ------
+        ModelError
+            If it would take more than 1 GiB.
+        """
+        size = _DATA_BYTES_PER_NV3 * self.nv**3
+        if size > _DATA_LIMIT:
+            raise ModelError(
+                f"'{self.name}' has {self.n} joints, for which Pinocchio's Data takes about "
+                f"{size / 2**30:.1f} GiB (limit 1 GiB); lock joints that do not matter"
+            )
+        return self.model.createData()
+
+    @cached_property
+    def _shape(self) -> tuple[int]:
+        return (self.nq,)
+
+    @cached_property
+    def _unbounded(self) -> dict[int, str]:
+        joints = (*self.joints, *(follower.joint for follower in self.followers))
+        return {joint.idx_q: joint.name for joint in joints if joint.unbounded}
+
+    def _followed(self, q: Array) -> Array:
+        followed = q.copy()
+        self.follow(followed)
+        for joint, leader, *_ in self.followers:
+            part = slice(joint.idx_q, joint.idx_q + 1 + joint.unbounded)
+            error = np.abs(followed[part] - q[part]).max()
+            if error > NORM_TOLERANCE * max(1.0, np.abs(followed[part]).max()):
+                raise InputError(
+                    f"joint '{joint.name}' is at {joint.value(q):.9g}, but it mimics "
+                    f"'{leader.name}', which puts it at {joint.value(followed):.9g}; "
+                    "`configuration` places mimic joints"
+                )
+        return followed
+
+
+def configuration(
+    robot: Robot,
+    joints: Mapping[str, float] | None = None,
+    base: pin.SE3 | None = None,
+) -> Array:
+    """Build a Pinocchio configuration.
+
+    Parameters
+    ----------
+    robot : Robot
+    joints : mapping, optional
+        {joint: value [rad|m]} of independent joints; the others stay at neutral.
+    base : pin.SE3, optional
+        Placement of the base in the world; the identity by default.
+
+    Returns
+    -------
+    ndarray (nq,)
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such joint.
+    InputError
+        If a value is not a finite number, or a joint mimics another.
+    """
+    if not isinstance(robot, Robot):
+        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
+    q = pin.neutral(robot.model)
+    if base is not None:
+        root = robot.model.jointPlacements[ROOT]
+        q[:7] = pin.SE3ToXYZQUAT(root.actInv(placement("base", base)))
+    if joints is not None and not isinstance(joints, Mapping):
+        raise InputError(f"joints is a {type(joints).__name__}, expected {{joint: value}}")
+    for name, value in (joints or {}).items():
+        robot.joint(name).place(q, number(f"joint '{name}'", value))
+    robot.follow(q)
+    return robot.checked_configuration(q)

@@ -1,0 +1,84 @@
+"""What a robot is, in words and tables."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterable
+
+from fflin.base.tables import counted, grid, width
+from fflin.robot.robot import ROOT, Robot
+
+_LIMITS = "limits in rad, N m and rad/s; of a prismatic joint in m, N and m/s"
+
+
+def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
+    """Show robots: (name, the robot or why it does not load, where from)."""
+    rows, refused = [["name", "n", "mass [kg]", "from"]], []
+    for name, robot, origin in entries:
+        if isinstance(robot, str):
+            refused.append(f"{name} does not load: {robot}")
+        else:
+            rows.append([name, str(robot.n), f"{robot.mass:.6g}", origin])
+    notes = [textwrap.fill(line, width(), subsequent_indent="  ") for line in refused]
+    return "\n\n".join((grid(rows, "lrrl"), *notes))
+
+
+def robot_info(robot: Robot) -> str:
+    """Show a robot's tree, masses and limits."""
+    model = robot.model
+    source = str(robot.urdf) if robot.urdf else "a Pinocchio model"
+    head = (
+        f"{robot.name}: {counted(robot.n, 'joint')}, {12 + 2 * robot.n} states, "
+        f"{6 + robot.n} inputs, mass {robot.mass:.6g} kg\nfrom {source}"
+    )
+    depth = {0: -1, 1: 0}
+    rows = [["joint", "type", "mass [kg]", "lower", "upper", "effort", "velocity"]]
+    rows.append(["(base)", "free", f"{model.inertias[1].mass:.6g}", ".", ".", ".", "."])
+    kinds = {
+        joint: "prismatic" if joint.prismatic else "continuous" if joint.unbounded else "revolute"
+        for joint in robot.joints
+    }
+    kinds |= {joint: "wheel" for joint in robot.joints if joint.name in robot.wheels}
+    for joint, leader, multiplier, offset in robot.followers:
+        kinds[joint] = f"mimics {leader.name} * {multiplier:g}"
+        kinds[joint] += f" {'-' if offset < 0 else '+'} {abs(offset):g}" if offset else ""
+    for joint in sorted(kinds, key=lambda joint: joint.idx_v):
+        index = model.getJointId(joint.name)
+        depth[index] = depth[model.parents[index]] + 1
+        limits = (
+            (".", ".")
+            if joint.unbounded
+            else (
+                _limit(model.lowerPositionLimit[joint.idx_q]),
+                _limit(model.upperPositionLimit[joint.idx_q]),
+            )
+        )
+        rows.append(
+            [
+                "  " * depth[index] + joint.name,
+                kinds[joint],
+                f"{model.inertias[index].mass:.6g}",
+                *limits,
+                _limit(model.effortLimit[joint.idx_v]),
+                _limit(model.velocityLimit[joint.idx_v]),
+            ]
+        )
+    frames = [frame.name for frame in model.frames.tolist() if frame.parentJoint >= ROOT]
+    wrapped = textwrap.fill(
+        ", ".join(dict.fromkeys(frames)), width(), initial_indent="  ", subsequent_indent="  "
+    )
+    limited = any(cell != "." for row in rows[1:] for cell in row[3:])
+    parts = [head, grid(rows, "ll"), *[_LIMITS] * limited, f"frames\n{wrapped}"]
+    if robot.notes:
+        notes = (
+            textwrap.fill(note, width(), initial_indent="  ", subsequent_indent="    ")
+            for note in robot.notes
+        )
+        parts.append("\n".join(("warnings", *notes)))
+    return "\n\n".join(parts)
+
+
+def _limit(value: float) -> str:
+    # Pinocchio marks what the URDF does not limit by the largest double or by infinity.
+    return "." if not math.isfinite(value) or abs(value) > 1e300 else f"{value:.5g}"

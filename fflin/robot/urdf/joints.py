@@ -1,0 +1,214 @@
+"""Joints of a URDF: what they connect and how they move."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from dataclasses import dataclass
+
+from fflin.robot.urdf.links import Pose, bounded, read_pose, refuse_near_miss
+from fflin.robot.urdf.xml import Element, decimal, quoted
+
+# Degrees of freedom of the types of joint.
+FREEDOM = {
+    "fixed": 0,
+    "revolute": 1,
+    "continuous": 1,
+    "prismatic": 1,
+    "planar": 3,
+    "floating": 6,
+}
+_AXIAL = ("revolute", "continuous", "prismatic", "planar")
+
+# What a joint without a limit is limited to.
+UNLIMITED = sys.float_info.max
+
+# An axis this short or long is no direction that somebody meant to write.
+_SHORTEST_AXIS, _LONGEST_AXIS = 1e-6, 1e6
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """A joint that moves with another: value = multiplier * leader's value + offset.
+
+    Attributes
+    ----------
+    leader : str
+        The joint that it follows.
+    multiplier : float
+        [rad/rad, m/rad, ...]
+    offset : float
+        [rad|m]
+    """
+
+    leader: str
+    multiplier: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class JointElement:
+    """One joint as the file describes it.
+
+    Attributes
+    ----------
+    name, type : str
+    parent, child : str
+        Names of the links.
+    element : Element
+        Where it stands in the file.
+    origin : Pose
+        Of the child's frame in the parent's.
+    axis : tuple of float
+        In the child's frame; Pinocchio scales it to unit length.
+    limits : dict
+        Those of lower, upper, effort and velocity that the file gives; None without <limit>.
+    damping, friction : float
+        [N m s/rad | N s/m], [N m | N].
+    mimic : Mimic or None
+        As written: the leader may itself be a mimic.
+    """
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    element: Element
+    origin: Pose
+    axis: tuple[float, ...]
+    limits: dict[str, float] | None
+    damping: float
+    friction: float
+    mimic: Mimic | None
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom."""
+        return FREEDOM[self.type]
+
+
+def read_joint(element: Element) -> JointElement:
+    """Read a <joint>; raise `UrdfError` where something in it is wrong."""
+    name = element.text("name", "a <joint>")
+    of = f"joint {quoted(name)}"
+    if name == "universe":
+        raise element.error("a joint is named 'universe', Pinocchio's name of the world; rename it")
+    kind = element.text("type", of)
+    if kind not in FREEDOM:
+        advice = "use three revolute joints" if kind == "spherical" else "correct it"
+        raise element.error(
+            f"{of} is of the unknown type {quoted(kind)}; known: {', '.join(FREEDOM)}; {advice}"
+        )
+    refuse_near_miss(
+        element,
+        of,
+        ("parent", "child", "origin", "axis", "limit", "dynamics", "mimic"),
+    )
+    for child in element.children:
+        prefix, _, local = child.tag.rpartition(":")
+        if prefix and local == "mimic":
+            raise child.error(f"<{child.tag}> in {of} is not read; write it as <mimic>")
+        if prefix and local == "rotor_inertia":
+            child.note(f"<{child.tag}> of {of} is not in the model")
+    ends = []
+    for end in ("parent", "child"):
+        found = element.require(end, of)
+        found.allow_only("link", of=of)
+        ends.append(found.text("link", f"<{end}> of {of}"))
+    damping, friction = _dynamics(element, of, kind)
+    return JointElement(
+        name,
+        kind,
+        ends[0],
+        ends[1],
+        element,
+        read_pose(element, of),
+        _axis(element, of, kind),
+        _limits(element, of, kind),
+        damping,
+        friction,
+        _mimic(element, of),
+    )
+
+
+def _axis(element: Element, of: str, kind: str) -> tuple[float, ...]:
+    found = element.find("axis", of)
+    # Exporters write a zero axis into fixed joints; it has no meaning there.
+    if kind not in _AXIAL:
+        return (1.0, 0.0, 0.0)
+    axis: tuple[float, ...] = (1.0, 0.0, 0.0)
+    if found is not None:
+        # Exporters write an rpy of zeros here, which turns nothing.
+        turned = any(decimal(entry) != 0.0 for entry in found.attributes.get("rpy", "").split())
+        found.allow_only("xyz", *(() if turned else ("rpy",)), of=of)
+        axis = found.vector("xyz", f"<axis> of {of}", 3)
+        length = math.hypot(*axis)
+        if not _SHORTEST_AXIS <= length <= _LONGEST_AXIS:
+            raise found.error(
+                f"<axis> of {of} has length {length:g}; expected a direction, such as 0 0 1"
+            )
+    if kind == "planar" and (axis[0] or axis[1] or axis[2] < 0.0):
+        raise element.error(
+            f"{of} is planar about an axis other than z; turn its <origin> so that "
+            '<axis xyz="0 0 1"/> is the normal of the plane'
+        )
+    return axis
+
+
+def _limits(element: Element, of: str, kind: str) -> dict[str, float] | None:
+    found = element.find("limit", of)
+    if found is None or FREEDOM[kind] != 1:
+        return None
+    names = ("lower", "upper", "effort", "velocity")
+    limits = {name: _limit(found, name, of) for name in names if name in found.attributes}
+    lower, upper = limits.get("lower", 0.0), limits.get("upper", 0.0)
+    if lower > upper:
+        found.note(f"lower of {of} is {lower:g}, more than upper, {upper:g}; taken as no limits")
+        limits |= {"lower": -UNLIMITED, "upper": UNLIMITED}
+    return limits
+
+
+def _limit(found: Element, name: str, of: str) -> float:
+    """Return one limit. They do not enter the linear model, so a wrong one is no error."""
+    none = -UNLIMITED if name == "lower" else UNLIMITED
+    text = found.attributes[name].strip()
+    value = float(text) if re.fullmatch(r"[+-]?inf(inity)?", text.lower()) else decimal(text)
+    least = -math.inf if name in ("lower", "upper") else 0.0
+    # Written so that NaN, of what is no number, fails too.
+    if not value >= least or value == -math.copysign(math.inf, none):
+        expected = "a number" if least else "one that is not negative"
+        found.note(f"{name} of {of} is {quoted(text)}, expected {expected}; taken as no limit")
+        return none
+    return none if math.isinf(value) else value
+
+
+def _dynamics(element: Element, of: str, kind: str) -> tuple[float, float]:
+    found = element.find("dynamics", of)
+    if found is None or FREEDOM[kind] != 1:
+        return 0.0, 0.0
+    values = []
+    found.allow_only("damping", "friction", of=of)
+    for name in ("damping", "friction"):
+        if not found.attributes.get(name, "0").strip():
+            found.note(f"{name} of {of} is empty; taken as 0")
+            values.append(0.0)
+            continue
+        value = bounded(found, name, of, found.number(name, f"<dynamics> of {of}", 0.0))
+        if value < 0.0:
+            raise found.error(f"{name} of {of} is {value:g}; it cannot be negative")
+        values.append(value)
+    return values[0], values[1]
+
+
+def _mimic(element: Element, of: str) -> Mimic | None:
+    found = element.find("mimic", of)
+    if found is None:
+        return None
+    found.allow_only("joint", "multiplier", "offset", of=of)
+    what = f"<mimic> of {of}"
+    return Mimic(
+        found.text("joint", what),
+        bounded(found, "multiplier", of, found.number("multiplier", what, 1.0)),
+        bounded(found, "offset", of, found.number("offset", what, 0.0)),
+    )

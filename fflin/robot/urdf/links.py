@@ -1,0 +1,150 @@
+"""Links of a URDF: where they are and what they weigh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fflin.base.validation import Array
+from fflin.robot.urdf.xml import Element, quoted
+
+# Beyond it nothing is physical, and products of two such numbers stay far from overflow.
+_ABSURD = 1e30
+
+# From 1e8 m on, in double precision the square of the length swallows that of a metre, and with
+# it what the links weigh about their own joints: ABA then divides zero by zero.
+_FARTHEST = 1e7  # [m]
+
+# Quaternions are written with four digits often, seldom with fewer.
+_QUATERNION_SLACK = 1e-3
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a frame lies in another, as the file writes it.
+
+    Attributes
+    ----------
+    xyz : tuple of float
+        [m].
+    rpy : tuple of float
+        Roll, pitch, yaw about fixed axes [rad].
+    quaternion : tuple of float or None
+        x y z w of unit length; in the place of `rpy`.
+    """
+
+    xyz: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rpy: tuple[float, ...] = (0.0, 0.0, 0.0)
+    quaternion: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Link:
+    """One link.
+
+    Attributes
+    ----------
+    name : str
+    element : Element
+        Where it stands in the file.
+    mass : float or None
+        [kg]; None where the link has no <inertial>.
+    com : Pose
+        Centre of mass, and axes of the inertia.
+    inertia : tuple of float
+        ixx ixy ixz iyy iyz izz [kg m^2] about the centre of mass.
+    """
+
+    name: str
+    element: Element
+    mass: float | None = None
+    com: Pose = Pose()
+    inertia: tuple[float, ...] = (0.0,) * 6
+
+    def principal_inertias(self) -> Array:
+        """Return the eigenvalues (3,) of the inertia, ascending [kg m^2]."""
+        xx, xy, xz, yy, yz, zz = self.inertia
+        moments: Array = np.linalg.eigvalsh(np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))))
+        return moments
+
+
+def read_link(element: Element) -> Link:
+    """Read a <link>; raise `UrdfError` where something in it is wrong."""
+    name = element.text("name", "a <link>")
+    of = f"link {quoted(name)}"
+    refuse_near_miss(element, of, ("inertial",))
+    for misplaced in element.find_all("mass"):
+        raise misplaced.error(f"<mass> stands directly in {of}; put it into an <inertial>")
+    inertial = element.find("inertial", of)
+    if inertial is None:
+        return Link(name, element)
+    refuse_near_miss(inertial, of, ("origin", "mass", "inertia"))
+    mass_element = inertial.require("mass", f"<inertial> of {of}")
+    mass_element.allow_only("value", of=of)
+    mass = bounded(mass_element, "mass", of, mass_element.number("value", f"<mass> of {of}"))
+    if mass < 0.0:
+        raise mass_element.error(f"mass of {of} is {mass:g} kg; it cannot be negative")
+    inertia = inertial.require("inertia", f"<inertial> of {of}")
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    inertia.allow_only(*names, of=of)
+    moments = tuple(
+        bounded(inertia, entry, of, inertia.number(entry, f"<inertia> of {of}")) for entry in names
+    )
+    return Link(name, element, mass, read_pose(inertial, of), moments)
+
+
+def read_pose(element: Element, of: str) -> Pose:
+    """Read the <origin> of an element; the identity where it has none."""
+    origin = element.find("origin", of)
+    if origin is None:
+        return Pose()
+    origin.allow_only("xyz", "rpy", "quat_xyzw", of=of)
+    what = f"<origin> of {of}"
+    xyz, rpy = (
+        origin.vector(name, what, 3) if name in origin.attributes else (0.0, 0.0, 0.0)
+        for name in ("xyz", "rpy")
+    )
+    for entry in xyz:
+        bounded_length(origin, "xyz", of, entry)
+    for entry in rpy:
+        bounded(origin, "rpy", of, entry)
+    if "quat_xyzw" not in origin.attributes:
+        return Pose(xyz, rpy)
+    if "rpy" in origin.attributes:
+        raise origin.error(f"{what} has both rpy and quat_xyzw; keep one of them")
+    quaternion = origin.vector("quat_xyzw", what, 4)
+    length = float(np.hypot.reduce(quaternion))
+    if not abs(length - 1.0) <= _QUATERNION_SLACK:
+        raise origin.error(f"quat_xyzw of {what} has length {length:g}, expected 1; normalise it")
+    return Pose(xyz, rpy, tuple(float(entry / length) for entry in quaternion))
+
+
+def bounded(element: Element, what: str, of: str, value: float) -> float:
+    """Return a number that is not absurdly large."""
+    if abs(value) > _ABSURD:
+        raise element.error(f"{what} of {of} is {value:g}, beyond anything physical; correct it")
+    return value
+
+
+def bounded_length(element: Element, what: str, of: str, value: float) -> float:
+    """Return a length [m] that is not too large for inertias about both of its ends."""
+    if abs(value) > _FARTHEST:
+        raise element.error(
+            f"{what} of {of} is {value:g} m, expected at most {_FARTHEST:g} m; correct it"
+        )
+    return value
+
+
+def refuse_near_miss(element: Element, of: str, known: tuple[str, ...]) -> None:
+    """Refuse children that are a known element misspelt; others are ignored as URDF has it."""
+    import difflib
+
+    for child in element.children:
+        if child.tag in known or ":" in child.tag:
+            continue
+        near = difflib.get_close_matches(child.tag.lower(), known, n=1, cutoff=0.85)
+        if near:
+            raise child.error(
+                f"<{child.tag}> in {of} is not known to URDF; did you mean <{near[0]}>?"
+            )

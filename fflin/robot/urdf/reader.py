@@ -1,0 +1,183 @@
+"""From a URDF file to a Pinocchio model with a free-flyer root."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pinocchio as pin
+
+from fflin.base.errors import UrdfError
+from fflin.base.writing import read_input
+from fflin.robot.urdf.inertias import inertia_notes
+from fflin.robot.urdf.joints import Mimic
+from fflin.robot.urdf.mimics import counted_leaders, resolve_mimics
+from fflin.robot.urdf.tree import Urdf, read_description
+from fflin.robot.urdf.writer import write_urdf
+from fflin.robot.urdf.xacro import expand, first_xacro
+from fflin.robot.urdf.xml import Element, named, parse, told
+
+_SIZE_LIMIT = 64 * 2**20
+
+# Pinocchio's Data takes about 32 nv^3 bytes: 1 GiB for this many degrees of freedom.
+_LARGEST_NV = 322
+
+# Up to this depth the recursion of the parsers fits the smallest stack of a thread in use, 512 kB.
+_SHALLOW = 100
+_STACK = 16 * 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """A robot as its file describes it.
+
+    Attributes
+    ----------
+    model : pin.Model
+        Free-flyer root joint, zero gravity; mimic joints move freely in it.
+    sha256 : str
+        Hash of the file as it was read; files that a xacro includes are not part of it.
+    mimics : dict
+        {joint: Mimic} of the joints that follow another, resolved to independent leaders.
+    damping, friction : dict
+        {joint: value} where not zero, [N m s/rad | N s/m] and [N m | N].
+    notes : tuple of str
+        Warnings, one line each.
+    """
+
+    model: pin.Model
+    sha256: str
+    mimics: dict[str, Mimic]
+    damping: dict[str, float]
+    friction: dict[str, float]
+    notes: tuple[str, ...]
+
+
+def read_urdf(path: Path, prune: Sequence[str] = ()) -> Description:
+    """Read a URDF, or a xacro, as a robot that floats free.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    prune : sequence of str
+        Joints to cut off with all that hangs on them.
+
+    Returns
+    -------
+    Description
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    UrdfError
+        If it does not describe a robot; the message gives file, line and what to mend.
+    MissingPackageError
+        If it is a xacro and xacrodoc is not installed.
+    UnknownNameError
+        If there is no such joint to prune.
+    """
+    return describe(read_document(path), path, prune)
+
+
+def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Description:
+    """Do what `read_urdf` does with the bytes of a file; `path` names it in errors."""
+    root = parse(document, str(path))
+    notes: list[str] = []
+    first = first_xacro(root)
+    if path.suffix == ".xacro" or first:
+        expanded, notes = expand(path, document, first)
+        root = parse(expanded, f"{path} as expanded by xacro")
+        _check_expanded(root)
+    urdf = read_description(root, prune)
+    mimics = resolve_mimics(urdf.joints)
+    model = _build(urdf, path, root, counted_leaders(urdf.joints, mimics))
+    notes += told(root)
+    notes += inertia_notes(urdf.links.values(), model, path.name)
+
+    moving = [joint for joint in urdf.joints.values() if joint.freedom]
+    damping = {joint.name: joint.damping for joint in moving if joint.damping}
+    friction = {joint.name: joint.friction for joint in moving if joint.friction}
+    for what, values in (("damping", damping), ("Coulomb friction", friction)):
+        if values:
+            notes.append(
+                f"{path.name}: the {what} of {named('joint', list(values))} is not in the linear "
+                "model unless it is asked for"
+            )
+    return Description(
+        model,
+        hashlib.sha256(document).hexdigest(),
+        mimics,
+        damping,
+        friction,
+        tuple(notes),
+    )
+
+
+def read_document(path: Path) -> bytes:
+    """Return what the file of a URDF holds, or raise `FileError`."""
+    return read_input(path, "URDF", _SIZE_LIMIT)
+
+
+def _check_expanded(root: Element) -> None:
+    left = first_xacro(root)
+    if left:
+        raise left.error(f"xacro is left in <{left.tag}>; is a macro missing?")
+
+
+def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> pin.Model:
+    nv = 6 + sum(joint.freedom for joint in urdf.joints.values())
+    if nv > _LARGEST_NV:
+        raise root.error(
+            f"the joints have {nv - 6} degrees of freedom; at most {_LARGEST_NV - 6} fit into "
+            "1 GiB of Pinocchio's Data; make joints fixed that do not matter"
+        )
+    root_joint = "root_joint"
+    while root_joint in urdf.joints or root_joint in urdf.links:
+        root_joint += "_"
+    document = write_urdf(urdf, counted)
+    try:
+        model = _with_stack(
+            urdf.depth,
+            lambda: pin.buildModelFromXML(document, pin.JointModelFreeFlyer(), root_joint),
+        )
+    except (ValueError, RuntimeError) as error:
+        raise UrdfError(
+            f"{path}: Pinocchio cannot build it: {' '.join(str(error).split())[:300]}"
+        ) from None
+    moving = {joint.name for joint in urdf.joints.values() if joint.freedom}
+    if set(model.names) != {"universe", root_joint, *moving} or model.nv != nv:
+        raise UrdfError(f"{path}: Pinocchio built other joints than the file describes")
+    model.gravity.setZero()
+    # The name of a file need not be text.
+    model.name = urdf.name or path.stem.encode(errors="backslashreplace").decode()
+    return model
+
+
+def _with_stack(depth: int, call: Callable[[], pin.Model]) -> pin.Model:
+    """Make a call that recurses along the tree on a stack that holds it."""
+    if depth <= _SHALLOW:
+        return call()
+    results: list[pin.Model] = []
+    errors: list[Exception] = []
+
+    def run() -> None:
+        try:
+            results.append(call())
+        except Exception as error:  # carried over to the thread that waits
+            errors.append(error)
+
+    usual = threading.stack_size(_STACK)
+    try:
+        thread = threading.Thread(target=run)
+        thread.start()
+    finally:
+        threading.stack_size(usual)
+    thread.join()
+    if errors:
+        raise errors[0]
+    return results[0]

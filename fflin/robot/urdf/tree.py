@@ -1,0 +1,215 @@
+"""From the elements of a URDF to a checked description: links and joints that form one tree."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from fflin.base.errors import unknown
+from fflin.robot.urdf.joints import JointElement, read_joint
+from fflin.robot.urdf.links import Link, read_link, refuse_near_miss
+from fflin.robot.urdf.xml import Element, enumerated, named, quoted
+
+# urdfdom and Pinocchio's parser recurse along the tree, about 2.5 kB of stack for each link.
+_DEPTH_LIMIT = 1_000
+
+# Pinocchio's time grows with the square of their number; these take some seconds.
+_LINK_LIMIT = 10_000
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """What a URDF describes, checked: the joints connect the links into one tree.
+
+    Attributes
+    ----------
+    name : str
+        Empty where the file gives none.
+    links : dict
+        By name, in the order of the file.
+    joints : dict
+        By name, in the order of the file.
+    depth : int
+        Number of links on the longest way from the root.
+    """
+
+    name: str
+    links: dict[str, Link]
+    joints: dict[str, JointElement]
+    depth: int
+
+
+def read_description(root: Element, prune: Collection[str] = ()) -> Urdf:
+    """Check the elements of a URDF and return what they describe.
+
+    Parameters
+    ----------
+    root : Element
+    prune : collection of str
+        Joints to cut off with all that hangs on them.
+
+    Returns
+    -------
+    Urdf
+
+    Raises
+    ------
+    UrdfError
+        If anything in it is wrong; the message gives file, line, element and what to mend.
+    UnknownNameError
+        If there is no such joint to prune.
+    """
+    _check_root(root)
+    links: dict[str, Link] = {}
+    for element in root.find_all("link"):
+        link = read_link(element)
+        _check_new("link", element, link.name, links.get(link.name))
+        links[link.name] = link
+    if len(links) > _LINK_LIMIT:
+        raise root.error(f"<robot> has {len(links)} links; at most {_LINK_LIMIT} are read")
+    if not links:
+        raise root.error("<robot> has no <link>; add one")
+    joints: dict[str, JointElement] = {}
+    for element in root.find_all("joint"):
+        joint = read_joint(element)
+        _check_new("joint", element, joint.name, joints.get(joint.name))
+        joints[joint.name] = joint
+    depths = _check_tree(root, links, joints)
+    if prune:
+        dropped = _hanging_on(prune, joints)
+        joints = {n: joint for n, joint in joints.items() if joint.child not in dropped}
+        links = {n: link for n, link in links.items() if n not in dropped}
+    _drop_world(links, joints)
+    depth = max(depths[name] for name in links)
+    return Urdf(root.attributes.get("name", "").strip(), links, joints, depth)
+
+
+def _check_root(root: Element) -> None:
+    if root.tag != "robot":
+        raise root.error(f"the root element is <{root.tag[:60]}>; expected <robot>")
+    version = root.attributes.get("version", "1.0")
+    if version.strip().partition(".")[0] != "1":
+        raise root.error(f"<robot> has version {quoted(version)}; expected 1.0, 1.1 or 1.2")
+    refuse_near_miss(root, "<robot>", ("link", "joint"))
+    for child in root.children:
+        if child.tag == "robot":
+            raise child.error(
+                "a <robot> inside <robot>; keep one <robot> with all links and joints"
+            )
+        if child.tag in ("link", "joint"):
+            continue
+        for inner in child.iterate():
+            tags = {part.tag for part in inner.children}
+            if (inner.tag == "joint" and tags >= {"parent", "child"}) or (
+                inner.tag == "link" and "inertial" in tags
+            ):
+                raise inner.error(
+                    f"<{inner.tag}> {quoted(inner.attributes.get('name', ''))} stands inside "
+                    f"<{child.tag}>, where URDF ignores it; put it directly into <robot>"
+                )
+    for element in root.children:
+        if element.tag in ("link", "joint"):
+            for inner in element.children:
+                if inner.tag in ("link", "joint"):
+                    raise inner.error(
+                        f"<{inner.tag}> inside a <{element.tag}>, where URDF ignores it; put it "
+                        "directly into <robot>"
+                    )
+
+
+def _check_new(kind: str, element: Element, name: str, earlier: Link | JointElement | None) -> None:
+    if earlier is not None:
+        raise element.error(
+            f"a second {kind} named {quoted(name)}, after that of line {earlier.element.line}; "
+            "rename one of them"
+        )
+
+
+def _check_tree(
+    root: Element, links: dict[str, Link], joints: dict[str, JointElement]
+) -> dict[str, int]:
+    """Check that the joints connect the links into one tree; return each link's depth."""
+    above: dict[str, JointElement] = {}
+    below: dict[str, list[str]] = {name: [] for name in links}
+    for joint in joints.values():
+        of = f"joint {quoted(joint.name)}"
+        for end, name in (("parent", joint.parent), ("child", joint.child)):
+            if name not in links:
+                error = unknown("link", name[:60], [link[:60] for link in links])
+                raise joint.element.error(f"the {end} of {of} does not exist: {error}")
+        if joint.parent == joint.child:
+            raise joint.element.error(
+                f"{of} connects link {quoted(joint.child)} to itself; correct its parent or child"
+            )
+        if joint.child in above:
+            other = above[joint.child]
+            raise joint.element.error(
+                f"link {quoted(joint.child)} is the child of {of} and of joint "
+                f"{quoted(other.name)} of line {other.element.line}; a link has one parent, and "
+                "closed loops cannot be described"
+            )
+        above[joint.child] = joint
+        below[joint.parent].append(joint.child)
+
+    roots = [name for name in links if name not in above]
+    if len(roots) > 1:
+        raise links[roots[1]].element.error(
+            f"the links fall into {len(roots)} parts, with roots {enumerated(roots)}; connect "
+            "them by joints"
+        )
+    depths = {name: 1 for name in roots}
+    stack = list(roots)
+    while stack:
+        name = stack.pop()
+        for child in below[name]:
+            depths[child] = depths[name] + 1
+            stack.append(child)
+    if len(depths) < len(links):
+        lost = next(name for name in links if name not in depths)
+        way = [lost]
+        while (parent := above[way[-1]].parent) not in way:
+            way.append(parent)
+        loop = [above[name].name for name in way[way.index(parent) :]]
+        raise above[parent].element.error(
+            f"{named('joint', loop)} form a closed loop that hangs on nothing; correct a parent "
+            "or child in it"
+        )
+    deepest = max(depths, key=depths.__getitem__)
+    if depths[deepest] > _DEPTH_LIMIT:
+        raise root.error(
+            f"link {quoted(deepest)} stands {depths[deepest]} links deep; at most {_DEPTH_LIMIT} "
+            "are read; join links that are fixed to each other"
+        )
+    return depths
+
+
+def _drop_world(links: dict[str, Link], joints: dict[str, JointElement]) -> None:
+    """Drop a root that stands for the world: without mass and inertia, its one joint floating."""
+    children = {joint.child for joint in joints.values()}
+    root = next(link for name, link in links.items() if name not in children)
+    hanging = [joint for joint in joints.values() if joint.parent == root.name]
+    if len(hanging) != 1 or hanging[0].type != "floating" or root.mass or any(root.inertia):
+        return
+    first = hanging[0]
+    first.element.note(
+        f"joint {quoted(first.name)} is floating and link {quoted(root.name)} has no mass; both "
+        f"are left out, for the base, link {quoted(first.child)}, floats free by itself"
+    )
+    del links[root.name], joints[first.name]
+
+
+def _hanging_on(prune: Collection[str], joints: dict[str, JointElement]) -> set[str]:
+    below: dict[str, list[str]] = {}
+    for joint in joints.values():
+        below.setdefault(joint.parent, []).append(joint.child)
+    stack = []
+    for name in prune:
+        if name not in joints:
+            raise unknown("joint to prune", name, joints)
+        stack.append(joints[name].child)
+    dropped: set[str] = set()
+    while stack:
+        name = stack.pop()
+        dropped.add(name)
+        stack.extend(below.get(name, ()))
+    return dropped

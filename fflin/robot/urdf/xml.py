@@ -1,0 +1,285 @@
+"""From bytes to a small tree of XML elements, each with the line it stands on."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from xml.parsers import expat
+
+from fflin.base.errors import UrdfError, listed
+
+# URDFs nest some 10 elements and hold some 10,000; these only keep hostile input off.
+_DEPTH_LIMIT = 100
+_ELEMENT_LIMIT = 500_000
+_TAG_LIMIT = 2**20  # bytes
+
+# Between xzy and xyz, quat and quat_xyzw; unit and value are farther apart.
+_NEAR = 0.6
+
+_SPACE = " \t\r\n"
+_ENTITY = re.compile(rb"&(?!(amp|lt|gt|quot|apos);|#)")
+_DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
+
+@dataclass(eq=False, repr=False, slots=True)
+class Element:
+    """One XML element; text between elements is not kept, for URDF has none.
+
+    Attributes
+    ----------
+    tag : str
+        With its prefix, if any: prefixes need not be bound.
+    attributes : dict
+    line : int
+        Line of its start tag.
+    origin : str
+        What errors call the document: the path of the file.
+    children : list of Element
+    notes : dict
+        {what is to be told: lines}, shared by all elements of the document.
+    """
+
+    tag: str
+    attributes: dict[str, str]
+    line: int
+    origin: str
+    children: list[Element] = field(default_factory=list)
+    notes: dict[str, list[int]] = field(default_factory=dict)
+
+    def error(self, message: str) -> UrdfError:
+        """Build an error that says where this element stands."""
+        return UrdfError(f"{self.origin}:{self.line}: {message}")
+
+    def note(self, message: str) -> None:
+        """Leave a warning about this element; the same one is told once for all its lines."""
+        self.notes.setdefault(message, []).append(self.line)
+
+    def find_all(self, tag: str) -> list[Element]:
+        """Return the children of that tag."""
+        return [child for child in self.children if child.tag == tag]
+
+    def find(self, tag: str, of: str) -> Element | None:
+        """Return the one child of that tag, None if there is none; `of` names this element."""
+        found = self.find_all(tag)
+        if len(found) > 1:
+            raise found[1].error(
+                f"a second <{tag}> in {of}, after that of line {found[0].line}; keep one of them"
+            )
+        return found[0] if found else None
+
+    def require(self, tag: str, of: str) -> Element:
+        """Return the one child of that tag."""
+        found = self.find(tag, of)
+        if found is None:
+            raise self.error(f"{of} has no <{tag}>; add it")
+        return found
+
+    def iterate(self) -> Iterator[Element]:
+        """Yield all elements below this one, in document order."""
+        stack = self.children[::-1]
+        while stack:
+            element = stack.pop()
+            yield element
+            stack.extend(element.children[::-1])
+
+    def allow_only(self, *names: str, of: str) -> None:
+        """Refuse a misspelt attribute, a default taken in silence; note others it does not know."""
+        import difflib
+
+        for name in self.attributes:
+            if name in names or ":" in name:
+                continue
+            if difflib.get_close_matches(name.lower(), names, n=1, cutoff=_NEAR):
+                raise self.error(
+                    f"<{self.tag}> of {of} has an unknown attribute {quoted(name)}; known: "
+                    f"{', '.join(names)}; correct it or take it out"
+                )
+            self.note(f"the attribute {quoted(name)} of <{self.tag}> is not in the model")
+
+    def text(self, name: str, of: str) -> str:
+        """Return an attribute that must be there and hold something."""
+        value = self.attributes.get(name)
+        if value is None or not value.strip():
+            what = "has no" if value is None else "has an empty"
+            raise self.error(f"{of} {what} '{name}'; write <{self.tag} {name}=\"...\">")
+        return value
+
+    def number(self, name: str, of: str, default: float | None = None) -> float:
+        """Return an attribute that is one finite decimal number."""
+        if default is not None and name not in self.attributes:
+            return default
+        text = self.text(name, of).strip(_SPACE)
+        return self._decimal(text, f"{name} of {of}")
+
+    def vector(self, name: str, of: str, size: int) -> tuple[float, ...]:
+        """Return an attribute that is `size` finite decimal numbers."""
+        text = self.text(name, of)
+        entries = re.split(rf"[{_SPACE}]+", text.strip(_SPACE))
+        if "," in text:
+            raise self.error(
+                f"{name} of {of} is {quoted(text)}; expected {size} numbers separated by spaces, "
+                "no commas"
+            )
+        if len(entries) != size:
+            raise self.error(
+                f"{name} of {of} has {len(entries)} entries, {quoted(text)}; expected {size}, "
+                "separated by spaces"
+            )
+        return tuple(self._decimal(entry, f"{name} of {of}") for entry in entries)
+
+    def _decimal(self, text: str, what: str) -> float:
+        value = decimal(text)
+        if not math.isfinite(value):
+            raise self.error(
+                f"{what} is {quoted(text)}; expected a plain finite number, such as 0.5"
+            )
+        return value
+
+
+def decimal(text: str) -> float:
+    """Return a decimal number, infinite where it overflows; NaN of anything else."""
+    return float(text) if _DECIMAL.fullmatch(text) else math.nan
+
+
+def quoted(text: str) -> str:
+    """Show text of a file in an error: quoted, short, on one line, nothing unprintable."""
+    return repr(text if len(text) <= 60 else f"{text[:57]}...")
+
+
+def enumerated(names: list[str]) -> str:
+    """Show names of a file in a sentence: the first six, and how many more there are."""
+    return listed(map(quoted, names))
+
+
+def named(kind: str, names: list[str]) -> str:
+    """Show names after what they are names of: joint 'a', joints 'a', 'b'."""
+    return f"{kind}{'s' if len(names) > 1 else ''} {enumerated(names)}"
+
+
+def told(root: Element) -> list[str]:
+    """Return the notes left on a document, one line each."""
+    # Notes are kept with the robot, where the folder does not matter.
+    origin = root.origin.rpartition(os.sep)[2]
+    return [
+        f"{origin}:{lines[0]}: {message}"
+        + (f" (and in {len(lines) - 1} more places)" if len(lines) > 2 else "")
+        + (f" (and in line {lines[1]})" if len(lines) == 2 else "")
+        for message, lines in root.notes.items()
+    ]
+
+
+def parse(document: bytes, origin: str) -> Element:
+    """Parse an XML document without namespaces and entities.
+
+    Parameters
+    ----------
+    document : bytes
+        In UTF-8 unless it declares another encoding or has a UTF-16 byte order mark.
+    origin : str
+        What errors call the document.
+
+    Returns
+    -------
+    Element
+        The root.
+
+    Raises
+    ------
+    UrdfError
+        If it is not well-formed, declares or uses entities of its own, or is nested too deeply
+        or too large for a robot description.
+    """
+    if not document.strip():
+        raise UrdfError(f"{origin}: is empty; expected a URDF with a <robot>")
+    builder = _Builder(origin)
+    try:
+        builder.parse(document)
+    except expat.ExpatError as error:
+        raise UrdfError(f"{origin}:{error.lineno}: {_explain(error)}") from None
+    except (LookupError, ValueError) as error:
+        if isinstance(error, UrdfError):
+            raise
+        raise UrdfError(
+            f"{origin}: its declared encoding cannot be read ({error}); save it as UTF-8"
+        ) from None
+    return builder.root.children[0]
+
+
+def _explain(error: expat.ExpatError) -> str:
+    what = expat.errors.messages[error.code]
+    advice = {
+        "junk after document element": "something follows the end of the root element; a URDF "
+        "holds one <robot> and nothing after it",
+        "unknown encoding": "its declared encoding is unknown; save it as UTF-8",
+    }
+    return advice.get(
+        what, f"not well-formed XML: {what} at column {error.offset + 1}; mend it there"
+    )
+
+
+class _Builder:
+    def __init__(self, origin: str) -> None:
+        self.root = Element("", {}, 0, origin)
+        self._open = [self.root]
+        self._count = 0
+        self.parser = expat.ParserCreate()
+        self.parser.StartElementHandler = self._start
+        self.parser.EndElementHandler = self._end
+        # A document type may be named; one that is declared elsewhere is not read.
+        self.parser.EntityDeclHandler = self._refuse_entities
+        self.parser.NotStandaloneHandler = self._meet_unread_declarations
+        self._unread = False
+
+    def parse(self, document: bytes) -> None:
+        self._parse(document)
+        # Where declarations are not read, expat drops entities that it does not know from
+        # attributes in silence. Without its zeros, UTF-16 is ASCII where it matters.
+        if self._unread and _ENTITY.search(document.replace(b"\0", b"")):
+            raise UrdfError(
+                f"{self.root.origin}: uses an entity that it does not declare itself; write what "
+                "it stands for in its place"
+            )
+
+    def _parse(self, document: bytes) -> None:
+        # In pieces, for expat's time for one tag grows faster than its length.
+        parser, step = self.parser, _TAG_LIMIT // 4
+        for begin in range(0, len(document), step):
+            parser.Parse(document[begin : begin + step], False)
+            if begin - parser.CurrentByteIndex > _TAG_LIMIT:
+                raise UrdfError(
+                    f"{self.root.origin}:{parser.CurrentLineNumber}: a tag or comment is longer "
+                    f"than {_TAG_LIMIT} bytes; mend it"
+                )
+        parser.Parse(b"", True)
+
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        element = Element(
+            tag, attributes, self.parser.CurrentLineNumber, self.root.origin, [], self.root.notes
+        )
+        self._count += 1
+        if self._count > _ELEMENT_LIMIT:
+            raise element.error(
+                f"more than {_ELEMENT_LIMIT} elements, which no robot description needs"
+            )
+        if len(self._open) > _DEPTH_LIMIT:
+            raise element.error(
+                f"elements are nested more than {_DEPTH_LIMIT} deep; is an end tag missing?"
+            )
+        self._open[-1].children.append(element)
+        self._open.append(element)
+
+    def _end(self, _: str) -> None:
+        self._open.pop()
+
+    def _meet_unread_declarations(self) -> int:
+        self._unread = True
+        return 1
+
+    def _refuse_entities(self, *_: object) -> None:
+        raise UrdfError(
+            f"{self.root.origin}:{self.parser.CurrentLineNumber}: entities (<!ENTITY>) are not "
+            "read; take the declaration out and write what each stands for"
+        )

@@ -1,0 +1,4 @@
+"""The nonlinear loop in time, and its `Motion`.
+
+Imports `base`, `robot`, `dynamics`, `linear` and `control`.
+"""

@@ -1,0 +1,151 @@
+"""What a motion conserves: energy and momentum, and the velocity that keeps the latter."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from scipy.linalg.lapack import dposv
+
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.robot.robot import ROOT, Robot
+
+_crba = pin.crba
+_placement = pin.XYZQUATToSE3
+
+
+class Histories(NamedTuple):
+    """Energy (N,), momentum (N, 6) about the centre of mass (N, 3), and the base's share of it."""
+
+    energy: Array
+    momentum: Array
+    center: Array
+    of_base: Array
+
+
+class Conserved:
+    """Energy and momentum of a robot.
+
+    Momentum is linear, then angular about a fixed point, in world axes. That point stands in for
+    the world's origin throughout, for digits would be lost far away from it.
+
+    Parameters
+    ----------
+    robot : Robot
+    start : ndarray (nq,)
+        A configuration; the point is near its base.
+    """
+
+    def __init__(self, robot: Robot, start: Array) -> None:
+        self._robot = robot
+        self._model = robot.model
+        self._data = data = robot.create_data()
+        self._M = data.M[:6]  # CRBA writes into it
+        self._M_bb = self._M[:, :6]
+        self._start = np.concatenate((start[:3], np.zeros(4)))
+        self._root = robot.model.jointPlacements[ROOT]
+        self._weight = robot.mass * np.array(robot.gravity) if any(robot.gravity) else None
+        self._free = self._root.isIdentity(0.0)
+        self._stored = robot.stored_momentum
+
+    def momentum(self, q: Array, v: Array) -> Array:
+        """Return the momentum (6,) about the point."""
+        history = self.histories(q[None], v[None])
+        return self.about_point(history)[0]
+
+    def about_point(self, history: Histories) -> Array:
+        """Return the momentum (N, 6) about the point."""
+        total = history.momentum.copy()
+        total[:, 3:] += np.cross(history.center, total[:, :3])
+        return total
+
+    def wrench(self, q: Array, push: Array) -> Array:
+        """Return the wrench (6,) about the point, in world axes, of what pushes the robot.
+
+        `push` (6,) is the wrench at the base origin in base axes, linear then angular: the sum
+        of all that acts from outside. Gravity is added.
+        """
+        total: Array = self._base(q).toDualActionMatrix().dot(push)
+        if self._weight is not None:
+            near = q.copy()
+            near[:7] -= self._start
+            com = pin.centerOfMass(self._model, self._data, near, False)
+            total[:3] += self._weight
+            total[3:] += skew(com).dot(self._weight)
+        return total
+
+    def impose(self, q: Array, v: Array, momentum: Array) -> None:
+        r"""Give `v` the base velocity, in place, that makes the momentum (6,) the given one.
+
+        .. math:: \nu_b = M_{bb}^{-1} (H_b - M_{bm} \dot q_m)
+
+        The present velocity is corrected by what it lacks, so that rounding is of the second
+        order.
+        """
+        _crba(self._model, self._data, q)
+        if self._stored:
+            pin.forwardKinematics(self._model, self._data, q)
+            momentum = momentum.copy()
+            momentum[3:] -= self._of_wheels()
+        lack: Array = self._base(q).toActionMatrix().T.dot(momentum)
+        lack -= self._M.dot(v)
+        v[:6] += dposv(self._M_bb, lack, 0, 0, 1)[1]
+
+    def histories(self, q: Array, v: Array) -> Histories:
+        """Return what is conserved at each row of q (N, nq) and v (N, nv)."""
+        model, data = self._model, self._data
+        rows, q = len(q), q.copy()
+        q[:, :7] -= self._start
+        energy, center = np.empty(rows), np.empty((rows, 3))
+        momentum, of_base = np.empty((rows, 6)), np.empty((rows, 6))
+        for i, (q_i, v_i) in enumerate(zip(q, v, strict=True)):
+            energy[i] = pin.computeKineticEnergy(model, data, q_i, v_i)
+            of_base[i] = pin.ccrba(model, data, q_i, v_i)[:, :6].dot(v_i[:6])
+            # What CCRBA has of it was summed about the origin, with more rounding.
+            momentum[i] = pin.computeCentroidalMomentum(model, data, q_i, v_i).vector
+            center[i] = data.com[0]
+            if self._stored:
+                momentum[i, 3:] += self._of_wheels()
+        if self._weight is not None:
+            energy -= (center + self._root.rotation @ self._start[:3]) @ self._weight
+        stiffness, _, rest = self._robot.passive
+        if stiffness.any():
+            positions = [[joint.value(q_i) for joint in self._robot.joints] for q_i in q]
+            energy += 0.5 * (np.array(positions) - rest) ** 2 @ stiffness
+        return Histories(energy, momentum, center, of_base)
+
+    def drift(self, history: Histories, expected: Array) -> Array:
+        """Return how far the momentum is from what is expected (N, 6), relative (N,).
+
+        To the largest sum of what base, joints and wheels add to it; about a fixed point the
+        flight of the whole counts too.
+        """
+        p = history.momentum[:, :3]
+        flight = np.linalg.norm(history.center, axis=1) * np.linalg.norm(p, axis=1)
+        shares = (history.of_base, history.momentum - history.of_base)
+        linear, angular = (
+            sum(np.linalg.norm(share[:, part], axis=1) for share in shares).max()
+            for part in (slice(0, 3), slice(3, 6))
+        )
+        angular += flight.max()
+        angular += sum(float(np.linalg.norm(stored)) for _, stored in self._stored)
+        missing = self.about_point(history) - expected
+        sizes = np.linalg.norm(missing.reshape(-1, 2, 3), axis=2)
+        scale = np.array((linear, angular))
+        relative = np.divide(sizes, scale, out=np.zeros_like(sizes), where=scale > 0.0)
+        largest: Array = relative.max(axis=1)
+        return largest
+
+    def _of_wheels(self) -> Array:
+        """Return the stored momentum (3,) where the links were put last."""
+        total: Array = np.zeros(3)
+        for joint, stored in self._stored:
+            total += self._data.oMi[joint].rotation @ stored
+        return total
+
+    def _base(self, q: Array) -> pin.SE3:
+        """Return the placement of the base, seen from the point."""
+        placement = _placement(q[:7] - self._start)
+        return placement if self._free else self._root * placement

@@ -1,0 +1,159 @@
+"""A simulated motion: what was done, where it led, and the figures that prove it."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base import record
+from fflin.base.errors import InputError
+from fflin.base.record import Design
+from fflin.base.validation import Array
+from fflin.base.writing import as_path, check_ending, write_whole
+
+FORMATS = (*record.FORMATS, ".csv")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Motion(Design):
+    """A motion of a robot, row by row.
+
+    Attributes
+    ----------
+    t : ndarray (N,)
+        Times [s].
+    q : ndarray (N, nq)
+    v : ndarray (N, nv)
+        Configuration and velocity in Pinocchio's order.
+    x : ndarray (N, nx)
+        The state in the chart of `reference` and `frame`; continuous joints go on counting turns.
+    u : ndarray (N, nu)
+        What acted from t on, in the frame's axes; the last row repeats what acted to the end.
+    target : ndarray (nx,)
+        The state that a feedback steers to; the initial one where there is none.
+    prediction : ndarray (N, nx)
+        The state as the linear model has it under the same law; no rows where there is none.
+    energy : ndarray (N,)
+        Kinetic, of gravity and of springs [J].
+    momentum : ndarray (N, 6)
+        Angular about the centre of mass [N m s], then linear [N s], in world axes.
+    momentum_drift : ndarray (N,)
+        How far the momentum is from its initial value and the impulse since, relative to the
+        largest sum of the momenta of base and joints.
+    state_names, input_names, state_units, input_units : tuple of str
+    frame : {"hybrid", "local", "world"}
+    robot, urdf_sha256 : str
+    stopped : str
+        Why it ended before its time; empty where it did not.
+    """
+
+    VECTORS: ClassVar = ("t", "target", "energy", "momentum_drift", "placement")
+
+    t: Array
+    q: Array
+    v: Array
+    x: Array
+    u: Array
+    target: Array
+    prediction: Array
+    energy: Array
+    momentum: Array
+    momentum_drift: Array
+    placement: Array
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_units: tuple[str, ...]
+    frame: str
+    robot: str
+    urdf_sha256: str
+    stopped: str
+
+    def __post_init__(self) -> None:
+        rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)
+        if {len(each) for each in rows} != {len(self.t)} or len(self.prediction) not in (
+            0,
+            len(self.t),
+        ):
+            raise InputError("the rows of the motion are not as many as its times")
+        if not len(self.prediction):  # of json, which knows no empty matrices
+            object.__setattr__(self, "prediction", np.zeros((0, self.x.shape[1])))
+        super().__post_init__()
+
+    def __repr__(self) -> str:
+        stopped = f", stopped: {self.stopped}" if self.stopped else ""
+        return (
+            f"Motion('{self.robot}', {len(self.t)} rows, {self.t[0]:g} to {self.t[-1]:g} s, "
+            f"momentum drift {self.momentum_drift.max():.1e}{stopped})"
+        )
+
+    @property
+    def reference(self) -> pin.SE3:
+        """Placement that attitude and position are relative to."""
+        return pin.XYZQUATToSE3(self.placement)
+
+    @property
+    def linear(self) -> Array | None:
+        """The linear model's states (N, nx), where it was asked for."""
+        return self.prediction if len(self.prediction) else None
+
+    @property
+    def error(self) -> Array:
+        """The states less the target (N, nx)."""
+        difference: Array = self.x - self.target
+        return difference
+
+    @property
+    def attitude_error(self) -> Array:
+        """Angle (N,) [deg] between the base's attitude and the target's."""
+        at, to = self.x[:, :3], self.target[:3]
+        scalar = np.sqrt(np.maximum(0.0, 1.0 - (at * at).sum(axis=1)))
+        target_scalar = np.sqrt(max(0.0, 1.0 - float(to @ to)))
+        # The vector part of target^-1 at, whose length is that of half the angle's sine.
+        vector = target_scalar * at - scalar[:, None] * to - np.cross(to, at)
+        sines: Array = np.minimum(1.0, np.linalg.norm(vector, axis=1))
+        cosines = np.abs(target_scalar * scalar + at @ to)
+        return np.degrees(2.0 * np.arctan2(sines, cosines))
+
+    def save(self, path: str | Path) -> None:
+        """Write it to a .npz, .mat, .json or .csv file, whole or not at all.
+
+        A csv has the times, states and inputs alone, and cannot be loaded.
+
+        Raises
+        ------
+        FileError
+            If the ending is another or the file cannot be written.
+        """
+        target = as_path(path)
+        check_ending(target, FORMATS)
+        if target.suffix != ".csv":
+            super().save(target)
+            return
+        record.require_finite({"t": self.t, "x": self.x, "u": self.u})
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(["t", *self.state_names, *(f"u.{name}" for name in self.input_names)])
+        writer.writerows(np.column_stack((self.t, self.x, self.u)).tolist())
+        write_whole({target: text.getvalue().encode()})
+
+    def plot(self, path: str | Path | None = None, **options: Any) -> Any:
+        """Draw the motion, see `plot_motion`; into a file where a path is given."""
+        from fflin.simulation.plots import plot_motion
+
+        return plot_motion(self, path, **options)
+
+
+def require_motion(motion: Any) -> Motion:
+    """Return the motion, or raise `InputError` where it is none."""
+    if not isinstance(motion, Motion):
+        raise InputError(
+            f"motion is a {type(motion).__name__}, expected a Motion, as fflin.simulate returns it"
+        )
+    return motion

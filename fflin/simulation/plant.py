@@ -1,0 +1,113 @@
+"""The accelerations of a robot in simulation, and what pushes it from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, as_double
+from fflin.dynamics.aba import Aba
+from fflin.dynamics.state import StateMap
+from fflin.robot.massless import require_inertia
+
+Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
+
+_aba = pin.aba
+# Velocity from which on a disturbance need not be finite: the motion is not.
+_DIVERGED = 1e6
+_LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
+
+
+class Dynamics:
+    """The nonlinear robot under inputs and a disturbance.
+
+    Parameters
+    ----------
+    state : StateMap
+        Its frame says the axes of the inputs on the base.
+    disturbance : callable, optional
+        disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order: on the base linear,
+        then angular, in base axes; then on the joints.
+    """
+
+    def __init__(self, state: StateMap, disturbance: Disturbance | None = None) -> None:
+        robot = state.robot
+        require_inertia(robot)
+        self._state, self._robot = state, robot
+        self._aba = Aba(state)
+        self.actuation = self._aba.actuation
+        if disturbance is not None and not callable(disturbance):
+            raise InputError(
+                f"disturbance is a {type(disturbance).__name__}, expected a function of (t, q, v)"
+            )
+        self._disturbance = disturbance
+        self._model, self._data = robot.model, robot.create_data()
+        nu = len(self.actuation.names)
+        self._columns = np.column_stack(
+            [state.lift(self.actuation.torques(unit)) for unit in np.eye(nu)]
+        )
+        # Where nothing but u acts, and that along fixed columns.
+        self._plain = (
+            state.S is None
+            and not self.actuation.carried
+            and not robot.stored_momentum
+            and not any(values.any() for values in robot.passive)
+            and not any(robot.gravity)
+        )
+
+    def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
+        """Return dv/dt (nv,) in Pinocchio's order, and what pushes from outside.
+
+        The latter is the sum (6,) of all wrenches but gravity's at the base origin, linear then
+        angular in base axes.
+        """
+        if self.actuation.held:
+            u = self._in_base_axes(q, u)
+        if self._plain and self._disturbance is None:
+            tau = self._columns.dot(u)
+            return _aba(self._model, self._data, q, v, tau), tau[:6]
+        push = (self.actuation.columns(self._data, q)[:6] @ u)[_LINEAR_FIRST]
+        if self._disturbance is None:
+            return self._aba.acceleration(q, v, u), push
+        disturbed = self._disturbed(t, q, v)
+        return self._aba.acceleration(q, v, u, disturbed), push + disturbed[:6]
+
+    def isolated(self, *, driven: bool) -> bool:
+        """Whether nothing pushes from outside, whatever the inputs are or where none acts."""
+        base = driven and (self._columns[:6].any() or self.actuation.carried)
+        return not (base or self._disturbance is not None or any(self._robot.gravity))
+
+    def held(self, u: Array) -> Callable[[float, Array, Array], Array]:
+        """Return f(t, q, v) for inputs that stay, with nothing in between where it can be.
+
+        What is held in reference axes must be zero.
+        """
+        if self._plain and self._disturbance is None:
+            model, data, tau = self._model, self._data, self._columns.dot(u)
+            return lambda _, q, v: _aba(model, data, q, v, tau)
+        return lambda t, q, v: self.stage(t, q, v, u)[0]
+
+    def _in_base_axes(self, q: Array, u: Array) -> Array:
+        """Return u (nu,) with what is held in reference axes in base axes, at any turn."""
+        R = self._state.rotation(q)
+        u = u.copy()
+        for held in self.actuation.held:
+            u[held.columns] = u[held.columns].dot(R)
+        return u
+
+    def _disturbed(self, t: float, q: Array, v: Array) -> Array:
+        assert self._disturbance is not None
+        given = self._disturbance(t, q.copy(), v.copy())
+        force = as_double(f"disturbance(t, q, v) at t = {t:g} s", given)
+        finite = np.isfinite(force).all() or not np.abs(v).max() < _DIVERGED
+        if force.shape != (self._robot.nv,) or not finite:
+            raise InputError(
+                f"disturbance(t, q, v) gave shape {force.shape} at t = {t:g} s, expected "
+                f"({self._robot.nv},) finite numbers: a generalised force in Pinocchio's order"
+            )
+        return force

@@ -1,0 +1,191 @@
+"""Figures of motions, with matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import numpy as np
+
+from fflin.base.figures import COLORS, cycle, saved, styled, target_of
+from fflin.base.validation import Array
+from fflin.simulation.motion import Motion, require_motion
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+_DASHES = ("-", "--", ":", "-.")
+_OF_JOINTS = ("q_m", "qdot_m")
+_MOST_IN_A_PANEL = 6
+_GROUPS = {
+    "q_b": "attitude q_b",
+    "r_b": "position r_b",
+    "q_m": "joints q_m",
+    "omega_b": "angular velocity omega_b",
+    "v_b": "velocity v_b",
+    "qdot_m": "joint rates",
+}
+
+
+def plot_motion(motion: Motion, path: str | Path | None = None) -> Figure:
+    """Draw the errors, inputs and momentum drift of a motion, linear beside nonlinear.
+
+    Parameters
+    ----------
+    motion : Motion
+        With a prediction, each group of states shows the nonlinear robot in full lines and the
+        linear model dashed, and below it their difference.
+    path : str or Path, optional
+        .png, .pdf or .svg to save to.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    MissingPackageError
+        If matplotlib is not installed.
+    FileError
+        If the ending is another or the file cannot be written.
+    """
+    motion = require_motion(motion)
+    target = target_of(path)
+    with styled() as figure_class:
+        both = motion.linear is not None
+        groups = _by_group(motion.state_names)
+        figure = figure_class(figsize=(11.0, 10.5 if both else 8.5), layout="constrained")
+        heights = [3.0, 1.2] * 2 if both else [3.0] * 2
+        grid = figure.add_gridspec(
+            len(heights) + 1, 3, height_ratios=[*heights, 3.0], hspace=0.06, wspace=0.06
+        )
+        lines: list[Line2D] = []
+        for place, (group, indices) in enumerate(groups.items()):
+            row, column = divmod(place, 3)
+            axes = figure.add_subplot(grid[row * (1 + both), column])
+            _histories(axes, motion, group, indices)
+            if both:
+                below = figure.add_subplot(grid[2 * row + 1, column], sharex=axes)
+                _difference(below, motion, indices)
+                axes.tick_params(labelbottom=False)
+            else:
+                axes.set_xlabel("t [s]")
+            if group == "q_m":
+                lines = [line for line in axes.get_lines() if line.get_label()[0] != "_"]
+        colors = {str(line.get_label()): str(line.get_color()) for line in lines}
+        _inputs(figure, grid, motion, len(heights), colors)
+        if lines:
+            # Joints are many, have long names, and are the same in three panels.
+            side: _Place = "outside lower left" if figure.legends else "outside lower center"
+            _below(figure, lines, "joints", side)
+        _momentum(figure.add_subplot(grid[len(heights), 2]), motion)
+        figure.suptitle(_title(motion, both), fontsize=11)
+        return saved(figure, target)
+
+
+def _histories(axes: Axes, motion: Motion, group: str, indices: list[int]) -> None:
+    t, shown = _broken(motion) if group == "q_b" else (motion.t, motion.x)
+    for color, i in zip(cycle(len(indices)), indices, strict=True):
+        axes.plot(t, shown[:, i], color=color, label=_short(motion.state_names[i]))
+        if motion.linear is not None:
+            axes.plot(motion.t, motion.linear[:, i], "--", color=color, lw=1.0)
+    axes.set(title=_GROUPS[group], ylabel=_unit(motion.state_units, indices))
+    if group not in _OF_JOINTS:
+        axes.legend(handlelength=1.2)
+    axes.margins(x=0.0)
+
+
+def _broken(motion: Motion) -> tuple[Array, Array]:
+    """Return times and states with a gap where the attitude goes through a turn of 180 degrees."""
+    q_b = motion.x[:, :3]
+    # The vector part of a unit quaternion whose sign has changed.
+    jumps = 1 + np.flatnonzero((q_b[1:] * q_b[:-1]).sum(axis=1) < -0.5)
+    t = np.insert(motion.t, jumps, motion.t[jumps])
+    return t, np.insert(motion.x, jumps, np.nan, axis=0)
+
+
+def _difference(axes: Axes, motion: Motion, indices: list[int]) -> None:
+    assert motion.linear is not None
+    for color, i in zip(cycle(len(indices)), indices, strict=True):
+        axes.plot(motion.t, motion.x[:, i] - motion.linear[:, i], color=color, lw=1.0)
+    unit = _unit(motion.state_units, indices)
+    axes.set(xlabel="t [s]", ylabel=f"difference\n{unit}".strip())
+    axes.margins(x=0.0)
+    axes.ticklabel_format(axis="y", scilimits=(-2, 3))
+
+
+def _inputs(figure: Figure, grid: Any, motion: Motion, row: int, colors: dict[str, str]) -> None:
+    """Draw what drives the joints beside what pushes the base, whose sizes differ widely.
+
+    The joints have their colours; all other inputs are named in the panel or below the figure.
+    """
+    groups = _by_group(motion.input_names)
+    joints = {"tau_m": groups.pop("tau_m")} if "tau_m" in groups else {}
+    panels = [panel for panel in (groups, joints) if panel]
+    places = (0, 1) if len(panels) == 2 else (slice(0, 2),)
+    for place, panel in zip(places, panels, strict=True):
+        axes = figure.add_subplot(grid[row, place])
+        shown = [i for indices in panel.values() for i in indices]
+        for style, indices in zip(_DASHES * len(panel), panel.values(), strict=False):
+            for color, i in zip(cycle(len(indices)), indices, strict=True):
+                name = motion.input_names[i]
+                axes.step(
+                    *(motion.t, motion.u[:, i], style),
+                    color=colors[_short(name)] if panel is joints else color,
+                    where="post",
+                    label=name,
+                )
+        title = "joint inputs tau_m" if panel is joints else "inputs"
+        axes.set(title=title, xlabel="t [s]", ylabel=_unit(motion.input_units, shown))
+        axes.margins(x=0.0)
+        if panel is not joints and len(shown) <= _MOST_IN_A_PANEL:
+            axes.legend(ncols=2 if len(shown) > 3 else 1, handlelength=1.6)
+        elif panel is not joints:
+            corner: _Place = "outside lower right" if colors else "outside lower center"
+            _below(figure, axes.get_lines(), "inputs", corner)
+
+
+_Place: TypeAlias = Literal["outside lower left", "outside lower center", "outside lower right"]
+
+
+def _below(figure: Figure, lines: Sequence[Line2D], title: str, place: _Place) -> None:
+    """Name lines below all panels, in as many columns as there is space for."""
+    letters = 150 if place == "outside lower center" else 75
+    longest = max(len(str(line.get_label())) for line in lines)
+    columns = min(len(lines), 8, max(1, letters // (longest + 6)))
+    figure.legend(handles=lines, loc=place, ncols=columns, handlelength=1.6, title=title)
+
+
+def _momentum(axes: Axes, motion: Motion) -> None:
+    # Zero has no place on a logarithmic axis: nothing is below the rounding of one.
+    drift = np.maximum(motion.momentum_drift, np.finfo(float).eps / 10.0)
+    axes.semilogy(motion.t, drift, color=COLORS[0])
+    axes.set(title="momentum drift, relative", xlabel="t [s]")
+    axes.set_ylim(1e-17, max(1e-13, 10.0 * float(drift.max())))
+    axes.margins(x=0.0)
+
+
+def _title(motion: Motion, both: bool) -> str:
+    text = f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"
+    if both:
+        text += "; full: nonlinear, dashed: linear"
+    return f"{text}\n{motion.stopped}" if motion.stopped else text
+
+
+def _by_group(names: Sequence[str]) -> dict[str, list[int]]:
+    groups: dict[str, list[int]] = {}
+    for index, name in enumerate(names):
+        groups.setdefault(name.partition(".")[0] if "." in name else "", []).append(index)
+    return groups
+
+
+def _short(name: str) -> str:
+    return name.partition(".")[2] or name
+
+
+def _unit(units: Sequence[str], indices: Sequence[int]) -> str:
+    shown = sorted({units[i] for i in indices} - {"1"})
+    return f"[{', '.join(shown)}]" if shown else ""

@@ -1,0 +1,197 @@
+"""The live viewer: a page on this machine's loopback, served by a thread of this process."""
+
+from __future__ import annotations
+
+import json
+import threading
+from time import monotonic, sleep
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.validation import Array
+from fflin.dynamics.state import StateMap
+from fflin.robot.robot import Robot
+from fflin.view.motion_page import corner_points, rounded, stage_info, subtitle, triads
+from fflin.view.page import build_page
+from fflin.view.playback import body_poses
+from fflin.view.recorder import Recorder
+from fflin.view.scene import Drawing, Visualizer, body_paths
+from fflin.view.server import Server
+
+
+class Live:
+    """A robot in a browser, that moves as it is told; made by `visualize(robot)`.
+
+    It is served by a thread of this process, to this machine only, and ends with it. Given to
+    `simulate` as its callback, it shows the simulation as it runs.
+
+    Parameters
+    ----------
+    robot : Robot
+    q : ndarray (nq,)
+        Where it stands first.
+    scene : str
+        "space" or "lab".
+    tool : str or None
+        Frame that gets a triad.
+    follow : bool
+        Whether the camera follows the base.
+    speed : float
+        Seconds of simulation per second, at most.
+    port : int
+        0 for one that is free.
+
+    Attributes
+    ----------
+    url : str
+    port : int
+    q : ndarray (nq,)
+        Where the robot stands; sliders move it.
+    meshcat : meshcat.Visualizer
+        For what else is to be drawn.
+    notes : tuple of str
+        What could not be drawn.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        q: Array,
+        *,
+        scene: str = "space",
+        tool: str | None = None,
+        follow: bool = False,
+        speed: float = 1.0,
+        port: int = 0,
+    ) -> None:
+        self.robot = robot
+        self._data = robot.model.createData()
+        self._state_map = StateMap(robot)
+        self._joints = _joints(robot)
+        self._lock = threading.Lock()
+        self._speed = speed
+        # When on the clock, and at which time, the simulation that is shown began.
+        self._began: tuple[float, float] | None = None
+        self._recorder = Recorder(self._forward)
+        self.meshcat = Visualizer(window=self._recorder)
+        drawing = Drawing(robot, self.meshcat["robot"])
+        self.notes = drawing.notes
+        poses = body_poses(robot, self._data, q)
+        info = stage_info(robot, drawing, poses, scene=scene, subtitle=subtitle(robot))
+        info |= {
+            "mode": "live",
+            "follow": follow,
+            "legend": [],
+            "points": rounded(corner_points(drawing, poses), info["size"]),
+            "joints": self._joints,
+            "names": [name.partition(".")[2] for name in self._state_map.names[-6 - robot.n :]],
+            "bodies": [["meshcat", "robot", path] for path in body_paths(robot)],
+            "triads": triads(robot, tool, info["size"]),
+        }
+        info["names"][:6] = [f"base {kind} {axis}" for kind in ("turn", "shift") for axis in "xyz"]
+        page = build_page(info, connect="'self' ws:")
+        self._server = Server(page, self._recorder.commands, self._asked, port)
+        self.url = self._recorder.web_url = self._server.url
+        self.port = self._server.port
+        self.show(q)
+
+    def show(self, q: Array, t: float | None = None) -> None:
+        """Put the robot at a configuration.
+
+        Parameters
+        ----------
+        q : array_like (nq,)
+        t : float, optional
+            Time to show [s].
+
+        Raises
+        ------
+        InputError
+            If q is no configuration of the robot.
+        """
+        q = self.robot.checked_configuration(q).copy()
+        q.setflags(write=False)
+        with self._lock:
+            poses = body_poses(self.robot, self._data, q)
+            inertia = pin.crba(self.robot.model, self._data, q)
+            inertia = self._state_map.project(np.triu(inertia) + np.triu(inertia, 1).T)
+            scale = np.sqrt(np.diag(inertia))
+            state = {
+                "time": None if t is None else float(t),
+                "poses": poses.round(7).tolist(),
+                "joints": [self.robot.joint(each["name"]).value(q) for each in self._joints],
+                "coupling": (inertia / np.outer(scale, scale)).round(4).ravel().tolist(),
+            }
+            self.q = q
+        self._server.update(json.dumps(state))
+
+    def __call__(self, t: float, q: Array, *_: Any) -> None:
+        """Show a step of a running simulation, no sooner than it is due."""
+        now = monotonic()
+        if self._began is None or t <= self._began[1]:
+            self._began = now, t
+        sleep(max(0.0, self._began[0] + (t - self._began[1]) / self._speed - now))
+        self.show(q, t)
+
+    def open(self) -> None:
+        """Open a browser on it."""
+        import webbrowser
+
+        webbrowser.open(self.url)
+
+    def wait(self) -> None:
+        """Wait until it is closed, or until Ctrl-C."""
+        self._server.wait()
+
+    def close(self) -> None:
+        """End it; the page says that the connection is lost."""
+        self._server.close()
+
+    def __enter__(self) -> Live:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _forward(self, command: bytes) -> None:
+        # What is drawn before there is a server waits in the recorder.
+        if hasattr(self, "_server"):
+            self._server.send(command)
+
+    def _asked(self, message: Any) -> None:
+        """Do what a browser asks: {"joints": {name: value}}, {"neutral": _}, {"random": _}."""
+        q = self.q.copy()
+        if message.get("neutral"):
+            q[7:] = self.robot.neutral()[7:]
+        limits = {each["name"]: each for each in self._joints}
+        wanted = dict(message.get("joints", {}))
+        if message.get("random"):
+            rng = np.random.default_rng()
+            wanted = {name: rng.uniform(x["low"], x["high"]) for name, x in limits.items()}
+        for name, value in wanted.items():
+            self.robot.joint(name).place(q, float(value))
+        self.robot.follow(q)
+        self.show(q)
+
+
+def _joints(robot: Robot) -> list[dict[str, Any]]:
+    """Return name and range of the slider of every joint; nobody sees a wheel turn."""
+    model = robot.model
+    found = []
+    for joint in robot.joints:
+        if joint.name in robot.wheels:
+            continue
+        low, high = -np.pi, np.pi
+        if not joint.unbounded:
+            low = max(
+                float(model.lowerPositionLimit[joint.idx_q]), -1.0 if joint.prismatic else -np.pi
+            )
+            high = min(
+                float(model.upperPositionLimit[joint.idx_q]), 1.0 if joint.prismatic else np.pi
+            )
+            if not low < high:
+                low, high = low - 1.0, low + 1.0
+        found.append({"name": joint.name, "low": low, "high": high, "length": joint.prismatic})
+    return found

@@ -1,0 +1,105 @@
+"""Mesh files as triangles light enough to be sent: welded, one array of faces for each colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from fflin.base.validation import Array
+from fflin.view.collada import Indices, read_collada
+from fflin.view.shapes import Color
+
+# Details smaller than this part of a mesh's extent are not drawn; it halves most CAD exports.
+_RESOLUTION = 1.0 / 400.0
+
+# Above this many triangles the grid is made coarser until they are fewer.
+_LARGEST = 20_000
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles of one colour.
+
+    Attributes
+    ----------
+    vertices : ndarray (V, 3) of float32
+    faces : ndarray (F, 3) of uint32
+    color : tuple of float, optional
+        None where the file says none.
+    """
+
+    vertices: Array
+    faces: Indices
+    color: Color | None
+
+
+@lru_cache(maxsize=256)
+def load_mesh(path: Path) -> tuple[Mesh, ...]:
+    """Read a mesh file, in its own unit of length.
+
+    Parameters
+    ----------
+    path : Path
+        What Pinocchio reads: STL, DAE, OBJ and others. Colours are taken of DAE.
+
+    Returns
+    -------
+    tuple of Mesh
+
+    Raises
+    ------
+    ValueError
+        If it cannot be read.
+    """
+    parts = read_collada(path) if path.suffix.lower() == ".dae" else None
+    if not parts:
+        parts = [(*_triangles(path), None)]
+    corners = np.concatenate([vertices[faces].reshape(-1, 3) for vertices, faces, _ in parts])
+    if not corners.size or not np.isfinite(corners).all():
+        raise ValueError(f"{path}: has no triangles")
+    extent = float(np.ptp(corners, axis=0).max())
+    resolution = _RESOLUTION
+    while True:
+        welded = [
+            Mesh(*_weld(vertices, faces, extent * resolution), color)
+            for vertices, faces, color in parts
+        ]
+        if sum(len(mesh.faces) for mesh in welded) <= _LARGEST or resolution > 0.02:
+            return tuple(mesh for mesh in welded if len(mesh.faces))
+        resolution *= 1.5
+
+
+def _triangles(path: Path) -> tuple[Array, Indices]:
+    import coal
+
+    try:
+        mesh = coal.MeshLoader().load(str(path), np.ones(3))
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(f"{path}: cannot be read: {' '.join(str(error).split())}") from None
+    vertices = np.array(mesh.vertices(), dtype=float).reshape(-1, 3)
+    triangles = (mesh.tri_indices(index) for index in range(mesh.num_tris))
+    faces = np.array([(t[0], t[1], t[2]) for t in triangles], dtype=np.intp).reshape(-1, 3)
+    return vertices, faces
+
+
+def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]:
+    """Let vertices in one cell of a grid be one, where they first stand; drop what collapses."""
+    if not cell:
+        return vertices[:0].astype(np.float32), faces[:0].astype(np.uint32)
+    _, first, inverse = np.unique(
+        np.round(vertices / cell).astype(np.int64), axis=0, return_index=True, return_inverse=True
+    )
+    faces = inverse.reshape(-1)[faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    # The same triangle may be left many times.
+    _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    faces = faces[np.sort(kept)]
+    used, compact = np.unique(faces, return_inverse=True)
+    return (
+        vertices[first[used]].astype(np.float32),
+        compact.reshape(-1, 3).astype(np.uint32),
+    )

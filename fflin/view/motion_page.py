@@ -1,0 +1,256 @@
+"""From a motion to what its page shows: the robots in the scene, and the figures beside them."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.validation import Array
+from fflin.dynamics.state import StateMap
+from fflin.robot.frames import find_frame
+from fflin.robot.robot import ROOT, Robot
+from fflin.view.page import build_page, packed
+from fflin.view.panel import panel
+from fflin.view.playback import Playback, body_poses, frame_indices, play_back, thrusters
+from fflin.view.recorder import Recorder
+from fflin.view.scene import Animation, Drawing, Visualizer, body_paths
+
+if TYPE_CHECKING:
+    from fflin.dynamics.state import Frame
+    from fflin.simulation.motion import Motion
+
+# Where one looks from, and where the sun stands, in world axes.
+VIEWS = {"space": (1.0, -0.62, 0.50), "lab": (1.0, -0.62, 0.36)}
+SUN = (0.62, -0.78, 0.62)
+
+TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
+FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
+
+# Length of the arrow of the largest force, and the way on which the camera goes along with the
+# base unless it is told otherwise, both in sizes of the robot.
+ARROW, _FAR = 0.62, 20.0
+
+
+def motion_page(
+    robot: Robot,
+    motion: Motion,
+    *,
+    scene: str,
+    fps: float,
+    speed: float,
+    follow: bool | None,
+    target: Array,
+    tool: str | None,
+) -> tuple[str, tuple[str, ...]]:
+    """Return the page of a motion, and what could not be drawn; see `visualize`."""
+    shown = frame_indices(motion.t, fps, speed)
+    t, q, u = motion.t[shown], motion.q[shown], motion.u[shown]
+    state = chart_of(robot, motion)
+    film = play_back(robot, state, t, q, u, tool)
+
+    window, sent = Recorder(), set[str]()
+    scenery = Visualizer(window=window)
+    drawing = Drawing(robot, scenery["robot"], sent=sent)
+    moving = [(drawing, film.poses)]
+    data = robot.model.createData()
+    Drawing(robot, scenery["target"], "ghost", sent).place(body_poses(robot, data, target))
+    predicted = _predicted(state, motion, shown)
+    if predicted is not None:
+        poses = np.array([body_poses(robot, data, each) for each in predicted])
+        moving.append((Drawing(robot, scenery["linear"], "linear", sent), poses))
+    clips = []
+    for each, poses in moving:
+        each.place(poses[0])
+        clips += each.tracks(t - t[0], poses)
+    window.send(Animation(clips))
+
+    # Without a policy that steers somewhere, errors are counted from the start.
+    ghost = "start" if np.array_equal(target, motion.q[0]) else "target"
+    about = f"{subtitle(robot)}, {t[-1] - t[0]:.4g} s"
+    info = stage_info(robot, drawing, film.poses[0], scene=scene, subtitle=about)
+    goal = corner_points(drawing, body_poses(robot, data, target))
+    shown_points = np.concatenate((frame_points(drawing, film, info["size"]), goal))
+    info["floor"][2] = float(shown_points[:, 2].min())
+    if follow is None:
+        # All of a long way at once, and nothing is to be seen of the robot.
+        follow = bool(np.ptp(shown_points, axis=0).max() > _FAR * info["size"])
+    if follow:
+        shown_points = frame_points(drawing, film, info["size"], follow=True)
+    info |= marks(robot, film, tool, info["size"])
+    info |= panel(robot, state, q, u, target, motion.momentum_drift[shown])
+    info |= {
+        "mode": "motion",
+        "t": packed(t),
+        "speed": speed,
+        "follow": follow,
+        "points": rounded(shown_points, info["size"]),
+        "legend": legend(info, ghost=ghost, linear=predicted is not None),
+    }
+    return build_page(info, window.commands()), drawing.notes
+
+
+def chart_of(robot: Robot, motion: Motion) -> StateMap:
+    """Return the map between a motion's states and configurations."""
+    return StateMap(robot, reference=motion.reference, frame=cast("Frame", motion.frame))
+
+
+def _predicted(state: StateMap, motion: Motion, shown: Array) -> Array | None:
+    """Return the configurations (N, nq) that the linear model predicts, where it was asked."""
+    if motion.linear is None:
+        return None
+    return np.array([state.to_pinocchio(x)[0] for x in motion.linear[shown]])
+
+
+def subtitle(robot: Robot) -> str:
+    """Return what the page says of a robot below its name."""
+    wheels = len(robot.wheels)
+    joints = robot.n - wheels
+    parts = [f"{joints} joint{'s' * (joints != 1)}"]
+    if wheels:
+        parts.append(f"{wheels} wheel{'s' * (wheels != 1)}")
+    return ", ".join([*parts, f"{robot.mass:.4g} kg"])
+
+
+def frame_points(
+    drawing: Drawing, film: Playback, size: float, *, follow: bool = False, most: int = 24
+) -> Array:
+    """Return corners of all that moves and tips of forces (M, 3) at some frames, for a camera."""
+    chosen = np.unique(np.linspace(0, len(film.t) - 1, most).astype(int))
+    strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
+    points = []
+    for index in chosen:
+        base = film.poses[index, 0, :3]
+        tip = base + ARROW * size * film.force[index] / strongest
+        shift = base - film.poses[0, 0, :3] if follow else np.zeros(3)
+        points.append(np.vstack((corner_points(drawing, film.poses[index]), tip)) - shift)
+    return np.concatenate(points)
+
+
+def rounded(points: Array, size: float) -> list[list[float]]:
+    """Return points (M, 3) as they are sent: as exact as a robot of that size needs."""
+    digits = max(4, 4 - math.floor(math.log10(size)))
+    found: list[list[float]] = points.round(digits).tolist()
+    return found
+
+
+def corner_points(drawing: Drawing, poses: Array) -> Array:
+    """Return the corners (M, 3) of all bodies' bounding boxes in the world."""
+    return np.concatenate(
+        [
+            np.array([placement.act(corner) for corner in corners])
+            for joint, corners in zip(drawing.bodies, drawing.corners, strict=True)
+            for placement in [pin.XYZQUATToSE3(poses[joint - ROOT])]
+        ]
+    )
+
+
+def stage_info(
+    robot: Robot, drawing: Drawing, poses: Array, *, scene: str, subtitle: str
+) -> dict[str, Any]:
+    """Return what the page's stage needs: sizes, light, floor and where the base is.
+
+    Parameters
+    ----------
+    robot : Robot
+    drawing : Drawing
+    poses : ndarray (njoints - 1, 7)
+        Of the first frame.
+    scene : str
+        "space" or "lab".
+    subtitle : str
+    """
+    points = corner_points(drawing, poses)
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre = (low + high) / 2.0
+    size = max(float(np.linalg.norm(points - centre, axis=1).max()), 1e-3)
+    return {
+        "title": robot.name,
+        "subtitle": subtitle,
+        "scene": scene,
+        "size": size,
+        "centre": centre.tolist(),
+        "floor": [*centre[:2].tolist(), float(low[2])],
+        "sun": SUN,
+        "direction": VIEWS[scene],
+        "base": ["meshcat", "robot", body_paths(robot)[0]],
+    }
+
+
+def triads(robot: Robot, tool: str | None, size: float) -> list[dict[str, Any]]:
+    """Return the axes drawn at the base and the tool."""
+    paths = body_paths(robot)
+    found = [(paths[0], pin.SE3.Identity(), 0.3)]
+    if tool:
+        joint, placement = find_frame(robot.model, tool)
+        found.append((paths[joint - ROOT], placement, 0.12))
+    return [
+        {
+            "path": ["meshcat", "robot", path],
+            "position": placement.translation.tolist(),
+            "quaternion": pin.SE3ToXYZQUAT(placement)[3:].tolist(),
+            "length": share * size,
+        }
+        for path, placement, share in found
+    ]
+
+
+def marks(robot: Robot, film: Playback, tool: str | None, size: float) -> dict[str, Any]:
+    """Return trails, arrows of the base's wrench and plumes."""
+    trails = [("centre of mass", COM_COLOR, film.com)]
+    if tool:
+        trails.insert(0, ("tool", TOOL_COLOR, film.tool))
+    arrows = [("force", FORCE_COLOR, film.force), ("torque", TORQUE_COLOR, film.torque)]
+    paths = body_paths(robot)
+    most = float(np.abs(film.thrust).max(initial=0.0))
+    return {
+        "trails": [
+            {"name": name, "colour": color, "points": packed(points), "radius": 0.0055 * size}
+            for name, color, points in trails
+        ],
+        "arrows": [
+            {
+                "kind": kind,
+                "longest": ARROW * size,
+                "colour": color,
+                "values": packed(values),
+                "most": float(np.linalg.norm(values, axis=1).max()),
+            }
+            for kind, color, values in arrows
+            if np.any(values)
+        ],
+        "plumes": [
+            {
+                "path": ["meshcat", "robot", paths[joint - ROOT]],
+                "position": position.tolist(),
+                "direction": direction.tolist(),
+                "values": packed(film.thrust[:, k]),
+                "most": most,
+            }
+            for k, (joint, position, direction) in enumerate(thrusters(robot))
+            if most
+        ],
+        "triads": triads(robot, tool, size),
+    }
+
+
+def legend(shown: dict[str, Any], *, ghost: str, linear: bool) -> list[dict[str, Any]]:
+    """Return the entries of the legend, each of which can be switched off."""
+    entries = [
+        {"label": f"path of the {each['name']}", "colour": each["colour"],
+         "paths": [["meshcat", "trails", each["name"]]]}
+        for each in shown["trails"]
+    ]  # fmt: skip
+    entries += [
+        {"label": f"{each['kind']} on the base", "colour": each["colour"],
+         "paths": [["meshcat", "wrench", each["kind"]]]}
+        for each in shown["arrows"]
+    ]  # fmt: skip
+    entries.append({"label": ghost, "colour": "#8fb4ff", "paths": [["meshcat", "target"]]})
+    if linear:
+        entries.append(
+            {"label": "linear model", "colour": "#ff7fc8", "paths": [["meshcat", "linear"]]}
+        )
+    return entries

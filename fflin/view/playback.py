@@ -1,0 +1,153 @@
+"""A motion as it is shown: poses, trails, forces and errors at the frames of an animation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.robot.frames import find_frame, frame_index
+from fflin.robot.inputs import Thruster
+from fflin.robot.robot import ROOT, Robot
+
+# More frames than this and a file grows for nothing that an eye could see.
+_MOST_FRAMES = 3000
+
+_ORIGIN = np.zeros(3)
+
+
+@dataclass(frozen=True)
+class Playback:
+    """What is shown of a motion at N frames.
+
+    Attributes
+    ----------
+    t : ndarray (N,)
+        Times [s]; each is one of the motion's own, so that no pose is interpolated.
+    poses : ndarray (N, njoints - 1, 7)
+        x, y, z and quaternion x, y, z, w of every joint's frame in the world.
+    com, tool : ndarray (N, 3)
+        Centre of mass and origin of the tool [m].
+    force, torque : ndarray (N, 3)
+        Base wrench in world axes [N], [N m].
+    thrust : ndarray (N, k)
+        Of each thruster [N].
+    """
+
+    t: Array
+    poses: Array
+    com: Array
+    tool: Array
+    force: Array
+    torque: Array
+    thrust: Array
+
+
+def frame_indices(t: Array, fps: float, speed: float) -> Array:
+    """Return which samples of a motion to show: those nearest to a film's frames.
+
+    Parameters
+    ----------
+    t : ndarray (N,)
+        Times of the motion [s].
+    fps : float
+        Frames per second of watching.
+    speed : float
+        Seconds of motion per second of watching.
+    """
+    duration = float(t[-1] - t[0])
+    count = min(round(duration * fps / speed), len(t) - 1, _MOST_FRAMES)
+    wanted = np.linspace(t[0], t[-1], max(count, 1) + 1)
+    after = np.clip(np.searchsorted(t, wanted), 1, len(t) - 1) if len(t) > 1 else np.zeros(1, int)
+    if len(t) > 1:
+        after -= wanted - t[after - 1] < t[after] - wanted
+    return np.unique(after)
+
+
+def default_tool(robot: Robot) -> str | None:
+    """Return the frame taken for the tool: "tool", or the last link of the longest chain."""
+    model = robot.model
+    if robot.n == 0:
+        return None
+    if model.existFrame("tool"):
+        return "tool"
+    depths = [len(support) for support in model.supports.tolist()]
+    deepest = max(range(ROOT, model.njoints), key=lambda joint: depths[joint])
+    links = [
+        frame.name
+        for frame in model.frames.tolist()
+        if frame.parentJoint == deepest and frame.type == pin.FrameType.BODY
+    ]
+    return links[-1] if links else None
+
+
+def body_poses(robot: Robot, data: pin.Data, q: Array) -> Array:
+    """Return the pose (njoints - 1, 7) of every joint's frame at q (nq,)."""
+    pin.forwardKinematics(robot.model, data, q)
+    return np.array([pin.SE3ToXYZQUAT(placement) for placement in data.oMi.tolist()[ROOT:]])
+
+
+def play_back(
+    robot: Robot, state: StateMap, t: Array, q: Array, u: Array, tool: str | None
+) -> Playback:
+    """Compute what is shown of a motion.
+
+    Parameters
+    ----------
+    robot : Robot
+    state : StateMap
+        Its frame says the axes of the base's wrench.
+    t : ndarray (N,)
+    q : ndarray (N, nq)
+    u : ndarray (N, nu)
+    tool : str or None
+        Frame of the model.
+    """
+    model, data = robot.model, robot.model.createData()
+    tool_id = frame_index(model, tool) if tool else None
+    actuation = Actuation(state)
+    poses: list[Array] = []
+    com: list[Array] = []
+    tools: list[Array] = []
+    force: list[Array] = []
+    torque: list[Array] = []
+    for q_k, u_k in zip(q, u, strict=True):
+        poses.append(body_poses(robot, data, q_k))
+        com.append(pin.centerOfMass(model, data, q_k).copy())
+        base = data.oMi[ROOT]
+        if tool_id is not None:
+            tools.append(pin.updateFramePlacement(model, data, tool_id).translation.copy())
+        else:
+            tools.append(base.translation.copy())
+        for kind, turned, found in (
+            ("tau_b", state.axes[0], torque),
+            ("F_b", state.axes[1], force),
+        ):
+            rows = actuation.groups.get(kind)
+            axes = state.reference.rotation if turned else base.rotation
+            found.append(_ORIGIN if rows is None else axes @ u_k[rows])
+    thrust = actuation.groups.get("thrust", np.zeros(0, dtype=int))
+    return Playback(
+        t,
+        np.array(poses),
+        np.array(com),
+        np.array(tools),
+        np.array(force),
+        np.array(torque),
+        u[:, thrust],
+    )
+
+
+def thrusters(robot: Robot) -> list[tuple[int, Array, Array]]:
+    """Return joint, position and direction of push, in the joint's frame, of each thruster."""
+    found = []
+    for item in robot.inputs:
+        if isinstance(item, Thruster):
+            joint, placement = find_frame(robot.model, item.frame)
+            position = placement.act(np.array(item.position))
+            found.append((joint, position, placement.rotation @ np.array(item.direction)))
+    return found

@@ -1,0 +1,242 @@
+"""A robot as nodes of a meshcat scene: one for each body, and below it its pieces."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from hashlib import sha1
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import pinocchio as pin
+import umsgpack
+
+from fflin.base.validation import Array
+from fflin.robot.robot import ROOT, Robot
+from fflin.robot.urdf.xml import named
+from fflin.view.collada import Indices
+from fflin.view.meshes import Mesh, load_mesh
+from fflin.view.shapes import PLAIN, Shape, shapes
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", DeprecationWarning)  # of what meshcat imports, not of ours
+    from meshcat import Visualizer
+    from meshcat.commands import SetAnimation, SetTransform
+    from meshcat.geometry import Mesh as MeshcatMesh
+
+# three.js draws cylinders along y, URDF along z.
+_Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+
+# Extension types of msgpack-lite, which the page decodes to typed arrays.
+_TYPED = {"<u2": (0x14, "Uint16Array"), "<u4": (0x16, "Uint32Array"), "<f4": (0x17, "Float32Array")}
+
+# Stands for a mesh that the page has already.
+_ELSEWHERE = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
+
+
+class _Piece(MeshcatMesh):
+    """A three.js mesh as it is sent.
+
+    The page gives it its material, and the geometry of an earlier piece where it names one.
+    """
+
+    def __init__(self, geometry: dict[str, Any], matrix: Array, about: dict[str, Any]) -> None:
+        self._geometry, self._matrix, self._about = geometry, matrix, about
+
+    def lower(self) -> dict[str, Any]:
+        return {
+            "metadata": {"version": 4.5, "type": "Object"},
+            "geometries": [self._geometry],
+            "materials": [{"uuid": "material", "type": "MeshStandardMaterial"}],
+            "object": {
+                "uuid": "object",
+                "type": "Mesh",
+                "geometry": self._geometry["uuid"],
+                "material": "material",
+                "matrix": self._matrix.T.ravel().tolist(),
+                "userData": self._about,
+            },
+        }
+
+
+def body_paths(robot: Robot) -> list[str]:
+    """Return the name of the node of each body, in the order of Pinocchio's joints from 1 on."""
+    return [quote(name, safe=" ") for name in list(robot.model.names)[ROOT:]]
+
+
+class Drawing:
+    """A robot drawn into a meshcat scene.
+
+    Parameters
+    ----------
+    robot : Robot
+    visualizer : meshcat.Visualizer
+        Node to draw below. The bodies become its children, named as their joints.
+    look : str
+        "real", or "ghost" and "linear" for translucent ones.
+    sent : set of str, optional
+        Meshes that the page has already; those of this drawing are added.
+
+    Attributes
+    ----------
+    notes : tuple of str
+        What could not be drawn, one line each.
+    corners : list of ndarray (8, 3)
+        Bounding box of each body's pieces in the body's frame, for those that have pieces.
+    bodies : list of int
+        The Pinocchio joints whose boxes these are.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        visualizer: Visualizer,
+        look: str = "real",
+        sent: set[str] | None = None,
+    ) -> None:
+        self.robot = robot
+        self._visualizer = visualizer
+        self._paths = body_paths(robot)
+        sent = set() if sent is None else sent
+        found, notes = shapes(robot)
+        corners: dict[int, list[Array]] = {}
+        unreadable: list[str] = []
+        for index, shape in enumerate(found):
+            node = visualizer[self._paths[shape.joint - ROOT]]
+            try:
+                pieces = _pieces(shape)
+            except ValueError:
+                assert shape.mesh is not None
+                unreadable.append(shape.mesh.name)
+                continue
+            for part, (geometry, matrix, color, box) in enumerate(pieces):
+                about = {"finish": shape.finish, "color": color, "look": look}
+                shown = geometry
+                if geometry["type"] == "BufferGeometry":
+                    about["mesh"] = geometry["uuid"]
+                    shown = _ELSEWHERE if geometry["uuid"] in sent else geometry
+                    sent.add(geometry["uuid"])
+                placed = shape.placement.homogeneous @ matrix
+                node[f"{index}_{part}"].set_object(_Piece(shown, placed, about))
+                corners.setdefault(shape.joint, []).append(_box_corners(placed, box))
+        if unreadable:
+            notes += (f"{robot.name}: {named('mesh file', unreadable)} cannot be read; not drawn",)
+        self.notes = notes
+        self.bodies = list(corners)
+        self.corners = [_bounds(np.concatenate(boxes)) for boxes in corners.values()]
+
+    def place(self, poses: Array) -> None:
+        """Put every body at its pose, (njoints - 1, 7) of x, y, z and quaternion x, y, z, w."""
+        for path, pose in zip(self._paths, poses, strict=True):
+            node = self._visualizer[path]
+            node.window.send(SetTransform(pin.XYZQUATToSE3(pose).homogeneous, node.path))
+
+    def tracks(self, t: Array, poses: Array) -> list[dict[str, Any]]:
+        """Return the animation of every body over times t (N,), poses (N, njoints - 1, 7)."""
+        times = typed(t)
+        clips = []
+        for index, path in enumerate(self._paths):
+            tracks = [
+                {"name": ".position", "type": "vector3", "values": typed(poses[:, index, :3])},
+                {"name": ".quaternion", "type": "quaternion", "values": typed(poses[:, index, 3:])},
+            ]
+            clip = {"fps": 1, "name": path, "tracks": [{**each, "times": times} for each in tracks]}
+            clips.append({"path": self._visualizer[path].path.lower(), "clip": clip})
+        return clips
+
+
+class Animation(SetAnimation):
+    """The animation of all that moves, as it is sent."""
+
+    def __init__(self, clips: Sequence[dict[str, Any]]) -> None:
+        self._clips = list(clips)
+
+    def lower(self) -> dict[str, Any]:
+        """Return the command."""
+        options = {"play": True, "repetitions": 1}
+        return {"type": "set_animation", "animations": self._clips, "options": options, "path": ""}
+
+
+def typed(array: Array | Indices, kind: str = "<f4") -> Any:
+    """Pack an array so that the page has it as a typed one."""
+    return umsgpack.Ext(_TYPED[kind][0], np.ascontiguousarray(array, dtype=kind).tobytes())
+
+
+def _pieces(shape: Shape) -> list[tuple[dict[str, Any], Array, Any, Array]]:
+    """Return geometry, matrix, colour and half of the bounding box's sides of each piece."""
+    unit = np.eye(4)
+    if shape.kind == "mesh":
+        assert shape.mesh is not None
+        scale = np.diag((*shape.size, 1.0))
+        return [
+            (*_triangles(mesh, scale), shape.color or mesh.color or PLAIN, _mesh_box(mesh))
+            for mesh in load_mesh(shape.mesh)
+        ]
+    color = shape.color or PLAIN
+    if shape.kind == "box":
+        names = ("width", "height", "depth")
+        box = {"uuid": "box", "type": "BoxGeometry", **dict(zip(names, shape.size, strict=True))}
+        return [(box, unit, color, _symmetric(np.array(shape.size) / 2.0))]
+    radius = shape.size[0]
+    ball = {
+        "uuid": "sphere",
+        "type": "SphereGeometry",
+        "radius": radius,
+        **{"widthSegments": 32, "heightSegments": 20},
+    }
+    around = _symmetric(np.full(3, radius))
+    if shape.kind == "sphere":
+        return [(ball, unit, color, around)]
+    length = shape.size[1]
+    tube = {
+        "uuid": "cylinder",
+        "type": "CylinderGeometry",
+        **{"radiusTop": radius, "radiusBottom": radius, "height": length, "radialSegments": 40},
+    }
+    pieces = [(tube, _Y_TO_Z, color, _symmetric(np.array([radius, length / 2.0, radius])))]
+    if shape.kind == "capsule":
+        for end in (-length / 2.0, length / 2.0):
+            lifted = unit.copy()
+            lifted[2, 3] = end
+            pieces.append((ball, lifted, color, around))
+    return pieces
+
+
+def _triangles(mesh: Mesh, matrix: Array) -> tuple[dict[str, Any], Array]:
+    kind = "<u2" if len(mesh.vertices) < 2**16 else "<u4"
+    digest = sha1(mesh.vertices.tobytes() + mesh.faces.tobytes(), usedforsecurity=False)
+    geometry = {
+        "uuid": digest.hexdigest(),
+        "type": "BufferGeometry",
+        "data": {
+            "index": {"type": _TYPED[kind][1], "array": typed(mesh.faces, kind)},
+            "attributes": {
+                "position": {
+                    "itemSize": 3,
+                    "type": "Float32Array",
+                    "array": typed(mesh.vertices),
+                    "normalized": False,
+                }
+            },
+        },
+    }
+    return geometry, matrix
+
+
+def _symmetric(half: Array) -> Array:
+    return np.stack((-half, half))
+
+
+def _mesh_box(mesh: Mesh) -> Array:
+    return np.stack((mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)))
+
+
+def _box_corners(matrix: Array, box: Array) -> Array:
+    choice = np.array([[i & 1, i >> 1 & 1, i >> 2 & 1] for i in range(8)])
+    corners = np.take_along_axis(box, choice, axis=0)
+    return corners @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _bounds(points: Array) -> Array:
+    return _box_corners(np.eye(4), np.stack((points.min(axis=0), points.max(axis=0))))

@@ -1,0 +1,226 @@
+"""What a robot looks like: the visual elements of its URDF, or boxes of its inertias."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import FflinError
+from fflin.base.writing import shown
+from fflin.robot.robot import ROOT, Robot
+from fflin.robot.urdf.reader import read_document
+from fflin.robot.urdf.xacro import expand, first_xacro
+from fflin.robot.urdf.xml import Element, decimal, named, parse
+
+Color = tuple[float, float, float, float]
+
+# Where a URDF names no colour.
+PLAIN: Color = (0.72, 0.74, 0.77, 1.0)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One visible piece of a robot, rigidly fixed to the body behind one joint.
+
+    Attributes
+    ----------
+    joint : int
+        Index of the Pinocchio joint that moves it.
+    kind : str
+        "box", "sphere", "cylinder", "capsule" or "mesh".
+    size : tuple of float
+        Side lengths; radius; radius and length [m]; or the scale of the mesh.
+    placement : pin.SE3
+        Where it stands in the joint's frame; the axis of a cylinder is z.
+    color : tuple of float, optional
+        Red, green, blue, opacity, each in [0, 1]; None where a mesh brings its own.
+    finish : str
+        Name of its material, which may tell gold from paint.
+    mesh : Path, optional
+        File of a mesh.
+    """
+
+    joint: int
+    kind: str
+    size: tuple[float, ...]
+    placement: pin.SE3
+    color: Color | None = PLAIN
+    finish: str = ""
+    mesh: Path | None = None
+
+
+def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
+    """Return what a robot looks like.
+
+    Parameters
+    ----------
+    robot : Robot
+
+    Returns
+    -------
+    shapes : tuple of Shape
+        Of its URDF's visual elements; where it has none, or no URDF, a box for each body whose
+        inertia is that of the body.
+    notes : tuple of str
+        What could not be drawn, one line each.
+    """
+    notes: list[str] = []
+    found = list(_visuals(robot, notes)) if robot.urdf else []
+    if not found:
+        notes.append(f"{robot.name}: no visual geometry; drawn as boxes of the links' inertias")
+        found = list(_inertia_boxes(robot))
+    return tuple(found), tuple(notes)
+
+
+def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
+    path = robot.urdf
+    assert path is not None
+    try:
+        root = _document(path)
+    except FflinError as error:
+        notes.append(f"no visual geometry: {error}")
+        return
+    colors = {
+        element.attributes["name"]: color
+        for element in root.find_all("material")
+        if "name" in element.attributes and (color := _color(element)) is not None
+    }
+    missing: list[str] = []
+    odd: list[int] = []
+    for link in root.find_all("link"):
+        frame_id = robot.model.getFrameId(link.attributes.get("name", ""), pin.FrameType.BODY)
+        if frame_id >= robot.model.nframes:
+            continue  # cut off
+        frame = robot.model.frames[frame_id]
+        if frame.parentJoint < ROOT:
+            continue
+        for visual in link.find_all("visual"):
+            try:
+                kind, size, mesh = _geometry(visual)
+                placement = frame.placement * _placement(visual)
+                color, finish = _material(visual, colors, kind)
+            except (ValueError, LookupError):
+                odd.append(visual.line)
+                continue
+            file = None
+            if mesh is not None:
+                file = find_mesh(mesh, path, robot.package_dirs)
+                if file is None:
+                    missing.append(shown(mesh))
+                    continue
+            yield Shape(frame.parentJoint, kind, size, placement, color, finish, file)
+    if missing:
+        where = ", ".join(str(folder) for folder in robot.package_dirs) or path.parent
+        notes.append(
+            f"{robot.name}: {named('mesh file', missing)} not found below {where}; the rest is "
+            "drawn (package_dirs of fflin.load names other folders)"
+        )
+    if odd:
+        lines = ", ".join(map(str, odd[:6])) + ", ..." * (len(odd) > 6)
+        notes.append(f"{path.name}: <visual> in line {lines} is malformed and not drawn")
+
+
+def _document(path: Path) -> Element:
+    document = read_document(path)
+    root = parse(document, str(path))
+    first = first_xacro(root)
+    if path.suffix == ".xacro" or first:
+        root = parse(expand(path, document, first)[0], str(path))
+    return root
+
+
+def _geometry(visual: Element) -> tuple[str, tuple[float, ...], str | None]:
+    (geometry,) = visual.find_all("geometry")
+    (shape,) = geometry.children
+    if shape.tag == "box":
+        return "box", _numbers(shape.attributes["size"], 3), None
+    if shape.tag == "sphere":
+        return "sphere", _numbers(shape.attributes["radius"], 1), None
+    if shape.tag in ("cylinder", "capsule"):
+        size = f"{shape.attributes['radius']} {shape.attributes['length']}"
+        return shape.tag, _numbers(size, 2), None
+    if shape.tag == "mesh":
+        scale = _numbers(shape.attributes.get("scale", "1 1 1"), 3)
+        return "mesh", scale, shape.attributes["filename"]
+    raise ValueError(shape.tag)
+
+
+def _placement(visual: Element) -> pin.SE3:
+    origins = visual.find_all("origin")
+    if not origins:
+        return pin.SE3.Identity()
+    xyz = _numbers(origins[0].attributes.get("xyz", "0 0 0"), 3)
+    rpy = _numbers(origins[0].attributes.get("rpy", "0 0 0"), 3)
+    return pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
+
+
+def _material(visual: Element, colors: Mapping[str, Color], kind: str) -> tuple[Color | None, str]:
+    materials = visual.find_all("material")
+    none = None if kind == "mesh" else PLAIN
+    if not materials:
+        return none, ""
+    name = materials[0].attributes.get("name", "")
+    return _color(materials[0]) or colors.get(name, none), name
+
+
+def _color(material: Element) -> Color | None:
+    found = material.find_all("color")
+    if not found:
+        return None
+    r, g, b, a = (min(max(x, 0.0), 1.0) for x in _numbers(found[0].attributes["rgba"], 4))
+    return r, g, b, a
+
+
+def _numbers(text: str, count: int) -> tuple[float, ...]:
+    values = tuple(decimal(word) for word in text.split())
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise ValueError(text)
+    return values
+
+
+def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
+    """Return the file of a mesh, None where it is not there.
+
+    Parameters
+    ----------
+    uri : str
+        package://NAME/PATH, file:///PATH, an absolute path or one relative to the URDF.
+    urdf : Path
+        The robot's file. A package is also looked for in the folders that this one lies in.
+    package_dirs : sequence of Path
+        Folders that hold packages.
+    """
+    scheme, separator, rest = uri.partition("://")
+    if not separator:
+        candidates = [urdf.parent / uri, *(folder / uri for folder in package_dirs)]
+    elif scheme == "file":
+        candidates = [Path(unquote(rest))]
+    else:
+        inside = Path(*Path(rest).parts[1:])
+        candidates = [folder / rest for folder in (*package_dirs, *urdf.resolve().parents)]
+        # A package's own folder may have been given, or be called otherwise.
+        candidates += [folder / inside for folder in (*package_dirs, *urdf.resolve().parents)]
+    # Unlike Path.is_file, this takes a name that is too long for one that does not exist.
+    return next((path for path in candidates if os.path.isfile(path)), None)
+
+
+def _inertia_boxes(robot: Robot) -> Iterator[Shape]:
+    for joint, inertia in enumerate(robot.model.inertias.tolist()):
+        if joint < ROOT or inertia.mass <= 0.0:
+            continue
+        moments, axes = np.linalg.eigh(inertia.inertia)
+        if np.linalg.det(axes) < 0.0:
+            axes[:, 0] = -axes[:, 0]
+        # A uniform box has moments m (b^2 + c^2)/12; published inertias may be of no real body.
+        squares = 6.0 / inertia.mass * (moments.sum() - 2.0 * moments)
+        sides = np.sqrt(np.maximum(squares, 0.0))
+        sides = np.maximum(sides, max(0.05 * sides.max(), 1e-3))
+        size = (float(sides[0]), float(sides[1]), float(sides[2]))
+        yield Shape(joint, "box", size, pin.SE3(axes, inertia.lever), finish="inertia")

@@ -1,0 +1,1 @@
+"""Tests of fflin, in the rooms of the code."""

@@ -1,0 +1,377 @@
+"""Natural modes: closed forms, the free-free pencil by another route, zeros, and bad input."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.linalg import eigh
+from scipy.optimize import linear_sum_assignment
+
+import fflin
+from fflin.analysis.modes import modes_report
+from fflin.commands import cli
+from fflin.commands.model_text import model_report
+from tests.support.robots import BUNDLED, FRAMES, random_point, random_pose
+
+# Hub and panels of a published test case (AVSLab/basilisk, hinged rigid bodies): masses [kg],
+# moments of inertia about y [kg m^2], hinge and panel arms [m].
+HUB, HUB_Y, PANEL, PANEL_Y, HINGE, ARM = 750.0, 800.0, 100.0, 50.0, 0.5, 1.5
+
+
+def two_panels(**fields):
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
+    com = np.array([0.0, 0.0, 1.0])
+    hub = pin.Inertia(HUB, com, np.diag([900.0, HUB_Y, 600.0]))
+    model.appendBodyToJoint(1, hub, pin.SE3.Identity())
+    for name, side in (("left", -1.0), ("right", 1.0)):
+        place = pin.SE3(np.eye(3), com + np.array([side * HINGE, 0.0, 0.0]))
+        index = model.addJoint(1, pin.JointModelRY(), place, name)
+        lever = np.array([side * ARM, 0.0, 0.0])
+        panel = pin.Inertia(PANEL, lever, np.diag([100.0, PANEL_Y, 50.0]))
+        model.appendBodyToJoint(index, panel, pin.SE3.Identity())
+    return fflin.from_model(model, name="two_panels", **fields)
+
+
+def felt_inertias():
+    """What a panel feels at its hinge when both flap alike, and when one goes up, one down.
+
+    About y the joint angles (a, -a) lift both tips by a ARM: the hub sinks. The angles (a, a) turn
+    both one way: the hub turns the other. Of T = 1/2 m v^2 + ... the hub's rate is eliminated by
+    the momentum that is conserved.
+    """
+    own = PANEL_Y + PANEL * ARM**2
+    lifting = own - 2.0 * (PANEL * ARM) ** 2 / (HUB + 2.0 * PANEL)
+    coupling = PANEL_Y + PANEL * ARM * (HINGE + ARM)
+    total = HUB_Y + 2.0 * (PANEL_Y + PANEL * (HINGE + ARM) ** 2)
+    turning = own - 2.0 * coupling**2 / total
+    return lifting, turning
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_two_hinged_panels_have_the_frequencies_derived_by_hand(frame):
+    k = 1562.0
+    robot = two_panels(stiffness=k)
+    q = fflin.configuration(robot, None, random_pose(np.random.default_rng(1), 130.0))
+    found = fflin.modes(fflin.linearize(robot, q, frame=frame, reference=pin.SE3.Identity()))
+    expected = np.sqrt(k / np.array(felt_inertias()))
+    assert found.frequencies == pytest.approx(expected, rel=1e-13)
+    assert found.frequencies == pytest.approx([2.61954, 3.45462], abs=5e-6)
+    assert not found.damping_ratios.any() and not found.unstable
+    assert found.rigid_body == 6 and found.zero_eigenvalues == 12
+    lifting, turning = (dict(zip(found.state_names, m.shape, strict=True)) for m in found.modes)
+    assert lifting["q_m.left"] == pytest.approx(-lifting["q_m.right"], rel=1e-12)
+    assert turning["q_m.left"] == pytest.approx(turning["q_m.right"], rel=1e-12)
+
+
+def test_mode_shapes_conserve_momentum():
+    """Of the panels lifting by ARM each, the hub sinks by 2 m ARM / (M + 2 m)."""
+    found = fflin.modes(fflin.linearize(two_panels(stiffness=50.0)))
+    shape = dict(zip(found.state_names, found.modes[0].shape, strict=True))
+    assert shape["q_m.left"] == pytest.approx(1.0, abs=1e-15) and shape["q_b.y"] == pytest.approx(
+        0.0, abs=1e-14
+    )
+    sunk = -2.0 * PANEL * ARM / (HUB + 2.0 * PANEL)
+    assert shape["r_b.z"] == pytest.approx(sunk, rel=1e-12)
+    assert shape["v_b.z"] == pytest.approx(found.modes[0].pole * sunk, rel=1e-12)
+    turned = dict(zip(found.state_names, found.modes[1].shape, strict=True))
+    coupling = PANEL_Y + PANEL * ARM * (HINGE + ARM)
+    total = HUB_Y + 2.0 * (PANEL_Y + PANEL * (HINGE + ARM) ** 2)
+    # q_b is half the angle.
+    assert turned["q_b.y"] == pytest.approx(-coupling / total, rel=1e-12)
+
+
+def test_damping_ratios_have_the_closed_form():
+    """J a'' + d a' + k a = 0: ratio d / (2 sqrt(k J)); beyond 1 two time constants."""
+    k, d = 100.0, 7.0
+    found = fflin.modes(fflin.linearize(two_panels(stiffness=k, damping=d)))
+    J = np.array(felt_inertias())
+    assert found.frequencies == pytest.approx(np.sqrt(k / J), rel=1e-12)
+    assert found.damping_ratios == pytest.approx(d / 2.0 / np.sqrt(k * J), rel=1e-12)
+    assert found.modes[0].time_constant == pytest.approx(2.0 * J[0] / d, rel=1e-12)
+    d = 2e3
+    found = fflin.modes(fflin.linearize(two_panels(stiffness=k, damping=d)))
+    assert not found.vibrations and found.zero_eigenvalues == 12 and not found.unstable
+    roots = np.concatenate([np.roots([inertia, d, k]) for inertia in J])
+    times = sorted(mode.time_constant for mode in found.modes)
+    assert times == pytest.approx(sorted(-1.0 / roots), rel=1e-10)
+    assert {mode.damping_ratio for mode in found.modes} == {1.0}
+
+
+def test_a_joint_that_only_drags_has_one_zero_and_one_time_constant():
+    robot = two_panels(damping={"left": 3.0})
+    lin = fflin.linearize(robot)
+    found = fflin.modes(lin)
+    (mode,) = found.modes
+    assert mode.pole.real == pytest.approx(-3.0 * lin.B[-2, -2], rel=1e-13)
+    assert (found.rigid_body, found.zero_eigenvalues) == (8, 15)
+    assert found.poles.shape == (16,)
+
+
+def matched(found, expected):
+    """Largest distance between two sets of eigenvalues, paired."""
+    distance = np.abs(found[:, None] - expected)
+    return distance[linear_sum_assignment(distance)].max()
+
+
+@pytest.mark.parametrize("damped", [False, True])
+@pytest.mark.parametrize("name", BUNDLED)
+def test_poles_are_the_eigenvalues(name, damped):
+    rng = np.random.default_rng(4)
+    bare = fflin.load(name)
+    for share in (1.0, 0.5):
+        some = [joint for joint in bare.joint_names if rng.random() < share]
+        inertia = fflin.linearize(bare).M.diagonal()[6:]
+        own = dict(zip(bare.joint_names, inertia, strict=True))
+        robot = bare.replace(stiffness={j: own[j] * rng.uniform(1, 9) for j in some})
+        if damped:
+            robot = robot.replace(damping={j: own[j] * rng.uniform(0.1, 2) for j in some})
+        q, _, _ = random_point(bare, rng)
+        robot = robot.replace(rest={joint.name: joint.value(q) for joint in bare.joints})
+        lin = fflin.linearize(robot, q)
+        found = fflin.modes(lin)
+        expected = np.linalg.eigvals(lin.A)
+        size = np.abs(expected).max(initial=1.0)
+        # The zeros of eigvals, Jordan blocks of two, are off by the root of its round-off.
+        assert matched(found.poles, expected) < 1e-6 * size
+        nonzero = expected[np.abs(expected) > 1e-6 * size]
+        assert len(nonzero) == 2 * len(some)
+        mine = found.poles[np.abs(found.poles) > 0.0]
+        if some:
+            assert matched(mine, nonzero) < 1e-9 * size
+        assert found.rigid_body == 6 + robot.n - len(some)
+        assert found.zero_eigenvalues == 12 + 2 * (robot.n - len(some))
+        assert not found.unstable and found.equilibrium
+        assert found.residual < 1e-14 + 1e-16 * lin.certificate.condition
+        if damped and some:
+            # The joints alone, the base and the free joints floating, have no zeros to disturb.
+            on = [6 + bare.joint_names.index(joint) for joint in some]
+            inverse = fflin.linearize(bare, q).B[6 + robot.n :][np.ix_(on, on)]
+            K, D = ([values[j] for j in some] for values in (robot.stiffness, robot.damping))
+            size = len(on)
+            alone = np.block([[np.zeros((size, size)), np.eye(size)], [-inverse * K, -inverse * D]])
+            expected = np.linalg.eigvals(alone)
+            assert matched(np.log(mine), np.log(expected)) < 3e-13
+        if not damped and some:
+            # The free-free pencil over all joints, M* by the Schur complement of the base.
+            M = fflin.linearize(bare, q).M
+            M_star = M[6:, 6:] - M[6:, :6] @ np.linalg.solve(M[:6, :6], M[:6, 6:])
+            squares = eigh(np.diag(robot.passive.stiffness), M_star, eigvals_only=True)
+            expected = np.sqrt(squares[-len(some) :])
+            assert found.frequencies == pytest.approx(expected, rel=1e-10)
+
+
+def test_only_rigid_body_modes_without_springs(robots):
+    for name, robot in robots.items():
+        found = fflin.modes(fflin.linearize(robot))
+        assert found.rigid_body == 6 + robot.n and not found.modes, name
+        assert not found.poles.any() and len(found.poles) == 12 + 2 * robot.n
+        assert str(found).startswith(f"{name}: {6 + robot.n} rigid-body modes")
+
+
+def test_chains_of_four_zeros_stay_zeros():
+    """Hover: attitude, rate, velocity, position integrate one another; eigvals is off by 1e-4."""
+    up = fflin.Thruster("base_link", (0, 0, 0), (0, 0, 1))
+    robot = fflin.load("hector", gravity=(0, 0, -9.81), inputs=[up, fflin.BaseTorque()])
+    lin = fflin.linearize(robot, u=fflin.equilibrium(robot).u)
+    found = fflin.modes(lin)
+    assert found.equilibrium and not found.modes
+    assert (found.rigid_body, found.zero_eigenvalues) == (4, 12)  # pitch and roll accelerate
+
+
+def test_a_stiff_and_a_soft_spring():
+    """1e8 apart in stiffness; the softer frequency is right to the rounding of the stiffer one."""
+    J, k = 0.2, 1e-2
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
+    model.appendBodyToJoint(1, pin.Inertia(5.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+    for name, joint in (("soft", pin.JointModelRX()), ("stiff", pin.JointModelRY())):
+        index = model.addJoint(1, joint, pin.SE3.Identity(), name)
+        rotor = pin.Inertia(1.0, np.zeros(3), J * np.eye(3))
+        model.appendBodyToJoint(index, rotor, pin.SE3.Identity())
+    robot = fflin.from_model(model, stiffness={"soft": k, "stiff": 1e8 * k})
+    found = fflin.modes(fflin.linearize(robot))
+    floating = 1.0 / (1.0 / J + 1.0 / (1.0 + J))  # the other rotor turns with the hub
+    expected = np.sqrt(np.array([k, 1e8 * k]) / floating)
+    assert found.frequencies == pytest.approx(expected, rel=1e-7)
+
+
+def test_a_spinning_wheel_nutates():
+    """Momentum h on a body of transverse inertia I: frequency h / I, neither damped nor growing."""
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
+    model.appendBodyToJoint(1, pin.Inertia(5.0, np.zeros(3), 2.0 * np.eye(3)), pin.SE3.Identity())
+    model.addJoint(1, pin.JointModelRZ(), pin.SE3.Identity(), "wheel")
+    wheel = pin.Inertia(1.0, np.zeros(3), np.diag([0.3, 0.3, 0.5]))
+    model.appendBodyToJoint(2, wheel, pin.SE3.Identity())
+    robot = fflin.from_model(model)
+    lin = fflin.linearize(robot, v=fflin.velocity(robot, {"wheel": 20.0}))
+    found = fflin.modes(lin)
+    (nutation,) = found.modes
+    assert found.equilibrium
+    assert nutation.pole == pytest.approx(1j * 0.5 * 20.0 / 2.3, rel=1e-12)
+    assert nutation.damping_ratio == 0.0 and not nutation.unstable
+    assert found.zero_eigenvalues == 12
+
+
+@pytest.mark.parametrize("name, rotor", [("canadarm2", "joint_7"), ("ets_vii", "joint_6")])
+def test_what_loses_no_energy_neither_decays_nor_grows(name, rotor):
+    """Springs and a spinning rotor: gyroscopic, so that every pole is imaginary; exactly so."""
+    rng = np.random.default_rng(5)
+    bare = fflin.load(name)
+    q, _, _ = random_point(bare, rng)
+    own = dict(zip(bare.joint_names, fflin.linearize(bare, q).M.diagonal()[6:], strict=True))
+    springs = {joint: own[joint] * rng.uniform(1, 9) for joint in own if joint != rotor}
+    rest = {joint.name: joint.value(q) for joint in bare.joints}
+    robot = bare.replace(stiffness=springs, rest=rest)
+    lin = fflin.linearize(robot, q, fflin.velocity(robot, {rotor: 3.0}))
+    assert lin.is_equilibrium() and lin.A[-len(lin.M) :, -len(lin.M) :].any()
+    found = fflin.modes(lin)
+    assert len(found.vibrations) == len(found.modes) >= len(springs)
+    assert not found.damping_ratios.any() and not found.unstable
+    assert matched(found.poles, np.linalg.eigvals(lin.A)) < 1e-6 * found.frequencies[-1]
+
+
+def test_null_space_thrust_on_moving_links_is_seen_to_be_unstable(capsys):
+    """Thrusters on arm and base that push against each other, the joints holding: B u = 0."""
+    arm = fflin.load("ets_vii")
+    tip = fflin.Thruster("link_6", (0.0, 0.0, 0.1), (0.3, -0.5, 1.0), name="tip")
+    elbow = fflin.Thruster("link_3", (0.1, 0.0, 0.0), (0.0, 1.0, 0.2), name="elbow")
+    robot = arm.replace(inputs=[tip, elbow, *arm.inputs])
+    q = fflin.configuration(robot, {"joint_2": 0.6, "joint_4": -0.8, "joint_5": 0.5})
+    thrust = np.array([12.0, 5.0])
+    linearizer = fflin.Linearizer(robot)
+    B = linearizer(q).M @ linearizer(q).B[6 + robot.n :]
+    u = np.concatenate((thrust, -B[:, :2] @ thrust))
+    lin = linearizer(q, None, u)
+    assert np.abs(B @ u).max() < 1e-13 * np.abs(u).max() and lin.is_equilibrium()
+    assert fflin.check(robot, lin).ok
+    found = fflin.modes(lin)
+    assert found.equilibrium and found.unstable
+    expected = np.linalg.eigvals(lin.A)
+    growing = expected[expected.real > 1e-2 * np.abs(expected).max()]
+    mine = np.array([mode.pole for mode in found.unstable])
+    assert matched(np.concatenate((mine, mine[mine.imag > 0].conj())), growing) < 1e-8
+    assert found.residual < 1e-12
+    for text in (model_report(lin), modes_report(found), str(found)):
+        assert "unstable: poles with a positive real part" in text
+        for mode in found.unstable:
+            assert f"{mode.pole:.5g}" in " ".join(text.split())
+
+
+@pytest.mark.parametrize("f", [5.0, 40.0])
+def test_a_rod_that_buckles_has_the_rate_derived_by_hand(f):
+    """Thrust f at the tip of a rod towards its hinge, and as much on the base against it.
+
+    The base, mass M, does not turn. Across the rod (M + m) y'' + m l a'' = -f a, and about the
+    hinge (J + m l^2) a'' + m l y'' = -k a: so (J + m l^2 - m^2 l^2 / (M + m)) a'' =
+    (m l f / (M + m) - k) a.
+    """
+    M, m, l, J, k = 10.0, 2.0, 0.5, 0.1, 2.0
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
+    model.addFrame(pin.Frame("base", 1, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
+    turns_not = pin.Inertia(M, np.zeros(3), 1e13 * np.eye(3))
+    model.appendBodyToJoint(1, turns_not, pin.SE3.Identity())
+    model.addJoint(1, pin.JointModelRZ(), pin.SE3.Identity(), "hinge")
+    model.addFrame(pin.Frame("rod", 2, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
+    rod = pin.Inertia(m, np.array([l, 0.0, 0.0]), J * np.eye(3))
+    model.appendBodyToJoint(2, rod, pin.SE3.Identity())
+    inputs = [
+        fflin.Thruster("rod", (1, 0, 0), (-1, 0, 0)),
+        fflin.Thruster("base", (0, 0, 0), (1, 0, 0)),
+    ]
+    robot = fflin.from_model(model, inputs=inputs, stiffness={"hinge": k})
+    found = fflin.modes(fflin.linearize(robot, u=[f, f]))
+    square = (m * l * f / (M + m) - k) / (J + m * l**2 - (m * l) ** 2 / (M + m))
+    assert found.equilibrium and found.zero_eigenvalues == 12
+    if square < 0.0:
+        assert found.frequencies == pytest.approx([np.sqrt(-square)], rel=1e-9)
+        assert not found.damping_ratios.any() and not found.unstable
+    else:
+        assert [mode.pole for mode in found.unstable] == pytest.approx([np.sqrt(square)], rel=1e-9)
+        assert len(found.modes) == 2 and found.unstable[0].damping_ratio == -1.0
+
+
+def test_models_from_files_and_in_other_hands(tmp_path):
+    robot = two_panels(stiffness=5.0)
+    lin = fflin.linearize(robot)
+    for ending in (".npz", ".mat", ".json", ".csv"):
+        lin.save(tmp_path / f"m{ending}")
+        loaded = fflin.modes(fflin.LinearModel.load(tmp_path / f"m{ending}"))
+        assert (loaded.frequencies == fflin.modes(lin).frequencies).all()
+    with pytest.raises(fflin.InputError, match=r"sampled at dt = 0\.1 s; give the continuous"):
+        fflin.modes(lin.discretize(0.1))
+    with pytest.raises(fflin.InputError, match="expected a fflin"):
+        fflin.modes(lin.A)
+    with pytest.raises(ValueError, match="read-only"):
+        fflin.modes(lin).modes[0].shape[0] = 1.0
+
+
+def test_tables_fit_in_80_columns(robots):
+    for robot in robots.values():
+        sprung = robot.replace(stiffness=3.0, damping=0.2)
+        for lin in (fflin.linearize(sprung), fflin.linearize(robot)):
+            assert max(map(len, str(fflin.modes(lin)).splitlines())) <= 80
+
+
+def test_command_line(capsys):
+    springs = ["--stiffness", "panel_left=100", "--stiffness", "panel_right=100"]
+    assert cli.main(["modes", "servicer_7dof", *springs]) == 0
+    out = capsys.readouterr().out
+    assert "13 rigid-body modes (26 eigenvalues at zero), 2 vibrations" in " ".join(out.split())
+    robot = fflin.load("servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 100.0})
+    for frequency in fflin.modes(fflin.linearize(robot)).frequencies:
+        assert f"{frequency:.6g}" in out
+
+
+def test_command_line_takes_an_equilibrium(capsys):
+    point = ["--joint", "panel_left=0.3", "--rpy", "30", "0", "20", "--gravity", "0", "0", "-1"]
+    point += ["--reference", "world", "--stiffness", "panel_left=100"]
+    assert cli.main(["linearize", "servicer_7dof", *point, "--equilibrium"]) == 0
+    out = capsys.readouterr().out
+    assert "a fixed point" in out and "not a fixed point" not in out
+    assert cli.main(["check", "servicer_7dof", *point, "--equilibrium", "--frame", "world"]) == 0
+    assert cli.main(["modes", "servicer_7dof", *point]) == 0
+    assert "not an equilibrium" in capsys.readouterr().out
+    assert cli.main(["modes", "servicer_7dof", *point, "--equilibrium"]) == 0
+    assert "not an equilibrium" not in capsys.readouterr().out
+    assert cli.main(["linearize", "canadarm2", "--velocity", "joint_7=1"]) == 0
+    assert "a relative equilibrium" in capsys.readouterr().out
+    for options, words in {
+        ("--effort", "F_b.x=1"): "--effort and --equilibrium both say",
+        ("--inputs", "servicer_7dof"): "left are tau_m.panel_left",
+        ("--velocity", "joint_1=1"): "only rotors may",
+    }.items():
+        assert cli.main(["modes", "servicer_7dof", *point, "--equilibrium", *options]) == 2
+        err = capsys.readouterr().err.splitlines()
+        assert len(err) == 1 and err[0].startswith("fflin: error: ") and words in err[0]
+
+
+def test_inputs_that_cancel_leave_no_mode():
+    robot = fflin.load("servicer_7dof")
+    pair = [fflin.Thruster("panel_left", (0, 0, 0.3), (x, 0, 0)) for x in (1, -1)]
+    robot = robot.replace(inputs=[*pair, *robot.inputs])
+    q = fflin.configuration(robot, {"joint_2": 0.4, "panel_left": 0.3})
+    lin = fflin.linearize(robot, q, u=fflin.effort(robot, {"thruster_1": 5, "thruster_2": 5}))
+    found = fflin.modes(lin)
+    assert lin.is_equilibrium() and not found.modes and found.zero_eigenvalues == 30
+
+
+@pytest.mark.parametrize("thrust", [1e-3, 1.0])
+def test_a_weak_asymmetry_is_not_taken_for_a_spring(thrust):
+    robot = fflin.load("servicer_7dof", stiffness={"panel_left": 100.0, "panel_right": 50.0})
+    pair = [
+        fflin.Thruster("panel_left", (0, 0.2, 0.3), (1, 0, 0)),
+        fflin.Thruster("panel_right", (0, 0.1, 0.3), (-1, 0, 0)),
+    ]
+    robot = robot.replace(inputs=pair)
+    lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}), u=[thrust] * 2)
+    found = fflin.modes(lin)
+    expected = np.linalg.eigvals(lin.A)
+    expected = expected[np.abs(expected) > 1e-4 * thrust**0.5]
+    poles = found.poles[np.abs(found.poles) > 1e-4 * thrust**0.5]
+    assert len(poles) == len(expected)
+    distance = np.abs(poles[:, None] - expected).min(axis=1)
+    assert (distance <= 1e-5 * np.abs(poles)).all()
+    growing = (expected.real > 1e-6) & (expected.imag >= 0.0)
+    assert len(found.unstable) == growing.sum() > 0

@@ -1,0 +1,300 @@
+"""How far the linear model and its loop reach."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+import fflin
+from fflin.analysis.closed_loop import Loop
+from fflin.analysis.validity import _LEVELS, _clopper_pearson, _crossing, _slope
+from fflin.batch.workers import OwnWorkers
+from fflin.control.weights import default_weights
+from tests.commands.test_cli import refused, run
+
+
+def held(robot, dt=0.0, reduce=False):
+    # Bent, since a straight arm has no terms of second order to show.
+    bent = {name: 0.4 + 0.2 * i for i, name in enumerate(robot.joint_names)}
+    lin = fflin.linearize(robot, fflin.configuration(robot, bent))
+    lin = fflin.momentum_reduction(lin) if reduce else lin
+    lin = lin.discretize(dt) if dt else lin
+    return lin, fflin.lqr(lin, *default_weights(lin))
+
+
+@pytest.fixture(scope="module")
+def arm(robots):
+    return robots["planar_detumble"]
+
+
+def test_prediction_error_is_of_second_order(robots, arm):
+    for robot, dt in ((arm, 0.0), (robots["cubesat"], 0.2)):
+        lin, gain = held(robot, dt)
+        found = fflin.validity(robot, lin, gain, samples=1)
+        assert found.slope == pytest.approx(2.0, abs=0.1)
+        assert (np.diff(found.prediction_error[:5]) > 0.0).all()
+        assert found.trusted["attitude"] > 0.0
+    # A model that is wrong to first order shows it.
+    robot = robots["cubesat"]
+    lin, gain = held(robot)
+    wrong = replace(lin, B=lin.B * 1.05)
+    assert fflin.validity(robot, wrong, gain, samples=1).slope < 1.2
+
+
+def test_trust_ends_where_the_error_reaches_a_tenth():
+    errors = np.array([0.005, 0.01, 0.02, 0.05, 0.2, np.nan, np.nan])
+    assert 1 / 8 < _crossing(errors) < 1 / 4
+    assert _crossing(np.full(7, 0.05)) == 1.0
+    assert _crossing(np.full(7, 0.2)) == pytest.approx(1 / 128)
+    assert _slope(0.3 * _LEVELS) == pytest.approx(2.0)
+
+
+def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
+    """A run against an integration of (q, v) by Pinocchio, which knows nothing of the chart."""
+    import pinocchio as pin
+
+    robot = robots["ets_vii"]
+    lin, gain = held(robot)
+    loop = Loop(robot, lin, gain.K)
+    x = loop.displaced(np.random.default_rng(1), 40.0, 0.3, 0.5)
+    times = np.linspace(0.0, 4.0, 9)
+    _, motion = loop.run(x, times, 1e-10)
+    data = robot.create_data()
+    q, v = loop.state.to_pinocchio(x)
+    h = 0.005
+    for _ in range(800):
+
+        def rate(dq, dv, q=q, v=v):
+            here, speed = pin.integrate(robot.model, q, dq), v + dv
+            state = loop.state.to_state(here, speed, near=x)
+            u = lin.u0 - gain.K @ (state - lin.x0)
+            frame = loop.state.chart(here)
+            u = u.copy()
+            u[3:6] = frame.R.T @ u[3:6]
+            tau = loop.state.lift(u)
+            return speed, pin.aba(robot.model, data, here, speed, tau).copy()
+
+        # The midpoint rule, for which the tangent at q is good enough.
+        k, a = rate(np.zeros(robot.nv), np.zeros(robot.nv))
+        k, a = rate(h / 2 * k, h / 2 * a)
+        q, v = pin.integrate(robot.model, q, h * k), v + h * a
+    last = loop.state.to_state(q, v, near=x)
+    assert motion[-1] == pytest.approx(last - lin.x0, abs=2e-4)
+
+
+def test_displacements_are_as_large_as_they_say(robots):
+    import pinocchio as pin
+
+    robot = robots["ets_vii"]
+    lin, gain = held(robot)
+    loop = Loop(robot, lin, gain.K)
+    x = loop.displaced(np.random.default_rng(0), 100.0, 0.3, 0.7)
+    q, v = loop.state.to_pinocchio(x)
+    moved = pin.XYZQUATToSE3(lin.q[:7]).actInv(pin.XYZQUATToSE3(q[:7]))
+    assert np.rad2deg(np.linalg.norm(pin.log3(moved.rotation))) == pytest.approx(100.0)
+    assert np.linalg.norm(moved.translation) == pytest.approx(0.3)
+    assert np.abs((x - lin.x0)[6:12]).max() == pytest.approx(0.7) and not v.any()
+
+
+def test_displacements_of_a_point_that_is_turned_from_the_reference(robots):
+    import pinocchio as pin
+
+    robot = robots["cubesat"]
+    turned = pin.SE3(pin.exp3(np.array([0.0, 2.6, 0.0])), np.zeros(3))
+    q0 = fflin.configuration(robot, base=turned)
+    lin = fflin.linearize(robot, q0, reference=pin.SE3.Identity())
+    loop = Loop(robot, lin, np.zeros((6, 12)))
+    for seed in range(8):  # on either side of a turn of 180 degrees from the reference
+        x = loop.displaced(np.random.default_rng(seed), 100.0, 0.0, 0.0)
+        q, _ = loop.state.to_pinocchio(x)
+        moved = turned.rotation.T @ pin.XYZQUATToSE3(q[:7]).rotation
+        assert np.rad2deg(np.linalg.norm(pin.log3(moved))) == pytest.approx(100.0)
+
+
+def test_same_seed_same_result_whoever_runs_it(robots):
+    robot = robots["cubesat"]
+    lin, gain = held(robot)
+    options = {"attitude": 170.0, "samples": 6}
+    one = fflin.validity(robot, lin, gain, seed=3, **options)
+    for executor in (ProcessPoolExecutor(2), ThreadPoolExecutor(3)):
+        with executor:
+            two = fflin.validity(robot, lin, gain, seed=3, executor=executor, **options)
+        assert two.outcomes == one.outcomes and two.slope == one.slope
+        assert (two.prediction_error == one.prediction_error)[:5].all()
+    other = fflin.validity(robot, lin, gain, seed=4, **options)
+    assert (other.prediction_error != one.prediction_error).any()
+
+
+def test_what_the_counts_say(robots):
+    """A loop that is lost far out: the runs below the first failure, and both intervals."""
+    robot = robots["ets_vii"]
+    lin, gain = held(robot)
+    found = fflin.validity(robot, lin, gain, attitude=174.0, samples=16)
+    failed = [i for i, outcome in enumerate(found.outcomes) if outcome != "settled"]
+    assert failed and found.inside == failed[0] > 0
+    assert found.settled == 16 - len(failed)
+    level = found.sampled[found.inside - 1]
+    assert found.holds == {"attitude": 174.0 * level, "position": 0.5 * level, "joint": level}
+    assert found.inside_rate == pytest.approx(0.05 ** (1.0 / found.inside))
+    assert f"{found.inside} of {found.inside} runs" in " ".join(str(found).split())
+    near = fflin.validity(robot, lin, gain, attitude=30.0, position=0.5, joint=0.3, samples=4)
+    assert near.settled == 4
+
+
+def test_interval_is_clopper_and_pearsons():
+    for successes, count in ((0, 10), (3, 10), (10, 10), (97, 100)):
+        for confidence in (0.9, 0.99):
+            exact = binomtest(successes, count).proportion_ci(confidence, method="exact")
+            found = _clopper_pearson(successes, count, confidence)
+            assert found == pytest.approx((exact.low, exact.high), rel=1e-9)
+
+
+def test_joints_only_hold_the_reduced_model(robots):
+    robot = robots["ets_vii"]
+    robot = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
+    lin, gain = held(robot, reduce=True)
+    found = fflin.validity(robot, lin, gain, joint=0.5, samples=5)
+    assert found.slope == pytest.approx(2.0, abs=0.1)
+    assert found.settled == 5
+
+
+def test_what_cannot_be_told_is_not(robots, arm):
+    robot = robots["cubesat"]
+    lin, gain = held(robot)
+    # A body that is only moved away comes back as the linear model says, to the last digit.
+    found = fflin.validity(robot, lin, gain, attitude=0.0, samples=1)
+    assert np.isnan(found.slope) and found.trusted == found.largest
+    assert found.largest == {"attitude": 0.0, "position": 0.5, "joint": 0.0}
+    said = " ".join(str(found).split())
+    assert "up to 0.5 m and beyond; no order of the error can be told" in said
+    # One that is hurled away is nowhere foreseen.
+    lin, gain = held(arm)
+    found = fflin.validity(arm, lin, gain, attitude=170.0, position=1e6, samples=1)
+    assert np.isnan(found.slope) and found.inside == 0
+    assert set(found.trusted.values()) == {0.0}
+    said = " ".join(str(found).split())
+    assert "smallest displacement tried, 42.5 deg, 2.5e+05 m and 0.25 rad|m, it did not" in said
+    assert "nan" not in said
+    pytest.importorskip("matplotlib")
+    fflin.plot_validity(found).draw_without_rendering()
+
+
+def test_what_a_reduced_model_has_not_is_not_told(robots):
+    robot = robots["ets_vii"]
+    robot = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
+    lin, gain = held(robot, reduce=True)
+    found = fflin.validity(robot, lin, gain, joint=0.5, samples=2)
+    assert found.largest == {"attitude": 0.0, "position": 0.0, "joint": 0.5}
+    assert "deg" not in str(found)
+    with pytest.raises(fflin.InputError, match="none of the coordinates that are displaced"):
+        fflin.validity(robot, lin, gain, joint=0.0, samples=2)
+
+
+def test_bad_input(arm):
+    lin, gain = held(arm)
+    for arguments, words in (
+        ((arm, lin, -gain.K), "not stable"),
+        ((arm, lin, gain.K[:, 1:]), "K has shape"),
+        ((arm, lin, "K"), "neither"),
+        ((arm, None, gain), "expected a fflin.Robot"),
+        ((arm.replace(inputs=[fflin.BaseTorque()]), lin, gain), "inputs are not those"),
+    ):
+        with pytest.raises(fflin.InputError, match=words):
+            fflin.validity(*arguments)
+    for options, words in (
+        ({"samples": 0}, "samples is 0"),
+        ({"seed": 1.5}, "seed is 1.5"),
+        ({"attitude": 180.0}, "below 175 deg"),
+        ({"joint": -1.0}, "none negative"),
+        ({"confidence": 1.0}, "between 0 and 1"),
+    ):
+        with pytest.raises(fflin.InputError, match=words):
+            fflin.validity(arm, lin, gain, **options)
+    gone = fflin.linearize(arm, v=fflin.velocity(arm, {"omega_b.z": 0.1}))
+    with pytest.raises(fflin.InputError, match="no fixed point"):
+        fflin.validity(arm, gone, gain)
+
+
+def test_command_line():
+    code, out, err = run("validity", "cubesat", "--samples", "4", "--jobs", "2")
+    assert code == 0 and not err
+    assert "4 of 4 runs" in out and max(map(len, out.splitlines())) <= 80
+    assert "--jobs is 0" in refused("validity", "cubesat", "--jobs", "0")
+    assert "below 175 deg" in refused("validity", "cubesat", "--attitude", "200")
+
+
+def test_jobs_are_at_most_one_for_each_core():
+    code, out, _ = run("validity", "cubesat", "--samples", "2", "--jobs", "10" + "0" * 30)
+    assert code == 0 and "of 2 runs settled" in " ".join(out.split())
+    done = subprocess.run(
+        [sys.executable, "-m", "fflin", "validity", "cubesat", "--samples", "2", "--jobs", "99999"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "99999 processes are more than there are cores" in done.stderr
+
+
+def test_progress_is_told_of_every_run(robots):
+    robot = robots["cubesat"]
+    lin, gain = held(robot)
+    for executor in (None, ThreadPoolExecutor(2)):
+        told = []
+        fflin.validity(
+            robot,
+            lin,
+            gain,
+            samples=3,
+            executor=executor,
+            progress=lambda *each, told=told: told.append(each),
+        )
+        assert told == [(done, 7) for done in range(1, 8)]
+    with pytest.raises(fflin.InputError, match="progress is 3"):
+        fflin.validity(robot, lin, gain, progress=3)
+
+
+def die(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_process_that_dies_is_one_line(robots, monkeypatch):
+    robot = robots["cubesat"]
+    lin, gain = held(robot)
+    monkeypatch.setattr(Loop, "__reduce__", lambda loop: (die, ()))
+    workers = OwnWorkers(1)
+    for executor in (workers, ProcessPoolExecutor(1, mp_context=get_context("spawn"))):
+        with executor, pytest.raises(fflin.FflinError, match="a process that did the runs died"):
+            fflin.validity(robot, lin, gain, samples=2, executor=executor)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no pseudo-terminal")
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
+    import pty
+
+    ours, theirs = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-m", "fflin", "validity", "ets_vii", "--samples", "9000", "--jobs", jobs],
+        stderr=theirs,
+        start_new_session=True,
+    ) as process:
+        os.close(theirs)
+        said = b""
+        while b"s left" not in said:
+            said += os.read(ours, 4096)
+        os.killpg(process.pid, signal.SIGINT)
+        with contextlib.suppress(OSError):  # Linux tells the end so
+            while more := os.read(ours, 4096):
+                said += more
+    os.close(ours)
+    assert process.returncode == 130
+    # The bar is taken away before the line.
+    assert said.endswith(b"\r\x1b[2Kfflin: stopped\r\n")

@@ -1,0 +1,396 @@
+"""Sweeps on executors: in order, the robot sent once, workers that die."""
+
+import os
+import signal
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.batch import chunks as batch_chunks
+from fflin.batch import dispatch as dispatching
+from fflin.batch.workers import OwnWorkers, WorkerDied
+from fflin.kernel import compiled
+from tests.batch.test_sweep import assert_same, points, singular_at
+from tests.support.patience import PATIENCE
+
+
+@pytest.fixture(scope="module")
+def pool():
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as executor:
+        yield executor
+
+
+@pytest.fixture
+def robot(robots):
+    return robots["ets_vii"]
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_processes_give_what_this_one_gives(moving, pool, robot):
+    q, v, u = points(robot, 50)
+    arguments = (v, u) if moving else ()
+    batch = fflin.sweep(robot, q, *arguments, executor=pool, chunk=4)
+    for one, other in zip(batch, fflin.sweep(robot, q, *arguments), strict=True):
+        # The compiled kernel may do one and the loop the other.
+        assert_same(one, other, 1e-12 * one.certificate.condition)
+    assert batch[0].certificate.inertia_residual < 1e-13
+
+
+class Counting:
+    """A thread pool that notes what is sent."""
+
+    def __init__(self):
+        self.pool, self.sent = ThreadPoolExecutor(2), []
+        self._max_workers = 2
+
+    def submit(self, function, parcel, *arguments):
+        self.sent.append(parcel.content is not None)
+        return self.pool.submit(function, parcel, *arguments)
+
+
+def test_the_robot_is_sent_to_each_worker_once(robot, monkeypatch):
+    monkeypatch.setattr(batch_chunks, "_JOBS", {})
+    executor = Counting()
+    q, _, _ = points(robot, 60)
+    batch = fflin.sweep(robot, q, executor=executor, chunk=2)
+    assert len(executor.sent) == 30 and sum(executor.sent) <= 4
+    assert np.array_equal(batch.q, q)
+    # A worker that has lost it, or is new, asks for it.
+    lost = iter([False] * 9 + [True] + [False] * 99)
+
+    class Forgetful(Counting):
+        def submit(self, function, parcel, *arguments):
+            if next(lost):
+                batch_chunks._JOBS.clear()
+            return super().submit(function, parcel, *arguments)
+
+    forgetful = Forgetful()
+    again = fflin.sweep(robot, q, executor=forgetful, chunk=2)
+    assert len(forgetful.sent) > 30
+    assert np.array_equal(again.B_lower, batch.B_lower)
+    executor.pool.shutdown()
+    forgetful.pool.shutdown()
+
+
+def kill_at(start_to_kill, marker, original=batch_chunks.ChunkJob.run):
+    """A run that kills its worker at one chunk, as long as the marker's count lasts."""
+
+    def run(job, points, start, out=None):
+        if start == start_to_kill and marker.exists():
+            left = int(marker.read_text()) - 1
+            if left:
+                marker.write_text(str(left))
+            else:
+                marker.unlink()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return original(job, points, start, out)
+
+    return run
+
+
+class KillingJob(batch_chunks.ChunkJob):
+    """A job whose worker is killed at the chunk that begins at 24."""
+
+    marker = None
+
+    def __reduce__(self):
+        return _killing, (self.marker, *self._arguments)
+
+    def run(self, points, start, out=None):
+        if self.marker is not None:
+            return kill_at(24, self.marker)(self, points, start, out)
+        return super().run(points, start, out)
+
+
+def _killing(marker, robot, frame, reference, moving, at_rest, count):
+    job = KillingJob(
+        robot, frame=frame, reference=reference, moving=moving, at_rest=at_rest, count=count
+    )
+    job.marker = marker
+    return job
+
+
+@pytest.fixture
+def killing(monkeypatch, tmp_path):
+    """A function that lets the chunk at 24 kill its worker so many times."""
+    marker = tmp_path / "marker"
+
+    def set_up(times):
+        marker.write_text(str(times))
+        monkeypatch.setattr(KillingJob, "marker", marker)
+        monkeypatch.setattr("fflin.batch.sweep.ChunkJob", KillingJob)
+
+    return set_up
+
+
+def test_a_worker_that_is_killed_is_replaced(robot, killing):
+    q, _, _ = points(robot, 80)
+    killing(1)
+    batch = fflin.sweep(robot, q, workers=2, chunk=8)
+    assert np.abs(batch.B_lower - fflin.sweep(robot, q).B_lower).max() < 1e-13
+
+
+def test_a_chunk_that_kills_every_worker_is_named_and_the_rest_is_there(robot, killing):
+    q, _, _ = points(robot, 80)
+    killing(99)
+    with pytest.raises(
+        fflin.SweepError, match="configurations 24 to 31: its worker died"
+    ) as caught:
+        fflin.sweep(robot, q, workers=2, chunk=8)
+    assert [failure[:2] for failure in caught.value.failed] == [(24, 32)]
+    rest = np.r_[0:24, 32:80]
+    assert np.array_equal(caught.value.batch.q, q[rest])
+    expected = fflin.sweep(robot, q[rest]).B_lower
+    assert np.abs(caught.value.batch.B_lower - expected).max() < 1e-13
+
+
+def half_sent(large=10**6):
+    """Return a large result of which only half is sent before the worker is killed."""
+    from multiprocessing.connection import Connection
+
+    whole = Connection._send
+
+    def send(self, buffer, *arguments):
+        if len(buffer) < large:
+            return whole(self, buffer, *arguments)
+        whole(self, buffer[: len(buffer) // 2], *arguments)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    Connection._send = send
+    return np.zeros(10**6)
+
+
+def test_a_worker_that_is_killed_in_the_middle_of_its_result_harms_no_other():
+    workers = OwnWorkers(2)
+    try:
+        lost = workers.submit(half_sent)
+        kept = [workers.submit(pow, 2, each) for each in range(9)]
+        with pytest.raises(WorkerDied):
+            lost.result(timeout=PATIENCE)
+        assert [each.result(timeout=PATIENCE) for each in kept] == [2**each for each in range(9)]
+    finally:
+        workers.shutdown()
+    with pytest.raises(RuntimeError):
+        workers.submit(pow, 2, 3)
+
+
+BEGIN = """
+import os, sys, time
+from fflin.batch.workers import OwnWorkers
+
+def busy(_):
+    print("begun", flush=True)
+    while True:
+        pass
+
+if __name__ == "__main__":
+    workers = OwnWorkers(2)
+    workers.submit(pow, 2, 3).result()
+    {task}
+    sys.stdin.read()
+    {end}
+"""
+
+
+@pytest.mark.parametrize(
+    "task, said",
+    [
+        ("workers.submit(busy, 0)", "begun"),
+        ("workers.submit(time.sleep, 9999); print('begun', flush=True)", "begun"),
+        ("print('idle', flush=True)", "idle"),
+        ("workers.submit(pow, 2, 4); workers.submit(pow, 2, 4); print('new', flush=True)", "new"),
+    ],
+)
+@pytest.mark.parametrize("end", ["kill", "workers.shutdown()"])
+def test_no_worker_outlives_its_caller(task, said, end, tmp_path):
+    """It is killed, or ends the workers; these may be busy, asleep, idle or not yet there."""
+    script = tmp_path / "script.py"
+    script.write_text(BEGIN.format(task=task, end="pass" if end == "kill" else end))
+    with subprocess.Popen(
+        [sys.executable, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == f"{said}\n"
+        if end == "kill":
+            process.kill()
+        # The workers have the same stdout, which ends with the last of them.
+        process.communicate(timeout=120)
+
+
+def test_there_are_no_more_workers_than_cores(robot):
+    cores = compiled.available_cores()
+    with pytest.warns(fflin.FflinWarning, match=rf"1000000 processes .* cores; {cores} do"):
+        workers = OwnWorkers(10**6)
+    workers.shutdown()
+    assert workers._max_workers == cores
+    assert dispatching._count(workers) == cores
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity")
+@pytest.mark.parametrize(
+    "files, cores",
+    [
+        (["150000 100000\n"], 2),
+        (["max 100000\n"], 8),
+        (["1000 100000\n"], 1),
+        (["900000 100000\n"], 8),
+        (["-1\n", "100000\n"], 8),
+        (["300000\n", "100000\n"], 3),
+        (["what is this"], 8),
+    ],
+)
+def test_cores_are_those_of_the_container(files, cores, tmp_path, monkeypatch):
+    paths = [tmp_path / str(index) for index in range(len(files))]
+    for path, text in zip(paths, files, strict=True):
+        path.write_text(text)
+    monkeypatch.setattr(compiled, "_QUOTAS", (("/nowhere",), tuple(map(str, paths))))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8))
+    assert compiled.available_cores() == cores
+
+
+class HalfSendingJob(batch_chunks.ChunkJob):
+    """A job whose worker is killed in the middle of the result of the chunk that begins at 24."""
+
+    here = os.getpid()
+
+    def __reduce__(self):
+        return _half_sending, self._arguments
+
+    def run(self, points, start, out=None):
+        if start == 24 and os.getpid() != self.here:
+            half_sent(1000)
+        return super().run(points, start, out)
+
+
+def _half_sending(robot, frame, reference, moving, at_rest, count):
+    job = HalfSendingJob(
+        robot, frame=frame, reference=reference, moving=moving, at_rest=at_rest, count=count
+    )
+    job.here = None
+    return job
+
+
+@pytest.mark.parametrize("method", ["spawn", "fork"])
+def test_a_pool_whose_worker_is_killed_in_the_middle_of_its_result_is_one_line(
+    method, robot, monkeypatch
+):
+    """Left alone it waits for the rest for ever, and so do those who use it."""
+    monkeypatch.setattr("fflin.batch.sweep.ChunkJob", HalfSendingJob)
+    monkeypatch.setattr(dispatching, "_GLANCE", 0.2)
+    q, _, _ = points(robot, 80)
+    with (
+        ProcessPoolExecutor(2, mp_context=get_context(method)) as doomed,
+        pytest.raises(fflin.SweepError, match="the executor died: BrokenProcessPool") as caught,
+    ):
+        fflin.sweep(robot, q, executor=doomed, chunk=8)
+    assert (24, 32) in [failure[:2] for failure in caught.value.failed]
+
+
+def test_workers_that_cannot_start_are_one_line(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import fflin\nrobot = fflin.load('ets_vii')\n"
+        "try:\n"
+        "    fflin.sweep(robot, fflin.random_configurations(robot, 40), workers=2)\n"
+        "except fflin.SweepError as error:\n"
+        "    print(error)\n"
+        "    raise SystemExit(3)\n"
+    )
+    command = [sys.executable, "-W", "ignore", script]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert done.returncode == 3
+    assert 'call sweep under `if __name__ == "__main__":`' in done.stdout
+
+
+def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(robot, killing, tmp_path):
+    pytest.importorskip("h5py")
+    q, _, _ = points(robot, 80)
+    killing(1)
+    path = tmp_path / "b.h5"
+    with (
+        ProcessPoolExecutor(1, mp_context=get_context("spawn")) as doomed,
+        pytest.raises(fflin.SweepError, match="the executor died: BrokenProcessPool") as caught,
+    ):
+        fflin.sweep(robot, q, executor=doomed, chunk=8, out=path)
+    assert (24, 32) in [failure[:2] for failure in caught.value.failed]
+    told = []
+    batch = fflin.sweep(
+        robot, q, executor=None, chunk=8, out=path, progress=lambda done, _: told.append(done)
+    )
+    assert told[0] == 24
+    assert np.abs(batch.B_lower - fflin.sweep(robot, q).B_lower).max() < 1e-13
+
+
+def test_an_executor_that_is_shut_down_is_one_line(robot):
+    executor = ThreadPoolExecutor(1)
+    executor.shutdown()
+    q, _, _ = points(robot, 8)
+    with pytest.raises(fflin.SweepError, match=r"the executor died: .*shutdown"):
+        fflin.sweep(robot, q, executor=executor)
+
+
+def test_an_executor_that_takes_no_more_is_one_line(robot):
+    class Full(ThreadPoolExecutor):
+        def submit(self, *arguments):
+            if len(taken) == 2:
+                raise ValueError("no slots")
+            taken.append(arguments)
+            return super().submit(*arguments)
+
+    taken = []
+    q, _, _ = points(robot, 32)
+    with (
+        Full(1) as executor,
+        pytest.raises(fflin.SweepError, match="the executor died: ValueError: no slots") as caught,
+    ):
+        fflin.sweep(robot, q, executor=executor, chunk=8)
+    assert len(caught.value.batch) == 16
+
+
+def test_a_singular_configuration_is_named_by_processes_too(pool):
+    robot = singular_at(0.5)
+    configurations = fflin.grid(robot, {"slide": np.arange(64) / 64.0})
+    with pytest.raises(fflin.SweepError, match="configuration 32: M of 'singular'"):
+        fflin.sweep(robot, configurations, chunk=10, executor=pool)
+
+
+def test_dask(robot, tmp_path):
+    """A local cluster of two processes, of which one is killed on the way."""
+    distributed = pytest.importorskip("distributed")
+    import dask
+
+    waits = ("connect", "tcp")
+    with (
+        dask.config.set({f"distributed.comm.timeouts.{each}": f"{PATIENCE} s" for each in waits}),
+        dask.config.set({"temporary-directory": str(tmp_path)}),
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        assert dispatching._count(client.get_executor()) == 2
+        configurations = fflin.random_configurations(robot, 400, seed=1)
+        expected = fflin.sweep(robot, configurations)
+        q, v, u = points(robot, 30)
+        moving = fflin.sweep(robot, q, v, u, executor=client.get_executor(), chunk=7)
+        here = fflin.sweep(robot, q, v, u).A
+        assert np.abs(moving.A - here).max() < 1e-12 * np.abs(here).max()
+        worker = next(iter(client.scheduler_info()["workers"].values()))["id"]
+        pid = next(nanny.pid for name, nanny in cluster.workers.items() if name == worker)
+        killed = []
+
+        def kill(done, _):
+            if not killed:
+                killed.append(done)
+                os.kill(pid, signal.SIGKILL)
+
+        batch = fflin.sweep(
+            robot, configurations, executor=client.get_executor(), chunk=10, progress=kill
+        )
+    assert killed
+    assert np.array_equal(batch.q, expected.q)
+    assert np.abs(batch.B_lower - expected.B_lower).max() < 1e-13

@@ -1,0 +1,450 @@
+"""The command line as a user runs it: in a process of its own."""
+
+import json
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.base.tables import matrix
+from fflin.robot.catalog import bundled_directory
+from tests.support.patience import PATIENCE
+from tests.support.robots import BUNDLED
+
+
+def run(*arguments, cwd=None, **environment):
+    """Run fflin; return exit code, stdout, and stderr without its warnings, a line each."""
+    done = subprocess.run(
+        [sys.executable, "-m", "fflin", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        env={**os.environ, **environment},
+        timeout=PATIENCE,
+        check=False,
+    )
+    return done.returncode, done.stdout, without_warnings(done.stderr)
+
+
+def without_warnings(err):
+    return "".join(x for x in err.splitlines(True) if not x.startswith("fflin: warning: "))
+
+
+def refused(*arguments, cwd=None):
+    """Run what must be refused: exit 2, nothing on stdout, one line on stderr, which it returns."""
+    code, out, err = run(*arguments, cwd=cwd)
+    assert code == 2 and not out
+    assert err.startswith("fflin: error: ") and err.count("\n") == 1 and err.endswith("\n")
+    return err
+
+
+def test_robots_lists_all_with_n_mass_and_origin():
+    code, out, err = run("robots")
+    assert code == 0 and not err
+    table, *refused = out.split("\n\n")
+    rows = {line.split()[0]: line.split() for line in table.splitlines()}
+    assert set(fflin.list_robots()) - set(rows) == {"alex_psyonic_hands"}
+    # By the name of its file: where that lies is of no use here, and breaks the lines.
+    assert "does not load: alex_psyonic_hands.urdf:" in refused[0] and "mimics" in refused[0]
+    assert max(map(len, out.splitlines())) <= 80
+    assert rows["ets_vii"][1:4] == ["6", "2690.4", "fflin"]
+    assert rows["talos"][1] == "32" and rows["talos"][3] == "example-robot-data"
+
+
+def test_info_shows_tree_masses_and_limits():
+    code, out, err = run("info", "dual_arm")
+    assert code == 0 and not err
+    assert "8 joints, 28 states, 14 inputs" in out
+    lines = out.splitlines()
+    left, deeper = (next(x for x in lines if x.strip().startswith(n)) for n in ("left_1", "left_2"))
+    assert len(deeper) - len(deeper.lstrip()) == len(left) - len(left.lstrip()) + 2
+    assert "revolute" in left and "tool_left" in out
+    assert "limits in rad, N m and rad/s" in out
+    assert max(map(len, lines)) <= 80
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_check_exits_0_on_every_bundled_robot(name):
+    code, out, err = run("check", name, "--frame", "world", "--rpy", 20, -30, 160)
+    assert code == 0 and not err
+    assert "figures hold; the largest error is" in out
+    assert max(map(len, out.splitlines())) <= 80
+
+
+def test_warnings_are_one_line_each_on_stderr_and_in_info():
+    done = subprocess.run(
+        [sys.executable, "-m", "fflin", "info", "planar_detumble"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    words = "the damping of joints 'joint_1', 'joint_2', 'joint_3' is not in the linear model"
+    assert done.returncode == 0
+    assert done.stderr.startswith("fflin: warning: ") and done.stderr.count("\n") == 1
+    assert words in done.stderr
+    assert words in " ".join(done.stdout.split())
+    silent = subprocess.run(
+        [sys.executable, "-W", "ignore", "-m", "fflin", "info", "planar_detumble"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert silent.returncode == 0 and not silent.stderr
+
+
+def test_round_off_is_not_shown_as_figures():
+    values = np.array([[2.0, 1e-17, 1e-20], [3e-16, 1.0, 0.0]])
+    shown = [line.split() for line in matrix(values, ["a", "b"], ["x", "y", "z"]).splitlines()]
+    # 1e-20 stands alone in its column, and 3e-16 is just above the rounding of a one.
+    assert shown == [["x", "y", "z"], ["a", "2", "~0", "1e-20"], ["b", "3e-16", "1", "."]]
+
+
+def test_linearize_prints_readable_tables():
+    code, out, err = run("linearize", "ets_vii", "--joint", "joint_2=0.5")
+    assert code == 0 and not err
+    assert max(map(len, out.splitlines())) <= 80
+    assert "24 states, 12 inputs, frame hybrid, a fixed point" in out
+    assert "x0: q_m.joint_2 = 0.5 rad" in out
+    assert "\x1b" not in out  # plain where it is not a terminal
+    robot = fflin.load("ets_vii")
+    lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.5}))
+    row = next(x for x in out.splitlines() if x.startswith("omega_b.x") and "e-" in x)
+    assert f"{lin.B[12, 0]:.5g}" in row.split()
+
+
+def test_units_stand_above_the_tables():
+    motion = ("--velocity", "joint_1=0.1", "--stiffness", "panel_left=100")
+    code, out, err = run("linearize", "servicer_7dof", *motion, "--output", "frame:tool")
+    assert code == 0 and not err
+    text = " ".join(out.split())
+    assert "u: tau_b [N m], F_b [N], tau_m [N m] y: tool.position [m], tool.rotation [rad]" in text
+    assert "f0: q_m.joint_1 = 0.1 rad/s," in text and "rad/s^2" in text and "/s/s" not in text
+    assert max(map(len, out.splitlines())) <= 80
+    # No entry is broken between its name, its value and its unit.
+    shown = out.split("f0: ")[1].split("\n\n")[0]
+    assert all(line.count(" = ") == line.count("/s") for line in shown.splitlines())
+    code, out, _ = run("linearize", "cubesat", "--inputs", "cubesat")
+    assert "u: x_plus_top ... z_minus_right [N], wheel_x ... wheel_z [N m]" in out
+    assert "q_m [rad], omega_b [rad/s]" in out
+
+
+def test_sampled_model_is_that_of_python(tmp_path):
+    path = tmp_path / "m.mat"
+    options = ("planar_detumble", "--dt", 0.1, "--velocity", "joint_1=0.1")
+    code, _, err = run("linearize", *options, "-o", path)
+    assert code == 0 and not err
+    robot = fflin.load("planar_detumble")
+    expected = fflin.linearize(robot, v=fflin.velocity(robot, {"joint_1": 0.1})).discretize(0.1)
+    saved = fflin.LinearModel.load(path)
+    assert saved.dt == 0.1
+    for key in ("A", "B", "f0"):
+        # The command reads the robot by another route, which rounds otherwise.
+        np.testing.assert_allclose(getattr(saved, key), getattr(expected, key), rtol=0, atol=1e-13)
+    code, out, err = run("linearize", *options)
+    assert code == 0 and not err and "sampled every 0.1 s" in " ".join(out.split())
+    assert "q_m.joint_1 = 0.0099" in out and "/s^2" not in out  # f0 is what a step adds
+    assert max(map(len, out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("linearize", "servicer_7dof", "--joint", "joint_2=9", "--joint", "joint_4=1"),
+        ("simulate", "servicer_7dof", "--target-joint", "joint_2=9", "--duration", "0.01"),
+    ],
+)
+def test_joints_beyond_their_limits_are_named(command):
+    done = subprocess.run(
+        [sys.executable, "-m", "fflin", *command], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0
+    assert done.stderr == (
+        "fflin: warning: joint 'joint_2' is put at 9 rad, outside its limits from -2.094 to "
+        "2.094 rad\n"
+    )
+
+
+def test_terminal_dims_zeros():
+    # `script` gives the command a terminal.
+    done = subprocess.run(
+        ["script", "-qec", f"{sys.executable} -m fflin linearize cubesat", "/dev/null"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "TERM": "xterm", "COLUMNS": "80"},
+        check=True,
+        stdin=subprocess.DEVNULL,
+    )
+    assert "\x1b[2m" in done.stdout
+
+
+@pytest.mark.parametrize("ending", [".npz", ".mat", ".json", ".csv"])
+def test_linearize_saves_what_python_gives(ending, tmp_path):
+    path = tmp_path / f"m{ending}"
+    options = (
+        "--joint",
+        "left_2=0.3",
+        "--frame",
+        "local",
+        "--lock",
+        "right_1=0.2",
+        "--lock",
+        "right_4",
+    )
+    code, out, err = run("linearize", "dual_arm", *options, "-o", path)
+    assert code == 0 and not err and "24 states, 12 inputs" in out
+    saved = fflin.LinearModel.load(path)
+    robot = fflin.load("dual_arm", lock={"right_1": 0.2, "right_4": None})
+    lin = fflin.linearize(robot, fflin.configuration(robot, {"left_2": 0.3}), frame="local")
+    assert (saved.B == lin.B).all() and saved.state_names == lin.state_names
+    assert saved.frame == "local" and saved.certificate == lin.certificate
+
+
+def test_reference_world_keeps_the_attitude_in_the_state(tmp_path):
+    path = tmp_path / "m.json"
+    options = ("--rpy", 90, 0, 0, "--position", 1, 2, 3)
+    run("linearize", "cubesat", *options, "--reference", "world", "-o", path)
+    x0 = json.loads(path.read_text())["x0"]
+    assert x0[:6] == pytest.approx([0.5**0.5, 0, 0, 1, 2, 3])
+    run("linearize", "cubesat", *options, "-o", path)
+    assert json.loads(path.read_text())["x0"][:6] == [0.0] * 6
+
+
+def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
+    output = tmp_path / "m.npz"
+    bad = tmp_path / "bad.urdf"
+    bad.write_text("<robot name='r'><link")
+    typo = tmp_path / "bad.toml"
+    typo.write_text('[[input]]\ntype = "truster"\n')
+    cases = {
+        ("linearize", "ets_vi", "-o", output): "no robot named 'ets_vi'; did you mean ets_vii",
+        ("linearize", bad, "-o", output): "bad.urdf:1: not well-formed",
+        ("linearize", tmp_path / "no.urdf", "-o", output): "no file at",
+        ("linearize", tmp_path, "-o", output): "a folder",
+        ("linearize", "ets_vii", "--joint", "joint_9=1", "-o", output): "no joint named 'joint_9'",
+        ("linearize", "ets_vii", "--joint", "joint_1=x", "-o", output): "'x' is not a number",
+        ("linearize", "ets_vii", "--joint", "joint_1", "-o", output): "'joint_1' is not NAME=VALUE",
+        ("linearize", "ets_vii", "--joint", "joint_1=nan", "-o", output): "not a finite number",
+        ("linearize", "ets_vii", "--frame", "body", "-o", output): "invalid choice: 'body'",
+        ("linearize", "ets_vii", "--lock", "tail", "-o", output): "no joint to lock named 'tail'",
+        ("linearize", "ets_vii", "-o", tmp_path / "m.xls"): "ends in '.xls'",
+        ("linearize", "ets_vii", "-o", tmp_path / "none" / "m.npz"): "cannot be written",
+        (
+            "linearize",
+            "ets_vii",
+            "--joint",
+            "joint_1=1",
+            "--joint",
+            "joint_1=2",
+        ): "names 'joint_1' twice",
+        ("linearize", "ets_vii", "--lock", "joint_1", "--joint", "joint_1=2"): "is locked",
+        ("linearize", "ets_vii", "--stiffness", "joint_1=-1"): "is -1, expected 0 or more",
+        ("linearize", "ets_vii", "--damping", "viscous"): "'viscous' is not",
+        ("linearize", "cubesat", "--inputs", typo, "-o", output): "bad.toml:2: no type of input",
+        ("check", "cubesat", "--inputs", "none.toml"): "none.toml: cannot be read: No such file",
+        (
+            "check",
+            "cubesat",
+            "--inputs",
+            "servicer_7dof",
+        ): "servicer_7dof: no joint named 'joint_1'",
+        ("check", "cubesat", "--inputs", "cubesats"): "named 'cubesats'; did you mean cubesat",
+        ("linearize", "ets_vii", "--dt", 0, "-o", output): "expected a positive sampling time",
+        ("check", "ets_vii", "--output", "pos:tool"): "no output named 'pos'; did you mean pose",
+        ("check", "ets_vii", "--output", "pose"): "output 'pose' is of no frame; write pose:NAME",
+        ("check", "ets_vii", "--output", "com:tool"): "is of the whole robot; write com",
+        ("check", "ets_vii", "--output", "pose:tol"): "no frame named 'tol'; did you mean tool",
+        ("check", "ets_vii", "--output", "base", "--output", "state"): "is asked for twice",
+        ("linearize", "ets_vii", "--out", "m.mat"): "ambiguous option: --out could match",
+        ("check", "romeo"): "cannot be inverted: joint 'LHand'",
+        ("check", "cubesat", "--rpy", 180, 0, 0, "--reference", "world"): "turned by 180 deg",
+        ("check",): "the following arguments are required: ROBOT",
+        ("dance",): "invalid choice: 'dance'",
+        (): "required",
+    }
+    for arguments, words in cases.items():
+        assert words in refused(*arguments)
+    assert sorted(tmp_path.iterdir()) == [typo, bad]
+
+
+def test_existing_output_survives_a_failure(tmp_path):
+    output = tmp_path / "m.npz"
+    output.write_text("precious")
+    refused("linearize", "romeo", "-o", output)
+    assert output.read_text() == "precious"
+
+
+def test_robots_own_file_is_never_the_output(tmp_path):
+    robot = tmp_path / "robot.json"
+    robot.write_bytes((Path(__file__).parents[2] / "robots" / "cubesat.urdf").read_bytes())
+    before = robot.read_bytes()
+    assert "is the input file" in refused("linearize", robot, "-o", robot)
+    assert robot.read_bytes() == before
+    sibling = tmp_path / "arm.A.csv"
+    sibling.write_bytes(before)
+    assert "is the input file" in refused("linearize", sibling, "-o", tmp_path / "arm.csv")
+    assert sibling.read_bytes() == before
+
+
+def test_unwritable_stdout_is_one_line():
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "fflin", "linearize", "cubesat"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert done.stderr == "fflin: error: the output cannot be written: No space left on device\n"
+
+
+def test_negative_numbers_are_no_options():
+    code, out, _ = run("check", "cubesat", "--rpy", "-30", "-1e-3", "0", "--position", "-.5", 0, 0)
+    assert code == 0 and "OK" in out
+
+
+def test_passive_joints_and_gravity(tmp_path):
+    path = tmp_path / "m.npz"
+    options = ("--stiffness", "panel_left=100", "--stiffness", "panel_right=90", "--damping", "0.5")
+    code, _, _ = run("linearize", "servicer_7dof", *options, "--gravity", 0, 0, -1.6, "-o", path)
+    assert code == 0
+    robot = fflin.load(
+        "servicer_7dof",
+        stiffness={"panel_left": 100.0, "panel_right": 90.0},
+        damping=0.5,
+        gravity=(0, 0, -1.6),
+    )
+    assert (fflin.LinearModel.load(path).A == fflin.linearize(robot).A).all()
+    options = ("--damping", "urdf", "--velocity", "joint_2=0.3", "--effort", "tau_m.joint_1=2")
+    code, out, _ = run("check", "planar_detumble", *options)
+    assert code == 0 and "OK" in out
+
+
+def test_inputs_and_outputs_are_those_of_python(tmp_path):
+    path = tmp_path / "m.mat"
+    springs = ("--stiffness", "panel_left=100", "--stiffness", "panel_right=100")
+    inputs = fflin.load_inputs("servicer_7dof")
+    options = ("--inputs", bundled_directory() / "servicer_7dof.toml", *springs)
+    code, out, err = run(
+        "linearize", "servicer_7dof", *options, "--output", "frame:tool", "-o", path
+    )
+    assert code == 0 and not err and "30 states, 17 inputs" in out
+    robot = fflin.load(
+        "servicer_7dof",
+        inputs=inputs,
+        outputs=[fflin.FramePose("tool"), fflin.FrameVelocity("tool")],
+        stiffness={"panel_left": 100.0, "panel_right": 100.0},
+    )
+    lin, saved = fflin.linearize(robot), fflin.LinearModel.load(path)
+    for key in "ABCD":
+        assert (getattr(saved, key) == getattr(lin, key)).all()
+    assert saved.input_names == lin.input_names and saved.output_names == lin.output_names
+    code, out, _ = run("check", "servicer_7dof", *options)
+    assert code == 0 and "figures hold" in out
+
+
+def test_output_and_output_file_are_told_apart(tmp_path):
+    for option in (("--output-file",), ("--output-f",), ("-o",)):
+        path = tmp_path / f"m{len(option[0])}.json"
+        code, _, err = run("linearize", "ets_vii", "--output=com", *option, path)
+        assert code == 0 and not err
+        assert fflin.LinearModel.load(path).output_names == ("com.x", "com.y", "com.z")
+
+
+def test_check_exits_1_where_it_falls_short(monkeypatch, capsys):
+    """The exit code of a model that does not hold, by planting a wrong one."""
+    from dataclasses import replace
+
+    from fflin.commands import cli
+    from fflin.linear import linearization
+
+    right = linearization.linearize
+    monkeypatch.setattr(
+        linearization, "linearize", lambda *a, **k: replace(lin := right(*a, **k), B=lin.B * 1.001)
+    )
+    assert cli.main(["check", "ets_vii"]) == 1
+    assert "FAILED" in capsys.readouterr().out
+
+
+def test_what_other_packages_warn_of_stands_before_no_error(monkeypatch, capsys):
+    """It is said where all went well; warnings of fflin's own are said at once."""
+    from fflin.commands import cli
+    from fflin.linear import linearization
+
+    right, outcome = linearization.linearize, []
+
+    def linearize(*arguments, **options):
+        assert (np.array([1e308]) * 10.0).max() == np.inf
+        warnings.warn("mind this", fflin.FflinWarning, stacklevel=2)
+        if outcome:
+            raise fflin.InputError("too large")
+        return right(*arguments, **options)
+
+    monkeypatch.setattr(linearization, "linearize", linearize)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert cli.main(["linearize", "cubesat"]) == 0
+        *_, own, foreign = capsys.readouterr().err.splitlines()
+        outcome.append("error")
+        assert cli.main(["linearize", "cubesat"]) == 2
+        error = capsys.readouterr().err
+    assert own == "fflin: warning: mind this"
+    assert foreign == "fflin: RuntimeWarning: overflow encountered in multiply"
+    assert error.endswith("fflin: warning: mind this\nfflin: error: too large\n")
+    assert "RuntimeWarning" not in error
+
+
+def test_help_has_an_example_in_every_command():
+    code, out, _ = run("--help")
+    assert code == 0
+    for command in ("robots", "info", "linearize", "check", "modes"):
+        assert command in out
+        code, text, _ = run(command, "--help")
+        assert code == 0 and f"example: fflin {command}" in " ".join(text.split())
+    assert run("--version")[1] == f"fflin {fflin.__version__}\n"
+
+
+def test_closed_pipe_is_no_error():
+    command = f"{sys.executable} -m fflin linearize talos | head -n 1"
+    done = subprocess.run(
+        ["bash", "-c", command],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(__file__).parent,
+    )
+    assert done.stdout.startswith("talos") and not without_warnings(done.stderr)
+
+
+def test_wheels_from_a_file_at_speed(tmp_path):
+    options = ("cubesat", "--inputs", "cubesat", "--velocity", "wheel_z=500")
+    code, out, err = run("linearize", *options, "-o", "m.json", cwd=tmp_path)
+    assert code == 0 and not err
+    saved = json.loads((tmp_path / "m.json").read_text())
+    names = saved["state_names"]
+    row, column = names.index("omega_b.x"), names.index("omega_b.y")
+    # (I - J a a^T) d(omega)/dt = -omega x h, h = 3e-6 * 500 about z
+    expected = -3e-6 * 500.0 / (0.01520407970002 - 3e-6)
+    assert saved["A"][row][column] == pytest.approx(expected, rel=1e-12)
+    code, out, _ = run("check", *options)
+    assert code == 0 and max(map(len, out.splitlines())) <= 80
+    stored = tmp_path / "stored.toml"
+    stored.write_text('[[input]]\ntype = "reaction_wheel"\naxis = [0, 0, 1]\nmomentum = 0.1\n')
+    assert run("check", "cubesat", "--inputs", stored)[0] == 0
+    err = refused("check", "cubesat", "--inputs", stored, "--velocity", "wheel_1=100")
+    assert "wheel 'wheel_1' has no inertia" in err
+
+
+def test_linearize_shows_no_rounding_in_f0_and_calls_no_frozen_model_unstable():
+    hover = ["linearize", "servicer_7dof", "--gravity", 0, 0, -9.81]
+    code, held, _ = run(*hover, "--equilibrium")
+    assert code == 0 and "a fixed point" in held
+    assert "unstable: poles" in held and "f0:" not in held
+    code, falling, _ = run(*hover, "--joint", "joint_2=0.3", "--effort", "F_b.z=9000")
+    assert code == 0 and "not a fixed point" in falling
+    assert "unstable" not in falling and "f0:" in falling

@@ -1,0 +1,94 @@
+"""fflin lqr."""
+
+import re
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.commands.cli import main
+
+
+def run(capsys, *arguments):
+    code = main(["lqr", *arguments])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def test_it_shows_and_saves_the_gain_that_the_library_gives(capsys, tmp_path):
+    path = tmp_path / "gain.npz"
+    code, out, err = run(
+        capsys,
+        *("ets_vii", "--joint", "joint_2=0.4", "--q", "q_b=5", "--bryson", "tau_m=10"),
+        *("--bryson", "q_m.joint_1=0.1", "--r", "tau_b.x=0.01", "-o", str(path)),
+    )
+    assert (code, err) == (0, "")
+    assert max(map(len, out.removesuffix(f"wrote {path}\n").splitlines())) <= 80
+    robot = fflin.load("ets_vii")
+    lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}))
+    Q, R = np.ones(24), lin.M.diagonal() ** -2.0
+    Q[:3], Q[6], R[0], R[6:] = 5.0, 100.0, 0.01, 0.01
+    expected = fflin.lqr(lin, Q, R)
+    saved = fflin.Gain.load(path)
+    assert saved.K == pytest.approx(expected.K, rel=1e-9, abs=1e-9 * np.abs(expected.K).max())
+    for words in ("norms of its blocks", "poles of A - B K", "Riccati residual", "disk margin"):
+        assert words in out
+
+
+def test_dt_keeps_the_continuous_cost(capsys, tmp_path):
+    path = tmp_path / "gain.json"
+    options = ("--q", "q_b=1", "--dt", "0.2", "-o", str(path))
+    assert run(capsys, "planar_detumble", *options)[0] == 0
+    lin = fflin.linearize(fflin.load("planar_detumble"))
+    cost = fflin.sampled_cost(lin, 0.2, 1.0, lin.M.diagonal() ** -2.0)
+    saved = fflin.Gain.load(path)
+    assert saved.dt == 0.2
+    assert saved.K == pytest.approx(fflin.lqr(lin.discretize(0.2), *cost).K, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("dt", [None, 0.2])
+def test_without_weights_accelerations_cost(capsys, tmp_path, dt):
+    path = tmp_path / "gain.json"
+    options = () if dt is None else ("--dt", str(dt))
+    assert run(capsys, "servicer_7dof", *options, "-o", str(path))[0] == 0
+    lin = fflin.linearize(fflin.load("servicer_7dof"))
+    expected = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0, dt=dt)
+    assert fflin.Gain.load(path).K == pytest.approx(expected.K, rel=1e-9)
+
+
+def test_joints_alone_cannot_hold_the_base(capsys):
+    code, out, err = run(capsys, "ets_vii", "--inputs", "joints")
+    assert (code, out) == (2, "")
+    assert re.search(r"base attitude and position \(momentum is conserved\).* \(--reduce\)$", err)
+    code, out, err = run(capsys, "ets_vii", "--inputs", "joints", "--reduce")
+    assert (code, err) == (0, "")
+    assert "K (6 x 12)" in out and "q_m.joint_6" in out
+    code, _, err = run(capsys, "servicer_7dof", "--inputs", "base")
+    assert code == 2 and "hold joints joint_1, joint_2" in err
+    code, _, err = run(capsys, "cubesat", "--inputs", "joints")
+    assert code == 2 and "'cubesat' has no joints" in err
+
+
+def test_bad_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
+    for words, arguments in {
+        "no state named 'nope'": ("--q", "nope=1"),
+        "no input named 'nope'": ("--r", "nope=1"),
+        "no state or input named 'taum'; did you mean tau_m": ("--bryson", "taum=5"),
+        "'q_b' (--bryson) is 0, expected a positive number": ("--bryson", "q_b=0"),
+        "(--bryson) is 1e-200, expected one between": ("--bryson", "q_b=1e-200"),
+        "'q_b' has a weight and a largest value": ("--bryson", "q_b=1", "--q", "q_b=1"),
+        "Q is not positive semidefinite: its eigenvalue -1": ("--q", "q_b=-1"),
+        "R is not positive definite: its eigenvalue 0": ("--r", "F_b.y=0"),
+        "dt is -1 s, expected a positive": ("--dt", "-1"),
+        "the point is not a fixed point: d q_b.x/dt": ("--velocity", "omega_b.x=0.1"),
+        "with moving=True (--equilibrium)\n": ("--gravity", "0", "0", "-9.81", "--q", "q_b=1"),
+        "--q names": ("--q", "q_b=1", "--q", "q_b=2"),
+    }.items():
+        code, out, err = run(capsys, "ets_vii", *arguments, "-o", str(tmp_path / "k.npz"))
+        assert (code, out) == (2, ""), words
+        assert err.count("\n") == 1 and err.startswith("fflin: error: ") and words in err, err
+    assert not list(tmp_path.iterdir())
+    code, _, err = run(capsys, "ets_vii", "-o", str(tmp_path / "k.csv"))
+    assert code == 2 and "ends in '.csv'" in err
+    code, out, err = run(capsys, "ets_vii", "-o", str(tmp_path / "nowhere" / "k.npz"))
+    assert (code, out) == (2, "") and "cannot be written" in err

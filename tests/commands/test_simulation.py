@@ -1,0 +1,194 @@
+"""The command simulate as a user runs it."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fflin
+from tests.commands.test_cli import refused, run
+
+
+def test_a_loop_settles_is_saved_and_drawn(tmp_path):
+    pytest.importorskip("matplotlib")
+    code, out, err = run(
+        *("simulate", "ets_vii", "--rpy", 30, 0, 0, "--duration", 60),
+        *("--plot", "loop.png", "-o", "loop.npz"),
+        cwd=tmp_path,
+    )
+    assert (code, err) == (0, "")
+    assert max(map(len, out.splitlines())) <= 80
+    motion = fflin.Motion.load(tmp_path / "loop.npz")
+    assert motion.t[-1] == 60.0
+    assert motion.attitude_error[0] == pytest.approx(30.0)
+    assert motion.attitude_error[-1] < 1e-4
+    assert (tmp_path / "loop.png").stat().st_size > 50_000
+    apart = np.abs(motion.x - motion.linear).max(axis=0)
+    most = motion.state_names[apart.argmax()]
+    assert f"difference from the linear model: {apart.max():.3g} rad in {most}" in out
+    assert out.splitlines()[-2:] == ["wrote loop.npz", "wrote loop.png"]
+
+
+def test_target_sampling_limits_and_delay(tmp_path):
+    code, _, err = run(
+        *("simulate", "ets_vii", "--target-joint", "joint_1=0.5", "--dt", 0.1),
+        *("--limit", "tau_m=8", "--delay", 0.1, "--duration", 30, "--step", 0.02),
+        *("-o", "m.json"),
+        cwd=tmp_path,
+    )
+    assert (code, err) == (0, "")
+    motion = fflin.Motion.load(tmp_path / "m.json")
+    joints = [i for i, name in enumerate(motion.input_names) if name.startswith("tau_m")]
+    assert np.abs(motion.u[:, joints]).max() == 8.0
+    assert not motion.u[:5].any()
+    assert motion.x[-1, motion.state_names.index("q_m.joint_1")] == pytest.approx(0.5, abs=0.02)
+
+
+def test_thrusts_are_allocated_or_their_cut_is_told(tmp_path):
+    command = ("simulate", "cubesat", "--inputs", "cubesat", "--rpy", 20, 0, 0, "--duration", 20)
+    command = [sys.executable, "-m", "fflin", *map(str, command), "--dt", "0.1"]
+    settled = []
+    for option in ((), ("--allocate",)):
+        done = subprocess.run(
+            [*command, *option, "-o", "m.npz"],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            check=False,
+        )
+        assert done.returncode == 0
+        motion = fflin.Motion.load(tmp_path / "m.npz")
+        assert motion.input_names[0] == "x_plus_top" and (motion.u[:, :12] >= 0.0).all()
+        assert motion.attitude_error[0] == pytest.approx(20.0)
+        assert motion.attitude_error[-1] < 0.1
+        settled.append(motion.t[motion.attitude_error > 0.4].max())
+        cut = "fflin: warning: thrusters cannot pull: in 100.0 % of the run"
+        assert done.stderr.startswith(cut) if not option else not done.stderr
+    assert settled[1] < 0.8 * settled[0]  # half of the torque was cut
+    assert "--allocate: 'ets_vii' has no thrusters" in refused("simulate", "ets_vii", "--allocate")
+
+
+def test_the_share_of_cut_thrust_is_that_of_the_motion(tmp_path):
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "fflin", "simulate", "servicer_7dof"),
+            *("--inputs", "servicer_7dof", "--position", "-0.3", "0", "0", "--damping", "5"),
+            *("--stiffness", "panel_left=100", "--stiffness", "panel_right=100"),
+            *("--duration", "10", "-o", "m.npz"),
+        ],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert done.returncode == 0
+    motion = fflin.Motion.load(tmp_path / "m.npz")
+    back = [i for i, name in enumerate(motion.input_names) if name.startswith("back_")]
+    share = 100.0 * (motion.u[:-1, back] == 0.0).any(axis=1).mean()
+    assert 5.0 < share < 95.0 and abs(share - 50.0) > 2.0  # forward first, then braking
+    told = float(done.stderr.split("in ")[1].split(" %")[0])
+    assert told == pytest.approx(share, abs=0.1)
+
+
+def test_the_linear_model_is_shown_between_samples_and_inputs_stay_with_their_units(tmp_path):
+    code, out, _ = run(
+        *("simulate", "cubesat", "--inputs", "cubesat", "--rpy", 5, 0, 0, "--dt", 0.5),
+        *("--duration", 5, "-o", "m.npz"),
+        cwd=tmp_path,
+    )
+    assert code == 0
+    motion = fflin.Motion.load(tmp_path / "m.npz")
+    assert motion.linear.shape == motion.x.shape
+    assert np.abs(motion.linear - motion.x).max() < 1e-4
+    lines = out.splitlines()
+    at = next(i for i, line in enumerate(lines) if line.startswith("largest inputs"))
+    until = next(i for i, line in enumerate(lines) if line.startswith("energy"))
+    inputs = [part for line in lines[at:until] for part in line.split(", ")]
+    assert all(part.rstrip(",").endswith((" N", " N m")) for part in inputs)
+    assert "e-1" not in " ".join(inputs)  # what is rounding is none of the largest
+    assert max(map(len, lines)) <= 80
+
+
+def test_the_motion_is_kept_though_nobody_reads_the_table(tmp_path):
+    pipe = os.pipe()
+    os.close(pipe[0])
+    with os.fdopen(pipe[1], "w") as closed:
+        command = [sys.executable, "-m", "fflin", "simulate", "cubesat", "--duration", "1"]
+        done = subprocess.run(
+            [*command, "-o", "m.npz"],
+            cwd=tmp_path,
+            stdout=closed,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.stderr == ""
+    assert len(fflin.Motion.load(tmp_path / "m.npz").t) == 101
+
+
+@pytest.mark.parametrize("option", ["-o", "--plot"])
+def test_a_place_that_cannot_be_written_is_said_before_the_run(tmp_path, option):
+    there = tmp_path / "nowhere" / ("m.npz" if option == "-o" else "m.png")
+    code, out, err = run("simulate", "cubesat", option, there, cwd=tmp_path)
+    assert (code, out) == (2, "")
+    assert "cannot be written" in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_is_interrupted_is_kept(tmp_path, monkeypatch, capsys):
+    from fflin.commands import cli, simulation
+
+    right = simulation.simulated
+    monkeypatch.setattr(
+        simulation,
+        "simulated",
+        lambda *a: replace(right(*a), stopped="interrupted at t = 0.5 s"),
+    )
+    path = tmp_path / "m.npz"
+    with pytest.raises(KeyboardInterrupt, match="interrupted at t"):
+        cli.main(["simulate", "cubesat", "--duration", "1", "-o", str(path)])
+    assert f"wrote {path}" in capsys.readouterr().out
+    assert fflin.Motion.load(path).stopped == "interrupted at t = 0.5 s"
+
+
+def test_a_free_robot_keeps_its_energy():
+    code, out, _ = run(
+        *("simulate", "planar_detumble", "--free", "--velocity", "omega_b.z=0.3"),
+        *("--duration", 2),
+    )
+    assert code == 0
+    first, last = (word for word in out.split() if word.replace(".", "").isdigit() and "." in word)
+    assert float(first) == pytest.approx(float(last), rel=1e-5)
+
+
+def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
+    err = refused("simulate", "ets_vii", "--inputs", "joints", "--duration", 1)
+    assert "base attitude and position" in err
+    assert "--reduce" in err
+    code, out, _ = run(
+        *("simulate", "ets_vii", "--inputs", "joints", "--reduce", "--joint", "joint_1=0.3"),
+        *("--duration", 20),
+    )
+    assert code == 0
+    joints = next(line for line in out.splitlines() if line.startswith("joints"))
+    assert float(joints.split()[4]) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--plot", "loop.bmp"], "ends in '.bmp'"),
+        (["-o", "loop.xyz"], "ends in '.xyz'"),
+        (["--limit", "tau_x=1"], "tau_x"),
+        (["--free", "--reduce"], "--free has no regulator"),
+        (["--free", "--limit", "tau_m=1"], "--free has no input"),
+        (["--step", "5"], "too large for a loop"),
+        (["--method", "rk4"], "method"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, arguments, said):
+    assert said in refused("simulate", "ets_vii", "--duration", 20, *arguments, cwd=tmp_path)
+    assert not list(tmp_path.iterdir())

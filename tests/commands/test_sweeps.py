@@ -1,0 +1,140 @@
+"""fflin sweep as a user runs it."""
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from tests.commands.test_cli import refused, run
+from tests.support.patience import PATIENCE
+
+pytest.importorskip("h5py")
+
+
+def test_grid_random_and_file_say_the_same(tmp_path, robots):
+    robot = robots["ets_vii"]
+    code, out, err = run(
+        *("sweep", "ets_vii", "--grid", "joint_2=-1:1:3", "--grid", "joint_4=-2:0:2"),
+        *("--joint", "joint_1=0.2", "-o", tmp_path / "g.h5"),
+    )
+    assert code == 0 and out == f"wrote {tmp_path / 'g.h5'}: 6 points, 24 states, 12 inputs\n"
+    assert re.match(r"fflin: 6 points of 'ets_vii', [\d.]+ kB to .*g\.h5\n", err)
+    batch = fflin.LinearBatch.load(tmp_path / "g.h5", robot)
+    assert batch.joint_positions[:, :4] == pytest.approx(
+        np.array([[0.2, a, 0.0, b] for a in (-1.0, 0.0, 1.0) for b in (-2.0, 0.0)])
+    )
+    np.savez(tmp_path / "q.npz", q=batch.q)
+    code, *_ = run(
+        *("sweep", "ets_vii", "--configurations", tmp_path / "q.npz"),
+        *("--workers", 2, "-o", tmp_path / "f.npz"),
+    )
+    again = fflin.LinearBatch.load(tmp_path / "f.npz", robot)
+    assert code == 0 and np.abs(again.B_lower - batch.B_lower).max() < 1e-13
+    code, *_ = run(
+        *("sweep", "ets_vii", "--random", 7, "--seed", 5, "--range", "joint_3=0.1:0.2"),
+        *("--velocity", "joint_1=0.3", "--frame", "world", "-o", tmp_path / "r.npz"),
+    )
+    drawn = fflin.LinearBatch.load(tmp_path / "r.npz", robot)
+    expected = fflin.random_configurations(robot, 7, seed=5, ranges={"joint_3": (0.1, 0.2)})
+    assert code == 0 and np.array_equal(drawn.q, expected.rows(0, 7))
+    lin = fflin.linearize(robot, drawn.q[4], fflin.velocity(robot, {"joint_1": 0.3}), frame="world")
+    assert drawn[4].A == pytest.approx(lin.A, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ((), "by one of --grid, --random and --configurations"),
+        (("--grid", "joint_22=0:1:3"), "no joint named 'joint_22'; did you mean joint_2"),
+        (("--grid", "joint_2=0:1"), "is not JOINT=LO:HI:N"),
+        (("--grid", "joint_2=1:1:3"), "'joint_2=1:1:3' is empty"),
+        (("--grid", "joint_2=0:1:0"), "0 is too few"),
+        (("--grid", "joint_2=0:1:2", "--grid", "joint_2=0:1:3"), "names 'joint_2' twice"),
+        (("--grid", "joint_2=0:1:2", "--joint", "joint_2=1"), "is on the grid and in joints"),
+        (
+            ("--grid", "joint_2=0:1:100000", "--grid", "joint_3=0:1:100000"),
+            r"10,000,000,000 points of 'ets_vii', [\d.]+ TB: add --yes",
+        ),
+        (("--random", "0"), "0 is too few"),
+        (("--random", "3", "--grid", "joint_2=0:1:2"), "by one of --grid"),
+        (("--random", "3", "--joint", "joint_2=1", "--range", "joint_2=0:1"), "give either"),
+        (("--configurations", "none.npz"), "none.npz: cannot be read"),
+        (("--random", "3", "--workers", "2", "--dask", "x"), "give either"),
+        (("--random", "3", "--dask", "nowhere"), "no dask scheduler answers at 'nowhere'"),
+        (("--configurations", "none.npz", "--rpy", "1", "0", "0"), "all place the base"),
+        (("--random", "3", "-o", "none/x.npz"), "there is no folder none"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, message, tmp_path):
+    if "--dask" in arguments:
+        pytest.importorskip("distributed")
+    error = refused("sweep", "ets_vii", "-o", "out.npz", *arguments, cwd=tmp_path)
+    assert re.search(message, error), error
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_missing_or_damaged_is_one_line(tmp_path, robots):
+    assert "-o says where" in refused("sweep", "ets_vii", "--random", "3", cwd=tmp_path)
+    assert "expected one of .npz, .h5" in refused(
+        "sweep", "ets_vii", "--random", "3", "-o", "x.mat", cwd=tmp_path
+    )
+    q = np.tile(robots["ets_vii"].neutral(), (9, 1))
+    q[4, 8] = np.nan
+    np.savez(tmp_path / "q.npz", q=q)
+    error = refused("sweep", "ets_vii", "--configurations", "q.npz", "-o", "x.npz", cwd=tmp_path)
+    assert error.startswith("fflin: error: configuration 4: q[8] is nan")
+    q[4, 8] = 0.0
+    np.savez(tmp_path / "q.npz", q=q)
+    error = refused("sweep", "ets_vii", "--configurations", "q.npz", "-o", "q.npz", cwd=tmp_path)
+    assert "q.npz is the input file" in error
+    assert [entry.name for entry in tmp_path.iterdir()] == ["q.npz"]
+    assert np.array_equal(np.load(tmp_path / "q.npz")["q"], q)
+
+
+def test_the_reference_may_be_the_world(tmp_path, robots):
+    options = ("--random", "3", "--rpy", "30", "0", "0", "--reference", "world", "-o")
+    code, *_ = run("sweep", "ets_vii", *options, tmp_path / "w.h5")
+    assert code == 0
+    batch = fflin.LinearBatch.load(tmp_path / "w.h5", robots["ets_vii"])
+    lin = fflin.linearize(robots["ets_vii"], batch.q[1], reference=pin.SE3.Identity())
+    assert batch[1].x0[0] == pytest.approx(np.sin(np.pi / 12), rel=1e-12)
+    assert batch[1].x0 == pytest.approx(lin.x0, abs=1e-14)
+    assert batch[1].A == pytest.approx(lin.A, abs=1e-14)
+
+
+INTERRUPTED = """
+import os, signal, sys
+from fflin.base import progress
+from fflin.__main__ import main
+def update(bar, done, total):
+    os.killpg(0, signal.SIGINT)
+progress.Progress.update = update
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("workers", [(), ("--workers", "2")])
+def test_ctrl_c_leaves_what_is_finished_and_no_process(workers, tmp_path):
+    """The whole group is interrupted, as a terminal does it."""
+    pytest.importorskip("h5py")
+    command = [sys.executable, "-c", INTERRUPTED, "sweep", "ets_vii", "--random", "100000"]
+    options = ["--velocity", "joint_1=0.3", "-o", "x.h5", *workers]
+    with subprocess.Popen(
+        [*command, *options],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        # These end with the last process that has them.
+        _, error = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    *_, last = error.splitlines()
+    assert last == "fflin: stopped; the same command goes on from x.h5.part"
+    assert "Traceback" not in error
+    assert [entry.name for entry in tmp_path.iterdir()] == ["x.h5.part"]

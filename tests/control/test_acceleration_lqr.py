@@ -1,0 +1,114 @@
+"""The closed form on accelerations: Yang's regulator, and the general solver's solution."""
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.control.riccati import solve
+from tests.support.robots import BUNDLED, random_point
+
+# The spacecraft of Yang (2012), section 7 of the specification.
+J = np.array([0.01520407970002, 0.01462135261765, 0.0062377583131])
+YANG_KW, YANG_KQ = (0.79813525, 0.7978466, 0.79368217), 0.79056942
+
+CUBE = """<robot name="yang"><link name="base"><inertial><mass value="1"/>
+<inertia ixx="{}" iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+
+
+@pytest.fixture
+def yang(tmp_path):
+    path = tmp_path / "yang.urdf"
+    path.write_text(CUBE.format(*J))
+    return fflin.linearize(fflin.load(path))
+
+
+def test_yangs_attitude_regulator_by_both_routes(yang):
+    weights = ({"q_b": 5.0, "r_b": 1.0, "omega_b": 5.0, "v_b": 1.0}, {"tau_b": 8.0, "F_b": 1.0})
+    general = fflin.lqr(yang, *weights)
+    closed = fflin.acceleration_lqr(
+        yang, {"q_b": 5.0, "r_b": 1.0}, {"omega_b": 5.0, "v_b": 1.0}, [*(8.0 * J**2), 1, 1, 1]
+    )
+    for gain in (general, closed):
+        assert gain.K[:3, 6:9] == pytest.approx(np.diag(YANG_KW), abs=5e-9)
+        assert gain.K[:3, :3] == pytest.approx(YANG_KQ * np.eye(3), abs=5e-9)
+        assert gain.residual < 1e-15
+    assert closed.R == pytest.approx(np.diag([8.0] * 3 + [1.0] * 3))
+    # His formula.
+    kw = np.sqrt((5.0 + J * np.sqrt(8.0 * 5.0)) / 8.0)
+    assert closed.K[:3, 6:9] == pytest.approx(np.diag(kw), rel=1e-14)
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+@pytest.mark.parametrize("dt", [None, 1e-4, 0.1, 5.0])
+def test_closed_form_solves_the_riccati_equation(robots, name, dt):
+    rng = np.random.default_rng(4)
+    lin = fflin.linearize(robots[name], random_point(robots[name], rng)[0])
+    m = len(lin.A) // 2
+    qp, qv, ra = 10 ** rng.uniform(-1, 1, (3, m))
+    gain = fflin.acceleration_lqr(lin, qp, qv, ra, dt=dt)
+    assert gain.method == "closed form" and gain.dt == (dt or 0.0)
+    assert gain.residual < 1e-15
+    # The general route with the accelerations as inputs, u = M a.
+    model = lin.discretize(dt) if dt else lin
+    s = lin.A[:m, m:]
+    B = np.vstack((s * dt**2 / 2, np.eye(m) * dt)) if dt else np.eye(2 * m)[:, m:]
+    found = solve(model.A, B, np.diag([*qp, *qv]), np.diag(ra), None, dt or 0.0)
+    # P agrees to what M M^-1 rounds to, which the closed form does without.
+    assert gain.P == pytest.approx(found.P, rel=1e-8, abs=1e-12 * np.abs(found.P).max())
+    expected = lin.M @ found.K
+    assert gain.K == pytest.approx(expected, rel=1e-7, abs=1e-9 * np.abs(expected).max())
+    # Its poles are those of the loop with the inertia divided out.
+    loop = np.linalg.eigvals(model.A - B @ found.K)
+    for pole in gain.poles:
+        near = np.abs(loop - pole).min()
+        assert near < 1e-7 * abs(pole - bool(dt)) + 1e-9
+
+
+def test_sampling_tends_to_the_continuous_gain(robots):
+    lin = fflin.linearize(robots["ets_vii"])
+    gain = fflin.acceleration_lqr(lin, 2.0, 1.0, 0.5)
+    errors = [
+        np.abs(fflin.acceleration_lqr(lin, 2.0, 1.0, 0.5, dt=h).K - gain.K).max()
+        for h in (1e-3, 1e-4)
+    ]
+    assert errors[1] == pytest.approx(errors[0] / 10.0, rel=0.05)
+
+
+def test_redundant_thrusters_share_the_least_forces():
+    thrusters = [x for x in fflin.load_inputs("cubesat") if isinstance(x, fflin.Thruster)]
+    robot = fflin.load("cubesat", inputs=thrusters)
+    lin = fflin.linearize(robot)
+    gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
+    full = fflin.acceleration_lqr(fflin.linearize(fflin.load("cubesat")), 1.0, 1.0, 1.0)
+    assert lin.B @ gain.K == pytest.approx(np.vstack((np.zeros((6, 12)), full.B[6:] @ full.K)))
+    assert gain.K == pytest.approx(np.linalg.pinv(lin.B[6:]) @ lin.B[6:] @ gain.K)
+
+
+def test_what_has_no_closed_form_is_refused():
+    robot = fflin.load("ets_vii")
+    lin = fflin.linearize(robot)
+    joints = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
+    for model in (joints, joints.replace(stiffness=0.0)):
+        with pytest.raises(fflin.StabilizabilityError, match="base attitude and position"):
+            fflin.acceleration_lqr(fflin.linearize(model), 1, 1, 1)
+    springs = fflin.linearize(robot.replace(stiffness=1.0))
+    for model in (springs, springs.discretize(0.1)):
+        with pytest.raises(fflin.InputError, match="not of double integrators"):
+            fflin.acceleration_lqr(model, 1, 1, 1)
+    for words, weights in {
+        "Qp is a matrix": (np.eye(12), 1, 1),
+        "Qp is not positive definite: its eigenvalue 0 .* q_b.x": (0, 1, 1),
+        "Ra is not positive definite": (1, 1, 0),
+        "Qv is not positive semidefinite": (1, -1, 1),
+        r"Ra has shape \(3,\), expected \(12,\)": (1, 1, np.ones(3)),
+        "Qp has no value for r_b.x; each needs one": ({"q_b": 1}, 1, 1),
+        "beyond what numbers hold": (1e300, 1, 1e-300),
+        "or dt are beyond": (1e-160, 1e160, 1e160),
+    }.items():
+        with pytest.raises(fflin.InputError, match=words):
+            fflin.acceleration_lqr(lin, *weights)
+    for weights, dt in (((1, 1, 1), 1e20), ((1e300, 1, 1e-300), 0.1), ((1e-160, 1e160, 1e160), 1)):
+        with pytest.raises(fflin.InputError, match="beyond what numbers hold"):
+            fflin.acceleration_lqr(lin, *weights, dt=dt)
+    with pytest.raises(fflin.InputError, match="sampled already"):
+        fflin.acceleration_lqr(lin.discretize(0.1), 1, 1, 1, dt=0.1)

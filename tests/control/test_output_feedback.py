@@ -1,0 +1,82 @@
+"""Loops closed over what is measured: the linear loop with its estimate foresees them."""
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.control.weights import default_weights
+
+POSITIONS = (fflin.BasePose(), fflin.JointPositions())
+FELT = (*POSITIONS, fflin.Accelerometer("base"))
+
+
+def designed(outputs, **fields):
+    robot = fflin.load("ets_vii", outputs=outputs, **fields)
+    q = fflin.configuration(robot, {"joint_2": 0.4})
+    lin = fflin.linearize(robot, q, None, fflin.equilibrium(robot, q).u)
+    sampled = lin.discretize(0.05)
+    gain = fflin.lqr(sampled, *fflin.sampled_cost(lin, 0.05, *default_weights(lin)))
+    estimator = fflin.kalman(sampled, np.diag(lin.B @ lin.B.T) + 1e-6, 1e-4)
+    return robot, sampled, fflin.lqg(gain, estimator)
+
+
+def foreseen(lin, compensator, x, steps):
+    """The states of the linear model under the compensator, sample by sample."""
+    e, z, rows = x - lin.x0, np.zeros(len(x)), []
+    for _ in range(steps + 1):
+        rows.append(e)
+        du = compensator.C @ z
+        z = compensator.A @ z + compensator.B @ (lin.C @ e + lin.D @ du)
+        e = lin.A @ e + lin.B @ du
+    return lin.x0 + np.array(rows)
+
+
+@pytest.mark.parametrize("outputs", [POSITIONS, FELT], ids=["positions", "felt"])
+def test_the_linear_loop_foresees_it_to_second_order(outputs):
+    robot, lin, compensator = designed(outputs, stiffness=3.0)
+    policy = fflin.OutputFeedback(lin, compensator)
+    apart = []
+    for size in (2e-4, 1e-4):
+        x0 = lin.x0 + size * np.cos(np.arange(len(lin.x0)))
+        motion = fflin.simulate(robot, policy, x0=x0, duration=2.0, dt=0.01, every=5)
+        expected = foreseen(lin, compensator, x0, 40)
+        apart.append(np.abs(motion.x - expected).max() / size)
+    assert apart[0] < 0.05
+    assert apart[0] / apart[1] == pytest.approx(2.0, abs=0.05)
+
+
+def test_it_settles_and_noise_is_what_keeps_it_from_it():
+    robot, lin, compensator = designed(POSITIONS)
+    x0 = lin.x0.copy()
+    x0[:6] += (0.05, -0.03, 0.02, 0.1, 0.05, -0.1)
+    rng = np.random.default_rng(0)
+
+    def noise(t):
+        return 1e-4 * rng.normal(size=len(lin.y0))
+
+    ends = []
+    for policy in (
+        fflin.OutputFeedback(lin, compensator),
+        fflin.OutputFeedback(lin, compensator, noise),
+    ):
+        motion = fflin.simulate(robot, policy, x0=x0, duration=60.0, dt=0.05)
+        assert not motion.stopped
+        ends.append(np.abs(motion.error[-1]).max())
+    assert ends[0] < 1e-6 < 1e-5 < ends[1] < 1e-2
+
+
+def test_compensators_that_do_not_fit_are_refused():
+    robot, lin, compensator = designed(POSITIONS)
+    continuous = fflin.linearize(robot)
+    with pytest.raises(fflin.InputError, match="must be sampled"):
+        fflin.OutputFeedback(continuous, compensator)
+    with pytest.raises(fflin.InputError, match="another model"):
+        fflin.OutputFeedback(continuous.discretize(0.1), compensator)
+    with pytest.raises(fflin.InputError, match="Compensator"):
+        fflin.OutputFeedback(lin, np.eye(3))
+    policy = fflin.OutputFeedback(lin, compensator)
+    with pytest.raises(fflin.InputError, match="outputs"):
+        fflin.simulate(robot.replace(outputs=[fflin.BasePose()]), policy, duration=1.0)
+    short = fflin.OutputFeedback(lin, compensator, lambda t: np.zeros(3))
+    with pytest.raises(fflin.InputError, match="one value for each output"):
+        fflin.simulate(robot, short, duration=1.0)

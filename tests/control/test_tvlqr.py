@@ -1,0 +1,154 @@
+"""The regulator along a trajectory: closed forms, the infinite horizon, the cost it promises."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import fflin
+from fflin.control.differential_riccati import Coefficients, step_back
+from tests.linear.test_trajectory import motion
+
+
+@pytest.fixture(scope="module")
+def moving():
+    robot = fflin.load("astrobee_arm", gravity=(0.0, 0.1, -0.2), damping=0.05)
+    return fflin.linearize_trajectory(robot, *motion(robot, knots=41))
+
+
+def resting(name, duration, knots=11):
+    robot = fflin.load(name)
+    q = np.tile(robot.neutral(), (knots, 1))
+    zero = np.zeros((knots, robot.nv))
+    t = np.linspace(0.0, duration, knots)
+    u = np.zeros((knots, 6 + robot.n))
+    return robot, fflin.linearize_trajectory(robot, t, q, zero, u)
+
+
+def weights(traj):
+    nx = traj.A.shape[1]
+    R = 1.0 / np.array([fflin.linearize(traj.robot).M.diagonal()]).ravel() ** 2
+    return np.linspace(1.0, 10.0, nx), R
+
+
+def integrated(rate, knots, y):
+    """The end of an initial value problem that is smooth between the knots, to 1e-12."""
+    for span in pairwise(knots):
+        y = solve_ivp(rate, span, y, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
+    return y
+
+
+def test_long_horizons_tend_to_the_regulator_and_keep_P_positive():
+    robot, traj = resting("ets_vii", 300.0)
+    Q, R = weights(traj)
+    gain = fflin.lqr(fflin.linearize(robot, moving=True), Q, R)
+    for Qf in (0.0, 1e6):
+        schedule = fflin.tvlqr(traj, Q, R, Qf)
+        assert schedule.P[0] == pytest.approx(gain.P, rel=1e-9, abs=1e-11 * np.abs(gain.P).max())
+        assert schedule.gain(0.0) == pytest.approx(gain.K, rel=1e-8, abs=1e-9 * gain.K.max())
+        assert schedule.residual < 1e-6
+        for P in schedule.P:
+            values = np.linalg.eigvalsh(P)
+            assert values[0] >= -1e-12 * values[-1]
+
+
+def test_double_integrators_have_the_closed_form():
+    """With Q = 0, P^-1 is a polynomial of the time to go s:
+    P^-1 = e^(-A s) Qf^-1 e^(-A' s) + the integral of e^(-A r) B R^-1 B' e^(-A' r) over [0, s]."""
+    robot, traj = resting("cubesat", 5.0)
+    lin = fflin.linearize(robot, moving=True)
+    Qf, R = np.diag(np.linspace(1.0, 4.0, 12)), np.diag(lin.M.diagonal() ** -2.0)
+    schedule = fflin.tvlqr(traj, 0.0, R, Qf)
+    S = lin.B @ np.linalg.solve(R, lin.B.T)
+    for t in (0.0, 1.234, 4.9):
+        s = 5.0 - t
+        back = np.eye(12) - lin.A * s
+        AS = lin.A @ S
+        gramian = S * s - (AS + AS.T) * s**2 / 2 + AS @ lin.A.T * s**3 / 3
+        expected = np.linalg.inv(back @ np.linalg.inv(Qf) @ back.T + gramian)
+        # Within the 1e-7 that interpolation is held to.
+        assert schedule.cost_to_go(t) == pytest.approx(expected, abs=3e-7 * np.abs(expected).max())
+        K = np.linalg.solve(R, lin.B.T @ expected)
+        assert schedule(t) == pytest.approx(K, abs=1e-6 * np.abs(K).max())
+    assert schedule.P[0] == pytest.approx(
+        np.linalg.inv(
+            (np.eye(12) - 5 * lin.A) @ np.linalg.inv(Qf) @ (np.eye(12) - 5 * lin.A).T
+            + S * 5
+            - (lin.A @ S + S @ lin.A.T) * 12.5
+            + lin.A @ S @ lin.A.T * 125 / 3
+        ),
+        rel=1e-9,
+        abs=1e-11,
+    )
+
+
+def test_cost_to_go_is_the_cost_of_the_loop(moving):
+    Q, R = weights(moving)
+    schedule = fflin.tvlqr(moving, Q, R, 3.0)
+    e = np.random.default_rng(0).normal(size=len(Q))
+
+    def rate(t, y):
+        A, B = moving.matrices(t)
+        u = -schedule.gain(t) @ y[:-1]
+        return np.append(A @ y[:-1] + B @ u, y[:-1] @ (Q * y[:-1]) + u @ (R * u))
+
+    y = integrated(rate, schedule.t, np.append(e, 0.0))
+    assert y[-1] + 3.0 * y[:-1] @ y[:-1] == pytest.approx(e @ schedule.P[0] @ e, rel=1e-10)
+    assert schedule.residual < 1e-6
+
+
+def test_it_solves_the_differential_equation(moving):
+    Q, R = weights(moving)
+    schedule = fflin.tvlqr(moving, Q, R, 1.0)
+    nx = len(Q)
+
+    def rate(t, p):
+        P = p.reshape(nx, nx)
+        A, B = moving.matrices(t)
+        return -(A.T @ P + P @ A - P @ B / R @ B.T @ P + np.diag(Q)).ravel()
+
+    expected = integrated(rate, moving.t[::-1], np.eye(nx).ravel()).reshape(nx, nx)
+    assert schedule.P[0] == pytest.approx(expected, rel=0.0, abs=1e-9 * np.abs(expected).max())
+
+
+def test_a_step_is_of_order_four():
+    rng = np.random.default_rng(5)
+    A0, A1, B0, B1 = (rng.normal(size=shape) for shape in ((4, 4), (4, 4), (4, 2), (4, 2)))
+    nodes = 0.5 + np.array([-1.0, 1.0]) * 3.0**0.5 / 6.0
+
+    def at(t):
+        B = (1 - t) * B0 + t * B1
+        return Coefficients((1 - t) * A0 + t * A1, B @ B.T, np.eye(4))
+
+    def solved(steps):
+        P, h = np.eye(4), 1.0 / steps
+        for k in range(steps, 0, -1):
+            a, b = (k - 1) * h, k * h
+            S = np.array([at(a + c * h).S for c in nodes])
+            P = step_back(at(a), at(b), S, P, h)
+        return P
+
+    exact = solved(256)
+    errors = [np.abs(solved(n) - exact).max() for n in (8, 16, 32)]
+    slopes = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert slopes == pytest.approx([4.0, 4.0], abs=0.25)
+
+
+def test_schedules_are_kept_and_bad_input_is_told(moving, tmp_path):
+    Q, R = weights(moving)
+    schedule = fflin.tvlqr(moving, Q, R, {"q_b": 5.0})
+    for ending in ("npz", "mat", "json"):
+        schedule.save(tmp_path / f"schedule.{ending}")
+        back = fflin.GainSchedule.load(tmp_path / f"schedule.{ending}")
+        assert (back.P == schedule.P).all() and (back.t == schedule.t).all()
+        assert (back.gain(0.1) == schedule.gain(0.1)).all()
+    with pytest.raises(fflin.InputError, match=r"t is 9 s, expected 0 to 0\.4 s"):
+        schedule.gain(9.0)
+    with pytest.raises(fflin.InputError, match="traj is a LinearModel, expected a LinearTraj"):
+        fflin.tvlqr(fflin.linearize(moving.robot), 1, 1, 1)
+    with pytest.raises(fflin.InputError, match="Qf is not positive semidefinite"):
+        fflin.tvlqr(moving, Q, R, -1.0)
+    with pytest.raises(fflin.InputError, match="P changes too fast"):
+        fflin.tvlqr(replace(moving, A=moving.A * 1e12), Q, R, 1.0)

@@ -1,0 +1,182 @@
+"""What feedback reads straight off q and v, and how steps are put together, by other routes."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from fflin.control.weights import default_weights
+from fflin.dynamics.state_rows import readout, states_of
+from fflin.simulation.integrators import integrator
+from tests.support.robots import BUNDLED, FRAMES, random_pose
+
+
+def anywhere(robot, rng):
+    """A configuration at any turn of the base, both signs of its quaternion, and a velocity."""
+    joints = dict(zip(robot.joint_names, rng.uniform(-3.0, 3.0, size=robot.n), strict=True))
+    q = fflin.configuration(robot, joints, random_pose(rng, 150.0))
+    q[3:7] *= rng.choice([-1.0, 1.0])
+    return q, fflin.StateMap(robot).spread(rng.normal(size=6 + robot.n))
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("name", [*BUNDLED, "tiago_dual"])
+def test_readout_is_the_feedback_of_the_state(name, frame):
+    robot = fflin.load(name)
+    rng = np.random.default_rng(5)
+    state = fflin.StateMap(robot, reference=random_pose(rng, 20.0), frame=frame)
+    K, offset = rng.normal(size=(4, state.nx)), rng.normal(size=4)
+    near = 5.0 * rng.normal(size=state.nx)
+    read = readout(state, K, offset, near)
+    for _ in range(10):
+        q, v = anywhere(robot, rng)
+        expected = offset - K @ state.to_state(q, v, near=near)
+        np.testing.assert_allclose(read(q, v), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("name", BUNDLED)
+def test_rows_of_a_motion_are_its_states(name, frame):
+    robot = fflin.load(name)
+    rng = np.random.default_rng(6)
+    state = fflin.StateMap(robot, reference=random_pose(rng, 20.0), frame=frame)
+    q, v = map(np.array, zip(*(anywhere(robot, rng) for _ in range(12)), strict=True))
+    near = 5.0 * rng.normal(size=state.nx)
+    rows = states_of(state, q, v, near)
+    for row, q_i, v_i in zip(rows, q, v, strict=True):
+        near = state.to_state(q_i, v_i, near=near)
+        np.testing.assert_allclose(row, near, atol=1e-13)
+
+
+def test_cf4_is_the_published_scheme():
+    # q2 = I(q, h/2 k1), q3 = I(q, h/2 k2), q4 = I(q2, h (k3 - k1/2)), then two exponentials.
+    robot = fflin.load("servicer_7dof")
+    model, data = robot.model, robot.create_data()
+    q, v = anywhere(robot, np.random.default_rng(7))
+    h, move = 0.05, pin.integrate
+    times = []
+
+    def f(t, q, v):
+        times.append(t)
+        return pin.aba(model, data, q, v, np.full(model.nv, np.cos(t))).copy()
+
+    k1, l1 = v, f(1.0, q, v)
+    q2, k2 = move(model, q, h / 2 * k1), v + h / 2 * l1
+    l2 = f(1.0 + h / 2, q2, k2)
+    q3, k3 = move(model, q, h / 2 * k2), v + h / 2 * l2
+    l3 = f(1.0 + h / 2, q3, k3)
+    q4, k4 = move(model, q2, h * (k3 - k1 / 2)), v + h * l3
+    l4 = f(1.0 + h, q4, k4)
+    half = move(model, q, h / 12 * (3 * k1 + 2 * k2 + 2 * k3 - k4))
+    expected = move(model, half, h / 12 * (-k1 + 2 * k2 + 2 * k3 + 3 * k4))
+    step = integrator("cf4")(model, h).step
+    for _ in range(2):  # the work space of the first step does not reach the second
+        found_q, found_v = step(f, 1.0, q, v)
+        np.testing.assert_allclose(found_q, expected, rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(found_v, v + h / 6 * (l1 + 2 * l2 + 2 * l3 + l4), atol=1e-14)
+    assert times[:4] == times[4:8]
+
+
+def test_a_policy_may_keep_what_it_is_given():
+    robot = fflin.load("servicer_7dof")
+    _, v0 = anywhere(robot, np.random.default_rng(8))
+    kept = []
+
+    def policy(t, q, v):
+        kept.append((q, v, q.copy(), v.copy()))
+        return np.zeros(6 + robot.n)
+
+    def push(t, q, v):
+        return policy(t, q, v)[: robot.nv]
+
+    fflin.simulate(robot, policy, v0=0.1 * v0, duration=0.05, dt=0.01, disturbance=push)
+    assert len(kept) == 40
+    assert all((q == q_then).all() and (v == v_then).all() for q, v, q_then, v_then in kept)
+
+
+def test_a_rotor_may_spin_fast_and_a_link_may_not():
+    # A turn of 6 rad in a step: nothing depends on a rotor's angle. Its motor turns the body
+    # about the same axis: with J of wheel and the whole about z, M^-1 says by how much.
+    body = fflin.load("cubesat")
+    wheel = fflin.ReactionWheel((0, 0, 1), inertia=1e-4)
+    robot = body.replace(inputs=[wheel])
+    v0 = fflin.velocity(robot, {"wheel_1": 600.0})
+    motion = fflin.simulate(robot, lambda t, q, v: [1e-4], v0=v0, duration=1.0, dt=0.01)
+    assert not motion.stopped
+    # Motor torque 1e-4 N m on 1e-4 kg m^2: 1 rad/s^2 in inertial axes.
+    speed = motion.v[-1, 6] + motion.v[-1, 5]
+    assert speed == pytest.approx(601.0, abs=1e-3)
+    assert motion.momentum_drift.max() < 1e-14
+    arm = fflin.load("canadarm2")
+    fast = fflin.velocity(arm, {arm.joint_names[0]: 600.0})
+    assert "diverged" in fflin.simulate(arm, v0=fast, duration=1.0, dt=0.01).stopped
+
+
+def test_momentum_is_kept_far_away():
+    # In orbit about the Earth's centre, where angular momentum about the origin has no digits.
+    robot = fflin.load("servicer_7dof")
+    q, v = anywhere(robot, np.random.default_rng(9))
+    q[:3] += (7e6, 1e6, -2e6)
+    motion = fflin.simulate(robot, q0=q, v0=0.2 * v, duration=1.0, dt=0.01)
+    # Of a place at 7e6 m the digits end at 1e-9 m.
+    assert motion.momentum_drift.max() < 1e-9
+    np.testing.assert_allclose(motion.momentum, np.tile(motion.momentum[:1], (101, 1)), atol=1e-8)
+
+
+def test_energy_counts_gravity_and_springs_from_where_they_are_zero():
+    model = fflin.load("servicer_7dof").model.copy()
+    model.jointPlacements[1] = random_pose(np.random.default_rng(3), 40.0)
+    robot = fflin.from_model(model, gravity=(0.3, -0.2, -1.5), stiffness=20.0)
+    q, v = anywhere(robot, np.random.default_rng(10))
+    motion = fflin.simulate(robot, q0=q, v0=0.2 * v, duration=0.2, dt=0.0005)
+    data = robot.create_data()
+    pin.centerOfMass(robot.model, data, q)
+    height = robot.mass * np.dot(robot.gravity, data.com[0])
+    angles = np.array([joint.value(q) for joint in robot.joints])
+    expected = pin.computeKineticEnergy(robot.model, data, q, 0.2 * v) - height
+    expected += 10.0 * float(angles @ angles)
+    assert motion.energy[0] == pytest.approx(expected, rel=1e-12)
+    np.testing.assert_allclose(motion.energy, expected, rtol=1e-7)
+
+
+def test_a_loop_that_leaves_the_chart_says_when():
+    # No feedback at all, and a turn of 1 rad/s: half a turn after pi seconds.
+    robot = fflin.load("cubesat")
+    lin = fflin.linearize(robot)
+    nothing = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
+    v0 = fflin.velocity(robot, {"omega_b.z": 1.0})
+    motion = fflin.simulate(robot, nothing, v0=v0, duration=10.0, dt=0.01)
+    assert motion.stopped.startswith("left the chart at t = 3.15 s")
+    assert motion.t[-1] == pytest.approx(3.15) and np.isfinite(motion.x).all()
+
+
+def bent(robot):
+    """A model about a bent arm that is held against its springs, and a gain for it."""
+    joints = dict.fromkeys(robot.joint_names, 0.4)
+    q = fflin.configuration(robot, joints, random_pose(np.random.default_rng(11), 50.0))
+    lin = fflin.linearize(robot, q, None, fflin.equilibrium(robot, q).u)
+    return lin, fflin.lqr(lin, *default_weights(lin))
+
+
+@pytest.mark.parametrize("sample", [None, 0.02])
+def test_loop_about_a_bent_point_comes_to_it_and_differs_in_second_order(sample):
+    robot = fflin.load("ets_vii", stiffness=3.0)
+    lin, gain = bent(robot)
+    assert np.abs(lin.u0).max() > 1.0 and np.abs(lin.x0).max() > 0.3
+    policy = fflin.StateFeedback(lin, gain.K)
+
+    def run(size, duration):
+        x0 = lin.x0 + size * np.cos(np.arange(len(lin.x0)))
+        options = {"duration": duration, "dt": 0.01, "sample": sample}
+        return fflin.simulate(robot, policy, x0=x0, **options)
+
+    # What the two models differ by over the displacement halves with it.
+    apart = []
+    for size in (2e-4, 1e-4):
+        motion = run(size, 2.0)
+        apart.append(np.abs(motion.x - motion.linear).max() / size)
+    assert apart[0] < 0.005
+    assert apart[0] / apart[1] == pytest.approx(2.0, abs=0.02)
+    end = run(0.02, 60.0)
+    assert np.abs(end.error[-1]).max() < 1e-6
+    np.testing.assert_allclose(end.u[-1], lin.u0, atol=1e-3)

@@ -1,0 +1,50 @@
+"""The compiled kernel on disk: made once, told once, and never from older sources."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+from types import SimpleNamespace
+
+import pytest
+
+from fflin.kernel import compiled as kernel_code
+
+pytest.importorskip("numba")
+
+
+@pytest.fixture
+def compiled(monkeypatch, tmp_path):
+    """A function of the kernel that keeps its code in a folder of its own."""
+    from fflin.kernel import factor as batch_kernel
+
+    new = SimpleNamespace(stats=SimpleNamespace(cache_path=tmp_path))
+    monkeypatch.setattr(batch_kernel, "invert", new)
+    kernel_code._prepared.cache_clear()
+    yield new
+    kernel_code._prepared.cache_clear()
+
+
+def test_compilation_is_told_once_whatever_the_threads(compiled, caplog, tmp_path):
+    ready = Barrier(4)
+
+    def ask():
+        ready.wait()
+        return kernel_code.kernel("factor", "invert")
+
+    with ThreadPoolExecutor(4) as threads:
+        found = [threads.submit(ask) for _ in range(4)]
+    assert all(each.result() is compiled for each in found)
+    assert [record.message for record in caplog.records] == [
+        f"fflin: compiling the batch kernel, once; it is kept in {tmp_path}"
+    ]
+
+
+@pytest.mark.parametrize("older", [False, True])
+def test_code_that_is_older_than_any_source_is_not_taken(compiled, caplog, tmp_path, older):
+    kept = tmp_path / "factor.invert-1.nbi"
+    kept.write_bytes(b"")
+    newest = max(file.stat().st_mtime for file in kernel_code._sources())
+    os.utime(kept, (newest, newest + (-1.0 if older else 1.0)))
+    kernel_code.kernel("factor", "invert")
+    assert kept.exists() is not older
+    assert bool(caplog.records) is older

@@ -1,0 +1,171 @@
+"""`check` must be able to fail: an error planted in any block is found, by both routes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from tests.support.robots import random_point, random_pose
+
+GROUPS = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
+INPUTS = {"tau_b": slice(0, 3), "F_b": slice(3, 6), "tau_m": slice(6, None)}
+
+
+@pytest.fixture(scope="module", params=["hybrid", "local", "world"])
+def moving(request):
+    robot = fflin.load("servicer_7dof")
+    point = random_point(robot, np.random.default_rng(1), degrees=50.0)
+    lin = fflin.linearize(robot, *point, frame=request.param, reference=pin.SE3.Identity())
+    return robot, lin, fflin.StateMap(robot, frame=request.param).groups._asdict()
+
+
+def planted(lin, matrix, rows, columns):
+    """The model with one entry of a block off by 1e-5 of the largest of its rows, or by 1e-5."""
+    array = getattr(lin, matrix).copy()
+    block = array[rows, columns]
+    at = np.unravel_index(np.abs(block).argmax(), block.shape)
+    size = np.abs(array[rows]).max() if block.any() else 1.0
+    if block[at]:
+        size = abs(block[at])
+    block[at] += 1e-5 * size
+    return replace(lin, **{matrix: array})
+
+
+@pytest.mark.parametrize("column", (*GROUPS, *INPUTS))
+@pytest.mark.parametrize("row", GROUPS)
+def test_planted_error_is_found_in_its_block(moving, row, column):
+    robot, lin, groups = moving
+    matrix = "A" if column in GROUPS else "B"
+    columns = groups[column] if column in GROUPS else INPUTS[column]
+    found = fflin.check(robot, planted(lin, matrix, groups[row], columns))
+    block = f"{matrix}[{row}, {column}]"
+    by = {row.test for row in found.failures if row.block == block}
+    assert {"ABA derivatives", "differences"} <= by
+    # Where B's block is wrong so is M^-1; no other block of A or B is accused.
+    others = {r.block for r in found.failures if r.test in ("ABA derivatives", "differences")}
+    assert others == {block}
+    assert not found.ok
+    assert f"{block} (" in str(found) and "FAILED" in str(found)
+
+
+@pytest.mark.parametrize("matrix", ["A", "B"])
+def test_flipped_sign_of_any_nonzero_block_is_found(moving, matrix):
+    robot, lin, groups = moving
+    columns = groups if matrix == "A" else INPUTS
+    flipped = 0
+    for row in GROUPS:
+        for column in columns:
+            array = getattr(lin, matrix).copy()
+            array[groups[row], columns[column]] *= -1.0
+            if (array == getattr(lin, matrix)).all():
+                continue
+            found = fflin.check(robot, replace(lin, **{matrix: array}))
+            assert f"{matrix}[{row}, {column}]" in {failure.block for failure in found.failures}
+            flipped += 1
+    assert flipped >= (10 if matrix == "A" else 9)
+
+
+def test_wrong_point_is_found():
+    robot = fflin.load("ets_vii")
+    lin = fflin.linearize(robot, *random_point(robot, np.random.default_rng(2)))
+    for name in ("x0", "f0"):
+        vector = getattr(lin, name).copy()
+        vector[7] += 1e-6
+        found = fflin.check(robot, replace(lin, **{name: vector}))
+        assert {"x0": "x0", "f0": "f0[q_m]"}[name] in {row.block for row in found.failures}
+
+
+def test_model_of_another_inertia_is_found():
+    """The matrices of one robot do not pass as those of another with the same joints."""
+    robot = fflin.load("ets_vii")
+    model = robot.model.copy()
+    model.inertias[3] = model.inertias[3] + pin.Inertia(0.01, np.zeros(3), np.eye(3) * 1e-3)
+    heavier = fflin.from_model(model, name="ets_vii")
+    assert not fflin.check(heavier, fflin.linearize(robot)).ok
+
+
+def test_own_m_of_a_model_does_not_loosen_the_check():
+    robot = fflin.load("servicer_7dof")
+    lin = fflin.linearize(robot)
+    noise = np.random.default_rng(3).normal(size=(15, 15))
+    nearly_singular = np.ones((15, 15)) + 1e-15 * noise @ noise.T
+    wrong = replace(lin, A=1.5 * lin.A, B=1.3 * lin.B, _inertia=lambda _: nearly_singular)
+    found = fflin.check(robot, wrong)
+    assert {"M", "B[omega_b, tau_b]", "A[q_b, omega_b]"} <= {row.block for row in found.failures}
+    assert max(row.tolerance for row in found.rows) < 1e-7
+
+
+def test_check_keeps_its_edge_at_orbital_speed():
+    robot = fflin.load("servicer_7dof")
+    q, v, u = random_point(robot, np.random.default_rng(4))
+    v[:3] = 7.6e3, -200.0, 30.0
+    for frame in ("hybrid", "local", "world"):
+        lin = fflin.linearize(robot, q, v, 0.05 * u, frame=frame, reference=pin.SE3.Identity())
+        assert fflin.check(robot, lin).ok
+        groups = fflin.StateMap(robot).groups
+        A = lin.A.copy()
+        A[groups.omega_b, groups.q_m] *= 1.0 + 1e-4
+        found = fflin.check(robot, replace(lin, A=A))
+        assert "A[omega_b, q_m]" in {row.block for row in found.failures}
+
+
+def test_far_joints_are_confirmed_as_far_as_m_is():
+    model = fflin.load("dual_arm").model.copy()
+    model.jointPlacements[4] = pin.SE3(np.eye(3), np.array([3e3, 0.0, 0.0]))
+    robot = fflin.from_model(model)
+    assert fflin.check(robot, fflin.linearize(robot)).ok
+
+
+def test_not_a_number_is_not_ok():
+    robot = fflin.load("cubesat")
+    lin = fflin.linearize(robot)
+    A = lin.A.copy()
+    A[0, 6] = np.nan
+    assert not fflin.check(robot, replace(lin, A=A)).ok
+
+
+def test_check_of_what_it_cannot_check_is_refused():
+    robot = fflin.load("cubesat")
+    lin = fflin.linearize(robot)
+    with pytest.raises(fflin.InputError, match=r"sampled at dt = 0\.1 s"):
+        fflin.check(robot, lin.discretize(0.1))
+    with pytest.raises(fflin.InputError, match=r"12 states of 'cubesat'.*24 states of 'ets_vii'"):
+        fflin.check(fflin.load("ets_vii"), lin)
+
+
+def test_report_fits_80_columns():
+    robot = fflin.load("tiago_dual")
+    text = str(fflin.check(robot, fflin.linearize(robot)))
+    assert max(map(len, text.splitlines())) <= 80
+    assert "OK: 123 figures hold" in text
+
+
+def test_rounding_of_a_large_acceleration_is_no_failure():
+    # Where an accelerometer sits at the pushed origin, its slopes vanish and only rounding is left.
+    robot = fflin.load("cubesat")
+    push = fflin.Thruster("base", (0.3, -1.1, 0.4), (1.0, 0.2, -0.5))
+    robot = robot.replace(inputs=[push], outputs=[fflin.Accelerometer("base")])
+    v = fflin.velocity(robot, {"omega_b.x": 1.3, "omega_b.y": -0.7, "v_b.z": 0.4})
+    for thrust in (1.0, 3.3, 7.1):
+        assert fflin.check(robot, fflin.linearize(robot, v=v, u=[thrust], moving=True)).ok
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("turn", [np.pi, -np.pi])
+def test_a_continuous_joint_may_pass_half_a_turn(turn, moving):
+    """Differences reach over the seam of the angle, on the turn of the point."""
+    robot = fflin.load("ets_vii")
+    rng = np.random.default_rng(5)
+    groups = fflin.StateMap(robot).groups
+    for distance in (0.0, 1e-9, 1e-4, 1e-2):
+        joints = {joint: turn - np.sign(turn) * distance for joint in robot.joint_names}
+        q = fflin.configuration(robot, joints, random_pose(rng, 70.0))
+        v, u = rng.normal(size=robot.nv), rng.normal(size=robot.nv)
+        lin = fflin.linearize(robot, q, v, u, moving=moving)
+        assert fflin.check(robot, lin).ok
+        A = lin.A.copy()
+        A[groups.q_m, groups.qdot_m] *= -1.0
+        found = fflin.check(robot, replace(lin, A=A))
+        assert "A[q_m, qdot_m]" in {row.block for row in found.failures}

@@ -1,0 +1,205 @@
+"""Inputs that balance a robot: laws, optimality against every active set, and refusals."""
+
+from dataclasses import FrozenInstanceError
+from itertools import combinations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from tests.support.robots import BUNDLED, FRAMES, random_pose, random_tree
+
+
+def sprung(name, rng, **fields):
+    """A robot in gravity on springs that pull, at random joints and attitude."""
+    robot = fflin.load(name)
+    robot = robot.replace(
+        stiffness={joint: rng.uniform(1, 50) for joint in robot.joint_names},
+        rest={joint: rng.normal() for joint in robot.joint_names},
+        gravity=rng.normal(size=3),
+        **fields,
+    )
+    joints = {joint: rng.uniform(-2, 2) for joint in robot.joint_names}
+    return robot, fflin.configuration(robot, joints, random_pose(rng, 150.0))
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_what_is_balanced_is_a_fixed_point(name):
+    rng = np.random.default_rng(1)
+    robot, q = sprung(name, rng)
+    found = fflin.equilibrium(robot, q)
+    lin = fflin.linearize(robot, q, u=found.u)
+    assert not fflin.linearize(robot, q).is_equilibrium()
+    # Balanced to the rounding of M^-1 times the forces.
+    assert np.abs(lin.f0).max() < 1e-11 * np.abs(np.linalg.solve(lin.M, found.u)).max()
+    assert lin.is_equilibrium(1e-8)
+    # With one force for each coordinate it is their negative: of a spring, K (q - rest).
+    floating = robot.replace(gravity=(0, 0, 0))
+    u = fflin.equilibrium(floating, q).u
+    state = StateMap(robot)
+    stiffness, _, rest = robot.passive
+    expected = np.concatenate((np.zeros(6), stiffness * (state.joint_positions(q) - rest)))
+    assert u == pytest.approx(expected, rel=1e-10, abs=1e-10)
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_axes_are_those_of_the_frame_and_reference(frame):
+    rng = np.random.default_rng(2)
+    robot, q = sprung("ets_vii", rng)
+    for reference in (None, pin.SE3.Identity(), random_pose(rng, 100.0)):
+        u = fflin.equilibrium(robot, q, frame=frame, reference=reference).u
+        lin = fflin.linearize(robot, q, u=u, frame=frame, reference=reference)
+        assert lin.is_equilibrium(1e-9)
+        assert np.linalg.norm(u[3:6]) == pytest.approx(
+            robot.mass * np.linalg.norm(robot.gravity), rel=1e-12
+        )
+    # Against gravity in the world's own axes.
+    if frame != "local":
+        u = fflin.equilibrium(robot, q, frame=frame, reference=pin.SE3.Identity()).u
+        assert u[3:6] == pytest.approx(-robot.mass * np.array(robot.gravity), rel=1e-12)
+
+
+def thrusters(robot, rng, count):
+    frames = [f.name for f in robot.model.frames if f.type == pin.FrameType.BODY]
+    return [
+        fflin.Thruster(str(rng.choice(frames)), rng.normal(size=3), rng.normal(size=3))
+        for _ in range(count)
+    ]
+
+
+def least_by_every_active_set(C, d, one_sided):
+    """The least u with C u = d and u[one_sided] >= 0 over all choices of what does not push."""
+    best = None
+    sided = np.flatnonzero(one_sided)
+    for count in range(len(sided) + 1):
+        for off in combinations(sided, count):
+            on = np.setdiff1d(np.arange(C.shape[1]), off)
+            u = np.zeros(C.shape[1])
+            u[on] = np.linalg.pinv(C[:, on]) @ d
+            feasible = np.linalg.norm(C @ u - d) < 1e-9 * np.linalg.norm(d)
+            better = best is None or np.linalg.norm(u) < np.linalg.norm(best)
+            if feasible and better and (u[sided] > -1e-12).all():
+                best = u
+    return best
+
+
+def test_least_norm_against_every_active_set():
+    """Random thrusters on a free body and on an arm, some with torques beside them."""
+    rng = np.random.default_rng(3)
+    balanced = refused = bound = 0
+    for trial in range(60):
+        body = fflin.load(("cubesat", "planar_detumble")[trial % 2])
+        n = body.n
+        fans = thrusters(body, rng, int(rng.integers(5, 11)))
+        torques = [fflin.BaseTorque()] if trial % 3 else []
+        robot = body.replace(
+            inputs=[*fans[:2], *torques, *fans[2:], *map(fflin.JointTorque, body.joint_names)],
+            gravity=rng.normal(size=3),
+        )
+        q = fflin.configuration(robot, dict.fromkeys(robot.joint_names, 0.7))
+        free = fflin.linearize(body.replace(gravity=robot.gravity), q)
+        d = -free.M @ free.f0[6 + n :]
+        state = StateMap(robot)
+        actuation = Actuation(state)
+        C = actuation.columns(robot.create_data(), q)
+        one_sided = np.isin(np.arange(C.shape[1]), actuation.groups["thrust"])
+        expected = least_by_every_active_set(C, d, one_sided)
+        if expected is None:
+            refused += 1
+            with pytest.raises(fflin.EquilibriumError, match="left are"):
+                fflin.equilibrium(robot, q)
+            continue
+        balanced += 1
+        u = fflin.equilibrium(robot, q).u
+        bound += bool((u[one_sided] == 0.0).any())
+        assert (u[one_sided] >= 0.0).all()
+        assert u == pytest.approx(expected, rel=1e-8, abs=1e-9 * np.abs(expected).max())
+        # Optimal: u is C^T y, cut off at zero where a thruster would have to pull.
+        active = one_sided & (u == 0.0)
+        y = np.linalg.lstsq(C[:, ~active].T, u[~active], rcond=None)[0]
+        pull = C.T @ y
+        assert pull[~active] == pytest.approx(u[~active], abs=1e-8 * np.abs(u).max())
+        assert fflin.linearize(robot, q, u=u).is_equilibrium(1e-8)
+    assert balanced >= 15 and refused >= 5 and bound >= 10
+
+
+def test_refusal_names_what_is_left():
+    robot = fflin.load("servicer_7dof", stiffness=100.0, rest={"panel_left": 0.2})
+    robot = robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce()])
+    with pytest.raises(fflin.EquilibriumError, match=r"left are tau_m.panel_left 20 N m; give"):
+        fflin.equilibrium(robot)
+    heavy = fflin.load("cubesat", gravity=(0, 0, -2.0), inputs=[fflin.BaseTorque()])
+    with pytest.raises(fflin.EquilibriumError, match=rf"left are F_b.z -{2 * heavy.mass:.3g} N;"):
+        fflin.equilibrium(heavy)
+    # The other way round, thrusters cannot pull.
+    up = fflin.Thruster("base", (0, 0, 0), (0, 0, 1))
+    down = fflin.Thruster("base", (0, 0, 0), (0, 0, -1))
+    lifted = heavy.replace(inputs=[fflin.BaseTorque(), up])
+    assert fflin.equilibrium(lifted).u[3] == pytest.approx(2.0 * heavy.mass, rel=1e-12)
+    with pytest.raises(fflin.EquilibriumError, match="thrusters only push"):
+        fflin.equilibrium(heavy.replace(inputs=[fflin.BaseTorque(), down]))
+
+
+def test_what_is_needed_is_shown_with_units():
+    robot = fflin.load("servicer_7dof", gravity=(0.0, 0.0, -9.81))
+    found = fflin.equilibrium(robot)
+    lines = str(found).splitlines()
+    assert lines[0].startswith("u: ") and max(map(len, lines)) <= 80
+    assert f"F_b.z = {9.81 * robot.mass:.6g} N" in str(found) and "tau_b.x" not in str(found)
+    assert str(fflin.equilibrium(fflin.load("cubesat"))) == "u: all zero"
+
+
+def test_nothing_to_balance_takes_nothing():
+    """Exactly zero, also where no input could do anything, or rounding asks for something."""
+    robot = fflin.load("ets_vii", inputs=[fflin.JointTorque("joint_1")])
+    found = fflin.equilibrium(robot)
+    assert found.u.shape == (1,) and not found.u.any() and not found.residual.any()
+    rest = dict.fromkeys(robot.joint_names, 0.3)
+    sprung = robot.replace(stiffness=1e3, rest=rest)
+    slightly = {joint: 0.1 + 0.2 for joint in rest}  # 0.30000000000000004
+    assert np.abs(fflin.equilibrium(sprung, fflin.configuration(sprung, slightly)).u).max() < 1e-12
+    with pytest.raises(fflin.EquilibriumError):
+        fflin.equilibrium(sprung, fflin.configuration(sprung, dict.fromkeys(rest, 0.3 + 1e-9)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_steady_motion_of_random_trees(seed):
+    """A turn about the vertical and a drift in body axes, joints at rest."""
+    rng = np.random.default_rng(seed)
+    robot = random_tree(rng, 5).replace(gravity=(0.0, 3.0, -4.0), stiffness=2.0, damping=0.1)
+    q = fflin.configuration(robot, dict.fromkeys(robot.joint_names, 0.4), random_pose(rng, 120.0))
+    axis = pin.XYZQUATToSE3(q[:7]).rotation.T @ np.array(robot.gravity)
+    v = np.zeros(robot.nv)
+    v[:3], v[3:6] = rng.normal(size=3), 0.3 * axis
+    u = fflin.equilibrium(robot, q, v=v).u
+    lin = fflin.linearize(robot, q, v, u, moving=True)
+    assert lin.is_equilibrium(1e-9)
+    assert not fflin.linearize(robot, q, v, moving=True).is_equilibrium()
+    # A second later: the same error dynamics.
+    later = fflin.linearize(robot, pin.integrate(robot.model, q, v), v, u, moving=True)
+    assert later.A == pytest.approx(lin.A, abs=1e-10 * np.abs(lin.A).max())
+    v[3:6] = 0.3 * rng.normal(size=3)
+    with pytest.raises(fflin.EquilibriumError, match="about the vertical only"):
+        fflin.equilibrium(robot, q, v=v)
+    v[3:6], v[6] = 0.0, 0.1
+    with pytest.raises(fflin.EquilibriumError, match=r"moves: q_m.joint_0 at 0.1 (rad|m)/s"):
+        fflin.equilibrium(robot, q, v=v)
+
+
+def test_bad_input_is_told():
+    robot = fflin.load("cubesat")
+    with pytest.raises(fflin.InputError, match="q has shape"):
+        fflin.equilibrium(robot, [0.0])
+    with pytest.raises(fflin.InputError, match=r"expected a fflin\.Robot"):
+        fflin.equilibrium("cubesat")
+    with pytest.raises(fflin.InputError, match="expected one of hybrid"):
+        fflin.equilibrium(robot, frame="body")
+    found = fflin.equilibrium(robot)
+    assert found.force_names[:4] == ("tau_b.x", "tau_b.y", "tau_b.z", "F_b.x")
+    with pytest.raises(FrozenInstanceError):
+        found.u = 0
+    with pytest.raises(ValueError, match="read-only"):
+        found.u[0] = 1.0

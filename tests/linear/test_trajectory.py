@@ -1,0 +1,161 @@
+"""The linear model along a motion."""
+
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+
+import fflin
+from fflin.dynamics.aba import Aba
+from tests.support.robots import random_point
+
+
+def motion(robot, start=None, duration=0.4, knots=81):
+    """A motion of the robot under inputs that change slowly, to 1e-10."""
+    q0, v0, u0 = random_point(robot, np.random.default_rng(1))
+    v0 = 0.3 * v0
+    if start is not None:
+        q0, v0 = start
+    state = fflin.StateMap(robot, frame="local")
+    aba = Aba(state)
+    t = np.linspace(0.0, duration, knots)
+
+    def inputs(time):
+        return 0.1 * u0 * np.cos(3 * time)
+
+    def rate(time, y):
+        # In the tangent at the beginning of each interval the motion is short: no singularity.
+        q = pin.integrate(robot.model, rate.q, y[: robot.nv])
+        v = y[robot.nv :]
+        slope = pin.dDifference(robot.model, rate.q, q, pin.ArgumentPosition.ARG1) @ v
+        return np.concatenate((slope, aba.acceleration(q, v, inputs(time))))
+
+    q, v = [q0], [v0]
+    for before, after in pairwise(t):
+        rate.q = q[-1]
+        y = solve_ivp(
+            rate,
+            (before, after),
+            np.concatenate((np.zeros(robot.nv), v[-1])),
+            rtol=1e-11,
+            atol=1e-12,
+        ).y[:, -1]
+        q.append(pin.integrate(robot.model, q[-1], y[: robot.nv]))
+        v.append(y[robot.nv :])
+    return t, np.array(q), np.array(v), np.array([inputs(time) for time in t])
+
+
+def test_knots_are_the_moving_models_and_errors_are_carried_along():
+    robot = fflin.load("astrobee_arm", gravity=(0.0, 0.1, -0.2), damping=0.05)
+    t, q, v, u = motion(robot)
+    along = fflin.linearize_trajectory(robot, t, q, v, u)
+    assert along.residual.max() < 1e-2 and len(along.residual) == len(t)
+    lin = fflin.linearize(robot, q[30], v[30], u[30], moving=True)
+    assert (along.A[30] == lin.A).all() and (along.B[30] == lin.B).all()
+    assert along.state_names == lin.state_names
+
+    # A second motion from a nearby start: its error is what the time-varying model carries.
+    def error(knot, q1, v1):
+        reference = pin.XYZQUATToSE3(q[knot][:7])
+        relative = fflin.StateMap(robot, reference=reference, frame="local")
+        return relative.to_state(q1, v1) - relative.to_state(q[knot], v[knot])
+
+    dx = 1e-6 * np.random.default_rng(2).normal(size=len(lin.x0))
+    first = fflin.StateMap(robot, reference=pin.XYZQUATToSE3(q[0][:7]), frame="local")
+    q1, v1 = first.to_pinocchio(first.to_state(q[0], v[0]) + dx)
+    _, q_near, v_near, _ = motion(robot, (q1, v1))
+    solution = solve_ivp(
+        lambda time, y: along.matrices(min(time, t[-1]))[0] @ y,
+        (t[0], t[-1]),
+        dx,
+        rtol=1e-10,
+        atol=1e-14,
+    ).y[:, -1]
+    # Matrices that are linear between knots leave 1e-5 of it, the second order in dx 1e-6.
+    drift = error(-1, q_near[-1], v_near[-1])
+    assert drift == pytest.approx(solution, abs=1e-4 * np.abs(solution).max())
+
+
+def test_interpolation_is_on_the_manifold():
+    robot = fflin.load("ets_vii")
+    along = fflin.linearize_trajectory(robot, *motion(robot))
+    middle = 0.5 * (along.t[3] + along.t[4])
+    q, v, _ = along.point(middle)
+    assert robot.checked_configuration(q) is not None
+    assert np.linalg.norm(q[3:7]) == pytest.approx(1.0, abs=1e-14)
+    assert v == pytest.approx(0.5 * (along.v[3] + along.v[4]))
+    half = pin.difference(robot.model, along.q[3], along.q[4]) / 2
+    assert pin.difference(robot.model, along.q[3], q) == pytest.approx(half, abs=1e-14)
+    assert (along.matrices(along.t[5])[0] == along.A[5]).all()
+    assert (along.matrices(along.t[-1])[1] == along.B[-1]).all()
+    with pytest.raises(fflin.InputError, match=r"t is 9 s, expected 0 to 0\.4 s"):
+        along.point(9.0)
+    with pytest.raises(ValueError, match="read-only"):
+        along.A[0] = 0.0
+
+
+def test_what_is_no_motion_is_refused_with_the_time():
+    robot = fflin.load("ets_vii")
+    t, q, v, u = motion(robot)
+    jump = q.copy()
+    jump[40:, 0] += 0.1
+    cases = {
+        r"not a motion of 'ets_vii': at t = 0\.(195|2) s": (t, jump, v, u),
+        "not a motion": (t, q, v, np.zeros_like(u)),
+        "each later than the one before": (t[::-1], q, v, u),
+        r"q has shape \(80, 19\), expected \(81, 19\)": (t, q[:-1], v, u),
+        r"v has shape \(81, 11\), expected \(81, 12\)": (t, q, v[:, 1:], u),
+        r"u has shape \(11,\), expected \(12,\)": (t, q, v, u[:, 1:]),
+        "not an array of numbers": (t, q, v, "none"),
+    }
+    for words, arguments in cases.items():
+        with pytest.raises(fflin.InputError, match=words):
+            fflin.linearize_trajectory(robot, *arguments)
+
+
+def test_coarse_knots_are_warned_of():
+    robot = fflin.load("ets_vii")
+    t, q, v, u = motion(robot, knots=4)
+    with pytest.warns(fflin.FflinWarning, match="coarse for a motion: at t ="):
+        fflin.linearize_trajectory(robot, t, q, v, u)
+
+
+def test_an_orbit_and_a_fast_wheel_hide_nothing():
+    wheel = fflin.ReactionWheel((0, 0, 1), inertia=0.01)
+    robot = fflin.load("ets_vii", inputs=[fflin.BaseForce(), wheel])
+    t = np.linspace(0.0, 1.0, 51)
+    v = np.tile(fflin.velocity(robot, {"v_b.x": 7000.0, "wheel_1": 500.0}), (len(t), 1))
+    q0 = fflin.configuration(robot, base=pin.SE3(np.eye(3), np.array([7e6, 0.0, 0.0])))
+    q = np.array([pin.integrate(robot.model, q0, time * v[0]) for time in t])
+    u = np.zeros((len(t), 4))
+    assert fflin.linearize_trajectory(robot, t, q, v, u).residual.max() < 1e-9
+    for column in (2, robot.joints[0].idx_v):  # along z; a joint of the arm
+        step = 0.01 * np.eye(robot.nv)[column]
+        jump = np.array([pin.integrate(robot.model, x, (k >= 25) * step) for k, x in enumerate(q)])
+        with pytest.raises(fflin.InputError, match=r"at t = 0\.(48|5) s"):
+            fflin.linearize_trajectory(robot, t, jump, v, u)
+    drifting = v.copy()
+    drifting[:, robot.joints[0].idx_v] = 0.01
+    with pytest.raises(fflin.InputError, match="not a motion"):
+        fflin.linearize_trajectory(robot, t, q, drifting, u)
+
+
+def test_an_orbit_changes_no_residual():
+    robot = fflin.load("ets_vii")
+    t, q, v, u = motion(robot)
+    still = fflin.linearize_trajectory(robot, t, q, v, u).residual
+    q[:, :3] += np.outer(t, [0.0, 7000.0, 100.0])
+    v[:, :3] += [pin.Quaternion(x[3:7]).matrix().T @ [0.0, 7000.0, 100.0] for x in q]
+    orbit = fflin.linearize_trajectory(robot, t, q, v, u).residual
+    assert orbit == pytest.approx(still, rel=1e-2)
+
+
+def test_holding_still_in_gravity_is_a_motion():
+    robot = fflin.load("servicer_7dof", gravity=(0.3, 0.2, -9.81), stiffness=20.0)
+    q = fflin.configuration(robot, {"joint_2": 0.7, "joint_4": -0.4, "panel_left": 0.2})
+    u = fflin.equilibrium(robot, q).u
+    t = np.linspace(0.0, 1.0, 5)
+    still = (np.tile(x, (len(t), 1)) for x in (q, np.zeros(robot.nv), u))
+    assert fflin.linearize_trajectory(robot, t, *still).residual.max() < 1e-9

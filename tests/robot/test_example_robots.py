@@ -1,0 +1,52 @@
+"""Every robot of example-robot-data that can be a free flyer, at rest and moving."""
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.robot.catalog import find_robot
+from tests.support.robots import FRAMES, random_point
+
+# What does not give a model at neutral, and why.
+REFUSED = {
+    "bravo7_gripper": "'bravo_finger1_joint', joint 'bravo_finger2_joint' can move",
+    "falcon_bravo7_gripper": "'bravo_finger1_joint', joint 'bravo_finger2_joint' can move",
+    "bluevolta_bravo7_gripper": "'bravo_finger1_joint', joint 'bravo_finger2_joint' can move",
+    "romeo": "joint 'LHand', joint 'RHand' can move without",
+    "icub": "'neck_roll', joint 'neck_yaw' can move together without moving mass",
+    "alex_psyonic_hands": "'Left_index_q2' mimics a joint that does not exist",
+}
+NAMES = [n for n in fflin.list_robots() if find_robot(n).origin == "example-robot-data"]
+
+
+def test_names_are_those_of_the_package():
+    from example_robot_data.robots_loader import ROBOTS
+
+    assert set(ROBOTS) - set(NAMES) == {"cassie"}  # SDF only
+    with pytest.raises(fflin.UrdfError, match="SDF only"):
+        fflin.load("cassie")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_check_holds(name):
+    if name in REFUSED:
+        with pytest.raises(fflin.FflinError, match=REFUSED[name]):
+            fflin.linearize(fflin.load(name))
+        return
+    robot = fflin.load(name)
+    assert robot.n == robot.model.nv - 6 - len(robot.followers)
+    found = fflin.check(robot, fflin.linearize(robot))
+    assert found.ok, found
+    rng = np.random.default_rng(1)
+    for frame in FRAMES:
+        point = random_point(robot, rng, degrees=160.0)
+        found = fflin.check(robot, fflin.linearize(robot, *point, frame=frame))
+        assert found.ok, found
+
+
+def test_talos_legs_are_talos_without_its_upper_body():
+    legs, talos = fflin.load("talos_legs"), fflin.load("talos")
+    assert legs.joint_names == talos.joint_names[:12]
+    assert legs.mass == pytest.approx(
+        sum(inertia.mass for inertia in talos.model.inertias.tolist()[1:14]), rel=1e-14
+    )

@@ -1,0 +1,146 @@
+"""C, D and y0 in the chart and the frame: by `check`, by laws, and that `check` can fail."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from tests.support.robots import FRAMES, random_point, random_pose
+
+
+def watched(robot, frame):
+    """A robot with every kind of output, and inputs that turn."""
+    return robot.replace(
+        outputs=[
+            fflin.Accelerometer(frame),
+            fflin.JointVelocities((robot.joint_names[1],)),
+            fflin.FramePose(frame),
+            fflin.BasePose(),
+            fflin.FrameVelocity(frame),
+            fflin.CenterOfMass(),
+            fflin.Gyroscope(frame),
+            fflin.JointPositions(),
+            fflin.Momentum(),
+        ],
+        inputs=[
+            fflin.Thruster(frame, (0.1, 0.2, 0.3), (1, 2, 3)),
+            fflin.BaseTorque(),
+            fflin.BaseForce(),
+        ],
+        gravity=(0.2, -0.3, -1.6),
+        stiffness=2.0,
+        damping=0.3,
+    )
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["own reference", "turned reference"])
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize(
+    ("name", "link"),
+    [
+        ("servicer_7dof", "tool"),
+        ("ets_vii", "link_4"),
+        ("dual_arm", "tool_left"),
+        ("panda", "panda_leftfinger"),
+    ],
+)
+def test_check_holds_with_every_output(name, link, frame, turned):
+    rng = np.random.default_rng(1)
+    bare = fflin.load(name)
+    robot = watched(bare, link)
+    q, v, _ = random_point(bare, rng)
+    reference = random_pose(rng, 100.0) if turned else None
+    u = rng.normal(size=7) * 10
+    lin = fflin.linearize(robot, q, v, u, frame=frame, reference=reference)
+    assert lin.D.any()
+    found = fflin.check(robot, lin)
+    assert found.ok, found
+
+
+@pytest.mark.parametrize("matrix", ["C", "D", "y0"])
+def test_planted_error_is_found_in_every_row(matrix):
+    bare = fflin.load("planar_detumble")
+    robot = watched(bare, "hand")
+    q, v, _ = random_point(bare, np.random.default_rng(2))
+    lin = fflin.linearize(robot, q, v, np.ones(7))
+    rows = np.flatnonzero(np.abs(lin.D).max(axis=1)) if matrix == "D" else range(len(lin.y0))
+    assert len(rows) >= 3
+    for row in rows:
+        wrong = getattr(lin, matrix).copy()
+        if matrix == "y0":
+            wrong[row] += 1e-5 * max(1.0, np.abs(lin.y0).max())
+        else:
+            wrong[row, np.abs(wrong[row]).argmax()] *= -1.0
+        found = fflin.check(robot, replace(lin, **{matrix: wrong}))
+        assert [failure.block for failure in found.failures] == [matrix]
+
+
+def test_outputs_follow_their_laws():
+    """Sums and rates that hold between outputs, states and inputs."""
+    bare = fflin.load("servicer_7dof")
+    robot = bare.replace(
+        outputs=[
+            fflin.CenterOfMass(),
+            fflin.Momentum(),
+            fflin.FramePose("tool"),
+            fflin.FrameVelocity("tool"),
+        ]
+    )
+    q, v, u = random_point(bare, np.random.default_rng(3))
+    lin = fflin.linearize(robot, q, v, u)
+    C = dict(zip(lin.output_names, lin.C, strict=True))
+    y = dict(zip(lin.output_names, lin.y0, strict=True))
+    for axis in "xyz":
+        # Momentum is mass times the rate of the centre of mass: its rate along f0, and in C, the
+        # slope over a velocity of that over the position it changes.
+        assert C[f"com.{axis}"] @ lin.f0 * bare.mass == pytest.approx(
+            y[f"momentum.linear.{axis}"], rel=1e-11, abs=1e-9
+        )
+        assert C[f"tool.position.{axis}"] @ lin.f0 == pytest.approx(
+            y[f"tool.velocity.{axis}"], abs=1e-11
+        )
+        # The force on the base, and nothing inside, is the rate of the momentum.
+        assert C[f"momentum.linear.{axis}"] @ lin.f0 == pytest.approx(
+            u[3 + "xyz".index(axis)], abs=1e-8
+        )
+        assert C[f"momentum.linear.{axis}"] @ lin.B[:, 6:] == pytest.approx(np.zeros(9), abs=1e-10)
+
+
+def test_sampled_model_keeps_its_outputs(tmp_path):
+    bare = fflin.load("cubesat")
+    robot = bare.replace(outputs=[fflin.Gyroscope("base"), fflin.Accelerometer("base")])
+    lin = fflin.linearize(robot)
+    assert lin.output_names == tuple(
+        f"base.{k}.{x}" for k in ("gyroscope", "acceleration") for x in "xyz"
+    )
+    assert lin.output_units == ("rad/s",) * 3 + ("m/s^2",) * 3
+    assert lin.D[3:, 3:] == pytest.approx(np.eye(3) / bare.mass, rel=1e-12)
+    assert (lin.discretize(0.1).D == lin.D).all()
+    lin.save(tmp_path / "m.npz")
+    loaded = fflin.LinearModel.load(tmp_path / "m.npz")
+    assert fflin.check(robot, loaded).ok
+    with pytest.raises(fflin.InputError, match="6 outputs, which are not the 12"):
+        fflin.check(bare, loaded)
+
+
+def test_bad_outputs_are_told():
+    robot = fflin.load("servicer_7dof")
+    for words, outputs in {
+        "no frame named 'tol'; did you mean tool": [fflin.FramePose("tol")],
+        "is asked for twice": [fflin.CenterOfMass(), fflin.CenterOfMass()],
+        "at least one output": [],
+        "is not an output": ["tool"],
+    }.items():
+        with pytest.raises(fflin.FflinError, match=words):
+            fflin.linearize(robot.replace(outputs=outputs))
+
+
+def test_pose_of_the_base_link_is_the_base_pose():
+    robot = fflin.load("cubesat", outputs=[fflin.FramePose("base"), fflin.BasePose()])
+    q = fflin.configuration(robot, base=random_pose(np.random.default_rng(4), 50.0))
+    lin = fflin.linearize(robot, q, reference=pin.SE3.Identity())
+    assert lin.y0[:3] == pytest.approx(lin.x0[3:6], abs=1e-15)
+    chart = fflin.StateMap(robot).chart(q)
+    assert lin.C[3:6, :3] == pytest.approx(chart.J, rel=1e-13)

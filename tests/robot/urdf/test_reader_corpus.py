@@ -1,0 +1,93 @@
+"""Each entry of the corpus through the command line, in a process of limited time and memory."""
+
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import pytest
+
+from tests.support.patience import PATIENCE
+from tests.support.reader_corpus import ACCEPT, CASES, REFUSE, WARN
+
+TIME_LIMIT = 20  # [s] of the processor
+MEMORY_LIMIT = 4 * 2**20  # [KiB]
+
+
+@dataclass(frozen=True)
+class Run:
+    code: int
+    out: str
+    err: str
+    left: list[str]  # names of files that the command left behind
+
+
+def run(case, folder):
+    folder.mkdir()
+    path = folder / f"robot{case.suffix}"
+    if callable(case.document):
+        path = case.document(path)
+    else:
+        raw = case.document
+        path.write_bytes(raw if isinstance(raw, bytes) else raw.encode())
+    if case.expected == REFUSE:
+        command = ["linearize", str(path), "-o", str(folder / "out.npz")]
+    else:
+        command = ["check", str(path)]
+    before = set(os.listdir(folder))
+    shell = ["sh", "-c", f'ulimit -v {MEMORY_LIMIT}; ulimit -t {TIME_LIMIT}; exec "$@"', "sh"]
+    result = subprocess.run(
+        [*shell, sys.executable, "-m", "fflin", *command],
+        capture_output=True,
+        timeout=PATIENCE,
+        check=False,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONWARNINGS": "default"},
+        cwd=folder,
+    )
+    left = sorted(set(os.listdir(folder)) - before)
+    return Run(result.returncode, result.stdout.decode(), result.stderr.decode(), left)
+
+
+@pytest.fixture(scope="module")
+def runs(request, tmp_path_factory):
+    """Start the selected entries two at a time."""
+    chosen = [
+        item.callspec.params["case"]
+        for item in request.session.items
+        if item.module is request.module and hasattr(item, "callspec")
+    ]
+    folder = tmp_path_factory.mktemp("corpus")
+    with ThreadPoolExecutor(2) as pool:
+        futures: dict[str, Future[Run]] = {
+            case.name: pool.submit(run, case, folder / str(k)) for k, case in enumerate(chosen)
+        }
+        yield futures
+        for future in futures.values():
+            future.cancel()
+
+
+def test_corpus_is_large_and_its_names_differ():
+    assert len(CASES) >= 150
+    assert not [name for name, n in Counter(case.name for case in CASES).items() if n > 1]
+    assert {case.expected for case in CASES} == {ACCEPT, WARN, REFUSE}
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_corpus(case, runs):
+    if "xacro" in case.name:
+        pytest.importorskip("xacrodoc")
+    result = runs[case.name].result()
+    lines = result.err.splitlines()
+    if case.expected == REFUSE:
+        assert (result.code, result.out, result.left) == (2, "", [])
+        assert len(lines) == 1 and lines[0].startswith("fflin: error: "), result.err
+    else:
+        assert result.code == 0, result.err
+        assert re.search(r"^OK: \d+ figures hold", result.out, re.MULTILINE)
+        assert all(line.startswith("fflin: warning: ") for line in lines), result.err
+        assert len(lines) == (case.expected == WARN), result.err
+    for word in case.words:
+        assert word in result.err

@@ -1,0 +1,137 @@
+"""The reader gives the model that Pinocchio builds from the same file, where it builds one."""
+
+import re
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from example_robot_data.robots_loader import getModelPath
+
+import fflin
+from fflin.base.errors import FflinError
+from fflin.robot.urdf.reader import read_urdf
+from tests.support.patience import PATIENCE
+
+BUNDLED = Path(__file__).parents[3] / "robots"
+EXAMPLES = Path(getModelPath("talos_data/robots/talos_reduced.urdf")).resolve()
+FILES = sorted(EXAMPLES.glob("**/*.urdf"))
+
+# What the reader refuses, and the words of the reason. Pinocchio builds the first two of them.
+REFUSED = {
+    "alex_psyonic_hands.urdf": "mimics a joint that does not exist: no joint named 'index_q1'",
+    "romeo_laas_small.urdf": "principal moments -0.0213, 0.0521, 0.099 kg m",
+    "falcon.urdf": "no link named 'Z_propeller'",
+    "ur3.urdf": "has no <link>",
+}
+
+
+def assert_same(model: pin.Model, expected: pin.Model) -> None:
+    assert list(model.names) == list(expected.names)
+    assert model.name == expected.name
+    assert list(model.parents) == list(expected.parents)
+    # Their text holds type, indices and axis.
+    assert [str(joint) for joint in model.joints] == [str(joint) for joint in expected.joints]
+    for placement, other in zip(model.jointPlacements, expected.jointPlacements, strict=True):
+        assert np.array_equal(placement.homogeneous, other.homogeneous)
+    for inertia, other in zip(model.inertias, expected.inertias, strict=True):
+        assert np.array_equal(inertia.matrix(), other.matrix())
+    for name in (
+        "lowerPositionLimit",
+        "upperPositionLimit",
+        "effortLimit",
+        "velocityLimit",
+        "damping",
+        "friction",
+        "armature",
+    ):
+        assert np.array_equal(getattr(model, name), getattr(expected, name)), name
+    assert len(model.frames) == len(expected.frames)
+    for frame, other in zip(model.frames, expected.frames, strict=True):
+        assert (frame.name, frame.type, frame.parentJoint) == (
+            other.name,
+            other.type,
+            other.parentJoint,
+        )
+        assert np.array_equal(frame.placement.homogeneous, other.placement.homogeneous)
+
+
+def test_all_files_are_there():
+    assert len(FILES) == 77
+
+
+@pytest.mark.parametrize(
+    "path",
+    [p for p in FILES if p.name not in REFUSED] + sorted(BUNDLED.glob("*.urdf")),
+    ids=lambda path: path.stem,
+)
+def test_same_model_as_pinocchio(path):
+    expected = pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer())
+    model = read_urdf(path).model
+    assert_same(model, expected)
+    assert not model.gravity.vector.any()
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refused_with_a_reason(name):
+    path = next(p for p in FILES if p.name == name)
+    with pytest.raises(fflin.UrdfError, match=rf"{name}:\d+: .*{re.escape(REFUSED[name])}"):
+        read_urdf(path)
+
+
+def test_prune_cuts_off_all_that_hangs_on_a_joint():
+    talos = read_urdf(EXAMPLES / "talos_data/robots/talos_reduced.urdf").model
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", fflin.FflinWarning)
+        legs = fflin.load("talos_legs").model
+    # The example's own loader keeps the first 14 joints of talos with their inertias.
+    assert list(legs.names) == list(talos.names)[:14]
+    for kept, original in zip(legs.inertias, talos.inertias, strict=False):
+        assert np.array_equal(kept.matrix(), original.matrix())
+
+
+def test_prune_of_an_unknown_joint_names_the_near_ones():
+    with pytest.raises(fflin.UnknownNameError, match="joint_6"):
+        read_urdf(BUNDLED / "ets_vii.urdf", ["joint_"])
+
+
+CHAIN = """
+import sys, threading
+from pathlib import Path
+from fflin.robot.urdf.reader import describe
+link = '<link name="l{0}"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" \
+iyz="0" izz="1"/></inertial></link>'
+joint = '<joint name="j{0}" type="fixed"><parent link="l{0}"/><child link="l{1}"/></joint>'
+text = "".join(link.format(i) for i in range(1000))
+text += "".join(joint.format(i, i + 1) for i in range(999))
+def run():
+    robot = describe(f"<robot>{text}</robot>".encode(), Path("chain.urdf"))
+    print(robot.model.inertias[1].mass)
+threading.stack_size(512 * 1024)
+thread = threading.Thread(target=run)
+thread.start()
+thread.join()
+"""
+
+
+def test_deep_chain_in_a_thread_of_small_stack():
+    # Pinocchio itself overruns such a stack between 200 and 400 links.
+    result = subprocess.run(
+        [sys.executable, "-c", CHAIN], capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
+    assert (result.stdout.strip(), result.stderr) == ("1000.0", "")
+
+
+def test_every_named_robot_loads_or_says_why():
+    reasons = {}
+    for name in fflin.list_robots():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", fflin.FflinWarning)
+            try:
+                fflin.load(name)
+            except FflinError as error:
+                reasons[name] = str(error)
+    assert set(reasons) == {"alex_psyonic_hands"}

@@ -1,0 +1,153 @@
+"""Figures: what they show and are named by, and the files they are saved to."""
+
+import math
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.control.weights import default_weights
+
+pytest.importorskip("matplotlib")
+
+
+@pytest.fixture(scope="module")
+def loop():
+    robot = fflin.load("planar_detumble")
+    lin = fflin.linearize(robot)
+    gain = fflin.lqr(lin, *default_weights(lin))
+    x0 = lin.x0.copy()
+    x0[2] = math.sin(math.radians(10.0))
+    policy = fflin.StateFeedback(lin, gain.K)
+    return lin, gain, fflin.simulate(robot, policy, x0=x0, duration=3.0, every=10)
+
+
+def lines(axes):
+    return {line.get_label(): line for line in axes.get_lines()}
+
+
+def test_motion_shows_linear_beside_nonlinear_and_their_difference(loop):
+    _, _, motion = loop
+    figure = motion.plot()
+    axes = {each.get_title(): each for each in figure.axes if each.get_title()}
+    attitude = axes["attitude q_b"]
+    full, dashed = attitude.get_lines()[4], attitude.get_lines()[5]
+    assert full.get_label() == "z"
+    np.testing.assert_array_equal(full.get_ydata(), motion.x[:, 2])
+    np.testing.assert_array_equal(dashed.get_ydata(), motion.linear[:, 2])
+    assert dashed.get_linestyle() == "--"
+    differences = [each for each in figure.axes if each.get_ylabel().startswith("difference")]
+    assert len(differences) == 6
+    apart = differences[0].get_lines()[2].get_ydata()
+    np.testing.assert_array_equal(apart, motion.x[:, 2] - motion.linear[:, 2])
+    assert axes["velocity v_b"].get_ylabel() == "[m/s]"
+    torque = lines(axes["inputs"])["tau_b.z"]
+    np.testing.assert_array_equal(torque.get_ydata(), motion.u[:, 2])
+    assert set(lines(axes["joint inputs tau_m"])) == {
+        name for name in motion.input_names if name.startswith("tau_m")
+    }
+    assert "momentum drift, relative" in axes
+
+
+def test_motion_without_a_prediction_has_no_differences():
+    robot = fflin.load("cubesat")
+    motion = fflin.simulate(robot, v0=[0, 0, 0, 0.1, 0, 0.2], duration=1.0, every=10)
+    figure = motion.plot()
+    assert not [each for each in figure.axes if each.get_ylabel().startswith("difference")]
+
+
+def test_many_inputs_and_joints_are_named_beside_the_panels_each_in_its_colour():
+    bare = fflin.load("servicer_7dof")
+    thrusters = [
+        fflin.Thruster("tool", (0, 0, 0), (1.0, k, 0.0), f"a_thruster_with_a_long_name_{k}")
+        for k in range(12)
+    ]
+    robot = bare.replace(inputs=[*thrusters, *bare.inputs[2:]])
+    motion = fflin.simulate(robot, duration=0.05)
+    figure = motion.plot()
+    named = {legend.get_title().get_text(): legend for legend in figure.legends}
+    shown = [text.get_text() for text in named["joints"].get_texts()]
+    assert shown == list(robot.joint_names)
+    assert len(named["inputs"].get_texts()) == 12
+    for legend in named.values():
+        colors = {line.get_color() for line in legend.get_lines()}
+        assert len(colors) == len(legend.get_lines())
+    axes = {each.get_title(): each for each in figure.axes}
+    torques, angles = (
+        {line.get_label().rpartition(".")[2]: line.get_color() for line in axes[title].get_lines()}
+        for title in ("joint inputs tau_m", "joints q_m")
+    )
+    assert torques == angles
+    # Nothing lies on anything else.
+    figure.draw_without_rendering()
+    boxes = [each.get_tightbbox() for each in (*figure.axes, *figure.legends)]
+    for i, one in enumerate(boxes):
+        assert not any(one.overlaps(other) for other in boxes[:i])
+        assert one.x0 >= 0.0
+        assert one.x1 <= figure.bbox.x1 + 1.0
+
+
+def test_attitude_through_180_degrees_has_a_gap():
+    robot = fflin.load("cubesat")
+    motion = fflin.simulate(robot, v0=[0, 0, 0, 0, 0, 2.0], duration=2.0)
+    z = motion.plot().axes[0].get_lines()[2].get_ydata()
+    assert np.isnan(z).sum() == 1
+    assert np.nanmax(np.abs(np.diff(z))) < 0.1
+
+
+def test_pole_map_and_pattern(loop):
+    lin, gain, _ = loop
+    figure = fflin.plot_poles({"open": lin, "closed": gain})
+    shown = lines(figure.axes[0])["closed"]
+    np.testing.assert_array_equal(np.sort(shown.get_xdata()), np.sort(gain.poles.real))
+    sampled = fflin.plot_poles(lin.discretize(0.1))
+    assert sampled.axes[0].get_xlabel() == "real part"
+    assert len(sampled.axes[0].get_lines()) == 2  # with the unit circle
+
+    pattern = fflin.plot_matrices(lin)
+    left, right = pattern.axes[:2]
+    for axes, values, names in ((left, lin.A, lin.state_names), (right, lin.B, lin.input_names)):
+        image = axes.get_images()[0].get_array()
+        np.testing.assert_array_equal(np.ma.getmaskarray(np.ma.masked_invalid(image)), values == 0)
+        assert [label.get_text() for label in axes.get_xticklabels()] == list(names)
+
+
+def test_validity_shows_the_runs_and_the_order(tmp_path):
+    robot = fflin.load("cubesat")
+    lin = fflin.linearize(robot)
+    gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
+    found = fflin.validity(robot, lin, gain, attitude=170.0, samples=12)
+    figure = fflin.plot_validity(found, tmp_path / "validity.png")
+    left, right = figure.axes
+    curve = left.get_lines()[0]
+    known = np.isfinite(found.prediction_error)
+    np.testing.assert_allclose(curve.get_ydata(), 100.0 * found.prediction_error[known])
+    heights = [sum(bar.get_height() for bar in bars) for bars in right.containers]
+    assert heights == [found.settled, 12 - found.settled]
+    assert (tmp_path / "validity.png").exists()
+    with pytest.raises(fflin.InputError, match=r"expected what fflin\.validity returns"):
+        fflin.plot_validity(3)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".pdf", ".svg"])
+def test_figures_are_saved_whole(loop, tmp_path, suffix):
+    _, _, motion = loop
+    path = tmp_path / f"loop{suffix}"
+    motion.plot(path)
+    start = {".png": b"\x89PNG", ".pdf": b"%PDF", ".svg": b"<?xml"}[suffix]
+    assert path.read_bytes().startswith(start)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_bad_figures_are_refused(loop, tmp_path, monkeypatch):
+    _, _, motion = loop
+    with pytest.raises(fflin.FileError, match=r"ends in '\.bmp'"):
+        motion.plot(tmp_path / "loop.bmp")
+    with pytest.raises(fflin.InputError, match="expected a Motion"):
+        fflin.plot_motion(3)
+    with pytest.raises(fflin.InputError, match="expected numbers or a Gain"):
+        fflin.plot_poles("stable")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(fflin.MissingPackageError, match=r"pip install 'fflin\[plot\]'"):
+        motion.plot()
+    assert not list(tmp_path.iterdir())

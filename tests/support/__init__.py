@@ -1,0 +1,1 @@
+"""Robots, points, corpora and a browser that several tests share."""

@@ -1,0 +1,314 @@
+"""Files and pictures: written whole or not at all, and one line for what cannot be done."""
+
+import base64
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import fflin
+from fflin.commands.cli import main
+from fflin.view.playback import default_tool, frame_indices
+from tests.support.motions import settling
+from tests.support.patience import PATIENCE, wait_until
+
+needs_chromium = pytest.mark.skipif(not shutil.which("chromium"), reason="no chromium")
+
+
+@pytest.fixture(scope="module")
+def motion(robots):
+    return settling(robots["planar_detumble"], duration=4.0)
+
+
+def test_nothing_is_left_behind_by_bad_input(robots, motion, tmp_path):
+    robot = robots["planar_detumble"]
+    other = robots["ets_vii"]
+    page = tmp_path / "m.html"
+    for error, match, arguments in (
+        (fflin.FileError, "there is no folder", {"html": tmp_path / "no" / "m.html"}),
+        (fflin.FileError, "expected .html", {"html": tmp_path / "m.txt"}),
+        (fflin.FileError, "expected .png", {"html": page, "png": tmp_path / "m.gif"}),
+        (fflin.InputError, "scene is 'moon'", {"html": page, "scene": "moon"}),
+        (fflin.InputError, "fps is 0", {"html": page, "fps": 0}),
+        (fflin.InputError, "speed is -1", {"html": page, "speed": -1}),
+        (fflin.InputError, "is not a path", {"html": 3}),
+        (fflin.UnknownNameError, "no frame named 'tol'", {"html": page, "tool": "tol"}),
+        (
+            fflin.InputError,
+            r"target is no .* expected \(13,\)",
+            {"html": page, "target": np.zeros(3)},
+        ),
+    ):
+        with pytest.raises(error, match=match) as caught:
+            fflin.visualize(robot, motion, **arguments)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(fflin.InputError, match="one of 'planar_detumble', not of 'ets_vii'"):
+        fflin.visualize(other, motion, html=page)
+    alike = replace(motion, urdf_sha256="0" * 64, robot="another")
+    with pytest.raises(fflin.InputError, match="one of 'another', not of 'planar_detumble'"):
+        fflin.visualize(robot, alike, html=page)
+    with pytest.raises(fflin.InputError, match="expected a Motion"):
+        fflin.visualize(robot, "motion", html=page)
+    with pytest.raises(fflin.InputError, match="expected a fflin"):
+        fflin.visualize("ets_vii", html=page)
+    with pytest.raises(fflin.InputError, match="a file shows a motion"):
+        fflin.visualize(robot, html=page)
+    (tmp_path / "folder.html").mkdir()
+    with pytest.raises(fflin.FileError, match="is a folder"):
+        fflin.visualize(robot, motion, html=tmp_path / "folder.html")
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.html"]
+
+
+def test_a_robot_without_visuals_is_drawn_as_boxes_and_says_so(robots, tmp_path):
+    robot = fflin.from_model(robots["planar_detumble"].model, name="bare")
+    with pytest.warns(fflin.FflinWarning, match="bare: no visual geometry; drawn as boxes"):
+        fflin.visualize(robot, settling(robot, 1.0), html=tmp_path / "m.html")
+    assert (tmp_path / "m.html").is_file()
+    whole = robots["ets_vii"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fflin.visualize(whole, settling(whole, 1.0), html=tmp_path / "e.html")
+
+
+def test_frames_are_samples_of_the_motion():
+    t = np.linspace(0.0, 10.0, 1001)
+    shown = frame_indices(t, 30.0, 1.0)
+    assert shown[0] == 0 and shown[-1] == 1000 and len(shown) == 301
+    assert np.diff(t[shown]).max() < 1.0 / 30.0 + 0.011
+    assert len(frame_indices(t, 30.0, 10.0)) == 31
+    # Uneven times: each frame is the sample nearest to it.
+    rng = np.random.default_rng(0)
+    uneven = np.sort(rng.uniform(0, 10, 300))
+    for index, wanted in zip(
+        frame_indices(uneven, 1.0, 1.0),
+        np.linspace(uneven[0], uneven[-1], round(np.ptp(uneven)) + 1),
+        strict=True,
+    ):
+        assert abs(uneven[index] - wanted) == np.abs(uneven - wanted).min()
+    assert len(frame_indices(np.linspace(0, 36000, 360_001), 30, 1)) <= 3001
+    assert frame_indices(np.zeros(1), 30, 1).tolist() == [0]
+
+
+def test_the_tool_is_the_end_of_the_longest_chain(robots):
+    assert default_tool(robots["servicer_7dof"]) == "tool"
+    assert default_tool(robots["cubesat"]) is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        panda = fflin.load("panda", lock=["panda_finger_joint1"])
+    name = default_tool(panda)
+    assert panda.model.frames[panda.model.getFrameId(name)].parentJoint == panda.model.njoints - 1
+
+
+@needs_chromium
+def test_pictures(robots, motion, tmp_path):
+    robot = robots["planar_detumble"]
+    strip, film = tmp_path / "m.png", tmp_path / "m.gif"
+    assert fflin.visualize(robot, motion, png=strip, gif=film, speed=8) is None
+    with Image.open(strip) as image:
+        assert image.size == (4 * 640, 480)
+        frames = np.split(np.asarray(image.convert("RGB"), dtype=int), 4, axis=1)
+    for frame in frames:
+        assert (frame.max(axis=2) > 90).mean() > 0.02
+    assert (np.abs(frames[0] - frames[3]).max(axis=2) > 30).mean() > 0.01
+    with Image.open(film) as image:
+        assert image.n_frames == 6 and image.size == (640, 400)
+    with pytest.raises(fflin.InputError, match="times are"):
+        fflin.visualize(robot, motion, png=strip, times=[9.0])
+
+
+def test_without_chromium_one_line_says_how(robots, motion, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(fflin.MissingPackageError, match="apt install chromium") as caught:
+        fflin.visualize(robots["planar_detumble"], motion, png=tmp_path / "m.png")
+    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
+
+
+def test_a_chromium_that_does_not_answer_is_one_line(robots, motion, tmp_path, monkeypatch):
+    program = tmp_path / "chromium"
+    program.write_text("#!/bin/sh\nexec sleep 60\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("fflin.view.capture.find_chromium", lambda: str(program))
+    monkeypatch.setattr("fflin.view.capture._PATIENCE", 1.0)
+    with pytest.raises(fflin.FileError, match="does not answer"):
+        fflin.visualize(robots["planar_detumble"], motion, png=tmp_path / "m.png", times=[0.0])
+    assert not (tmp_path / "m.png").exists()
+
+
+def test_a_page_is_opened_where_no_file_is_named(robots, motion, monkeypatch):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    path = fflin.visualize(robots["planar_detumble"], motion)
+    assert opened == [path.as_uri()] and path.read_text().startswith("<!DOCTYPE html>")
+    path.unlink()
+    path = fflin.visualize(robots["planar_detumble"], motion, open=False)
+    path.unlink()
+    assert len(opened) == 1
+
+
+def test_names_of_robots_and_links_do_no_harm(robots, motion, tmp_path):
+    """A name with a script's end in it stays text."""
+    import pinocchio as pin
+
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "a/b </script><b>")
+    model.appendBodyToJoint(1, pin.Inertia.Random(), pin.SE3.Identity())
+    name = "</script><script>alert(1)</script>"
+    robot = fflin.from_model(model, name=name)
+    with pytest.warns(fflin.FflinWarning):
+        fflin.visualize(robot, settling(robot, 1.0), html=tmp_path / "m.html")
+    text = (tmp_path / "m.html").read_text()
+    assert "<script>alert" not in text and text.count("</script>") == 3
+
+
+def test_view_on_the_command_line(capsys, monkeypatch):
+    waited = []
+    monkeypatch.setattr(
+        "fflin.view.live.Live.wait", lambda self: (waited.append(self), self.close())
+    )
+    code = main(["view", "cubesat", "--no-open", "--rpy", "10", "0", "0"])
+    out, error = capsys.readouterr()
+    assert (code, out) == (0, "") and waited[0].url in error
+    np.testing.assert_allclose(waited[0].q[3], np.sin(np.radians(5.0)))
+    assert main(["view", "cubesat", "--no-open", "--port", "70000"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith("fflin: error: port is 70000")
+    assert main(["view", "cubesat", "--no-open", "--tool", "x"]) == 2
+
+
+def test_simulate_on_the_command_line(capsys, tmp_path, monkeypatch):
+    page = tmp_path / "loop.html"
+    command = ["simulate", "cubesat", "--rpy", "30", "0", "0", "--duration", "5"]
+    assert main([*command, "--html", str(page), "--scene", "lab", "--fps", "10", "--follow"]) == 0
+    assert f"wrote {page}: " in capsys.readouterr().out
+    text = page.read_text()
+    assert '<body class="lab motion">' in text and '"follow":true' in text
+    data = json.loads(text.partition('id="data">')[2].partition("</script>")[0])
+    times = np.frombuffer(base64.b64decode(data["t"]), dtype="<f4")
+    np.testing.assert_allclose(times, np.linspace(0, 5, 51), atol=6e-3)
+    assert [entry["label"] for entry in data["legend"]][-2:] == ["target", "linear model"]
+    # What cannot be written is told before anything is simulated.
+    monkeypatch.setattr(
+        "fflin.simulation.simulate.simulate", lambda *_, **__: pytest.fail("simulated")
+    )
+    assert main([*command, "--html", str(tmp_path / "no" / "m.html")]) == 2
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert main([*command, "--png", str(tmp_path / "m.png")]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2 and "no folder" in lines[0] and "apt install chromium" in lines[1]
+    page = ["--html", str(tmp_path / "m.html"), "-o", str(tmp_path / "m.npz")]
+    (tmp_path / "folder.html").mkdir()
+    for wrong, message in (
+        (["--fps", "0"], "fps is 0"),
+        (["--fps", "1e6"], "fps is 1e+06"),
+        (["--speed", "-1"], "speed is -1"),
+        (["--tool", "tol"], "no frame named 'tol'"),
+        (["--times", "9"], "times are [9.0], expected some from 0 to 5 s"),
+        (["--html", str(tmp_path / "folder.html")], "is a folder"),
+    ):
+        assert main([*command, *page, *wrong]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert message in line
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert left == ["folder.html", "loop.html"]
+
+
+@needs_chromium
+def test_films(robots, motion, tmp_path, monkeypatch):
+    """Whenever a motion begins all of it is shown, and nothing is left behind."""
+    folder = tmp_path / "t"  # a longer path is too long for Chromium's sockets
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    monkeypatch.setenv("TMPDIR", str(folder))
+    later = replace(motion, t=motion.t + 100.0)
+    fflin.visualize(robots["planar_detumble"], later, gif=tmp_path / "m.gif", speed=8.0)
+    with Image.open(tmp_path / "m.gif") as image:
+        first = np.asarray(image.convert("RGB"), dtype=int)
+        image.seek(image.n_frames - 1)
+        last = np.asarray(image.convert("RGB"), dtype=int)
+    assert (np.abs(first - last).max(axis=2) > 30).mean() > 0.01
+    assert not list(folder.iterdir())
+
+
+@needs_chromium
+@pytest.mark.skipif(not shutil.which("setpriv"), reason="no setpriv")
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+def test_the_browser_ends_with_the_one_who_films(tmp_path, sent, code):
+    """At once, and not when the film is done."""
+    folder = Path(tempfile.mkdtemp(dir="/tmp"))  # Chromium's sockets need a short name
+    # A film that takes minutes, so that a machine that is busy for seconds makes no difference.
+    command = ["simulate", "cubesat", "--rpy", "10", "0", "0", "--duration", "300"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "fflin", *command, "--gif", str(tmp_path / "m.gif")],
+        env={**os.environ, "TMPDIR": str(folder)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    browsing = f"--user-data-dir={folder}".encode()
+    try:
+        wait_until(lambda: list(folder.glob("*/DevToolsActivePort")))
+        assert running(browsing)
+        process.send_signal(sent)
+        _, error = process.communicate(timeout=PATIENCE)
+        assert process.returncode == code and "Traceback" not in error
+        wait_until(lambda: not running(browsing))
+        assert not (tmp_path / "m.gif").exists()
+        assert sent == signal.SIGKILL or not list(folder.iterdir())
+    finally:
+        process.kill()
+        process.communicate()
+        # What dies of a signal may still write for a moment.
+        wait_until(lambda: removed(folder))
+
+
+def removed(folder):
+    shutil.rmtree(folder, ignore_errors=True)
+    return not folder.exists()
+
+
+def test_files_are_written_even_where_nobody_reads_what_is_said(tmp_path):
+    page = tmp_path / "m.html"
+    command = ["simulate", "cubesat", "--rpy", "10", "0", "0", "--duration", "1"]
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "wb") as closed:
+        done = subprocess.run(
+            [sys.executable, "-u", "-m", "fflin", *command, "--html", str(page)],
+            stdout=closed,
+            stderr=subprocess.PIPE,
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == (0, b"") and page.is_file()
+
+
+def running(argument):
+    """Whether a process has an argument that begins so."""
+    for file in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            if any(each.startswith(argument) for each in file.read_bytes().split(b"\0")):
+                return True
+    return False
+
+
+def test_a_name_that_is_no_files_name_does_no_harm(robots, monkeypatch):
+    robot = fflin.from_model(robots["planar_detumble"].model, name="../a/b \u2603" * 99)
+    with pytest.warns(fflin.FflinWarning, match="boxes"):
+        path = fflin.visualize(robot, settling(robot, 1.0), open=False)
+    path.unlink()
+    assert path.name.startswith("fflin-_a_b_")
+
+
+def test_assets_are_part_of_the_package():
+    names = {path.name for path in Path(fflin.__file__).parent.joinpath("assets").iterdir()}
+    assert {"page.html", "style.css", "main.js", "sky.js"} <= names

@@ -1,0 +1,281 @@
+"""The live page: only of this machine, ends with its process, keeps up, and moves as told."""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from fflin.robot.robot import ROOT
+from tests.support.browser import Watched, chromium
+from tests.support.patience import PATIENCE, wait_until
+
+
+@pytest.fixture
+def live(robots):
+    with fflin.visualize(robots["ets_vii"], open=False) as live:
+        yield live
+
+
+def websocket(live, origin=None, host=None):
+    from tornado.httpclient import HTTPRequest
+    from tornado.websocket import websocket_connect
+
+    headers = {"Origin": origin or live.url.rstrip("/")}
+    if host:
+        headers["Host"] = host
+    url = live.url.replace("http", "ws") + "socket"
+    return websocket_connect(HTTPRequest(url, headers=headers))
+
+
+async def state(connection):
+    """Return the next state, past the commands that build the scene."""
+    while True:
+        message = await asyncio.wait_for(connection.read_message(), PATIENCE)
+        assert message is not None
+        if isinstance(message, str):
+            return json.loads(message)
+
+
+def addresses():
+    """This machine's addresses other than loopback."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(("192.0.2.1", 9))  # sends nothing
+        yield probe.getsockname()[0]
+    yield "127.0.0.2"
+
+
+def test_it_is_reached_by_loopback_alone(live):
+    assert live.url == f"http://127.0.0.1:{live.port}/"
+    assert b"<title>ets_vii</title>" in urllib.request.urlopen(live.url).read()
+    for address in addresses():
+        with pytest.raises(OSError):
+            socket.create_connection((address, live.port), 1.0).close()
+
+
+def test_pages_of_other_sites_get_nothing(live):
+    request = urllib.request.Request(live.url, headers={"Host": "evil.example"})
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(request)
+
+    async def refused(**fields):
+        from tornado.httpclient import HTTPClientError
+
+        with pytest.raises(HTTPClientError, match="403"):
+            await websocket(live, **fields)
+
+    asyncio.run(refused(origin="http://evil.example"))
+    asyncio.run(refused(host="evil.example"))
+
+
+def test_it_survives_a_thousand_reconnects(live):
+    def count():
+        return len(os.listdir("/proc/self/fd")) if os.path.isdir("/proc/self/fd") else 0
+
+    async def reconnect():
+        for index in range(1000):
+            connection = await websocket(live)
+            if index % 100 == 0:
+                assert len((await state(connection))["poses"]) == 7
+            connection.close()
+            while await connection.read_message() is not None:
+                pass
+
+    before = count()
+    asyncio.run(reconnect())
+    wait_until(lambda: not live._server.clients)
+    assert count() <= before + 5
+    assert urllib.request.urlopen(live.url).status == 200
+
+
+def test_it_sends_where_the_robot_is_and_takes_the_sliders(live, robots):
+    robot = robots["ets_vii"]
+
+    async def play():
+        connection = await websocket(live)
+        first = await state(connection)
+        await connection.write_message(json.dumps({"joints": {"joint_2": 0.7}}))
+        second = await state(connection)
+        for nonsense in ("", "{", "[]", '{"joints": {"none": 1}}', '{"joints": {"joint_2": "x"}}'):
+            await connection.write_message(nonsense)
+        await connection.write_message(json.dumps({"neutral": True}))
+        third = await state(connection)
+        connection.close()
+        while await connection.read_message() is not None:
+            pass
+        return first, second, third
+
+    first, second, third = asyncio.run(play())
+    assert first["joints"] == third["joints"] == [0.0] * 6
+    np.testing.assert_allclose(second["joints"], [0, 0.7, 0, 0, 0, 0])
+    q = fflin.configuration(robot, {"joint_2": 0.7})
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, q)
+    for pose, placement in zip(second["poses"], list(data.oMi)[ROOT:], strict=True):
+        assert pin.XYZQUATToSE3(np.array(pose)).isApprox(placement, 1e-6)
+    inertia = fflin.linearize(robot, q).M
+    scale = np.sqrt(np.diag(inertia))
+    coupling = np.reshape(second["coupling"], inertia.shape)
+    np.testing.assert_allclose(coupling, inertia / np.outer(scale, scale), atol=1e-4)
+
+
+@pytest.mark.parametrize("opening", ["[", '{"joints":', '{"joints": {"joint_2": ['])
+def test_what_is_nested_too_deep_ends_its_connection_alone(opening, live, caplog):
+    async def play():
+        connection, other = await websocket(live), await websocket(live)
+        await connection.write_message(opening * 100_000)
+        while await asyncio.wait_for(connection.read_message(), 60.0) is not None:
+            pass
+        await state(other)
+        await other.write_message(json.dumps({"joints": {"joint_2": 10**400}}))  # passed over
+        await other.write_message(json.dumps({"joints": {"joint_2": 0.5}}))
+        after = await state(other)
+        for each in (connection, other):
+            each.close()
+        return connection.close_code, connection.close_reason, after
+
+    code, reason, after = asyncio.run(play())
+    assert (code, reason) == (1008, "nested too deep")
+    assert after["joints"][1] == 0.5
+    assert not caplog.records
+
+
+def test_a_running_simulation_is_shown_as_it_runs(robots):
+    robot = robots["planar_detumble"]
+    v = fflin.velocity(robot, {"omega_b.z": 0.3})
+    seen = []
+    with fflin.visualize(robot, open=False, speed=4.0) as live:
+        show = live.show
+        live.show = lambda q, t: (seen.append((t, q.copy(), time.monotonic())), show(q, t))
+        begun = time.monotonic()
+        motion = fflin.simulate(robot, v0=v, duration=2.0, callback=live)
+        assert json.loads(live._server.state)["time"] == pytest.approx(2.0)
+    assert [t for t, _, _ in seen] == motion.t.tolist()
+    assert (np.array([q for _, q, _ in seen]) == motion.q).all()
+    for t, _, when in seen:  # a quarter of a second for each second
+        assert when - begun > t / 4.0 - 1e-6
+    with pytest.raises(fflin.InputError, match="speed is 0"):
+        fflin.visualize(robot, open=False, speed=0)
+
+
+def test_a_slow_browser_gets_the_newest_state_and_not_all(live, robots):
+    """What waits for one that reads nothing stays small, and ends with the last state."""
+    robot = robots["ets_vii"]
+    q = robot.neutral()
+    with socket.create_connection(("127.0.0.1", live.port)) as slow:
+        host = f"127.0.0.1:{live.port}"
+        lines = ["GET /socket HTTP/1.1", f"Host: {host}", f"Origin: http://{host}"]
+        lines += ["Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13"]
+        lines += ["Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "", ""]
+        slow.sendall("\r\n".join(lines).encode())
+        wait_until(lambda: live._server.clients)
+        last = 20_000
+        for k in range(last + 1):
+            live.show(q, k)
+        total = last * len(live._server.state)
+        slow.settimeout(PATIENCE)
+        final = live._server.state.encode()
+        assert json.loads(final)["time"] == last
+        received, tail = 0, b""
+        while tail != final:
+            chunk = slow.recv(2**20)
+            assert chunk, "it ended before the last state"
+            received += len(chunk)
+            tail = (tail + chunk)[-len(final) :]
+    assert received < total / 2
+
+
+def test_an_occupied_port_is_one_line(live, robots):
+    with pytest.raises(fflin.InputError, match=f"port {live.port} cannot be had"):
+        fflin.visualize(robots["ets_vii"], open=False, port=live.port)
+    for port in (-1, 65536, "8000", True):
+        with pytest.raises(fflin.InputError, match="port is"):
+            fflin.visualize(robots["ets_vii"], open=False, port=port)
+
+
+def test_it_ends_with_close_and_leaves_no_thread(robots):
+    before = threading.active_count()
+    live = fflin.visualize(robots["cubesat"], open=False)
+    live.close()
+    live.close()
+    assert threading.active_count() == before
+    with pytest.raises(OSError):
+        socket.create_connection(("127.0.0.1", live.port), 1.0).close()
+    live.show(robots["cubesat"].neutral())  # nobody watches
+
+
+PROGRAM = """
+import fflin
+live = fflin.visualize(fflin.load("cubesat"), open=False)
+server = live._server._thread
+join = server.join
+def say_that_it_waits(*seconds):
+    server.join = join
+    print(live.port, flush=True)
+    join(*seconds)
+server.join = say_that_it_waits
+live.wait()
+"""
+
+
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_nothing_is_left_when_its_process_is_killed(ending):
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    port = int(process.stdout.readline())
+    assert urllib.request.urlopen(f"http://127.0.0.1:{port}/").status == 200
+    process.send_signal(ending)
+    out, error = process.communicate(timeout=PATIENCE)
+    if ending == signal.SIGINT:  # Ctrl-C is the way to end it
+        assert (process.returncode, out, error) == (0, "", "")
+    with pytest.raises(OSError):
+        socket.create_connection(("127.0.0.1", port), 1.0).close()
+    with pytest.raises(ProcessLookupError):  # nobody of its session is left
+        os.killpg(process.pid, 0)
+
+
+def test_the_page_follows_in_a_browser(live, robots):
+    robot = robots["ets_vii"]
+    with chromium() as browser:
+        watched = Watched(browser, live.url)
+        watched.page.wait_for_function("fflin.state !== null")
+        assert watched.page.locator("#panel input[type=range]").count() == robot.n
+        still = watched.picture()
+        slider = watched.page.locator("#panel input[type=range]").nth(1)
+        assert slider.bounding_box()["width"] > 80  # enough to aim with
+        slider.fill("1.25")
+        watched.page.wait_for_function("fflin.state.joints[1] === 1.25")
+        assert live.robot.joint("joint_2").value(live.q) == pytest.approx(1.25)
+        q = fflin.configuration(robot, {"joint_1": 0.3, "joint_4": -0.5})
+        live(0.25, q)
+        watched.page.wait_for_function("fflin.state.time === 0.25")
+        data = robot.model.createData()
+        pin.forwardKinematics(robot.model, data, q)
+        for name, placement in zip(list(robot.model.names)[ROOT:], data.oMi[ROOT:], strict=True):
+            pose = watched.pose(["meshcat", "robot", name])
+            assert pin.XYZQUATToSE3(np.array(pose)).isApprox(placement, 1e-6)
+        watched.drawn()
+        moved = watched.picture()
+        assert (np.abs(moved - still).max(axis=2) > 30).mean() > 1e-3
+        assert not watched.errors
+        host = live.url.rstrip("/").partition("://")[2]
+        assert all(url.partition("://")[2].startswith(host) for url in watched.requests)
+        live.close()
+        watched.page.wait_for_selector("#problem:not([hidden])")
