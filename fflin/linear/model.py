@@ -84,6 +84,8 @@ class LinearModel:
         "joint=value" [rad|m] of the joints that are welded in it.
     fflin_version, pinocchio_version : str
         What made the model.
+    verified : bool
+        Whether it is as it was made; False of a file that has no digest to tell damage by.
     """
 
     A: Array
@@ -118,6 +120,7 @@ class LinearModel:
     # Of a sampled model: its own fingerprint and the continuous model that it was made of, whose
     # structure no exponential has blurred.
     _source: tuple[str, LinearModel] | None = None
+    verified: bool = True
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -154,6 +157,11 @@ class LinearModel:
         nx, nu = self.B.shape
         time = f"dt={self.dt:g} s" if self.dt else "continuous"
         return f"LinearModel('{self.robot}', nx={nx}, nu={nu}, frame='{self.frame}', {time})"
+
+    def __str__(self) -> str:
+        from fflin.base.record import NOT_VERIFIED
+
+        return repr(self) if self.verified else f"{self!r}\n{NOT_VERIFIED}"
 
     @property
     def reference(self) -> pin.SE3:
@@ -325,11 +333,13 @@ class LinearModel:
         ------
         FileError
             If the ending is another or the file cannot be written.
+        InputError
+            If a figure is not finite.
         """
         from fflin.base.writing import as_path
-        from fflin.linear.files import save_model
+        from fflin.linear.files import record_of, write_model
 
-        save_model(self, as_path(path))
+        write_model(as_path(path), record_of(self))
 
     @staticmethod
     def load(path: str | Path) -> LinearModel:
@@ -338,12 +348,19 @@ class LinearModel:
         Raises
         ------
         FileError
-            If the file cannot be read or is not such a model.
+            If the file cannot be read, is damaged or is not such a model.
         """
         from fflin.base.writing import as_path
-        from fflin.linear.files import load_model
+        from fflin.linear.files import read_model
 
-        return load_model(as_path(path))
+        values, certificate = read_model(as_path(path))
+        given: Any = partial(_given, Certificate(**certificate))
+        lin = LinearModel(**values, _certify=given)
+        return replace(lin, _certify=partial(_same_certificate, lin, lin.fingerprint))
+
+
+def _given(certificate: Certificate, _: LinearModel) -> Certificate:
+    return certificate
 
 
 def _same_M(continuous: LinearModel, _: LinearModel) -> Array:
