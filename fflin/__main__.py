@@ -1,7 +1,24 @@
-"""Run the command line as ``python -m fflin``."""
+"""Run the command line, as ``fflin`` and as ``python -m fflin``."""
 
+import signal
 import sys
 
-from fflin.commands.cli import main
+from fflin.commands.interruption import leave, listen
 
-sys.exit(main())
+
+def main() -> int:
+    """Run the command line on the arguments of this process, and return its exit code."""
+    listen()
+    try:
+        from fflin.commands import cli
+
+        code = cli.main()
+    except KeyboardInterrupt as reason:
+        leave(reason)
+    # All is done and said.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

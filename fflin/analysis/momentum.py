@@ -10,11 +10,14 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.analysis.mechanics import checked, conserved
-from fflin.base.errors import InputError, unknown
+from fflin.analysis.names import undecided
+from fflin.analysis.ranks import Margin
+from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
 from fflin.linear.model import Certificate, LinearModel
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.frames import frame_index
+from fflin.robot.robot import Robot
 
 # f0 outside of what the reduced state can follow, relative to f0.
 _DRIFT = 1e-9
@@ -37,12 +40,18 @@ class ReducedModel(LinearModel):
         Rows L1: what is conserved, and zero in the reduced model.
     coordinates : ndarray (k, nx)
         Rows L2: what drifts at the rate of L1, and is held at zero in the reduced model.
+    margin : Margin
+        Distance from doubt of the decision on what is conserved: far above 1, far below 1.
+    notes : tuple of str
+        What is undecided.
     """
 
     T: Array
     S: Array
     momenta: Array
     coordinates: Array
+    margin: Margin
+    notes: tuple[str, ...]
 
 
 def momentum_reduction(lin: LinearModel) -> ReducedModel:
@@ -110,9 +119,19 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
         "_drift": None if lin._drift is None else lin._drift[z],
         "_inertia": partial(_given, M),
     }
-    reduced = ReducedModel(**values, T=T, S=S, momenta=held.momenta, coordinates=held.coordinates)
-    certify = partial(_same_certificate, lin, reduced.fingerprint)
-    return replace(reduced, _certify=certify)
+    reduced = ReducedModel(
+        **values,
+        T=T,
+        S=S,
+        momenta=held.momenta,
+        coordinates=held.coordinates,
+        margin=held.margin,
+        notes=undecided(lin, held.margin, "kept by the reduction", len(z)),
+    )
+    fingerprint, source = reduced.fingerprint, lin.generator
+    certify = partial(_same_certificate, lin, fingerprint)
+    of = (fingerprint, momentum_reduction(source)) if lin.dt and source is not None else None
+    return replace(reduced, _certify=certify, _source=of)
 
 
 def generalized_inertia(lin: LinearModel) -> Array:
@@ -180,15 +199,7 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
     state = StateMap(robot)
     q = robot.neutral() if q is None else robot.checked_configuration(q)
     model, data = robot.model, robot.create_data()
-    known = [item.name for item in model.frames.tolist() if item.parentJoint >= ROOT]
-    if frame not in known:
-        raise unknown("frame", str(frame), known)
-    axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-    index = next(
-        i
-        for i, item in enumerate(model.frames.tolist())
-        if item.name == frame and item.parentJoint >= ROOT
-    )
+    index, axes = frame_index(model, frame), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     full = pin.computeFrameJacobian(model, data, q, index, axes)
     J = state.columns(np.vstack((full[LINEAR], full[ANGULAR])))
     M = state.project(pin.crba(model, data, q).T)

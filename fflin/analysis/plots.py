@@ -10,7 +10,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, saved, styled, target_of
-from fflin.base.validation import Array
+from fflin.base.validation import Array, number
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
@@ -44,19 +44,19 @@ def plot_poles(
     MissingPackageError, FileError
         As in `plot_motion`.
     """
-    target = target_of(path)
+    target, dt = target_of(path), number("dt", dt)
     sets = poles if isinstance(poles, dict) else {"": poles}
     with styled() as figure_class:
         figure = figure_class(figsize=(5.5, 5.0), layout="constrained")
         axes = figure.add_subplot()
-        for number, (label, given) in enumerate(sets.items()):
+        for place, (label, given) in enumerate(sets.items()):
             values, own_dt = _poles_of(given)
             dt = own_dt or dt
             axes.plot(
                 values.real,
                 values.imag,
-                "x" if number == 0 else "+",
-                color=COLORS[number % len(COLORS)],
+                "x" if place == 0 else "+",
+                color=COLORS[place % len(COLORS)],
                 label=label or None,
             )
         if dt:
@@ -208,6 +208,9 @@ def _poles_of(given: Any) -> tuple[Any, float]:
     if hasattr(given, "poles"):
         return np.asarray(given.poles), float(getattr(given, "dt", 0.0))
     try:
-        return np.atleast_1d(np.asarray(given, dtype=complex)).ravel(), 0.0
-    except (TypeError, ValueError):
-        raise InputError(f"poles is a {type(given).__name__}, expected numbers or a Gain") from None
+        poles = np.asarray(given)
+    except ValueError:
+        poles = np.asarray(None)  # its rows differ in length
+    if poles.dtype.kind not in "fiuc" or not np.isfinite(poles).all():
+        raise InputError(f"poles is a {type(given).__name__}, expected finite numbers or a Gain")
+    return poles.ravel(), 0.0

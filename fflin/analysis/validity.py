@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import textwrap
 from collections import Counter
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, as_completed
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -12,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from fflin.analysis.closed_loop import SETTLED, Loop
-from fflin.base.errors import InputError
+from fflin.base.errors import FflinError, InputError
 from fflin.base.tables import width
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, as_double, number, whole
 from fflin.dynamics.actuation import Actuation
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -26,6 +27,9 @@ _DIRECTIONS = 4
 # Time constants of the slowest pole over which the prediction is measured, and of a run.
 _FORESIGHT, _PATIENCE = 3.0, 3.0
 _STEPS = 60
+
+# Random runs at most, and displacement [m], [rad].
+_MOST, _FARTHEST = 1_000_000, 1e6
 
 # Relative error of the integration, and prediction errors too small to be told from it.
 _PRECISION, _ROUNDING = 1e-9, 1e-7
@@ -134,6 +138,7 @@ def validity(
     seed: int = 0,
     confidence: float = 0.95,
     executor: Executor | None = None,
+    progress: Callable[[int, int], object] | None = None,
 ) -> Validity:
     """Measure how far from its point a linear model can be trusted, and its loop holds.
 
@@ -161,6 +166,8 @@ def validity(
         Of the intervals.
     executor : concurrent.futures.Executor, optional
         Runs them in parallel, such as a ProcessPoolExecutor.
+    progress : callable, optional
+        ``progress(done, total)`` is called with the number of runs, random or not, as they end.
 
     Returns
     -------
@@ -171,6 +178,8 @@ def validity(
     InputError
         If the linear loop is unstable, the point is no fixed point, or an argument has a wrong
         size or value.
+    FflinError
+        If a process of the executor died.
 
     References
     ----------
@@ -180,7 +189,7 @@ def validity(
     loop = _checked(robot, lin, gain)
     largest = {"attitude": attitude, "position": position, "joint": joint}
     largest = {key: number(key, value) for key, value in largest.items()}
-    samples, seed = _count("samples", samples, 1), _count("seed", seed, 0)
+    samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = number("confidence", confidence)
     if not 0.0 < confidence < 1.0:
         raise InputError(f"confidence is {confidence:g}, expected a share between 0 and 1")
@@ -188,6 +197,11 @@ def validity(
         raise InputError(
             f"the displacements are {shown(largest)}; expected none negative, and an attitude "
             "below 175 deg, where the chart ends"
+        )
+    if max(largest.values()) > _FARTHEST:
+        raise InputError(
+            f"the displacements are {shown(largest)}; expected none beyond {_FARTHEST:g}, where no "
+            "loop settles"
         )
     there = {name.partition(".")[0] for name in lin.state_names}
     groups = {"attitude": "q_b", "position": "r_b", "joint": "q_m"}
@@ -199,16 +213,23 @@ def validity(
     # Of each run its own stream, so that it does not matter who does which.
     streams = np.random.SeedSequence(seed).spawn(samples + _DIRECTIONS)
     levels = (np.arange(samples) + 0.5) / samples
-    each: Any = map
     if executor is not None and not isinstance(executor, Executor):
         raise InputError(
             f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
         )
-    if executor:
-        each = partial(executor.map, chunksize=1 + samples // 16)
-    errors = np.array(list(each(partial(_foreseen, loop, largest), streams[:_DIRECTIONS])))
-    outcomes = tuple(each(partial(_outcome, loop, largest), levels, streams[_DIRECTIONS:]))
-    worst = errors.max(axis=0)
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
+    runs: list[Callable[[], Any]] = [
+        *(partial(_foreseen, loop, largest, stream) for stream in streams[:_DIRECTIONS]),
+        *map(partial(partial, _outcome, loop, largest), levels, streams[_DIRECTIONS:]),
+    ]
+    found: list[Any] = [None] * len(runs)
+    for done, (index, result) in enumerate(_each(runs, executor), 1):
+        found[index] = result
+        if progress:
+            progress(done, len(runs))
+    worst = np.array(found[:_DIRECTIONS]).max(axis=0)
+    outcomes = tuple(found[_DIRECTIONS:])
     failed = [i for i, outcome in enumerate(outcomes) if outcome != "settled"]
     inside = failed[0] if failed else samples
     settled = outcomes.count("settled")
@@ -230,13 +251,26 @@ def validity(
     )
 
 
+def _each(runs: list[Callable[[], Any]], executor: Executor | None) -> Iterator[tuple[int, Any]]:
+    """Yield the number and the result of each run as it ends."""
+    if executor is None:
+        yield from ((index, run()) for index, run in enumerate(runs))
+        return
+    futures = {executor.submit(run): index for index, run in enumerate(runs)}
+    try:
+        for future in as_completed(futures):
+            yield futures.pop(future), future.result()
+    except BrokenExecutor as error:
+        raise FflinError(f"a process that did the runs died: {error}") from None
+    finally:
+        for future in futures:
+            future.cancel()
+
+
 def _checked(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
         raise InputError("expected a fflin.Robot, its fflin.LinearModel and a gain")
-    try:
-        K = np.array(getattr(gain, "K", gain), dtype=float)
-    except (TypeError, ValueError):
-        raise InputError("gain is neither a fflin.Gain nor a matrix of numbers") from None
+    K = as_double("gain", getattr(gain, "K", gain))
     if K.shape != lin.B.T.shape or not np.isfinite(K).all():
         raise InputError(f"K has shape {K.shape}, expected {lin.B.T.shape} of finite numbers")
     loop = Loop(robot, lin, K)
@@ -252,12 +286,6 @@ def _checked(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
             "design the gain with fflin.lqr"
         )
     return loop
-
-
-def _count(name: str, value: Any, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise InputError(f"{name} is {value!r}, expected a whole number of at least {least}")
-    return int(value)
 
 
 def _times(loop: Loop, horizon: float) -> Array:

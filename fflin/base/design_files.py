@@ -6,7 +6,7 @@ import io
 import json
 import zipfile
 import zlib
-from dataclasses import Field, fields
+from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any, TypeVar
@@ -74,7 +74,9 @@ def load_design(cls: type[Kind], path: str | Path) -> Kind:
         record = reader(content)
         if _text(record["kind"]) != name:
             raise ValueError(f"it is a {_text(record['kind'])}")
-        return cls(**{field.name: _value(cls, field, record) for field in fields(cls)})
+        # What has a default came later than some files.
+        told = [f for f in fields(cls) if f.name in record or f.default_factory is MISSING]
+        return cls(**{field.name: _value(cls, field, record) for field in told})
     except _UNREADABLE as error:
         raise FileError(f"{source}: not a {name} saved by fflin ({error})") from None
 

@@ -5,7 +5,10 @@ from typing import Any
 
 
 class FflinError(Exception):
-    """Base of every error that a public call of fflin raises on purpose."""
+    """Base of every error that a public call of fflin raises on purpose; reads as one line."""
+
+    def __str__(self) -> str:
+        return " ".join(line.strip() for line in super().__str__().splitlines())
 
 
 class InputError(FflinError, ValueError):
@@ -41,11 +44,27 @@ class EquilibriumError(FflinError, ValueError):
 
 
 class StabilizabilityError(FflinError, ValueError):
-    """The inputs cannot hold what does not settle by itself."""
+    """The inputs cannot hold what does not settle by itself.
+
+    Attributes
+    ----------
+    margin : Margin or None
+        Distance from doubt of the decisions behind it; None where they were not made.
+    """
+
+    margin: Any = None
 
 
 class DetectabilityError(FflinError, ValueError):
-    """The outputs do not show what does not settle by itself."""
+    """The outputs do not show what does not settle by itself.
+
+    Attributes
+    ----------
+    margin : Margin or None
+        Distance from doubt of the decisions behind it; None where they were not made.
+    """
+
+    margin: Any = None
 
 
 class MissingPackageError(FflinError, ImportError):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -62,11 +61,16 @@ class styled:
 
 
 def require_matplotlib() -> None:
-    """Raise `MissingPackageError` where matplotlib is not installed."""
-    if importlib.util.find_spec("matplotlib") is None:
+    """Raise `MissingPackageError` where matplotlib is not installed or cannot be loaded."""
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError:
         raise MissingPackageError(
             "figures need matplotlib; install it with: pip install 'fflin[plot]'"
-        )
+        ) from None
+    except ValueError as error:  # of the environment's MPLBACKEND, or of a settings file
+        said = str(error).partition(";")[0]
+        raise MissingPackageError(f"matplotlib cannot be loaded: {said}; mend MPLBACKEND") from None
 
 
 def check_figure_format(path: Path) -> None:

@@ -10,27 +10,26 @@ _INTERVAL = 0.1
 
 
 class Progress:
-    """A bar of so many steps; `shown` None shows it on a terminal, once the run takes long."""
+    """A bar; `shown` None shows it on a terminal, once the run takes long."""
 
-    def __init__(self, total: int, shown: bool | None = None) -> None:
+    def __init__(self, shown: bool | None = None) -> None:
         terminal = sys.stderr is not None and sys.stderr.isatty()
-        self._total = total
         self._shown = terminal if shown is None else shown
         self._start = time.monotonic()
         self._next = self._start + (_PATIENCE if shown is None else 0.0)
         self._drawn = False
 
-    def update(self, done: int) -> None:
-        """Say how many steps are done."""
+    def update(self, done: int, total: int) -> None:
+        """Say how many steps of how many are done."""
         if not self._shown or (now := time.monotonic()) < self._next:
             return
         self._next = now + _INTERVAL
-        share = done / self._total
+        share = done / total
         left = (now - self._start) * (1.0 - share) / share
         bar = "#" * round(30 * share)
+        self._drawn = True
         print(f"\r[{bar:<30}] {share:4.0%}, {left:.0f} s left ", end="", file=sys.stderr)
         sys.stderr.flush()
-        self._drawn = True
 
     def close(self) -> None:
         """Take the bar away."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -64,6 +65,7 @@ def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
 
 def number(name: str, value: Any) -> float:
     """Return a finite float, or raise `InputError` that says what was given."""
+    refuse_masked(name, value)
     try:
         result = float(value)
     except (TypeError, ValueError, OverflowError):
@@ -71,6 +73,44 @@ def number(name: str, value: Any) -> float:
     if not math.isfinite(result):
         raise InputError(f"{name} is {result}, expected a finite number")
     return result
+
+
+def refuse_masked(name: str, value: Any) -> None:
+    """Raise `InputError` where an entry is masked, which NumPy makes NaN or takes as it is."""
+    if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
+        raise InputError(f"{name} has masked entries; fill them first")
+
+
+def truth(name: str, value: Any) -> bool:
+    """Return whether a switch is on, or raise `InputError` where it is no True or False."""
+    if not isinstance(value, bool | np.bool_ | int):
+        raise InputError(f"{name} is a {type(value).__name__}, expected True or False")
+    return bool(value)
+
+
+def whole(name: str, value: Any, least: int, largest: int = 2**63 - 1) -> int:
+    """Return a whole number within limits, or raise `InputError` that says what was given."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
+        raise InputError(f"{name} is {value!r}, expected a whole number from {least} on")
+    if not least <= value <= largest:
+        bound = f"from {least} on" if value < least else f"of at most {largest:,}"
+        raise InputError(f"{name} is {value}, expected a whole number {bound}")
+    return int(value)
+
+
+def by_name(name: str, value: Any, of_what: str) -> Mapping[str, Any]:
+    """Return a mapping whose keys are names, or raise `InputError`."""
+    if not isinstance(value, Mapping):
+        raise InputError(f"{name} is a {type(value).__name__}, expected {{{of_what}: value}}")
+    return value
+
+
+def dimension(name: str, value: Any) -> int:
+    """Return how many indices an array has, or raise `InputError` where it is none."""
+    try:
+        return np.ndim(value)
+    except ValueError:
+        raise InputError(f"{name} is not an array: its rows differ in length") from None
 
 
 def placement(name: str, value: Any) -> pin.SE3:
@@ -93,8 +133,7 @@ def placement(name: str, value: Any) -> pin.SE3:
 
 def as_double(name: str, value: ArrayLike) -> Array:
     """Return a new array of native floats, or raise `InputError` where it is none of numbers."""
-    if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
-        raise InputError(f"{name} has masked entries; fill them first")
+    refuse_masked(name, value)
     try:
         array = np.asarray(value)
     except ValueError:

@@ -9,9 +9,10 @@ from concurrent.futures import (
     CancelledError,
     Executor,
     Future,
+    ProcessPoolExecutor,
     wait,
 )
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from fflin.base.errors import FflinError
 from fflin.batch.chunks import Chunk, ChunkJob, Parcel, Points, packed, work
@@ -22,6 +23,9 @@ _ATTEMPTS = 3
 
 # Chunks that wait at each worker, so that none stands idle.
 _QUEUED = 2
+
+# How long nothing is finished before the workers are looked at [s].
+_GLANCE = 1.0
 
 # Of an executor that does not say how many workers it has.
 _UNKNOWN_WORKERS = 16
@@ -104,17 +108,24 @@ class _WorkPlace:
         """Wait for a chunk and yield what is finished."""
         if not self.running:
             return
-        for future in wait(self.running, return_when=FIRST_COMPLETED).done:
+        pool = self._workers if isinstance(self._workers, ProcessPoolExecutor) else None
+        hung = False
+        while not (done := wait(self.running, _GLANCE if pool else None, FIRST_COMPLETED).done):
+            assert pool is not None
+            if hung:
+                _break(pool)
+            hung = _lost_a_worker(pool)
+        for future in done:
             span = self.running.pop(future)
             try:
                 chunk = future.result()
             except FflinError as error:
                 yield Done(span, None, str(error))
+            except WorkerDied as error:
+                yield from self._lost(span, str(error))
             except (BrokenExecutor, CancelledError) as error:
                 self.broken = self.broken or error
                 self.waiting.append(span)
-            except WorkerDied as error:
-                yield from self._lost(span, str(error))
             except Exception as error:
                 # Of the executor's own, such as a scheduler that gave up on a worker.
                 yield from self._lost(span, f"{type(error).__name__}: {error}")
@@ -172,3 +183,21 @@ def _count(executor: Executor) -> int:
     if client is not None and hasattr(client, "nthreads"):
         return max(1, sum(client.nthreads().values()))
     return _UNKNOWN_WORKERS
+
+
+def _lost_a_worker(pool: ProcessPoolExecutor) -> bool:
+    """Whether a process of a pool was killed."""
+    processes = list((pool._processes or {}).values())
+    return any(process.exitcode not in (None, 0) for process in processes)
+
+
+def _break(pool: ProcessPoolExecutor) -> None:
+    """End a pool that waits for the rest of a result whose worker was killed as it sent it.
+
+    It waits as long as anybody could still write to the pipe that all workers and this process
+    share. Where nobody can, it finds itself broken, and its futures with it.
+    """
+    for process in list((pool._processes or {}).values()):
+        process.kill()
+    channel: Any = pool._result_queue
+    channel._writer.close()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fflin.base.errors import FflinError, InputError
-from fflin.base.validation import NORM_TOLERANCE, Array
+from fflin.base.validation import NORM_TOLERANCE, Array, as_double, dimension
 from fflin.batch.configurations import follow_rows
 from fflin.robot.robot import _ROUND_OFF, Robot
 
@@ -57,7 +57,7 @@ def checked_velocities(robot: Robot, v: Any, count: int) -> Array:
     InputError
         If the shape is wrong or a row is no velocity; the message names it.
     """
-    if np.ndim(v) == 1:
+    if dimension("v", v) == 1:
         return np.broadcast_to(robot.checked_velocity(v).copy(), (count, robot.nv))
     rows = _rows("v", v, robot.nv, "a velocity in Pinocchio's order each", count)
     doubtful = ~np.isfinite(rows).all(axis=1) | bool(robot.followers)
@@ -75,8 +75,14 @@ def checked_inputs(names: tuple[str, ...], u: Any, count: int) -> Array:
     InputError
         If the shape is wrong or an entry is not finite.
     """
-    one = np.ndim(u) == 1
-    rows = _rows("u", [u] if one else u, len(names), "the robot's inputs each", 1 if one else count)
+    one = dimension("u", u) == 1
+    rows = _rows(
+        "u",
+        as_double("u", u)[None] if one else u,
+        len(names),
+        "the robot's inputs each",
+        1 if one else count,
+    )
     for row in np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist():
         index = int(np.flatnonzero(~np.isfinite(rows[row]))[0])
         raise InputError(f"u[{row}, {index}] is {rows[row, index]}; every entry must be finite")
@@ -85,20 +91,13 @@ def checked_inputs(names: tuple[str, ...], u: Any, count: int) -> Array:
 
 
 def _rows(name: str, value: Any, size: int, of_what: str, count: int | None = None) -> Array:
-    try:
-        array = np.asarray(value)
-    except ValueError:
-        raise InputError(f"{name} is not an array: its rows differ in length") from None
+    array = as_double(name, value)
     expected = f"({'N' if count is None else count}, {size})"
-    if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
-        raise InputError(f"{name} has masked entries; fill them first")
-    if array.dtype.kind not in "fiu":
-        raise InputError(f"{name} holds {array.dtype} values, expected real numbers {expected}")
     if array.ndim != 2 or array.shape[1] != size or (count is not None and len(array) != count):
         raise InputError(f"{name} has shape {array.shape}, expected {expected}: {of_what}")
     if not len(array):
         raise InputError(f"{name} has no rows; give at least one")
-    return np.array(array, dtype=np.float64, order="C")
+    return np.ascontiguousarray(array)
 
 
 def _named(check: Callable[[Array], Array], what: str, row: int, value: Array) -> Array:

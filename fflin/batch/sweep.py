@@ -27,7 +27,7 @@ from fflin.batch.space import check_room
 from fflin.batch.store import FileStore, MemoryStore
 from fflin.batch.task import SweepTask, as_configurations
 from fflin.batch.workers import OwnWorkers
-from fflin.kernel.compiled import available_threads
+from fflin.kernel.compiled import available_cores
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -86,8 +86,8 @@ def sweep(
         Whose workers do the chunks: processes, dask (``Client.get_executor()``), mpi4py.futures.
         The robot is sent to each worker once. It is not shut down.
     workers : int, optional
-        Do it on so many processes of our own; one that dies is replaced. Call `sweep` under
-        ``if __name__ == "__main__":`` then.
+        Do it on so many processes of our own, at most one for each core; one that dies is
+        replaced. Call `sweep` under ``if __name__ == "__main__":`` then.
     threads : int, optional
         Threads of the kernel in this process; all cores that it may use by default.
     chunk : int, optional
@@ -144,7 +144,7 @@ def sweep(
     check_room(len(points), len(points) * _row_bytes(job), path)
     task = SweepTask(job, points, v, u)
     parallel = executor is not None or workers is not None
-    threads = threads or available_threads()
+    threads = threads or available_cores()
     shares = (_SHARES, 1) if parallel else (4 * threads, threads)
     store = _store(task, path, chunk or _chunk_size(task, *shares))
     size = store.chunk
@@ -235,8 +235,8 @@ def _here(
     if threads == 1 or len(spans) == 1 or not task.job.parallel:
         yield from map(run, spans)
         return
-    with ThreadPoolExecutor(threads) as pool:
-        begun: deque[Future[Done]] = deque()
+    pool, begun = ThreadPoolExecutor(threads), deque[Future[Done]]()
+    try:
         for span in spans:
             begun.append(pool.submit(run, span))
             # Not far ahead of what takes the results, which would fill the memory.
@@ -244,6 +244,9 @@ def _here(
                 yield begun.popleft().result()
         while begun:
             yield begun.popleft().result()
+    finally:
+        # Ctrl-C does not wait for what they compile.
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _collect(

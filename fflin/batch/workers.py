@@ -1,22 +1,27 @@
-"""Processes of our own for a sweep, each with a pipe of its own."""
+"""Processes of our own, each with a pipe of its own."""
 
 from __future__ import annotations
 
+import os
 import signal
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
-from threading import Lock, local
+from threading import Lock, Thread, local
 from typing import Any
+
+from fflin.base.errors import FflinWarning
+from fflin.kernel.compiled import available_cores
 
 # How long a process is given to end when it is told to [s].
 _PATIENCE = 5.0
 
 
-class WorkerDied(Exception):
-    """The process that did a task is gone."""
+class WorkerDied(BrokenExecutor):
+    """The process that did a task is gone; the others are not."""
 
 
 class NoWorkers(BrokenExecutor):
@@ -28,14 +33,25 @@ class OwnWorkers(Executor):
 
     Those of `concurrent.futures.ProcessPoolExecutor` share one pipe for their results: where one
     is killed in the middle of a large result, all wait for the rest of it for ever. They also
-    outlive a caller that is killed; these end when their pipe does.
+    outlive a caller that is killed; these end with it.
 
     Parameters
     ----------
     count : int
+        Processes, at most one for each core.
+
+    Warns
+    -----
+    FflinWarning
+        Where there are fewer cores.
     """
 
     def __init__(self, count: int) -> None:
+        cores = available_cores()
+        if count > cores:
+            said = f"{count} processes are more than there are cores; {cores} do the work"
+            warnings.warn(said, FflinWarning, stacklevel=3)
+            count = cores
         self._max_workers = count
         # A fork would take a copy of locks that other threads hold.
         self._context = get_context("spawn")
@@ -128,6 +144,7 @@ def _deaf() -> Iterator[None]:
 def _serve(pipe: Connection) -> None:
     """Do tasks until the pipe ends, with the caller or at its word."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_end_with_the_caller, daemon=True).start()
     try:
         pipe.send(None)
         while True:
@@ -140,3 +157,11 @@ def _serve(pipe: Connection) -> None:
             pipe.send(answer)
     except (EOFError, OSError):
         return
+
+
+def _end_with_the_caller() -> None:
+    """End this process with the one that started it, in the middle of a task too."""
+    caller = parent_process()
+    assert caller is not None
+    caller.join()
+    os._exit(1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import textwrap
-from functools import partial
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,7 +58,7 @@ def add_commands(commands: Commands) -> None:
     for name, default, what in (
         ("samples", 100, "random runs"),
         ("seed", 0, "seed of the random runs"),
-        ("jobs", 1, "processes"),
+        ("jobs", 1, "processes, at most one for each core"),
     ):
         validity.add_argument(
             f"--{name}",
@@ -106,14 +106,16 @@ def _momentum(lin: LinearModel) -> str:
             )
         elif not lin.is_equilibrium():
             text = "none can be split off: the model is one of a point that moves on"
-    return textwrap.fill(text, width())
+        text = "\n".join((text, *(f"note: {note}" for note in reduced.notes)))
+    lines = (textwrap.fill(line, width(), subsequent_indent="  ") for line in text.splitlines())
+    return "\n".join(lines)
 
 
 def _validity(arguments: argparse.Namespace) -> int:
-    from concurrent.futures import ProcessPoolExecutor
-
     from fflin.analysis.momentum import momentum_reduction
     from fflin.analysis.validity import validity
+    from fflin.base.progress import Progress
+    from fflin.batch.workers import OwnWorkers
 
     if arguments.jobs < 1:
         raise InputError(f"--jobs is {arguments.jobs}, expected at least 1")
@@ -123,22 +125,23 @@ def _validity(arguments: argparse.Namespace) -> int:
     lin = momentum_reduction(lin) if arguments.reduce else lin
     gain = gain_of(lin, arguments)
     judged = lin.discretize(arguments.dt) if arguments.dt else lin
-    measure = partial(
-        validity,
-        robot,
-        judged,
-        gain,
-        attitude=arguments.attitude,
-        position=arguments.offset,
-        joint=arguments.spread,
-        samples=arguments.samples,
-        seed=arguments.seed,
-    )
-    if arguments.jobs == 1:
-        found = measure()
-    else:
-        with ProcessPoolExecutor(arguments.jobs) as executor:
-            found = measure(executor=executor)
+    bar = Progress()
+    try:
+        with OwnWorkers(arguments.jobs) if arguments.jobs > 1 else nullcontext() as executor:
+            found = validity(
+                robot,
+                judged,
+                gain,
+                attitude=arguments.attitude,
+                position=arguments.offset,
+                joint=arguments.spread,
+                samples=arguments.samples,
+                seed=arguments.seed,
+                executor=executor,
+                progress=bar.update,
+            )
+    finally:
+        bar.close()
     print(found)
     if arguments.plot:
         from fflin.analysis.plots import plot_validity

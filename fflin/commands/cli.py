@@ -16,7 +16,6 @@ from fflin.base.version import __version__
 from fflin.commands import (
     BAD_INPUT,
     DONE,
-    INTERRUPTED,
     analysis,
     models,
     modes,
@@ -44,8 +43,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     -------
     int
         0 done; 1 a check fell short; 2 bad input.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        On Ctrl-C.
     """
-    warnings.showwarning = _show_warning
+    # What other packages warn of is shown at the end of what went well: an error says why.
+    held: list[str] = []
+
+    def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+        text = " ".join(str(message).split())
+        if issubclass(category, FflinWarning):
+            print(f"fflin: warning: {text}", file=sys.stderr)
+        else:
+            held.append(f"fflin: {category.__name__}: {text}")
+
+    warnings.showwarning = show
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Names may hold what the terminal cannot show.
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -54,6 +68,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         code: int = arguments.run(arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
+        for line in held:
+            print(line, file=sys.stderr)
         return code
     except (FflinError, FflinWarning) as error:  # a warning where Python is told to raise them
         print(f"fflin: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -66,15 +82,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"fflin: error: the output cannot be written: {error.strerror}", file=sys.stderr)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BAD_INPUT
-    except KeyboardInterrupt:
-        return INTERRUPTED
-
-
-def _show_warning(
-    message: Warning | str, category: type[Warning], *_: object, **__: object
-) -> None:
-    name = "warning" if issubclass(category, FflinWarning) else category.__name__
-    print(f"fflin: {name}: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -106,7 +106,7 @@ def add_commands(commands: Commands) -> None:
 
 def _simulate(arguments: argparse.Namespace) -> int:
     from fflin.base.writing import check_place
-    from fflin.simulation.motion import check_motion_format
+    from fflin.simulation.motion import check_motion_format, motion_report
 
     if arguments.output_file:
         check_motion_format(arguments.output_file)
@@ -116,7 +116,6 @@ def _simulate(arguments: argparse.Namespace) -> int:
     robot = load_robot(arguments)
     check_pictures(robot, arguments)
     motion = simulated(robot, arguments)
-    from fflin.simulation.motion_text import motion_report
 
     # Said when the files are there, which they are then even where nobody reads it to its end.
     lines = [motion_report(motion, controlled=not arguments.free)]
@@ -130,6 +129,8 @@ def _simulate(arguments: argparse.Namespace) -> int:
         lines += show_motion(robot, motion, arguments)
     finally:
         print("\n".join(lines))
+    if motion.stopped.startswith("interrupted"):
+        raise KeyboardInterrupt(motion.stopped)
     return FELL_SHORT if motion.stopped else DONE
 
 

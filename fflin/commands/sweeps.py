@@ -96,7 +96,10 @@ def add_commands(commands: Commands) -> None:
         "or the world",
     )
     sweep.add_argument(
-        "--workers", metavar="N", type=_count, help="share the work among N processes"
+        "--workers",
+        metavar="N",
+        type=_count,
+        help="share the work among N processes, at most one for each core",
     )
     sweep.add_argument(
         "--dask", metavar="ADDRESS", help="share it among the workers of a dask scheduler"
@@ -167,7 +170,7 @@ def _sweep(arguments: argparse.Namespace) -> int:
     options: dict[str, Any] = {"frame": arguments.frame, "reference": reference}
     announce = _Announcement(robot, path, options, arguments.yes)
     q, v, u = _points(robot, arguments, v, u, announce)
-    bar = Progress(len(q))
+    bar = Progress()
     with _executor(arguments.dask) as executor:
         announce.say()
         try:
@@ -179,16 +182,14 @@ def _sweep(arguments: argparse.Namespace) -> int:
                 **options,
                 executor=executor,
                 workers=arguments.workers,
-                progress=lambda done, _: bar.update(done),
+                progress=bar.update,
                 out=path,
             )
         except KeyboardInterrupt:
-            bar.close()
             if part_of(path).exists():
-                print(
-                    f"fflin: stopped; the same command goes on from {part_of(path)}",
-                    file=sys.stderr,
-                )
+                raise KeyboardInterrupt(
+                    f"stopped; the same command goes on from {part_of(path)}"
+                ) from None
             raise
         finally:
             bar.close()

@@ -9,7 +9,7 @@ import numpy as np
 
 from fflin.analysis.stabilizability import require_stabilizable
 from fflin.base.errors import InputError, StabilizabilityError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, dimension
 from fflin.control.lqr import Gain, make_gain, require_fixed_point
 from fflin.control.riccati import Riccati, Solution
 from fflin.control.weights import Weight, weight
@@ -151,7 +151,7 @@ def _integrators(lin: LinearModel) -> tuple[Array, Array]:
 
 
 def _diagonal(what: str, value: Weight, names: Sequence[str], *, definite: bool) -> Array:
-    if not isinstance(value, Mapping) and np.ndim(value) == 2:
+    if not isinstance(value, Mapping) and dimension(what, value) == 2:
         raise InputError(f"{what} is a matrix; the closed form needs its diagonal alone, use lqr")
     return weight(what, value, names, definite=definite).diagonal()
 

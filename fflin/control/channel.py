@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fflin.base.errors import InputError, unknown
-from fflin.base.validation import DOUBLE, Array, as_double, number
+from fflin.base.validation import DOUBLE, Array, as_double, dimension, number
 from fflin.dynamics.actuation import Actuation
 
 
@@ -45,7 +45,7 @@ def limits_of(actuation: Actuation, limits: Any) -> tuple[Array, Array]:
             raise unknown("input", str(name), (*groups, *names))
         entries = [names.index(name)] if name in names else groups[name]
         value = given[name]
-        if np.ndim(value) == 1 and len(value) == 2:
+        if dimension(f"limit of '{name}'", value) == 1 and len(value) == 2:
             least, largest = (number(f"limit of '{name}'", x) for x in value)
         else:
             largest = number(f"limit of '{name}'", value)

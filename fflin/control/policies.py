@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.rotation import conjugate, quaternion_product, rotation_matrix
-from fflin.base.validation import Array
+from fflin.base.validation import Array, as_double
 from fflin.control.channel import Law
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
@@ -234,10 +234,10 @@ def bound(policy: Any, robot: Robot) -> Policy:
 
 
 def _gain(K: ArrayLike, shape: tuple[int, ...]) -> Array:
-    gain = np.array(K, dtype=float) if np.shape(K) == shape else None
-    if gain is None or not np.isfinite(gain).all():
+    gain = as_double("K", K)
+    if gain.shape != shape or not np.isfinite(gain).all():
         raise InputError(
-            f"K has shape {np.shape(K)}, expected {shape} (nu, nx) and finite numbers; take the "
+            f"K has shape {gain.shape}, expected {shape} (nu, nx) and finite numbers; take the "
             "gain that was designed for this model"
         )
     gain.setflags(write=False)

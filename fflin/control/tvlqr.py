@@ -153,7 +153,9 @@ def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSched
     Q, Qf = weight("Q", Q, names), weight("Qf", Qf, names)
     R = weight("R", R, traj.input_names, definite=True)
     try:
-        t, P = _solve(traj, Q, R, Qf)
+        # What overflows is refused, and not warned of.
+        with np.errstate(over="ignore", invalid="ignore"):
+            t, P = _solve(traj, Q, R, Qf)
     except np.linalg.LinAlgError:
         raise InputError(_TOO_FAST.format("some time")) from None
     A, B = map(np.array, zip(*(traj.matrices(float(x)) for x in t), strict=True))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError, unknown
-from fflin.base.validation import Array, number, vector
+from fflin.base.validation import Array, dimension, number, vector
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -56,6 +56,8 @@ def bryson(lin: LinearModel, largest: Mapping[str, float]) -> Array:
     >>> Q = bryson(lin, {"q_b": 0.05, "r_b": 0.1, "q_m": 0.1})  # doctest: +SKIP
     >>> R = bryson(lin, {"tau_b": 1.0, "F_b": 5.0, "tau_m": 2.0})  # doctest: +SKIP
     """
+    if not (hasattr(lin, "state_names") and hasattr(lin, "input_names")):
+        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
     if not isinstance(largest, Mapping) or not largest:
         raise InputError(f"largest is {largest!r}, expected {{name: largest acceptable value}}")
     known = {*lin.input_names, *map(_group, lin.input_names)}
@@ -116,9 +118,9 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
     size = len(names)
     if isinstance(value, Mapping):
         diagonal = _diagonal(what, value, names, complete=definite)
-    elif (dimension := _dimension(what, value)) == 0:
+    elif (indices := dimension(what, value)) == 0:
         diagonal = np.full(size, number(what, value))
-    elif dimension == 1:
+    elif indices == 1:
         diagonal = vector(what, value, size, f"its diagonal, {names[0]} to {names[-1]}")
     else:
         return _checked_matrix(what, value, names, definite)
@@ -130,14 +132,14 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
 
 def cross_weight(what: str, value: ArrayLike, rows: int, columns: int) -> Array:
     """Return a matrix (rows, columns)."""
-    if _dimension(what, value) != 2 or np.shape(value) != (rows, columns):
+    if dimension(what, value) != 2 or np.shape(value) != (rows, columns):
         raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, {columns})")
     return vector(what, np.ravel(value), rows * columns, "its entries").reshape(rows, columns)
 
 
 def columns(what: str, value: ArrayLike, rows: int) -> Array:
     """Return a matrix (rows, k) with k >= 1."""
-    shape = np.shape(value) if _dimension(what, value) == 2 else ()
+    shape = np.shape(value) if dimension(what, value) == 2 else ()
     if not shape or not shape[1]:
         raise InputError(f"{what} has shape {np.shape(value)}, expected ({rows}, k) with k >= 1")
     return cross_weight(what, value, rows, shape[1])
@@ -213,13 +215,6 @@ def _diagonal(
     if missing.size:
         raise InputError(f"{what} has no value for {names[missing[0]]}; each needs one")
     return diagonal
-
-
-def _dimension(what: str, value: Any) -> int:
-    try:
-        return np.ndim(value)
-    except ValueError:
-        raise InputError(f"{what} is not an array: its rows differ in length") from None
 
 
 def _group(name: str) -> str:

@@ -9,6 +9,7 @@ from fflin.base.errors import FflinWarning, SingularInertiaError, listed
 from fflin.base.validation import Array
 from fflin.dynamics.inertia_bounds import STROKE, inertia_bounds
 from fflin.dynamics.state import StateMap
+from fflin.robot.massless import coordinate_names
 
 # M_ii (M^-1)_ii is 1 for a decoupled coordinate, more for any other, and grows as a coordinate
 # loses inertia of its own; times the rounding unit it is the relative error of (M^-1)_ii. Of the
@@ -125,29 +126,17 @@ def _invert_dense(M: Array, out: Array) -> None:
 
 
 def _singular(state: StateMap, M: Array) -> SingularInertiaError:
-    robot = state.robot
-    diagonal = M.diagonal()
-    massless = [_names(state)[i] for i in np.flatnonzero(~(diagonal > 0.0))]
-    if massless:
-        verb = "moves" if len(set(massless)) == 1 else "move"
-        return SingularInertiaError(
-            f"M of '{robot.name}' cannot be inverted: {listed(massless)} {verb} no mass; "
-            "give the links beyond an inertia, or lock what needs none"
-        )
     return SingularInertiaError(
-        f"M of '{robot.name}' is singular at this configuration: {_involved(state, M)} can move "
-        "together without moving mass; choose another configuration, give the links an inertia, "
-        "or lock one of them"
+        f"M of '{state.robot.name}' is singular at this configuration: {_involved(state, M)} can "
+        "move together without moving mass; choose another configuration, give the links an "
+        "inertia, or lock one of them"
     )
 
 
 def _involved(state: StateMap, M: Array) -> str:
     """Name the coordinates of the motion with the least inertia."""
-    scale = 1.0 / np.sqrt(M.diagonal())
+    diagonal = M.diagonal()
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     mode = np.linalg.eigh(scale[:, None] * M * scale)[1][:, 0]
-    names = _names(state)
+    names = coordinate_names(state.robot)
     return listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
-
-
-def _names(state: StateMap) -> list[str]:
-    return ["the base"] * 6 + [f"joint '{name}'" for name in state.robot.joint_names]

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from fflin.base.errors import unknown
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, by_name, number
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.inputs import named_wheels
@@ -33,9 +33,10 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     InputError
         If a value is not a finite number.
     """
+    state = StateMap(robot)
     base = [f"{group}.{axis}" for group in ("omega_b", "v_b") for axis in "xyz"]
     nu = np.zeros(6 + robot.n)
-    for name, value in values.items():
+    for name, value in by_name("values", values, "velocity").items():
         if name in base:
             index = base.index(name)
         elif name in robot.joint_names:
@@ -45,7 +46,7 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
         else:
             raise unknown("velocity", name, (*robot.joint_names, *base))
         nu[index] = number(f"velocity '{name}'", value)
-    return StateMap(robot).spread(nu)
+    return state.spread(nu)
 
 
 def effort(robot: Robot, values: Mapping[str, float]) -> Array:
@@ -70,7 +71,7 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     """
     names = Actuation(StateMap(robot)).names
     u = np.zeros(len(names))
-    for name, value in values.items():
+    for name, value in by_name("values", values, "input").items():
         if name not in names:
             raise unknown("input", name, names)
         u[names.index(name)] = number(f"effort '{name}'", value)

@@ -25,6 +25,11 @@ _IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
 ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
 
 
+def unknown_frame(frame: object) -> InputError:
+    """Build the error for what is no frame of velocities."""
+    return InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
+
+
 class Groups(NamedTuple):
     """Slices of the six groups of the state."""
 
@@ -69,6 +74,8 @@ class StateMap:
     ------
     InputError
         If the frame is unknown or the reference is not a pin.SE3.
+    ModelError
+        If the robot's model was changed after it was made.
     """
 
     def __repr__(self) -> str:
@@ -82,7 +89,8 @@ class StateMap:
                 f"robot is a {type(robot).__name__}, expected a fflin.Robot; fflin.load makes one"
             )
         if not isinstance(frame, str) or frame not in get_args(Frame):
-            raise InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
+            raise unknown_frame(frame)
+        robot.require_unchanged()
         n = robot.n
         self.robot = robot
         self.frame: Frame = frame

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import sys
 from functools import cache
@@ -16,15 +17,30 @@ from typing import Any
 # this size does not win back but the next ones do: they are seldom alone.
 _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
 
+# Where Linux tells a container how much of each period [us] it may compute: version 2 of its
+# control groups, and version 1.
+_QUOTAS = (
+    ("/sys/fs/cgroup/cpu.max",),
+    ("/sys/fs/cgroup/cpu/cpu.cfs_quota_us", "/sys/fs/cgroup/cpu/cpu.cfs_period_us"),
+)
+
 _log = logging.getLogger("fflin")
 _TURN = Lock()
 
 
-def available_threads() -> int:
-    """How many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+def available_cores() -> int:
+    """How many cores this process may use, by its affinity and its share in a container."""
+    if not hasattr(os, "sched_getaffinity"):
+        return os.cpu_count() or 1
+    cores = len(os.sched_getaffinity(0))
+    for names in _QUOTAS:
+        try:
+            quota, period = " ".join(Path(name).read_text() for name in names).split()
+        except (OSError, ValueError):
+            continue
+        if quota not in ("max", "-1"):
+            cores = min(cores, math.ceil(int(quota) / int(period)))
+    return max(cores, 1)
 
 
 def pays(count: int) -> bool:

@@ -12,18 +12,19 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.rotation import skew
-from fflin.base.validation import Array, vector
+from fflin.base.validation import Array, truth, vector
 from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.rnea import Accelerations, Rates
-from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap
+from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap, unknown_frame
 from fflin.linear.certificate import certify, inertia_matrix
 from fflin.linear.ignorable import ignorable_states
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
 from fflin.linear.state_equations import STANDING, Point, at_rest, ride_along, state_equations
 from fflin.robot.frames import ROOT
+from fflin.robot.massless import require_inertia
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
@@ -69,8 +70,11 @@ class Linearizer:
     InputError
         If the frame is unknown, the reference is not a pin.SE3, or `moving` is asked for with a
         reference or with a frame other than "local".
+    SingularInertiaError
+        If M is singular at every configuration.
     ModelError
-        If Pinocchio's Data for the robot would pass 1 GiB.
+        If Pinocchio's Data for the robot would pass 1 GiB, or its model was changed after the
+        robot was made.
 
     References
     ----------
@@ -87,15 +91,20 @@ class Linearizer:
         moving: bool = False,
     ) -> None:
         self.robot = robot
-        if moving and (reference is not None or frame not in (None, "local")):
+        moving = truth("moving", moving)
+        if frame is None:
+            frame = "local" if moving else "hybrid"
+        elif not isinstance(frame, str):  # nor one whose comparison below is an array
+            raise unknown_frame(frame)
+        if moving and (reference is not None or frame != "local"):
             raise InputError(
                 "moving=True takes the error in the moving base's own axes: leave out the "
                 "reference, and the frame or make it 'local'"
             )
-        frame = frame or ("local" if moving else "hybrid")
-        self._moving = bool(moving)
+        self._moving = moving
         self._map = StateMap(robot, reference=reference, frame=frame)
         self._own_reference = reference is None
+        require_inertia(robot)
         self._data = robot.create_data()
         self._lock = Lock()  # of the work space
         self._actuation = Actuation(self._map)
@@ -119,6 +128,8 @@ class Linearizer:
             and not any(values.any() for values in robot.passive)
         )
         self._plain = self._free and self._actuation.default
+        given = hypot(*robot.gravity, *np.concatenate(robot.passive).tolist())
+        self._moderate = given < _MODERATE
         nv, nx = 6 + robot.n, self._map.nx
         self._zero_v, self._zero_u, self._zero_x = (
             _frozen(np.zeros(size)) for size in (robot.nv, len(self._actuation.names), nx)
@@ -181,7 +192,7 @@ class Linearizer:
         v = self._zero_v if v is None else v
         u = self._zero_u if u is None else u
         with self._lock:
-            if hypot(*v.tolist(), *u.tolist()) < _MODERATE:
+            if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
                 return self._anywhere(q, v, u)
             # What overflows is refused, and not warned of. Every call of NumPy costs more here.
             with np.errstate(over="ignore", invalid="ignore"):

@@ -117,6 +117,9 @@ class LinearModel:
     # Of a moving reference, whose f0 is zero by construction: its own rate (nx,), that of its
     # attitude without turns about gravity. None otherwise.
     _drift: Array | None = None
+    # Of a sampled model: its own fingerprint and the continuous model that it was made of, whose
+    # structure no exponential has blurred.
+    _source: tuple[str, LinearModel] | None = None
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -173,6 +176,17 @@ class LinearModel:
                 "A, B or f0 were changed after they were certified; hold them against the robot "
                 "with fflin.check"
             )
+
+    @property
+    def generator(self) -> LinearModel | None:
+        """The continuous model that this is sampled from, or itself.
+
+        None where that is not known: of a file, or of matrices that were changed.
+        """
+        if not self.dt:
+            return self
+        known = self._source is not None and self._source[0] == self.fingerprint
+        return self._source[1] if self._source and known else None
 
     @cached_property
     def certificate(self) -> Certificate:
@@ -235,24 +249,26 @@ class LinearModel:
             raise InputError(f"the model is sampled already, at dt = {self.dt:g} s")
         nx, nu = self.B.shape
         driven = np.column_stack((self.B, self.f0))
-        if not (self.A @ self.A).any():
-            Ad = np.eye(nx) + self.A * dt
-            held = driven * dt + self.A @ driven * (dt * dt / 2.0)
-        else:
-            from scipy.linalg import expm
+        # What overflows is refused below, and not warned of.
+        with np.errstate(over="ignore", invalid="ignore"):
+            if not (self.A @ self.A).any():
+                Ad = np.eye(nx) + self.A * dt
+                held = driven * dt + self.A @ driven * (dt * dt / 2.0)
+            else:
+                from scipy.linalg import expm
 
-            block = np.zeros((nx + nu + 1, nx + nu + 1))
-            block[:nx, :nx] = self.A
-            block[:nx, nx:] = driven
-            exponential = expm(block * dt)
-            Ad, held = exponential[:nx, :nx], exponential[:nx, nx:]
+                block = np.zeros((nx + nu + 1, nx + nu + 1))
+                block[:nx, :nx] = self.A
+                block[:nx, nx:] = driven
+                exponential = expm(block * dt)
+                Ad, held = exponential[:nx, :nx], exponential[:nx, nx:]
         if not (np.isfinite(Ad).all() and np.isfinite(held).all()):
             raise InputError(f"dt is {dt:g} s, over which the model grows beyond all numbers")
         sampled = replace(
             self, A=Ad, B=held[:, :nu], f0=held[:, nu], dt=dt, _inertia=partial(_same_M, self)
         )
         certify = partial(_same_certificate, self, sampled.fingerprint)
-        return replace(sampled, _certify=certify)
+        return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))
 
     def to_scipy(self) -> Any:
         """Return a `scipy.signal.StateSpace` of the deviations; names and f0 are lost."""

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.rotation import rotation_matrix
-from fflin.base.validation import Array, number, vector
+from fflin.base.validation import Array, as_double, number, vector
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.state import StateMap
 from fflin.linear.linearization import Linearizer
@@ -129,7 +129,8 @@ def linearize_trajectory(
     FflinWarning
         If the knots are so coarse that the motion between them is in doubt.
     """
-    times = vector("t", t, np.size(t), "times of the knots")
+    times = as_double("t", t)
+    times = vector("t", times, times.size, "times of the knots")
     if len(times) < 2 or (np.diff(times) <= 0.0).any():
         raise InputError("t must hold at least two times, each later than the one before")
     linearizer = Linearizer(robot, moving=True)

@@ -9,7 +9,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, number, refuse_masked
 
 Vector3: TypeAlias = Sequence[float]
 
@@ -177,6 +177,7 @@ KINDS: tuple[type[Input], ...] = (BaseTorque, BaseForce, JointTorque, Thruster, 
 
 def three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
     """Return three finite floats, or raise `InputError` that says what was given."""
+    refuse_masked(what, value)
     try:
         x, y, z = (float(entry) for entry in value)
     except (TypeError, ValueError, OverflowError):

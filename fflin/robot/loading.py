@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +11,10 @@ from typing import Any
 import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
-from fflin.base.validation import number
+from fflin.base.validation import Array, number
 from fflin.robot.catalog import find_robot
 from fflin.robot.joints import Follower, Joint
+from fflin.robot.massless import massless_note
 from fflin.robot.model_checks import check_model
 from fflin.robot.robot import ROOT, Robot
 from fflin.robot.urdf.joints import Mimic
@@ -68,13 +70,16 @@ def load(
     found = find_robot(robot)
     description = read_urdf(found.path, found.prune)
     loaded = _robot(description.model, found.name, lock, description.mimics)
-    for note in description.notes:
+    notes = description.notes
+    if loaded.idle:
+        notes = (*notes, massless_note(loaded))
+    for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
     loaded = replace(
         loaded,
         urdf=found.path,
         urdf_sha256=description.sha256,
-        notes=description.notes,
+        notes=notes,
         package_dirs=(*_folders(package_dirs), *found.package_dirs),
         urdf_damping=_independent_damping(loaded, description.damping),
     )
@@ -110,6 +115,8 @@ def from_model(
     """
     if not isinstance(model, pin.Model):
         raise ModelError(f"the model is a {type(model).__name__}, expected a pin.Model")
+    if name is not None and not isinstance(name, str):
+        raise InputError(f"name is a {type(name).__name__}, expected a word")
     copy = model.copy()
     copy.gravity.setZero()
     name = name or model.name or "model"
@@ -185,9 +192,7 @@ def _locked(
 
     Returns the smaller model, the mimics that are left, and "joint=value" of what was welded.
     """
-    if not isinstance(lock, Iterable):
-        raise InputError(f"lock is {lock!r}, expected {{joint: value}} or names of joints")
-    names = [lock] if isinstance(lock, str) else list(lock)
+    names = [lock] if isinstance(lock, str) else _listed(lock)
     given = lock if isinstance(lock, Mapping) else {}
     movable = list(model.names)[ROOT + 1 :]
     q = pin.neutral(model)
@@ -215,7 +220,38 @@ def _locked(
         if not model.existFrame(name, pin.FrameType.JOINT):
             model.addJointFrame(index)
     left = {name: mimic for name, mimic in mimics.items() if name not in values}
-    return pin.buildReducedModel(model, indices, q), left, tuple(locked)
+    return _reduced(model, indices, q), left, tuple(locked)
+
+
+def _listed(lock: Any) -> list[str]:
+    try:
+        names = list(lock)
+    except TypeError:
+        names = [None]
+    if not all(isinstance(name, str) for name in names):
+        raise InputError(
+            f"lock is a {type(lock).__name__}, expected {{joint: value}} or names of joints"
+        )
+    return names
+
+
+def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
+    """Weld joints at q (nq,). Pinocchio looks frames up by name, which links and joints may share.
+
+    The joints' own frames keep their names, by which it finds them.
+    """
+    names = Counter(frame.name for frame in model.frames.tolist())
+    shared: dict[str, str] = {}
+    for index, frame in enumerate(model.frames):
+        if index and frame.type != pin.FrameType.JOINT and names[frame.name] > 1:
+            alias = f"{index}/{frame.name}"
+            while alias in names:
+                alias += "/"
+            shared[alias], frame.name = frame.name, alias
+    reduced = pin.buildReducedModel(model, indices, q)
+    for frame in reduced.frames:
+        frame.name = shared.get(frame.name, frame.name)
+    return reduced
 
 
 def _joint(model: pin.Model, index: int) -> Joint:

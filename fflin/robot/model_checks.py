@@ -1,4 +1,4 @@
-"""What a Pinocchio model that was built by other means must hold before anything is computed."""
+"""What a Pinocchio model must hold before anything is computed, and whether it was changed."""
 
 from __future__ import annotations
 
@@ -36,6 +36,39 @@ def check_model(model: pin.Model, name: str) -> None:
         _check_placement(model, name, index)
         _check_body(model, name, index)
         _check_armature(model, name, index)
+
+
+def change_in(model: pin.Model, made: pin.Model) -> str:
+    """Say what of a model that A, B and C depend on differs from what it was made as.
+
+    Frames may have been added, and limits changed; the answer is then empty.
+    """
+    for what, now, before in (
+        ("its joints", model.names.tolist(), made.names.tolist()),
+        ("the parents of its joints", model.parents.tolist(), made.parents.tolist()),
+        ("its gravity", model.gravity, made.gravity),
+    ):
+        if now != before:
+            return what
+    for what in ("joints", "jointPlacements", "inertias"):
+        for index, (now, before) in enumerate(
+            zip(getattr(model, what), getattr(made, what), strict=True)
+        ):
+            if now != before:
+                return f"{_OF_JOINT[what]} joint '{made.names[index]}'"
+    if not np.array_equal(model.armature, made.armature):
+        return "its armature"
+    for frame, before in zip(model.frames, made.frames, strict=False):
+        if frame != before:
+            return f"frame '{before.name}'"
+    return "its frames" if model.nframes < made.nframes else ""
+
+
+_OF_JOINT = {
+    "joints": "the axis of",
+    "jointPlacements": "the placement of",
+    "inertias": "the inertia of",
+}
 
 
 def _check_placement(model: pin.Model, name: str, index: int) -> None:

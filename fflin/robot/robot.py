@@ -18,6 +18,8 @@ from fflin.robot.fields import validated_fields, validated_inputs
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.inputs import Input, default_inputs, named_wheels
 from fflin.robot.joints import Follower, Joint
+from fflin.robot.massless import idle_coordinates
+from fflin.robot.model_checks import change_in
 from fflin.robot.outputs import FullState, Output
 from fflin.robot.wheels import stored_momentum, with_wheels
 
@@ -47,8 +49,8 @@ class Robot:
     ----------
     model : pin.Model
         Free-flyer root joint, zero gravity; its mimic joints are joints like the others, and so
-        are the wheels with an inertia among the inputs. To be read; what is changed in it after
-        loading is not seen everywhere.
+        are the wheels with an inertia among the inputs. To be read: a robot whose model was
+        changed is refused, see `from_model`.
     name : str
         Name or file stem it was loaded by.
     urdf : Path or None
@@ -98,8 +100,11 @@ class Robot:
     package_dirs: tuple[Path, ...] = ()
     # Where some of its joints are wheels: the same robot without them.
     _wheelless: Robot | None = None
+    # What the model was when the robot was made.
+    _as_made: pin.Model = field(init=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "_as_made", self.model.copy())
         if not self.inputs:
             object.__setattr__(self, "inputs", default_inputs(self.joint_names))
 
@@ -135,8 +140,10 @@ class Robot:
         UnknownNameError
             If there is no such joint, or no such frame for an input or output.
         ModelError
-            If dry friction is asked for, which is not differentiable at rest.
+            If dry friction is asked for, which is not differentiable at rest, or the robot's
+            model was changed after it was made.
         """
+        self.require_unchanged()
         robot = self
         if "inputs" in fields:
             robot = self._with_inputs(fields.pop("inputs"))
@@ -188,6 +195,11 @@ class Robot:
     def nv(self) -> int:
         """Size of Pinocchio's velocity: 6 + n, and one for each mimic joint."""
         return int(self.model.nv)
+
+    @cached_property
+    def idle(self) -> tuple[str, ...]:
+        """What can move together without moving mass, so that M is singular everywhere."""
+        return idle_coordinates(self)
 
     @property
     def mass(self) -> float:
@@ -320,6 +332,18 @@ class Robot:
             rest=rest,
             _wheelless=bare if wheels else None,
         )
+
+    def require_unchanged(self) -> None:
+        """Raise `ModelError` where the model was changed in place after the robot was made.
+
+        Results prepared before the change would be of another robot than those made after it.
+        """
+        # Tells in a microsecond that nothing at all was changed.
+        if self.model != self._as_made and (change := change_in(self.model, self._as_made)):
+            raise ModelError(
+                f"the model of '{self.name}' was changed after the robot was made: {change}; make "
+                "a robot of it with fflin.from_model(model)"
+            )
 
     def create_data(self) -> pin.Data:
         """Make Pinocchio's work space for this robot.

@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Iterable
 
 from fflin.base.tables import counted, grid, width
-from fflin.robot.robot import Robot
+from fflin.robot.robot import ROOT, Robot
 
 _LIMITS = "limits in rad, N m and rad/s; of a prismatic joint in m, N and m/s"
 
@@ -64,7 +64,7 @@ def robot_info(robot: Robot) -> str:
                 _limit(model.velocityLimit[joint.idx_v]),
             ]
         )
-    frames = [f.name for f in model.frames if f.name != "universe"]
+    frames = [frame.name for frame in model.frames.tolist() if frame.parentJoint >= ROOT]
     wrapped = textwrap.fill(
         ", ".join(dict.fromkeys(frames)), width(), initial_indent="  ", subsequent_indent="  "
     )

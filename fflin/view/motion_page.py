@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from fflin.base.validation import Array
 from fflin.dynamics.state import StateMap
+from fflin.robot.frames import find_frame
 from fflin.robot.robot import ROOT, Robot
 from fflin.view.page import build_page, packed
 from fflin.view.panel import panel
@@ -79,7 +80,9 @@ def motion_page(
     if follow:
         shown_points = frame_points(drawing, film, info["size"], follow=True)
     info |= marks(robot, film, tool, info["size"])
-    info |= panel(robot, state, q, u, target, motion.momentum_drift[shown])
+    # A file may not tell how far the centre of mass drifts.
+    of_com = motion.com_drift[shown] if len(motion.com_drift) else None
+    info |= panel(robot, state, q, u, target, motion.momentum_drift[shown], of_com)
     info |= {
         "mode": "motion",
         "t": packed(t),
@@ -183,8 +186,8 @@ def triads(robot: Robot, tool: str | None, size: float) -> list[dict[str, Any]]:
     paths = body_paths(robot)
     found = [(paths[0], pin.SE3.Identity(), 0.3)]
     if tool:
-        frame = robot.model.frames[robot.model.getFrameId(tool)]
-        found.append((paths[frame.parentJoint - ROOT], frame.placement, 0.12))
+        joint, placement = find_frame(robot.model, tool)
+        found.append((paths[joint - ROOT], placement, 0.12))
     return [
         {
             "path": ["meshcat", "robot", path],

@@ -10,6 +10,7 @@ import pinocchio as pin
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
+from fflin.robot.frames import find_frame, frame_index
 from fflin.robot.inputs import Thruster
 from fflin.robot.robot import ROOT, Robot
 
@@ -107,7 +108,7 @@ def play_back(
         Frame of the model.
     """
     model, data = robot.model, robot.model.createData()
-    tool_id = model.getFrameId(tool) if tool else None
+    tool_id = frame_index(model, tool) if tool else None
     actuation = Actuation(state)
     poses: list[Array] = []
     com: list[Array] = []
@@ -146,9 +147,7 @@ def thrusters(robot: Robot) -> list[tuple[int, Array, Array]]:
     found = []
     for item in robot.inputs:
         if isinstance(item, Thruster):
-            frame = robot.model.frames[robot.model.getFrameId(item.frame)]
-            position = frame.placement.act(np.array(item.position))
-            found.append(
-                (frame.parentJoint, position, frame.placement.rotation @ np.array(item.direction))
-            )
+            joint, placement = find_frame(robot.model, item.frame)
+            position = placement.act(np.array(item.position))
+            found.append((joint, position, placement.rotation @ np.array(item.direction)))
     return found

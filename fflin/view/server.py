@@ -177,9 +177,13 @@ class _Socket(_Guarded, WebSocketHandler):
         self._fields["server"].clients.discard(self)
 
     def on_message(self, message: str | bytes) -> None:
-        # What no page of ours sends is passed over.
-        with contextlib.suppress(FflinError, ValueError, TypeError, AttributeError):
+        # What no page of ours sends is passed over, and what is nested too deep ends it.
+        try:
             self._fields["server"].asked(json.loads(message))
+        except (FflinError, ValueError, TypeError, AttributeError, ArithmeticError):
+            return
+        except RecursionError:
+            self.close(1008, "nested too deep")
 
     def send(self, content: bytes | str) -> Any:
         try:

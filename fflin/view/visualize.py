@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from warnings import warn
 
-from fflin.base.errors import FflinWarning, FileError, InputError, unknown
-from fflin.base.validation import Array, number
+from fflin.base.errors import FflinWarning, FileError, InputError
+from fflin.base.validation import Array, number, truth
 from fflin.base.writing import as_path, write_whole
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.frames import find_frame
+from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -118,8 +119,9 @@ def visualize(
         )
     if scene is None:
         scene = "lab" if any(robot.gravity) else "space"
-    if scene not in SCENES:
+    if not isinstance(scene, str) or scene not in SCENES:
         raise InputError(f"scene is {scene!r}, expected one of {', '.join(SCENES)}")
+    opened = None if open is None else truth("open", open)
     check_tool(robot, tool)
     from fflin.view.playback import default_tool
 
@@ -128,7 +130,7 @@ def visualize(
         if any(file is not None for file in (html, png, gif)):
             raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
         start = robot.neutral() if q is None else _configuration(robot, "q", q)
-        return _live(robot, start, open is None or open, scene, tool, bool(follow), speed, port)
+        return _live(robot, start, opened is not False, scene, tool, bool(follow), speed, port)
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif}, robot.urdf)
     _check_motion(robot, motion)
     fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
@@ -155,7 +157,7 @@ def visualize(
         ) as file:
             file.write(page.encode())
         shown = Path(file.name)
-    if shown and (open if open is not None else not outputs):
+    if shown and (not outputs if opened is None else opened):
         import webbrowser
 
         webbrowser.open(shown.resolve().as_uri())
@@ -214,9 +216,8 @@ def check_outputs(files: dict[str, Any], spare: Path | None = None) -> dict[str,
 
 def check_tool(robot: Robot, tool: str | None) -> None:
     """Raise UnknownNameError where there is no such frame."""
-    if tool is not None and not robot.model.existFrame(tool):
-        frames = [frame.name for frame in robot.model.frames.tolist() if frame.parentJoint >= ROOT]
-        raise unknown("frame", tool, frames)
+    if tool is not None:
+        find_frame(robot.model, tool)
 
 
 def check_rates(fps: float, speed: float | None, duration: float) -> tuple[float, float]:

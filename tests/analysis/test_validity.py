@@ -1,7 +1,13 @@
 """How far the linear model and its loop reach."""
 
+import contextlib
+import os
+import signal
+import subprocess
+import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -10,6 +16,7 @@ from scipy.stats import binomtest
 import fflin
 from fflin.analysis.closed_loop import Loop
 from fflin.analysis.validity import _LEVELS, _clopper_pearson, _crossing, _slope
+from fflin.batch.workers import OwnWorkers
 from fflin.control.weights import default_weights
 from tests.commands.test_cli import refused, run
 
@@ -222,3 +229,72 @@ def test_command_line():
     assert "4 of 4 runs" in out and max(map(len, out.splitlines())) <= 80
     assert "--jobs is 0" in refused("validity", "cubesat", "--jobs", "0")
     assert "below 175 deg" in refused("validity", "cubesat", "--attitude", "200")
+
+
+def test_jobs_are_at_most_one_for_each_core():
+    code, out, _ = run("validity", "cubesat", "--samples", "2", "--jobs", "10" + "0" * 30)
+    assert code == 0 and "of 2 runs settled" in " ".join(out.split())
+    done = subprocess.run(
+        [sys.executable, "-m", "fflin", "validity", "cubesat", "--samples", "2", "--jobs", "99999"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "99999 processes are more than there are cores" in done.stderr
+
+
+def test_progress_is_told_of_every_run(robots):
+    robot = robots["cubesat"]
+    lin, gain = held(robot)
+    for executor in (None, ThreadPoolExecutor(2)):
+        told = []
+        fflin.validity(
+            robot,
+            lin,
+            gain,
+            samples=3,
+            executor=executor,
+            progress=lambda *each, told=told: told.append(each),
+        )
+        assert told == [(done, 7) for done in range(1, 8)]
+    with pytest.raises(fflin.InputError, match="progress is 3"):
+        fflin.validity(robot, lin, gain, progress=3)
+
+
+def die(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_process_that_dies_is_one_line(robots, monkeypatch):
+    robot = robots["cubesat"]
+    lin, gain = held(robot)
+    monkeypatch.setattr(Loop, "__reduce__", lambda loop: (die, ()))
+    workers = OwnWorkers(1)
+    for executor in (workers, ProcessPoolExecutor(1, mp_context=get_context("spawn"))):
+        with executor, pytest.raises(fflin.FflinError, match="a process that did the runs died"):
+            fflin.validity(robot, lin, gain, samples=2, executor=executor)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no pseudo-terminal")
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
+    import pty
+
+    ours, theirs = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-m", "fflin", "validity", "ets_vii", "--samples", "9000", "--jobs", jobs],
+        stderr=theirs,
+        start_new_session=True,
+    ) as process:
+        os.close(theirs)
+        said = b""
+        while b"s left" not in said:
+            said += os.read(ours, 4096)
+        os.killpg(process.pid, signal.SIGINT)
+        with contextlib.suppress(OSError):  # Linux tells the end so
+            while more := os.read(ours, 4096):
+                said += more
+    os.close(ours)
+    assert process.returncode == 130
+    # The bar is taken away before the line.
+    assert said.endswith(b"\r\x1b[2Kfflin: stopped\r\n")

@@ -14,6 +14,7 @@ import fflin
 from fflin.batch import chunks as batch_chunks
 from fflin.batch import dispatch as dispatching
 from fflin.batch.workers import OwnWorkers, WorkerDied
+from fflin.kernel import compiled
 from tests.batch.test_sweep import assert_same, points, singular_at
 from tests.support.patience import PATIENCE
 
@@ -148,14 +149,14 @@ def test_a_chunk_that_kills_every_worker_is_named_and_the_rest_is_there(robot, k
     assert np.abs(caught.value.batch.B_lower - expected).max() < 1e-13
 
 
-def half_sent():
+def half_sent(large=10**6):
     """Return a large result of which only half is sent before the worker is killed."""
     from multiprocessing.connection import Connection
 
     whole = Connection._send
 
     def send(self, buffer, *arguments):
-        if len(buffer) < 10**6:
+        if len(buffer) < large:
             return whole(self, buffer, *arguments)
         whole(self, buffer[: len(buffer) // 2], *arguments)
         os.kill(os.getpid(), signal.SIGKILL)
@@ -178,25 +179,115 @@ def test_a_worker_that_is_killed_in_the_middle_of_its_result_harms_no_other():
         workers.submit(pow, 2, 3)
 
 
+BEGIN = """
+import os, sys, time
+from fflin.batch.workers import OwnWorkers
+
+def busy(_):
+    print("begun", flush=True)
+    while True:
+        pass
+
+if __name__ == "__main__":
+    workers = OwnWorkers(2)
+    workers.submit(pow, 2, 3).result()
+    {task}
+    sys.stdin.read()
+    {end}
+"""
+
+
 @pytest.mark.parametrize(
-    "task, end",
+    "task, said",
     [
-        ("time.sleep, 3", "os.kill(os.getpid(), signal.SIGKILL)"),
-        ("time.sleep, 9999", "workers.shutdown()"),
+        ("workers.submit(busy, 0)", "begun"),
+        ("workers.submit(time.sleep, 9999); print('begun', flush=True)", "begun"),
+        ("print('idle', flush=True)", "idle"),
+        ("workers.submit(pow, 2, 4); workers.submit(pow, 2, 4); print('new', flush=True)", "new"),
     ],
 )
-def test_no_worker_outlives_its_caller(task, end, tmp_path):
+@pytest.mark.parametrize("end", ["kill", "workers.shutdown()"])
+def test_no_worker_outlives_its_caller(task, said, end, tmp_path):
+    """It is killed, or ends the workers; these may be busy, asleep, idle or not yet there."""
     script = tmp_path / "script.py"
-    script.write_text(
-        "import os, signal, time\nfrom fflin.batch.workers import OwnWorkers\n"
-        "if __name__ == '__main__':\n"
-        "    workers = OwnWorkers(2)\n"
-        "    workers.submit(pow, 2, 3).result()\n"
-        f"    workers.submit({task})\n    time.sleep(1)\n"
-        f"    {end}\n"
+    script.write_text(BEGIN.format(task=task, end="pass" if end == "kill" else end))
+    with subprocess.Popen(
+        [sys.executable, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == f"{said}\n"
+        if end == "kill":
+            process.kill()
+        # The workers have the same stdout, which ends with the last of them.
+        process.communicate(timeout=120)
+
+
+def test_there_are_no_more_workers_than_cores(robot):
+    cores = compiled.available_cores()
+    with pytest.warns(fflin.FflinWarning, match=rf"1000000 processes .* cores; {cores} do"):
+        workers = OwnWorkers(10**6)
+    workers.shutdown()
+    assert workers._max_workers == cores
+    assert dispatching._count(workers) == cores
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity")
+@pytest.mark.parametrize(
+    "files, cores",
+    [
+        (["150000 100000\n"], 2),
+        (["max 100000\n"], 8),
+        (["1000 100000\n"], 1),
+        (["900000 100000\n"], 8),
+        (["-1\n", "100000\n"], 8),
+        (["300000\n", "100000\n"], 3),
+        (["what is this"], 8),
+    ],
+)
+def test_cores_are_those_of_the_container(files, cores, tmp_path, monkeypatch):
+    paths = [tmp_path / str(index) for index in range(len(files))]
+    for path, text in zip(paths, files, strict=True):
+        path.write_text(text)
+    monkeypatch.setattr(compiled, "_QUOTAS", (("/nowhere",), tuple(map(str, paths))))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8))
+    assert compiled.available_cores() == cores
+
+
+class HalfSendingJob(batch_chunks.ChunkJob):
+    """A job whose worker is killed in the middle of the result of the chunk that begins at 24."""
+
+    here = os.getpid()
+
+    def __reduce__(self):
+        return _half_sending, self._arguments
+
+    def run(self, points, start, out=None):
+        if start == 24 and os.getpid() != self.here:
+            half_sent(1000)
+        return super().run(points, start, out)
+
+
+def _half_sending(robot, frame, reference, moving, at_rest, count):
+    job = HalfSendingJob(
+        robot, frame=frame, reference=reference, moving=moving, at_rest=at_rest, count=count
     )
-    # The workers have the same stdout, which ends with the last of them.
-    subprocess.run([sys.executable, script], stdout=subprocess.PIPE, timeout=PATIENCE, check=False)
+    job.here = None
+    return job
+
+
+@pytest.mark.parametrize("method", ["spawn", "fork"])
+def test_a_pool_whose_worker_is_killed_in_the_middle_of_its_result_is_one_line(
+    method, robot, monkeypatch
+):
+    """Left alone it waits for the rest for ever, and so do those who use it."""
+    monkeypatch.setattr("fflin.batch.sweep.ChunkJob", HalfSendingJob)
+    monkeypatch.setattr(dispatching, "_GLANCE", 0.2)
+    q, _, _ = points(robot, 80)
+    with (
+        ProcessPoolExecutor(2, mp_context=get_context(method)) as doomed,
+        pytest.raises(fflin.SweepError, match="the executor died: BrokenProcessPool") as caught,
+    ):
+        fflin.sweep(robot, q, executor=doomed, chunk=8)
+    assert (24, 32) in [failure[:2] for failure in caught.value.failed]
 
 
 def test_workers_that_cannot_start_are_one_line(tmp_path):

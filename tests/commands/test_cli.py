@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -368,6 +369,34 @@ def test_check_exits_1_where_it_falls_short(monkeypatch, capsys):
     )
     assert cli.main(["check", "ets_vii"]) == 1
     assert "FAILED" in capsys.readouterr().out
+
+
+def test_what_other_packages_warn_of_stands_before_no_error(monkeypatch, capsys):
+    """It is said where all went well; warnings of fflin's own are said at once."""
+    from fflin.commands import cli
+    from fflin.linear import linearization
+
+    right, outcome = linearization.linearize, []
+
+    def linearize(*arguments, **options):
+        assert (np.array([1e308]) * 10.0).max() == np.inf
+        warnings.warn("mind this", fflin.FflinWarning, stacklevel=2)
+        if outcome:
+            raise fflin.InputError("too large")
+        return right(*arguments, **options)
+
+    monkeypatch.setattr(linearization, "linearize", linearize)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert cli.main(["linearize", "cubesat"]) == 0
+        *_, own, foreign = capsys.readouterr().err.splitlines()
+        outcome.append("error")
+        assert cli.main(["linearize", "cubesat"]) == 2
+        error = capsys.readouterr().err
+    assert own == "fflin: warning: mind this"
+    assert foreign == "fflin: RuntimeWarning: overflow encountered in multiply"
+    assert error.endswith("fflin: warning: mind this\nfflin: error: too large\n")
+    assert "RuntimeWarning" not in error
 
 
 def test_help_has_an_example_in_every_command():

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -135,6 +136,22 @@ def test_a_place_that_cannot_be_written_is_said_before_the_run(tmp_path, option)
     assert (code, out) == (2, "")
     assert "cannot be written" in err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_is_interrupted_is_kept(tmp_path, monkeypatch, capsys):
+    from fflin.commands import cli, simulation
+
+    right = simulation.simulated
+    monkeypatch.setattr(
+        simulation,
+        "simulated",
+        lambda *a: replace(right(*a), stopped="interrupted at t = 0.5 s"),
+    )
+    path = tmp_path / "m.npz"
+    with pytest.raises(KeyboardInterrupt, match="interrupted at t"):
+        cli.main(["simulate", "cubesat", "--duration", "1", "-o", str(path)])
+    assert f"wrote {path}" in capsys.readouterr().out
+    assert fflin.Motion.load(path).stopped == "interrupted at t = 0.5 s"
 
 
 def test_a_free_robot_keeps_its_energy():

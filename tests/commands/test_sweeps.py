@@ -109,11 +109,11 @@ def test_the_reference_may_be_the_world(tmp_path, robots):
 INTERRUPTED = """
 import os, signal, sys
 from fflin.base import progress
-from fflin.commands import cli
-def update(bar, done):
+from fflin.__main__ import main
+def update(bar, done, total):
     os.killpg(0, signal.SIGINT)
 progress.Progress.update = update
-sys.exit(cli.main(sys.argv[1:]))
+sys.exit(main())
 """
 
 

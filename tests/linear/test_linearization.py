@@ -326,7 +326,7 @@ def test_singular_inertia_names_the_joint():
     model.appendBodyToJoint(1, pin.Inertia.Random(), pin.SE3.Identity())
     model.addJoint(1, pin.JointModelRZ(), pin.SE3.Random(), "ghost")
     robot = fflin.from_model(model)
-    with pytest.raises(fflin.SingularInertiaError, match=r"joint 'ghost' moves no mass.*lock"):
+    with pytest.raises(fflin.SingularInertiaError, match=r"joint 'ghost' can move without.*lock"):
         fflin.linearize(robot)
     assert fflin.linearize(fflin.from_model(model, lock=["ghost"])).B.shape == (12, 6)
 

@@ -131,6 +131,27 @@ def test_it_sends_where_the_robot_is_and_takes_the_sliders(live, robots):
     np.testing.assert_allclose(coupling, inertia / np.outer(scale, scale), atol=1e-4)
 
 
+@pytest.mark.parametrize("opening", ["[", '{"joints":', '{"joints": {"joint_2": ['])
+def test_what_is_nested_too_deep_ends_its_connection_alone(opening, live, caplog):
+    async def play():
+        connection, other = await websocket(live), await websocket(live)
+        await connection.write_message(opening * 100_000)
+        while await asyncio.wait_for(connection.read_message(), 60.0) is not None:
+            pass
+        await state(other)
+        await other.write_message(json.dumps({"joints": {"joint_2": 10**400}}))  # passed over
+        await other.write_message(json.dumps({"joints": {"joint_2": 0.5}}))
+        after = await state(other)
+        for each in (connection, other):
+            each.close()
+        return connection.close_code, connection.close_reason, after
+
+    code, reason, after = asyncio.run(play())
+    assert (code, reason) == (1008, "nested too deep")
+    assert after["joints"][1] == 0.5
+    assert not caplog.records
+
+
 def test_a_running_simulation_is_shown_as_it_runs(robots):
     robot = robots["planar_detumble"]
     v = fflin.velocity(robot, {"omega_b.z": 0.3})

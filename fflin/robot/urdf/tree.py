@@ -184,11 +184,11 @@ def _check_tree(
 
 
 def _drop_world(links: dict[str, Link], joints: dict[str, JointElement]) -> None:
-    """Drop a root that stands for the world: without mass, its one joint floating."""
+    """Drop a root that stands for the world: without mass and inertia, its one joint floating."""
     children = {joint.child for joint in joints.values()}
     root = next(link for name, link in links.items() if name not in children)
     hanging = [joint for joint in joints.values() if joint.parent == root.name]
-    if len(hanging) != 1 or hanging[0].type != "floating" or root.mass:
+    if len(hanging) != 1 or hanging[0].type != "floating" or root.mass or any(root.inertia):
         return
     first = hanging[0]
     first.element.note(

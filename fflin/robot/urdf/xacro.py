@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import contextlib
-import io
-import warnings
+import ctypes
+import faulthandler
+import os
+import signal
+import subprocess
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from fflin.base.errors import MissingPackageError, UrdfError
 from fflin.robot.urdf.xml import Element
+
+# How long an expansion may take [s]; xacro's expressions and macros may be without end.
+LIMIT = 60.0
+
+# Of Linux, prctl.h: the signal that a process gets where the one that started it ends.
+_PR_SET_PDEATHSIG = 1
 
 # What lies below these does not reach the model, so a "${" there is no reason to expand.
 _IGNORED = frozenset(
@@ -33,7 +44,7 @@ def first_xacro(root: Element) -> Element | None:
 
 
 def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, list[str]]:
-    """Expand a xacro document.
+    """Expand a xacro document, in a process of its own that may take `LIMIT`.
 
     Parameters
     ----------
@@ -56,30 +67,59 @@ def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, l
     MissingPackageError
         If xacrodoc is not installed.
     UrdfError
-        If xacro cannot expand it.
+        If xacro cannot expand it, or takes too long.
     """
     use = f", first used by <{first.tag}> in line {first.line}" if first else ""
-    said = io.StringIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the packages themselves, on import
-        try:
-            import xacro
-            from xacrodoc import XacroDoc, packages
-        except ImportError:
-            raise MissingPackageError(
-                f"{path}: is written in xacro{use}; pip install 'fflin[xacro]' to have it expanded"
-            ) from None
-        try:
-            with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
-                packages.walk_up_from(path)
-                # Files to include are looked up from the one on top of xacro's stack.
-                xacro.init_stacks(str(path))
-                urdf = XacroDoc.from_string(
-                    document.decode("utf-8-sig"), resolve_packages=False, rootdir=path.parent
-                ).to_urdf_string()
-        except Exception as error:  # xacro evaluates Python expressions, which may raise anything
-            text = " ".join(str(error).split()) or type(error).__name__
-            raise UrdfError(f"{path}: cannot be expanded by xacro{use}: {text[:300]}") from None
-        finally:
-            xacro.init_stacks(None)
-    return urdf.encode(), [f"{path.name}: {line}" for line in said.getvalue().splitlines() if line]
+    if not (find_spec("xacro") and find_spec("xacrodoc")):
+        raise MissingPackageError(
+            f"{path}: is written in xacro{use}; pip install 'fflin[xacro]' to have it expanded"
+        )
+    failed = f"{path}: cannot be expanded by xacro{use}"
+    try:
+        # Python's packages are looked for where this process does.
+        done = subprocess.run(
+            [sys.executable, "-W", "ignore", "-m", __name__, str(path), str(LIMIT)],
+            input=document,
+            capture_output=True,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONUTF8": "1"},
+            timeout=LIMIT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise UrdfError(
+            f"{failed}: it takes more than {LIMIT:g} s; is there a macro or an expression "
+            "without end?"
+        ) from None
+    said = done.stderr.decode(errors="replace").splitlines()
+    if done.returncode:
+        why = " ".join(said[-1:]) or f"its process ended with {done.returncode}"
+        raise UrdfError(f"{failed}: {why[:300]}")
+    return done.stdout, [f"{path.name}: {line}" for line in said if line]
+
+
+def _expand_here(path: Path, limit: float) -> None:
+    """Expand what comes in on stdin to stdout, in a process of its own."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever started it ends it
+    # It ends with who started it, or else in time, whatever it does.
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    faulthandler.dump_traceback_later(limit, exit=True)
+    import xacro
+    from xacrodoc import XacroDoc, packages
+
+    document = sys.stdin.buffer.read().decode("utf-8-sig")
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            packages.walk_up_from(path)
+            # Files to include are looked up from the one on top of xacro's stack.
+            xacro.init_stacks(str(path))
+            urdf = XacroDoc.from_string(
+                document, resolve_packages=False, rootdir=path.parent
+            ).to_urdf_string()
+    except Exception as error:  # xacro evaluates Python expressions, which may raise anything
+        sys.exit(" ".join(str(error).split()) or type(error).__name__)
+    sys.stdout.buffer.write(urdf.encode())
+
+
+if __name__ == "__main__":
+    _expand_here(Path(sys.argv[1]), float(sys.argv[2]))

@@ -2,6 +2,10 @@
 
 import hashlib
 import math
+import os
+import select
+import subprocess
+import sys
 import threading
 import warnings
 from pathlib import Path
@@ -11,6 +15,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.robot.urdf import xacro as expansion
 from fflin.robot.urdf.joints import Mimic
 from fflin.robot.urdf.reader import describe, read_urdf
 from fflin.robot.urdf.xml import parse
@@ -294,6 +299,47 @@ def test_without_xacrodoc_one_line_says_how(monkeypatch):
     with pytest.raises(fflin.MissingPackageError):
         read(arm(), "robot.xacro")
     read(arm())
+
+
+@pytest.mark.parametrize(
+    "endless",
+    [
+        inertial("${[None for i in range(10**15)]}"),
+        inertial("${9**9**9}"),
+        '<xacro:macro name="a" params="n"><xacro:if value="${n}"><xacro:a n="${n - 1}"/>'
+        '<xacro:a n="${n - 1}"/></xacro:if></xacro:macro><xacro:a n="60"/>',
+    ],
+)
+def test_a_xacro_without_end_is_one_line(endless, monkeypatch):
+    """In Python, inside a call that holds the interpreter, and by macros."""
+    pytest.importorskip("xacrodoc")
+    monkeypatch.setattr(expansion, "LIMIT", 1.0)
+    with pytest.raises(fflin.UrdfError, match=r"cannot be expanded by xacro, .*: .* 1 s; is there"):
+        read(arm(child=endless, attributes='name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"'))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere it ends in time")
+def test_a_xacro_ends_with_who_expands_it(tmp_path):
+    pytest.importorskip("xacrodoc")
+    path = tmp_path / "r.xacro"
+    # It says that it has begun, and never ends.
+    path.write_text(
+        arm(
+            child='<xacro:include filename="fifo"/>',
+            attributes='name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"',
+        )
+    )
+    os.mkfifo(tmp_path / "fifo")
+    with (
+        subprocess.Popen([sys.executable, "-m", "fflin", "info", path]) as process,
+        # Opened for writing once xacro opens it for reading, and broken as xacro ends.
+        (tmp_path / "fifo").open("wb", buffering=0) as fifo,
+    ):
+        process.kill()
+        process.wait()
+        poll = select.poll()
+        poll.register(fifo, select.POLLERR)
+        assert poll.poll(55_000)
 
 
 def test_xacro_includes_from_its_own_folder(tmp_path):

@@ -1,0 +1,114 @@
+"""What of a robot can move without moving mass at every configuration, so that M is singular."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import SingularInertiaError, listed
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.robot.frames import ROOT
+
+if TYPE_CHECKING:
+    from fflin.robot.robot import Robot
+
+# Of singular values: rounding leaves 1e-15 of the largest; links 1e7 m apart, 1e-7 of it.
+_ZERO = 1e-12
+
+# Of the principal moments of a body, what rounding leaves of zero.
+_NO_MOMENT = 1e-12
+
+# Share of a coordinate in a motion from which on it is named.
+_INVOLVED = 0.1
+
+
+def idle_coordinates(robot: Robot) -> tuple[str, ...]:
+    r"""Name what can move together without moving mass, at every configuration; nothing mostly.
+
+    :math:`\nu^T M \nu` is the sum over bodies of :math:`m |v|^2 + \omega^T I \omega` and over
+    joints of their armature's share. It vanishes only if the velocity of every mass, every turn
+    that has inertia and every rate that has an armature do: whether some :math:`\nu` makes them
+    do so is a question of geometry, decided without the masses, whose rounding could hide it.
+
+    Parameters
+    ----------
+    robot : Robot
+
+    Returns
+    -------
+    tuple of str
+    """
+    bodies = robot.model.inertias.tolist()[ROOT:]
+    moments = [np.linalg.eigh(body.inertia) for body in bodies]
+    if all(
+        body.mass > 0.0 and values[0] > _NO_MOMENT * values[2]
+        for body, (values, _) in zip(bodies, moments, strict=True)
+    ):
+        return ()
+    columns = _independent(robot)
+    names = np.array(coordinate_names(robot))
+    rng = np.random.default_rng(0)
+    idle: tuple[str, ...] = ()
+    # What is singular at two configurations taken at random is so at all.
+    for _ in range(2):
+        velocity = columns @ rng.uniform(-1.0, 1.0, columns.shape[1])
+        q = pin.integrate(robot.model, robot.neutral(), velocity)
+        moved = _moved(robot, q, moments) @ columns
+        moved /= np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
+        _, sizes, modes = np.linalg.svd(np.linalg.qr(moved, mode="r"))
+        rank = int(np.count_nonzero(sizes > _ZERO * sizes[0]))
+        involved = np.linalg.norm(modes[rank:], axis=0) > _INVOLVED
+        idle = tuple(dict.fromkeys(names[involved].tolist()))
+        if not idle:
+            break
+    return idle
+
+
+def coordinate_names(robot: Robot) -> list[str]:
+    """Return the names (6 + n) of the coordinates of velocity, in state order, for a message."""
+    return ["the base"] * 6 + [f"joint '{name}'" for name in robot.joint_names]
+
+
+def massless_note(robot: Robot) -> str:
+    """Say what of a robot can move without moving mass, and what to do about it."""
+    return (
+        f"M of '{robot.name}' cannot be inverted at any configuration: {listed(robot.idle)} can "
+        "move without moving mass; give the links an inertia, or lock what needs none"
+    )
+
+
+def require_inertia(robot: Robot) -> None:
+    """Raise `SingularInertiaError` where M is singular at every configuration.
+
+    The rounding of its factors may hide it.
+    """
+    if robot.idle:
+        raise SingularInertiaError(massless_note(robot))
+
+
+def _independent(robot: Robot) -> Array:
+    """Return (nv, 6 + n) with v = columns nu, in Pinocchio's order; mimics follow."""
+    columns = np.eye(robot.nv)
+    for joint, leader, multiplier, _ in robot.followers:
+        columns[joint.idx_v, leader.idx_v] = multiplier
+    kept = [*range(6), *(joint.idx_v for joint in robot.joints)]
+    return columns[:, kept]
+
+
+def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Array:
+    """Return rows (k, nv) that give, from v, every velocity that has inertia."""
+    model, data = robot.model, robot.create_data()
+    pin.computeJointJacobians(model, data, q)
+    rows = [np.eye(model.nv)[model.armature > 0.0]]
+    for index, (values, axes) in enumerate(moments, start=ROOT):
+        body = model.inertias[index]
+        J = pin.getJointJacobian(model, data, index, pin.ReferenceFrame.LOCAL)
+        if body.mass > 0.0:
+            rows.append(J[:3] - skew(body.lever) @ J[3:])
+        turning = values > _NO_MOMENT * values[2]
+        rows.append(axes[:, turning].T @ J[3:])
+    return np.vstack(rows)

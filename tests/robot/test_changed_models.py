@@ -1,0 +1,100 @@
+"""A robot whose model was changed in place makes no results under the old certificate."""
+
+import copy
+import pickle
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+
+
+def heavier(model):
+    model.inertias[2] = model.inertias[2] + pin.Inertia(1.0, np.zeros(3), np.eye(3))
+
+
+def longer(model):
+    model.jointPlacements[3].translation[0] += 1e-9
+
+
+def in_gravity(model):
+    model.gravity.linear = np.array([0.0, 0.0, -9.81])
+
+
+def geared(model):
+    model.armature[7] = 0.1
+
+
+def moved(model):
+    model.frames[4].placement = pin.SE3.Random()
+
+
+CHANGES = [
+    (heavier, "the inertia of joint 'joint_1'"),
+    (longer, "the placement of joint 'joint_2'"),
+    (in_gravity, "its gravity"),
+    (geared, "its armature"),
+    (moved, "frame 'link_1'"),
+]
+
+
+@pytest.mark.parametrize(("change", "said"), CHANGES)
+def test_a_changed_model_is_refused_wherever_results_are_made(change, said, tmp_path):
+    robot = fflin.load("ets_vii")
+    linearizer = fflin.Linearizer(robot)
+    before = linearizer()
+    gain = fflin.lqr(before, 1.0, 1.0)
+    change(robot.model)
+    after = linearizer()
+    q = robot.neutral()
+    for result in (
+        lambda: fflin.linearize(robot),
+        lambda: fflin.Linearizer(robot),
+        lambda: fflin.check(robot, before),
+        lambda: after.certificate,
+        lambda: after.M,
+        lambda: after.save(tmp_path / "after.npz"),
+        lambda: fflin.sweep(robot, [q]),
+        lambda: fflin.simulate(robot, duration=0.1),
+        lambda: fflin.validity(robot, before, gain, samples=1),
+        lambda: robot.replace(damping=1.0),
+    ):
+        with pytest.raises(fflin.ModelError, match=f"changed after .*: {said}; .*from_model"):
+            result()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_robot_made_of_the_changed_model_works_and_differs():
+    robot = fflin.load("ets_vii")
+    B = fflin.linearize(robot).B
+    heavier(robot.model)
+    other = fflin.from_model(robot.model)
+    lin = fflin.linearize(other)
+    assert fflin.check(other, lin).ok
+    assert np.abs(lin.B - B).max() > 1e-6
+
+
+def test_copies_remember_what_was_made():
+    robot = fflin.load("ets_vii")
+    heavier(robot.model)
+    for twin in (pickle.loads(pickle.dumps(robot)), copy.deepcopy(robot)):
+        with pytest.raises(fflin.ModelError, match="the inertia of joint 'joint_1'"):
+            fflin.linearize(twin)
+
+
+def test_limits_and_new_frames_are_no_change():
+    robot = fflin.load("ets_vii")
+    B = fflin.linearize(robot).B
+    robot.model.upperPositionLimit[7] = 0.5
+    frame = pin.Frame("nozzle", 1, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME)
+    robot.model.addFrame(frame, False)
+    np.testing.assert_array_equal(fflin.linearize(robot).B, B)
+    pushed = robot.replace(inputs=[fflin.Thruster("nozzle", (0, 0, 0), (1, 0, 0))])
+    assert fflin.check(pushed, fflin.linearize(pushed)).ok
+
+
+def test_a_limit_that_is_no_number_is_no_change():
+    model = fflin.load("ets_vii").model.copy()
+    model.lowerPositionLimit[7] = np.nan
+    fflin.linearize(fflin.from_model(model))

@@ -1,0 +1,155 @@
+"""Calls of every public function with arguments that nobody should give it."""
+
+import math
+
+import numpy as np
+import pinocchio as pin
+
+import fflin
+
+ODD = {
+    "None": None,
+    "word": "nosuch",
+    "nan": math.nan,
+    "inf": math.inf,
+    "huge": 1e300,
+    "tiny": 1e-300,
+    "negative": -1.0,
+    "zero": 0,
+    "many": 99999999999999999999,
+    "complex": 1j,
+    "ragged": [[1.0, 2.0], [3.0]],
+    "masked": np.ma.masked_array(np.zeros(3), mask=[1, 0, 0]),
+    "object": np.array([None, {}], dtype=object),
+    "matrix": np.full((2, 3), np.nan),
+    "scalar": np.array(3.0),
+    "empty": [],
+    "mapping": {"nosuch": 1.0},
+    "keys": {3: None},
+    "words": ["a", ["b"]],
+    "type": dict,
+    "bytes": b"\x00",
+    "pose": pin.SE3(2.0 * np.eye(3), np.zeros(3)),
+}
+
+
+def sound(folder):
+    """What each public function takes, by the names of its arguments: a call that works."""
+    robot = fflin.load("planar_detumble")
+    q, v, u = robot.neutral(), np.zeros(robot.nv), np.zeros(6 + robot.n)
+    lin = fflin.linearize(robot)
+    gain = fflin.lqr(lin, 1.0, 1.0)
+    filtered = fflin.kalman(lin, 1.0, 1.0)
+    motion = fflin.simulate(robot, fflin.StateFeedback(lin, gain.K), duration=0.05)
+    t = np.array([0.0, 0.01, 0.02])
+    rows = [np.tile(row, (3, 1)) for row in (q, v, u)]
+    along = fflin.linearize_trajectory(robot, t, *rows)
+    schedule = fflin.tvlqr(along, 1.0, 1.0, 1.0)
+    batch = fflin.sweep(robot, [q, q])
+    found = {"robot": robot, "q": q, "v": v, "u": u}
+    place = {"frame": "hybrid", "reference": pin.SE3.Identity(), "moving": False}
+    weights = {"Q": 1.0, "R": 1.0}
+    filtered_model = fflin.linearize(robot.replace(stiffness=1.0, damping=1.0))
+    vector = (0.0, 0.0, 1.0)
+    joint = robot.joint_names[0]
+    return {
+        "acceleration_lqr": {"lin": lin, "Qp": 1.0, "Qv": 1.0, "Ra": 1.0, "dt": None},
+        "Accelerometer": {"frame": "base"},
+        "Allocation": {"policy": fflin.StateFeedback(lin, gain.K), "design": robot},
+        "BaseForce": {},
+        "BasePose": {},
+        "BaseTorque": {},
+        "bryson": {"lin": lin, "largest": {"q_b": 1.0}},
+        "CenterOfMass": {},
+        "check": {"robot": robot, "lin": lin},
+        "configuration": {"robot": robot, "joints": {joint: 0.1}, "base": pin.SE3.Identity()},
+        "controllability": {"lin": lin},
+        "effort": {"robot": robot, "values": {}},
+        "equilibrium": {"robot": robot, "q": q, "v": v, "frame": "hybrid"},
+        "FramePose": {"frame": "base"},
+        "FrameVelocity": {"frame": "base"},
+        "from_model": {"model": robot.model, "name": "x", "lock": None, "gravity": vector},
+        "FullState": {},
+        "generalized_inertia": {"lin": lin},
+        "generalized_jacobian": {"robot": robot, "q": q, "frame": "base"},
+        "gramians": {"lin": filtered_model, "duration": 1.0},
+        "grid": {"robot": robot, "axes": {joint: [0.0, 1.0]}, "base": None},
+        "Gyroscope": {"frame": "base"},
+        "JointPositions": {"joints": (joint,)},
+        "JointTorque": {"joint": joint},
+        "JointVelocities": {"joints": (joint,)},
+        "kalman": {"lin": lin, "W": 1.0, "V": 1.0, "G": lin.B},
+        "linearize": found | place,
+        "linearize_trajectory": {"robot": robot, "t": t, "q": rows[0], "v": rows[1], "u": rows[2]},
+        "Linearizer": {"robot": robot} | place,
+        "list_robots": {},
+        "load": {
+            **{"robot": "planar_detumble", "lock": [joint], "package_dirs": (), "inputs": None},
+            **{"outputs": None, "stiffness": 1.0, "damping": "urdf", "rest": {}, "gravity": vector},
+        },
+        "load_inputs": {"path": "nosuch.toml"},
+        "lqg": {"gain": gain, "estimator": filtered},
+        "lqr": {"lin": lin} | weights | {"N": None},
+        "lqr_batch": {"batch": batch} | weights,
+        "modes": {"lin": lin},
+        "Momentum": {},
+        "momentum_reduction": {"lin": fflin.linearize(robot.replace(inputs=robot.inputs[2:]))},
+        "observability": {"lin": lin},
+        "OutputFeedback": {"lin": lin, "compensator": fflin.lqg(gain, filtered), "noise": None},
+        "plot_matrices": {"lin": lin, "path": None},
+        "plot_motion": {"motion": motion, "path": None},
+        "plot_poles": {"poles": gain, "path": None, "dt": 0.0, "title": "x"},
+        "plot_validity": {"validity": None, "path": None},
+        "random_configurations": {
+            "robot": robot,
+            "count": 3,
+            "seed": 0,
+            "ranges": None,
+            "base": None,
+        },
+        "RelativePose": {"frame": "base", "to": "base"},
+        "ReactionWheel": {
+            "axis": vector,
+            "frame": None,
+            "inertia": 0.1,
+            "name": "w",
+            "momentum": 0,
+        },
+        "sampled_cost": {"lin": lin, "dt": 0.1} | weights,
+        "ScheduledFeedback": {"lin": lin, "gains": fflin.lqr_batch(batch, **weights)},
+        "simulate": {
+            **{"robot": robot, "policy": None, "q0": q, "v0": v, "duration": 0.02, "dt": 0.01},
+            **{"method": "cf4", "sample": None, "delay": 0.0, "limits": None, "events": ()},
+            **{"disturbance": None, "callback": None, "linear": None, "every": 1, "x0": None},
+            **{"frame": "hybrid", "reference": None},
+        },
+        "StateFeedback": {"lin": lin, "K": gain.K},
+        "StateMap": {"robot": robot, "reference": None, "frame": "hybrid"},
+        "sweep": found
+        | {"q": [q]}
+        | place
+        | dict.fromkeys(("executor", "threads", "chunk", "progress", "out")),
+        "Thruster": {"frame": "base", "position": vector, "direction": vector, "name": "t"},
+        "TrajectoryFeedback": {"trajectory": along, "schedule": schedule},
+        "tvlqr": {"traj": along, "Qf": 1.0} | weights,
+        "validity": {
+            **{"robot": robot, "lin": lin, "gain": None, "attitude": 5.0, "position": 0.1},
+            **{"joint": 0.1, "samples": 1, "seed": 0, "confidence": 0.9, "executor": None},
+        },
+        "velocity": {"robot": robot, "values": {}},
+        "visualize": {
+            **{"robot": robot, "motion": motion, "html": folder / "a.html", "open": False},
+            **{"tool": None, "fps": 10.0, "speed": 1.0, "scene": "space"},
+        },
+        "LinearModel.discretize": {"self": lin, "dt": 0.1},
+        "LinearModel.is_equilibrium": {"self": lin, "tol": 1e-9},
+        "LinearModel.load": {"path": "nosuch.npz"},
+        "LinearModel.save": {"self": lin, "path": folder / "a.npz"},
+        "Motion.save": {"self": motion, "path": folder / "b.npz"},
+        "Robot.replace": {
+            **{"self": robot, "inputs": robot.inputs, "outputs": robot.outputs, "gravity": vector},
+            **{"stiffness": 1.0, "damping": {}, "rest": {}},
+        },
+        "StateMap.to_pinocchio": {"self": fflin.StateMap(robot), "x": lin.x0},
+        "StateMap.to_state": {"self": fflin.StateMap(robot), "q": q, "v": v},
+    }
