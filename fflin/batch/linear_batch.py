@@ -285,13 +285,16 @@ class LinearBatch:
         certify: Any = partial(_no_robot, "certificate", self.robot)
         inertia: Any = partial(_no_robot, "inertia M", self.robot)
         ignorable: Any = partial(_given, self._ignorable)
+        limits: Any = None
         if self._system is not None:
             from fflin.linear.certificate import certify as certified
             from fflin.linear.certificate import inertia_matrix
             from fflin.linear.ignorable import ignorable_states
 
-            ignorable = partial(ignorable_states, self._system)
+            from fflin.robot.limits import joint_limits
 
+            ignorable = partial(ignorable_states, self._system)
+            limits = partial(joint_limits, self._system)
             certify = partial(certified, self._system)
             inertia = partial(inertia_matrix, self._system)
         B.setflags(write=False)
@@ -305,7 +308,7 @@ class LinearBatch:
             | names
             | {"B": B, "x0": x0, "y0": x0 if y0 is None else y0, "dt": 0.0}
             | {"_inertia": inertia, "_certify": certify, "_drift": rows.get("_drift")}
-            | {"_ignorable": ignorable}
+            | {"_ignorable": ignorable, "_limits": limits}
         )
 
     def _rest_states(self, rows: slice) -> Array:

@@ -108,7 +108,7 @@ class SweepTask:
 
 
 # Fields of a linear model that a batch has as arrays, or not at all.
-_OF_MODELS = ("C", "D", "dt", "_inertia", "_certify", "_ignorable")
+_OF_MODELS = ("C", "D", "dt", "_inertia", "_certify", "_ignorable", "_limits")
 
 # What the robot is, beside what its model and its mappings hold.
 _OF_THE_ROBOT = (

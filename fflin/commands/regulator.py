@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import suppress
+import warnings
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError, unknown
+from fflin.base.errors import (
+    EquilibriumError,
+    FflinWarning,
+    InputError,
+    StabilizabilityError,
+    unknown,
+)
 from fflin.commands import DONE
 from fflin.commands.arguments import (
     Commands,
@@ -19,7 +26,6 @@ from fflin.commands.arguments import (
 from fflin.commands.points import linear_model, once
 
 if TYPE_CHECKING:
-    from fflin.base.validation import Array
     from fflin.control.lqr import Gain
     from fflin.linear.model import LinearModel
 
@@ -31,7 +37,7 @@ def add_commands(commands: Commands) -> None:
         "lqr",
         _lqr,
         "design the linear quadratic regulator: gain, poles, residual, margins",
-        "fflin lqr ets_vii --bryson q_b=0.05 --bryson tau_m=5 -o gain.npz",
+        "fflin lqr canadarm2 -o gain.npz",
     )
     add_point(lqr)
     add_weights(lqr)
@@ -40,18 +46,23 @@ def add_commands(commands: Commands) -> None:
 
 def add_weights(command: argparse.ArgumentParser) -> None:
     """Add what is regulated and at which cost: --q, --r, --bryson, --dt and --reduce."""
+    command.add_argument(
+        "--weights",
+        choices=("urdf", "identity"),
+        help="what weighs what is not named: `urdf` (default), with which the inputs keep within "
+        "the limits of the URDF where the base is turned by 30 deg and the joints by 0.3 rad, or "
+        "`identity`, 1 on each",
+    )
     add_values(
         command,
         "--q",
-        "weight on a state or a group of them, such as q_b or q_m.joint_1; 1 by default; without "
-        "any weight the cost is on states and accelerations, 1 on each",
+        "weight on a state or a group of them, such as q_b or q_m.joint_1",
         metavar="NAME=W",
     )
     add_values(
         command,
         "--r",
-        "weight on an input or a group of them, such as tau_b; by default the squares of the "
-        "accelerations that a unit of it gives the coordinates, each taken alone",
+        "weight on an input or a group of them, such as tau_b",
         metavar="NAME=W",
     )
     add_values(
@@ -82,14 +93,9 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
 
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
-    """Return the regulator that the weights say.
-
-    Without any, a model of double integrators, as a driven robot at rest is, gets the cost on
-    accelerations: its poles are of the order of 1/s whatever the robot weighs.
-    """
-    from fflin.control.acceleration_lqr import acceleration_lqr
+    """Return the regulator that the weights say, and warn of one that bears little."""
+    from fflin.control.gain_text import fragility
     from fflin.control.lqr import lqr, require_fixed_point
-    from fflin.control.sampled_cost import sampled_cost
 
     try:
         require_fixed_point(lin)
@@ -97,22 +103,26 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
         # It balances forces; a base that moves stays no fixed point.
         hint = "" if arguments.equilibrium or lin.v.any() else " (--equilibrium)"
         raise EquilibriumError(f"{error}{hint}") from None
-    if not (arguments.q or arguments.r or arguments.bryson):
-        with suppress(InputError, StabilizabilityError):
-            return acceleration_lqr(lin, 1.0, 1.0, 1.0, dt=arguments.dt)
-    Q, R = _weights(lin, arguments)
+    if arguments.dt is not None:
+        lin = lin.discretize(arguments.dt)
     try:
-        if arguments.dt is None:
-            return lqr(lin, Q, R)
-        return lqr(lin.discretize(arguments.dt), *sampled_cost(lin, arguments.dt, Q, R))
+        if arguments.q or arguments.r or arguments.bryson:
+            gain = _weighed(lin, arguments)
+        else:
+            gain = lqr(lin, weights=arguments.weights)
     except StabilizabilityError as error:
         hint = " (--reduce)" if "momentum_reduction" in str(error) else ""
         raise StabilizabilityError(f"{error}{hint}") from None
+    if fragile := fragility(gain):
+        warnings.warn(fragile, FflinWarning, stacklevel=2)
+    return gain
 
 
-def _weights(lin: LinearModel, arguments: argparse.Namespace) -> tuple[Array, Array]:
-    """Return the diagonals of Q and R."""
-    from fflin.control.weights import default_weights, inverse_square, named_weights
+def _weighed(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
+    """Return the regulator with weights that are named, and a rule's for what is not."""
+    from fflin.control.default_weights import rule_weights
+    from fflin.control.lqr import lqr
+    from fflin.control.weights import inverse_square
 
     values = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
     squares = {}
@@ -130,11 +140,9 @@ def _weights(lin: LinearModel, arguments: argparse.Namespace) -> tuple[Array, Ar
     both = [*(set(values["q"]) & set(of_states)), *(set(values["r"]) & set(of_inputs))]
     if both:
         raise InputError(f"'{both[0]}' has a weight and a largest value; give either")
-    Q, R = default_weights(lin)
-    return (
-        named_weights("state", values["q"] | of_states, lin.state_names, Q),
-        named_weights("input", values["r"] | of_inputs, lin.input_names, R),
-    )
+    q, r = values["q"] | of_states, values["r"] | of_inputs
+    *weights, rule = rule_weights(lin, arguments.weights, q, r)
+    return replace(lqr(lin, *weights), weights=rule)
 
 
 def _lqr(arguments: argparse.Namespace) -> int:

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
     from fflin.control.lqr import Gain
 
+# A disk margin [-] below which a loop is called fragile.
+_FRAGILE = 0.3
+
 # A gain of more entries, of more than three joints, is shown by the norms of its blocks.
 _LARGE = 9 * 18
 
@@ -33,7 +36,31 @@ def gain_report(gain: Gain) -> str:
     else:
         body = f"K ({nu} x {nx}): norms of its blocks; a file holds all of it\n\n{_blocks(gain)}"
     parts = [head, body, _poles(gain), _figures(gain)]
+    if gain.weights:
+        parts.append(textwrap.fill(f"weights: {gain.weights}", width()))
+    if fragile := fragility(gain):
+        parts.append(textwrap.fill(f"warning: {fragile}", width()))
     return "\n\n".join(parts if gain.verified else [*parts, NOT_VERIFIED])
+
+
+def fragility(gain: Gain) -> str:
+    """Say what to do about a gain that bears little at its inputs; nothing where it bears enough.
+
+    A continuous optimal loop with a diagonal R has a disk margin of 2/3 at least.
+    """
+    R = gain.R
+    alone = np.count_nonzero(R) == np.count_nonzero(R.diagonal())
+    if alone and not gain.dt and not gain.N.any():
+        return ""
+    margins = gain.margins
+    if margins.disk >= _FRAGILE:
+        return ""
+    remedy = "shorten dt or weigh the inputs more" if gain.dt else "weigh each input alone"
+    return (
+        f"the loop bears only {margins.phase:.2g} deg of phase at its inputs (disk margin "
+        f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or error of the model makes it "
+        f"unstable; {remedy}, as the default weights do"
+    )
 
 
 def _blocks(gain: Gain) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -12,7 +12,8 @@ import numpy as np
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.base.record import Design
 from fflin.base.validation import Array
-from fflin.control.weights import Weight, cross_weight, require_semidefinite, weight
+from fflin.control.default_weights import rule_weights
+from fflin.control.weights import Weight, cost_weights
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
@@ -57,6 +58,8 @@ class Gain(Design):
     state_names, input_names, state_units, input_units : tuple of str
     frame, robot : str
         Of the model.
+    weights : str
+        The rule that made the weights, in words.
     """
 
     VECTORS: ClassVar = ("poles", "x0", "u0")
@@ -81,6 +84,7 @@ class Gain(Design):
     input_units: tuple[str, ...]
     frame: str
     robot: str
+    weights: str = field(default_factory=str)
 
     def __repr__(self) -> str:
         nu, nx = self.K.shape
@@ -109,7 +113,14 @@ class Gain(Design):
         return input_margins(self.A, self.B, self.K, self.R, self.dt)
 
 
-def lqr(lin: LinearModel, Q: Weight, R: Weight, N: ArrayLike | None = None) -> Gain:
+def lqr(
+    lin: LinearModel,
+    Q: Weight | None = None,
+    R: Weight | None = None,
+    N: ArrayLike | None = None,
+    *,
+    weights: str | None = None,
+) -> Gain:
     r"""Return the linear quadratic regulator of a model about a fixed point.
 
     For a continuous model u = u0 - K (x - x0) minimises
@@ -124,17 +135,25 @@ def lqr(lin: LinearModel, Q: Weight, R: Weight, N: ArrayLike | None = None) -> G
     the inertia, such as M^-1 R_a M^-1 on accelerations, has lost what the inertia's condition
     takes before any solver sees it: `acceleration_lqr` does without.
 
+    Without weights the regulator is one that the robot can bear: every coordinate comes back alike,
+    at 0.3 rad/s or as much slower as the efforts and speeds of the URDF ask for where the base is
+    turned by 30 deg and the joints by 0.3 rad; see `fflin.control.default_weights`. Every input
+    then bears 60 deg of phase and half to any gain.
+
     Parameters
     ----------
     lin : LinearModel
         About a fixed point, or about a steady motion with ``moving=True``.
-    Q : array_like (nx, nx) or (nx,), float, or mapping
+    Q : array_like (nx, nx) or (nx,), float, or mapping, optional
         Weight on the state, positive semidefinite: a matrix, its diagonal, or {name: weight}
         with names of states or of their groups, such as ``q_b``; what is not named costs nothing.
-    R : array_like (nu, nu) or (nu,), float, or mapping
+    R : array_like (nu, nu) or (nu,), float, or mapping, optional
         Weight on the inputs, positive definite; likewise.
     N : array_like (nx, nu), optional
         Cross weight, with which Q - N R^-1 N' is positive semidefinite.
+    weights : {"urdf", "identity"}, optional
+        Instead of Q and R: those above (default), or 1 on every state and input. Of a sampled
+        model they are those of the continuous cost under the hold.
 
     Returns
     -------
@@ -162,23 +181,14 @@ def lqr(lin: LinearModel, Q: Weight, R: Weight, N: ArrayLike | None = None) -> G
     B. D. O. Anderson and J. B. Moore, Optimal Control: Linear Quadratic Methods, 1990.
     """
     require_fixed_point(lin)
+    rule = "as given"
+    if Q is None and R is None and N is None:
+        Q, R, N, rule = rule_weights(lin, weights)
+    elif weights is not None or Q is None or R is None:
+        raise InputError("give Q and R, both, or weights='urdf' or 'identity' without them")
     Q, R, cross = cost_weights(lin, Q, R, N)
     solution = _solve(lin, Q, R, cross)
-    return make_gain(lin, solution, Q, R, cross)
-
-
-def cost_weights(
-    lin: LinearModel, Q: Weight, R: Weight, N: ArrayLike | None
-) -> tuple[Array, Array, Array | None]:
-    """Return the weights as matrices, checked."""
-    nx, nu = lin.B.shape
-    Q = weight("Q", Q, lin.state_names)
-    R = weight("R", R, lin.input_names, definite=True)
-    if N is None:
-        return Q, R, None
-    cross = cross_weight("N", N, nx, nu)
-    require_semidefinite("Q - N R^-1 N'", Q - cross @ np.linalg.solve(R, cross.T), lin.state_names)
-    return Q, R, cross
+    return make_gain(lin, solution, Q, R, cross, rule)
 
 
 def require_fixed_point(lin: LinearModel) -> None:
@@ -203,7 +213,14 @@ def require_fixed_point(lin: LinearModel) -> None:
     )
 
 
-def make_gain(lin: LinearModel, solution: Any, Q: Array, R: Array, N: Array | None) -> Gain:
+def make_gain(
+    lin: LinearModel,
+    solution: Any,
+    Q: Array,
+    R: Array,
+    N: Array | None,
+    weights: str = "as given",
+) -> Gain:
     """Return a gain of a solution (P, K, poles, residual, method)."""
     poles = solution.poles[np.lexsort((solution.poles.imag, solution.poles.real))]
     margin = 1.0 - np.abs(poles).max() if lin.dt else -poles.real.max()
@@ -215,6 +232,7 @@ def make_gain(lin: LinearModel, solution: Any, Q: Array, R: Array, N: Array | No
         Q=Q,
         R=R,
         N=np.zeros(lin.B.shape) if N is None else N,
+        weights=weights,
     )
 
 

@@ -9,8 +9,7 @@ import numpy as np
 from fflin.analysis.gramians import held_cost
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, number
-from fflin.control.lqr import cost_weights
-from fflin.control.weights import Weight
+from fflin.control.weights import Weight, cost_weights
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:

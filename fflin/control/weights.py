@@ -154,6 +154,20 @@ def require_semidefinite(what: str, matrix: Array, names: Sequence[str]) -> None
         raise _negative(what, float(values[0]), where, definite=False)
 
 
+def cost_weights(
+    lin: LinearModel, Q: Weight, R: Weight, N: ArrayLike | None
+) -> tuple[Array, Array, Array | None]:
+    """Return the weights as matrices, checked."""
+    nx, nu = lin.B.shape
+    Q = weight("Q", Q, lin.state_names)
+    R = weight("R", R, lin.input_names, definite=True)
+    if N is None:
+        return Q, R, None
+    cross = cross_weight("N", N, nx, nu)
+    require_semidefinite("Q - N R^-1 N'", Q - cross @ np.linalg.solve(R, cross.T), lin.state_names)
+    return Q, R, cross
+
+
 def _checked_matrix(what: str, value: Any, names: Sequence[str], definite: bool) -> Array:
     size = len(names)
     matrix = cross_weight(what, value, size, size)
@@ -176,45 +190,40 @@ def _checked_matrix(what: str, value: Any, names: Sequence[str], definite: bool)
     return matrix
 
 
-def default_weights(lin: LinearModel) -> tuple[Array, Array]:
-    """Return diagonals that suit a robot of any size: 1 on every state, and on each input.
-
-    An input costs the squares of the accelerations that a unit of it gives the coordinates, each
-    taken alone with its inertia on the diagonal of M.
-    """
-    nx, nu = lin.B.shape
-    if lin.M.shape != (nx - nx // 2,) * 2:
-        return np.ones(nx), np.ones(nu)
-    forces = lin.M @ lin.B[nx // 2 :] / (lin.dt or 1.0)
-    return np.ones(nx), ((forces / lin.M.diagonal()[:, None]) ** 2).sum(axis=0)
-
-
-def named_weights(
-    what: str, values: Mapping[str, float], names: Sequence[str], others: Array
-) -> Array:
-    """Return a diagonal (k,) of {name of an entry or of a group: value} and of the `others`."""
+def named_weights(what: str, values: Mapping[str, float], names: Sequence[str]) -> dict[int, float]:
+    """Return {index: value} of {name of an entry or of a group: value}."""
     groups: dict[str, list[int]] = {}
     for index, name in enumerate(names):
         groups.setdefault(_group(name), []).append(index)
-    diagonal = others.astype(float)
+    found: dict[int, float] = {}
     # A single name goes before its group's, whichever stands first.
     for name, value in sorted(values.items(), key=lambda item: item[0] in names):
         if name not in names and name not in groups:
             raise unknown(what, name, (*groups, *names))
         entries = [names.index(name)] if name in names else groups[name]
-        diagonal[entries] = number(f"weight of '{name}'", value)
-    return diagonal
+        found |= dict.fromkeys(entries, number(f"weight of '{name}'", value))
+    return found
+
+
+def reweighed(
+    what: str, matrix: Array, values: Mapping[str, float], names: Sequence[str]
+) -> Array:
+    """Return a weight (k, k) in which what is named has a weight of its own, coupled to nothing."""
+    matrix = matrix.copy()
+    for index, value in named_weights(what, values, names).items():
+        matrix[index], matrix[:, index] = 0.0, 0.0
+        matrix[index, index] = value
+    return matrix
 
 
 def _diagonal(
     what: str, values: Mapping[str, float], names: Sequence[str], *, complete: bool
 ) -> Array:
-    others = np.full(len(names), np.nan if complete else 0.0)
-    diagonal = named_weights(f"entry of {what}", values, names, others)
-    missing = np.flatnonzero(np.isnan(diagonal))
-    if missing.size:
-        raise InputError(f"{what} has no value for {names[missing[0]]}; each needs one")
-    return diagonal
+    found = named_weights(f"entry of {what}", values, names)
+    if complete and len(found) < len(names):
+        missing = next(name for index, name in enumerate(names) if index not in found)
+        raise InputError(f"{what} has no value for {missing}; each needs one")
+    return np.array([found.get(index, 0.0) for index in range(len(names))])
 
 
 def _group(name: str) -> str:

@@ -21,8 +21,9 @@ _NAMES = (
     *("state_names", "input_names", "output_names"),
     *("state_units", "input_units", "output_units"),
 )
-_LISTS = (*_NAMES, "locked", "ignorable")
-_LATER: Record = {"ignorable": (), "drift": ()}  # which files once had not
+_LISTS = (*_NAMES, "locked", "ignorable", "limit_names")
+# Which files once had not.
+_LATER: Record = {"ignorable": (), "drift": (), "limit_names": (), "limits": ()}
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version")
 _CERTIFICATE = ("condition", "inertia_residual", "route_A", "route_B", "f0")
 
@@ -37,7 +38,9 @@ def record_of(lin: Any) -> Record:
     entries: Record = {key: getattr(lin, key) for key in (*_MATRICES, *_VECTORS[:-1])}
     entries["reference"] = lin._reference
     entries["drift"] = np.zeros(0) if lin._drift is None else lin._drift
-    entries |= {key: list(getattr(lin, key)) for key in _LISTS}
+    entries["limits"] = np.array(list(lin.limits.values()))
+    entries |= {key: list(getattr(lin, key)) for key in _LISTS[:-1]}
+    entries["limit_names"] = list(lin.limits)
     entries |= {key: getattr(lin, key) for key in _TEXTS}
     entries["dt"], entries["moving"] = float(lin.dt), float(lin.moving)
     entries["certificate"] = {key: getattr(lin.certificate, key) for key in _CERTIFICATE}
@@ -83,12 +86,14 @@ def _fields(entries: Record) -> dict[str, Any]:
     for key, shape in shapes.items():
         fields[key] = _numbers(key, entries[key]).reshape(shape)
     expected = {"f0": nx, "x0": nx, "u0": nu, "y0": ny, "reference": 7}
-    for key in (*_VECTORS, "drift"):
+    expected["limits"] = len(fields["limit_names"])
+    for key in (*_VECTORS, "drift", "limits"):
         fields[key] = _numbers(key, entries[key]).reshape(-1)
         _check_size(key, fields[key].size, expected.get(key, fields[key].size))
     if fields["frame"] not in ("hybrid", "local", "world"):
         raise ValueError(f"unknown frame '{fields['frame']}'")
     M, drift = fields.pop("M"), fields.pop("drift")
+    limits = dict(zip(fields.pop("limit_names"), fields.pop("limits").tolist(), strict=True))
     _check_size("drift", drift.size, nx if drift.size else 0)
     M.setflags(write=False)
     return fields | {
@@ -98,6 +103,7 @@ def _fields(entries: Record) -> dict[str, Any]:
         "_drift": drift if drift.size else None,
         "_inertia": partial(_given, M),
         "_ignorable": partial(_given, fields.pop("ignorable")),
+        "_limits": partial(_given, limits, None),
     }
 
 
@@ -149,12 +155,12 @@ def _tables(entries: Record) -> dict[str, list[list[Any]]]:
         tables[f"{title}s"] = [["name", "unit", *vectors], *rows]
     point = [
         [f"{key}[{i}]", x]
-        for key in ("q", "v", "reference", "drift")
+        for key in ("q", "v", "reference", "drift", "limits")
         for i, x in enumerate(entries[key].tolist())
     ]
     tables["point"] = [["name", "value"], *point]
     info = {key: entries[key] for key in (*_TEXTS, "dt", "moving")}
-    info |= {key: ";".join(entries[key]) for key in ("locked", "ignorable")}
+    info |= {key: ";".join(entries[key]) for key in _LISTS[-3:]}
     info |= {f"certificate.{key}": value for key, value in entries["certificate"].items()}
     tables["info"] = [["name", "value"], *map(list, info.items())]
     return tables
@@ -190,14 +196,14 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
         entries[f"{title}_names"], entries[f"{title}_units"] = columns[:2]
         for vector, column in zip(vectors, columns[2:], strict=True):
             entries[vector] = [float(x) for x in column]
-    for key in ("q", "v", "reference", "drift"):
+    for key in ("q", "v", "reference", "drift", "limits"):
         entries[key] = [float(x) for name, x in tables["point"] if name.startswith(f"{key}[")]
     info = dict(tables["info"])
     prefix = "certificate."
     entries["certificate"] = {
         key.removeprefix(prefix): float(x) for key, x in info.items() if key.startswith(prefix)
     }
-    for key in ("locked", "ignorable"):
+    for key in _LISTS[-3:]:
         entries[key] = [entry for entry in info.get(key, "").split(";") if entry]
     return {**entries, **{key: info[key] for key in (*_TEXTS, "dt", "moving")}}, bool(mark)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from hashlib import sha256
@@ -121,6 +121,7 @@ class LinearModel:
     # structure no exponential has blurred.
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
+    _limits: Callable[[], Mapping[str, float]] | None = None
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -223,6 +224,15 @@ class LinearModel:
         too. A rotor is symmetric about its axis and has nothing fixed on it.
         """
         return () if self._ignorable is None else self._ignorable(self)
+
+    @cached_property
+    def limits(self) -> Mapping[str, float]:
+        """{name of an input or state: limit} of those that the URDF limits, found on the robot.
+
+        Of ``tau_m`` the largest effort [N m | N], of ``qdot_m`` the largest speed [rad/s | m/s],
+        of ``q_m`` the whole travel [rad | m].
+        """
+        return {} if self._limits is None else self._limits()
 
     def is_equilibrium(self, tol: float = 1e-9) -> bool:
         """Whether the point is a fixed point or a relative equilibrium, so that A and B stay.

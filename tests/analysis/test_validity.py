@@ -17,7 +17,7 @@ import fflin
 from fflin.analysis.closed_loop import Loop
 from fflin.analysis.validity import _LEVELS, _clopper_pearson, _crossing, _slope
 from fflin.batch.workers import OwnWorkers
-from fflin.control.weights import default_weights
+from tests.support.weights import unit_weights
 from tests.support.commands import refused, run
 
 
@@ -27,7 +27,7 @@ def held(robot, dt=0.0, reduce=False):
     lin = fflin.linearize(robot, fflin.configuration(robot, bent))
     lin = fflin.momentum_reduction(lin) if reduce else lin
     lin = lin.discretize(dt) if dt else lin
-    return lin, fflin.lqr(lin, *default_weights(lin))
+    return lin, fflin.lqr(lin, *unit_weights(lin))
 
 
 @pytest.fixture(scope="module")

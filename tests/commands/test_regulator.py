@@ -26,34 +26,42 @@ def test_it_shows_and_saves_the_gain_that_the_library_gives(capsys, tmp_path):
     assert max(map(len, out.removesuffix(f"wrote {path}\n").splitlines())) <= 80
     robot = fflin.load("ets_vii")
     lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}))
-    Q, R = np.ones(24), lin.M.diagonal() ** -2.0
-    Q[:3], Q[6], R[0], R[6:] = 5.0, 100.0, 0.01, 0.01
+    rule = fflin.lqr(lin)
+    Q, R = rule.Q.copy(), rule.R.diagonal().copy()
+    for index, weight in {0: 5.0, 1: 5.0, 2: 5.0, 6: 100.0}.items():
+        Q[index], Q[:, index], Q[index, index] = 0.0, 0.0, weight
+    R[0], R[6:] = 0.01, 0.01
     expected = fflin.lqr(lin, Q, R)
     saved = fflin.Gain.load(path)
+    assert (saved.Q == Q).all() and (saved.R == np.diag(R)).all()
+    assert saved.weights.startswith("q_b, q_m.joint_1, tau_b.x, tau_m as given, the others from ")
     assert saved.K == pytest.approx(expected.K, rel=1e-9, abs=1e-9 * np.abs(expected.K).max())
-    for words in ("norms of its blocks", "poles of A - B K", "Riccati residual", "disk margin"):
+    for words in ("norms of its blocks", "poles of A - B K", "disk margin", "weights: q_b, q_m"):
         assert words in out
 
 
 def test_dt_keeps_the_continuous_cost(capsys, tmp_path):
     path = tmp_path / "gain.json"
-    options = ("--q", "q_b=1", "--dt", "0.2", "-o", str(path))
+    options = ("--weights", "identity", "--r", "tau_m=2", "--dt", "0.2", "-o", str(path))
     assert run(capsys, "planar_detumble", *options)[0] == 0
     lin = fflin.linearize(fflin.load("planar_detumble"))
-    cost = fflin.sampled_cost(lin, 0.2, 1.0, lin.M.diagonal() ** -2.0)
+    cost = fflin.sampled_cost(lin, 0.2, 1.0, {"tau_b": 1.0, "F_b": 1.0, "tau_m": 2.0})
     saved = fflin.Gain.load(path)
     assert saved.dt == 0.2
     assert saved.K == pytest.approx(fflin.lqr(lin.discretize(0.2), *cost).K, rel=1e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize("dt", [None, 0.2])
-def test_without_weights_accelerations_cost(capsys, tmp_path, dt):
+def test_without_weights_the_limits_of_the_urdf_choose_them(capsys, tmp_path, dt):
     path = tmp_path / "gain.json"
     options = () if dt is None else ("--dt", str(dt))
-    assert run(capsys, "servicer_7dof", *options, "-o", str(path))[0] == 0
+    assert main(["lqr", "servicer_7dof", *options, "-o", str(path)]) == 0
     lin = fflin.linearize(fflin.load("servicer_7dof"))
-    expected = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0, dt=dt)
-    assert fflin.Gain.load(path).K == pytest.approx(expected.K, rel=1e-9)
+    expected = fflin.lqr(lin.discretize(dt) if dt else lin)
+    saved = fflin.Gain.load(path)
+    assert (saved.K == expected.K).all() and saved.weights == expected.weights
+    out = " ".join(capsys.readouterr().out.split())
+    assert f"weights: {saved.weights}" in out and "from the limits of the URDF" in saved.weights
 
 
 def test_joints_alone_cannot_hold_the_base(capsys):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.control.weights import default_weights
+from tests.support.weights import unit_weights
 
 POSITIONS = (fflin.BasePose(), fflin.JointPositions())
 FELT = (*POSITIONS, fflin.Accelerometer("base"))
@@ -15,7 +15,7 @@ def designed(outputs, **fields):
     q = fflin.configuration(robot, {"joint_2": 0.4})
     lin = fflin.linearize(robot, q, None, fflin.equilibrium(robot, q).u)
     sampled = lin.discretize(0.05)
-    gain = fflin.lqr(sampled, *fflin.sampled_cost(lin, 0.05, *default_weights(lin)))
+    gain = fflin.lqr(sampled, *fflin.sampled_cost(lin, 0.05, *unit_weights(lin)))
     estimator = fflin.kalman(sampled, np.diag(lin.B @ lin.B.T) + 1e-6, 1e-4)
     return robot, sampled, fflin.lqg(gain, estimator)
 

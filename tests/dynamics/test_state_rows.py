@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.control.weights import default_weights
+from tests.support.weights import unit_weights
 from fflin.dynamics.state_rows import readout, states_of
 from fflin.simulation.integrators import integrator
 from tests.support.robots import BUNDLED, FRAMES, random_pose
@@ -155,7 +155,7 @@ def bent(robot):
     joints = dict.fromkeys(robot.joint_names, 0.4)
     q = fflin.configuration(robot, joints, random_pose(np.random.default_rng(11), 50.0))
     lin = fflin.linearize(robot, q, None, fflin.equilibrium(robot, q).u)
-    return lin, fflin.lqr(lin, *default_weights(lin))
+    return lin, fflin.lqr(lin, *unit_weights(lin))
 
 
 @pytest.mark.parametrize("sample", [None, 0.02])

@@ -20,7 +20,7 @@ KEYS = {
 }
 
 
-@pytest.fixture(scope="module", params=["cubesat", "planar_detumble"])
+@pytest.fixture(scope="module", params=["cubesat", "planar_detumble", "astrobee_arm"])
 def lin(request):
     robot = fflin.load(request.param)
     return fflin.linearize(robot, *random_point(robot, np.random.default_rng(1)), frame="world")
@@ -34,7 +34,7 @@ def test_round_trip_is_exact(lin, ending, dt, tmp_path):
     saved.save(path)
     loaded = fflin.LinearModel.load(path)
     for field in fields(saved):
-        if field.name in ("_certify", "_inertia", "_ignorable", "_source"):
+        if field.name in ("_certify", "_inertia", "_ignorable", "_limits", "_source"):
             continue
         before, after = getattr(saved, field.name), getattr(loaded, field.name)
         if isinstance(before, np.ndarray):
@@ -43,6 +43,7 @@ def test_round_trip_is_exact(lin, ending, dt, tmp_path):
             assert before == after and type(before) is type(after), field.name
     assert loaded.certificate == saved.certificate == lin.certificate
     assert loaded.reference == saved.reference and loaded.ignorable == saved.ignorable
+    assert loaded.limits == saved.limits == lin.limits
     assert (loaded.M == saved.M).all() and not loaded.M.flags.writeable
     if not dt:
         assert fflin.check(fflin.load(lin.robot), loaded).ok

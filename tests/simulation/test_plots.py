@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.control.weights import default_weights
+from tests.support.weights import unit_weights
 
 pytest.importorskip("matplotlib")
 
@@ -16,7 +16,7 @@ pytest.importorskip("matplotlib")
 def loop():
     robot = fflin.load("planar_detumble")
     lin = fflin.linearize(robot)
-    gain = fflin.lqr(lin, *default_weights(lin))
+    gain = fflin.lqr(lin, *unit_weights(lin))
     x0 = lin.x0.copy()
     x0[2] = math.sin(math.radians(10.0))
     policy = fflin.StateFeedback(lin, gain.K)

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.control.weights import default_weights
+from tests.support.weights import unit_weights
 from tests.support.motions import displaced, regulated
 from tests.support.robots import BUNDLED, free_body
 
@@ -192,7 +192,7 @@ def test_regulated_loop_converges_and_the_linear_model_foresees_it(name):
 def test_sampled_feedback_is_held_and_foreseen():
     robot, lin, _ = regulated("ets_vii")
     sampled = lin.discretize(0.1)
-    gain = fflin.lqr(sampled, *fflin.sampled_cost(lin, 0.1, *default_weights(lin)))
+    gain = fflin.lqr(sampled, *fflin.sampled_cost(lin, 0.1, *unit_weights(lin)))
     x0 = lin.x0 + 1e-4 * (displaced(lin) - lin.x0)
     policy = fflin.StateFeedback(sampled, gain.K)
     motion = fflin.simulate(robot, policy, x0=x0, duration=2.0, dt=0.02)
@@ -302,7 +302,7 @@ def test_feedback_along_a_trajectory_brings_the_robot_back_to_it():
     )
     traj = fflin.linearize_trajectory(robot, reference.t, reference.q, reference.v, reference.u)
     lin = fflin.linearize(robot)
-    Q, R = default_weights(lin)
+    Q, R = unit_weights(lin)
     schedule = fflin.tvlqr(traj, 10.0 * Q, R, 10.0 * Q)
     off = pin.integrate(robot.model, q0, 0.02 * np.ones(robot.nv))
     policy = fflin.TrajectoryFeedback(traj, schedule)

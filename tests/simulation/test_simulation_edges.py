@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.control.weights import default_weights
+from tests.support.weights import unit_weights
 from tests.support.motions import displaced, regulated
 from tests.support.robots import free_body
 
@@ -213,7 +213,7 @@ def test_the_linear_loop_is_that_of_scipy_late_limited_and_off_a_fixed_point():
     lin = fflin.linearize(robot, u=u0)
     assert not lin.is_equilibrium()
     calm = fflin.linearize(fflin.load("ets_vii"))
-    K = fflin.lqr(calm, *default_weights(calm)).K
+    K = fflin.lqr(calm, *unit_weights(calm)).K
     policy, x0 = fflin.StateFeedback(lin, K), displaced(lin)
     options = {"x0": x0, "duration": 2.0, "dt": 0.05, "limits": {"tau_b": 300.0, "tau_m": 4.0}}
     late = fflin.simulate(robot, policy, sample=0.1, delay=0.15, **options)
@@ -245,7 +245,7 @@ def test_feedback_along_a_trajectory_does_not_see_the_quaternions_sign():
     q = np.tile(robot.neutral(), (5, 1))
     traj = fflin.linearize_trajectory(robot, t, q, np.zeros((5, 12)), np.zeros((5, 12)))
     lin = fflin.linearize(robot)
-    Q, R = default_weights(lin)
+    Q, R = unit_weights(lin)
     policy = fflin.TrajectoryFeedback(traj, fflin.tvlqr(traj, Q, R, Q)).bind(robot)
     here, speed = fflin.StateMap(robot).to_pinocchio(displaced(lin))
     other = here.copy()

@@ -8,7 +8,7 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 import fflin
-from fflin.control.weights import default_weights
+from tests.support.weights import unit_weights
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
 from fflin.simulation.motion import Motion
@@ -101,7 +101,7 @@ def motion(robot, start=None, duration=0.4, knots=81):
 def regulated(name, **fields):
     robot = fflin.load(name, **fields)
     lin = fflin.linearize(robot)
-    return robot, lin, fflin.lqr(lin, *default_weights(lin))
+    return robot, lin, fflin.lqr(lin, *unit_weights(lin))
 
 
 def displaced(lin, degrees=30.0, offset=0.5, spread=0.3):

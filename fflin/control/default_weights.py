@@ -1,0 +1,302 @@
+"""The weights that a regulator gets where none are given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import eigh
+
+from fflin.base.errors import InputError, unknown
+from fflin.base.validation import Array
+from fflin.control.riccati import half_size, solve
+from fflin.control.sampled_cost import sampled_cost
+from fflin.control.weights import reweighed
+
+if TYPE_CHECKING:
+    from fflin.linear.model import LinearModel
+
+# The bandwidth [rad/s] of a loop that no limit slows: it settles in about twenty seconds. Under a
+# hold of h it is this much over h at the most.
+BANDWIDTH, _HELD = 0.3, 0.3
+
+# The displacements that the limits must bear: a turn of the base [deg], a way of it in radii of
+# gyration, and a joint's [rad], [m], or this share of its travel.
+TURN, WAY, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
+
+# So many times the loops of springs and gravity are slowed.
+_TRIALS = 8
+
+
+_NO_NAMES: Mapping[str, float] = MappingProxyType({})
+
+
+class Weights(NamedTuple):
+    """Weights of a continuous cost (nx, nx) and (nu, nu), and the rule that made them."""
+
+    Q: Array
+    R: Array
+    rule: str
+
+
+class _Limit(NamedTuple):
+    """The largest bandwidth that a limit leaves, and what limits it."""
+
+    bandwidth: float
+    what: str
+
+
+def rule_weights(
+    lin: LinearModel,
+    name: str | None,
+    q: Mapping[str, float] = _NO_NAMES,
+    r: Mapping[str, float] = _NO_NAMES,
+) -> tuple[Array, Array, Array | None, str]:
+    """Return Q, R and N of a model by a rule, and the rule in words.
+
+    The cost of a sampled model is the continuous one under the hold, where it is known what it
+    was sampled from.
+
+    Parameters
+    ----------
+    lin : LinearModel
+    name : {"urdf", "identity"} or None
+        "urdf" is `default_weights`, and the default; "identity" is 1 on every state and input.
+    q, r : mapping
+        {name of a state, an input or a group: weight} of those that have their own.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such rule, state or input.
+    """
+    source = lin.generator or lin
+    if name is None or name == "urdf":
+        Q, R, rule = default_weights(source, lin.dt)
+    elif name == "identity":
+        nx, nu = lin.B.shape
+        Q, R, rule = np.eye(nx), np.eye(nu), "identity: 1 on every state and every input"
+    else:
+        raise unknown("rule of weights", name, ("urdf", "identity"))
+    if q or r:
+        Q = reweighed("state", Q, q, lin.state_names)
+        R = reweighed("input", R, r, lin.input_names)
+        rule = f"{', '.join((*q, *r))} as given, the others {rule}"
+    if source.dt == lin.dt:
+        return Q, R, None, rule
+    return (*sampled_cost(source, lin.dt, Q, R), rule)
+
+
+def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:
+    r"""Return weights with which a displaced robot comes back within the URDF's limits.
+
+    With the forces S u of the inputs, a model at rest is :math:`M \dot\nu = S u`,
+    :math:`\dot x_1 = N \nu`. Each coordinate i has a displacement :math:`\theta_i`: the base is
+    turned by 30 deg and moved by a tenth of its radius of gyration, and every joint by 0.3 rad, or
+    0.1 m, or a quarter of its travel where that is less. With the stiffness
+    :math:`D_i = \sum_j |M_{ij}| \theta_j / \theta_i`, which no inertia exceeds, the cost is
+
+    .. math:: \delta x_1^T N^{-T} (\bar D \,\#\, M) N^{-1} \delta x_1 + \delta u^T R\,\delta u / w^4,
+              \qquad R = \operatorname{diag}(S^T D^{-1} S), \quad \bar D = S R^{-1} S^T,
+
+    where # is the geometric mean. The coordinates in which :math:`\bar D` and M are diagonal, 1
+    and :math:`\lambda_k`, then come back one by one, damped by 0.71, at
+    :math:`w \lambda_k^{3/8}`: the slowest at w, and those of little inertia faster, so that what
+    the others do does not carry them away. R is diagonal: every input has the margins of an
+    optimal loop whatever the others do, gains of 1/2 and more and 60 deg of phase.
+
+    The bandwidth w is 0.3 rad/s, or what the limits leave: from these displacements, all at once
+    and in any direction, no input exceeds the effort and no joint the speed that the URDF allows.
+    Where nothing limits them, the poles do not depend on the units of mass and length.
+
+    Springs, gravity and motion are in the model, not in the weights; where there are any, the loop
+    is solved and slowed until its inputs hold the limits, or found to need more.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        Whole or reduced; of a sampled one, weights for the sum over its samples.
+    hold : float
+        Time [s] that the inputs will be held for.
+
+    Raises
+    ------
+    InputError
+        If the model has not coordinates and their rates as states, or an input acts on nothing.
+
+    References
+    ----------
+    A. E. Bryson and Y.-C. Ho, Applied Optimal Control, 1975. M. G. Safonov and M. Athans, Gain and
+    phase margin for multiloop LQG regulators, IEEE Trans. Automatic Control 22(2), 1977.
+    """
+    h = lin.dt or 1.0
+    m = len(lin.M)
+    A = lin.A - np.eye(len(lin.A)) if lin.dt else lin.A
+    N = A[:m, m:] / h
+    if N.shape != lin.M.shape or not np.linalg.cond(N) < 1e8:
+        raise InputError(
+            f"the model of '{lin.robot}' has not the coordinates and their rates as states, which "
+            "the default weights are made for; give Q and R"
+        )
+    size = _displacements(lin)
+    inverse = np.linalg.inv(N)
+    theta = np.abs(inverse) @ size
+    D = np.abs(lin.M) @ theta / theta
+    S = lin.M @ lin.B[m:] / h
+    cost = (S**2 / D[:, None]).sum(axis=0)
+    if not cost.all():
+        raise InputError(
+            f"input {lin.input_names[int(cost.argmin())]} acts on nothing; leave it out, or give "
+            "Q and R"
+        )
+    reach = _reach(S, cost, D)
+    ratios, T = eigh(reach, lin.M)
+    back = T.T @ lin.M  # T^-1
+    # The slowest is to have the bandwidth w.
+    cost, reach, ratios = cost * ratios[0], reach / ratios[0], ratios / ratios[0]
+    to_modes = back @ inverse
+    Q = np.zeros_like(lin.A)
+    Q[:m, :m] = to_modes.T @ (np.sqrt(ratios)[:, None] * to_modes)
+    Q = 0.5 * (Q + Q.T)
+    # At w = 1, before anything slows it.
+    stiffness = back.T @ (ratios[:, None] ** 0.75 * to_modes)
+    gain = (S / cost).T @ np.linalg.solve(reach, stiffness)
+    rates = ratios**0.375
+    limits = [
+        _Limit(BANDWIDTH, ""),
+        *_of_speeds(lin, _fastest(T, rates, to_modes, size, lin)),
+        *_of_efforts(lin, _largest(gain, size, lin.state_names)),
+    ]
+    if hold or lin.dt:
+        fastest = _HELD / ((hold or lin.dt) * rates[-1])
+        limits.append(_Limit(float(fastest), "the time of the hold"))
+    limit = min(limits, key=_bandwidth)
+    if A[m:].any() or A[:m, :m].any():
+        limit = _slowed(lin, Q, cost, size, limit)
+    return Weights(h * Q, np.diag(h * cost / limit.bandwidth**4), _rule(lin, size, limit))
+
+
+def _displacements(lin: LinearModel) -> Array:
+    """Return what each coordinate (m,) is displaced by."""
+    m = len(lin.M)
+    names, units = lin.state_names[:m], lin.state_units[:m]
+    radius = _radius_of_gyration(lin.M) if names[:6] == _BASE else 1.0
+    size = np.empty(m)
+    for i, (name, unit) in enumerate(zip(names, units, strict=True)):
+        if name.startswith("q_b."):
+            size[i] = math.sin(math.radians(TURN / 2.0))
+        elif name.startswith("r_b."):
+            size[i] = WAY * radius
+        else:
+            most = LENGTH if unit == "m" else ANGLE
+            size[i] = min(most, TRAVEL * lin.limits.get(name, math.inf))
+    return size
+
+
+_BASE = tuple(f"{group}.{axis}" for group in ("q_b", "r_b") for axis in "xyz")
+
+
+def _radius_of_gyration(M: Array) -> float:
+    """Return the radius [m] at which a sphere would have the mass to have such moments."""
+    mass = M[3, 3]
+    way = np.array((M[4, 2] - M[5, 1], M[5, 0] - M[3, 2], M[3, 1] - M[4, 0])) / (2.0 * mass)
+    moment = np.trace(M[:3, :3]) - 2.0 * mass * way @ way
+    return math.sqrt(max(float(moment) / (2.0 * mass), 1e-300))
+
+
+def _largest(K: Array, size: Array, names: tuple[str, ...]) -> Array:
+    """Return the largest K d of all displacements d: the base's in any direction, joints' signs."""
+    groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
+    scaled = K[:, : len(size)] * size
+    total: Array = np.abs(scaled[:, (groups != "q_b") & (groups != "r_b")]).sum(axis=1)
+    for group in ("q_b", "r_b"):
+        total += np.linalg.norm(scaled[:, groups == group], axis=1)
+    return total
+
+
+def _reach(S: Array, cost: Array, D: Array) -> Array:
+    """Return S R^-1 S' (m, m), and D where no input acts."""
+    reach = (S / cost) @ S.T
+    idle = reach.diagonal() <= 1e-12 * D
+    reach[idle, idle] = D[idle]
+    if np.linalg.eigvalsh(reach / np.sqrt(np.outer(D, D)))[0] < 1e-9:
+        reach += np.diag(D)
+    return reach
+
+
+def _fastest(T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel) -> Array:
+    """Return the largest speed (m,) at w = 1 on the way back from any displacement."""
+    speeds = np.zeros(len(size))
+    if any(name in lin.limits for name in lin.state_names[len(size) :]):
+        for time in np.geomspace(0.1 / rates[-1], 3.0, 60):
+            x = rates * time / math.sqrt(2.0)
+            moving = math.sqrt(2.0) * rates * np.exp(-x) * np.sin(x)
+            now = _largest(T @ (moving[:, None] * to_modes), size, lin.state_names)
+            speeds = np.maximum(speeds, now)
+    return speeds
+
+
+def _of_speeds(lin: LinearModel, speeds: Array) -> list[_Limit]:
+    """Return what the limits of speeds leave of a bandwidth at which they are these times it."""
+    names = lin.state_names[len(speeds) :]
+    return [
+        _Limit(lin.limits[name] / speed, f"the speed of {name.partition('.')[2]}")
+        for name, speed in zip(names, speeds, strict=True)
+        if name in lin.limits and speed > 0.0
+    ]
+
+
+def _of_efforts(lin: LinearModel, use: Array, bandwidth: float = 1.0) -> list[_Limit]:
+    """Return what the limits of the inputs leave of a bandwidth at which they come to `use`."""
+    found = []
+    for name, used, at in zip(lin.input_names, use, lin.u0, strict=True):
+        room = lin.limits.get(name, math.inf) - abs(at)
+        if 0.0 < room < math.inf and used > 0.0:
+            what = f"the effort of {name.partition('.')[2]}"
+            found.append(_Limit(bandwidth * math.sqrt(room / used), what))
+    return found
+
+
+def _slowed(lin: LinearModel, Q: Array, cost: Array, size: Array, limit: _Limit) -> _Limit:
+    """Return the bandwidth at which a loop with springs or gravity keeps within the limits."""
+    for _ in range(_TRIALS):
+        arguments = (lin.A, lin.B, Q, np.diag(cost / limit.bandwidth**4), None, lin.dt)
+        try:
+            solution: Any = half_size(*arguments) or solve(*arguments)
+        except np.linalg.LinAlgError:
+            break  # which the regulator tells with the reason
+        use = _largest(solution.K, size, lin.state_names)
+        least = min(_of_efforts(lin, use, limit.bandwidth), key=_bandwidth, default=limit)
+        if least.bandwidth >= (1.0 - 1e-6) * limit.bandwidth:
+            return limit
+        # What springs and gravity ask for stays however slow the loop.
+        limit = least._replace(bandwidth=max(least.bandwidth, 0.3 * limit.bandwidth))
+    return limit._replace(what=f"{limit.what}, which is not enough for all displacements")
+
+
+def _bandwidth(limit: _Limit) -> float:
+    return limit.bandwidth
+
+
+def _rule(lin: LinearModel, size: Array, limit: _Limit) -> str:
+    groups = [name.partition(".")[0] for name in lin.state_names[: len(size)]]
+    base = [f"{TURN:g} deg"] * ("q_b" in groups)
+    if "r_b" in groups:
+        base.append(f"{size[groups.index('r_b')]:.2g} m")
+    joints: dict[str, float] = {}
+    for group, unit, d in zip(groups, lin.state_units, size, strict=False):
+        if group == "q_m":
+            joints[unit] = max(d, joints.get(unit, 0.0))
+    from_where = [f"the base from {' and '.join(base)}"] if base else []
+    if joints:
+        sizes = " or ".join(f"{d:.2g} {unit}" for unit, d in joints.items())
+        from_where.append(f"joints from {sizes}")
+    source = "the limits of the URDF" if lin.limits else "mass and size, the URDF has no limits"
+    slow = f", set by {limit.what}" if limit.what else ""
+    return (
+        f"from {source}: {', '.join(from_where)} come back at {limit.bandwidth:.3g} rad/s or "
+        f"faster{slow}"
+    )

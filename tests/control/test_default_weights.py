@@ -1,0 +1,276 @@
+"""The weights that a regulator gets where none are given."""
+
+import re
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from fflin.commands.cli import main
+from fflin.dynamics.state import StateMap
+from fflin.robot.catalog import find_robot
+
+BUNDLED = [n for n in fflin.list_robots() if find_robot(n).origin == "fflin"]
+# Arms, legs, hands, rotorcraft; limits that are zero, infinite, absurd or slow (pr2's torso).
+OTHERS = (
+    *("a1", "anymal_kinova", "asr_twodof", "b1", "baxter", "borinot", "bravo7_no_ee"),
+    *("double_pendulum", "finger_edu", "go2", "hector", "hextilt", "hyq", "kinova"),
+    *("panda", "pr2", "so100", "solo12", "talos_arm", "ur5"),
+)
+ANGLE = 30.0
+
+
+@pytest.fixture(scope="module")
+def loops():
+    made = {}
+
+    def loop(name):
+        if name not in made:
+            robot = fflin.load(name)
+            lin = fflin.linearize(robot)
+            made[name] = robot, lin, fflin.lqr(lin)
+        return made[name]
+
+    return loop
+
+
+def inertia(robot, model):
+    data = model.createData()
+    M = pin.crba(model, data, robot.neutral())
+    return StateMap(robot).project(np.triu(M) + np.triu(M, 1).T)
+
+
+def parts_of_inertia(robot):
+    """Return M (bodies, nv, nv) of each body alone; M is linear in the bodies' inertias."""
+    whole, parts = inertia(robot, robot.model), []
+    for index in range(1, robot.model.njoints):
+        model = robot.model.copy()
+        body = model.inertias[index]
+        model.inertias[index] = pin.Inertia(0.5 * body.mass, body.lever, 0.5 * body.inertia)
+        parts.append(2.0 * (whole - inertia(robot, model)))
+    assert np.abs(sum(parts) - whole).max() <= 1e-9 * np.abs(whole).max()
+    return np.array(parts)
+
+
+def displaced(robot, lin, rng):
+    """Return a configuration: 30 deg about a random axis, joints at corners of what is stated."""
+    q = robot.neutral().copy()
+    axis = rng.normal(size=3)
+    turn = pin.exp3(np.radians(ANGLE) * axis / np.linalg.norm(axis))
+    q[3:7] = pin.Quaternion(turn).coeffs()
+    for joint in robot.joints:
+        size = min(
+            0.1 if joint.prismatic else 0.3, lin.limits.get(f"q_m.{joint.name}", np.inf) / 4
+        )
+        joint.place(q, joint.value(q) + rng.choice((-1.0, 1.0)) * size)
+    robot.follow(q)
+    return q
+
+
+@pytest.mark.parametrize("name", (*BUNDLED, *OTHERS))
+def test_every_input_has_the_margins_of_an_optimal_loop(loops, name):
+    _, lin, gain = loops(name)
+    # All inputs at once bear less than each alone. From rest: 2 tan(60 deg / 2).
+    assert gain.margins.disk == pytest.approx(2.0 * np.tan(np.pi / 6.0), abs=2e-3)
+    assert gain.residual < 1e-11
+    # Modes of second degree, damped by 0.71, none slower than the one at the bandwidth.
+    poles = np.sort(gain.poles[gain.poles.imag > 0.0])
+    assert len(poles) == len(lin.M)
+    damping = -poles.real / np.abs(poles)
+    assert damping == pytest.approx(np.full(len(poles), 0.5**0.5), abs=1e-5)
+    bandwidth = np.abs(poles).min()
+    assert f"come back at {bandwidth:.3g} rad/s" in gain.weights
+    limited = "set by" in gain.weights
+    assert (bandwidth < 0.3) == limited or bandwidth == pytest.approx(0.3)
+    assert bandwidth <= 0.3 * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize("name", (*BUNDLED, *OTHERS))
+def test_two_hundred_loops_with_errors_of_ten_percent_are_stable(loops, name):
+    robot, lin, gain = loops(name)
+    rng = np.random.default_rng(14)
+    parts, m = parts_of_inertia(robot), len(lin.M)
+    masses = 1.0 + 0.1 * rng.choice((-1.0, 1.0), size=(200, len(parts)))
+    gains = 1.0 + 0.1 * rng.choice((-1.0, 1.0), size=(200, len(gain.K)))
+    M = np.tensordot(masses, parts, axes=1)
+    loops_ = np.zeros((200, 2 * m, 2 * m))
+    loops_[:, :m] = lin.A[:m]
+    loops_[:, m:] = -np.linalg.solve(M, gains[:, :, None] * gain.K)
+    slowest = np.linalg.eigvals(loops_).real.max(axis=1)
+    assert (slowest < -0.5 * gain.margin).sum() == 200
+
+
+@pytest.mark.parametrize(
+    "name", (*BUNDLED, "a1", "kinova", "double_pendulum", "pr2", "so100", "talos_arm", "ur5")
+)
+def test_slews_of_the_nonlinear_robot_settle_within_the_limits(loops, name):
+    robot, lin, gain = loops(name)
+    q0 = displaced(robot, lin, np.random.default_rng(30))
+    duration = 6.0 / gain.margin
+    motion = fflin.simulate(
+        robot,
+        fflin.StateFeedback(lin, gain.K),
+        q0=q0,
+        duration=duration,
+        dt=min(0.5 / np.abs(gain.poles).max(), duration / 100.0),
+        linear=False,
+    )
+    assert not motion.stopped
+    first, last = (np.abs(motion.x[row] - motion.target) for row in (0, -1))
+    assert motion.attitude_error[0] == pytest.approx(ANGLE)
+    assert motion.attitude_error[-1] < 0.01 * ANGLE
+    assert (last[6 : 6 + robot.n] < 0.01 * first[6 : 6 + robot.n].max(initial=0.0)).all()
+    signals = {
+        **dict(zip(motion.input_names, motion.u.T, strict=True)),
+        **dict(zip(motion.state_names, motion.x.T, strict=True)),
+    }
+    for limited, limit in lin.limits.items():
+        if not limited.startswith("q_m."):
+            assert np.abs(signals[limited]).max() <= limit, limited
+
+
+@pytest.mark.parametrize("name", ["canadarm2", "servicer_7dof", "pr2", "talos_arm"])
+def test_efforts_hold_for_every_displacement_and_one_limit_binds(loops, name):
+    robot, _, _ = loops(name)
+    model = robot.model.copy()
+    model.effortLimit[6:] *= 1e-3
+    model.velocityLimit[:] = 0.0
+    model.gravity.linear = np.zeros(3)
+    weak = fflin.from_model(model)
+    lin = fflin.linearize(weak)
+    gain = fflin.lqr(lin)
+    assert re.search(r"rad/s or faster, set by the effort of \w+$", gain.weights)
+    m = len(lin.M)
+    sizes = np.array(
+        [
+            min(0.1 if unit == "m" else 0.3, lin.limits.get(name, np.inf) / 4.0)
+            for name, unit in zip(lin.state_names[6:m], lin.state_units[6:m], strict=True)
+        ]
+    )
+    way = float(re.search(r"deg and ([\d.e-]+) m", gain.weights).group(1))
+    # The largest of each input, the base in its worst direction, every joint at its worst sign.
+    largest = (
+        np.sin(np.radians(15.0)) * np.linalg.norm(gain.K[:, :3], axis=1)
+        + way * np.linalg.norm(gain.K[:, 3:6], axis=1)
+        + np.abs(gain.K[:, 6:m]) @ sizes
+    )
+    share = [largest[i] / lin.limits.get(name, np.inf) for i, name in enumerate(lin.input_names)]
+    # The way is shown to two digits.
+    assert max(share) == pytest.approx(1.0, rel=5e-3)
+
+
+def test_a_limit_of_zero_or_beyond_all_use_is_none(loops):
+    robot, lin, gain = loops("double_pendulum")
+    assert not robot.model.effortLimit[6:].any() and not lin.limits.keys() & set(lin.input_names)
+    assert "the URDF has no limits" in fflin.lqr(fflin.linearize(fflin.load("ets_vii"))).weights
+    _, lin, gain = loops("solo12")
+    assert lin.limits["tau_m.FL_HAA"] == 1000.0 and "set by" not in gain.weights
+
+
+@pytest.mark.parametrize("name", ["ets_vii", "double_pendulum", "planar_detumble"])
+def test_without_limits_the_loop_does_not_depend_on_units_of_mass_and_length(loops, name):
+    robot, _, gain = loops(name)
+    model = robot.model.copy()
+    for index in range(1, model.njoints):
+        body = model.inertias[index]
+        model.inertias[index] = pin.Inertia(
+            1e3 * body.mass, 10.0 * body.lever, 1e5 * body.inertia
+        )
+        model.jointPlacements[index].translation *= 10.0
+    scaled = fflin.lqr(fflin.linearize(fflin.from_model(model)))
+    assert np.sort(scaled.poles) == pytest.approx(np.sort(gain.poles), rel=1e-5)
+    joints = (slice(6, None), slice(6, len(gain.x0) // 2))
+    expected = 1e5 * gain.K[joints]
+    assert scaled.K[joints] == pytest.approx(expected, rel=1e-5, abs=1e-6 * np.abs(expected).max())
+
+
+def test_thrusters_springs_gravity_and_reduced_models_have_weights_too():
+    cubesat = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
+    gain = fflin.lqr(fflin.linearize(cubesat))
+    assert np.abs(gain.poles).min() == pytest.approx(0.3, rel=1e-6)
+    assert gain.margins.disk > 0.6
+    panels = dict.fromkeys(("panel_left", "panel_right"), 100.0)
+    servicer = fflin.load(
+        "servicer_7dof", inputs=fflin.load_inputs("servicer_7dof"), stiffness=panels
+    )
+    assert fflin.lqr(fflin.linearize(servicer)).margins.disk > 0.6
+    arm = fflin.load("ets_vii")
+    arm = arm.replace(inputs=[fflin.JointTorque(name) for name in arm.joint_names])
+    reduced = fflin.momentum_reduction(fflin.linearize(arm))
+    gain = fflin.lqr(reduced)
+    assert gain.weights.endswith("limits: joints from 0.3 rad come back at 0.3 rad/s or faster")
+    assert gain.margins.disk > 0.6
+    heavy = fflin.load("canadarm2", gravity=(0.0, 0.0, -9.81))
+    u = fflin.equilibrium(heavy).u
+    gain = fflin.lqr(fflin.linearize(heavy, u=u))
+    assert gain.margins.disk > 0.6 and gain.margin > 0.0
+
+
+def test_what_the_limits_leave_beside_gravity_is_what_the_loop_may_use(loops):
+    robot, _, _ = loops("talos_arm")
+    still = fflin.lqr(fflin.linearize(robot))
+    heavy = robot.replace(gravity=(0.0, 0.0, -3.0))
+    lin = fflin.linearize(heavy, u=fflin.equilibrium(heavy).u)
+    gain = fflin.lqr(lin)
+    assert gain.margin > 0.0 and gain.weights != ""
+    m, size = len(lin.M), np.full(len(lin.M), 0.0)
+    size[6:] = [min(0.3, lin.limits.get(name, np.inf) / 4.0) for name in lin.state_names[6:m]]
+    used = np.abs(gain.K[:, :m]) @ size + np.abs(lin.u0)
+    for index, name in enumerate(lin.input_names):
+        assert used[index] <= lin.limits.get(name, np.inf), name
+    assert still.margins.disk > gain.margins.disk - 1e-3
+
+
+@pytest.mark.parametrize("name", ["canadarm2", "ets_vii"])
+@pytest.mark.parametrize("dt", [0.05, 0.5])
+def test_a_sampled_model_gets_the_same_cost_and_keeps_its_margins(loops, name, dt, tmp_path):
+    _, lin, gain = loops(name)
+    sampled = fflin.lqr(lin.discretize(dt))
+    assert sampled.dt == dt and sampled.margins.disk > 0.9
+    lin.discretize(dt).save(tmp_path / "m.npz")
+    # Of a file it is not known what it was sampled from; the sum over samples is near the integral.
+    loaded = fflin.lqr(fflin.LinearModel.load(tmp_path / "m.npz"))
+    assert loaded.margins.disk > 0.6
+    if dt < 0.1 and "hold" not in sampled.weights:
+        assert sampled.weights == gain.weights
+        assert loaded.K == pytest.approx(sampled.K, rel=0.1, abs=0.05 * np.abs(sampled.K).max())
+
+
+def test_identity_and_given_weights_are_said(loops):
+    _, lin, _ = loops("ets_vii")
+    plain = fflin.lqr(lin, weights="identity")
+    assert (plain.K == fflin.lqr(lin, 1.0, 1.0).K).all()
+    assert plain.weights == "identity: 1 on every state and every input"
+    assert fflin.lqr(lin, 1.0, 1.0).weights == "as given"
+    assert "weights: identity" in str(plain)
+    with pytest.raises(fflin.UnknownNameError, match="no rule of weights named 'bryson'"):
+        fflin.lqr(lin, weights="bryson")
+    for arguments, options in (((1.0,), {}), ((None, 1.0), {}), ((1.0, 1.0), {"weights": "urdf"})):
+        with pytest.raises(fflin.InputError, match="give Q and R, both, or weights="):
+            fflin.lqr(lin, *arguments, **options)
+
+
+def test_an_input_that_acts_on_nothing_is_named():
+    lin = fflin.linearize(fflin.load("cubesat"))
+    from dataclasses import replace
+
+    B = lin.B.copy()
+    B[:, 4] = 0.0
+    with pytest.raises(fflin.InputError, match=r"input F_b\.y acts on nothing"):
+        fflin.lqr(replace(lin, B=B))
+
+
+def test_a_gain_that_bears_little_is_warned_of_wherever_it_is_shown(capsys):
+    lin = fflin.linearize(fflin.load("canadarm2"))
+    fragile = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
+    assert fragile.margins.disk < 0.01
+    shown = " ".join(str(fragile).split())
+    assert "warning: the loop bears only" in shown and "weigh each input alone" in shown
+    assert "warning" not in str(fflin.lqr(lin))
+    options = ("--weights", "identity", "--r", "tau_b=1e-9", "--r", "F_b=1e-9", "--r", "tau_m=1e-9")
+    assert main(["lqr", "ets_vii", "--dt", "0.5", *options]) == 0
+    out, err = capsys.readouterr()
+    told = [line for line in err.splitlines() if line.startswith("fflin: warning: the loop bears")]
+    assert len(told) == 1 and "shorten dt" in told[0]
+    assert "warning: the loop bears only" in out
