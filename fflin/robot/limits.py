@@ -20,9 +20,9 @@ def joint_limits(robot: Robot) -> dict[str, float]:
     model = robot.model
     found = {}
     for joint in robot.joints:
-        found[f"tau_m.{joint.name}"] = model.effortLimit[joint.idx_v]
-        found[f"qdot_m.{joint.name}"] = model.velocityLimit[joint.idx_v]
+        found[f"tau_m.{joint.name}"] = float(model.effortLimit[joint.idx_v])
+        found[f"qdot_m.{joint.name}"] = float(model.velocityLimit[joint.idx_v])
         if not joint.unbounded:
             low, high = model.lowerPositionLimit, model.upperPositionLimit
-            found[f"q_m.{joint.name}"] = high[joint.idx_q] - low[joint.idx_q]
-    return {name: float(value) for name, value in found.items() if 0.0 < value < _NONE}
+            found[f"q_m.{joint.name}"] = float(high[joint.idx_q]) - float(low[joint.idx_q])
+    return {name: value for name, value in found.items() if 0.0 < value < _NONE}
