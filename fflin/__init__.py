@@ -92,7 +92,7 @@ _PUBLIC = {
     "momentum_reduction": "analysis.momentum",
     "observability": "analysis.observability",
     "plot_matrices": "analysis.plots",
-    "plot_motion": "simulation.plots",
+    "plot_motion": "simulation.motion",
     "plot_poles": "analysis.plots",
     "plot_validity": "analysis.plots",
     "random_configurations": "batch.configurations",
@@ -173,8 +173,7 @@ if TYPE_CHECKING:
         RelativePose,
     )
     from fflin.robot.robot import Robot
-    from fflin.simulation.motion import Motion
-    from fflin.simulation.plots import plot_motion
+    from fflin.simulation.motion import Motion, plot_motion
     from fflin.simulation.simulate import simulate
     from fflin.view.visualize import visualize
 

@@ -115,9 +115,9 @@ def _validity(arguments: argparse.Namespace) -> int:
 
     if arguments.jobs < 1:
         raise InputError(f"--jobs is {arguments.jobs}, expected at least 1")
+    robot, lin = linear_model(arguments)
     if arguments.plot:
         check_figure(arguments.plot)
-    robot, lin = linear_model(arguments)
     lin = regulated_part(lin, arguments)
     gain = gain_of(lin, arguments)
     judged = lin.discretize(arguments.dt) if arguments.dt else lin

@@ -33,7 +33,7 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
             fields[name] = for_all[0] if for_all else once(f"--{name}", values)
     if getattr(arguments, "gravity", None):
         fields["gravity"] = arguments.gravity
-    if getattr(arguments, "inputs", None):
+    if getattr(arguments, "inputs", None) is not None:
         inputs = _inputs(robot, arguments.inputs)
         try:
             robot = robot.replace(inputs=inputs)

@@ -138,11 +138,12 @@ def _weights(lin: LinearModel, arguments: argparse.Namespace) -> tuple[Array, Ar
 
 
 def _lqr(arguments: argparse.Namespace) -> int:
-    if arguments.output_file:
-        from fflin.base.design_files import check_design_format
-
-        check_design_format(arguments.output_file)
     _, lin = linear_model(arguments)
+    if arguments.output_file:
+        from fflin.base.record import FORMATS
+        from fflin.base.writing import check_place
+
+        check_place(arguments.output_file, FORMATS)
     gain = gain_of(regulated_part(lin, arguments), arguments)
     if arguments.output_file:
         gain.save(arguments.output_file)

@@ -89,18 +89,17 @@ def add_commands(commands: Commands) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
-    from fflin.base.writing import check_place
-    from fflin.simulation.motion import check_motion_format
+    from fflin.simulation.motion import FORMATS, motion_report
 
+    robot = load_robot(arguments)
     if arguments.output_file:
-        check_motion_format(arguments.output_file)
-        check_place(arguments.output_file)
+        from fflin.base.writing import check_place
+
+        check_place(arguments.output_file, FORMATS)
     if arguments.plot:
         check_figure(arguments.plot)
-    robot = load_robot(arguments)
     check_pictures(robot, arguments)
     motion = simulated(robot, arguments)
-    from fflin.simulation.motion_text import motion_report
 
     # Said when the files are there, which they are then even where nobody reads it to its end.
     lines = [motion_report(motion, controlled=not arguments.free)]

@@ -194,8 +194,9 @@ class _Announcement:
 
     def __call__(self, count: int, *, at_rest: bool) -> None:
         from fflin.batch.space import check_room, part_of, readable
-        from fflin.batch.sweep import planned_bytes
+        from fflin.batch.sweep import output_path, planned_bytes
 
+        output_path(self._path)  # once more, when the inputs are known
         size = planned_bytes(self._robot, count, at_rest=at_rest, **self._options)
         said = f"{count:,} points of '{self._robot.name}', {readable(size)}"
         if size > _LARGE and not self._agreed:
@@ -233,8 +234,6 @@ def _points(
             raise InputError("--joint and --configurations both place joints; give either")
         if any(arguments.rpy) or any(arguments.position):
             raise InputError("--rpy, --position and --configurations all place the base; give one")
-        if arguments.configurations.resolve() == arguments.output_file.resolve():
-            raise FileError(f"{arguments.output_file} is what --configurations reads; name another")
         given = _given(arguments.configurations)
         for name, value in (("v", v), ("u", u)):
             if name in given and value is not None:
@@ -273,17 +272,23 @@ def _base(robot: Robot, q: Array) -> Any:
 
 
 def _given(path: Path) -> dict[str, Array]:
-    import zipfile
+    import io
+    import warnings
 
     import numpy as np
 
+    from fflin.base.writing import read_input, reason
+
+    content = io.BytesIO(read_input(path, ".npz"))
     try:
-        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
-            given = {key: file[key] for key in ("q", "v", "u") if key in file.files}
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except (ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile):
-        raise FileError(f"{path}: not an npz file as numpy.savez writes it") from None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers that damage makes look old
+            with np.load(content, allow_pickle=False) as file:
+                given = {key: file[key] for key in ("q", "v", "u") if key in file.files}
+    except Exception as error:  # each decoder of what may stand in a zip archive has its own
+        raise FileError(
+            f"{path}: not an npz file as numpy.savez writes it ({reason(error)})"
+        ) from None
     if "q" not in given:
         raise FileError(f"{path}: has no array named q, the configurations (N, nq)")
     if given["q"].ndim != 2:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.base.design import Design
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
+from fflin.base.record import Design
 from fflin.base.validation import Array
 from fflin.control.weights import Weight, cross_weight, require_semidefinite, weight
 from fflin.linear.model import LinearModel
@@ -189,7 +189,7 @@ def require_fixed_point(lin: LinearModel) -> None:
         )
     if lin.is_equilibrium():
         return
-    rate = lin.f0 if lin._drift is None else lin._drift
+    rate = lin.f0 if lin.drift is None else lin.drift
     judged = [name not in lin.ignorable for name in lin.state_names]
     rows = [i for i in np.argsort(-np.abs(rate)) if judged[i] and abs(rate[i]) > 1e-9]
     shown = ", ".join(

@@ -25,7 +25,7 @@ from fflin.robot.wheels import stored_momentum, with_wheels
 _CONFIGURATION = "a configuration in Pinocchio's order"
 
 # What renormalising a unit quaternion leaves: two ulp of unity.
-_ROUND_OFF = 2.0 * float(np.finfo(float).eps)
+ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
 # Data holds a third-order tensor of nv^3 entries among others: about 32 nv^3 bytes in all.
 _DATA_BYTES_PER_NV3 = 32
@@ -271,17 +271,17 @@ class Robot:
                 f"the base quaternion q[3:7] has length {np.linalg.norm(q[3:7]):.9g}, expected 1; "
                 "normalise it (x, y, z, w)"
             )
-        for index in self._unbounded:
+        for index in self.unbounded:
             c, s = entries[index], entries[index + 1]
             excess = abs(c * c + s * s - 1.0)
             if excess > worst:
                 worst = excess
                 if excess > NORM_TOLERANCE:
                     raise InputError(
-                        f"(cos, sin) of continuous joint '{self._unbounded[index]}', "
+                        f"(cos, sin) of continuous joint '{self.unbounded[index]}', "
                         f"q[{index}:{index + 2}], has length {np.hypot(c, s):.9g}, expected 1"
                     )
-        if worst > _ROUND_OFF:
+        if worst > ROUND_OFF:
             q = pin.normalize(self.model, q)
         return followed(self.followers, q) if self.followers else q
 
@@ -354,6 +354,7 @@ class Robot:
         return (self.nq,)
 
     @cached_property
-    def _unbounded(self) -> dict[int, str]:
+    def unbounded(self) -> dict[int, str]:
+        """{index of the cosine in q: joint} of the joints that turn without end."""
         joints = (*self.joints, *(follower.joint for follower in self.followers))
         return {joint.idx_q: joint.name for joint in joints if joint.unbounded}

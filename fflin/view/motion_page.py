@@ -81,7 +81,9 @@ def motion_page(
     if follow:
         shown_points = frame_points(drawing, film, info["size"], follow=True)
     info |= marks(robot, film, tool, info["size"])
-    info |= panel(robot, state, q, u, target, motion.momentum_drift[shown])
+    # A file may not tell how far the centre of mass drifts.
+    of_com = motion.com_drift[shown] if len(motion.com_drift) else None
+    info |= panel(robot, state, q, u, target, motion.momentum_drift[shown], of_com)
     info |= {
         "mode": "motion",
         "t": packed(t),

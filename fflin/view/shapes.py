@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +12,10 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinError
+from fflin.base.writing import shown
 from fflin.robot.robot import ROOT, Robot
 from fflin.robot.urdf.links import read_pose
-from fflin.robot.urdf.reader import read_file
+from fflin.robot.urdf.reader import read_document
 from fflin.robot.urdf.xacro import expand, first_xacro
 from fflin.robot.urdf.xml import Element, named, parse
 
@@ -111,7 +113,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
             if mesh is not None:
                 file = find_mesh(mesh, path, robot.package_dirs)
                 if file is None:
-                    missing.append(mesh)
+                    missing.append(shown(mesh))
                     continue
             yield Shape(frame.parentJoint, kind, size, placement, color, finish, file)
     if missing:
@@ -126,7 +128,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
 
 
 def _document(path: Path) -> Element:
-    document = read_file(path)
+    document = read_document(path)
     root = parse(document, str(path))
     first = first_xacro(root)
     if path.suffix == ".xacro" or first:
@@ -196,7 +198,8 @@ def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None
         candidates = [folder / rest for folder in (*package_dirs, *urdf.resolve().parents)]
         # A package's own folder may have been given, or be called otherwise.
         candidates += [folder / inside for folder in (*package_dirs, *urdf.resolve().parents)]
-    return next((path for path in candidates if path.is_file()), None)
+    # Unlike Path.is_file, this takes a name that is too long for one that does not exist.
+    return next((path for path in candidates if os.path.isfile(path)), None)
 
 
 def _inertia_boxes(robot: Robot) -> Iterator[Shape]:

@@ -11,7 +11,7 @@ from warnings import warn
 
 from fflin.base.errors import FflinWarning, FileError, InputError
 from fflin.base.validation import Array, number, truth
-from fflin.base.writing import as_path, write_whole
+from fflin.base.writing import as_path, check_place, write_whole
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import find_frame
@@ -142,7 +142,7 @@ def visualize(
         if opened is not False:
             live.open()
         return live
-    outputs = check_outputs({".html": html, ".png": png, ".gif": gif}, robot.urdf)
+    outputs = check_outputs({".html": html, ".png": png, ".gif": gif})
     _check_motion(robot, motion)
     fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
     from fflin.view.motion_page import chart_of, motion_page
@@ -180,11 +180,8 @@ def _check_port(port: Any) -> None:
         raise InputError(f"port is {port!r}, expected 0 to 65535 (0: one that is free)")
 
 
-def check_outputs(files: dict[str, Any], spare: Path | None = None) -> dict[str, Path]:
-    """Return {ending: path} of the files that are named, or raise where one cannot be written.
-
-    `spare` is a file that must not be overwritten, such as the robot's own.
-    """
+def check_outputs(files: dict[str, Any]) -> dict[str, Path]:
+    """Return {ending: path} of the files that are named, or raise where one cannot be written."""
     outputs = {}
     for ending, file in files.items():
         if file is None:
@@ -192,12 +189,7 @@ def check_outputs(files: dict[str, Any], spare: Path | None = None) -> dict[str,
         path = as_path(file)
         if path.suffix.lower() != ending:
             raise FileError(f"'{path}' ends in '{path.suffix}', expected {ending}")
-        if not path.absolute().parent.is_dir():
-            raise FileError(f"{path}: cannot be written: there is no folder {path.parent}")
-        if path.is_dir():
-            raise FileError(f"{path}: is a folder; give the name of a file")
-        if spare and path.resolve() == spare.resolve():
-            raise FileError(f"{path} is the robot's own file; name another to write")
+        check_place(path)
         outputs[ending] = path
     if ".png" in outputs or ".gif" in outputs:
         from fflin.view.capture import find_chromium

@@ -256,11 +256,11 @@ def test_robots_own_file_is_never_the_output(tmp_path):
     robot = tmp_path / "robot.json"
     robot.write_bytes((Path(__file__).parents[2] / "robots" / "cubesat.urdf").read_bytes())
     before = robot.read_bytes()
-    assert "is the robot's own file" in refused("linearize", robot, "-o", robot)
+    assert "is the input file" in refused("linearize", robot, "-o", robot)
     assert robot.read_bytes() == before
     sibling = tmp_path / "arm.A.csv"
     sibling.write_bytes(before)
-    assert "is the robot's own file" in refused("linearize", sibling, "-o", tmp_path / "arm.csv")
+    assert "is the input file" in refused("linearize", sibling, "-o", tmp_path / "arm.csv")
     assert sibling.read_bytes() == before
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import stat
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -12,7 +10,8 @@ from pathlib import Path
 
 import pinocchio as pin
 
-from fflin.base.errors import FileError, UrdfError
+from fflin.base.errors import UrdfError
+from fflin.base.writing import read_input
 from fflin.robot.urdf.inertias import inertia_notes
 from fflin.robot.urdf.joints import Mimic
 from fflin.robot.urdf.mimics import counted_leaders, resolve_mimics
@@ -82,7 +81,7 @@ def read_urdf(path: Path, prune: Sequence[str] = ()) -> Description:
     UnknownNameError
         If there is no such joint to prune.
     """
-    return describe(read_file(path), path, prune)
+    return describe(read_document(path), path, prune)
 
 
 def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Description:
@@ -120,26 +119,9 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     )
 
 
-def read_file(path: Path, kind: str = "URDF", limit: int = _SIZE_LIMIT) -> bytes:
-    """Return what a regular file of at most `limit` bytes holds, or raise `FileError`."""
-    try:
-        # Without O_NONBLOCK, opening a pipe would wait for somebody to write into it.
-        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-        if path.is_dir():
-            raise FileError(f"{path}: is a folder; give the path of a {kind} file")
-        with open(os.open(path, flags | getattr(os, "O_CLOEXEC", 0)), "rb") as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise FileError(f"{path}: is not a regular file; give the path of a {kind} file")
-            document = file.read(limit + 1)
-    except FileError:
-        raise
-    except (OSError, ValueError) as error:
-        what = error.strerror if isinstance(error, OSError) else str(error)
-        raise FileError(f"{path}: cannot be read: {what}") from None
-    if len(document) > limit:
-        size = f"{limit >> 20} MiB" if limit >> 20 else f"{limit >> 10} KiB"
-        raise FileError(f"{path}: is larger than {size}, too large for a {kind} file")
-    return document
+def read_document(path: Path) -> bytes:
+    """Return what the file of a URDF holds, or raise `FileError`."""
+    return read_input(path, "URDF", _SIZE_LIMIT)
 
 
 def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> pin.Model:
