@@ -109,16 +109,18 @@ def controllability(lin: LinearModel) -> Controllability:
 
     About rest the momenta with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved, and with the
     coordinates :math:`W M N^{-1} x_1` that they drive they are split off exactly. Without
-    springs and dampers that is all: the dimension is 2 rank(B). With springs alone the rest is
-    decided frequency by frequency on the modes of :math:`(K, M)`, equal frequencies together:
-    :math:`2 \sum_g \mathrm{rank}(\Phi_g^T S)`. With dampers, off rest, or sampled with springs,
-    it is decided at each eigenvalue by singular values of :math:`[A - s E, B]`, in units of
-    energy (Popov, Belevitch, Hautus).
+    springs and dampers that is all: the dimension is 2 rank(B). With them the rest is decided on
+    :math:`M a + D v + K s = S u` itself, by the rank of :math:`[p^2 M + p D + K, S]` at each pole
+    p, where rounding is put to zero and every row is scaled by what stands in it. Off rest, and
+    where springs or dampers are not symmetric, it is decided by singular values of
+    :math:`[A - p E, B]` in units of energy (Popov, Belevitch, Hautus).
 
-    Every rank is that of a matrix scaled by M, with inputs of unit length; the tolerances are
-    small multiples of the rounding, and `margin` says how near the decisions came to them.
-    Frequencies whose squares differ by less than 1e4 roundings are taken as equal. A sampled
-    model is judged as it stands: sampling at a period of a vibration loses it.
+    A sampled model has the structure of the continuous one that it was made of, but for a
+    vibration that is lost where it is sampled at a period of it. Of a file, which holds the
+    samples alone, these are judged as they stand.
+
+    Every tolerance is a small multiple of the rounding; `margin` says how near the decisions came
+    to them, and `notes` where one is within rounding.
 
     Parameters
     ----------
@@ -138,8 +140,8 @@ def controllability(lin: LinearModel) -> Controllability:
     -----
     Inputs act in both directions: that a thruster only pushes is not considered. At a nonzero
     angular velocity the answer is that of the frozen model, which certifies nothing about the
-    motion. Where the fastest pole is more than about 1e8 times the slowest that is not zero, as
-    with a heavy damper on a light link, the slow ones are taken for rounding, as `margin` shows.
+    motion. Off rest, where the fastest pole is more
+    than about 1e8 times the slowest that is not zero, the slow ones are taken for rounding.
 
     References
     ----------
@@ -148,9 +150,10 @@ def controllability(lin: LinearModel) -> Controllability:
     """
     lin = checked(lin)
     held = conserved(lin)
-    z, nx = held.selected, len(lin.A)
     part = _split_kept(lin, held)
-    rows = np.vstack((held.momenta, held.coordinates, part.rows @ _selector(z, nx)))
+    others: Array = np.zeros((len(part.rows), len(lin.A)))
+    others[:, held.selected] = part.rows
+    rows = np.vstack((held.momenta, held.coordinates, others))
     names = (*momentum_names(lin, held), *part.names)
     size = _state_sizes(lin)
     spanned = held.T @ part.reached
@@ -268,24 +271,14 @@ def _labels(lin: LinearModel, rows: Array, held: Conserved) -> tuple[Array, tupl
     return echeloned, tuple(combination(row, names, size) for row in echeloned)
 
 
-def _selector(states: Array, nx: int) -> Array:
-    selector: Array = np.zeros((len(states), nx))
-    selector[np.arange(len(states)), states] = 1.0
-    return selector
-
-
 def _state_sizes(lin: LinearModel) -> Array:
-    """Weights (nx,) that make states comparable: what a unit of each moves, by its inertia."""
+    """Weights (nx,) that make states comparable, by their inertia."""
     return np.tile(np.sqrt(lin.M.diagonal()), 2)
 
 
 def _driven_states(lin: LinearModel) -> Array:
     """Return the states of coordinates that an input pushes on directly."""
-    force = np.abs(lin.M @ lin.B[len(lin.M) :])
-    rounding = (
-        1e3 * len(lin.M) * np.finfo(float).eps * (np.abs(lin.M) @ np.abs(lin.B[len(lin.M) :]))
-    )
-    return np.tile((force > rounding).any(axis=1), 2)
+    return np.tile(second_order(lin.generator or lin).S.values.any(axis=1), 2)
 
 
 def _reach(lin: LinearModel, weighted: Array) -> dict[str, int]:

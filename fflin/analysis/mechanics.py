@@ -138,7 +138,7 @@ def conserved(lin: LinearModel) -> Conserved:
     :math:`\sqrt{M_{ii}}` and each is scaled to unit length, so that neither newton against
     newton metre nor a weak thruster plays a part.
     """
-    lin = _judged(lin)
+    lin = lin.generator or lin  # which conserves the same
     nv, X, system = len(lin.M), slopes(lin), second_order(lin)
     size = system.size
     pushes = stacked([[system.K.T], [system.D.T], [system.S.T]])
@@ -162,11 +162,6 @@ def conserved(lin: LinearModel) -> Conserved:
     zero = np.zeros((k, nv))
     L1, L2 = np.hstack((zero, momenta)), np.hstack((coordinates, zero))
     return Conserved(W, L1, L2, kept, T, margin)
-
-
-def _judged(lin: LinearModel) -> LinearModel:
-    """Return the model that a sampled one is made of, which conserves the same, where known."""
-    return lin.generator or lin
 
 
 def _driven(X: Array, momenta: Array) -> Array | None:

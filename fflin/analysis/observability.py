@@ -80,10 +80,10 @@ class Observability:
 def observability(lin: LinearModel) -> Observability:
     r"""Find what the outputs show, from C and the structure of A.
 
-    About rest without springs and dampers :math:`A^2 = 0`, and the unobservable subspace is the
-    kernel of :math:`[C; C A]`, which is one decision. Elsewhere it is the orthogonal complement
-    of what the dual pair :math:`(A^T, C^T)` reaches, found eigenvalue by eigenvalue in units of
-    energy, as in `controllability`.
+    About rest it is decided on :math:`M a + D v + K s = 0`, by the null space of
+    :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p; that of p = 0 is one decision. Elsewhere
+    the unobservable subspace is the orthogonal complement of what the dual pair
+    :math:`(A^T, C^T)` reaches, in units of energy, as in `controllability`.
 
     Parameters
     ----------

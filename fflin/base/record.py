@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import Field, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -262,7 +262,13 @@ class Design:
             record, verified = read_record(source)
             if text(record["kind"]) != name:
                 raise ValueError(f"it is a {text(record['kind'])}")
-            values = {item.name: _value(cls, item, record[item.name]) for item in _saved(cls)}
+            # What has a default came later than some files.
+            stored = [
+                item
+                for item in _saved(cls)
+                if item.name in record or item.default_factory is MISSING
+            ]
+            values = {item.name: _value(cls, item, record[item.name]) for item in stored}
             return cls(**values, verified=verified)
 
 

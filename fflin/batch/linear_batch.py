@@ -300,7 +300,7 @@ class LinearBatch:
             for item in fields(self)
             if not item.name.startswith("_") and item.name not in rows and item.name != "B_lower"
         }
-        return LinearModel._from_fields(
+        return LinearModel.from_fields(
             rows
             | names
             | {"B": B, "x0": x0, "y0": x0 if y0 is None else y0, "dt": 0.0}

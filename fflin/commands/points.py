@@ -83,7 +83,7 @@ def placed(
     robot: Robot, option: str, pairs: list[tuple[str, Any]], base: pin.SE3 | None = None
 ) -> Array:
     """Return the configuration (nq,) with the joints that an option says; warn beyond limits."""
-    from fflin.robot.robot import configuration
+    from fflin.dynamics.points import configuration
 
     joints = once(option, pairs)
     q = configuration(robot, joints, base)

@@ -116,8 +116,6 @@ class LinearModel:
     _inertia: Callable[[LinearModel], Array] = field()
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
-    # Of a moving reference, whose f0 is zero by construction: its own rate (nx,), that of its
-    # attitude without turns about gravity. None otherwise.
     _drift: Array | None = None
     # Of a sampled model: its own fingerprint and the continuous model that it was made of, whose
     # structure no exponential has blurred.
@@ -133,7 +131,15 @@ class LinearModel:
                 object.__setattr__(self, item.name, value)
 
     @classmethod
-    def _from_fields(cls, values: dict[str, Any]) -> LinearModel:
+    def from_fields(cls, values: dict[str, Any]) -> LinearModel:
+        """Return a model whose fields are given; its arrays must be read-only and stay so.
+
+        Parameters
+        ----------
+        values : dict
+            Every field by its name. What it has under ``_when_asked`` is {name of a field:
+            function of q} for those that are made when they are asked for.
+        """
         # The generated __init__ sets two dozen frozen fields one by one, which costs as much
         # as the dynamics of a small robot. The caller passes read-only arrays of its own.
         lin = _new(cls)
@@ -163,6 +169,14 @@ class LinearModel:
         import pinocchio as pin
 
         return pin.XYZQUATToSE3(self._reference)
+
+    @property
+    def drift(self) -> Array | None:
+        """Own rate (nx,) of a moving reference, whose f0 is zero by construction; else None.
+
+        That of its attitude is without turns about gravity, which change nothing.
+        """
+        return self._drift
 
     @cached_property
     def M(self) -> Array:
@@ -223,7 +237,7 @@ class LinearModel:
         tol : float
             What no rate may exceed, in SI units; those of ignorable coordinates may.
         """
-        rate = self.f0 if self._drift is None else self._drift
+        rate = self.f0 if self.drift is None else self.drift
         judged = [name not in self.ignorable for name in self.state_names]
         return bool(np.abs(rate[judged]).max(initial=0.0) <= number("tol", tol))
 

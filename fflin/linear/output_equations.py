@@ -57,6 +57,5 @@ def output_equations(
     C[:, g.q_b] = turn.dot(chart.J)
     C[:, g.r_b] = by_q[:, LINEAR].dot(chart.R.T)
     C[:, g.q_m] = by_q_m
-    C[:, -len(nu) :] = by_nu
-    state.to_frame(chart, C[:, -len(nu) :].T)
+    C[:, -len(nu) :] = state.to_frame(chart, by_nu.T).T
     return C, D

@@ -129,8 +129,19 @@ def visualize(
     if motion is None:
         if any(file is not None for file in (html, png, gif)):
             raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
+        _check_port(port)
         start = robot.neutral() if q is None else _configuration(robot, "q", q)
-        return _live(robot, start, opened is not False, scene, tool, bool(follow), speed, port)
+        from fflin.view.live import Live
+
+        pace = _speed(speed, 1.0)
+        live = Live(
+            robot, start, scene=scene, tool=tool, follow=bool(follow), speed=pace, port=port
+        )
+        for note in live.notes:
+            warn(note, FflinWarning, stacklevel=2)
+        if opened is not False:
+            live.open()
+        return live
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif})
     _check_motion(robot, motion)
     fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
@@ -164,28 +175,9 @@ def visualize(
     return shown
 
 
-def _live(
-    robot: Robot,
-    q: Array,
-    open: bool,
-    scene: str,
-    tool: str | None,
-    follow: bool,
-    speed: float | None,
-    port: int,
-) -> Live:
+def _check_port(port: Any) -> None:
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port < 2**16:
         raise InputError(f"port is {port!r}, expected 0 to 65535 (0: one that is free)")
-    from fflin.view.live import Live
-
-    live = Live(
-        robot, q, scene=scene, tool=tool, follow=follow, speed=_speed(speed, 1.0), port=port
-    )
-    for note in live.notes:
-        warn(note, FflinWarning, stacklevel=3)
-    if open:
-        live.open()
-    return live
 
 
 def check_outputs(files: dict[str, Any]) -> dict[str, Path]:

@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from tests.commands.test_cli import refused, run
+from tests.support.commands import refused, run
 from tests.support.patience import PATIENCE
 
 pytest.importorskip("h5py")

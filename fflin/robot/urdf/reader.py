@@ -92,7 +92,8 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     if path.suffix == ".xacro" or first:
         expanded, notes = expand(path, document, first)
         root = parse(expanded, f"{path} as expanded by xacro")
-        _check_expanded(root)
+        if left := first_xacro(root):
+            raise left.error(f"xacro is left in <{left.tag}>; is a macro missing?")
     urdf = read_description(root, prune)
     mimics = resolve_mimics(urdf.joints)
     model = _build(urdf, path, root, counted_leaders(urdf.joints, mimics))
@@ -121,12 +122,6 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
 def read_document(path: Path) -> bytes:
     """Return what the file of a URDF holds, or raise `FileError`."""
     return read_input(path, "URDF", _SIZE_LIMIT)
-
-
-def _check_expanded(root: Element) -> None:
-    left = first_xacro(root)
-    if left:
-        raise left.error(f"xacro is left in <{left.tag}>; is a macro missing?")
 
 
 def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> pin.Model:
@@ -162,22 +157,12 @@ def _with_stack(depth: int, call: Callable[[], pin.Model]) -> pin.Model:
     """Make a call that recurses along the tree on a stack that holds it."""
     if depth <= _SHALLOW:
         return call()
-    results: list[pin.Model] = []
-    errors: list[Exception] = []
+    from concurrent.futures import ThreadPoolExecutor
 
-    def run() -> None:
+    with ThreadPoolExecutor(1) as other:
+        usual = threading.stack_size(_STACK)
         try:
-            results.append(call())
-        except Exception as error:  # carried over to the thread that waits
-            errors.append(error)
-
-    usual = threading.stack_size(_STACK)
-    try:
-        thread = threading.Thread(target=run)
-        thread.start()
-    finally:
-        threading.stack_size(usual)
-    thread.join()
-    if errors:
-        raise errors[0]
-    return results[0]
+            built = other.submit(call)
+        finally:
+            threading.stack_size(usual)
+        return built.result()
