@@ -8,16 +8,31 @@ from typing import Any
 
 import numpy as np
 
-from fflin.analysis.mechanics import Conserved, Scaled, checked, conserved, scaled, slopes
-from fflin.analysis.names import combination, grouped, momentum_names, with_rates
-from fflin.analysis.ranks import Margin, echelon, reached_by, split, unit_columns
-from fflin.analysis.vibrations import undamped_modes, vibration_rows
+from fflin.analysis.mechanics import (
+    Conserved,
+    at_rest,
+    checked,
+    conserved,
+    fixed_poles,
+    rates_of_positions,
+    scaled,
+    second_order,
+    slopes,
+)
+from fflin.analysis.names import (
+    combination,
+    grouped,
+    momentum_names,
+    undecided,
+    unsettled,
+    with_rates,
+)
+from fflin.analysis.ranks import Margin, echelon, null_space, reached_by, split, unit_columns
+from fflin.analysis.second_order import Noisy, SecondOrder, aliased, hidden
+from fflin.analysis.vibrations import vibration_rows
 from fflin.base.tables import width
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
-
-# A defective pair of poles at zero moves by the square root of round-off.
-_DECAY = 1e-7
 
 _LOOPS = (
     "closed loops of the joints still turn the base of the nonlinear robot (a loop of amplitude "
@@ -94,16 +109,18 @@ def controllability(lin: LinearModel) -> Controllability:
 
     About rest the momenta with :math:`W M [A_{21}, A_{22}, B_2] = 0` are conserved, and with the
     coordinates :math:`W M N^{-1} x_1` that they drive they are split off exactly. Without
-    springs and dampers that is all: the dimension is 2 rank(B). With springs alone the rest is
-    decided frequency by frequency on the modes of :math:`(K, M)`, equal frequencies together:
-    :math:`2 \sum_g \mathrm{rank}(\Phi_g^T S)`. With dampers, off rest, or sampled with springs,
-    it is decided at each eigenvalue by singular values of :math:`[A - s E, B]`, in units of
-    energy (Popov, Belevitch, Hautus).
+    springs and dampers that is all: the dimension is 2 rank(B). With them the rest is decided on
+    :math:`M a + D v + K s = S u` itself, by the rank of :math:`[p^2 M + p D + K, S]` at each pole
+    p, where rounding is put to zero and every row is scaled by what stands in it. Off rest, and
+    where springs or dampers are not symmetric, it is decided by singular values of
+    :math:`[A - p E, B]` in units of energy (Popov, Belevitch, Hautus).
 
-    Every rank is that of a matrix scaled by M, with inputs of unit length; the tolerances are
-    small multiples of the rounding, and `margin` says how near the decisions came to them.
-    Frequencies whose squares differ by less than 1e4 roundings are taken as equal. A sampled
-    model is judged as it stands: sampling at a period of a vibration loses it.
+    A sampled model has the structure of the continuous one that it was made of, but for a
+    vibration that is lost where it is sampled at a period of it. Of a file, which holds the
+    samples alone, these are judged as they stand.
+
+    Every tolerance is a small multiple of the rounding; `margin` says how near the decisions came
+    to them, and `notes` where one is within rounding.
 
     Parameters
     ----------
@@ -123,8 +140,8 @@ def controllability(lin: LinearModel) -> Controllability:
     -----
     Inputs act in both directions: that a thruster only pushes is not considered. At a nonzero
     angular velocity the answer is that of the frozen model, which certifies nothing about the
-    motion. Where the fastest pole is more than about 1e8 times the slowest that is not zero, as
-    with a heavy damper on a light link, the slow ones are taken for rounding, as `margin` shows.
+    motion. Off rest, where the fastest pole is more
+    than about 1e8 times the slowest that is not zero, the slow ones are taken for rounding.
 
     References
     ----------
@@ -132,17 +149,20 @@ def controllability(lin: LinearModel) -> Controllability:
     second-order systems, J. Applied Mechanics 47(2), 1980.
     """
     lin = checked(lin)
-    X, held = slopes(lin), conserved(lin)
-    z, B = held.selected, lin.B[held.selected]
-    A, M = X[z] @ held.T, held.T[len(lin.M) :, len(held.kept) :]
-    part = _split_kept(lin, A, B, M.T @ lin.M @ M, held)
-    rows = np.vstack((held.momenta, held.coordinates, part.rows @ _selector(z, len(X))))
+    held = conserved(lin)
+    part = _split_kept(lin, held)
+    others: Array = np.zeros((len(part.rows), len(lin.A)))
+    others[:, held.selected] = part.rows
+    rows = np.vstack((held.momenta, held.coordinates, others))
     names = (*momentum_names(lin, held), *part.names)
     size = _state_sizes(lin)
     spanned = held.T @ part.reached
     basis, pivots = echelon(spanned, size, _driven_states(lin))
     zero = np.full(2 * len(held.weights), 1.0 if lin.dt else 0.0)
-    notes = _notes(lin, held, part)
+    margin = held.margin & part.margin
+    notes = (*_notes(lin, held), *undecided(lin, margin, "controllable", basis.shape[1]))
+    if not len(zero):
+        notes += unsettled(lin, part.settling, "stabilizable")
     return Controllability(
         dimension=basis.shape[1],
         controllable=tuple(lin.state_names[i] for i in pivots),
@@ -153,7 +173,7 @@ def controllability(lin: LinearModel) -> Controllability:
         stabilizable=not len(zero) and part.decays,
         reach=_reach(lin, basis * size[:, None]),
         method=part.method,
-        margin=held.margin & part.margin,
+        margin=margin,
         notes=notes,
         robot=lin.robot,
     )
@@ -170,71 +190,95 @@ class _Part:
     decays: bool
     method: str
     margin: Margin
+    settling: Margin
 
 
-def _split_kept(lin: LinearModel, A: Array, B: Array, M: Array, held: Conserved) -> _Part:
-    r = len(M)
+def _split_kept(lin: LinearModel, held: Conserved) -> _Part:
+    source = at_rest(lin)
+    if source is not None:
+        r, nv = len(held.kept), len(lin.M)
+        R = held.T[nv:, r:]
+        system = second_order(source).restricted(R)
+        to_s = np.linalg.inv((rates_of_positions(slopes(source)) @ R)[held.kept])
+        part = _by_second_order(lin, system, to_s, held)
+        if part is not None:
+            return part
+    return _by_eigenvalues(lin, held)
+
+
+def _by_second_order(
+    lin: LinearModel, system: SecondOrder, to_s: Array, held: Conserved
+) -> _Part | None:
+    r, names = len(system.M), tuple(np.array(lin.state_names)[held.selected])
+    acting = system.K.values.any() or system.D.values.any()
+    idle, margin = null_space(system.S.T @ np.diag(1.0 / system.size))
+    margin = margin.seen(held.T[len(lin.M) :, r:] / system.size)
     everything = np.eye(2 * r)
-    if not A[r:].any():
-        return _whole(everything, Margin())
-    size = np.sqrt(M.diagonal())
-    driven = unit_columns((M @ B[r:]) / size[:, None])
-    image, _, margin = split(driven, 1e-9)
-    if image.shape[1] == r and not lin.dt:
-        return _whole(everything, margin)
-    modes = None if lin.dt else undamped_modes(A, M)
-    if modes is not None:
-        found = modes.split(B[r:])
-        rows, names, poles = vibration_rows(
-            found, modes, tuple(np.array(lin.state_names)[held.selected])
+    if not acting or (not idle.shape[1] and not lin.dt):
+        # What is not conserved is pushed.
+        return _Part(
+            everything, everything[:0], (), np.zeros(0), True, "closed form", margin, Margin()
         )
-        return _Part(found.reached, rows, names, poles, not len(rows), "modes", found.margin)
-    return _by_eigenvalues(lin, scaled(A, M, lin.dt), B, held)
+    if not system.symmetric or (lin.dt and aliased(system.poles[0], lin.dt)):
+        return None
+    found = hidden(system, system.S.T, Noisy(*np.zeros_like(system.S.T)))
+    if not found.simple:
+        return None
+    # By symmetry a motion (s, v) that S^T s does not show is a row that no input moves.
+    s, v = np.split(found.motions, 2)
+    pushed = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
+    reached = _across(pushed / np.tile(system.size, 2)) / np.tile(system.size, 2)[:, None]
+    reached[:r] = np.linalg.solve(to_s, reached[:r])
+    if system.D.values.any():
+        rows, labels = _labels(lin, np.hstack((pushed[:, :r] @ to_s, pushed[:, r:])), held)
+        method = "eigenvalues"
+    else:
+        rows, labels = vibration_rows(found, system.M, to_s, names)
+        method = "modes"
+    R = held.T[len(lin.M) :, r:]
+    margin, settling = found.margin.seen(R), found.settling.seen(R)
+    poles = np.exp(found.poles * lin.dt) if lin.dt else found.poles
+    return _Part(reached, rows, labels, poles, found.decays, method, margin, settling)
 
 
-def _whole(everything: Array, margin: Margin) -> _Part:
-    none = everything[:0]
-    return _Part(everything, none, (), np.zeros(0), True, "closed form", margin)
+def _across(rows: Array) -> Array:
+    """Return an orthonormal basis of what is orthogonal to independent rows (k, n)."""
+    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    basis: Array = np.linalg.qr(rows.T, mode="complete")[0][:, len(rows) :]
+    return basis
 
 
-def _by_eigenvalues(lin: LinearModel, pair: Scaled, B: Array, held: Conserved) -> _Part:
-    drive = unit_columns(pair.from_x @ B)
+def _by_eigenvalues(lin: LinearModel, held: Conserved) -> _Part:
+    z, nv = held.selected, len(lin.M)
+    rates = held.T[nv:, len(held.kept) :]
+    pair = scaled(slopes(lin)[z] @ held.T, rates.T @ lin.M @ rates, lin.dt)
+    drive = unit_columns(pair.from_x @ lin.B[z])
     reached, rest, F, margin = reached_by(pair.A, drive, pair.tolerance)
+    rows, labels = _labels(lin, rest.T @ pair.from_x, held)
+    poles, decays, lost, settling = fixed_poles(F, rest, pair, lin.dt)
+    margin = margin.halved().seen(pair.to_x[len(rates.T) :, len(rates.T) :]) & lost
+    margin, settling = margin.seen(rates), settling.seen(rates)
+    method = "eigenvalues"
+    return _Part(pair.to_x @ reached, rows, labels, poles, decays, method, margin, settling)
+
+
+def _labels(lin: LinearModel, rows: Array, held: Conserved) -> tuple[Array, tuple[str, ...]]:
+    if not len(rows):
+        return rows, ()
     names = tuple(np.array(lin.state_names)[held.selected])
-    size = _state_sizes(lin)[held.selected]
-    rows: Array = rest.T @ pair.from_x
-    labels: tuple[str, ...] = ()
-    if len(rows):
-        echeloned, _ = echelon(rows.T, 1.0 / size)
-        rows = echeloned.T
-        labels = tuple(combination(row, names, 1.0 / size) for row in rows)
-    rates = np.linalg.eigvals(F) if len(F) else np.zeros(0)
-    decays = bool((rates.real < -_DECAY).all())
-    poles = rates / pair.unit
-    if lin.dt:
-        poles = 1.0 + lin.dt * poles
-        decays = bool((np.abs(poles) < 1.0 - _DECAY).all())
-    return _Part(pair.to_x @ reached, rows, labels, poles, decays, "eigenvalues", margin)
-
-
-def _selector(states: Array, nx: int) -> Array:
-    selector: Array = np.zeros((len(states), nx))
-    selector[np.arange(len(states)), states] = 1.0
-    return selector
+    size = 1.0 / _state_sizes(lin)[held.selected]
+    echeloned = echelon(rows.T, size)[0].T
+    return echeloned, tuple(combination(row, names, size) for row in echeloned)
 
 
 def _state_sizes(lin: LinearModel) -> Array:
-    """Weights (nx,) that make states comparable: what a unit of each moves, by its inertia."""
+    """Weights (nx,) that make states comparable, by their inertia."""
     return np.tile(np.sqrt(lin.M.diagonal()), 2)
 
 
 def _driven_states(lin: LinearModel) -> Array:
     """Return the states of coordinates that an input pushes on directly."""
-    force = np.abs(lin.M @ lin.B[len(lin.M) :])
-    rounding = (
-        1e3 * len(lin.M) * np.finfo(float).eps * (np.abs(lin.M) @ np.abs(lin.B[len(lin.M) :]))
-    )
-    return np.tile((force > rounding).any(axis=1), 2)
+    return np.tile(second_order(lin.generator or lin).S.values.any(axis=1), 2)
 
 
 def _reach(lin: LinearModel, weighted: Array) -> dict[str, int]:
@@ -249,7 +293,7 @@ def _reach(lin: LinearModel, weighted: Array) -> dict[str, int]:
     return reach
 
 
-def _notes(lin: LinearModel, held: Conserved, part: _Part) -> tuple[str, ...]:
+def _notes(lin: LinearModel, held: Conserved) -> tuple[str, ...]:
     notes = []
     turned = any("angular momentum" in name for name in momentum_names(lin, held))
     if turned and any(lin.state_names[i].startswith("q_m.") for i in held.kept):
@@ -258,10 +302,4 @@ def _notes(lin: LinearModel, held: Conserved, part: _Part) -> tuple[str, ...]:
         notes.append("conserved momenta are split off by fflin.momentum_reduction")
     if not lin.is_equilibrium():
         notes.append("the point is not a fixed point: this speaks of the frozen A and B")
-    margin = held.margin & part.margin
-    if margin.kept < 1e2 or margin.dropped > 0.3:
-        notes.append(
-            f"a rank was a near decision: kept {margin.kept:.0e} and dropped {margin.dropped:.0e} "
-            "times the tolerance"
-        )
     return tuple(notes)

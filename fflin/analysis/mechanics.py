@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from fflin.analysis.ranks import EPS, Margin, echelon, split
+from fflin.analysis.ranks import EPS, Margin, decided, echelon, null_space
+from fflin.analysis.second_order import Noisy, SecondOrder, stacked, without_rounding
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
-
-# A column that is not this many times its rounding is taken for zero.
-_ABOVE_ROUNDING = 1e3
 
 # Relative residual beyond which a momentum is not the rate of a coordinate: off rest.
 _CONSISTENT = 1e-8
@@ -47,6 +46,13 @@ def rounding(lin: LinearModel) -> float:
     return EPS * float(np.abs(lin.A).max()) / lin.dt if lin.dt else 0.0
 
 
+# A defective pair of poles at zero moves by the square root of round-off.
+_DECAY = 1e-7
+
+# What is left of a motion after a sample where it is rounding.
+_DEAD = 1e4 * EPS
+
+
 @dataclass(frozen=True)
 class Conserved:
     """The momenta that no input, spring or damper changes, and what follows from them.
@@ -79,29 +85,69 @@ class Conserved:
         return np.concatenate((self.kept, self.kept + len(self.T) // 2))
 
 
+def second_order(lin: LinearModel) -> SecondOrder:
+    """Return the forces of a continuous model, or those that a sampled one shows as it stands.
+
+    What the product with M leaves of a slope or an input that is none is put to zero: one floor
+    for springs and one for dampers, per unit of energy, and one for each input.
+    """
+    nv, M, X = len(lin.M), lin.M, slopes(lin)
+    size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
+    rates = np.hstack((X[nv:], lin.B[nv:]))
+    spread = 4.0 * nv * EPS * np.abs(rates)
+    spread[:, : 2 * nv] += 4.0 * nv * rounding(lin) * (rates[:, : 2 * nv] != 0.0)
+    forces = Noisy(M @ rates, np.abs(M) @ spread)
+    K, D, S = (
+        Noisy(forces.values[:, part], forces.noise[:, part])
+        for part in (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None))
+    )
+    # Relative to the largest force of the same input.
+    each = np.linalg.norm(S.values / size[:, None], axis=0)
+    return SecondOrder(
+        M=M,
+        K=without_rounding(K @ -N, size, size),
+        D=without_rounding(D @ -np.eye(nv), size, size),
+        S=without_rounding(S, size, np.where(each > 0.0, each, 1.0)),
+    )
+
+
+def at_rest(lin: LinearModel) -> LinearModel | None:
+    """Return a model with the second-order structure of the given one, None where it has none.
+
+    That is the continuous one where positions change at the rates of velocities alone, which
+    also tells the structure of what was sampled from it; or a sampled one without forces.
+    """
+    source, nv = lin.generator or lin, len(lin.M)
+    X = slopes(source)
+    if X[:nv, :nv].any() or (source.dt and X[nv:].any()):
+        return None
+    return source
+
+
+def rates_of_positions(X: Array) -> Array:
+    """Return N (nv, nv) with dp/dt = N nu; of a model sampled at a period of its own, identity."""
+    nv = len(X) // 2
+    N = X[:nv, nv:]
+    return N if np.linalg.cond(N) < 1e6 else np.eye(nv)
+
+
 def conserved(lin: LinearModel) -> Conserved:
     r"""Find the conserved momenta: :math:`W M [A_{21}, A_{22}, B_2] = 0`.
 
     The generalised forces of states and inputs are compared in units of
     :math:`\sqrt{M_{ii}}` and each is scaled to unit length, so that neither newton against
-    newton metre nor a weak thruster plays a part; the tolerance is ten times their rounding.
+    newton metre nor a weak thruster plays a part.
     """
-    nv, M, X = len(lin.M), lin.M, slopes(lin)
-    size = np.sqrt(M.diagonal())
-    rates = np.hstack((X[nv:], lin.B[nv:]))
-    spread = EPS * np.abs(rates)
-    spread[:, : 2 * nv] += rounding(lin) * (rates[:, : 2 * nv] != 0.0)
-    forces = (M @ rates) / size[:, None]
-    noise = 4.0 * nv * np.linalg.norm(np.abs(M) @ spread / size[:, None], axis=0)
-    sizes = np.linalg.norm(forces, axis=0)
-    real = sizes > _ABOVE_ROUNDING * noise
-    share = noise[real] / sizes[real]
-    tolerance = 10.0 * max(nv * EPS, float(share.max(initial=0.0)))
-    _, free, margin = split(forces[:, real] / sizes[real], tolerance)
+    lin = lin.generator or lin  # which conserves the same
+    nv, X, system = len(lin.M), slopes(lin), second_order(lin)
+    size = system.size
+    pushes = stacked([[system.K.T], [system.D.T], [system.S.T]])
+    free, margin = null_space(pushes @ np.diag(1.0 / size))
+    margin = margin.seen(1.0 / size, 2)
     # Columns of W^T: unit vectors where a coordinate has its momentum to itself.
     basis, pivots = echelon(free / size[:, None], size)
     W = basis.T
-    momenta = W @ M
+    momenta = W @ lin.M
     coordinates = _driven(X, momenta)
     if coordinates is None:
         pivots, W = pivots[:0], W[:0]
@@ -155,9 +201,7 @@ def scaled(X: Array, M: Array, dt: float = 0.0) -> Scaled:
     """
     nv = len(M)
     L = np.linalg.cholesky(M)
-    N = X[:nv, nv:]
-    if not np.linalg.cond(N) < 1e6:  # sampled at a period of its own
-        N = np.eye(nv)
+    N = rates_of_positions(X)
     to_velocity = np.linalg.inv(L.T)
     to_position = N @ to_velocity
     to_x = np.block([[to_position, np.zeros((nv, nv))], [np.zeros((nv, nv)), to_velocity]])
@@ -184,6 +228,26 @@ def scaled(X: Array, M: Array, dt: float = 0.0) -> Scaled:
         unit=unit,
         tolerance=20.0 * max(len(X) * EPS * condition, noise),
     )
+
+
+def fixed_poles(F: Array, rest: Array, pair: Scaled, dt: float) -> tuple[Any, bool, Margin, Margin]:
+    """Return the poles of dynamics F on `rest` of a pair and whether all decay.
+
+    Also the margin of what has died out between samples, which cannot be told apart any more,
+    and that of the decay.
+    """
+    if not len(F):
+        return np.zeros(0), True, Margin(), Margin()
+    rates, vectors = np.linalg.eig(F)
+    shapes = pair.to_x @ rest @ vectors
+    poles = 1.0 + dt * rates / pair.unit if dt else rates / pair.unit
+    decay = 1.0 - np.abs(poles) if dt else -rates.real
+    least, most = int(decay.argmin()), int(decay.argmax())
+    settling = decided(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least]).halved()
+    lost = Margin()
+    if dt and abs(poles[most]) < _DEAD:
+        lost = decided(1.0, shapes[:, most]).halved()
+    return poles, bool(decay[least] > _DECAY), lost, settling
 
 
 def _quarters(nv: int) -> list[tuple[slice, slice]]:

@@ -38,11 +38,14 @@ class Mode:
         Eigenvector in the units of the state; of the positions the one that moves most is 1.
     unstable : bool
         Whether it grows, by more than rounding can explain.
+    margin : float
+        The real part of the pole as a multiple of its rounding; infinite where it has none.
     """
 
     pole: complex
     shape: NDArray[np.complexfloating[Any]]
     unstable: bool
+    margin: float
 
     def __post_init__(self) -> None:
         self.shape.setflags(write=False)
@@ -120,6 +123,16 @@ class Modes:
         return tuple(mode for mode in self.modes if mode.unstable)
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """Of which modes it hangs on rounding whether they grow or decay."""
+        return tuple(
+            f"undecided: whether the mode at {mode.frequency:.4g} rad/s grows or decays; its real "
+            f"part is {mode.margin:.1g} times its rounding"
+            for mode in self.modes
+            if 0.1 < abs(mode.margin) < 10.0
+        )
+
+    @property
     def poles(self) -> NDArray[np.complexfloating[Any]]:
         """All nx eigenvalues of A, with the zeros and the conjugates."""
         listed = [0j] * self.zero_eigenvalues
@@ -182,7 +195,9 @@ def modes(lin: LinearModel) -> Modes:
         left = weight * (A @ shape - pole * shape) / fastest
         residual = max(residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape)))
     return Modes(
-        tuple(Mode(pole, _normalised(shape), grows) for pole, shape, grows in triples),
+        tuple(
+            Mode(pole, _normalised(shape), margin > 1.0, margin) for pole, shape, margin in triples
+        ),
         rigid_body,
         zeros,
         residual,
@@ -192,8 +207,8 @@ def modes(lin: LinearModel) -> Modes:
     )
 
 
-# A pole, its shape, and whether it grows.
-_Found = tuple[list[tuple[complex, Any, bool]], int, int]
+# A pole, its shape, and its real part as a multiple of rounding.
+_Found = tuple[list[tuple[complex, Any, float]], int, int]
 
 
 def _significant(lin: LinearModel) -> Array:
@@ -229,7 +244,8 @@ def _free_free(A: Array, M: Array, inertia: Array) -> _Found | None:
     M_star = unit[np.ix_(felt, felt)] - across.T @ np.linalg.solve(unit[np.ix_(free, free)], across)
     K = -M_star @ by_s[np.ix_(felt, felt)]
     squares, vectors = eigh((K + K.T) / 2.0, (M_star + M_star.T) / 2.0)
-    found: list[tuple[complex, Any, bool]] = []
+    squares, vectors = _polished(by_s[np.ix_(felt, felt)], squares, vectors)
+    found: list[tuple[complex, Any, float]] = []
     for square, vector in zip(squares.tolist(), vectors.T, strict=True):
         if abs(square) <= _NO_STIFFNESS * len(felt) * float(np.abs(squares).max()):
             continue
@@ -238,9 +254,22 @@ def _free_free(A: Array, M: Array, inertia: Array) -> _Found | None:
         root = abs(square) ** 0.5
         for pole in [1j * root] if square > 0.0 else [complex(root), complex(-root)]:
             shape = np.concatenate((N @ s, pole * s))
-            found.append((pole, shape, pole.real > 0.0))
+            found.append((pole, shape, math.copysign(math.inf, pole.real) if pole.real else 0.0))
     counted = sum(2 if pole.imag else 1 for pole, *_ in found)
     return found, nv - counted // 2, 2 * nv - counted
+
+
+def _polished(by_s: Array, squares: Array, vectors: Array) -> tuple[Array, Array]:
+    """Return the pairs of -by_s, after one Newton step from those of its symmetric pencil.
+
+    The Schur complement rounds by the conditioning of M, A itself is right to the last digits.
+    """
+    defect = -np.linalg.solve(vectors, by_s @ vectors) - np.diag(squares)
+    gaps = squares - squares[:, None]
+    # Equal ones stay as they are: any of their combinations will do.
+    apart = np.abs(defect) < 1e-3 * np.abs(gaps)
+    mixed = np.divide(defect, gaps, out=np.zeros_like(defect), where=apart)
+    return squares + defect.diagonal(), vectors + vectors @ mixed
 
 
 def _scales(A: Array, inertia: Array) -> tuple[Array, float]:
@@ -259,13 +288,13 @@ def _general(A: Array, weight: Array, fastest: float) -> _Found:
     """Return the modes of any model, by the eigenvalues of A."""
     scaled = weight[:, None] * A / weight / fastest
     found, nullity = nonzero_eigenpairs(scaled, _NO_STIFFNESS)
-    listed: list[tuple[complex, Any, bool]] = []
+    listed: list[tuple[complex, Any, float]] = []
     for pole, vector, error in found:
         if pole.imag < 0.0:
             continue
         real = 0.0 if abs(pole.real) <= error and pole.imag else pole.real
         value = complex(real, pole.imag) * fastest
-        listed.append((value, vector / weight, pole.real > error))
+        listed.append((value, vector / weight, pole.real / error))
     return listed, nullity, len(weight) - len(found)
 
 
@@ -291,6 +320,7 @@ def modes_report(found: Modes) -> str:
     if found.unstable:
         poles = ", ".join(f"{mode.pole:.5g}" for mode in found.unstable)
         parts.append(textwrap.fill(f"unstable: poles with a positive real part {poles}", width()))
+    parts += [textwrap.fill(f"note: {note}", width()) for note in found.notes]
     rows = [["rad/s", "damping", "time [s]", "", "what moves"]]
     rows += [
         [

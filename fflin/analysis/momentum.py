@@ -10,6 +10,8 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.analysis.mechanics import checked, conserved
+from fflin.analysis.names import undecided
+from fflin.analysis.ranks import Margin
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
@@ -38,12 +40,18 @@ class ReducedModel(LinearModel):
         Rows L1: what is conserved, and zero in the reduced model.
     coordinates : ndarray (k, nx)
         Rows L2: what drifts at the rate of L1, and is held at zero in the reduced model.
+    margin : Margin
+        Distance from doubt of the decision on what is conserved: far above 1, far below 1.
+    notes : tuple of str
+        What is undecided.
     """
 
     T: Array
     S: Array
     momenta: Array
     coordinates: Array
+    margin: Margin
+    notes: tuple[str, ...]
 
 
 def momentum_reduction(lin: LinearModel) -> ReducedModel:
@@ -111,9 +119,19 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
         "_drift": None if lin.drift is None else lin.drift[z],
         "_inertia": partial(_given, M),
     }
-    reduced = ReducedModel(**values, T=T, S=S, momenta=held.momenta, coordinates=held.coordinates)
-    certify = partial(_same_certificate, lin, reduced.fingerprint)
-    return replace(reduced, _certify=certify)
+    reduced = ReducedModel(
+        **values,
+        T=T,
+        S=S,
+        momenta=held.momenta,
+        coordinates=held.coordinates,
+        margin=held.margin,
+        notes=undecided(lin, held.margin, "kept by the reduction", len(z)),
+    )
+    fingerprint, source = reduced.fingerprint, lin.generator
+    certify = partial(_same_certificate, lin, fingerprint)
+    of = (fingerprint, momentum_reduction(source)) if lin.dt and source is not None else None
+    return replace(reduced, _certify=certify, _source=of)
 
 
 def generalized_inertia(lin: LinearModel) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fflin.analysis.mechanics import Conserved
+from fflin.analysis.ranks import Margin
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 
@@ -77,6 +78,35 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
     if len(shown) > most:
         terms.append("+ ...")
     return " ".join(terms)
+
+
+def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[str, ...]:
+    """Say what is decided within rounding, and the two answers: `count` states, or others."""
+    notes = []
+    for ratio, at, change in margin.doubts:
+        verb = "counts" if change < 0 else "does not count"
+        notes.append(
+            f"undecided: {shape(lin, at)} {verb} as {what}, by {ratio:.1g} times its rounding; "
+            f"{count} or {count + change} of {len(lin.A)} states"
+        )
+    return tuple(notes)
+
+
+def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
+    """Say where it hangs on rounding whether the slowest motion decays."""
+    return tuple(
+        f"undecided: whether {shape(lin, at)} settles by itself, at {ratio:.1g} times its "
+        f"rounding; {what} or not {what}"
+        for ratio, at, _ in settling.doubts
+    )
+
+
+def shape(lin: LinearModel, at: Array) -> str:
+    """Name the coordinates that rates (nv,) move, real or complex, by the largest."""
+    size = np.sqrt(lin.M.diagonal())
+    largest = at[int(np.abs(at * size).argmax())]
+    names = tuple(name.partition(".")[2] or name for name in lin.state_names[len(lin.M) :])
+    return combination(np.real(at / largest), names, size)
 
 
 def _term(weight: float, name: str, *, first: bool) -> str:

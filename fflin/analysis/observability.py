@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.analysis.mechanics import checked, scaled, slopes
-from fflin.analysis.names import combination, with_rates
-from fflin.analysis.ranks import EPS, Margin, echelon, reached_by, split, unit_columns
+from fflin.analysis.mechanics import (
+    at_rest,
+    checked,
+    fixed_poles,
+    rates_of_positions,
+    scaled,
+    second_order,
+    slopes,
+)
+from fflin.analysis.names import combination, undecided, unsettled, with_rates
+from fflin.analysis.ranks import EPS, Margin, echelon, reached_by, unit_columns
+from fflin.analysis.second_order import Noisy, aliased, hidden, without_rounding
 from fflin.base.tables import width
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
-
-# A defective pair of poles at zero moves by the square root of round-off.
-_DECAY = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +47,8 @@ class Observability:
         "closed form" or "eigenvalues": how the dimension was found.
     margin : Margin
         Distance of the rank decisions from doubt: far above 1, far below 1.
+    notes : tuple of str
+        What is undecided.
     """
 
     dimension: int
@@ -51,6 +59,7 @@ class Observability:
     detectable: bool
     method: str
     margin: Margin
+    notes: tuple[str, ...]
     robot: str
 
     def __post_init__(self) -> None:
@@ -64,16 +73,17 @@ class Observability:
         ]
         if self.unobservable:
             lines.append(f"unobservable: {with_rates(self.unobservable)}")
+        lines += [f"note: {note}" for note in self.notes]
         return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
 
 
 def observability(lin: LinearModel) -> Observability:
     r"""Find what the outputs show, from C and the structure of A.
 
-    About rest without springs and dampers :math:`A^2 = 0`, and the unobservable subspace is the
-    kernel of :math:`[C; C A]`, which is one decision. Elsewhere it is the orthogonal complement
-    of what the dual pair :math:`(A^T, C^T)` reaches, found eigenvalue by eigenvalue in units of
-    energy, as in `controllability`.
+    About rest it is decided on :math:`M a + D v + K s = 0`, by the null space of
+    :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p; that of p = 0 is one decision. Elsewhere
+    the unobservable subspace is the orthogonal complement of what the dual pair
+    :math:`(A^T, C^T)` reaches, in units of energy, as in `controllability`.
 
     Parameters
     ----------
@@ -90,41 +100,69 @@ def observability(lin: LinearModel) -> Observability:
         If `lin` is no linear model of positions and their rates.
     """
     lin = checked(lin)
-    X = slopes(lin)
-    pair = scaled(X, lin.M, lin.dt)
-    seen = unit_columns((lin.C @ pair.to_x).T)
-    nv = len(lin.M)
-    if X[:nv, :nv].any() or X[nv:].any():
-        reached, rest, F, margin = reached_by(pair.A.T, seen, pair.tolerance)
-        method = "eigenvalues"
-    else:
-        drifted = unit_columns(_clean(pair.A.T @ seen))
-        reached, rest, margin = split(np.hstack((seen, drifted)), pair.tolerance)
-        F, method = rest.T @ pair.A.T @ rest, "closed form"
+    part = _by_second_order(lin) or _by_eigenvalues(lin)
     size = np.tile(np.sqrt(lin.M.diagonal()), 2)
-    basis, _ = echelon(pair.to_x @ rest, size)
-    rates = np.linalg.eigvals(F) if len(F) else np.zeros(0)
-    if method == "closed form":
-        rates = np.zeros(len(F))
-    poles = rates / pair.unit
-    decays = bool((rates.real < -_DECAY).all())
-    if lin.dt:
-        poles = 1.0 + lin.dt * poles
-        decays = bool((np.abs(poles) < 1.0 - _DECAY).all())
+    basis, _ = echelon(part.motions, size)
+    scaled_basis = np.linalg.qr(basis * size[:, None], mode="complete")[0]
     return Observability(
-        dimension=reached.shape[1],
+        dimension=len(basis) - basis.shape[1],
         unobservable=tuple(combination(column, lin.state_names, size) for column in basis.T),
         basis=basis,
-        rows=reached.T @ pair.from_x,
-        fixed_poles=poles,
-        detectable=decays,
-        method=method,
-        margin=margin,
+        rows=scaled_basis[:, basis.shape[1] :].T * size,
+        fixed_poles=part.poles,
+        detectable=part.decays,
+        method=part.method,
+        margin=part.margin,
+        notes=(
+            *undecided(lin, part.margin, "observable", len(basis) - basis.shape[1]),
+            *unsettled(lin, part.settling, "detectable"),
+        ),
         robot=lin.robot,
     )
 
 
-def _clean(columns: Array) -> Array:
-    """Put to zero the columns that are rounding of columns of unit length."""
-    sizes = np.linalg.norm(columns, axis=0)
-    return np.where(sizes > 1e2 * len(columns) * EPS, columns, 0.0)
+class _Part(NamedTuple):
+    """The motions (nx, k) that the outputs do not show."""
+
+    motions: Array
+    poles: Any
+    decays: bool
+    method: str
+    margin: Margin
+    settling: Margin
+
+
+def _by_second_order(lin: LinearModel) -> _Part | None:
+    source = at_rest(lin)
+    if source is None:
+        return None
+    system, nv = second_order(source), len(lin.M)
+    if not system.symmetric or (lin.dt and aliased(system.poles[0], lin.dt)):
+        return None
+    N = rates_of_positions(slopes(source))
+    C = np.hstack((lin.C[:, :nv] @ N, lin.C[:, nv:]))
+    size = np.tile(system.size, 2)
+    each = np.linalg.norm(C / size, axis=1)
+    noise = 4.0 * EPS * np.abs(C)
+    shown = without_rounding(Noisy(C, noise), np.where(each > 0.0, each, 1.0), size)
+    position, velocity = (
+        Noisy(shown.values[:, half], shown.noise[:, half])
+        for half in (slice(0, nv), slice(nv, None))
+    )
+    found = hidden(system, position, velocity)
+    if not found.simple:
+        return None
+    acting = system.K.values.any() or system.D.values.any()
+    motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
+    poles = np.exp(found.poles * lin.dt) if lin.dt else found.poles
+    method = "eigenvalues" if acting else "closed form"
+    return _Part(motions, poles, found.decays, method, found.margin, found.settling)
+
+
+def _by_eigenvalues(lin: LinearModel) -> _Part:
+    pair, nv = scaled(slopes(lin), lin.M, lin.dt), len(lin.M)
+    seen = unit_columns((lin.C @ pair.to_x).T)
+    _, rest, F, margin = reached_by(pair.A.T, seen, pair.tolerance)
+    poles, decays, lost, settling = fixed_poles(F, rest, pair, lin.dt)
+    margin = margin.halved().seen(pair.to_x[nv:, nv:]) & lost
+    return _Part(pair.to_x @ rest, poles, decays, "eigenvalues", margin, settling)

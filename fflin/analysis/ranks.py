@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,10 @@ _CLEAN = 1e-10
 # An eigenvector that inputs of unit length see by less than this, or that has a neighbour this
 # near, is decided by singular values; the others are seen without doubt.
 _SUSPICIOUS = 1e-3
+
+# A tolerance is this many times the rounding, and singular values between these parts of it are
+# within doubt.
+SAFETY, CLEAR, LOST = 10.0, 30.0, 0.01
 
 # Eigenvalues nearer than this are one: a defective one moves by the root of round-off. The
 # Rayleigh quotient of the singular vector converges quadratically to it.
@@ -31,14 +35,105 @@ class Margin(NamedTuple):
         The smallest singular value that counted; infinite where there was none to decide.
     dropped : float
         The largest that did not; zero where there was none.
+    kept_at, dropped_at : ndarray or None
+        The directions of these.
+    kept_count, dropped_count : int
+        How many states hang on each: two on a pair of poles, or a momentum and what it drives.
     """
 
     kept: float = np.inf
     dropped: float = 0.0
+    kept_at: Any = None
+    dropped_at: Any = None
+    kept_count: int = 1
+    dropped_count: int = 1
 
     def __and__(self, other: Margin) -> Margin:
         """Return the nearer to doubt of two."""
-        return Margin(min(self.kept, other.kept), max(self.dropped, other.dropped))
+        kept = self if self.kept <= other.kept else other
+        dropped = self if self.dropped >= other.dropped else other
+        return Margin(
+            *(kept.kept, dropped.dropped, kept.kept_at, dropped.dropped_at),
+            *(kept.kept_count, dropped.dropped_count),
+        )
+
+    def seen(self, change: Array, count: int | None = None) -> Margin:
+        """Return it with the directions in other coordinates, ``change * v`` or ``change @ v``."""
+        kept, dropped = (
+            v if v is None else change * v if change.ndim == 1 else change @ v
+            for v in (self.kept_at, self.dropped_at)
+        )
+        changed = self._replace(kept_at=kept, dropped_at=dropped)
+        return changed._replace(kept_count=count, dropped_count=count) if count else changed
+
+    def halved(self) -> Margin:
+        """Return it with the positions or the rates of the directions, whichever are larger."""
+        kept, dropped = (
+            v if v is None else max(np.split(v, 2), key=np.linalg.norm)
+            for v in (self.kept_at, self.dropped_at)
+        )
+        return self._replace(kept_at=kept, dropped_at=dropped)
+
+    @property
+    def doubts(self) -> tuple[tuple[float, Any, int], ...]:
+        """The decisions within rounding: their ratios, directions, and by how much they differ.
+
+        The last is negative where less would count.
+        """
+        kept = (self.kept, self.kept_at, -self.kept_count)
+        dropped = (self.dropped, self.dropped_at, self.dropped_count)
+        return (kept,) * int(self.kept < CLEAR) + (dropped,) * int(self.dropped > LOST)
+
+
+def decided(ratio: float, direction: Any, count: int = 1) -> Margin:
+    """Return the margin of one decision: of what counts where the ratio is above 1."""
+    if ratio > 1.0:
+        return Margin(kept=ratio, kept_at=direction, kept_count=count)
+    return Margin(dropped=ratio, dropped_at=direction, dropped_count=count)
+
+
+def even_rows(values: Any, noise: Array) -> tuple[Any, float]:
+    """Return rows of unit length, or shorter so that none has more rounding, and a tolerance.
+
+    None hides behind another, and none that is rounding itself hides the others.
+    """
+    least = values.shape[1] * EPS
+    sizes, spread = np.linalg.norm(values, axis=1), np.linalg.norm(noise, axis=1)
+    real = sizes > 0.0
+    sizes, spread = sizes[real], spread[real]
+    weights = 1.0 / np.maximum(sizes, spread / least)
+    tolerance = SAFETY * max(least, float(np.linalg.norm(spread * weights)))
+    return values[real] * weights[:, None], tolerance
+
+
+def right_vectors(values: Any, noise: Array, count: int = 1) -> tuple[Array, Any, int, Margin]:
+    """Return n singular values of `even_rows`, right vectors (n, n), the rank, and its margin."""
+    n = values.shape[1]
+    rows, tolerance = even_rows(values, noise)
+    if not n or not len(rows):
+        return np.zeros(n), np.eye(n), 0, Margin()
+    rows = rows if np.imag(rows).any() else np.real(rows)
+    _, singular, right = np.linalg.svd(rows, full_matrices=len(rows) < n)
+    singular = np.pad(singular, (0, n - len(singular)))
+    rank, vectors = int((singular > tolerance).sum()), right.conj().T
+    return singular, vectors, rank, judged(singular / tolerance, vectors, rank, count)
+
+
+def judged(ratios: Array, vectors: Any, rank: int, count: int = 1) -> Margin:
+    """Return the margin of a rank, of singular values as ratios to the tolerance."""
+    margin = Margin()
+    for index in range(max(rank - 1, 0), min(rank + 1, len(ratios))):
+        margin &= decided(float(ratios[index]), vectors[:, index], count)
+    return margin
+
+
+def null_space(matrix: tuple[Array, Array]) -> tuple[Array, Margin]:
+    """Return the null space (n, k) of a matrix, orthonormal, with bounds of its entries' rounding.
+
+    Rows are scaled by `even_rows`.
+    """
+    _, vectors, rank, margin = right_vectors(*matrix)
+    return vectors[:, rank:], margin
 
 
 def split(matrix: Array, tolerance: float) -> tuple[Array, Array, Margin]:
@@ -131,8 +226,8 @@ def reached_by(A: Array, B: Array, tolerance: float) -> tuple[Array, Array, Arra
     inside, margin = np.eye(len(A)), Margin()
     split_off: Array = np.zeros((len(A), 0))
     while inside.shape[1]:
-        lost, decided = _left_vectors(inside.T @ A @ inside, inside.T @ B, tolerance)
-        margin &= decided
+        lost, found = _left_vectors(inside.T @ A @ inside, inside.T @ B, tolerance)
+        margin &= found.seen(inside)
         if not lost.shape[1]:
             break
         split_off = np.hstack((split_off, inside @ lost))
@@ -147,15 +242,19 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
     poles, left = eig(A, left=True, right=False)
     unseen = np.linalg.norm(left.conj().T @ B, axis=1) < _SUSPICIOUS
     distances = np.abs(poles[:, None] - poles) + np.eye(len(A))
-    candidates = poles[(poles.imag >= 0.0) & (unseen | (distances.min(axis=1) < _SUSPICIOUS))]
+    near = unseen | (distances.min(axis=1) < _SUSPICIOUS)
+    # A defective zero splits into poles of the root of rounding: it is tested itself, and first.
+    candidates = [0j, *poles[(poles.imag >= 0.0) & near]]
     found: Array = np.zeros((len(A), 0))
-    margin, tested = Margin(), np.zeros(0, dtype=complex)
+    margin, known = Margin(), np.zeros(0, dtype=complex)
     for pole in candidates:
-        vectors, at, decided = _at_pole(A, B, complex(pole), tolerance)
-        if (np.abs(tested - at) < _SAME_POLE).any():
+        vectors, at, decision = _at_pole(A, B, complex(pole), tolerance)
+        if (np.abs(known - at) < _SAME_POLE).any():
             continue
-        margin &= decided
-        tested = np.append(tested, at)
+        margin &= decision
+        if not vectors.shape[1]:
+            continue
+        known = np.append(known, at)
         parts = np.hstack((vectors.real, vectors.imag)) if abs(at.imag) > _SAME_POLE else vectors
         parts = np.real(parts)
         # Of poles that were told apart only by rounding the vectors are the same.
@@ -172,10 +271,9 @@ def _at_pole(A: Array, B: Array, pole: complex, tolerance: float) -> tuple[Array
         U, values, _ = np.linalg.svd(np.hstack((A - shift * np.eye(size), B)))
         last = U[:, -1]
         refined = complex(last.conj() @ A @ last)
-        if abs(refined - pole) < EPS or values[-1] > _SUSPICIOUS:
+        if not pole or abs(refined - pole) < EPS or values[-1] > _SUSPICIOUS:
             break
         pole = refined
     rank = int((values > tolerance).sum())
-    kept = float(values[rank - 1]) if rank else np.inf
-    dropped = float(values[rank]) if rank < size else 0.0
-    return U[:, rank:], complex(shift), Margin(kept / tolerance, dropped / tolerance)
+    count = 2 if abs(shift.imag) > _SAME_POLE else 1
+    return U[:, rank:], complex(shift), judged(values / tolerance, U, rank, count)

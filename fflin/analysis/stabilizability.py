@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fflin.base.errors import DetectabilityError, InputError, StabilizabilityError, listed
+from fflin.analysis.ranks import Margin, decided
+from fflin.base.errors import (
+    DetectabilityError,
+    FflinWarning,
+    InputError,
+    StabilizabilityError,
+    listed,
+)
 from fflin.base.validation import Array
 
 if TYPE_CHECKING:
@@ -29,15 +37,23 @@ def require_stabilizable(lin: LinearModel) -> None:
         weights = conserved(lin).weights
         words = _forces_missing(lin, weights) if len(weights) else None
         words = words or f"{', '.join(grouped(found.uncontrollable))}; add inputs"
-        raise StabilizabilityError(f"the inputs cannot hold {words}")
+        error = StabilizabilityError(f"the inputs cannot hold {words}{_doubts(found.notes)}")
+        error.margin = found.margin
+        raise error
+    _warn_of_doubts(found.notes)
 
 
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
     """Raise `InputError` that names the modes on the boundary of stability that Q leaves out."""
-    hidden = hidden_modes(A.T, Q, bool(lin.dt))
+    hidden, margin = hidden_modes(A.T, Q, bool(lin.dt))
+    doubts = _boundary_doubts(lin, margin, "weighed by Q")
     if hidden:
         words = _dominant(np.vstack(hidden), lin.state_names)
-        raise InputError(f"Q does not weigh {words}, which do not settle by themselves; weigh them")
+        raise InputError(
+            f"Q does not weigh {words}, which do not settle by themselves; weigh them"
+            f"{_doubts(doubts)}"
+        )
+    _warn_of_doubts(doubts)
 
 
 def require_detectable(lin: LinearModel) -> None:
@@ -47,25 +63,51 @@ def require_detectable(lin: LinearModel) -> None:
 
     found = observability(lin)
     if not found.detectable:
-        raise DetectabilityError(
+        error = DetectabilityError(
             f"the outputs do not show {with_rates(found.unobservable)}, which do not settle by "
-            "themselves; add outputs"
+            f"themselves; add outputs{_doubts(found.notes)}"
         )
+        error.margin = found.margin
+        raise error
+    _warn_of_doubts(found.notes)
+
+
+def _doubts(notes: tuple[str, ...]) -> str:
+    return "".join(f"; {note}" for note in notes if note.startswith("undecided"))
+
+
+def _warn_of_doubts(notes: tuple[str, ...]) -> None:
+    for note in notes:
+        if note.startswith("undecided"):
+            warnings.warn(note, FflinWarning, stacklevel=4)
 
 
 def require_disturbed(lin: LinearModel, W: Array) -> None:
     """Raise `InputError` that names the modes on the boundary that no disturbance reaches."""
-    hidden = hidden_modes(lin.A, W, bool(lin.dt))
+    hidden, margin = hidden_modes(lin.A, W, bool(lin.dt))
+    doubts = _boundary_doubts(lin, margin, "disturbed by W")
     if hidden:
         words = _dominant(np.vstack(hidden), lin.state_names)
         raise InputError(
             f"W does not disturb {words}, which do not settle by themselves: a steady filter "
-            "would not correct them; give them an intensity"
+            f"would not correct them; give them an intensity{_doubts(doubts)}"
         )
+    _warn_of_doubts(doubts)
 
 
-def hidden_modes(A: Array, B: Array, discrete: bool) -> list[Array]:
+def _boundary_doubts(lin: LinearModel, margin: Margin, what: str) -> tuple[str, ...]:
+    return tuple(
+        f"undecided: {_dominant(at[None], lin.state_names)} "
+        f"{'counts' if change < 0 else 'does not count'} as {what}, by {ratio:.1g} times its "
+        "rounding; it may be the other way"
+        for ratio, at, change in margin.doubts
+    )
+
+
+def hidden_modes(A: Array, B: Array, discrete: bool) -> tuple[list[Array], Margin]:
     """Return left eigenvectors (k, nx) that B misses, of eigenvalues that neither decay nor grow.
+
+    Beside them the margin of these decisions.
 
     Parameters
     ----------
@@ -82,14 +124,16 @@ def hidden_modes(A: Array, B: Array, discrete: bool) -> list[Array]:
     for pole in poles[near & (poles.imag >= 0.0)]:
         if all(abs(pole - other) > 1e-3 * size for other in candidates):
             candidates.append(complex(pole))
-    found = []
+    found, margin = [], Margin()
     for pole in candidates:
         shifted = A - (pole if pole.imag else pole.real) * np.eye(len(A))
-        found.append(_left_null(np.column_stack((shifted, B))))
-    return [vectors for vectors in found if len(vectors)]
+        vectors, judged = _left_null(np.column_stack((shifted, B)))
+        found.append(vectors)
+        margin &= judged
+    return [vectors for vectors in found if len(vectors)], margin
 
 
-def _left_null(matrix: Array) -> Array:
+def _left_null(matrix: Array) -> tuple[Array, Margin]:
     """Return the left null space (k, rows) of a matrix, its rows and columns of unlike units."""
     rows, columns = np.ones(len(matrix)), np.ones(matrix.shape[1])
     scaled = matrix
@@ -100,8 +144,12 @@ def _left_null(matrix: Array) -> Array:
         columns /= np.where(sizes > 0.0, sizes, 1.0)
         scaled = rows[:, None] * matrix * columns
     left, values, _ = np.linalg.svd(scaled)
-    null: Array = left[:, values <= _RANK * values[0]].conj().T * rows
-    return null / np.linalg.norm(null, axis=1, keepdims=True)
+    vectors: Array = left.conj().T * rows
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    margin = Margin()
+    for value, vector in zip(values[-2:] / (_RANK * values[0]), vectors[-2:], strict=True):
+        margin &= decided(float(value), vector)
+    return vectors[values <= _RANK * values[0]], margin
 
 
 def _forces_missing(lin: LinearModel, weights: Array) -> str | None:

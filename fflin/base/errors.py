@@ -44,11 +44,27 @@ class EquilibriumError(FflinError, ValueError):
 
 
 class StabilizabilityError(FflinError, ValueError):
-    """The inputs cannot hold what does not settle by itself."""
+    """The inputs cannot hold what does not settle by itself.
+
+    Attributes
+    ----------
+    margin : Margin or None
+        Distance from doubt of the decisions behind it; None where they were not made.
+    """
+
+    margin: Any = None
 
 
 class DetectabilityError(FflinError, ValueError):
-    """The outputs do not show what does not settle by itself."""
+    """The outputs do not show what does not settle by itself.
+
+    Attributes
+    ----------
+    margin : Margin or None
+        Distance from doubt of the decisions behind it; None where they were not made.
+    """
+
+    margin: Any = None
 
 
 class MissingPackageError(FflinError, ImportError):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fflin.base.record import NOT_VERIFIED
 from fflin.base.tables import grid, matrix, width
 
 if TYPE_CHECKING:
@@ -31,7 +32,8 @@ def gain_report(gain: Gain) -> str:
         body = f"K ({nu} x {nx})\n\n{matrix(gain.K, gain.input_names, gain.state_names)}"
     else:
         body = f"K ({nu} x {nx}): norms of its blocks; a file holds all of it\n\n{_blocks(gain)}"
-    return "\n\n".join((head, body, _poles(gain), _figures(gain)))
+    parts = [head, body, _poles(gain), _figures(gain)]
+    return "\n\n".join(parts if gain.verified else [*parts, NOT_VERIFIED])
 
 
 def _blocks(gain: Gain) -> str:

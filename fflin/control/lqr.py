@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.base.design import Design
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
+from fflin.base.record import Design
 from fflin.base.validation import Array
 from fflin.control.weights import Weight, cross_weight, require_semidefinite, weight
 from fflin.linear.model import LinearModel

@@ -84,6 +84,8 @@ class LinearModel:
         "joint=value" [rad|m] of the joints that are welded in it.
     fflin_version, pinocchio_version : str
         What made the model.
+    verified : bool
+        Whether it is as it was made; False of a file that has no digest to tell damage by.
     """
 
     A: Array
@@ -115,6 +117,10 @@ class LinearModel:
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
     _drift: Array | None = None
+    # Of a sampled model: its own fingerprint and the continuous model that it was made of, whose
+    # structure no exponential has blurred.
+    _source: tuple[str, LinearModel] | None = None
+    verified: bool = True
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -152,12 +158,22 @@ class LinearModel:
         time = f"dt={self.dt:g} s" if self.dt else "continuous"
         return f"LinearModel('{self.robot}', nx={nx}, nu={nu}, frame='{self.frame}', {time})"
 
+    def __str__(self) -> str:
+        from fflin.base.record import NOT_VERIFIED
+
+        return repr(self) if self.verified else f"{self!r}\n{NOT_VERIFIED}"
+
     @property
     def reference(self) -> pin.SE3:
         """Placement oMref that attitude and position are relative to."""
         import pinocchio as pin
 
-        return pin.XYZQUATToSE3(self._reference)
+        return pin.XYZQUATToSE3(self.placement)
+
+    @property
+    def placement(self) -> Array:
+        """`reference` (7,) as its position [m] and quaternion x, y, z, w."""
+        return self._reference
 
     @property
     def drift(self) -> Array | None:
@@ -187,6 +203,17 @@ class LinearModel:
                 "A, B or f0 were changed after they were certified; hold them against the robot "
                 "with fflin.check"
             )
+
+    @property
+    def generator(self) -> LinearModel | None:
+        """The continuous model that this is sampled from, or itself.
+
+        None where that is not known: of a file, or of matrices that were changed.
+        """
+        if not self.dt:
+            return self
+        known = self._source is not None and self._source[0] == self.fingerprint
+        return self._source[1] if self._source and known else None
 
     @cached_property
     def certificate(self) -> Certificate:
@@ -268,7 +295,7 @@ class LinearModel:
             self, A=Ad, B=held[:, :nu], f0=held[:, nu], dt=dt, _inertia=partial(_same_M, self)
         )
         certify = partial(_same_certificate, self, sampled.fingerprint)
-        return replace(sampled, _certify=certify)
+        return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))
 
     def to_scipy(self) -> Any:
         """Return a `scipy.signal.StateSpace` of the deviations; names and f0 are lost."""
@@ -311,11 +338,13 @@ class LinearModel:
         ------
         FileError
             If the ending is another or the file cannot be written.
+        InputError
+            If a figure is not finite.
         """
         from fflin.base.writing import as_path
-        from fflin.linear.files import save_model
+        from fflin.linear.files import record_of, write_model
 
-        save_model(self, as_path(path))
+        write_model(as_path(path), record_of(self))
 
     @staticmethod
     def load(path: str | Path) -> LinearModel:
@@ -324,12 +353,19 @@ class LinearModel:
         Raises
         ------
         FileError
-            If the file cannot be read or is not such a model.
+            If the file cannot be read, is damaged or is not such a model.
         """
         from fflin.base.writing import as_path
-        from fflin.linear.files import load_model
+        from fflin.linear.files import read_model
 
-        return load_model(as_path(path))
+        values, certificate = read_model(as_path(path))
+        given: Any = partial(_given, Certificate(**certificate))
+        lin = LinearModel(**values, _certify=given)
+        return replace(lin, _certify=partial(_same_certificate, lin, lin.fingerprint))
+
+
+def _given(certificate: Certificate, _: LinearModel) -> Certificate:
+    return certificate
 
 
 def _same_M(continuous: LinearModel, _: LinearModel) -> Array:

@@ -122,7 +122,7 @@ def flow_error(robot: Robot, lin: LinearModel) -> float:
             x[6 + robot.n + unit] += 1.0
         q, v, a = model.acceleration(x, lin.u0)
         h = 1e-2 * state.chart(q).q0 / (1.0 + float(np.abs(v[3:]).max()))
-        rate = _derivative(partial(_moved, state, q, h * v, v, h * a)) / h
+        rate = _derivative(partial(_moved, state, x, q, h * v, v, h * a)) / h
         if lin.moving:
             q_star = lin.q.copy()
             q_star[:3] = 0.0
@@ -136,8 +136,10 @@ def flow_error(robot: Robot, lin: LinearModel) -> float:
     return worst
 
 
-def _moved(state: StateMap, q: Array, dq: Array, v: Array, dv: Array, t: float) -> Array:
-    return state.to_state(pin.integrate(state.robot.model, q, t * dq), v + t * dv)
+def _moved(
+    state: StateMap, near: Array, q: Array, dq: Array, v: Array, dv: Array, t: float
+) -> Array:
+    return state.to_state(pin.integrate(state.robot.model, q, t * dq), v + t * dv, near=near)
 
 
 def _moved_error(robot: Robot, q: Array, dq: Array, q1: Array, dq1: Array, t: float) -> Array:

@@ -1,4 +1,7 @@
-"""What a motion conserves: energy and momentum, and the velocity that keeps the latter."""
+"""What a motion conserves: energy, momentum and the line of the centre of mass, and how it is kept.
+
+Without force from outside, the momentum about a fixed point and r_c(t) = r_c(0) + p t / m stay.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from scipy.linalg.lapack import dposv
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.robot.robot import ROOT, Robot
+from fflin.simulation.integrators import Integrator
 
 _crba = pin.crba
 _placement = pin.XYZQUATToSE3
@@ -39,21 +43,22 @@ class Conserved:
     """
 
     def __init__(self, robot: Robot, start: Array) -> None:
-        self._robot = robot
+        self._robot, self.mass = robot, robot.mass
         self._model = robot.model
         self._data = data = robot.create_data()
         self._M = data.M[:6]  # CRBA writes into it
         self._M_bb = self._M[:, :6]
+        # M_bb has -m [c]x beside m 1: where m c stands in M, and what makes -c of it.
+        # An index into the memory costs a fifth of one by rows and columns.
+        self._M_flat = data.M.ravel(order="K")
+        self._lever = np.array(((1, 5), (2, 3), (0, 4))) @ data.M.strides // data.M.itemsize
+        self._per_mass = np.full(3, -1.0 / robot.mass)
         self._start = np.concatenate((start[:3], np.zeros(4)))
+        self._x, self._y, self._z = start[:3].tolist()  # sums of arrays take longer
         self._root = robot.model.jointPlacements[ROOT]
         self._weight = robot.mass * np.array(robot.gravity) if any(robot.gravity) else None
         self._free = self._root.isIdentity(0.0)
         self._stored = robot.stored_momentum
-
-    def momentum(self, q: Array, v: Array) -> Array:
-        """Return the momentum (6,) about the point."""
-        history = self.histories(q[None], v[None])
-        return self.about_point(history)[0]
 
     def about_point(self, history: Histories) -> Array:
         """Return the momentum (N, 6) about the point."""
@@ -76,22 +81,35 @@ class Conserved:
             total[3:] += skew(com).dot(self._weight)
         return total
 
-    def impose(self, q: Array, v: Array, momentum: Array) -> None:
-        r"""Give `v` the base velocity, in place, that makes the momentum (6,) the given one.
+    def impose(self, q: Array, v: Array, momentum: Array, center: Array) -> None:
+        r"""Shift the base of `q` and set its velocity in `v`, in place, so that both are kept.
 
-        .. math:: \nu_b = M_{bb}^{-1} (H_b - M_{bm} \dot q_m)
+        The centre of mass comes to `center` (3,), seen from the point, and the momentum (6,) is
+        the given one:
 
-        The present velocity is corrected by what it lacks, so that rounding is of the second
-        order.
+        .. math::
+
+            r_b = r_c - R\, c_b, \qquad \nu_b = M_{bb}^{-1} (H_b - M_{bm} \dot q_m)
+
+        The velocity is corrected by what the momentum lacks, so that rounding is of the second
+        order. M is in base axes, and a shift leaves it as it is.
         """
         _crba(self._model, self._data, q)
         if self._stored:
             pin.forwardKinematics(self._model, self._data, q)
             momentum = momentum.copy()
             momentum[3:] -= self._of_wheels()
-        lack: Array = self._base(q).toActionMatrix().T.dot(momentum)
-        lack -= self._M.dot(v)
-        v[:6] += dposv(self._M_bb, lack, 0, 0, 1)[1]
+        base = _placement(q[:7])
+        if not self._free:
+            base = self._root * base
+        base.translation = center
+        place = base.act(self._M_flat[self._lever] * self._per_mass)
+        base.translation = place
+        x, y, z = (place if self._free else self._root.actInv(place)).tolist()
+        q[0], q[1], q[2] = x + self._x, y + self._y, z + self._z
+        lack: Array = momentum.dot(base.toActionMatrix()) - self._M.dot(v)
+        v_b = v[:6]
+        v_b += dposv(self._M_bb, lack, 0, 0, 1)[1]
 
     def histories(self, q: Array, v: Array) -> Histories:
         """Return what is conserved at each row of q (N, nq) and v (N, nv)."""
@@ -149,3 +167,51 @@ class Conserved:
         """Return the placement of the base, seen from the point."""
         placement = _placement(q[:7] - self._start)
         return placement if self._free else self._root * placement
+
+
+class Course:
+    r"""Momentum and centre of mass as the impulse from outside takes them, step by step.
+
+    .. math:: H(t) = H(0) + \int w\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
+
+    where w is summed with the weights of the integrator's stages, and p with those of its
+    positions.
+
+    Attributes
+    ----------
+    momentum : ndarray (6,)
+        About the point.
+    wrenches : tuple of ndarray (6,)
+        Of the stages of a step, about the point, to be written.
+    """
+
+    def __init__(
+        self, conserved: Conserved, method: type[Integrator], h: float, q: Array, v: Array
+    ) -> None:
+        history = conserved.histories(q[None], v[None])
+        per_mass = 1.0 / conserved.mass
+        self.momentum: Array = conserved.about_point(history)[0]
+        self._momentum, self._start = self.momentum, history.center[0]
+        # The line that is followed while nothing pushes: place and velocity.
+        self._line = np.column_stack((self._start, self.momentum[:3] * per_mass))
+        self._time = np.ones(2)
+        # The impulse, and the way that it makes besides that of the initial velocity, above the
+        # wrenches of a step. Where nothing pushes they stay zero, so that no rounding adds up.
+        self._stack = np.zeros((2 + len(method.weights), 6))
+        self._sums, self.wrenches = self._stack[:2], tuple(self._stack[2:])
+        weights, moments = np.array(method.weights), np.array(method.moments)
+        self._after = np.array(
+            [[1.0, 0.0, *(h * weights)], [h * per_mass, 1.0, *(h * h * per_mass * moments)]]
+        )
+
+    def center(self, t: float) -> Array:
+        """Return where the centre of mass is (3,), seen from the point."""
+        self._time[1] = t
+        place: Array = self._line.dot(self._time)
+        return place
+
+    def advance(self) -> None:
+        """Go on by a step with the wrenches that have been written."""
+        self._sums[:] = impulse, way = self._after.dot(self._stack)
+        self.momentum = self._momentum + impulse
+        self._line[:, 0] = self._start + way[:3]

@@ -26,12 +26,15 @@ class Integrator:
     Attributes
     ----------
     weights : tuple of float
-        Of the stages.
+        Of the stages, in what is summed along: v of the end is v + h sum(weights a).
+    moments : tuple of float
+        Of the stages, in the sum of a sum: a free place of the end is r + h v + h^2 sum(moments a).
     reach : float
         Largest pole times step with which it is stable on the negative real axis.
     """
 
     weights: ClassVar[tuple[float, ...]]
+    moments: ClassVar[tuple[float, ...]]
     reach: ClassVar[float]
 
     def __init__(self, model: pin.Model, dt: float) -> None:
@@ -55,6 +58,7 @@ class CommutatorFree4(Integrator):
     """
 
     weights = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
+    moments = (1.0 / 6.0, 1.0 / 6.0, 1.0 / 6.0, 0.0)
     reach = 2.78
 
     def __init__(self, model: pin.Model, dt: float) -> None:
@@ -96,7 +100,7 @@ class CommutatorFree4(Integrator):
 class RungeKuttaMuntheKaas4(Integrator):
     """Order 4 in the tangent at q, with the inverse of dexp at each stage."""
 
-    weights = CommutatorFree4.weights
+    weights, moments = CommutatorFree4.weights, CommutatorFree4.moments
     reach = 2.78
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
@@ -125,7 +129,7 @@ class RungeKuttaMuntheKaas4(Integrator):
 class SemiImplicitEuler(Integrator):
     """Order 1: the new velocity moves the configuration."""
 
-    weights = (1.0,)
+    weights = moments = (1.0,)
     reach = 2.0
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import dataclass
+import textwrap
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.design import Design
-from fflin.base.errors import FileError, InputError
+from fflin.base import record
+from fflin.base.errors import InputError
+from fflin.base.record import Design
+from fflin.base.tables import grid, width
 from fflin.base.validation import Array
+from fflin.base.writing import as_path, check_ending, write_whole
+
+FORMATS = (*record.FORMATS, ".csv")
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,6 +51,9 @@ class Motion(Design):
     momentum_drift : ndarray (N,)
         How far the momentum is from its initial value and the impulse since, relative to the
         largest sum of the momenta of base and joints.
+    com_drift : ndarray (N,)
+        How far the centre of mass is from where its initial velocity and the impulse since take
+        it [m]; no rows where a file does not tell.
     state_names, input_names, state_units, input_units : tuple of str
     frame : {"hybrid", "local", "world"}
     robot, urdf_sha256 : str
@@ -49,7 +61,7 @@ class Motion(Design):
         Why it ended before its time; empty where it did not.
     """
 
-    VECTORS: ClassVar = ("t", "target", "energy", "momentum_drift", "placement")
+    VECTORS: ClassVar = ("t", "target", "energy", "momentum_drift", "com_drift", "placement")
 
     t: Array
     q: Array
@@ -70,21 +82,25 @@ class Motion(Design):
     robot: str
     urdf_sha256: str
     stopped: str
+    com_drift: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)
-        if {len(each) for each in rows} != {len(self.t)} or len(self.prediction) not in (
-            0,
-            len(self.t),
+        may_lack = (self.prediction, self.com_drift)
+        if {len(each) for each in rows} != {len(self.t)} or any(
+            len(each) not in (0, len(self.t)) for each in may_lack
         ):
             raise InputError("the rows of the motion are not as many as its times")
+        if not len(self.prediction):  # of json, which knows no empty matrices
+            object.__setattr__(self, "prediction", np.zeros((0, self.x.shape[1])))
         super().__post_init__()
 
     def __repr__(self) -> str:
         stopped = f", stopped: {self.stopped}" if self.stopped else ""
         return (
             f"Motion('{self.robot}', {len(self.t)} rows, {self.t[0]:g} to {self.t[-1]:g} s, "
-            f"momentum drift {self.momentum_drift.max():.1e}{stopped})"
+            f"momentum drift {self.momentum_drift.max():.1e}, "
+            f"com drift {self.com_drift.max(initial=0.0):.1e} m{stopped})"
         )
 
     @property
@@ -125,15 +141,12 @@ class Motion(Design):
         FileError
             If the ending is another or the file cannot be written.
         """
-        from fflin.base.writing import as_path, write_whole
-
         target = as_path(path)
-        check_motion_format(target)
+        check_ending(target, FORMATS)
         if target.suffix != ".csv":
             super().save(target)
             return
-        if not all(np.isfinite(each).all() for each in (self.t, self.x, self.u)):
-            raise InputError("the motion has entries that are not finite; it is not saved")
+        record.require_finite({"t": self.t, "x": self.x, "u": self.u})
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(["t", *self.state_names, *(f"u.{name}" for name in self.input_names)])
@@ -142,18 +155,7 @@ class Motion(Design):
 
     def plot(self, path: str | Path | None = None, **options: Any) -> Any:
         """Draw the motion, see `plot_motion`; into a file where a path is given."""
-        from fflin.simulation.plots import plot_motion
-
         return plot_motion(self, path, **options)
-
-
-def check_motion_format(path: Path) -> None:
-    """Raise `FileError` where a motion cannot be saved under that name."""
-    from fflin.base.design_files import FORMATS
-
-    if path.suffix not in (*FORMATS, ".csv"):
-        expected = ", ".join((*FORMATS, ".csv"))
-        raise FileError(f"'{path}' ends in '{path.suffix}', expected one of {expected}")
 
 
 def require_motion(motion: Any) -> Motion:
@@ -163,3 +165,110 @@ def require_motion(motion: Any) -> Motion:
             f"motion is a {type(motion).__name__}, expected a Motion, as fflin.simulate returns it"
         )
     return motion
+
+
+def plot_motion(motion: Motion, path: str | Path | None = None) -> Figure:
+    """Draw the errors, inputs and momentum drift of a motion, linear beside nonlinear.
+
+    Parameters
+    ----------
+    motion : Motion
+        With a prediction, each group of states shows the nonlinear robot in full lines and the
+        linear model dashed, and below it their difference.
+    path : str or Path, optional
+        .png, .pdf or .svg to save to.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    MissingPackageError
+        If matplotlib is not installed.
+    FileError
+        If the ending is another or the file cannot be written.
+    """
+    from fflin.simulation.plots import Signals, draw
+
+    motion = require_motion(motion)
+    title = f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"
+    if motion.linear is not None:
+        title += "; full: nonlinear, dashed: linear"
+    return draw(
+        motion.t,
+        Signals(motion.x, motion.state_names, motion.state_units),
+        Signals(motion.u, motion.input_names, motion.input_units),
+        motion.linear,
+        {"momentum": motion.momentum_drift, "centre of mass [m]": motion.com_drift},
+        title=f"{title}\n{motion.stopped}" if motion.stopped else title,
+        path=path,
+    )
+
+
+# Of an error relative to its largest, where a motion is taken to have settled.
+_SETTLED = 0.02
+
+# Below which an error is rounding, in SI units.
+_NOTHING = 1e-14
+
+
+def motion_report(motion: Motion, *, controlled: bool = True) -> str:
+    """Show where a motion began and ended, what it took, and the figures that prove it."""
+    end = motion.t[-1]
+    parts = [f"{motion.robot}: {end:g} s, {len(motion.t)} rows, frame {motion.frame}"]
+    if motion.stopped:
+        parts.append(textwrap.fill(f"stopped: {motion.stopped}", width(), subsequent_indent="  "))
+    error = np.abs(motion.error)
+    if controlled:
+        rows = [["error", "unit", "first", "largest", "last", "settled after [s]"]]
+        rows.append(["attitude", "deg", *_course(motion.attitude_error, motion.t)])
+        groups = {"r_b": "position", "q_m": "joints", "omega_b": "omega_b", "v_b": "v_b"}
+        groups["qdot_m"] = "joint rates"
+        for group, title in groups.items():
+            at = [i for i, n in enumerate(motion.state_names) if n.partition(".")[0] == group]
+            if at:
+                units = "|".join(dict.fromkeys(motion.state_units[i] for i in at))
+                rows.append([title, units, *_course(error[:, at].max(axis=1), motion.t)])
+        parts.append(f"\n{grid(rows, 'll')}\n")
+        largest = np.abs(motion.u).max(axis=0)
+        kinds: dict[tuple[str, str], float] = {}
+        for name, unit, value in zip(motion.input_names, motion.input_units, largest, strict=True):
+            if value < _NOTHING:
+                continue
+            key = (name.partition(".")[0], unit.replace(" ", "\u00a0"))
+            kinds[key] = max(kinds.get(key, 0.0), float(value))
+        shown = [f"{name}\u00a0{value:.4g}\u00a0{unit}" for (name, unit), value in kinds.items()]
+        line = f"largest inputs: {', '.join(shown) or 'none'}"
+        # Name, value and unit stay on one line.
+        line = textwrap.fill(line, width(), subsequent_indent="  ", break_on_hyphens=False)
+        parts.append(line.replace("\u00a0", " "))
+    energy = motion.energy
+    parts.append(
+        f"energy {energy[0]:.6g} J at first, {energy[-1]:.6g} J at last; "
+        f"momentum drift {motion.momentum_drift.max():.1e}"
+    )
+    if len(motion.com_drift):
+        largest = motion.com_drift.max()
+        parts.append(f"largest distance of the centre of mass from its line: {largest:.1e} m")
+    if motion.linear is not None:
+        apart = np.abs(motion.x - motion.linear).max(axis=0)
+        most = int(apart.argmax())
+        unit = motion.state_units[most].replace("1", "")
+        size = f"{apart[most]:.3g} {unit}".rstrip()
+        parts.append(
+            f"largest difference from the linear model: {size} in {motion.state_names[most]}"
+        )
+    return "\n".join(parts)
+
+
+def _course(error: Array, t: Array) -> list[str]:
+    largest = float(error.max())
+    outside = np.flatnonzero(error > _SETTLED * largest)
+    if largest < _NOTHING:
+        return [".", ".", ".", "."]
+    if len(outside) and outside[-1] == len(error) - 1:
+        settled = "not yet"
+    else:
+        settled = f"{t[outside[-1] + 1]:.3g}"
+    return [*(f"{value:.3g}" for value in (error[0], largest, error[-1])), settled]

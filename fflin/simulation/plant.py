@@ -23,7 +23,7 @@ _DIVERGED = 1e6
 _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
 
-class Dynamics:
+class Plant:
     """The nonlinear robot under inputs and a disturbance.
 
     Parameters
@@ -38,7 +38,7 @@ class Dynamics:
     def __init__(self, state: StateMap, disturbance: Disturbance | None = None) -> None:
         robot = state.robot
         require_inertia(robot)
-        self._state, self._robot = state, robot
+        self.state, self.robot = state, robot
         self._aba = Aba(state)
         self.actuation = self._aba.actuation
         if disturbance is not None and not callable(disturbance):
@@ -80,7 +80,7 @@ class Dynamics:
     def isolated(self, *, driven: bool) -> bool:
         """Whether nothing pushes from outside, whatever the inputs are or where none acts."""
         base = driven and (self._columns[:6].any() or self.actuation.carried)
-        return not (base or self._disturbance is not None or any(self._robot.gravity))
+        return not (base or self._disturbance is not None or any(self.robot.gravity))
 
     def held(self, u: Array) -> Callable[[float, Array, Array], Array]:
         """Return f(t, q, v) for inputs that stay, with nothing in between where it can be.
@@ -94,7 +94,7 @@ class Dynamics:
 
     def _in_base_axes(self, q: Array, u: Array) -> Array:
         """Return u (nu,) with what is held in reference axes in base axes, at any turn."""
-        R = self._state.rotation(q)
+        R = self.state.rotation(q)
         u = u.copy()
         for held in self.actuation.held:
             u[held.columns] = u[held.columns].dot(R)
@@ -105,9 +105,9 @@ class Dynamics:
         given = self._disturbance(t, q.copy(), v.copy())
         force = as_double(f"disturbance(t, q, v) at t = {t:g} s", given)
         finite = np.isfinite(force).all() or not np.abs(v).max() < _DIVERGED
-        if force.shape != (self._robot.nv,) or not finite:
+        if force.shape != (self.robot.nv,) or not finite:
             raise InputError(
                 f"disturbance(t, q, v) gave shape {force.shape} at t = {t:g} s, expected "
-                f"({self._robot.nv},) finite numbers: a generalised force in Pinocchio's order"
+                f"({self.robot.nv},) finite numbers: a generalised force in Pinocchio's order"
             )
         return force

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from fflin.base.figures import COLORS, cycle, saved, styled, target_of
 from fflin.base.validation import Array
-from fflin.simulation.motion import Motion, require_motion
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,99 +29,107 @@ _GROUPS = {
 }
 
 
-def plot_motion(motion: Motion, path: str | Path | None = None) -> Figure:
-    """Draw the errors, inputs and momentum drift of a motion, linear beside nonlinear.
+class Signals(NamedTuple):
+    """Histories (N, k), with names GROUP.NAME and units."""
 
-    Parameters
-    ----------
-    motion : Motion
-        With a prediction, each group of states shows the nonlinear robot in full lines and the
-        linear model dashed, and below it their difference.
-    path : str or Path, optional
-        .png, .pdf or .svg to save to.
+    values: Array
+    names: Sequence[str]
+    units: Sequence[str]
 
-    Returns
-    -------
-    matplotlib.figure.Figure
+    def groups(self) -> dict[str, list[int]]:
+        """Return the columns of each group."""
+        groups: dict[str, list[int]] = {}
+        for index, name in enumerate(self.names):
+            groups.setdefault(name.partition(".")[0] if "." in name else "", []).append(index)
+        return groups
 
-    Raises
-    ------
-    MissingPackageError
-        If matplotlib is not installed.
-    FileError
-        If the ending is another or the file cannot be written.
-    """
-    motion = require_motion(motion)
+    def unit(self, indices: Sequence[int]) -> str:
+        """Return the units of some columns in brackets."""
+        shown = sorted({self.units[i] for i in indices} - {"1"})
+        return f"[{', '.join(shown)}]" if shown else ""
+
+
+def draw(
+    t: Array,
+    states: Signals,
+    inputs: Signals,
+    linear: Array | None,
+    drifts: Mapping[str, Array],
+    *,
+    title: str,
+    path: str | Path | None = None,
+) -> Figure:
+    """Draw states, those of the linear model dashed, inputs and {label: drift} over time."""
     target = target_of(path)
     with styled() as figure_class:
-        both = motion.linear is not None
-        groups = _by_group(motion.state_names)
+        both = linear is not None
         figure = figure_class(figsize=(11.0, 10.5 if both else 8.5), layout="constrained")
         heights = [3.0, 1.2] * 2 if both else [3.0] * 2
         grid = figure.add_gridspec(
             len(heights) + 1, 3, height_ratios=[*heights, 3.0], hspace=0.06, wspace=0.06
         )
         lines: list[Line2D] = []
-        for place, (group, indices) in enumerate(groups.items()):
+        for place, (group, indices) in enumerate(states.groups().items()):
             row, column = divmod(place, 3)
             axes = figure.add_subplot(grid[row * (1 + both), column])
-            _histories(axes, motion, group, indices)
-            if both:
+            _histories(axes, t, states, linear, group, indices)
+            if linear is not None:
                 below = figure.add_subplot(grid[2 * row + 1, column], sharex=axes)
-                _difference(below, motion, indices)
+                _difference(below, t, states, linear, indices)
                 axes.tick_params(labelbottom=False)
             else:
                 axes.set_xlabel("t [s]")
             if group == "q_m":
                 lines = [line for line in axes.get_lines() if line.get_label()[0] != "_"]
         colors = {str(line.get_label()): str(line.get_color()) for line in lines}
-        _inputs(figure, grid, motion, len(heights), colors)
+        _inputs(figure, grid, t, inputs, len(heights), colors)
         if lines:
             # Joints are many, have long names, and are the same in three panels.
             side: _Place = "outside lower left" if figure.legends else "outside lower center"
             _below(figure, lines, "joints", side)
-        _momentum(figure.add_subplot(grid[len(heights), 2]), motion)
-        figure.suptitle(_title(motion, both), fontsize=11)
+        _drifts(figure.add_subplot(grid[len(heights), 2]), t, drifts)
+        figure.suptitle(title, fontsize=11)
         return saved(figure, target)
 
 
-def _histories(axes: Axes, motion: Motion, group: str, indices: list[int]) -> None:
-    t, shown = _broken(motion) if group == "q_b" else (motion.t, motion.x)
+def _histories(
+    axes: Axes, t: Array, states: Signals, linear: Array | None, group: str, indices: list[int]
+) -> None:
+    times, shown = _broken(t, states.values) if group == "q_b" else (t, states.values)
     for color, i in zip(cycle(len(indices)), indices, strict=True):
-        axes.plot(t, shown[:, i], color=color, label=_short(motion.state_names[i]))
-        if motion.linear is not None:
-            axes.plot(motion.t, motion.linear[:, i], "--", color=color, lw=1.0)
-    axes.set(title=_GROUPS[group], ylabel=_unit(motion.state_units, indices))
+        axes.plot(times, shown[:, i], color=color, label=_short(states.names[i]))
+        if linear is not None:
+            axes.plot(t, linear[:, i], "--", color=color, lw=1.0)
+    axes.set(title=_GROUPS[group], ylabel=states.unit(indices))
     if group not in _OF_JOINTS:
         axes.legend(handlelength=1.2)
     axes.margins(x=0.0)
 
 
-def _broken(motion: Motion) -> tuple[Array, Array]:
+def _broken(t: Array, x: Array) -> tuple[Array, Array]:
     """Return times and states with a gap where the attitude goes through a turn of 180 degrees."""
-    q_b = motion.x[:, :3]
+    q_b = x[:, :3]
     # The vector part of a unit quaternion whose sign has changed.
     jumps = 1 + np.flatnonzero((q_b[1:] * q_b[:-1]).sum(axis=1) < -0.5)
-    t = np.insert(motion.t, jumps, motion.t[jumps])
-    return t, np.insert(motion.x, jumps, np.nan, axis=0)
+    return np.insert(t, jumps, t[jumps]), np.insert(x, jumps, np.nan, axis=0)
 
 
-def _difference(axes: Axes, motion: Motion, indices: list[int]) -> None:
-    assert motion.linear is not None
+def _difference(axes: Axes, t: Array, states: Signals, linear: Array, indices: list[int]) -> None:
     for color, i in zip(cycle(len(indices)), indices, strict=True):
-        axes.plot(motion.t, motion.x[:, i] - motion.linear[:, i], color=color, lw=1.0)
-    unit = _unit(motion.state_units, indices)
-    axes.set(xlabel="t [s]", ylabel=f"difference\n{unit}".strip())
+        axes.plot(t, states.values[:, i] - linear[:, i], color=color, lw=1.0)
+    axes.set(xlabel="t [s]", ylabel=f"difference\n{states.unit(indices)}".strip())
     axes.margins(x=0.0)
     axes.ticklabel_format(axis="y", scilimits=(-2, 3))
 
 
-def _inputs(figure: Figure, grid: Any, motion: Motion, row: int, colors: dict[str, str]) -> None:
+def _inputs(
+    figure: Figure, grid: Any, t: Array, inputs: Signals, row: int, colors: dict[str, str]
+) -> None:
     """Draw what drives the joints beside what pushes the base, whose sizes differ widely.
 
     The joints have their colours; all other inputs are named in the panel or below the figure.
     """
-    groups = _by_group(motion.input_names)
+    groups = inputs.groups()
     joints = {"tau_m": groups.pop("tau_m")} if "tau_m" in groups else {}
     panels = [panel for panel in (groups, joints) if panel]
     places = (0, 1) if len(panels) == 2 else (slice(0, 2),)
@@ -131,15 +138,15 @@ def _inputs(figure: Figure, grid: Any, motion: Motion, row: int, colors: dict[st
         shown = [i for indices in panel.values() for i in indices]
         for style, indices in zip(_DASHES * len(panel), panel.values(), strict=False):
             for color, i in zip(cycle(len(indices)), indices, strict=True):
-                name = motion.input_names[i]
+                name = inputs.names[i]
                 axes.step(
-                    *(motion.t, motion.u[:, i], style),
+                    *(t, inputs.values[:, i], style),
                     color=colors[_short(name)] if panel is joints else color,
                     where="post",
                     label=name,
                 )
         title = "joint inputs tau_m" if panel is joints else "inputs"
-        axes.set(title=title, xlabel="t [s]", ylabel=_unit(motion.input_units, shown))
+        axes.set(title=title, xlabel="t [s]", ylabel=inputs.unit(shown))
         axes.margins(x=0.0)
         if panel is not joints and len(shown) <= _MOST_IN_A_PANEL:
             axes.legend(ncols=2 if len(shown) > 3 else 1, handlelength=1.6)
@@ -159,33 +166,16 @@ def _below(figure: Figure, lines: Sequence[Line2D], title: str, place: _Place) -
     figure.legend(handles=lines, loc=place, ncols=columns, handlelength=1.6, title=title)
 
 
-def _momentum(axes: Axes, motion: Motion) -> None:
+def _drifts(axes: Axes, t: Array, drifts: Mapping[str, Array]) -> None:
     # Zero has no place on a logarithmic axis: nothing is below the rounding of one.
-    drift = np.maximum(motion.momentum_drift, np.finfo(float).eps / 10.0)
-    axes.semilogy(motion.t, drift, color=COLORS[0])
+    shown = {k: np.maximum(v, np.finfo(float).eps / 10.0) for k, v in drifts.items() if len(v)}
+    for color, (label, drift) in zip(COLORS, shown.items(), strict=False):
+        axes.semilogy(t, drift, color=color, label=label)
     axes.set(title="momentum drift, relative", xlabel="t [s]")
-    axes.set_ylim(1e-17, max(1e-13, 10.0 * float(drift.max())))
+    axes.set_ylim(1e-17, max(1e-13, *(10.0 * float(drift.max()) for drift in shown.values())))
+    axes.legend(handlelength=1.2)
     axes.margins(x=0.0)
-
-
-def _title(motion: Motion, both: bool) -> str:
-    text = f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"
-    if both:
-        text += "; full: nonlinear, dashed: linear"
-    return f"{text}\n{motion.stopped}" if motion.stopped else text
-
-
-def _by_group(names: Sequence[str]) -> dict[str, list[int]]:
-    groups: dict[str, list[int]] = {}
-    for index, name in enumerate(names):
-        groups.setdefault(name.partition(".")[0] if "." in name else "", []).append(index)
-    return groups
 
 
 def _short(name: str) -> str:
     return name.partition(".")[2] or name
-
-
-def _unit(units: Sequence[str], indices: Sequence[int]) -> str:
-    shown = sorted({units[i] for i in indices} - {"1"})
-    return f"[{', '.join(shown)}]" if shown else ""

@@ -7,43 +7,39 @@ import numpy as np
 from fflin.base.validation import Array
 from fflin.control.channel import Channel
 from fflin.linear.model import LinearModel
+from fflin.simulation.plan import Plan
 
 
-def predict(
-    lin: LinearModel,
-    K: Array,
-    limits: tuple[Array, Array],
-    sample: int,
-    delay: int,
-    x: Array,
-    dt: float,
-    steps: int,
-    every: int,
-) -> Array:
-    """Return the states (rows, nx) of the linear model in closed loop.
+def predict(lin: LinearModel, K: Array, plan: Plan, x: Array, steps: int) -> Array:
+    """Return the states (N, nx) of the linear model in closed loop; no rows where it has none.
 
     Parameters
     ----------
     lin : LinearModel
         Continuous, or sampled with the time of the samples.
     K : ndarray (nu, nx)
-    limits : tuple of ndarray (nu,)
-    sample, delay : int
-        In steps, as `Channel` takes them.
-    x : ndarray (nx,)
-        Where it begins.
-    dt : float
-        Step [s].
-    steps, every : int
-        Steps in all, and from one row to the next; the last step has a row in any case.
+    plan : Plan
+        Whose limits and times hold.
+    x : ndarray (N, nx)
+        The states of the nonlinear robot, where the first row begins.
+    steps : int
+        That are taken; the last one has a row in any case.
     """
+    # A prediction that overflows is none.
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = _states(lin, K, plan, x[0], steps)[: len(x)]
+    return found if len(found) == len(x) and np.isfinite(found).all() else x[:0]
+
+
+def _states(lin: LinearModel, K: Array, plan: Plan, x: Array, steps: int) -> Array:
+    dt, _, every, sample, delay, _ = plan.times
     x0, u0 = lin.x0, lin.u0
 
     def law(e: Array) -> Array:
         u: Array = u0 - K @ e
         return u
 
-    channel = Channel(law, u0, *limits, sample, delay)
+    channel = Channel(law, u0, *plan.limits, sample, delay)
     rows = []
     e = x - x0
     if lin.dt:

@@ -5,22 +5,38 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import pinocchio as pin
+
 from fflin.base.errors import InputError
-from fflin.simulation.recording import check_prediction, motion_of
-from fflin.simulation.run import Run
+from fflin.base.validation import Array, truth
+from fflin.control.channel import limits_of
+from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import states_of
+from fflin.linear.model import LinearModel
+from fflin.simulation.conservation import Conserved
+from fflin.simulation.motion import Motion
+from fflin.simulation.plan import (
+    Plan,
+    events_of,
+    law_of,
+    method_of,
+    start_of,
+    times_of,
+    turning,
+)
+from fflin.simulation.plant import Plant
+from fflin.simulation.prediction import predict
+from fflin.simulation.run import go
 
 if TYPE_CHECKING:
-    import pinocchio as pin
     from numpy.typing import ArrayLike
 
-    from fflin.base.validation import Array
     from fflin.control.policies import Policy, StateFeedback
     from fflin.dynamics.state import Frame
-    from fflin.linear.model import LinearModel
     from fflin.robot.robot import Robot
-    from fflin.simulation.motion import Motion
+    from fflin.simulation.plan import Event
     from fflin.simulation.plant import Disturbance
-    from fflin.simulation.run import Event
 
 
 def simulate(
@@ -49,9 +65,10 @@ def simulate(
     r"""Simulate a robot under a policy.
 
     Steps of fixed size on the manifold, by default of the commutator-free method CF4 of order 4.
-    After each step the velocity of the base is set so that the momentum is what the impulse from
-    outside makes it, :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`, where H is integrated with
-    the weights of the method. Thrusters never pull: a negative thrust is cut to zero.
+    After each step the base is shifted so that the centre of mass is where momentum and impulse
+    take it, and its velocity is set so that the momentum is what the impulse from outside makes
+    it, :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`, where H is integrated with the weights of
+    the method. Thrusters never pull: a negative thrust is cut to zero.
 
     Parameters
     ----------
@@ -72,7 +89,7 @@ def simulate(
         Where the input is neither sampled nor late, it is made to divide the duration.
     method : {"cf4", "rkmk4", "semi_implicit_euler"}
     project : bool
-        Whether the momentum is kept as above.
+        Whether momentum and centre of mass are kept as above.
     sample : float, optional
         Time [s] between the samples of the policy, a multiple of dt, between which u is held; by
         default that of the policy's model where it is sampled, else the policy is asked at every
@@ -117,17 +134,112 @@ def simulate(
     ----------
     E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
     """
-    run = Run(robot, policy, frame, reference, disturbance)
-    check_prediction(run, linear)
-    run.begin(x0, q0, v0)
-    run.clock(duration, dt, every, sample, delay)
-    run.actuate(limits)
-    run.choose(method, project)
-    run.guard(events, callback)
+    own: Any = getattr(policy, "lin", None)
+    K: Any = getattr(policy, "K", None)
+    lin = own if isinstance(own, LinearModel) else None
+    if lin is not None:
+        if frame is not None or reference is not None:
+            raise InputError("frame and reference are those of the policy's model; leave out")
+        frame, reference = lin.frame, lin.reference
+    state = StateMap(robot, reference=reference, frame="hybrid" if frame is None else frame)
+    plant = Plant(state, disturbance)
+    predictor = _predictor(plant, K, lin, linear)
+    q, v = start_of(state, x0, q0, v0)
+    width = robot.nq + robot.nv + 2 * state.nx
+    times = times_of(policy, duration, dt, every, sample, delay, width)
+    within = limits_of(plant.actuation, limits)
+    # The model's inputs are others where they are allocated to the robot's.
+    same = lin is not None and lin.input_names == plant.actuation.names
+    plan = Plan(
+        q=q,
+        v=v,
+        times=times,
+        law=law_of(policy, plant, within, times),
+        initial=lin.u0 if lin is not None and same else np.zeros(len(within[0])),
+        limits=within,
+        method=method_of(method, times),
+        project=truth("project", project),
+        turning=turning(robot),
+        chart=None if lin is None else state,
+        events=events_of(events, callback),
+        callback=callback,
+    )
+    target = None if lin is None else _target(state, lin)
+    near = target if x0 is None else np.asarray(x0, dtype=float)
     try:
-        return motion_of(run, run.go(progress), linear)
+        return _motion(plant, plan, progress, target, near, predictor, K)
     except MemoryError:
         raise InputError(
-            f"{run.steps // run.every} rows of '{run.robot.name}' do not fit into the memory; take "
+            f"{times.steps // times.every} rows of '{robot.name}' do not fit into the memory; take "
             "a larger dt or `every`"
         ) from None
+
+
+def _motion(
+    plant: Plant,
+    plan: Plan,
+    progress: bool | None,
+    target: Array | None,
+    near: Array | None,
+    predictor: LinearModel | None,
+    K: Any,
+) -> Motion:
+    """Return the motion that a plan leads to."""
+    state, robot = plant.state, plant.robot
+    conserved = Conserved(robot, plan.q)
+    record = go(plan, plant, conserved, progress)
+
+    x = states_of(state, record.q, record.v, near)
+    history = conserved.histories(record.q, record.v)
+    return Motion(
+        t=record.t,
+        q=record.q,
+        v=record.v,
+        x=x,
+        u=record.u,
+        target=x[0] if target is None else target,
+        prediction=x[:0] if predictor is None else predict(predictor, K, plan, x, record.steps),
+        energy=history.energy,
+        momentum=np.roll(history.momentum, 3, axis=1),
+        momentum_drift=conserved.drift(history, record.momentum),
+        com_drift=np.linalg.norm(history.center - record.center, axis=1),
+        placement=pin.SE3ToXYZQUAT(state.reference),
+        state_names=state.names,
+        input_names=plant.actuation.names,
+        state_units=state.units,
+        input_units=plant.actuation.units,
+        frame=state.frame,
+        robot=robot.name,
+        urdf_sha256=robot.urdf_sha256,
+        stopped=record.stopped,
+    )
+
+
+def _predictor(
+    plant: Plant, K: Array | None, own: LinearModel | None, linear: Any
+) -> LinearModel | None:
+    """Return the model that predicts the run: the policy's own one, or the one that is given."""
+    if linear is None or isinstance(linear, bool | np.bool_):
+        fits = own is not None and own.state_names == plant.state.names
+        wanted = linear is None or bool(linear)
+        return own if wanted and fits and K is not None else None
+    if not isinstance(linear, LinearModel):
+        raise InputError(
+            f"linear is a {type(linear).__name__}, expected a fflin.LinearModel, True or False"
+        )
+    names = (plant.state.names, plant.actuation.names, plant.state.frame)
+    if (linear.state_names, linear.input_names, linear.frame) != names or linear.moving:
+        raise InputError(
+            f"linear is a model of '{linear.robot}' that has not the states, inputs and frame of "
+            f"the run of '{plant.robot.name}'; linearise that robot in the policy's frame"
+        )
+    if K is None:
+        raise InputError("linear predicts under a StateFeedback alone; leave it out")
+    return linear
+
+
+def _target(state: StateMap, lin: LinearModel) -> Array:
+    """Return the state (nx,) that a feedback about a model's point steers to."""
+    target = state.read(lin.q, lin.v)
+    target[[state.names.index(name) for name in lin.state_names]] = lin.x0
+    return target

@@ -50,7 +50,13 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, Array]:
 
 
 def panel(
-    robot: Robot, state: StateMap, q: Array, u: Array, target: Array, drift: Array
+    robot: Robot,
+    state: StateMap,
+    q: Array,
+    u: Array,
+    target: Array,
+    drift: Array,
+    of_com: Array | None = None,
 ) -> dict[str, Any]:
     """Return the readouts and plots of a motion's page.
 
@@ -63,6 +69,8 @@ def panel(
     target : ndarray (nq,)
     drift : ndarray (N,)
         Of the momentum, relative.
+    of_com : ndarray (N,), optional
+        Distance of the centre of mass from its line [m].
     """
     found = errors(robot, q, target)
     slide = any(joint.prismatic for joint in robot.joints)
@@ -73,6 +81,7 @@ def panel(
         *([("largest joint error", "°", found["turns"])] if turn else []),
         *([("largest slide error", "m", found["slides"])] if slide else []),
         ("momentum drift", "", drift),
+        *([] if of_com is None else [("centre of mass drift", "m", of_com)]),
     ]
     plots: list[dict[str, Any]] = [
         _plot("attitude error", "°", [("", found["attitude"])]),

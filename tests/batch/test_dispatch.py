@@ -15,7 +15,9 @@ from fflin.batch import chunks as batch_chunks
 from fflin.batch import dispatch as dispatching
 from fflin.batch.workers import OwnWorkers, WorkerDied
 from fflin.kernel import compiled
-from tests.batch.test_sweep import assert_same, points, singular_at
+from tests.support.patience import PATIENCE
+from tests.support.robots import singular_at
+from tests.support.sweeps import assert_same, points
 
 
 @pytest.fixture(scope="module")
@@ -170,8 +172,8 @@ def test_a_worker_that_is_killed_in_the_middle_of_its_result_harms_no_other():
         lost = workers.submit(half_sent)
         kept = [workers.submit(pow, 2, each) for each in range(9)]
         with pytest.raises(WorkerDied):
-            lost.result(timeout=60)
-        assert [each.result(timeout=60) for each in kept] == [2**each for each in range(9)]
+            lost.result(timeout=PATIENCE)
+        assert [each.result(timeout=PATIENCE) for each in kept] == [2**each for each in range(9)]
     finally:
         workers.shutdown()
     with pytest.raises(RuntimeError):
@@ -300,7 +302,7 @@ def test_workers_that_cannot_start_are_one_line(tmp_path):
         "    raise SystemExit(3)\n"
     )
     command = [sys.executable, "-W", "ignore", script]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert done.returncode == 3
     assert 'call sweep under `if __name__ == "__main__":`' in done.stdout
 
@@ -357,12 +359,17 @@ def test_a_singular_configuration_is_named_by_processes_too(pool):
         fflin.sweep(robot, configurations, chunk=10, executor=pool)
 
 
-def test_dask(robot, monkeypatch):
+def test_dask(robot, tmp_path):
     """A local cluster of two processes, of which one is killed on the way."""
     distributed = pytest.importorskip("distributed")
+    import dask
+
+    waits = ("connect", "tcp")
     with (
+        dask.config.set({f"distributed.comm.timeouts.{each}": f"{PATIENCE} s" for each in waits}),
+        dask.config.set({"temporary-directory": str(tmp_path)}),
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
         ) as cluster,
         distributed.Client(cluster) as client,
     ):

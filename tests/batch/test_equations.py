@@ -8,8 +8,7 @@ import pytest
 
 import fflin
 from fflin.batch.equations import BatchEquations
-from tests.dynamics.test_inertia import LINKS, MIMIC
-from tests.support.robots import BUNDLED, random_tree
+from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
 
 pytest.importorskip("numba")
 

@@ -1,18 +1,16 @@
 """fflin sweep as a user runs it."""
 
-import os
 import re
-import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
 import fflin
-from tests.commands.test_cli import refused, run
+from tests.support.commands import refused, run
+from tests.support.patience import PATIENCE
 
 pytest.importorskip("h5py")
 
@@ -92,7 +90,7 @@ def test_what_is_missing_or_damaged_is_one_line(tmp_path, robots):
     q[4, 8] = 0.0
     np.savez(tmp_path / "q.npz", q=q)
     error = refused("sweep", "ets_vii", "--configurations", "q.npz", "-o", "q.npz", cwd=tmp_path)
-    assert "q.npz is what --configurations reads" in error
+    assert "q.npz is the input file" in error
     assert [entry.name for entry in tmp_path.iterdir()] == ["q.npz"]
     assert np.array_equal(np.load(tmp_path / "q.npz")["q"], q)
 
@@ -108,11 +106,22 @@ def test_the_reference_may_be_the_world(tmp_path, robots):
     assert batch[1].A == pytest.approx(lin.A, abs=1e-14)
 
 
+INTERRUPTED = """
+import os, signal, sys
+from fflin.base import progress
+from fflin.__main__ import main
+def update(bar, done, total):
+    os.killpg(0, signal.SIGINT)
+progress.Progress.update = update
+sys.exit(main())
+"""
+
+
 @pytest.mark.parametrize("workers", [(), ("--workers", "2")])
 def test_ctrl_c_leaves_what_is_finished_and_no_process(workers, tmp_path):
     """The whole group is interrupted, as a terminal does it."""
     pytest.importorskip("h5py")
-    command = [sys.executable, "-m", "fflin", "sweep", "ets_vii", "--random", "100000"]
+    command = [sys.executable, "-c", INTERRUPTED, "sweep", "ets_vii", "--random", "100000"]
     options = ["--velocity", "joint_1=0.3", "-o", "x.h5", *workers]
     with subprocess.Popen(
         [*command, *options],
@@ -122,12 +131,8 @@ def test_ctrl_c_leaves_what_is_finished_and_no_process(workers, tmp_path):
         text=True,
         start_new_session=True,
     ) as process:
-        part = tmp_path / "x.h5.part"
-        while not part.exists() and process.poll() is None:
-            time.sleep(0.01)
-        os.killpg(process.pid, signal.SIGINT)
         # These end with the last process that has them.
-        _, error = process.communicate(timeout=120)
+        _, error = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
     *_, last = error.splitlines()
     assert last == "fflin: stopped; the same command goes on from x.h5.part"

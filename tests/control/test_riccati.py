@@ -47,6 +47,23 @@ def general(A, B, Q, R, N=None, dt=0.0):
     return 0.5 * (P + P.T)
 
 
+def compare_with_the_general_solution(equation, found, P, label):
+    """Not behind it in the residual, and no further from it than it is from the solution."""
+    A, B, Q, R, dt = equation.A, equation.B, equation.Q, equation.R, float(equation.discrete)
+    trial = equation.trial(P)
+    assert found.residual <= trial.residual, label
+    # Written another way, it holds too but for the rounding of that, which is what is left of
+    # either where the inertia is ill-conditioned.
+    check = relative_residual(A, B, Q, R, found.P, None, dt)
+    assert check <= 2.0 * relative_residual(A, B, Q, R, P, None, dt) + 1e-14, label
+    # What the general solver is off by, to first order, is what the two differ by.
+    F = equation.closed_loop(P)
+    lyapunov = sl.solve_discrete_lyapunov if dt else sl.solve_continuous_lyapunov
+    error = lyapunov(F.T, trial.defect if dt else -trial.defect)
+    own = np.linalg.norm(error) / np.linalg.norm(P) + 1e-13
+    assert np.linalg.norm(found.P - P) <= 3.0 * own * np.linalg.norm(P), label
+
+
 @pytest.mark.parametrize("name", [*BUNDLED, "tree_7", "tree_32"])
 @pytest.mark.parametrize("dt", [0.0, 0.05])
 def test_residual_is_at_or_below_the_general_solvers_and_gains_agree(robots, name, dt):
@@ -57,21 +74,14 @@ def test_residual_is_at_or_below_the_general_solvers_and_gains_agree(robots, nam
     for label, (Q, R) in weightings(rest, rng).items():
         found = solve(lin.A, lin.B, Q, R, None, dt)
         equation = Riccati(lin.A, lin.B, Q, R, None, dt)
-        P = general(lin.A, lin.B, Q, R, None, dt)
         # Under a hold the bilinear map may cost an ill-conditioned inertia the fallback.
         assert found.method == "structured" or dt, label
-        assert found.residual <= equation.trial(P).residual, label
-        # Written another way, it holds too but for the rounding of that, which is what is left of
-        # either where the inertia is ill-conditioned.
-        check = relative_residual(lin.A, lin.B, Q, R, found.P, None, dt)
-        assert check <= 2.0 * relative_residual(lin.A, lin.B, Q, R, P, None, dt) + 1e-14, label
-        # What the general solver is off by, to first order, is what the two differ by.
-        F = lin.A - lin.B @ equation.gain(P)
-        lyapunov = sl.solve_discrete_lyapunov if dt else sl.solve_continuous_lyapunov
-        defect = equation.trial(P).defect
-        error = lyapunov(F.T, defect if dt else -defect)
-        own = np.linalg.norm(error) / np.linalg.norm(P) + 1e-13
-        assert np.linalg.norm(found.P - P) <= 3.0 * own * np.linalg.norm(P), label
+        try:
+            P = general(lin.A, lin.B, Q, R, None, dt)
+        except (ValueError, np.linalg.LinAlgError):  # which of the samples depends on the processor
+            assert dt and found.residual < 1e-12, label
+        else:
+            compare_with_the_general_solution(equation, found, P, label)
         poles = np.linalg.eigvals(lin.A - lin.B @ found.K)
         scale = np.abs(poles - bool(dt)) if dt else np.abs(poles)
         for pole in found.poles:

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from tests.support.robots import random_point
+from tests.support.robots import random_point, random_pose
 
 GROUPS = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
 INPUTS = {"tau_b": slice(0, 3), "F_b": slice(3, 6), "tau_m": slice(6, None)}
@@ -150,3 +150,22 @@ def test_rounding_of_a_large_acceleration_is_no_failure():
     v = fflin.velocity(robot, {"omega_b.x": 1.3, "omega_b.y": -0.7, "v_b.z": 0.4})
     for thrust in (1.0, 3.3, 7.1):
         assert fflin.check(robot, fflin.linearize(robot, v=v, u=[thrust], moving=True)).ok
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("turn", [np.pi, -np.pi])
+def test_a_continuous_joint_may_pass_half_a_turn(turn, moving):
+    """Differences reach over the seam of the angle, on the turn of the point."""
+    robot = fflin.load("ets_vii")
+    rng = np.random.default_rng(5)
+    groups = fflin.StateMap(robot).groups
+    for distance in (0.0, 1e-9, 1e-4, 1e-2):
+        joints = {joint: turn - np.sign(turn) * distance for joint in robot.joint_names}
+        q = fflin.configuration(robot, joints, random_pose(rng, 70.0))
+        v, u = rng.normal(size=robot.nv), rng.normal(size=robot.nv)
+        lin = fflin.linearize(robot, q, v, u, moving=moving)
+        assert fflin.check(robot, lin).ok
+        A = lin.A.copy()
+        A[groups.q_m, groups.qdot_m] *= -1.0
+        found = fflin.check(robot, replace(lin, A=A))
+        assert "A[q_m, qdot_m]" in {row.block for row in found.failures}

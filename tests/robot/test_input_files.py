@@ -207,7 +207,7 @@ def test_files_that_are_none(tmp_path, written):
 )
 def test_hostile_files_are_refused_in_time(written, content):
     path = written(content)
-    begin = time.perf_counter()
+    begin = time.process_time()
     with pytest.raises(fflin.FflinError):
         fflin.load_inputs(path)
-    assert time.perf_counter() - begin < 5.0
+    assert time.process_time() - begin < 5.0

@@ -61,8 +61,8 @@ def test_check_holds_with_every_output(name, link, frame, turned):
 
 @pytest.mark.parametrize("matrix", ["C", "D", "y0"])
 def test_planted_error_is_found_in_every_row(matrix):
-    bare = fflin.load("dual_arm")
-    robot = watched(bare, "tool_left")
+    bare = fflin.load("planar_detumble")
+    robot = watched(bare, "hand")
     q, v, _ = random_point(bare, np.random.default_rng(2))
     lin = fflin.linearize(robot, q, v, np.ones(7))
     rows = np.flatnonzero(np.abs(lin.D).max(axis=1)) if matrix == "D" else range(len(lin.y0))

@@ -6,6 +6,8 @@ import shutil
 
 import pytest
 
+from tests.support.patience import PATIENCE
+
 ARGUMENTS = (
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
     *("--disable-background-networking", "--disable-quic", "--no-first-run"),
@@ -22,7 +24,9 @@ def chromium():
         pytest.skip("no chromium; apt install chromium")
     arguments = [*ARGUMENTS, *(["--no-sandbox"] if os.geteuid() == 0 else [])]
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=program, args=arguments)
+        browser = driver.chromium.launch(
+            executable_path=program, args=arguments, timeout=1e3 * PATIENCE
+        )
         yield browser
         browser.close()
 
@@ -33,11 +37,12 @@ class Watched:
     def __init__(self, browser, url, size=(960, 600)):
         self.errors, self.requests = [], []
         self.page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        self.page.set_default_timeout(1e3 * PATIENCE)
         self.page.on("console", self._console)
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.goto(url)
-        self.page.wait_for_function("window.fflin && fflin.ready", timeout=60_000)
+        self.page.wait_for_function("window.fflin && fflin.ready")
 
     def _console(self, message):
         if message.type in ("error", "warning"):
@@ -46,6 +51,17 @@ class Watched:
     def do(self, expression):
         """Evaluate JavaScript."""
         return self.page.evaluate(expression)
+
+    def resize(self, width, height):
+        """Give the window another size, and wait until it has it."""
+        self.page.set_viewport_size({"width": width, "height": height})
+        self.page.wait_for_function(f"innerWidth === {width} && innerHeight === {height}")
+        self.drawn()
+
+    def drawn(self):
+        """Wait until all that was asked for before is on the screen."""
+        frame = "await new Promise(requestAnimationFrame);"
+        self.do(f"(async () => {{ {3 * frame} }})()")
 
     def pose(self, path):
         """Return position and quaternion of a node of meshcat's scene."""

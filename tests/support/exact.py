@@ -69,3 +69,18 @@ def dimension(M, K, D, S):
     A[size:] = forces[:, : 2 * size]
     B = np.vstack((np.zeros_like(S), forces[:, 2 * size :]))
     return krylov_dimension(A, B)
+
+
+def observable(M, K, D, C):
+    """Dimension of what C (ny, 2 nv) shows of M a + D v + K q = 0."""
+    size = len(M)
+    forces = solve(modular(M), np.hstack((-modular(K), -modular(D))))
+    A = np.zeros((2 * size, 2 * size), dtype=np.int64)
+    A[:size, size:] = np.eye(size, dtype=np.int64)
+    A[size:] = forces
+    return krylov_dimension(A.T.copy(), modular(C).T.copy())
+
+
+def rank(matrix):
+    """Rank modulo the prime."""
+    return krylov_dimension(np.zeros((len(matrix), len(matrix)), dtype=np.int64), modular(matrix))

@@ -1,4 +1,4 @@
-"""Feed the reader mutated bytes: ``python -m tests.support.fuzz_reader SECONDS SEED FOLDER``.
+"""Feed the reader mutated bytes: ``python -m tests.support.fuzz_reader COUNT SEED FOLDER``.
 
 Each document is written to FOLDER before it is read, so that the last one there is the one that
 a crash or a hang was on.
@@ -70,19 +70,18 @@ def mutate(document: bytes, other: bytes, rng: random.Random) -> bytes:
     return bytes(data)
 
 
-def main(seconds: float, seed: int, folder: Path) -> None:
+def main(count: int, seed: int, folder: Path) -> None:
     """Run and print how many documents were read and refused."""
     rng = random.Random(seed)
     path = folder / "last.urdf"
     documents = seeds()
     counts = {True: 0, False: 0}
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
+    while sum(counts.values()) < count:
         document = mutate(rng.choice(documents), rng.choice(documents), rng)
         if b"${" in document or b"$(" in document or b"<xacro:" in document:
             continue
         path.write_bytes(document)
-        begin = time.monotonic()
+        begin = time.process_time()
         try:
             accepted = isinstance(describe(document, path), Description)
         except FflinError as error:
@@ -90,11 +89,11 @@ def main(seconds: float, seed: int, folder: Path) -> None:
             if "\n" in text or not text.startswith(f"{path}:") or len(text) > 2_000:
                 raise AssertionError(f"not one line that names the file: {text!r}") from error
             accepted = False
-        if time.monotonic() - begin > 5.0:
-            raise AssertionError("it took more than 5 s")
+        if time.process_time() - begin > 5.0:
+            raise AssertionError("it took more than 5 s of the processor")
         counts[accepted] += 1
     print(f"accepted {counts[True]}, refused {counts[False]}")
 
 
 if __name__ == "__main__":
-    main(float(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]))
+    main(int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]))

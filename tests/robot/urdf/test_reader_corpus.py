@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import pytest
 
+from tests.support.patience import PATIENCE
 from tests.support.reader_corpus import ACCEPT, CASES, REFUSE, WARN
 
-TIME_LIMIT = 20  # [s]
+TIME_LIMIT = 20  # [s] of the processor
 MEMORY_LIMIT = 4 * 2**20  # [KiB]
 
 
@@ -37,11 +38,11 @@ def run(case, folder):
     else:
         command = ["check", str(path)]
     before = set(os.listdir(folder))
-    shell = ["sh", "-c", f'ulimit -v {MEMORY_LIMIT}; exec "$@"', "sh"]
+    shell = ["sh", "-c", f'ulimit -v {MEMORY_LIMIT}; ulimit -t {TIME_LIMIT}; exec "$@"', "sh"]
     result = subprocess.run(
         [*shell, sys.executable, "-m", "fflin", *command],
         capture_output=True,
-        timeout=TIME_LIMIT,
+        timeout=PATIENCE,
         check=False,
         env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONWARNINGS": "default"},
         cwd=folder,

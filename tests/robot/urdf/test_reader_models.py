@@ -14,6 +14,7 @@ from example_robot_data.robots_loader import getModelPath
 import fflin
 from fflin.base.errors import FflinError
 from fflin.robot.urdf.reader import read_urdf
+from tests.support.patience import PATIENCE
 
 BUNDLED = Path(__file__).parents[3] / "robots"
 EXAMPLES = Path(getModelPath("talos_data/robots/talos_reduced.urdf")).resolve()
@@ -119,7 +120,7 @@ thread.join()
 def test_deep_chain_in_a_thread_of_small_stack():
     # Pinocchio itself overruns such a stack between 200 and 400 links.
     result = subprocess.run(
-        [sys.executable, "-c", CHAIN], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", CHAIN], capture_output=True, text=True, timeout=PATIENCE, check=False
     )
     assert (result.stdout.strip(), result.stderr) == ("1000.0", "")
 

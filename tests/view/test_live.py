@@ -20,6 +20,7 @@ import pytest
 import fflin
 from fflin.robot.robot import ROOT
 from tests.support.browser import Watched, chromium
+from tests.support.patience import PATIENCE, wait_until
 
 
 @pytest.fixture
@@ -42,7 +43,7 @@ def websocket(live, origin=None, host=None):
 async def state(connection):
     """Return the next state, past the commands that build the scene."""
     while True:
-        message = await asyncio.wait_for(connection.read_message(), 60.0)
+        message = await asyncio.wait_for(connection.read_message(), PATIENCE)
         assert message is not None
         if isinstance(message, str):
             return json.loads(message)
@@ -94,10 +95,7 @@ def test_it_survives_a_thousand_reconnects(live):
 
     before = count()
     asyncio.run(reconnect())
-    deadline = time.monotonic() + 60.0
-    while live._server.clients and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert not live._server.clients
+    wait_until(lambda: not live._server.clients)
     assert count() <= before + 5
     assert urllib.request.urlopen(live.url).status == 200
 
@@ -182,20 +180,20 @@ def test_a_slow_browser_gets_the_newest_state_and_not_all(live, robots):
         lines += ["Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13"]
         lines += ["Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "", ""]
         slow.sendall("\r\n".join(lines).encode())
-        while not live._server.clients:
-            time.sleep(0.01)
+        wait_until(lambda: live._server.clients)
         last = 20_000
         for k in range(last + 1):
             live.show(q, k)
         total = last * len(live._server.state)
-        slow.settimeout(60.0)
+        slow.settimeout(PATIENCE)
+        final = live._server.state.encode()
+        assert json.loads(final)["time"] == last
         received, tail = 0, b""
-        while not tail.endswith(live._server.state.encode()):
+        while tail != final:
             chunk = slow.recv(2**20)
-            assert chunk
+            assert chunk, "it ended before the last state"
             received += len(chunk)
-            tail = (tail + chunk)[-len(live._server.state) :]
-    assert json.loads(tail)["time"] == last
+            tail = (tail + chunk)[-len(final) :]
     assert received < total / 2
 
 
@@ -221,15 +219,13 @@ def test_it_ends_with_close_and_leaves_no_thread(robots):
 PROGRAM = """
 import fflin
 live = fflin.visualize(fflin.load("cubesat"), open=False)
-thread = live._server._thread
-join = thread.join
-
-def joined(timeout):
-    thread.join = join
-    print(live.port, flush=True)  # it waits
-    join(timeout)
-
-thread.join = joined
+server = live._server._thread
+join = server.join
+def say_that_it_waits(*seconds):
+    server.join = join
+    print(live.port, flush=True)
+    join(*seconds)
+server.join = say_that_it_waits
 live.wait()
 """
 
@@ -246,7 +242,7 @@ def test_nothing_is_left_when_its_process_is_killed(ending):
     port = int(process.stdout.readline())
     assert urllib.request.urlopen(f"http://127.0.0.1:{port}/").status == 200
     process.send_signal(ending)
-    out, error = process.communicate(timeout=60)
+    out, error = process.communicate(timeout=PATIENCE)
     if ending == signal.SIGINT:  # Ctrl-C is the way to end it
         assert (process.returncode, out, error) == (0, "", "")
     with pytest.raises(OSError):
@@ -275,7 +271,7 @@ def test_the_page_follows_in_a_browser(live, robots):
         for name, placement in zip(list(robot.model.names)[ROOT:], data.oMi[ROOT:], strict=True):
             pose = watched.pose(["meshcat", "robot", name])
             assert pin.XYZQUATToSE3(np.array(pose)).isApprox(placement, 1e-6)
-        watched.page.wait_for_timeout(300)
+        watched.drawn()
         moved = watched.picture()
         assert (np.abs(moved - still).max(axis=2) > 30).mean() > 1e-3
         assert not watched.errors

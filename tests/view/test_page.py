@@ -110,16 +110,18 @@ def test_slider_play_speed_and_keys_work(settled, watched):
     assert page.locator("#bar output").text_content().startswith("7.50 /")
     before = watched.pose(["meshcat", "robot", "root_joint"])
     watched.do("fflin.seek(0)")
+    watched.do("window.clock = 0, performance.now = () => window.clock")
     page.locator("#bar select").select_option("5")
     page.locator("#bar button.play").click()
-    page.wait_for_timeout(600)
-    playing = watched.do("[fflin.state.time, fflin.state.playing]")
-    assert playing[1] and 1.0 < playing[0] < 10.0
+    watched.do("window.clock = 600")  # ms
+    page.wait_for_function("fflin.state.time > 0")
+    assert watched.do("[fflin.state.time, fflin.state.playing]") == [3.0, True]
     assert watched.pose(["meshcat", "robot", "root_joint"]) != before
     page.locator("#bar button.play").click()
-    at = watched.do("fflin.state.time")
-    page.wait_for_timeout(200)
-    assert watched.do("fflin.state.time") == at
+    watched.do("window.clock = 900")
+    watched.drawn()
+    assert watched.do("fflin.state.time") == 3.0
+    watched.do("delete performance.now")
     page.locator("h1").click(force=True)
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("End")
@@ -171,10 +173,10 @@ def test_the_panel_says_what_the_motion_says(settled, watched):
 
 def test_the_picture_is_not_blank_and_changes(settled, watched):
     watched.do("fflin.seek(0)")
-    watched.page.wait_for_timeout(200)
+    watched.drawn()
     first = watched.picture()
     watched.do("fflin.seek(6)")
-    watched.page.wait_for_timeout(200)
+    watched.drawn()
     second = watched.picture()
     assert (np.abs(first - second).max(axis=2) > 30).mean() > 0.01
     # The robot is in the middle, before a dark sky.
@@ -202,8 +204,7 @@ def on_screen(watched, points):
 def test_all_of_the_motion_is_within_the_view(settled, watched, width, height):
     """Robot, target and tips of forces lie in what the panels leave free, and fill it well."""
     _, motion, _ = settled
-    watched.page.set_viewport_size({"width": width, "height": height})
-    watched.page.wait_for_timeout(300)
+    watched.resize(width, height)
     points = watched.do("JSON.parse(document.getElementById('data').textContent).points")
     seen = on_screen(watched, points)
     panel, bar = (watched.page.locator(name).bounding_box() for name in ("#panel", "#bar"))
@@ -224,16 +225,14 @@ def test_a_camera_that_was_taken_stays_where_it_was_put(settled, browser):
     watched = Watched(browser, settled[2].as_uri() + "#pause", size=(960, 600))
     at = "viewer.camera.position.toArray()"
     framed = watched.do(at)
-    watched.page.set_viewport_size({"width": 500, "height": 600})
-    watched.page.wait_for_timeout(200)
+    watched.resize(500, 600)
     assert not np.allclose(watched.do(at), framed)
     watched.page.mouse.move(150, 300)
     watched.page.mouse.down()
     watched.page.mouse.move(220, 320, steps=3)
     watched.page.mouse.up()
     put = watched.do(at)
-    watched.page.set_viewport_size({"width": 960, "height": 600})
-    watched.page.wait_for_timeout(200)
+    watched.resize(960, 600)
     np.testing.assert_allclose(watched.do(at), put, atol=1e-6)
     watched.page.close()
 

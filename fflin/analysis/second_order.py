@@ -1,0 +1,293 @@
+"""M a + D v + K s = S u: a model at rest as matrices of forces, and what a reading misses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fflin.analysis.ranks import CLEAR, EPS, SAFETY, Margin, decided, null_space, right_vectors
+from fflin.base.validation import Array
+
+# A force this small beside the largest of its kind, per unit of energy, may be rounding; less
+# than this part of it is.
+_FLOOR, _ROUNDING = 1e3 * EPS, 0.3
+
+# Relative asymmetry of springs or dampers that is more than rounding.
+_SYMMETRIC = 1e-8
+
+# Poles whose distance is less than this part of them are judged as one; poles that move this
+# much faster than the matrices are defective, and no eigenvectors tell them apart.
+_SAME_POLE, _DEFECTIVE = 1e-9, 1e-5
+
+# Logarithms of sampled poles that are this near may hide what the continuous model shows.
+_ALIASED = 1e-6
+
+# Above it a singular value is no approximate zero; a shape moves a pole that it belongs to by
+# less than this part.
+_SUSPICIOUS, _NEAR, _REFINEMENTS = 1e-3, 0.1, 8
+
+
+class Noisy(NamedTuple):
+    """A matrix and what rounding may have done to each of its entries."""
+
+    values: Array
+    noise: Array
+
+    def __matmul__(self, right: Array) -> Noisy:
+        return Noisy(self.values @ right, self.noise @ np.abs(right))
+
+    def after(self, left: Array) -> Noisy:
+        """Return ``left @ self``."""
+        return Noisy(left @ self.values, np.abs(left) @ self.noise)
+
+    @property
+    def T(self) -> Noisy:
+        """The transpose."""
+        return Noisy(self.values.T, self.noise.T)
+
+
+def stacked(rows: list[list[Noisy]]) -> Noisy:
+    """Join matrices as `numpy.block` does."""
+    return Noisy(
+        np.block([[m.values for m in row] for row in rows]),
+        np.block([[m.noise for m in row] for row in rows]),
+    )
+
+
+def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
+    """Put to zero the entries that are rounding, also beside the largest, in units of energy.
+
+    What may be rounding and may be not stays, with that much of noise.
+    """
+    units = rows[:, None] * columns
+    size = np.abs(forces.values)
+    least = np.maximum(forces.noise, _FLOOR * (size / units).max(initial=0.0) * units)
+    real = size > _ROUNDING * least
+    noise = np.where(size < CLEAR * least, np.maximum(forces.noise, least / SAFETY), forces.noise)
+    return Noisy(np.where(real, forces.values, 0.0), np.where(real, noise, 0.0))
+
+
+@dataclass(frozen=True)
+class SecondOrder:
+    """The forces of a model, in coordinates s whose rates are the velocities.
+
+    Attributes
+    ----------
+    M : ndarray (nv, nv)
+    K, D : Noisy (nv, nv)
+    S : Noisy (nv, nu)
+    """
+
+    M: Array
+    K: Noisy
+    D: Noisy
+    S: Noisy
+
+    @cached_property
+    def size(self) -> Array:
+        """Roots of the diagonal of M (nv,), which make forces and speeds comparable."""
+        return np.sqrt(self.M.diagonal())
+
+    def restricted(self, R: Array) -> SecondOrder:
+        """Return the system of the motions R z; what holds them to it does no work."""
+        M = R.T @ self.M @ R
+        K, D = ((forces @ R).after(R.T) for forces in (self.K, self.D))
+        return SecondOrder(M, K, D, self.S.after(R.T))
+
+    @cached_property
+    def symmetric(self) -> bool:
+        """Whether springs are symmetric, and dampers are and all take energy, or all give it."""
+        units = np.outer(self.size, self.size)
+        for matrix in (self.K.values / units, self.D.values / units):
+            if np.abs(matrix - matrix.T).max(initial=0.0) > _SYMMETRIC * np.abs(matrix).max():
+                return False
+        drag = np.linalg.eigvalsh(self.D.values / units)
+        least: bool = min(-drag.min(), drag.max()) <= _SYMMETRIC * np.abs(drag).max()
+        return least
+
+    @cached_property
+    def poles(self) -> tuple[Any, Margin]:
+        """The poles that are not zero, one of each pair, as far as eigenvalues tell them."""
+        rigid, margin = self._null(self.K, self.D)
+        still, other = self._null(self.K)
+        R = null_space(Noisy(rigid.T @ self.M / self.size, np.zeros(rigid.T.shape)))[0]
+        part = self.restricted(R / self.size[:, None])
+        r = len(part.M)
+        if not r:
+            return np.zeros(0, dtype=complex), margin & other
+        L = np.linalg.inv(np.linalg.cholesky(part.M))
+        K, D = L @ part.K.values @ L.T, L @ part.D.values @ L.T
+        fastest = max(np.linalg.norm(K, 2) ** 0.5, np.linalg.norm(D, 2))
+        A = np.block([[np.zeros((r, r)), np.eye(r)], [-K / fastest**2, -D / fastest]])
+        if not D.any():
+            squares = np.linalg.eigvalsh((K + K.T) / 2.0).astype(complex)
+            found = np.concatenate((np.sqrt(-squares), -np.sqrt(-squares)))
+            zeros = 2 * (still.shape[1] - rigid.shape[1])
+        else:
+            found = np.linalg.eigvals(A) * fastest
+            zeros = still.shape[1] - rigid.shape[1]
+        found = found[np.argsort(np.abs(found))][zeros:]
+        return found[found.imag >= 0.0], margin & other
+
+    def _null(self, *matrices: Noisy) -> tuple[Array, Margin]:
+        stack = stacked([[matrix] for matrix in matrices]) @ np.diag(1.0 / self.size)
+        basis, margin = null_space(stack)
+        return basis / self.size[:, None], margin.seen(1.0 / self.size)
+
+
+class Hidden(NamedTuple):
+    """What a reading of positions and velocities misses of the free motion.
+
+    Attributes
+    ----------
+    motions : ndarray (2 nv, k)
+        Basis of the unobservable subspace, (s, ds/dt).
+    poles : ndarray (k,)
+    shapes : tuple of (complex, ndarray (nv, m))
+        Of the poles that are not zero, one of each pair.
+    decays : bool
+        Whether all of them do, beyond rounding.
+    margin, settling : Margin
+        Of what is missed, and of whether the slowest of it decays.
+    simple : bool
+        Whether the eigenvectors tell them apart; what is defective must be judged otherwise.
+    """
+
+    motions: Array
+    poles: Any
+    shapes: tuple[tuple[complex, Any], ...]
+    decays: bool
+    margin: Margin
+    settling: Margin
+    simple: bool
+
+
+def hidden(system: SecondOrder, position: Noisy, velocity: Noisy) -> Hidden:
+    r"""Find the motions that ``position @ s + velocity @ ds/dt`` does not show.
+
+    At a pole p they are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]`. Every row is
+    scaled by what stands in it, so that a slow mode beside a fast one keeps its figures. Where K
+    is symmetric and D symmetric and semidefinite, those of the pole zero come in chains of two
+    at the most, and are the :math:`(s, v)` with :math:`K s = K v = D v = C_s v = 0` and
+    :math:`C_s s + C_v v = 0`.
+
+    What hides from the inputs are the left vectors, which by symmetry are found with
+    :math:`C_s = S^T, C_v = 0`.
+    """
+    still, margin = _still(system, position, velocity)
+    vectors, poles = [still], [0j] * still.shape[1]
+    settling, simple = Margin(), True
+    starts, decided_zero = system.poles
+    margin &= decided_zero
+    missed: list[tuple[complex, Any]] = []
+    for start in starts:
+        shapes, pole, judged = _at_pole(system, position, velocity, complex(start))
+        if any(abs(pole - other) < _SAME_POLE * abs(pole) for other, _ in missed):
+            continue
+        margin &= judged
+        if not shapes.shape[1]:
+            continue
+        missed.append((pole, shapes))
+        simple = simple and _simple(system, shapes, pole)
+        motion = np.vstack((shapes, pole * shapes))
+        if pole.imag:
+            motion = np.hstack((motion.real, motion.imag))
+            poles += [pole] * shapes.shape[1] + [pole.conjugate()] * shapes.shape[1]
+        else:
+            poles += [pole] * shapes.shape[1]
+        vectors.append(np.real(motion))
+        slow = -pole.real / abs(pole) / (1e2 * EPS * len(system.M))
+        settling = min(settling, decided(max(slow, 0.0), shapes[:, 0]), key=_least)
+    known = [pole for pole, _ in missed]
+    near = [abs(a - b) < _DEFECTIVE * abs(a) for i, a in enumerate(known) for b in known[:i]]
+    near += [0.0 < pole.imag < _DEFECTIVE * abs(pole) for pole in known]
+    return Hidden(
+        motions=np.hstack(vectors),
+        poles=np.array(poles),
+        shapes=tuple(missed),
+        decays=not still.shape[1] and _least(settling) > 1.0,
+        margin=margin,
+        settling=Margin() if still.shape[1] else settling,
+        simple=simple and not any(near),
+    )
+
+
+def _least(margin: Margin) -> float:
+    return margin.dropped if margin.dropped_at is not None else margin.kept
+
+
+def _still(system: SecondOrder, position: Noisy, velocity: Noisy) -> tuple[Array, Margin]:
+    none = Noisy(np.zeros_like(system.M), np.zeros_like(system.M))
+    empty = Noisy(np.zeros_like(position.values), np.zeros_like(position.values))
+    rows = [[system.K, none], [none, system.K], [none, system.D], [empty, position]]
+    fast, slow = np.abs(velocity.values).max(initial=0.0), np.abs(position.values).max(initial=0.0)
+    unit = slow / fast if fast and slow else 1.0
+    scale = np.concatenate((1.0 / system.size, unit / system.size))
+    basis, margin = null_space(stacked([*rows, [position, velocity]]) @ np.diag(scale))
+    return basis * scale[:, None], margin.halved().seen(1.0 / system.size)
+
+
+def _at_pole(
+    system: SecondOrder, position: Noisy, velocity: Noisy, pole: complex
+) -> tuple[Any, complex, Margin]:
+    """Return the shapes (nv, k) that are missed at a pole, the pole refined, and the margin."""
+    M, K, D = system.M, system.K.values, system.D.values
+    for step in range(_REFINEMENTS):
+        s = pole if pole.imag else pole.real
+        size = abs(s)
+        weight = np.sqrt(
+            size**2 * M.diagonal() + size * np.abs(D.diagonal()) + np.abs(K.diagonal())
+        )
+        units = np.outer(weight, weight)
+        spread = 4.0 * EPS * size**2 * np.outer(system.size, system.size)
+        spread = (spread + size * system.D.noise + system.K.noise) / units
+        noise = (position.noise + size * velocity.noise) / weight
+        pencil = (s * s * M + s * D + K) / units
+        seen = (position.values + s * velocity.values) / weight
+        stack, noise = np.vstack((pencil, seen)), np.vstack((spread, noise))
+        values, vectors, rank, margin = right_vectors(stack, noise, 2 if pole.imag else 1)
+        shapes = vectors / weight[:, None]
+        refined = _root(system, shapes[:, -1], pole)
+        moved = abs(refined - pole) / size
+        if not 4.0 * EPS < moved < _NEAR or (step and values[-1] > _SUSPICIOUS):
+            break
+        pole = refined
+    return shapes[:, rank:], pole, margin.seen(1.0 / weight)
+
+
+def _root(system: SecondOrder, shape: Any, near: complex) -> complex:
+    """Return the root of the scalar equation of a shape that is nearest to a pole."""
+    left = shape
+    if abs(shape @ system.M @ shape) < 0.1 * abs(shape.conj() @ system.M @ shape):
+        left = shape.conj()  # of equal poles a shape may be orthogonal to itself
+    a, b, c = (left @ X @ shape for X in (system.M, system.D.values, system.K.values))
+    root = np.sqrt(complex(b * b - 4.0 * a * c))
+    q = -(b + (root if (np.conj(b) * root).real >= 0.0 else -root)) / 2.0
+    roots = [q / a, c / q] if q else [0j]
+    refined = complex(min(roots, key=lambda value: abs(value - near)))
+    if not near.imag:
+        return complex(refined.real)
+    if not system.D.values.any():
+        return complex(0.0, refined.imag)
+    return refined
+
+
+def _simple(system: SecondOrder, shapes: Any, pole: complex) -> bool:
+    """Whether as many eigenvectors belong to a pole as it has places, beyond rounding."""
+    change = shapes.T @ (2.0 * pole * system.M + system.D.values) @ shapes
+    size = np.abs(shapes).T @ (2.0 * abs(pole) * np.abs(system.M) + np.abs(system.D.values))
+    least = np.linalg.svd(change, compute_uv=False)[-1]
+    simple: bool = least > _DEFECTIVE * np.linalg.norm(size @ np.abs(shapes))
+    return simple
+
+
+def aliased(poles: Any, dt: float) -> bool:
+    """Whether sampling takes two poles for one, or a vibration for what stands."""
+    s = np.concatenate((poles, np.conj(poles), [0.0])) * dt
+    apart = s[:, None] - s
+    turns = np.round(apart.imag / (2.0 * np.pi))
+    same: bool = ((turns != 0.0) & (np.abs(apart - 2j * np.pi * turns) < _ALIASED)).any()
+    return same
