@@ -164,6 +164,11 @@ class LinearBatch:
         return self.x0 if self._y0 is None else self._y0
 
     @property
+    def columns(self) -> tuple[tuple[int, int], ...]:
+        """Where each joint stands in q: (index, -1), or those of (cos, sin)."""
+        return self._columns
+
+    @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the n independent joints in state order."""
         return tuple(

@@ -185,9 +185,9 @@ def test_gravity_lets_a_base_turn_about_the_vertical_only():
     tilted = fflin.configuration(robot, None, random_pose(np.random.default_rng(3), 40.0))
     free = fflin.linearize(robot, tilted, v, moving=True)
     # Whatever balances its velocities, gravity turns against it.
-    u = free.M @ -free._drift[6:]
+    u = free.M @ -free.drift[6:]
     held = fflin.linearize(robot, tilted, v, u, moving=True)
-    assert np.abs(held._drift[6:]).max() < 1e-12 and not held.is_equilibrium()
+    assert np.abs(held.drift[6:]).max() < 1e-12 and not held.is_equilibrium()
     later = pin.integrate(robot.model, tilted, v)
     assert differs(held, fflin.linearize(robot, later, v, u, moving=True)) > 1e-3
 
@@ -205,9 +205,9 @@ def test_files_keep_what_is_ignorable(ending, moving, tmp_path):
         assert loaded.ignorable == lin.ignorable
         assert loaded.is_equilibrium() == lin.is_equilibrium() == steady
         if moving:
-            assert (loaded._drift == lin._drift).all()
+            assert (loaded.drift == lin.drift).all()
         else:
-            assert loaded._drift is None
+            assert loaded.drift is None
 
 
 def test_files_from_before_are_read(tmp_path):
@@ -233,5 +233,5 @@ def test_files_from_before_are_read(tmp_path):
         path.write_text("".join(line for line in lines if not line.startswith(key)))
     for ending in (".json", ".npz", ".mat", ".csv"):
         loaded = fflin.LinearModel.load(tmp_path / f"m{ending}")
-        assert loaded.ignorable == () and loaded._drift is None
+        assert loaded.ignorable == () and loaded.drift is None
         assert not loaded.is_equilibrium() and (loaded.A == lin.A).all()
