@@ -39,7 +39,7 @@ def output_equations(
     g = state.groups
     by_q, by_nu = state.columns(sensed.by_q), state.columns(sensed.by_v)
     turn, by_q_m = by_q[:, ANGULAR].copy(), by_q[:, 6:]
-    D = np.zeros((len(by_q), len(u)))
+    D: Array = np.zeros((len(by_q), len(u)))
     if sensed.by_a is not None:
         by_rate = state.columns(sensed.by_a)
         rate_by_nu = rates.by_nu.copy()
