@@ -310,7 +310,7 @@ class LinearBatch:
             | names
             | {"B": B, "x0": x0, "y0": x0 if y0 is None else y0, "dt": 0.0}
             | {"_inertia": inertia, "_certify": certify, "_drift": rows.get("_drift")}
-            | {"_ignorable": ignorable}
+            | {"_ignorable": ignorable, "_source": None}
         )
 
     def _rest_states(self, rows: slice) -> Array:
