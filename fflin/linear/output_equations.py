@@ -51,7 +51,7 @@ def output_equations(
         by_u = by_rate.dot(rates.by_u)
         for columns, _ in actuation.held:
             turn += by_u[:, columns].dot(skew(u[columns]))
-        D = actuation.over_inputs(chart, by_u)  # (8.2)
+        D[:] = actuation.over_inputs(chart, by_u)  # (8.2)
     for turned, part in zip(state.axes, (ANGULAR, LINEAR), strict=True):
         if turned:
             turn += by_nu[:, part].dot(skew(nu[part]))
