@@ -149,9 +149,8 @@ class Robot:
         own = (robot._wheelless or robot).joint_names
         robot = replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
         for item in (*robot.inputs, *robot.outputs):
-            frame = getattr(item, "frame", None)
-            if frame is not None:
-                find_frame(robot.model, frame)
+            for name in item.frames:
+                find_frame(robot.model, name)
         return robot
 
     @cached_property
