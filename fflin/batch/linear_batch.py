@@ -164,6 +164,11 @@ class LinearBatch:
         return self.x0 if self._y0 is None else self._y0
 
     @property
+    def columns(self) -> tuple[tuple[int, int], ...]:
+        """Where each joint stands in q: (index, -1), or those of (cos, sin)."""
+        return self._columns
+
+    @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the n independent joints in state order."""
         return tuple(
@@ -285,12 +290,11 @@ class LinearBatch:
         certify: Any = partial(_no_robot, "certificate", self.robot)
         inertia: Any = partial(_no_robot, "inertia M", self.robot)
         ignorable: Any = partial(_given, self._ignorable)
-        limits: Any = None
+        limits: Any = dict
         if self._system is not None:
             from fflin.linear.certificate import certify as certified
             from fflin.linear.certificate import inertia_matrix
             from fflin.linear.ignorable import ignorable_states
-
             from fflin.robot.limits import joint_limits
 
             ignorable = partial(ignorable_states, self._system)
@@ -308,7 +312,7 @@ class LinearBatch:
             | names
             | {"B": B, "x0": x0, "y0": x0 if y0 is None else y0, "dt": 0.0}
             | {"_inertia": inertia, "_certify": certify, "_drift": rows.get("_drift")}
-            | {"_ignorable": ignorable, "_limits": limits}
+            | {"_ignorable": ignorable, "_limits": limits, "_source": None}
         )
 
     def _rest_states(self, rows: slice) -> Array:

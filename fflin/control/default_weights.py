@@ -19,9 +19,9 @@ from fflin.control.weights import reweighed
 if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
 
-# The bandwidth [rad/s] of a loop that no limit slows: it settles in about twenty seconds. Under a
+# The bandwidth [rad/s] of a loop that no limit slows: it settles in about thirty seconds. Under a
 # hold of h it is this much over h at the most.
-BANDWIDTH, _HELD = 0.3, 0.3
+BANDWIDTH, _HELD = 0.2, 0.3
 
 # The displacements that the limits must bear: a turn of the base [deg], a way of it in radii of
 # gyration, and a joint's [rad], [m], or this share of its travel.
@@ -99,8 +99,9 @@ def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:
     0.1 m, or a quarter of its travel where that is less. With the stiffness
     :math:`D_i = \sum_j |M_{ij}| \theta_j / \theta_i`, which no inertia exceeds, the cost is
 
-    .. math:: \delta x_1^T N^{-T} (\bar D \,\#\, M) N^{-1} \delta x_1 + \delta u^T R\,\delta u / w^4,
-              \qquad R = \operatorname{diag}(S^T D^{-1} S), \quad \bar D = S R^{-1} S^T,
+    .. math:: \delta x_1^T N^{-T} (\bar D \,\#\, M) N^{-1} \delta x_1
+              + \delta u^T R\,\delta u / w^4,\quad
+              R = \operatorname{diag}(S^T D^{-1} S),\ \bar D = S R^{-1} S^T,
 
     where # is the geometric mean. The coordinates in which :math:`\bar D` and M are diagonal, 1
     and :math:`\lambda_k`, then come back one by one, damped by 0.71, at
@@ -108,7 +109,7 @@ def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:
     the others do does not carry them away. R is diagonal: every input has the margins of an
     optimal loop whatever the others do, gains of 1/2 and more and 60 deg of phase.
 
-    The bandwidth w is 0.3 rad/s, or what the limits leave: from these displacements, all at once
+    The bandwidth w is 0.2 rad/s, or what the limits leave: from these displacements, all at once
     and in any direction, no input exceeds the effort and no joint the speed that the URDF allows.
     Where nothing limits them, the poles do not depend on the units of mass and length.
 

@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from fflin.base.record import NOT_VERIFIED
 from fflin.base.tables import grid, matrix, width
-
-if TYPE_CHECKING:
-    from typing import Any
-
-    from fflin.control.lqr import Gain
 
 # A disk margin [-] below which a loop is called fragile.
 _FRAGILE = 0.3
@@ -23,8 +18,8 @@ _FRAGILE = 0.3
 _LARGE = 9 * 18
 
 
-def gain_report(gain: Gain) -> str:
-    """Show a gain, its poles, and the figures that prove it."""
+def gain_report(gain: Any) -> str:
+    """Show a `Gain`, its poles, and the figures that prove it."""
     nu, nx = gain.K.shape
     time = f"sampled at {gain.dt:g} s" if gain.dt else "continuous"
     head = textwrap.fill(
@@ -43,7 +38,7 @@ def gain_report(gain: Gain) -> str:
     return "\n\n".join(parts if gain.verified else [*parts, NOT_VERIFIED])
 
 
-def fragility(gain: Gain) -> str:
+def fragility(gain: Any) -> str:
     """Say what to do about a gain that bears little at its inputs; nothing where it bears enough.
 
     A continuous optimal loop with a diagonal R has a disk margin of 2/3 at least.
@@ -55,7 +50,7 @@ def fragility(gain: Gain) -> str:
     margins = gain.margins
     if margins.disk >= _FRAGILE:
         return ""
-    remedy = "shorten dt or weigh the inputs more" if gain.dt else "weigh each input alone"
+    remedy = "shorten dt, or slow the loop" if gain.dt else "weigh each input alone"
     return (
         f"the loop bears only {margins.phase:.2g} deg of phase at its inputs (disk margin "
         f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or error of the model makes it "
@@ -63,7 +58,7 @@ def fragility(gain: Gain) -> str:
     )
 
 
-def _blocks(gain: Gain) -> str:
+def _blocks(gain: Any) -> str:
     rows, columns = _groups(gain.input_names), _groups(gain.state_names)
     values = np.array(
         [[np.linalg.norm(gain.K[np.ix_(i, j)]) for j in columns.values()] for i in rows.values()]
@@ -78,7 +73,7 @@ def _groups(names: Sequence[str]) -> dict[str, list[int]]:
     return groups
 
 
-def _poles(gain: Gain) -> str:
+def _poles(gain: Any) -> str:
     poles: Any = gain.poles[gain.poles.imag >= 0.0]
     if gain.dt:
         order, heads = np.argsort(-np.abs(poles)), ["pole", "modulus", "frequency [rad/s]"]
@@ -101,7 +96,7 @@ def _pole(pole: complex) -> str:
     return f"{pole.real:.5g}" + (f" +- {pole.imag:.5g}i" if pole.imag else "")
 
 
-def _figures(gain: Gain) -> str:
+def _figures(gain: Any) -> str:
     margins = gain.margins
     slowest = "1 - largest modulus" if gain.dt else "slowest decay [1/s]"
     low, high = margins.gain

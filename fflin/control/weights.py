@@ -205,9 +205,7 @@ def named_weights(what: str, values: Mapping[str, float], names: Sequence[str]) 
     return found
 
 
-def reweighed(
-    what: str, matrix: Array, values: Mapping[str, float], names: Sequence[str]
-) -> Array:
+def reweighed(what: str, matrix: Array, values: Mapping[str, float], names: Sequence[str]) -> Array:
     """Return a weight (k, k) in which what is named has a weight of its own, coupled to nothing."""
     matrix = matrix.copy()
     for index, value in named_weights(what, values, names).items():

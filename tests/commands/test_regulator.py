@@ -33,7 +33,9 @@ def test_it_shows_and_saves_the_gain_that_the_library_gives(capsys, tmp_path):
     R[0], R[6:] = 0.01, 0.01
     expected = fflin.lqr(lin, Q, R)
     saved = fflin.Gain.load(path)
-    assert (saved.Q == Q).all() and (saved.R == np.diag(R)).all()
+    assert saved.Q == pytest.approx(Q, rel=1e-12) and saved.R == pytest.approx(
+        np.diag(R), rel=1e-12
+    )
     assert saved.weights.startswith("q_b, q_m.joint_1, tau_b.x, tau_m as given, the others from ")
     assert saved.K == pytest.approx(expected.K, rel=1e-9, abs=1e-9 * np.abs(expected.K).max())
     for words in ("norms of its blocks", "poles of A - B K", "disk margin", "weights: q_b, q_m"):

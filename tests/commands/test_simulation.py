@@ -24,7 +24,7 @@ def test_a_loop_settles_is_saved_and_drawn(tmp_path):
     motion = fflin.Motion.load(tmp_path / "loop.npz")
     assert motion.t[-1] == 60.0
     assert motion.attitude_error[0] == pytest.approx(30.0)
-    assert motion.attitude_error[-1] < 1e-4
+    assert motion.attitude_error[-1] < 0.01
     assert (tmp_path / "loop.png").stat().st_size > 50_000
     apart = np.abs(motion.x - motion.linear).max(axis=0)
     most = motion.state_names[apart.argmax()]
@@ -35,20 +35,20 @@ def test_a_loop_settles_is_saved_and_drawn(tmp_path):
 def test_target_sampling_limits_and_delay(tmp_path):
     code, _, err = run(
         *("simulate", "ets_vii", "--target-joint", "joint_1=0.5", "--dt", 0.1),
-        *("--limit", "tau_m=8", "--delay", 0.1, "--duration", 30, "--step", 0.02),
+        *("--limit", "tau_m=3", "--delay", 0.1, "--duration", 40, "--step", 0.02),
         *("-o", "m.json"),
         cwd=tmp_path,
     )
     assert (code, err) == (0, "")
     motion = fflin.Motion.load(tmp_path / "m.json")
     joints = [i for i, name in enumerate(motion.input_names) if name.startswith("tau_m")]
-    assert np.abs(motion.u[:, joints]).max() == 8.0
+    assert np.abs(motion.u[:, joints]).max() == 3.0
     assert not motion.u[:5].any()
     assert motion.x[-1, motion.state_names.index("q_m.joint_1")] == pytest.approx(0.5, abs=0.02)
 
 
 def test_thrusts_are_allocated_or_their_cut_is_told(tmp_path):
-    command = ("simulate", "cubesat", "--inputs", "cubesat", "--rpy", 20, 0, 0, "--duration", 20)
+    command = ("simulate", "cubesat", "--inputs", "cubesat", "--rpy", 20, 0, 0, "--duration", 80)
     command = [sys.executable, "-m", "fflin", *map(str, command), "--dt", "0.1"]
     settled = []
     for option in ((), ("--allocate",)):
@@ -170,7 +170,7 @@ def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
     assert "--reduce" in err
     code, out, _ = run(
         *("simulate", "ets_vii", "--inputs", "joints", "--reduce", "--joint", "joint_1=0.3"),
-        *("--duration", 20),
+        *("--duration", 50),
     )
     assert code == 0
     joints = next(line for line in out.splitlines() if line.startswith("joints"))

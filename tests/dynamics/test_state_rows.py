@@ -5,10 +5,10 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from tests.support.weights import unit_weights
 from fflin.dynamics.state_rows import readout, states_of
 from fflin.simulation.integrators import integrator
 from tests.support.robots import BUNDLED, FRAMES, random_pose
+from tests.support.weights import unit_weights
 
 
 def anywhere(robot, rng):

@@ -7,9 +7,9 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from tests.support.weights import unit_weights
 from tests.support.motions import displaced, regulated
 from tests.support.robots import BUNDLED, free_body
+from tests.support.weights import unit_weights
 
 
 def tumbling(robot, seed=0, size=0.4):

@@ -11,9 +11,9 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from tests.support.weights import unit_weights
 from tests.support.motions import displaced, regulated
 from tests.support.robots import free_body
+from tests.support.weights import unit_weights
 
 
 def finite(motion):

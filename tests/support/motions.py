@@ -8,11 +8,11 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 import fflin
-from tests.support.weights import unit_weights
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
 from fflin.simulation.motion import Motion
 from tests.support.robots import random_point
+from tests.support.weights import unit_weights
 
 HOME = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), np.array([0.2, 0.1, -0.3]))
 
