@@ -1,6 +1,9 @@
 """The weights that a regulator gets where none are given."""
 
 import re
+import subprocess
+import sys
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -10,7 +13,6 @@ import fflin
 from fflin.control.default_weights import BANDWIDTH
 from fflin.dynamics.state import StateMap
 from fflin.robot.catalog import find_robot
-from tests.support.commands import run
 
 BUNDLED = [n for n in fflin.list_robots() if find_robot(n).origin == "fflin"]
 # Arms, legs, hands, rotorcraft; limits that are zero, infinite, absurd or slow (pr2's torso).
@@ -249,8 +251,6 @@ def test_identity_and_given_weights_are_said(loops):
 
 def test_an_input_that_acts_on_nothing_is_named():
     lin = fflin.linearize(fflin.load("cubesat"))
-    from dataclasses import replace
-
     B = lin.B.copy()
     B[:, 4] = 0.0
     with pytest.raises(fflin.InputError, match=r"input F_b\.y acts on nothing"):
@@ -265,8 +265,9 @@ def test_a_gain_that_bears_little_is_warned_of_wherever_it_is_shown():
     assert "warning: the loop bears only" in shown and "weigh each input alone" in shown
     assert "warning" not in str(fflin.lqr(lin))
     options = ("--weights", "identity", "--r", "tau_b=1e-9", "--r", "F_b=1e-9", "--r", "tau_m=1e-9")
-    code, out, err = run("lqr", "cubesat", "--dt", "0.5", *options[:-2])
-    assert code == 0
+    command = [sys.executable, "-m", "fflin", "lqr", "ets_vii", "--dt", "0.5", *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    out, err = done.stdout, done.stderr
     told = [line for line in err.splitlines() if line.startswith("fflin: warning: the loop bears")]
     assert len(told) == 1 and "shorten dt" in told[0]
     assert "warning: the loop bears only" in out
