@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError, listed, unknown
 from fflin.base.validation import Array
 from fflin.control.riccati import half_size, solve
 from fflin.control.sampled_cost import sampled_cost
@@ -31,9 +30,6 @@ TURN, WAY, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 _TRIALS = 8
 
 
-_NO_NAMES: Mapping[str, float] = MappingProxyType({})
-
-
 class Weights(NamedTuple):
     """Weights of a continuous cost (nx, nx) and (nu, nu), and the rule that made them."""
 
@@ -52,8 +48,8 @@ class _Limit(NamedTuple):
 def rule_weights(
     lin: LinearModel,
     name: str | None,
-    q: Mapping[str, float] = _NO_NAMES,
-    r: Mapping[str, float] = _NO_NAMES,
+    q: Mapping[str, float] | None = None,
+    r: Mapping[str, float] | None = None,
 ) -> tuple[Array, Array, Array | None, str]:
     """Return Q, R and N of a model by a rule, and the rule in words.
 
@@ -81,6 +77,7 @@ def rule_weights(
         Q, R, rule = np.eye(nx), np.eye(nu), "identity: 1 on every state and every input"
     else:
         raise unknown("rule of weights", name, ("urdf", "identity"))
+    q, r = q or {}, r or {}
     if q or r:
         Q = reweighed("state", Q, q, lin.state_names)
         R = reweighed("input", R, r, lin.input_names)
@@ -174,7 +171,7 @@ def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:
     if hold or lin.dt:
         fastest = _HELD / ((hold or lin.dt) * rates[-1])
         limits.append(_Limit(float(fastest), "the time of the hold"))
-    limit = min(limits, key=_bandwidth)
+    limit = min(limits)
     if A[m:].any() or A[:m, :m].any():
         limit = _slowed(lin, Q, cost, size, limit)
     return Weights(h * Q, np.diag(h * cost / limit.bandwidth**4), _rule(lin, size, limit))
@@ -270,16 +267,12 @@ def _slowed(lin: LinearModel, Q: Array, cost: Array, size: Array, limit: _Limit)
         except np.linalg.LinAlgError:
             break  # which the regulator tells with the reason
         use = _largest(solution.K, size, lin.state_names)
-        least = min(_of_efforts(lin, use, limit.bandwidth), key=_bandwidth, default=limit)
+        least = min(_of_efforts(lin, use, limit.bandwidth), default=limit)
         if least.bandwidth >= (1.0 - 1e-6) * limit.bandwidth:
             return limit
         # What springs and gravity ask for stays however slow the loop.
         limit = least._replace(bandwidth=max(least.bandwidth, 0.3 * limit.bandwidth))
     return limit._replace(what=f"{limit.what}, which is not enough for all displacements")
-
-
-def _bandwidth(limit: _Limit) -> float:
-    return limit.bandwidth
 
 
 def _rule(lin: LinearModel, size: Array, limit: _Limit) -> str:
@@ -297,6 +290,13 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit) -> str:
         from_where.append(f"joints from {sizes}")
     source = "the limits of the URDF" if lin.limits else "mass and size, the URDF has no limits"
     slow = f", set by {limit.what}" if limit.what else ""
+    beyond = [
+        name
+        for name, at in zip(lin.input_names, lin.u0, strict=True)
+        if abs(at) >= lin.limits.get(name, math.inf)
+    ]
+    if beyond:
+        slow += f"; the point alone asks {listed(beyond)} for more than the URDF allows"
     return (
         f"from {source}: {', '.join(from_where)} come back at {limit.bandwidth:.3g} rad/s or "
         f"faster{slow}"

@@ -32,6 +32,22 @@ def test_a_loop_settles_is_saved_and_drawn(tmp_path):
     assert out.splitlines()[-2:] == ["wrote loop.npz", "wrote loop.png"]
 
 
+def test_an_arm_with_slow_joints_comes_back_within_its_limits(tmp_path):
+    code, out, _ = run(
+        *("simulate", "canadarm2", "--joint", "joint_2=0.5", "--duration", 40, "-o", "m.npz"),
+        cwd=tmp_path,
+    )
+    assert code == 0 and "stopped" not in out
+    motion = fflin.Motion.load(tmp_path / "m.npz")
+    limits = fflin.linearize(fflin.load("canadarm2")).limits
+    for names, rows in ((motion.input_names, motion.u), (motion.state_names, motion.x)):
+        for name, row in zip(names, rows.T, strict=True):
+            if not name.startswith("q_m."):
+                assert np.abs(row).max() <= limits.get(name, np.inf), name
+    joint = motion.x[:, motion.state_names.index("q_m.joint_2")]
+    assert joint[0] == 0.5 and abs(joint[-1]) < 0.4 * joint[0] and joint.max() == joint[0]
+
+
 def test_target_sampling_limits_and_delay(tmp_path):
     code, _, err = run(
         *("simulate", "ets_vii", "--target-joint", "joint_1=0.5", "--dt", 0.1),

@@ -205,6 +205,18 @@ def test_thrusters_springs_gravity_and_reduced_models_have_weights_too():
     assert gain.margins.disk > 0.6 and gain.margin > 0.0
 
 
+def test_a_point_that_asks_for_more_than_the_limits_is_told(loops):
+    model = loops("talos_arm")[0].model.copy()
+    model.effortLimit[6:] *= 1e-2
+    heavy = fflin.from_model(model, gravity=(0.0, 0.0, -3.0))
+    lin = fflin.linearize(heavy, u=fflin.equilibrium(heavy).u)
+    asked = dict(zip(lin.input_names, np.abs(lin.u0), strict=True))
+    beyond = [name for name in asked if asked[name] > lin.limits.get(name, np.inf)]
+    said = fflin.lqr(lin).weights
+    words = f"; the point alone asks {', '.join(beyond)} for more than the URDF allows"
+    assert beyond and said.endswith(words)
+
+
 def test_what_the_limits_leave_beside_gravity_is_what_the_loop_may_use(loops):
     robot, _, _ = loops("talos_arm")
     still = fflin.lqr(fflin.linearize(robot))
