@@ -12,7 +12,7 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from fflin.base.validation import Array
 from fflin.control.half_size import second_order_loop
-from fflin.control.lyapunov import Modes, eigenvalues
+from fflin.control.lyapunov import ModalMatrix
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 
@@ -215,16 +215,16 @@ def _bilinear(equation: Riccati) -> Riccati | None:
 
 
 def _finished(
-    equation: Riccati, trial: _Trial, modes: Modes | None, method: str
+    equation: Riccati, trial: _Trial, modes: ModalMatrix | None, method: str
 ) -> Solution | None:
     K = equation.gain(trial.P)
     F = equation.A - equation.B @ K
-    poles = modes.poles(F) if modes else eigenvalues(F)
+    poles = modes.poles(F) if modes else np.linalg.eigvals(F).astype(complex)
     stable = np.abs(poles).max() < 1.0 if equation.discrete else poles.real.max() < 0.0
     return Solution(trial.P, K, poles, trial.residual, method) if stable else None
 
 
-def _refined(equation: Riccati, P: Array, modes: Modes | None) -> tuple[_Trial, Modes | None]:
+def _refined(equation: Riccati, P: Array, modes: ModalMatrix | None) -> tuple[_Trial, ModalMatrix | None]:
     """Apply Newton steps; `modes` are those of a closed loop near that of P, where known."""
     enough = 0.5 * _EPS * len(P) ** 0.5
     trial = best = equation.trial(P)
@@ -233,7 +233,7 @@ def _refined(equation: Riccati, P: Array, modes: Modes | None) -> tuple[_Trial, 
         if best.residual <= enough:
             break
         if modes is None:
-            modes, fresh = Modes.of(equation.closed_loop(trial.P), equation.discrete), True
+            modes, fresh = ModalMatrix.of(equation.closed_loop(trial.P), equation.discrete), True
         better = equation.trial(trial.P + modes.lyapunov(trial.defect))
         gain = trial.residual / max(better.residual, _TINY)
         # From afar the first steps may raise the residual; what they do to P is for the better.
