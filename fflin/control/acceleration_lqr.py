@@ -10,7 +10,8 @@ import numpy as np
 from fflin.analysis.stabilizability import require_stabilizable
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.validation import Array, dimension
-from fflin.control.lqr import Gain, make_gain, require_fixed_point
+from fflin.control.gain import Gain, make_gain
+from fflin.control.lqr import require_fixed_point
 from fflin.control.riccati import Riccati, Solution
 from fflin.control.weights import Weight, weight
 from fflin.linear.model import LinearModel

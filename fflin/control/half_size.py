@@ -83,10 +83,13 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalL
     squares, W = one_of_each(*np.linalg.eig(C))
     if ((squares.imag == 0.0) & (squares.real <= 0.0)).any():
         return None
-    poles, alone = -np.sqrt(squares), np.count_nonzero(squares.imag == 0.0)
+    poles, alone = -np.sqrt(squares), (squares.imag == 0.0).sum()
     # The lower half of w is a = mu p.
     W = W[m:]
-    motion, a = real_columns(np.concatenate((W / squares, W / poles)), alone), real_columns(W, alone)
+    motion, a = (
+        real_columns(np.concatenate((W / squares, W / poles)), alone),
+        real_columns(W, alone),
+    )
     if not plain:
         a -= F @ motion[:m] + H @ motion[m:]
     cost = motion.T @ weight @ motion + a.T @ a

@@ -49,7 +49,7 @@ class ModalMatrix:
     """
 
     def __init__(self, poles: Any, V: Array, discrete: bool) -> None:
-        alone = np.count_nonzero(poles.imag == 0.0)
+        alone = (poles.imag == 0.0).sum()
         self.V, self.inverse = V, np.linalg.inv(V)
         self._pairs = slice(alone, len(poles)), slice(len(poles), None)
         left = self.values = np.concatenate((poles, poles[alone:].conj()))
@@ -59,7 +59,7 @@ class ModalMatrix:
     def of(cls, F: Array, discrete: bool) -> ModalMatrix:
         """Compute the modes of a matrix."""
         poles, modes = one_of_each(*np.linalg.eig(F))
-        return cls(poles, real_columns(modes, np.count_nonzero(poles.imag == 0.0)), discrete)
+        return cls(poles, real_columns(modes, (poles.imag == 0.0).sum()), discrete)
 
     def lyapunov(self, r: Array) -> Array:
         """Solve F' D + D F = -r, or where discrete F' D F - D = -r, for a symmetric r (n, n)."""

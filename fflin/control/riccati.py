@@ -35,6 +35,11 @@ class Solution(NamedTuple):
     residual: float
     method: str
 
+    def ordered(self, dt: float) -> tuple[Any, float]:
+        """Return the poles in order, and how far they are from the boundary of stability."""
+        poles = self.poles[np.lexsort((self.poles.imag, self.poles.real))]
+        return poles, float(1.0 - np.abs(poles).max() if dt else -poles.real.max())
+
 
 class _Trial(NamedTuple):
     P: Array
@@ -224,7 +229,9 @@ def _finished(
     return Solution(trial.P, K, poles, trial.residual, method) if stable else None
 
 
-def _refined(equation: Riccati, P: Array, modes: ModalMatrix | None) -> tuple[_Trial, ModalMatrix | None]:
+def _refined(
+    equation: Riccati, P: Array, modes: ModalMatrix | None
+) -> tuple[_Trial, ModalMatrix | None]:
     """Apply Newton steps; `modes` are those of a closed loop near that of P, where known."""
     enough = 0.5 * _EPS * len(P) ** 0.5
     trial = best = equation.trial(P)

@@ -11,17 +11,16 @@ import numpy as np
 from fflin.base.design import Design
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, number
+from fflin.control.differential_riccati import NODES, Coefficients, step_back
 from fflin.control.weights import Weight, weight
 
 if TYPE_CHECKING:
-    from fflin.control.differential_riccati import Coefficients
     from fflin.linear.trajectory import LinearTrajectory
 
 # Between two knots P is a cubic; knots are put in until it holds to this, relative to P.
 _ACCURACY = 1e-7
 _KNOTS_LIMIT = 100_000
 _TOO_FAST = "P changes too fast at {}; give smaller weights or a larger R"
-_NODES = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -153,7 +152,7 @@ def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSched
     Q, Qf = weight("Q", Q, names), weight("Qf", Qf, names)
     R = weight("R", R, traj.input_names, definite=True)
     try:
-        # What overflows is refused, and not warned of.
+        # A P that overflows is refused below, so that NumPy need not warn of it.
         with np.errstate(over="ignore", invalid="ignore"):
             t, P = _solve(traj, Q, R, Qf)
     except np.linalg.LinAlgError:
@@ -185,14 +184,12 @@ def cubic(
 
 
 def _solve(traj: LinearTrajectory, Q: Array, R: Array, Qf: Array) -> tuple[Array, Array]:
-    from fflin.control.differential_riccati import Coefficients, step_back
-
     def at(t: float) -> Coefficients:
         A, B = traj.matrices(t)
         return Coefficients(A, _spread(B, R), Q)
 
     def back(a: float, b: float, P: Array) -> Array:
-        nodes = np.array([_spread(traj.matrices(a + c * (b - a))[1], R) for c in _NODES])
+        nodes = np.array([_spread(traj.matrices(a + c * (b - a))[1], R) for c in NODES])
         return step_back(at(a), at(b), nodes, P, b - a)
 
     times, values = [float(traj.t[-1])], [Qf]
