@@ -103,8 +103,7 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
         )
     S = np.zeros((len(z), len(T)))
     S[np.arange(len(z)), z] = 1.0
-    rates = T[len(lin.M) :, len(held.kept) :]
-    M = rates.T @ lin.M @ rates
+    M = held.rates.T @ lin.M @ held.rates
     M.setflags(write=False)
     values = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
     values |= {

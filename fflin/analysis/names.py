@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fflin.analysis.mechanics import Conserved
+from fflin.analysis.mechanics import ConservedMomenta
 from fflin.analysis.ranks import Margin
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
@@ -13,7 +13,7 @@ _MOMENTUM = {"omega_b": "angular momentum {}", "v_b": "linear momentum {}"}
 _COORDINATE = {"omega_b": "base attitude {}", "v_b": "base position {}"}
 
 
-def momentum_names(lin: LinearModel, held: Conserved) -> tuple[str, ...]:
+def momentum_names(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
     """Name the conserved momenta, and then the coordinates that they drive."""
     nv = len(lin.M)
     size = 1.0 / np.sqrt(lin.M.diagonal())

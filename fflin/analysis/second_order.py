@@ -8,12 +8,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.analysis.ranks import CLEAR, EPS, SAFETY, Margin, decided, null_space, right_vectors
+from fflin.analysis.ranks import (
+    EPS,
+    Decision,
+    Margin,
+    Noisy,
+    decided,
+    null_space,
+    right_vectors,
+    stacked,
+)
 from fflin.base.validation import Array
-
-# A force this small beside the largest of its kind, per unit of energy, may be rounding; less
-# than this part of it is.
-_FLOOR, _ROUNDING = 1e3 * EPS, 0.3
 
 # Relative asymmetry of springs or dampers that is more than rounding.
 _SYMMETRIC = 1e-8
@@ -28,46 +33,6 @@ _ALIASED = 1e-6
 # Above it a singular value is no approximate zero; a shape moves a pole that it belongs to by
 # less than this part.
 _SUSPICIOUS, _NEAR, _REFINEMENTS = 1e-3, 0.1, 8
-
-
-class Noisy(NamedTuple):
-    """A matrix and what rounding may have done to each of its entries."""
-
-    values: Array
-    noise: Array
-
-    def __matmul__(self, right: Array) -> Noisy:
-        return Noisy(self.values @ right, self.noise @ np.abs(right))
-
-    def after(self, left: Array) -> Noisy:
-        """Return ``left @ self``."""
-        return Noisy(left @ self.values, np.abs(left) @ self.noise)
-
-    @property
-    def T(self) -> Noisy:
-        """The transpose."""
-        return Noisy(self.values.T, self.noise.T)
-
-
-def stacked(rows: list[list[Noisy]]) -> Noisy:
-    """Join matrices as `numpy.block` does."""
-    return Noisy(
-        np.block([[m.values for m in row] for row in rows]),
-        np.block([[m.noise for m in row] for row in rows]),
-    )
-
-
-def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
-    """Put to zero the entries that are rounding, also beside the largest, in units of energy.
-
-    What may be rounding and may be not stays, with that much of noise.
-    """
-    units = rows[:, None] * columns
-    size = np.abs(forces.values)
-    least = np.maximum(forces.noise, _FLOOR * (size / units).max(initial=0.0) * units)
-    real = size > _ROUNDING * least
-    noise = np.where(size < CLEAR * least, np.maximum(forces.noise, least / SAFETY), forces.noise)
-    return Noisy(np.where(real, forces.values, 0.0), np.where(real, noise, 0.0))
 
 
 @dataclass(frozen=True)
@@ -97,6 +62,11 @@ class SecondOrder:
         K, D = ((forces @ R).after(R.T) for forces in (self.K, self.D))
         return SecondOrder(M, K, D, self.S.after(R.T))
 
+    @property
+    def acting(self) -> bool:
+        """Whether there are springs or dampers."""
+        return bool(self.K.values.any() or self.D.values.any())
+
     @cached_property
     def symmetric(self) -> bool:
         """Whether springs are symmetric, and dampers are and all take energy, or all give it."""
@@ -113,7 +83,7 @@ class SecondOrder:
         """The poles that are not zero, one of each pair, as far as eigenvalues tell them."""
         rigid, margin = self._null(self.K, self.D)
         still, other = self._null(self.K)
-        R = null_space(Noisy(rigid.T @ self.M / self.size, np.zeros(rigid.T.shape)))[0]
+        R = null_space(Noisy.exact(rigid.T @ self.M / self.size))[0]
         part = self.restricted(R / self.size[:, None])
         r = len(part.M)
         if not r:
@@ -146,14 +116,13 @@ class Hidden(NamedTuple):
     motions : ndarray (2 nv, k)
         Basis of the unobservable subspace, (s, ds/dt).
     poles : ndarray (k,)
+        Of the sampled model where there is one.
     shapes : tuple of (complex, ndarray (nv, m))
-        Of the poles that are not zero, one of each pair.
+        Of the continuous poles that are not zero, one of each pair.
     decays : bool
         Whether all of them do, beyond rounding.
     margin, settling : Margin
         Of what is missed, and of whether the slowest of it decays.
-    simple : bool
-        Whether the eigenvectors tell them apart; what is defective must be judged otherwise.
     """
 
     motions: Array
@@ -162,10 +131,9 @@ class Hidden(NamedTuple):
     decays: bool
     margin: Margin
     settling: Margin
-    simple: bool
 
 
-def hidden(system: SecondOrder, position: Noisy, velocity: Noisy) -> Hidden:
+def hidden(system: SecondOrder, position: Noisy, velocity: Noisy, dt: float) -> Hidden | None:
     r"""Find the motions that ``position @ s + velocity @ ds/dt`` does not show.
 
     At a pole p they are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]`. Every row is
@@ -176,10 +144,18 @@ def hidden(system: SecondOrder, position: Noisy, velocity: Noisy) -> Hidden:
 
     What hides from the inputs are the left vectors, which by symmetry are found with
     :math:`C_s = S^T, C_v = 0`.
+
+    Returns
+    -------
+    Hidden or None
+        None where K or D are of another kind, where sampling every `dt` takes two poles for one,
+        and where a pole is defective, so that eigenvectors do not tell what belongs to it.
     """
+    if not system.symmetric or (dt and _aliased(system.poles[0], dt)):
+        return None
     still, margin = _still(system, position, velocity)
-    vectors, poles = [still], [0j] * still.shape[1]
-    settling, simple = Margin(), True
+    motions, poles = [still], [0j] * still.shape[1]
+    slowest = Decision(np.inf)
     starts, decided_zero = system.poles
     margin &= decided_zero
     missed: list[tuple[complex, Any]] = []
@@ -190,38 +166,32 @@ def hidden(system: SecondOrder, position: Noisy, velocity: Noisy) -> Hidden:
         margin &= judged
         if not shapes.shape[1]:
             continue
+        if not _simple(system, shapes, pole):
+            return None
         missed.append((pole, shapes))
-        simple = simple and _simple(system, shapes, pole)
         motion = np.vstack((shapes, pole * shapes))
-        if pole.imag:
-            motion = np.hstack((motion.real, motion.imag))
-            poles += [pole] * shapes.shape[1] + [pole.conjugate()] * shapes.shape[1]
-        else:
-            poles += [pole] * shapes.shape[1]
-        vectors.append(np.real(motion))
-        slow = -pole.real / abs(pole) / (1e2 * EPS * len(system.M))
-        settling = min(settling, decided(max(slow, 0.0), shapes[:, 0]), key=_least)
+        pair = [pole, pole.conjugate()] if pole.imag else [pole]
+        motions += [motion.real, motion.imag][: len(pair)]
+        poles += [each for each in pair for _ in shapes.T]
+        slow = max(-pole.real / abs(pole) / (1e2 * EPS * len(system.M)), 0.0)
+        slowest = min(slowest, Decision(slow, shapes[:, 0]), key=lambda decision: decision.ratio)
     known = [pole for pole, _ in missed]
     near = [abs(a - b) < _DEFECTIVE * abs(a) for i, a in enumerate(known) for b in known[:i]]
     near += [0.0 < pole.imag < _DEFECTIVE * abs(pole) for pole in known]
+    if any(near):
+        return None
     return Hidden(
-        motions=np.hstack(vectors),
-        poles=np.array(poles),
+        motions=np.hstack(motions),
+        poles=np.exp(np.array(poles) * dt) if dt else np.array(poles),
         shapes=tuple(missed),
-        decays=not still.shape[1] and _least(settling) > 1.0,
+        decays=not still.shape[1] and slowest.ratio > 1.0,
         margin=margin,
-        settling=Margin() if still.shape[1] else settling,
-        simple=simple and not any(near),
+        settling=Margin() if still.shape[1] else decided(slowest.ratio, slowest.at),
     )
 
 
-def _least(margin: Margin) -> float:
-    return margin.dropped if margin.dropped_at is not None else margin.kept
-
-
 def _still(system: SecondOrder, position: Noisy, velocity: Noisy) -> tuple[Array, Margin]:
-    none = Noisy(np.zeros_like(system.M), np.zeros_like(system.M))
-    empty = Noisy(np.zeros_like(position.values), np.zeros_like(position.values))
+    none, empty = (Noisy.exact(np.zeros_like(m)) for m in (system.M, position.values))
     rows = [[system.K, none], [none, system.K], [none, system.D], [empty, position]]
     fast, slow = np.abs(velocity.values).max(initial=0.0), np.abs(position.values).max(initial=0.0)
     unit = slow / fast if fast and slow else 1.0
@@ -247,8 +217,8 @@ def _at_pole(
         noise = (position.noise + size * velocity.noise) / weight
         pencil = (s * s * M + s * D + K) / units
         seen = (position.values + s * velocity.values) / weight
-        stack, noise = np.vstack((pencil, seen)), np.vstack((spread, noise))
-        values, vectors, rank, margin = right_vectors(stack, noise, 2 if pole.imag else 1)
+        stack = Noisy(np.vstack((pencil, seen)), np.vstack((spread, noise)))
+        values, vectors, rank, margin = right_vectors(stack, 2 if pole.imag else 1)
         shapes = vectors / weight[:, None]
         refined = _root(system, shapes[:, -1], pole)
         moved = abs(refined - pole) / size
@@ -284,7 +254,7 @@ def _simple(system: SecondOrder, shapes: Any, pole: complex) -> bool:
     return simple
 
 
-def aliased(poles: Any, dt: float) -> bool:
+def _aliased(poles: Any, dt: float) -> bool:
     """Whether sampling takes two poles for one, or a vibration for what stands."""
     s = np.concatenate((poles, np.conj(poles), [0.0])) * dt
     apart = s[:, None] - s

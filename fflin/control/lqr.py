@@ -135,7 +135,6 @@ def _still(poles: Any, dt: float) -> bool:
 
 
 def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
-    from fflin.analysis.stabilizability import require_stabilizable, require_weighed
     from fflin.control.riccati import half_size, solve
 
     arguments = (lin.A, lin.B, Q, R, N, lin.dt)
@@ -143,6 +142,8 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
     if structured is not None and not _still(structured.poles, lin.dt):
         return structured
     # Before a general solver fails without a word.
+    from fflin.analysis.stabilizability import require_stabilizable, require_weighed
+
     require_stabilizable(lin)
     free, A = Q, lin.A
     if N is not None:
