@@ -27,7 +27,7 @@ from fflin.analysis.names import (
     with_rates,
 )
 from fflin.analysis.pbh import split_by_poles
-from fflin.analysis.ranks import Margin, Noisy, echelon, image, null_space, unit_columns
+from fflin.analysis.ranks import FixedPoles, Margin, Noisy, echelon, image, null_space, unit_columns
 from fflin.analysis.second_order import Hidden, SecondOrder, hidden
 from fflin.base.tables import width
 from fflin.base.validation import Array
@@ -150,30 +150,29 @@ def controllability(lin: LinearModel) -> Controllability:
     lin = checked(lin)
     held = conserved(lin)
     part = _split_kept(lin, held)
+    fixed, size = part.fixed, state_sizes(lin)
     others: Array = np.zeros((len(part.rows), len(lin.A)))
     others[:, held.selected] = part.rows
-    rows = np.vstack((held.momenta, held.coordinates, others))
-    names = (*momentum_names(lin, held), *part.names)
-    size = state_sizes(lin)
-    spanned = held.T @ part.reached
-    basis, pivots = echelon(spanned, size, _driven_states(lin))
+    # Coordinates that an input pushes on directly are named first.
+    driven = second_order(lin.generator or lin).S.values.any(axis=1)
+    basis, pivots = echelon(held.T @ part.reached, size, np.tile(driven, 2))
     zero = np.full(2 * len(held.weights), 1.0 if lin.dt else 0.0)
-    margin = held.margin & part.margin
-    notes = (*_notes(lin, held), *undecided(lin, margin, "controllable", basis.shape[1]))
+    margin = held.margin & fixed.margin
+    doubts = undecided(lin, margin, "controllable", basis.shape[1])
     if not len(zero):
-        notes += unsettled(lin, part.settling, "stabilizable")
+        doubts += unsettled(lin, fixed.settling, "stabilizable")
     return Controllability(
         dimension=basis.shape[1],
         controllable=tuple(lin.state_names[i] for i in pivots),
-        uncontrollable=names,
-        rows=rows,
+        uncontrollable=(*momentum_names(lin, held), *part.names),
+        rows=np.vstack((held.momenta, held.coordinates, others)),
         basis=basis,
-        fixed_poles=np.concatenate((zero, part.poles)),
-        stabilizable=not len(zero) and part.decays,
+        fixed_poles=np.concatenate((zero, fixed.poles)),
+        stabilizable=not len(zero) and fixed.decays,
         reach=_reach(lin, basis * size[:, None]),
         method=part.method,
         margin=margin,
-        notes=notes,
+        notes=(*_notes(lin, held), *doubts),
         robot=lin.robot,
     )
 
@@ -185,10 +184,7 @@ class _Part(NamedTuple):
     rows: Array
     names: tuple[str, ...]
     method: str
-    margin: Margin
-    poles: Any = np.zeros(0)
-    decays: bool = True
-    settling: Margin = Margin()
+    fixed: FixedPoles
 
 
 def _split_kept(lin: LinearModel, held: ConservedMomenta) -> _Part:
@@ -198,10 +194,7 @@ def _split_kept(lin: LinearModel, held: ConservedMomenta) -> _Part:
     z, R = held.selected, held.rates
     found = split_by_poles(slopes(lin)[z] @ held.T, lin.B[z], R.T @ lin.M @ R, lin.dt)
     rows, names = _labels(lin, found.rows, held)
-    margin, settling = found.margin.seen(R), found.settling.seen(R)
-    return _Part(
-        found.reached, rows, names, "eigenvalues", margin, found.poles, found.decays, settling
-    )
+    return _Part(found.reached, rows, names, "eigenvalues", found.fixed.seen(R))
 
 
 def _by_second_order(lin: LinearModel, held: ConservedMomenta) -> _Part | None:
@@ -212,8 +205,8 @@ def _by_second_order(lin: LinearModel, held: ConservedMomenta) -> _Part | None:
     idle, margin = null_space(system.S.T @ np.diag(1.0 / system.size))
     if not system.acting or (not idle.shape[1] and not lin.dt):
         # What is not conserved is pushed.
-        everything, margin = np.eye(2 * r), margin.seen(R / system.size)
-        return _Part(everything, everything[:0], (), "closed form", margin)
+        everything, fixed = np.eye(2 * r), FixedPoles(margin=margin.seen(R / system.size))
+        return _Part(everything, everything[:0], (), "closed form", fixed)
     found = hidden(system, system.S.T, Noisy.exact(np.zeros_like(system.S.values.T)), lin.dt)
     if found is None:
         return None
@@ -230,8 +223,7 @@ def _by_second_order(lin: LinearModel, held: ConservedMomenta) -> _Part | None:
     else:
         rows, names = _vibration_rows(found, system, to_s, lin, held)
         method = "modes"
-    margin, settling = found.margin.seen(R), found.settling.seen(R)
-    return _Part(reached, rows, names, method, margin, found.poles, found.decays, settling)
+    return _Part(reached, rows, names, method, found.fixed.seen(R))
 
 
 def _across(rows: Array) -> Array:
@@ -249,21 +241,14 @@ def _labels(lin: LinearModel, rows: Array, held: ConservedMomenta) -> tuple[Arra
     return rows, tuple(combination(row, names, size) for row in rows)
 
 
-def _driven_states(lin: LinearModel) -> Array:
-    """Return the states of coordinates that an input pushes on directly."""
-    return np.tile(second_order(lin.generator or lin).S.values.any(axis=1), 2)
-
-
 def _reach(lin: LinearModel, weighted: Array) -> dict[str, int]:
-    nv = len(lin.M)
-    groups = [name.split(".", 1)[0] for name in lin.state_names[:nv]]
+    groups = [name.partition(".")[0] for name in lin.state_names[: len(lin.M)]]
     titles = {"q_b": "base attitude", "r_b": "base position", "q_m": "joints"}
-    reach = {}
-    for group, title in titles.items():
-        rows = [i for i, other in enumerate(groups) if other == group]
-        if rows:
-            reach[title] = image(unit_columns(weighted[rows]), 1e-8)[0].shape[1]
-    return reach
+    rows = {title: np.array(groups) == group for group, title in titles.items() if group in groups}
+    return {
+        title: image(unit_columns(weighted[: len(groups)][chosen]), 1e-8)[0].shape[1]
+        for title, chosen in rows.items()
+    }
 
 
 def _notes(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:

@@ -17,9 +17,9 @@ from fflin.analysis.mechanics import (
     state_sizes,
 )
 from fflin.analysis.names import combination, undecided, unsettled, with_rates
-from fflin.analysis.pbh import Split, split_by_poles
-from fflin.analysis.ranks import EPS, Margin, Noisy, echelon, without_rounding
-from fflin.analysis.second_order import Hidden, hidden
+from fflin.analysis.pbh import split_by_poles
+from fflin.analysis.ranks import EPS, FixedPoles, Margin, Noisy, echelon, without_rounding
+from fflin.analysis.second_order import hidden
 from fflin.base.tables import width
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
@@ -100,7 +100,7 @@ def observability(lin: LinearModel) -> Observability:
         If `lin` is no linear model of positions and their rates.
     """
     lin = checked(lin)
-    part, motions, method = _unobservable(lin)
+    motions, fixed, method = _unobservable(lin)
     size = state_sizes(lin)
     basis, _ = echelon(motions, size)
     scaled_basis = np.linalg.qr(basis * size[:, None], mode="complete")[0]
@@ -109,20 +109,20 @@ def observability(lin: LinearModel) -> Observability:
         unobservable=tuple(combination(column, lin.state_names, size) for column in basis.T),
         basis=basis,
         rows=scaled_basis[:, basis.shape[1] :].T * size,
-        fixed_poles=part.poles,
-        detectable=part.decays,
+        fixed_poles=fixed.poles,
+        detectable=fixed.decays,
         method=method,
-        margin=part.margin,
+        margin=fixed.margin,
         notes=(
-            *undecided(lin, part.margin, "observable", len(basis) - basis.shape[1]),
-            *unsettled(lin, part.settling, "detectable"),
+            *undecided(lin, fixed.margin, "observable", len(basis) - basis.shape[1]),
+            *unsettled(lin, fixed.settling, "detectable"),
         ),
         robot=lin.robot,
     )
 
 
-def _unobservable(lin: LinearModel) -> tuple[Hidden | Split, Array, str]:
-    """Return what the outputs miss, those motions (nx, k), and the method."""
+def _unobservable(lin: LinearModel) -> tuple[Array, FixedPoles, str]:
+    """Return the motions (nx, k) that the outputs miss, their poles, and the method."""
     source, nv = at_rest(lin), len(lin.M)
     if source is not None:
         system, N = second_order(source), rates_of_positions(slopes(source))
@@ -135,6 +135,7 @@ def _unobservable(lin: LinearModel) -> tuple[Hidden | Split, Array, str]:
         found = hidden(system, position, velocity, lin.dt)
         if found is not None:
             method = "eigenvalues" if system.acting else "closed form"
-            return found, np.vstack((N @ found.motions[:nv], found.motions[nv:])), method
+            motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
+            return motions, found.fixed, method
     part = split_by_poles(slopes(lin), lin.C.T, lin.M, lin.dt, dual=True)
-    return part, part.rest, "eigenvalues"
+    return part.rest, part.fixed, "eigenvalues"

@@ -1,13 +1,13 @@
-"""What inputs reach and outputs show, pole by pole (Popov, Belevitch, Hautus), in units of energy."""
+"""What inputs reach and outputs show, pole by pole, as Popov, Belevitch and Hautus test it."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from fflin.analysis.mechanics import rates_of_positions
-from fflin.analysis.ranks import EPS, Margin, decided, image, judged, unit_columns
+from fflin.analysis.ranks import EPS, FixedPoles, Margin, decided, image, judged, unit_columns
 from fflin.base.validation import Array
 
 # An eigenvector that inputs of unit length see by less than this, or that has a neighbour this
@@ -80,21 +80,14 @@ class Split(NamedTuple):
         Bases; of the dual pair the rest is what no output shows.
     rows : ndarray (nx - d, nx)
         ``rows @ x`` is what no input acts on.
-    poles : ndarray (nx - d,)
+    fixed : FixedPoles
         Of the rest.
-    decays : bool
-        Whether all of them do, beyond rounding.
-    margin, settling : Margin
-        Of the split, and of whether the slowest pole decays.
     """
 
     reached: Array
     rest: Array
     rows: Array
-    poles: Any
-    decays: bool
-    margin: Margin
-    settling: Margin
+    fixed: FixedPoles
 
 
 def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False) -> Split:
@@ -133,7 +126,7 @@ def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = 
     margin = margin.halved().seen(pair.to_x[nv:, nv:])
     parts = (pair.to_x @ inside, pair.to_x @ rest, rest.T @ pair.from_x)
     if not rest.shape[1]:
-        return Split(*parts, np.zeros(0), True, margin, Margin())
+        return Split(*parts, FixedPoles(margin=margin))
     rates, vectors = np.linalg.eig(rest.T @ A @ rest)
     shapes = pair.to_x @ rest @ vectors
     poles = 1.0 + dt * rates / pair.unit if dt else rates / pair.unit
@@ -143,7 +136,7 @@ def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = 
     if dt and abs(poles[most]) < _DEAD:
         # What has died out between samples cannot be told apart.
         margin &= decided(1.0, shapes[:, most]).halved()
-    return Split(*parts, poles, bool(decay[least] > _DECAY), margin, settling)
+    return Split(*parts, FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling))
 
 
 def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:

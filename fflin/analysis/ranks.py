@@ -102,6 +102,30 @@ def decided(ratio: float, direction: Any, states: int = 1) -> Margin:
     return Margin(counted=one) if ratio > 1.0 else Margin(left_out=one)
 
 
+class FixedPoles(NamedTuple):
+    """The poles of what inputs do not reach, or outputs do not show.
+
+    Attributes
+    ----------
+    poles : ndarray (k,)
+        [1/s], or of the sampled model.
+    decays : bool
+        Whether all of them do, beyond rounding.
+    margin, settling : Margin
+        Of what is reached or shown, and of whether the slowest of these poles decays.
+    """
+
+    poles: Any = np.zeros(0)
+    decays: bool = True
+    margin: Margin = Margin()
+    settling: Margin = Margin()
+
+    def seen(self, change: Array) -> FixedPoles:
+        """Return it with the directions of its margins in other coordinates."""
+        margin, settling = self.margin.seen(change), self.settling.seen(change)
+        return self._replace(margin=margin, settling=settling)
+
+
 class Noisy(NamedTuple):
     """A matrix and what rounding may have done to each of its entries."""
 

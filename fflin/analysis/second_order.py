@@ -11,6 +11,7 @@ import numpy as np
 from fflin.analysis.ranks import (
     EPS,
     Decision,
+    FixedPoles,
     Margin,
     Noisy,
     decided,
@@ -115,22 +116,14 @@ class Hidden(NamedTuple):
     ----------
     motions : ndarray (2 nv, k)
         Basis of the unobservable subspace, (s, ds/dt).
-    poles : ndarray (k,)
-        Of the sampled model where there is one.
     shapes : tuple of (complex, ndarray (nv, m))
         Of the continuous poles that are not zero, one of each pair.
-    decays : bool
-        Whether all of them do, beyond rounding.
-    margin, settling : Margin
-        Of what is missed, and of whether the slowest of it decays.
+    fixed : FixedPoles
     """
 
     motions: Array
-    poles: Any
     shapes: tuple[tuple[complex, Any], ...]
-    decays: bool
-    margin: Margin
-    settling: Margin
+    fixed: FixedPoles
 
 
 def hidden(system: SecondOrder, position: Noisy, velocity: Noisy, dt: float) -> Hidden | None:
@@ -180,14 +173,13 @@ def hidden(system: SecondOrder, position: Noisy, velocity: Noisy, dt: float) -> 
     near += [0.0 < pole.imag < _DEFECTIVE * abs(pole) for pole in known]
     if any(near):
         return None
-    return Hidden(
-        motions=np.hstack(motions),
+    fixed = FixedPoles(
         poles=np.exp(np.array(poles) * dt) if dt else np.array(poles),
-        shapes=tuple(missed),
         decays=not still.shape[1] and slowest.ratio > 1.0,
         margin=margin,
         settling=Margin() if still.shape[1] else decided(slowest.ratio, slowest.at),
     )
+    return Hidden(np.hstack(motions), tuple(missed), fixed)
 
 
 def _still(system: SecondOrder, position: Noisy, velocity: Noisy) -> tuple[Array, Margin]:

@@ -68,19 +68,23 @@ def _warn_of_doubts(notes: tuple[str, ...]) -> None:
 
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
     """Raise `InputError` that names the modes on the boundary of stability that Q leaves out."""
-    _require_reached(lin, A.T, Q, "weighed by Q", "Q does not weigh {}; weigh them")
+    missed = "Q does not weigh {}, which do not settle by themselves; weigh them"
+    _warn_of_doubts(_checked_reach(lin, A.T, Q, "weighed by Q", missed))
 
 
 def require_disturbed(lin: LinearModel, W: Array) -> None:
     """Raise `InputError` that names the modes on the boundary that no disturbance reaches."""
-    complaint = (
-        "W does not disturb {}: a steady filter would not correct them; give them an intensity"
+    missed = (
+        "W does not disturb {}, which do not settle by themselves: a steady filter would not "
+        "correct them; give them an intensity"
     )
-    _require_reached(lin, lin.A, W, "disturbed by W", complaint)
+    _warn_of_doubts(_checked_reach(lin, lin.A, W, "disturbed by W", missed))
 
 
-def _require_reached(lin: LinearModel, A: Array, B: Array, what: str, complaint: str) -> None:
-    """Raise `InputError` where B misses a left eigenvector whose motion neither decays nor grows."""
+def _checked_reach(
+    lin: LinearModel, A: Array, B: Array, what: str, complaint: str
+) -> tuple[str, ...]:
+    """Return what is undecided; raise `InputError` where B misses a mode on the boundary."""
     discrete = bool(lin.dt)
     poles = np.linalg.eigvals(A)
     size = max(float(np.abs(poles - discrete).max()), 1e-300)
@@ -104,9 +108,8 @@ def _require_reached(lin: LinearModel, A: Array, B: Array, what: str, complaint:
     )
     if missed:
         words = _dominant(np.array(missed), lin.state_names)
-        words = complaint.format(f"{words}, which do not settle by themselves")
-        raise InputError(f"{words}{_doubts(doubts)}")
-    _warn_of_doubts(doubts)
+        raise InputError(f"{complaint.format(words)}{_doubts(doubts)}")
+    return doubts
 
 
 def _left_null(matrix: Array) -> tuple[Array, Margin]:
