@@ -134,7 +134,8 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     MissingPackageError, FileError
         As in `plot_motion`.
     """
-    from fflin.analysis.validity import TRUSTED, Validity, shown
+    from fflin.analysis.displacement import shown
+    from fflin.analysis.validity import TRUSTED, Validity
 
     if not isinstance(validity, Validity):
         raise InputError(
