@@ -77,7 +77,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     pairs = ((lin.A, lin.B), (lin.A.T, lin.C.T))
     if duration is None:
         _require_decay(lin)
-        reach, show = (_symmetric(_endless(A, B @ B.T, lin.dt)) for A, B in pairs)
+        found = [_endless(A, B @ B.T, lin.dt) for A, B in pairs]
+        reach, show = (0.5 * (W + W.T) for W in found)
         return Gramians(reach, show, np.inf)
     duration = number("duration", duration)
     if duration <= 0.0:
@@ -86,7 +87,7 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
         found = [_finite(A, B @ B.T, lin.dt, duration) for A, B in pairs]
     if not all(np.isfinite(W).all() for W in found):
         raise InputError(f"duration is {duration:g} s, over which the model grows beyond numbers")
-    reach, show = map(_symmetric, found)
+    reach, show = (0.5 * (W + W.T) for W in found)
     return Gramians(reach, show, duration)
 
 
@@ -130,10 +131,6 @@ def _summed(A: Array, Q: Array, steps: int) -> Array:
         leap = leap @ leap
         steps >>= 1
     return W
-
-
-def _symmetric(W: Array) -> Array:
-    return (W + W.T) / 2.0
 
 
 def held_cost(F: Array, W: Array, h: float) -> Array:

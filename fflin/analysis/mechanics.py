@@ -42,14 +42,6 @@ def slopes(lin: LinearModel) -> Array:
     return (lin.A - np.eye(len(lin.A))) / lin.dt if lin.dt else lin.A
 
 
-def rounding(lin: LinearModel) -> float:
-    """Return what each entry of the slopes of a sampled model is worth; 0 in continuous time.
-
-    An exponential has the rounding of its largest entry in all of them.
-    """
-    return EPS * float(np.abs(lin.A).max()) / lin.dt if lin.dt else 0.0
-
-
 @dataclass(frozen=True)
 class ConservedMomenta:
     """The momenta that no input, spring or damper changes, and what follows from them.
@@ -97,7 +89,9 @@ def second_order(lin: LinearModel) -> SecondOrder:
     size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
     rates = np.hstack((X[nv:], lin.B[nv:]))
     spread = 4.0 * nv * EPS * np.abs(rates)
-    spread[:, : 2 * nv] += 4.0 * nv * rounding(lin) * (rates[:, : 2 * nv] != 0.0)
+    if lin.dt:
+        # An exponential has the rounding of its largest entry in all of them.
+        spread[:, : 2 * nv] += 4.0 * nv * EPS * np.abs(lin.A).max() / lin.dt * (X[nv:] != 0.0)
     forces = Noisy(M @ rates, np.abs(M) @ spread)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
     # Relative to the largest force of the same input.

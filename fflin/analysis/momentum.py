@@ -158,7 +158,8 @@ def generalized_inertia(lin: LinearModel) -> Array:
     Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
     """
     lin = checked(lin)
-    if len(lin.A) != 12 + 2 * _joints(lin):
+    joints = sum(name.startswith("q_m.") for name in lin.state_names)
+    if len(lin.A) != 12 + 2 * joints:
         raise InputError("the base is not among the states; take the model before its reduction")
     M = lin.M
     inertia: Array = M[6:, 6:] + M[6:, :6] @ _following(M)
@@ -210,10 +211,6 @@ def _following(M: Array) -> Array:
     """Return G (6, n), what the free base does when the joints move."""
     G: Array = -np.linalg.solve(M[:6, :6], M[:6, 6:])
     return G
-
-
-def _joints(lin: LinearModel) -> int:
-    return sum(name.startswith("q_m.") for name in lin.state_names)
 
 
 def _given(value: Any, _: LinearModel) -> Any:

@@ -175,27 +175,21 @@ def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
     return Noisy(np.where(real, forces.values, 0.0), np.where(real, noise, 0.0))
 
 
-def even_rows(matrix: Noisy) -> tuple[Any, float]:
-    """Return rows of unit length, or shorter so that none has more rounding, and a tolerance.
-
-    None hides behind another, and none that is rounding itself hides the others.
-    """
-    values, noise = matrix
-    least = values.shape[1] * EPS
-    sizes, spread = np.linalg.norm(values, axis=1), np.linalg.norm(noise, axis=1)
-    real = sizes > 0.0
-    sizes, spread = sizes[real], spread[real]
-    weights = 1.0 / np.maximum(sizes, spread / least)
-    tolerance = SAFETY * max(least, float(np.linalg.norm(spread * weights)))
-    return values[real] * weights[:, None], tolerance
-
-
 def right_vectors(matrix: Noisy, states: int = 1) -> tuple[Array, Any, int, Margin]:
-    """Return n singular values of `even_rows`, right vectors (n, n), the rank, and its margin."""
+    """Return n singular values, right vectors (n, n), the rank, and its margin.
+
+    Rows are brought to unit length, or shorter so that none has more rounding: none hides behind
+    another, and none that is rounding itself hides the others.
+    """
     n = matrix.values.shape[1]
-    rows, tolerance = even_rows(matrix)
-    if not n or not len(rows):
+    sizes, spread = (np.linalg.norm(entries, axis=1) for entries in matrix)
+    real = sizes > 0.0
+    if not n or not real.any():
         return np.zeros(n), np.eye(n), 0, Margin()
+    least = n * EPS
+    weights = 1.0 / np.maximum(sizes[real], spread[real] / least)
+    tolerance = SAFETY * max(least, float(np.linalg.norm(spread[real] * weights)))
+    rows = matrix.values[real] * weights[:, None]
     rows = rows if np.imag(rows).any() else np.real(rows)
     _, singular, right = np.linalg.svd(rows, full_matrices=len(rows) < n)
     singular = np.pad(singular, (0, n - len(singular)))
@@ -212,7 +206,7 @@ def judged(ratios: Array, vectors: Any, rank: int, states: int = 1) -> Margin:
 
 
 def null_space(matrix: Noisy, states: int = 1) -> tuple[Array, Margin]:
-    """Return the null space (n, k) of a matrix, orthonormal; rows are scaled by `even_rows`."""
+    """Return the null space (n, k) of a matrix, orthonormal; see `right_vectors`."""
     _, vectors, rank, margin = right_vectors(matrix, states)
     return vectors[:, rank:], margin
 

@@ -92,15 +92,13 @@ def acceleration_lqr(
     )
     with np.errstate(all="ignore"):
         channel = _sampled(rates, qp, qv, ra, lin.dt) if lin.dt else _continuous(rates, qp, qv, ra)
-    _require_sound(channel, lin.dt)
+    stable = np.abs(channel.poles) < 1.0 if lin.dt else channel.poles.real < 0.0
+    if not stable.all() or not all(np.isfinite(part).all() for part in channel):
+        raise InputError(_BEYOND)
     inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
     K = inverse @ np.hstack((np.diag(channel.kp), np.diag(channel.kd)))
-    P = np.block(
-        [
-            [np.diag(channel.p11), np.diag(channel.p12)],
-            [np.diag(channel.p12), np.diag(channel.p22)],
-        ]
-    )
+    p12 = np.diag(channel.p12)
+    P = np.block([[np.diag(channel.p11), p12], [p12, np.diag(channel.p22)]])
     Q = np.diag(np.concatenate((qp, qv)))
     # The same equation with the accelerations as inputs.
     hold = np.vstack((np.diag(0.5 * lin.dt**2 * rates), lin.dt * np.eye(m)))
@@ -114,13 +112,6 @@ def acceleration_lqr(
         raise InputError(_BEYOND) from None
     solution = Solution(P, K, channel.poles, residual, "closed form")
     return make_gain(lin, solution, Q, 0.5 * (R + R.T), None)
-
-
-def _require_sound(channel: _Channel, dt: float) -> None:
-    poles = channel.poles
-    stable = np.abs(poles) < 1.0 if dt else poles.real < 0.0
-    if not stable.all() or not all(np.isfinite(part).all() for part in channel):
-        raise InputError(_BEYOND)
 
 
 def _integrators(lin: LinearModel) -> tuple[Array, Array]:

@@ -151,7 +151,7 @@ def solve(
     D. L. Kleinman, IEEE Trans. Automatic Control 13(1), 1968.
     """
     equation = Riccati(A, B, Q, R, N, dt)
-    start = _attempt(equation)
+    start = _half_size(equation)
     if start is not None and start.residual <= _SOUND:
         return start
     found = [] if start is None else [start]
@@ -172,31 +172,27 @@ def half_size(
     A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
 ) -> Solution | None:
     """Solve as `solve` does by the half-size method; None where it falls short."""
-    solution = _attempt(Riccati(A, B, Q, R, N, dt))
+    solution = _half_size(Riccati(A, B, Q, R, N, dt))
     return solution if solution is not None and solution.residual <= _SOUND else None
 
 
-def _attempt(equation: Riccati) -> Solution | None:
-    with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
-        return _half_size(equation)
-    return None
-
-
 def _half_size(equation: Riccati) -> Solution | None:
-    source = _bilinear(equation) if equation.discrete else equation
-    if source is None:
-        return None
-    A, Q, cross = source.A, source.Q, source.cross
-    if cross is not None:
-        # The input is counted from -R^-1 N' x, from where the cost has no cross term.
-        A = A - source.B @ dtrtrs(source.R_factor, cross, lower=1, trans=1)[0]
-        Q = Q - cross.T @ cross
-    loop = second_order_loop(A, source.B, Q, source.R_factor)
-    if loop is None:
-        return None
-    P = loop.modes.lyapunov_modal(loop.cost)
-    modes = None if equation.discrete else loop.modes
-    return _finished(equation, *_refined(equation, P, modes), "structured")
+    with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
+        source = _bilinear(equation) if equation.discrete else equation
+        if source is None:
+            return None
+        A, Q, cross = source.A, source.Q, source.cross
+        if cross is not None:
+            # The input is counted from -R^-1 N' x, from where the cost has no cross term.
+            A = A - source.B @ dtrtrs(source.R_factor, cross, lower=1, trans=1)[0]
+            Q = Q - cross.T @ cross
+        loop = second_order_loop(A, source.B, Q, source.R_factor)
+        if loop is None:
+            return None
+        P = loop.modes.lyapunov_modal(loop.cost)
+        modes = None if equation.discrete else loop.modes
+        return _finished(equation, *_refined(equation, P, modes), "structured")
+    return None
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:
