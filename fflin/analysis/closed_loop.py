@@ -1,4 +1,4 @@
-"""The nonlinear robot under a state feedback, in the chart, beside what the linear model says."""
+"""The nonlinear robot under a state feedback, and the motion that the linear model predicts."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from fflin.robot.robot import Robot
 # function, and has diverged where it is this many times as large.
 SETTLED, DIVERGED = 1e-3, 1e3
 
-# 1 - |q_b|^2 where a run is taken to have left the chart: 4 degrees before its end.
+# A run has left the chart where 1 - |q_b|^2 is less: within 4 degrees of a turn of 180.
 _EDGE = 1e-3
 
-# Time constants of the slowest pole over which the prediction is measured, and of a run, and the
-# relative error of the integration of the first.
-_FORESIGHT, _PATIENCE, _PRECISION = 3.0, 3.0, 1e-9
+# The prediction is measured over so many time constants of the slowest pole, integrated to this
+# relative error; a random run may take as many times what the slowest pole needs to settle.
+_FORESIGHT, _PRECISION, _PATIENCE = 3.0, 1e-9, 3.0
 _STEPS = 60
 
 # Evaluations of the dynamics that a run may take; a loop that settles takes a tenth.
@@ -68,7 +68,7 @@ class Loop:
 
     @cached_property
     def rate(self) -> Array:
-        """A - B K."""
+        """State matrix of the linear loop, A - B K."""
         closed: Array = self.lin.A - self.lin.B @ self.K
         return closed
 
@@ -133,7 +133,7 @@ class Loop:
         return max(map(self.size, motion - foreseen)) / first
 
     def outcome(self, x: Array) -> str:
-        """Return what `run` does of a run that is given time enough to settle."""
+        """Return the outcome of a run with time enough to settle, as `run` names it."""
         return self.run(x, self._times(_PATIENCE * np.log(1.0 / SETTLED) / self.decay), 1e-6)[0]
 
     def _times(self, horizon: float) -> Array:
@@ -156,13 +156,13 @@ class Loop:
         follow = self._sampled if self.lin.dt else self._continuous
         motion = [x[self.watched] - self.lin.x0]
         try:
-            # A run that overflows has diverged, and need not be warned of.
+            # A run that overflows counts as diverged; NumPy and SciPy need not warn of it.
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 outcome = follow(x, times, precision, motion)
         except ChartError:
             outcome = "chart"
-        except InputError:  # not finite, or spinning ever faster
+        except InputError:  # an overflow, or a spin that takes too many evaluations
             outcome = "diverged"
         return outcome, np.array(motion)
 
@@ -186,7 +186,7 @@ class Loop:
             return float(self._outcome(x, first) == "slow") - 0.5
 
         ended.terminal = True  # type: ignore[attr-defined]
-        # Fast poles of the loop make it stiff; LSODA switches by itself.
+        # A loop with fast poles is stiff; LSODA finds that out and changes its method.
         found = solve_ivp(
             lambda _, x: dynamics(x, self._input(x)),
             (times[0], times[-1]),
@@ -238,7 +238,7 @@ class Loop:
         return "slow" if now < (1.0 - slack) * DIVERGED * first else "diverged"
 
     def linear(self, error: Array, times: Array) -> Array:
-        """Return the deviations (len(times), nz) that the linear model foresees."""
+        """Return the deviations (len(times), nz) that the linear model predicts."""
         from scipy.linalg import expm
 
         step = self.rate if self.lin.dt else expm(self.rate * (times[1] - times[0]))

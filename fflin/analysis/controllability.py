@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -29,7 +28,7 @@ from fflin.analysis.names import (
 from fflin.analysis.pbh import split_by_poles
 from fflin.analysis.ranks import FixedPoles, Margin, Noisy, echelon, image, null_space, unit_columns
 from fflin.analysis.second_order import Hidden, SecondOrder, hidden
-from fflin.base.tables import width
+from fflin.base.tables import folded
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 
@@ -100,7 +99,7 @@ class Controllability:
             placed = [f"{what} in {count}" for what, count in self.reach.items()]
             lines.append(f"directions that the inputs move: {', '.join(placed)}")
         lines += [f"note: {note}" for note in self.notes]
-        return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
+        return folded(lines)
 
 
 def controllability(lin: LinearModel) -> Controllability:
@@ -153,7 +152,7 @@ def controllability(lin: LinearModel) -> Controllability:
     fixed, size = part.fixed, state_sizes(lin)
     others: Array = np.zeros((len(part.rows), len(lin.A)))
     others[:, held.selected] = part.rows
-    # Coordinates that an input pushes on directly are named first.
+    # States are named after the coordinates that an input pushes on directly, where possible.
     driven = second_order(lin.generator or lin).S.values.any(axis=1)
     basis, pivots = echelon(held.T @ part.reached, size, np.tile(driven, 2))
     zero = np.full(2 * len(held.weights), 1.0 if lin.dt else 0.0)
@@ -204,7 +203,7 @@ def _by_second_order(lin: LinearModel, held: ConservedMomenta) -> _Part | None:
     system, r = second_order(source).restricted(R), len(held.kept)
     idle, margin = null_space(system.S.T @ np.diag(1.0 / system.size))
     if not system.acting or (not idle.shape[1] and not lin.dt):
-        # What is not conserved is pushed.
+        # Inputs reach every momentum that is not conserved, and so the coordinates.
         everything, fixed = np.eye(2 * r), FixedPoles(margin=margin.seen(R / system.size))
         return _Part(everything, everything[:0], (), "closed form", fixed)
     found = hidden(system, system.S.T, Noisy.exact(np.zeros_like(system.S.values.T)), lin.dt)
@@ -272,7 +271,7 @@ def _vibration_rows(
     rates = (lin.state_names[len(lin.M) + i] for i in held.kept)
     members = tuple(name.split(".", 1)[-1] for name in rates)
     for pole, missed in found.shapes:
-        if pole.real < 0.0:  # of a pair of real poles the other has the same shapes
+        if pole.real < 0.0:  # the positive one of the pair has the same shapes
             continue
         shapes = missed.real
         momenta = shapes.T @ system.M

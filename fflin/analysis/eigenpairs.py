@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     Vector = NDArray[np.complexfloating[Any]]
 
-# A stiffness this far below the largest, both scaled to unit inertias, is taken for none: modes
-# of less than 3e-7 of the highest frequency count as rigid.
+# A stiffness less than this part of the largest, both scaled to unit inertias, counts as zero:
+# modes below 3e-7 of the highest frequency are rigid.
 _NO_STIFFNESS = 1e-13
 
 
@@ -73,7 +73,7 @@ def _free_free(A: Array, M: Array, inertia: Array) -> NaturalModes | None:
     N, slope = A[:nv, nv:], A[nv:, :nv] @ A[:nv, nv:]
     if A[:nv, :nv].any() or A[nv:, nv:].any():
         return None
-    # Over s with p = N s, ds/dt = nu; scaled to a unit diagonal of M.
+    # In quasi-coordinates s, with p = N s and ds/dt = nu, scaled to a unit diagonal of M.
     unit = M / np.outer(inertia, inertia)
     by_s = slope * inertia[:, None] / inertia
     K = -unit @ by_s
@@ -94,7 +94,7 @@ def _free_free(A: Array, M: Array, inertia: Array) -> NaturalModes | None:
     for square, vector in zip(squares.tolist(), vectors.T, strict=True):
         if abs(square) <= _NO_STIFFNESS * len(felt) * float(np.abs(squares).max()):
             continue
-        # All that floats follows: -omega^2 s = (d nudot/ds) s, of any size.
+        # The coordinates without stiffness follow from -omega^2 s = (d nudot/ds) s.
         s = by_s[:, felt] @ vector / inertia
         root = abs(square) ** 0.5
         for pole in [1j * root] if square > 0.0 else [complex(root), complex(-root)]:
@@ -107,11 +107,11 @@ def _free_free(A: Array, M: Array, inertia: Array) -> NaturalModes | None:
 def _polished(by_s: Array, squares: Array, vectors: Array) -> tuple[Array, Array]:
     """Return the pairs of -by_s, after one Newton step from those of its symmetric pencil.
 
-    The Schur complement rounds by the conditioning of M, A itself is right to the last digits.
+    The Schur complement rounds by the condition of M, while A itself is exact to the last digits.
     """
     defect = -np.linalg.solve(vectors, by_s @ vectors) - np.diag(squares)
     gaps = squares - squares[:, None]
-    # Equal ones stay as they are: any of their combinations will do.
+    # Vectors of equal frequencies are not mixed: any combination of them is a mode.
     apart = np.abs(defect) < 1e-3 * np.abs(gaps)
     mixed = np.divide(defect, gaps, out=np.zeros_like(defect), where=apart)
     return squares + defect.diagonal(), vectors + vectors @ mixed
@@ -184,11 +184,11 @@ def nonzero_eigenpairs(
     for value, y, x in zip(values.tolist(), left.T, right.T, strict=True):
         error = 1e2 * EPS * size / max(abs(np.vdot(y, x)), EPS)
         for step in reversed(steps):
-            # value (V_0 a + V_1 x) = A (V_0 a + V_1 x), and A V_0 = 0; of any size.
+            # As A V_0 = 0, an eigenvector V_0 a + V_1 x is A V_1 x, up to a factor.
             x = step @ x  # noqa: PLW2901 - the same vector in a larger space
-        # What slow modes lost on the way, one inverse iteration brings back.
+        # Slow modes lost digits on the way; one inverse iteration restores them.
         near = whole - (value + EPS * size) * np.eye(n)
-        with suppress(np.linalg.LinAlgError):  # singular to the last bit
+        with suppress(np.linalg.LinAlgError):  # the shift is an eigenvalue exactly
             x = np.linalg.solve(near, x / np.linalg.norm(x))  # noqa: PLW2901
         pairs.append((complex(value), x / np.linalg.norm(x), error))
     return pairs, nullity
@@ -198,7 +198,7 @@ def _complement(A: Array, tolerance: float) -> Array | None:
     """Return a basis of what is orthogonal to the null space of A; None where that is empty."""
     used = A.any(axis=0)
     if not used.all():
-        # Of columns that are zero exactly: without the rounding of any rotation.
+        # Columns that are exactly zero are dropped as they stand: a rotation would round.
         return np.eye(len(A))[:, used]
     _, singular, transposed = np.linalg.svd(A)
     rank = int(np.count_nonzero(singular > tolerance))

@@ -1,4 +1,4 @@
-"""A linear model as a mechanical system: its slopes, its energy scale, what it conserves."""
+"""A linear model as a mechanical system: its slopes, its forces, the momenta it conserves."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 
-# Relative residual beyond which a momentum is not the rate of a coordinate: off rest.
+# A momentum with a larger relative residual is not the rate of a coordinate: the model moves.
 _CONSISTENT = 1e-8
 
 
@@ -82,19 +82,19 @@ class ConservedMomenta:
 def second_order(lin: LinearModel) -> SecondOrder:
     """Return the forces of a continuous model, or those that a sampled one shows as it stands.
 
-    What the product with M leaves of a slope or an input that is none is put to zero: one floor
-    for springs and one for dampers, per unit of energy, and one for each input.
+    The product with M leaves rounding where there is no spring, damper or input. It is put to
+    zero by one floor for springs and one for dampers, per unit of energy, and one for each input.
     """
     nv, M, X = len(lin.M), lin.M, slopes(lin)
     size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
     rates = np.hstack((X[nv:], lin.B[nv:]))
     spread = 4.0 * nv * EPS * np.abs(rates)
     if lin.dt:
-        # An exponential has the rounding of its largest entry in all of them.
+        # Every entry of an exponential carries the rounding of the largest.
         spread[:, : 2 * nv] += 4.0 * nv * EPS * np.abs(lin.A).max() / lin.dt * (X[nv:] != 0.0)
     forces = Noisy(M @ rates, np.abs(M) @ spread)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
-    # Relative to the largest force of the same input.
+    # The forces of an input are compared with the largest of the same input.
     each = np.linalg.norm(S.values / size[:, None], axis=0)
     return SecondOrder(
         M=M,
@@ -118,7 +118,7 @@ def at_rest(lin: LinearModel) -> LinearModel | None:
 
 
 def rates_of_positions(X: Array) -> Array:
-    """Return N (nv, nv) with dp/dt = N nu; of a model sampled at a period of its own, identity."""
+    """Return N (nv, nv) with dp/dt = N nu; the identity where sampling at a period hides it."""
     nv = len(X) // 2
     N = X[:nv, nv:]
     return N if np.linalg.cond(N) < 1e6 else np.eye(nv)
@@ -131,12 +131,12 @@ def conserved(lin: LinearModel) -> ConservedMomenta:
     :math:`\sqrt{M_{ii}}` and each is scaled to unit length, so that neither newton against
     newton metre nor a weak thruster plays a part.
     """
-    lin = lin.generator or lin  # which conserves the same
+    lin = lin.generator or lin  # it conserves the same momenta
     nv, X, system = len(lin.M), slopes(lin), second_order(lin)
     size = system.size
     pushes = stacked([[system.K.T], [system.D.T], [system.S.T]])
     free, margin = null_space(pushes @ np.diag(1.0 / size), states=2)
-    # Columns of W^T: unit vectors where a coordinate has its momentum to itself.
+    # A column of W^T is a unit vector where the momentum is that of one coordinate alone.
     basis, pivots = echelon(free / size[:, None], size)
     W = basis.T
     momenta = W @ lin.M

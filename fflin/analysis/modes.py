@@ -118,7 +118,7 @@ class Modes:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Of which modes it hangs on rounding whether they grow or decay."""
+        """Modes of which rounding decides whether they grow or decay."""
         return tuple(
             f"undecided: whether the mode at {mode.frequency:.4g} rad/s grows or decays; its real "
             f"part is {mode.margin:.1g} times its rounding"
@@ -195,7 +195,7 @@ def modes(lin: LinearModel) -> Modes:
 
 def _normalised(shape: Array) -> NDArray[np.complexfloating[Any]]:
     positions = np.abs(shape[: len(shape) // 2])
-    # Of equals, such as two panels in symmetry, the first.
+    # Of several that move equally, such as symmetric panels, the first.
     largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
     return np.asarray(shape / shape[largest], dtype=complex)
 

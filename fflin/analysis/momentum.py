@@ -19,7 +19,7 @@ from fflin.linear.model import Certificate, LinearModel
 from fflin.robot.frames import frame_index
 from fflin.robot.robot import Robot
 
-# f0 outside of what the reduced state can follow, relative to f0.
+# Largest part of f0, relative to it, that the reduced state may leave out.
 _DRIFT = 1e-9
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +19,7 @@ from fflin.analysis.names import combination, undecided, unsettled, with_rates
 from fflin.analysis.pbh import split_by_poles
 from fflin.analysis.ranks import EPS, FixedPoles, Margin, Noisy, echelon, without_rounding
 from fflin.analysis.second_order import hidden
-from fflin.base.tables import width
+from fflin.base.tables import folded
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 
@@ -74,7 +73,7 @@ class Observability:
         if self.unobservable:
             lines.append(f"unobservable: {with_rates(self.unobservable)}")
         lines += [f"note: {note}" for note in self.notes]
-        return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
+        return folded(lines)
 
 
 def observability(lin: LinearModel) -> Observability:

@@ -10,18 +10,18 @@ from fflin.analysis.mechanics import rates_of_positions
 from fflin.analysis.ranks import EPS, FixedPoles, Margin, decided, image, judged, unit_columns
 from fflin.base.validation import Array
 
-# An eigenvector that inputs of unit length see by less than this, or that has a neighbour this
-# near, is decided by singular values; the others are seen without doubt.
+# Singular values decide on an eigenvector whose product with inputs of unit length is smaller, or
+# whose eigenvalue has a neighbour this near; any other is reached without doubt.
 _SUSPICIOUS = 1e-3
 
-# Eigenvalues nearer than this are one: a defective one moves by the root of round-off. The
-# Rayleigh quotient of the singular vector converges quadratically to it.
+# Eigenvalues nearer than this are the same: rounding moves a defective one by its square root.
+# The Rayleigh quotient of the singular vector converges quadratically, in few steps.
 _SAME_POLE, _REFINEMENTS = 1e-9, 4
 
-# A defective pair of poles at zero moves by the square root of round-off.
+# A slower decay may be a defective pair of poles at zero, which rounding moves by its square root.
 _DECAY = 1e-7
 
-# What is left of a motion after a sample where it is rounding.
+# A motion of which a sample leaves less has died out: the rest is rounding.
 _DEAD = 1e4 * EPS
 
 
@@ -56,12 +56,12 @@ def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
     A = back @ X @ to_x
     turning, fall, drag = (float(np.linalg.norm(A[i, j], 2)) for i, j in ((p, p), (v, p), (v, v)))
     rate = max(turning, drag, np.sqrt(fall))
-    # Where nothing but inertia acts, any unit will do.
+    # Without forces no unit of time is better than another.
     unit = 1.0 / rate if rate > 0.0 else 1.0
     if dt:
-        # Sampled at a period of its only vibration, all but inertia is rounding.
+        # Sampled at the period of its only vibration, the model shows only rounding as forces.
         unit = min(unit, 100.0 * dt)
-    # Positions change by 1/unit where velocities change by 1.
+    # With time in this unit, positions are measured in it too.
     stretch = np.repeat((unit, 1.0), nv)
     to_x, back = to_x * stretch, back / stretch[:, None]
     root = np.sqrt(M.diagonal())
@@ -134,20 +134,20 @@ def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = 
     least, most = int(decay.argmin()), int(decay.argmax())
     settling = decided(max(float(decay[least]), 0.0) / _DECAY, shapes[:, least]).halved()
     if dt and abs(poles[most]) < _DEAD:
-        # What has died out between samples cannot be told apart.
+        # Motions that die out between samples cannot be distinguished.
         margin &= decided(1.0, shapes[:, most]).halved()
     return Split(*parts, FixedPoles(poles, bool(decay[least] > _DECAY), margin, settling))
 
 
 def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
-    """Return an orthonormal real basis (m, k) of the left eigenvectors that B does not see."""
+    """Return an orthonormal real basis (m, k) of the left eigenvectors that are orthogonal to B."""
     from scipy.linalg import eig
 
     poles, left = eig(A, left=True, right=False)
     unseen = np.linalg.norm(left.conj().T @ B, axis=1) < _SUSPICIOUS
     distances = np.abs(poles[:, None] - poles) + np.eye(len(A))
     near = unseen | (distances.min(axis=1) < _SUSPICIOUS)
-    # A defective zero splits into poles of the root of rounding: it is tested itself, and first.
+    # Rounding splits a defective zero into several poles, so that zero itself is tested first.
     candidates = [0j, *poles[(poles.imag >= 0.0) & near]]
     found: Array = np.zeros((len(A), 0))
     margin, known = Margin(), np.zeros(0, dtype=complex)
@@ -161,7 +161,7 @@ def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
         known = np.append(known, at)
         parts = np.hstack((vectors.real, vectors.imag)) if abs(at.imag) > _SAME_POLE else vectors
         parts = np.real(parts)
-        # Of poles that were told apart only by rounding the vectors are the same.
+        # Poles that differ only by rounding have the same vectors.
         new = parts - found @ (found.T @ parts)
         found = np.hstack((found, image(new, _SUSPICIOUS)[0]))
     return found, margin

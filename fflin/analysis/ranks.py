@@ -11,15 +11,15 @@ from fflin.base.validation import Array
 
 EPS = float(np.finfo(float).eps)
 
-# What an echelon form leaves of a coefficient that is zero, relative to a pivot of 1.
+# A coefficient of an echelon form that is smaller, relative to a pivot of 1, is rounding.
 _CLEAN = 1e-10
 
-# A tolerance is this many times the rounding, and singular values between these parts of it are
-# within doubt.
+# A tolerance is SAFETY times the rounding; singular values between LOST and CLEAR times the
+# tolerance are in doubt.
 SAFETY, CLEAR, LOST = 10.0, 30.0, 0.01
 
-# A force this small beside the largest of its kind, per unit of energy, may be rounding; less
-# than this part of it is.
+# A force below _FLOOR times the largest of its kind, per unit of energy, may be rounding; below
+# the part _ROUNDING of that it is taken for it.
 _FLOOR, _ROUNDING = 1e3 * EPS, 0.3
 
 
@@ -165,7 +165,7 @@ def stacked(rows: list[list[Noisy]]) -> Noisy:
 def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
     """Put to zero the entries that are rounding, also beside the largest, in units of energy.
 
-    What may be rounding and may be not stays, with that much of noise.
+    What is in doubt stays, with that much noise.
     """
     units = rows[:, None] * columns
     size = np.abs(forces.values)
@@ -251,7 +251,7 @@ def echelon(columns: Array, weights: Array, preferred: Array | None = None) -> t
     if not size:
         return columns.copy(), np.zeros(0, dtype=np.intp)
     weighted = np.linalg.qr(columns * weights[:, None])[0]
-    # A preferred row is a thousand times as good as another: less than what a bad pivot costs.
+    # A preferred row counts a thousand times; more would cost digits by bad pivots.
     graded = weighted if preferred is None else weighted * np.where(preferred, 1e3, 1.0)[:, None]
     pivots = np.sort(qr(graded.T, mode="r", pivoting=True)[1][:size])
     basis = np.linalg.solve(columns[pivots].T, columns.T).T

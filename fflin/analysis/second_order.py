@@ -1,4 +1,4 @@
-"""M a + D v + K s = S u: a model at rest as matrices of forces, and what a reading misses."""
+"""M a + D v + K s = S u: a model at rest by its forces, and the motions that stay hidden."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from fflin.analysis.ranks import (
 )
 from fflin.base.validation import Array
 
-# Relative asymmetry of springs or dampers that is more than rounding.
+# Springs or dampers with a larger relative asymmetry are not symmetric.
 _SYMMETRIC = 1e-8
 
-# Poles whose distance is less than this part of them are judged as one; poles that move this
-# much faster than the matrices are defective, and no eigenvectors tell them apart.
+# Poles at a relative distance below _SAME_POLE are one; below _DEFECTIVE they are taken for
+# defective, of which eigenvectors say too little.
 _SAME_POLE, _DEFECTIVE = 1e-9, 1e-5
 
-# Logarithms of sampled poles that are this near may hide what the continuous model shows.
+# Poles that sampling brings this near to each other may hide what the continuous model shows.
 _ALIASED = 1e-6
 
-# Above it a singular value is no approximate zero; a shape moves a pole that it belongs to by
-# less than this part.
+# A larger singular value is not zero even roughly. A pole is refined in a few steps, each by
+# less than this part of it.
 _SUSPICIOUS, _NEAR, _REFINEMENTS = 1e-3, 0.1, 8
 
 
@@ -81,7 +81,7 @@ class SecondOrder:
 
     @cached_property
     def poles(self) -> tuple[Any, Margin]:
-        """The poles that are not zero, one of each pair, as far as eigenvalues tell them."""
+        """The poles that are not zero, one of each pair, as eigenvalues approximate them."""
         rigid, margin = self._null(self.K, self.D)
         still, other = self._null(self.K)
         R = null_space(Noisy.exact(rigid.T @ self.M / self.size))[0]
@@ -91,15 +91,14 @@ class SecondOrder:
             return np.zeros(0, dtype=complex), margin & other
         L = np.linalg.inv(np.linalg.cholesky(part.M))
         K, D = L @ part.K.values @ L.T, L @ part.D.values @ L.T
-        fastest = max(np.linalg.norm(K, 2) ** 0.5, np.linalg.norm(D, 2))
-        A = np.block([[np.zeros((r, r)), np.eye(r)], [-K / fastest**2, -D / fastest]])
-        if not D.any():
-            squares = np.linalg.eigvalsh((K + K.T) / 2.0).astype(complex)
-            found = np.concatenate((np.sqrt(-squares), -np.sqrt(-squares)))
-            zeros = 2 * (still.shape[1] - rigid.shape[1])
-        else:
+        zeros = still.shape[1] - rigid.shape[1]
+        if D.any():
+            fastest = max(np.linalg.norm(K, 2) ** 0.5, np.linalg.norm(D, 2))
+            A = np.block([[np.zeros((r, r)), np.eye(r)], [-K / fastest**2, -D / fastest]])
             found = np.linalg.eigvals(A) * fastest
-            zeros = still.shape[1] - rigid.shape[1]
+        else:
+            roots = np.sqrt(-np.linalg.eigvalsh((K + K.T) / 2.0).astype(complex))
+            found, zeros = np.concatenate((roots, -roots)), 2 * zeros
         found = found[np.argsort(np.abs(found))][zeros:]
         return found[found.imag >= 0.0], margin & other
 
@@ -224,7 +223,7 @@ def _root(system: SecondOrder, shape: Any, near: complex) -> complex:
     """Return the root of the scalar equation of a shape that is nearest to a pole."""
     left = shape
     if abs(shape @ system.M @ shape) < 0.1 * abs(shape.conj() @ system.M @ shape):
-        left = shape.conj()  # of equal poles a shape may be orthogonal to itself
+        left = shape.conj()  # where poles are equal, shape^T M shape may vanish
     a, b, c = (left @ X @ shape for X in (system.M, system.D.values, system.K.values))
     root = np.sqrt(complex(b * b - 4.0 * a * c))
     q = -(b + (root if (np.conj(b) * root).real >= 0.0 else -root)) / 2.0
@@ -238,7 +237,7 @@ def _root(system: SecondOrder, shape: Any, near: complex) -> complex:
 
 
 def _simple(system: SecondOrder, shapes: Any, pole: complex) -> bool:
-    """Whether as many eigenvectors belong to a pole as it has places, beyond rounding."""
+    """Whether a pole has as many eigenvectors as its multiplicity, beyond rounding."""
     change = shapes.T @ (2.0 * pole * system.M + system.D.values) @ shapes
     size = np.abs(shapes).T @ (2.0 * abs(pole) * np.abs(system.M) + np.abs(system.D.values))
     least = np.linalg.svd(change, compute_uv=False)[-1]
@@ -247,7 +246,7 @@ def _simple(system: SecondOrder, shapes: Any, pole: complex) -> bool:
 
 
 def _aliased(poles: Any, dt: float) -> bool:
-    """Whether sampling takes two poles for one, or a vibration for what stands."""
+    """Whether sampling maps two poles to one, or a vibration to a pole at rest."""
     s = np.concatenate((poles, np.conj(poles), [0.0])) * dt
     apart = s[:, None] - s
     turns = np.round(apart.imag / (2.0 * np.pi))

@@ -25,8 +25,8 @@ from fflin.base.validation import Array
 if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
 
-# Of the smallest singular value of an equilibrated Popov-Belevitch-Hautus matrix: what computed
-# eigenvalues are off by where they are repeated.
+# A relative singular value of the equilibrated Popov-Belevitch-Hautus matrix below this counts as
+# zero: repeated eigenvalues are computed with such errors.
 _RANK = 1e-7
 
 
@@ -89,7 +89,7 @@ def _checked_reach(
     poles = np.linalg.eigvals(A)
     size = max(float(np.abs(poles - discrete).max()), 1e-300)
     beyond = np.abs(poles) - 1.0 if discrete else poles.real
-    # A block of four moves by the fourth root of rounding.
+    # Rounding moves a Jordan block of four by its fourth root.
     candidates = [complex(discrete)]
     for pole in poles[(np.abs(beyond) <= 1e-3 * size) & (poles.imag >= 0.0)]:
         if all(abs(pole - other) > 1e-3 * size for other in candidates):

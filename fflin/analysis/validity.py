@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, as_completed
@@ -15,19 +14,19 @@ import numpy as np
 from fflin.analysis.closed_loop import Loop, checked_loop
 from fflin.analysis.displacement import checked_displacement, scaled, shown
 from fflin.base.errors import FflinError, InputError
-from fflin.base.tables import width
+from fflin.base.tables import folded
 from fflin.base.validation import Array, number, whole
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
-# Displacements, as shares of the largest, at which the prediction is measured, and directions.
+# The prediction is measured at these shares of the largest displacement, in so many directions.
 _LEVELS = 2.0 ** np.arange(-6.0, 1.0)
 _DIRECTIONS = 4
 
 # Random runs at most.
 _MOST = 1_000_000
 
-# Prediction errors of less are those of the integration.
+# Smaller prediction errors are those of the integration.
 _ROUNDING = 1e-7
 
 # Relative prediction error up to which the linear model is called trusted.
@@ -112,7 +111,7 @@ class Validity:
             f"between {100.0 * low:.1f} and {100.0 * high:.1f} % do ({sure} confidence)"
             + (f"; {failures}" if failures else ""),
         ]
-        return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
+        return folded(lines)
 
 
 _ENDS = {
@@ -153,7 +152,7 @@ def validity(
         K, which makes the linear loop stable.
     attitude, position, joint : float
         Largest displacement of the base [deg], [m], and of the joint displaced most [rad|m]. What
-        is not among the states of a reduced model is not displaced, and told as 0.
+        is not among the states of a reduced model is not displaced, and given as 0.
     samples : int
         Number of random runs.
     seed : int
@@ -188,7 +187,7 @@ def validity(
     confidence = number("confidence", confidence)
     if not 0.0 < confidence < 1.0:
         raise InputError(f"confidence is {confidence:g}, expected a share between 0 and 1")
-    # Of each run its own stream, so that it does not matter who does which.
+    # Each run has its own random stream, so that results do not depend on the order.
     streams = np.random.SeedSequence(seed).spawn(samples + _DIRECTIONS)
     levels = (np.arange(samples) + 0.5) / samples
     if executor is not None and not isinstance(executor, Executor):

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.analysis.stabilizability import require_stabilizable
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.validation import Array, dimension
 from fflin.control.gain import Gain, make_gain
@@ -16,7 +15,7 @@ from fflin.control.riccati import Riccati, Solution
 from fflin.control.weights import Weight, weight
 from fflin.linear.model import LinearModel
 
-_BEYOND = "the weights or dt are beyond what numbers hold: scale Qp, Qv and Ra nearer to each other"
+_BEYOND = "the weights or dt make the solution overflow: scale Qp, Qv and Ra nearer to each other"
 
 
 class _Channel(NamedTuple):
@@ -100,7 +99,7 @@ def acceleration_lqr(
     p12 = np.diag(channel.p12)
     P = np.block([[np.diag(channel.p11), p12], [p12, np.diag(channel.p22)]])
     Q = np.diag(np.concatenate((qp, qv)))
-    # The same equation with the accelerations as inputs.
+    # The residual is that of the same equation with accelerations as inputs.
     hold = np.vstack((np.diag(0.5 * lin.dt**2 * rates), lin.dt * np.eye(m)))
     by_acceleration = hold if lin.dt else np.vstack((np.zeros((m, m)), np.eye(m)))
     equation = Riccati(lin.A, by_acceleration, Q, np.diag(ra), None, lin.dt)
@@ -125,7 +124,7 @@ def _integrators(lin: LinearModel) -> tuple[Array, Array]:
     expected = np.zeros((nx, nx))
     expected[:m, m:] = np.diag(s)
     top = 0.5 * lin.dt * s[:, None] * L
-    # Division by the sampling time rounds.
+    # A tolerance, since the division by the sampling time rounds.
     if (
         nx != 2 * m
         or not np.allclose(slope, expected, rtol=1e-12, atol=0.0)
@@ -137,6 +136,8 @@ def _integrators(lin: LinearModel) -> tuple[Array, Array]:
         )
     sizes = np.abs(L).max(axis=1, keepdims=True)
     if not sizes.all() or np.linalg.matrix_rank(L / sizes, tol=1e-10) < m:
+        from fflin.analysis.stabilizability import require_stabilizable
+
         require_stabilizable(lin)
         raise StabilizabilityError("the inputs do not accelerate every coordinate; use lqr")
     return s, L

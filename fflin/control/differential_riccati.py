@@ -55,7 +55,7 @@ def _passage(coefficients: Coefficients, h: float) -> _Passage:
     """Return an interval of constant coefficients: a short exponential, doubled."""
     A, S, Q = coefficients
     n = len(A)
-    # Costates in units in which the equations of both halves are of one size.
+    # The costate is scaled so that Q and S are of the same size.
     unit = math.sqrt(max(_size(Q), 1e-300) / max(_size(S), 1e-300))
     H = np.block([[A, -S * unit], [-Q / unit, -A.T]])
     doublings = max(0, math.ceil(math.log2(max(4.0 * h * _size(H), 1.0))))

@@ -19,7 +19,7 @@ from fflin.linear.model import LinearModel
 if TYPE_CHECKING:
     from fflin.control.riccati import Solution
 
-# A gain of more entries, of more than three joints, is shown by the norms of its blocks.
+# A larger gain, of more than three joints, is shown by the norms of its blocks.
 _LARGE = 9 * 18
 
 
@@ -106,7 +106,7 @@ class Gain(Design):
 
     @cached_property
     def margins(self) -> Margins:
-        """Gain and phase that the inputs bear, computed when first asked for."""
+        """Gain and phase margins at the inputs, computed when first asked for."""
         return input_margins(self.A, self.B, self.K, self.R, self.dt)
 
 

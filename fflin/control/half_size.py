@@ -19,7 +19,7 @@ class OptimalLoop(NamedTuple):
 
 
 def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalLoop | None:
-    r"""Return a stable loop, optimal but for odd powers; None where the system is another.
+    r"""Return a stable loop, optimal but for odd powers; None for a system of another form.
 
     A state (x1, x2) of m entries each with
 
@@ -56,7 +56,7 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalL
     if nx != 2 * m or B[:m].any():
         return None
     white = _lower(R_factor, B[m:].T)
-    # Of the inverse weight on forces, S = Ls Ls'; squaring it would square its condition.
+    # The inverse weight on forces is Ls Ls'; forming the product would square its condition.
     Ls: Array = np.triu(dgeqrf(white)[0][:m]).T
     sizes = np.abs(Ls.diagonal())
     A11, A12 = A[:m, :m], A[:m, m:]

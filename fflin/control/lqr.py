@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 _SHOWN_RESIDUALS = 6
 
-# Relative residuals that a user should know of, and beyond which a gain means nothing.
+# A relative residual above _COARSE is worth a warning; above _USELESS the gain is wrong.
 _COARSE, _USELESS = 1e-8, 1e-3
 
-# A pole this near to the boundary of stability, relative to the others, may be one that Q leaves
-# on it, moved by rounding.
+# A pole that is nearer to the boundary of stability, relative to the others, may be one on it that
+# Q does not weigh and rounding moved.
 _STILL = 1e-6
 
 
@@ -121,7 +121,7 @@ def require_fixed_point(lin: LinearModel) -> None:
 
 
 def _difference(a: Array, b: Array, c: Array) -> Array:
-    """Return a - b c with zeros for what is rounding."""
+    """Return a - b c, with zeros where the difference is rounding."""
     rounding = 1e3 * np.finfo(float).eps * (np.abs(a) + np.abs(b) @ np.abs(c))
     difference = a - b @ c
     return np.where(np.abs(difference) > rounding, difference, 0.0)
@@ -141,7 +141,7 @@ def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
     structured = half_size(*arguments)
     if structured is not None and not _still(structured.poles, lin.dt):
         return structured
-    # Before a general solver fails without a word.
+    # A general solver would fail without saying which mode is to blame.
     from fflin.analysis.stabilizability import require_stabilizable, require_weighed
 
     require_stabilizable(lin)

@@ -67,7 +67,7 @@ class ModalMatrix:
 
     def lyapunov_modal(self, r: Array) -> Array:
         """Solve the same where V' r V is given."""
-        # Between the complex eigenvectors a + ib and a - ib the equation is a division.
+        # In the basis of the complex eigenvectors a + ib and a - ib each entry is a division.
         z = self._complex(self._complex(r).T) * self._factors
         first, second = self._pairs
         for _ in range(2):  # back to a and b, in the columns and in the rows
@@ -88,13 +88,13 @@ class ModalMatrix:
         z[first], z[second] = 0.5 * (z[first] - turned), 0.5 * (z[first] + turned)
         values = z.diagonal().copy()
         z.flat[:: len(z) + 1] = 0.0
-        # Those of a normal matrix times E + X move by the norm of X at most, relatively.
+        # Eigenvalues of a normal matrix times E + X differ relatively by at most the norm of X.
         if np.linalg.norm(z / np.abs(values)) <= 1e-7:
             return values
         return np.linalg.eigvals(F).astype(complex)
 
     def _complex(self, r: Any) -> Any:
-        """Return the columns of the complex eigenvectors of those of their parts."""
+        """Return r with columns of a pair, for a and b, as those of a + ib and a - ib."""
         first, second = self._pairs
         z, turned = r.astype(complex), 1j * r[:, second]
         z[:, first], z[:, second] = r[:, first] + turned, r[:, first] - turned

@@ -213,8 +213,8 @@ class Allocation:
             size = float(np.linalg.norm(b))
             if size == 0.0:
                 return np.zeros(len(least))
-            # To unity, for the solver stops at absolute figures. Of the thrusts that do the
-            # same, the least: what is added is below rounding.
+            # Scaled to 1, as the solver stops at absolute figures. The added rows choose the
+            # least of the thrusts that do the same; their effect is below rounding.
             unit = float(np.linalg.norm(A))
             found = lsq_linear(
                 np.vstack((A / unit, 1e-7 * np.eye(len(least)))),

@@ -1,4 +1,4 @@
-"""Algebraic Riccati equations: a solution with its residual, by half the size where it goes."""
+"""Algebraic Riccati equations: a solution with its residual, from half the size where possible."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from fflin.control.lyapunov import ModalMatrix
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 
-# A residual at which nothing is wrong with the solution but rounding.
+# A solution with a smaller residual is exact but for rounding.
 _SOUND = 1e-11
 _STEPS = 25
 
-# Of a residual: where what a step does not lower is rounding, and where Newton's method lowers it
-# at every step.
+# Residuals below _ROUNDED are rounding if a step does not lower them; below _NEAR every Newton step
+# lowers the residual.
 _ROUNDED = 1e-12
 _NEAR = 1e-3
 
@@ -66,7 +66,7 @@ class Riccati:
     def __init__(self, A: Array, B: Array, Q: Array, R: Array, N: Array | None, dt: float) -> None:
         self.A, self.B, self.Q, self.R, self.N = A, B, Q, R, N
         self.discrete = bool(dt)
-        # Of a sampled system only what A differs by from the identity counts.
+        # For a sampled system A - E, since the difference of P and A' P A would cancel.
         self.rate = A - np.eye(len(A)) if dt else A
         self.R_factor, indefinite = dpotrf(R, lower=1)
         self.definite = not indefinite
@@ -93,7 +93,7 @@ class Riccati:
             size += _norm(second)
         residual = _norm(defect) / max(size, _TINY)
         if not math.isfinite(residual + size):
-            raise np.linalg.LinAlgError("the weights or the model are beyond all numbers")
+            raise np.linalg.LinAlgError("the weights or the model overflow")
         return _Trial(P, defect, residual)
 
     def closed_loop(self, P: Array) -> Array:
@@ -156,7 +156,7 @@ def solve(
         return start
     found = [] if start is None else [start]
     for unit in (False, True):
-        # SciPy raises either where a pencil cannot be reordered.
+        # SciPy raises one or the other where it cannot reorder a pencil.
         with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
             refined = _refined(equation, _general(equation, unit), None)
             if (general := _finished(equation, *refined, "general")) is not None:
@@ -183,7 +183,7 @@ def _half_size(equation: Riccati) -> Solution | None:
             return None
         A, Q, cross = source.A, source.Q, source.cross
         if cross is not None:
-            # The input is counted from -R^-1 N' x, from where the cost has no cross term.
+            # In terms of u + R^-1 N' x the cost has no cross term.
             A = A - source.B @ dtrtrs(source.R_factor, cross, lower=1, trans=1)[0]
             Q = Q - cross.T @ cross
         loop = second_order_loop(A, source.B, Q, source.R_factor)
@@ -208,7 +208,7 @@ def _bilinear(equation: Riccati) -> Riccati | None:
     FB = F @ B
     R = equation.R - N.T @ FB - FB.T @ N + FB.T @ Q @ FB
     Bc = 2.0**0.5 * FB
-    # What rounding leaves of the zeros at most; Newton's method works on the true ones.
+    # Rows that should be zero are rounding; Newton's method uses the equation without this map.
     Bc[np.abs(Bc).max(axis=1) <= 1e-12 * np.abs(Bc).max()] = 0.0
     N = 2.0**0.5 * F.T @ (N - Q @ FB)
     continuous = Riccati(F @ equation.rate, Bc, 2.0 * F.T @ Q @ F, R, N, 0.0)
@@ -239,7 +239,7 @@ def _refined(
             modes, fresh = ModalMatrix.of(equation.closed_loop(trial.P), equation.discrete), True
         better = equation.trial(trial.P + modes.lyapunov(trial.defect))
         gain = trial.residual / max(better.residual, _TINY)
-        # From afar the first steps may raise the residual; what they do to P is for the better.
+        # Far from the solution a first step may raise the residual and still improve P.
         if gain > 1.0 or (fresh and trial.residual > _NEAR):
             trial = better
         if trial.residual < best.residual:
@@ -248,7 +248,7 @@ def _refined(
             if gain < 2.0:
                 break
         elif gain < 10.0:
-            # These modes are those of another loop.
+            # Slow progress: the modes are those of a loop too far away.
             if fresh and trial is not better:
                 break
             modes = None
@@ -266,7 +266,7 @@ def _general(equation: Riccati, unit: bool) -> Array:
         N = None if N is None else dtrtrs(equation.R_factor, N.T, lower=1)[0].T
         R = np.eye(len(R))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of ill-conditioning: the residual is measured
+        warnings.simplefilter("ignore")  # ill-conditioning shows in the residual
         P: Array = solver(equation.A, B, equation.Q, R, s=N)
     return 0.5 * (P + P.T)
 

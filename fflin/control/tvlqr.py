@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from fflin.linear.trajectory import LinearTrajectory
 
-# Between two knots P is a cubic; knots are put in until it holds to this, relative to P.
+# Between two knots P is a cubic; knots are added until it is this accurate, relative to P.
 _ACCURACY = 1e-7
 _KNOTS_LIMIT = 100_000
 _TOO_FAST = "P changes too fast at {}; give smaller weights or a larger R"
@@ -178,7 +178,7 @@ def _solve(traj: LinearTrajectory, Q: Array, R: Array, Qf: Array) -> tuple[Array
 
     times, values = [float(traj.t[-1])], [Qf]
     for a in traj.t[-2::-1].tolist():
-        # Intervals to do, the latest last, each with P at its start by one step where known.
+        # Intervals left to do, the latest last; with P at the start from one step, where known.
         pending: list[tuple[float, float, Array | None]] = [(a, times[-1], None)]
         while pending:
             start, end, single = pending.pop()
