@@ -103,7 +103,7 @@ def test_what_has_no_closed_form_is_refused():
         r"Ra has shape \(3,\), expected \(12,\)": (1, 1, np.ones(3)),
         "Qp has no value for r_b.x; each needs one": ({"q_b": 1}, 1, 1),
         "overflow": (1e300, 1, 1e-300),
-        "or dt are beyond": (1e-160, 1e160, 1e160),
+        "or dt make": (1e-160, 1e160, 1e160),
     }.items():
         with pytest.raises(fflin.InputError, match=words):
             fflin.acceleration_lqr(lin, *weights)
