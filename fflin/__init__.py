@@ -70,7 +70,7 @@ _PUBLIC = {
     "acceleration_lqr": "control.acceleration_lqr",
     "bryson": "control.weights",
     "check": "linear.check",
-    "configuration": "robot.robot",
+    "configuration": "dynamics.points",
     "controllability": "analysis.controllability",
     "effort": "dynamics.points",
     "equilibrium": "linear.equilibrium",
@@ -149,7 +149,7 @@ if TYPE_CHECKING:
     from fflin.control.sampled_cost import sampled_cost
     from fflin.control.tvlqr import GainSchedule, tvlqr
     from fflin.control.weights import bryson
-    from fflin.dynamics.points import effort, velocity
+    from fflin.dynamics.points import configuration, effort, velocity
     from fflin.dynamics.state import StateMap
     from fflin.linear.check import Check, check
     from fflin.linear.equilibrium import Equilibrium, equilibrium
@@ -173,7 +173,7 @@ if TYPE_CHECKING:
         Momentum,
         RelativePose,
     )
-    from fflin.robot.robot import Robot, configuration
+    from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion, plot_motion
     from fflin.simulation.simulate import simulate
     from fflin.view.visualize import visualize

@@ -115,7 +115,7 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
         "state_names": tuple(lin.state_names[i] for i in z),
         "state_units": tuple(lin.state_units[i] for i in z),
         "_ignorable": partial(_given, tuple(lin.state_names[i] for i in z if not judged[i])),
-        "_drift": None if lin._drift is None else lin._drift[z],
+        "_drift": None if lin.drift is None else lin.drift[z],
         "_inertia": partial(_given, M),
     }
     reduced = ReducedModel(

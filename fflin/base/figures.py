@@ -6,8 +6,8 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import FileError, MissingPackageError
-from fflin.base.writing import as_path, write_whole
+from fflin.base.errors import MissingPackageError
+from fflin.base.writing import as_path, check_ending, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -73,18 +73,12 @@ def require_matplotlib() -> None:
         raise MissingPackageError(f"matplotlib cannot be loaded: {said}; mend MPLBACKEND") from None
 
 
-def check_figure_format(path: Path) -> None:
-    """Raise `FileError` where the ending of a figure's name is no known one."""
-    if path.suffix not in FORMATS:
-        raise FileError(f"'{path}' ends in '{path.suffix}', expected one of {', '.join(FORMATS)}")
-
-
 def target_of(path: str | Path | None) -> Path | None:
     """Return the path of a figure, checked, or None."""
     if path is None:
         return None
     target = as_path(path)
-    check_figure_format(target)
+    check_ending(target, FORMATS)
     return target
 
 

@@ -1,11 +1,25 @@
-"""Files that are written whole or not at all."""
+"""The one rule for files.
+
+What is written takes a new name or the place of a regular file, never that of a file that was
+read as input; it is whole, or what was there stays; an old file keeps its mode, and a new one has
+what the umask leaves. Where the target is a link, the file that it leads to is written, and the
+link stays.
+"""
+
+from __future__ import annotations
 
 import os
+import stat
 import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from fflin.base.errors import FileError, InputError
+
+# What was read as input in this process; no name of these files is written to.
+_inputs: set[str] = set()
 
 
 def as_path(path: Any) -> Path:
@@ -15,7 +29,42 @@ def as_path(path: Any) -> Path:
     return Path(path)
 
 
-def write_whole(contents: dict[Path, bytes]) -> None:
+def check_ending(path: Path, endings: tuple[str, ...]) -> None:
+    """Raise `FileError` where the name of a file ends in none of those that are known."""
+    if path.suffix not in endings:
+        raise FileError(f"'{path}' ends in '{path.suffix}', expected one of {', '.join(endings)}")
+
+
+def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
+    """Return what a regular file of at most `limit` bytes holds, or raise `FileError`."""
+    what = f"; give the path of a {kind} file"
+    try:
+        # Without O_NONBLOCK, opening a pipe would wait for somebody to write into it.
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        if path.is_dir():
+            raise FileError(f"{path}: is a folder{what}")
+        with open(os.open(path, flags | getattr(os, "O_CLOEXEC", 0)), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise FileError(f"{path}: is not a regular file{what}")
+            content = file.read() if limit is None else file.read(limit + 1)
+    except FileError:
+        raise
+    except (OSError, ValueError) as error:
+        raise FileError(f"{shown(path)}: cannot be read: {reason(error)}") from None
+    if limit is not None and len(content) > limit:
+        size = f"{limit >> 20} MiB" if limit >> 20 else f"{limit >> 10} KiB"
+        raise FileError(f"{path}: is larger than {size}, too large for a {kind} file")
+    return content
+
+
+def read_input(path: Path, kind: str, limit: int | None = None) -> bytes:
+    """Do what `read_file` does, and let nothing that is written take the file's place."""
+    content = read_file(path, kind, limit)
+    _inputs.add(os.path.abspath(path))
+    return content
+
+
+def write_whole(contents: Mapping[Path, bytes]) -> None:
     """Write files so that each is whole or, where anything fails, as it was before.
 
     Raises
@@ -23,45 +72,93 @@ def write_whole(contents: dict[Path, bytes]) -> None:
     FileError
         If a file cannot be written.
     """
+    with replacing(*contents) as files:
+        for file, content in zip(files, contents.values(), strict=True):
+            file.write_bytes(content)
+
+
+@contextmanager
+def replacing(*targets: Path) -> Iterator[list[Path]]:
+    """Yield a new file for each target, which takes its place where all ends well."""
     written: dict[Path, Path] = {}
     target = Path()
     try:
-        for target, content in contents.items():
-            real = _real(target)
+        for target in targets:
+            real = place(target)
             handle, name = tempfile.mkstemp(prefix=".fflin-", dir=real.parent)
-            temporary = Path(name)
-            written[temporary] = real
-            with os.fdopen(handle, "wb") as file:
-                file.write(content)
-            os.chmod(temporary, real.stat().st_mode & 0o777 if real.exists() else 0o666 & ~_umask())
+            os.close(handle)
+            written[Path(name)] = target
+        yield list(written)
         for temporary, target in list(written.items()):
-            os.replace(temporary, target)
+            install(temporary, target)
             del written[temporary]
     except FileError:
         raise
     except OSError as error:
-        raise FileError(f"{target}: cannot be written: {error.strerror}") from None
+        raise FileError(f"{shown(target)}: cannot be written: {reason(error)}") from None
     finally:
         for temporary in written:
             temporary.unlink(missing_ok=True)
 
 
-def check_place(target: Path) -> None:
-    """Raise `FileError` where no file can be written there, before work is done for it."""
-    try:
-        with tempfile.TemporaryFile(prefix=".fflin-", dir=_real(target).parent):
-            pass
-    except OSError as error:
-        raise FileError(f"{target}: cannot be written: {error.strerror}") from None
+def install(temporary: Path, target: Path) -> None:
+    """Let a file that is whole take the place of its target."""
+    real = place(target)
+    os.chmod(temporary, real.stat().st_mode & 0o777 if real.exists() else 0o666 & ~_umask())
+    os.replace(temporary, real)
 
 
-def _real(target: Path) -> Path:
-    """Return the file that is meant, so that a link stays one."""
+def place(target: Path) -> Path:
+    """Return the file that is meant, a link followed; `FileError` where none may be written."""
     real = Path(os.path.realpath(target))
-    if real.exists() and not real.is_file():
-        kind = "a folder" if real.is_dir() else "not a regular file"
+    try:
+        found = os.stat(real)
+    except FileNotFoundError:
+        if not real.parent.is_dir():
+            folder = real.parent if os.path.islink(target) else target.parent
+            raise FileError(f"{target}: cannot be written: there is no folder {folder}") from None
+        return real
+    except OSError as error:
+        raise FileError(f"{shown(target)}: cannot be written: {reason(error)}") from None
+    if not stat.S_ISREG(found.st_mode):
+        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "not a regular file"
         raise FileError(f"{target}: is {kind}; give the name of a file")
+    for path in _inputs:
+        if os.path.exists(path) and os.path.samestat(os.stat(path), found):
+            raise FileError(f"{target} is the input file {path}; name another to write")
     return real
+
+
+def check_place(target: Path, endings: tuple[str, ...] = ()) -> None:
+    """Raise `FileError` where no file can be written there, before work is done for it."""
+    if endings:
+        check_ending(target, endings)
+    try:
+        with tempfile.TemporaryFile(prefix=".fflin-", dir=place(target).parent):
+            pass
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(f"{target}: cannot be written: {reason(error)}") from None
+
+
+def reserve(path: Path) -> None:
+    """Give a file the room on the disk that its size says, or raise `OSError`."""
+    if hasattr(os, "posix_fallocate"):
+        with path.open("r+b") as file:
+            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+
+
+def reason(error: Exception) -> str:
+    """Return why a file could not be opened, in a line."""
+    said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return " ".join(said.split())
+
+
+def shown(path: str | Path) -> str:
+    """Show a path in an error; one that is too long for a file by its ends."""
+    text = str(path)
+    return text if len(text) < 500 else f"{text[:60]} ... {text[-60:]}"
 
 
 def _umask() -> int:

@@ -73,7 +73,7 @@ class ChunkJob:
         self._count = count
         self.linearizer = Linearizer(robot, frame=frame, reference=reference, moving=moving)
         # There all but M^-1 is known beforehand.
-        self.only_inertia = at_rest and reference is None and self.linearizer._free
+        self.only_inertia = at_rest and reference is None and self.linearizer.prepared.free
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuilt, self._arguments
@@ -81,14 +81,15 @@ class ChunkJob:
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of each array that differs from point to point, for one point."""
-        common, nx = self.linearizer._common, self.linearizer._map.nx
-        ny, nu = len(common["output_names"]), len(common["input_names"])
+        prepared = self.linearizer.prepared
+        nx, nu = prepared.map.nx, len(prepared.actuation.names)
+        ny = len(prepared.common["output_names"])
         shapes: dict[str, tuple[int, ...]] = {"B_lower": (nx // 2, nu)}
         if not self.only_inertia:
             shapes |= {"A": (nx, nx), "f0": (nx,), "_x0": (nx,)}
-            if self.linearizer._moving:
+            if prepared.moving:
                 shapes["_drift"] = (nx,)
-            if self.linearizer._sensing is not None:
+            if prepared.sensing is not None:
                 shapes |= {"C": (ny, nx), "D": (ny, nu), "_y0": (ny,)}
         return shapes
 
@@ -115,10 +116,10 @@ class ChunkJob:
         return Chunk(dict(out), self._anywhere(points, start, out))
 
     def _at_rest(self, q: Array, start: int, out: Array) -> list[str]:
-        actuation, state = self.linearizer._actuation, self.linearizer._map
+        actuation, nv = self.linearizer.prepared.actuation, 6 + self.linearizer.robot.n
         inverse = out
         if not actuation.default:
-            inverse = np.empty((len(q), state.nx // 2, state.nx // 2))
+            inverse = np.empty((len(q), nv, nv))
         # Without joints M is the same everywhere.
         rigid = not self.linearizer.robot.n
         left: Rows = np.arange(1) if rigid else self._inertia.compiled(q, inverse)
@@ -132,7 +133,7 @@ class ChunkJob:
         if rigid:
             inverse[1:] = inverse[0]
         if inverse is not out and not actuation.carried:
-            np.matmul(inverse, actuation.columns(self.linearizer._data, q[0]), out=out)
+            np.matmul(inverse, actuation.fixed, out=out)
         elif inverse is not out:
             data = self.linearizer.robot.create_data()
             for row, point in enumerate(q):
@@ -143,7 +144,7 @@ class ChunkJob:
         return [str(note.message) for note in notes]
 
     def _anywhere(self, points: Points, start: int, out: Mapping[str, Array]) -> list[str]:
-        nv = self.linearizer._map.nx // 2
+        nv = 6 + self.linearizer.robot.n
         left: Rows = np.arange(len(points.q))
         if self._equations is not None:
             left = self._equations.write(*points, out)

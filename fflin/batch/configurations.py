@@ -15,8 +15,9 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, number
+from fflin.dynamics.points import configuration
 from fflin.robot.joints import Joint
-from fflin.robot.robot import Robot, configuration
+from fflin.robot.robot import Robot
 
 # Random rows are drawn in blocks of this many, so that they do not depend on how they are read.
 _DRAWN = 4096

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from fflin.base.rotation import product_matrix, rotation_matrices
 from fflin.base.validation import Array
 from fflin.batch.inertia import FARTHEST, Rows
-from fflin.dynamics.chart import SMALLEST_Q0, Chart
+from fflin.dynamics.chart import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.inertia import Inertia
-from fflin.kernel.accelerations import BatchRates, Points, Rates
+from fflin.dynamics.rnea import Rates
+from fflin.kernel.accelerations import BatchRates, Points, Written
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.linear.linearization import LARGEST, Linearizer
-from fflin.linear.state_equations import STANDING, Point, ride_along, state_equations, turned
+from fflin.linear.state_equations import assemble, drift
 from fflin.robot.frames import ROOT
 
 # Points that are done at a time, so that what is computed on the way stays in the cache.
@@ -32,8 +33,8 @@ class BatchEquations:
     """
 
     def __init__(self, linearizer: Linearizer) -> None:
-        self._linearizer = linearizer
-        self._state, self._actuation = linearizer._map, linearizer._actuation
+        self._prepared = linearizer.prepared
+        self._state, self._actuation = self._prepared.map, self._prepared.actuation
         self._rates = BatchRates(self._state, self._actuation)
         robot = linearizer.robot
         self._root = robot.model.jointPlacements[ROOT].rotation
@@ -42,7 +43,7 @@ class BatchEquations:
     @staticmethod
     def possible(linearizer: Linearizer) -> bool:
         """Whether the kernel knows the robot's joints, and no output is to be differentiated."""
-        return linearizer._sensing is None and batch_tree(linearizer.robot) is not None
+        return linearizer.prepared.sensing is None and batch_tree(linearizer.robot) is not None
 
     def write(self, q: Array, v: Array | None, u: Array | None, out: Mapping[str, Array]) -> Rows:
         """Write what differs from point to point, and return the rows that are left.
@@ -74,38 +75,32 @@ class BatchEquations:
     def _block(self, q: Array, nu: Array, u: Array, out: Mapping[str, Array]) -> NDArray[np.bool_]:
         state, groups, nv = self._state, self._state.groups, self._state.nx // 2
         q_m = state.joint_positions(q)
-        chart, within = self._chart(q)
+        chart, r_b, within = self._place(q)
         u_base = self._actuation.in_base_axes(chart, u)
         stiffness, damping, rest = state.robot.passive
         forces = u_base @ self._actuation.fixed.T
         forces[:, 6:] -= stiffness * (q_m - rest) + damping * nu[:, 6:]
         A, B = out["A"], out["B_lower"]
-        A[:] = self._linearizer._A_rest
-        rates = self._evaluate(Points(q, nu, forces, u_base), A)
-        self._set_inputs(rates, B)
-        point = Point(nu, u_base, rates.c, self._gravity(q))
-        out["f0"][:] = state_equations(state, self._actuation, chart, point, A, B)
-        if "_drift" in out:
-            out["_drift"][:] = ride_along(state, point, A, out["f0"])
-        x0 = out["_x0"]
-        x0[:, :6] = 0.0
-        x0[:, groups.q_m] = q_m
-        x0[:, nv:] = nu
-        if chart is not STANDING:
-            x0[:, groups.q_b] = chart.q_b
-            x0[:, groups.r_b] = state.positions(q)
-            for part, held in zip((groups.omega_b, groups.v_b), state.axes, strict=True):
-                if held:
-                    x0[:, part] = turned(chart.R, x0[:, part])
+        A[:] = self._prepared.rest["A"]
+        written = self._evaluate(Points(q, nu, forces, u_base), A)
+        self._set_inputs(written, B)
+        lower = A[:, nv:]
+        rates = Rates(written.c, lower[..., groups.q_m], lower[..., nv:], B, self._gravity(q))
+        moving = self._prepared.moving
+        f0 = assemble(state, self._actuation, chart, nu, u_base, rates, A, B, moving=moving)
+        if moving:
+            out["_drift"][:] = drift(state, f0, rates.gravity)
+        out["f0"][:] = 0.0 if moving else f0
+        out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
         good = within & (np.abs(q[:, 7:]) < FARTHEST).all(axis=1)
-        good &= self._least_coupling < rates.couplings
-        good &= rates.couplings < Inertia.warning_coupling
+        good &= self._least_coupling < written.couplings
+        good &= written.couplings < Inertia.warning_coupling
         # What is not finite shows in these, NaN too.
         for array in (A[:, nv:], B, out["f0"][:, None]):
             good &= np.einsum("ijk,ijk->i", array, array) < LARGEST
         return good
 
-    def _evaluate(self, points: Points, A: Array) -> Rates:
+    def _evaluate(self, points: Points, A: Array) -> Written:
         """Return the rates, their slopes in the lower half of A."""
         count, nv = points.nu.shape
         carried = len(self._rates.carried)
@@ -114,8 +109,8 @@ class BatchEquations:
             slopes: Array = np.zeros((LANES, *A.shape[1:]))
             rates = self._evaluate(filled, slopes)
             A[:, nv:] = slopes[:count, nv:]
-            return Rates(*(array[:count] for array in rates))
-        rates = Rates(
+            return Written(*(array[:count] for array in rates))
+        rates = Written(
             np.empty((count, nv, nv)),
             np.empty((count, nv)),
             A.reshape(count, -1),
@@ -125,7 +120,7 @@ class BatchEquations:
         self._rates.evaluate(points, rates)
         return rates
 
-    def _set_inputs(self, rates: Rates, B: Array) -> None:
+    def _set_inputs(self, rates: Written, B: Array) -> None:
         if self._actuation.default:
             B[:] = rates.inverse
             return
@@ -135,16 +130,17 @@ class BatchEquations:
             columns = rates.columns.reshape(len(B), -1, len(carried))
             B[:, :, carried] = rates.inverse @ columns
 
-    def _chart(self, q: Array) -> tuple[Chart, NDArray[np.bool_]]:
-        """Return the chart at each configuration, and where it reaches."""
-        if self._linearizer._own_reference:
-            return STANDING, np.ones(len(q), dtype=bool)
+    def _place(self, q: Array) -> tuple[Chart, Array, NDArray[np.bool_]]:
+        """Return the chart and the base's position, and where the chart reaches."""
+        if self._prepared.own_reference:
+            chart: Chart = Standing(len(q))
+            return chart, chart.q_b, np.ones(len(q), dtype=bool)
         quaternions = q[:, 3:7] @ product_matrix(self._state.origin_quaternion).T
         quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
         quaternions[quaternions[:, 3] < 0.0] *= -1.0
         q0 = quaternions[:, 3:]
         chart = Chart(quaternions[:, :3], q0, rotation_matrices(quaternions))
-        return chart, q0[:, 0] >= SMALLEST_Q0
+        return chart, self._state.positions(q), q0[:, 0] >= SMALLEST_Q0
 
     def _gravity(self, q: Array) -> Array:
         gravity = np.array(self._state.robot.gravity)

@@ -1,29 +1,34 @@
-"""Batches on disk: npz, and HDF5 whose arrays are read as they are used."""
+"""Batches on disk: npz, and HDF5 whose arrays are read as they are used.
+
+An HDF5 file has a dataset for each array, ``chunk_sha256`` of the rows of so many points as its
+attribute ``chunk`` says, and ``sha256`` of all else and of those.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
-import tempfile
-import zlib
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from tokenize import TokenError
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fflin.base.errors import FileError, InputError, MissingPackageError
+from fflin.base.errors import MissingPackageError
+from fflin.base.record import DAMAGED, SEAL, check_seal, content_digest, reading
 from fflin.base.validation import Array
-from fflin.batch.linear_batch import LinearBatch, is_constant
-
-if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
+from fflin.base.writing import check_ending, replacing
 
 FORMATS = (".npz", ".h5")
 
 # The version of HDF5 from which the file's own records have checksums: without them, a damaged
 # file can take the process with it.
 CHECKED = ("v108", "v108")
+
+CHUNK_SEALS = f"chunk_{SEAL}"
+_CHUNK_BYTES = 2**22
 
 # Fields of a batch that are text or lists of it; they stand in the file as one JSON document.
 _TEXTS = (
@@ -38,8 +43,7 @@ _MAYBE = ("_x0", "_y0", "_reference", "_drift")
 
 def check_format(path: Path) -> None:
     """Raise where the ending says no known format, or h5py is needed and not installed."""
-    if path.suffix not in FORMATS:
-        raise FileError(f"'{path}' ends in '{path.suffix}', expected one of {', '.join(FORMATS)}")
+    check_ending(path, FORMATS)
     if path.suffix == ".h5":
         hdf5()
 
@@ -61,99 +65,125 @@ def hdf5() -> Any:
     return h5py
 
 
-def header(batch: LinearBatch) -> str:
-    """Return what of a batch is text, as JSON."""
-    record = {key: getattr(batch, key) for key in _TEXTS}
-    record["_ignorable"] = batch[0].ignorable
-    return json.dumps({**record, "points": len(batch), "columns": batch._columns})
+def is_constant(array: Array) -> bool:
+    """Whether all rows of an array of a batch are one row, held once."""
+    return array.strides[0] == 0
 
 
-def save_batch(batch: LinearBatch, path: Path) -> None:
-    """Write a batch; see `LinearBatch.save`."""
+def header(batch: Any, count: int) -> str:
+    """Return what of a `LinearBatch` of so many points is text, as JSON."""
+    texts = {key: getattr(batch, key) for key in _TEXTS}
+    texts["_ignorable"] = batch[0].ignorable
+    return json.dumps({**texts, "points": count, "columns": batch.columns})
+
+
+def write_batch(path: Path, arrays: Mapping[str, Array], header: str) -> None:
+    """Write the arrays of a batch; see `LinearBatch.save`."""
     check_format(path)
-    if not len(batch):
-        raise InputError("the batch has no points; there is nothing to save")
-    arrays = batch._arrays()
-    held = {key: value[0] if is_constant(value) else value for key, value in arrays.items()}
-    constant = json.dumps([key for key, value in arrays.items() if is_constant(value)])
-    texts = {"header": header(batch), "constant": constant}
-    real = Path(os.path.realpath(path))
-    temporary = None
-    try:
-        handle, name = tempfile.mkstemp(prefix=".fflin-", suffix=path.suffix, dir=real.parent)
-        os.close(handle)
-        temporary = Path(name)
+    constants = {key: value[0] for key, value in arrays.items() if is_constant(value)}
+    varying = {key: value for key, value in arrays.items() if key not in constants}
+    texts = {"header": header, "constant": json.dumps(list(constants))}
+    with replacing(path) as (new,):
         if path.suffix == ".npz":
-            plain: dict[str, Any] = {**held, **texts}
-            np.savez(temporary, **plain)
-        else:
-            with hdf5().File(temporary, "w", libver=CHECKED) as file:
-                for key, value in held.items():
-                    file.create_dataset(key, data=value)
-                file.attrs.update(texts)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, real)
-    except OSError as error:
-        raise FileError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
+            plain: dict[str, Any] = {**varying, **constants, **texts}
+            with new.open("wb") as file:
+                plain[SEAL] = content_digest(plain)
+                np.savez(file, **plain)
+            return
+        count = len(arrays["q"])
+        row = sum(value.nbytes // count for value in varying.values())
+        chunk = max(1, _CHUNK_BYTES // row)
+        seals = chunk_seals(varying, count, chunk)
+        with hdf5().File(new, "w", libver=CHECKED) as file:
+            for key, value in {**varying, **constants, CHUNK_SEALS: seals}.items():
+                file.create_dataset(key, data=value)
+            file.create_dataset(SEAL, data=batch_seal(texts, chunk, seals, constants))
+            file.attrs.update(texts)
+            file.attrs["chunk"] = chunk
 
 
-def load_batch(path: Path, robot: Robot | None = None, *, suffix: str | None = None) -> LinearBatch:
-    """Read a batch; see `LinearBatch.load`. `suffix` tells the format where the name does not."""
-    if suffix is None:
-        check_format(path)
-    try:
-        arrays, texts = (_from_npz if (suffix or path.suffix) == ".npz" else _from_hdf5)(path)
-        batch = _batch(arrays, json.loads(texts["header"]), json.loads(texts["constant"]), robot)
-    except FileNotFoundError:
-        raise FileError(f"{path}: cannot be read: No such file or directory") from None
-    except InputError:
-        raise
-    except _UNREADABLE as error:
-        raise FileError(f"{path}: not a batch saved by fflin ({error})") from None
-    return batch
+def chunk_seal(arrays: Mapping[str, Array]) -> bytes:
+    """Return the SHA-256 of the rows of some points."""
+    digest = hashlib.sha256()
+    for _, rows in sorted(arrays.items()):
+        digest.update(np.ascontiguousarray(rows).data)
+    return digest.digest()
 
 
-_UNREADABLE = (
-    *(OSError, KeyError, ValueError, TypeError, IndexError, AttributeError, EOFError),
-    *(OverflowError, RuntimeError, SyntaxError, zlib.error, TokenError),
-)
+def chunk_seals(varying: Mapping[str, Array], count: int, chunk: int) -> NDArray[np.uint8]:
+    """Return the SHA-256 (chunks, 32) of the rows of each chunk."""
+
+    def seal(start: int) -> bytes:
+        return chunk_seal({key: value[start : start + chunk] for key, value in varying.items()})
+
+    # Hashing lets other threads run.
+    with ThreadPoolExecutor() as pool:
+        seals = b"".join(pool.map(seal, range(0, count, chunk)))
+    return np.frombuffer(seals, np.uint8).reshape(-1, 32)
 
 
-def _from_npz(path: Path) -> tuple[dict[str, Array], dict[str, str]]:
-    from zipfile import BadZipFile
-
-    try:
-        # Opened here, since NumPy leaves a damaged file open.
-        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
-            texts = {key: str(file[key]) for key in ("header", "constant")}
-            return {key: file[key] for key in file.files if key not in texts}, texts
-    except BadZipFile as error:
-        raise ValueError(str(error)) from None
+def batch_seal(
+    texts: Mapping[str, str], chunk: int, seals: Any, constants: Mapping[str, Array]
+) -> NDArray[np.uint8]:
+    """Return the SHA-256 (32,) of all of a file, its rows by those of their chunks."""
+    whole = content_digest({**texts, "chunk": chunk, CHUNK_SEALS: seals, **constants})
+    return np.frombuffer(bytes.fromhex(whole), np.uint8)
 
 
-def _from_hdf5(path: Path) -> tuple[dict[str, Array], dict[str, str]]:
+def read_batch(path: Path, *, verify: bool = True) -> dict[str, Any]:
+    """Return the fields of a batch, but for its robot; see `LinearBatch.load`."""
+    with reading(path, "batch"):
+        with path.open("rb") as file:
+            zipped = file.read(2) == b"PK"
+        if not zipped and path.suffix == ".npz":
+            raise ValueError("it is no zip archive")
+        arrays, texts, verified = (_from_npz if zipped else _from_hdf5)(path, verify)
+        constant = json.loads(texts["constant"])
+        return {**_fields(arrays, json.loads(texts["header"]), constant), "verified": verified}
+
+
+def _from_npz(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, str], bool]:
+    # Opened here, since NumPy leaves a damaged file open.
+    with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
+        entries = {key: file[key] for key in file.files}
+    verified = verify and check_seal(entries)
+    entries.pop(SEAL, None)
+    return entries, {key: str(entries.pop(key)) for key in ("header", "constant")}, verified
+
+
+def _from_hdf5(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, str], bool]:
     with hdf5().File(path, "r") as file:
         texts = {key: str(file.attrs[key]) for key in ("header", "constant")}
-        return {key: mapped(path, file[key]) for key in file}, texts
+        arrays = {key: mapped(path, file[key]) for key in file}
+        chunk = int(file.attrs.get("chunk", 0))
+    seal, seals = arrays.pop(SEAL, None), arrays.pop(CHUNK_SEALS, None)
+    if seal is None or seals is None or not verify:
+        return arrays, texts, False
+    constants = {key: arrays[key] for key in json.loads(texts["constant"])}
+    varying = {key: value for key, value in arrays.items() if key not in constants}
+    if (
+        chunk < 1
+        or not np.array_equal(seal, batch_seal(texts, chunk, seals, constants))
+        or not np.array_equal(seals, chunk_seals(varying, len(arrays["q"]), chunk))
+    ):
+        raise ValueError(DAMAGED)
+    return arrays, texts, True
 
 
-def mapped(path: Path, dataset: Any, mode: Any = "r") -> Array:
+def mapped(path: Path, dataset: Any) -> Array:
     """Return a contiguous dataset as an array that is read as it is used."""
     offset = dataset.id.get_offset()
     if offset is None or not dataset.size:
         return np.asarray(dataset[()])
     result: Array = np.memmap(
-        path, dtype=dataset.dtype, mode=mode, offset=offset, shape=dataset.shape
+        path, dtype=dataset.dtype, mode="r", offset=offset, shape=dataset.shape
     )
     return result
 
 
-def _batch(
-    arrays: dict[str, Array], record: dict[str, Any], constant: list[str], robot: Robot | None
-) -> LinearBatch:
+def _fields(
+    arrays: dict[str, Array], record: dict[str, Any], constant: list[str]
+) -> dict[str, Any]:
     count = int(record.pop("points"))
     columns = tuple((int(first), int(second)) for first, second in record.pop("columns"))
     rows: dict[str, Any] = {}
@@ -172,10 +202,4 @@ def _batch(
     for key, shape in shapes.items():
         if rows[key].shape[1:] != shape:
             raise ValueError(f"{key} has shape {rows[key].shape[1:]} a point, expected {shape}")
-    if robot is not None and (robot.urdf_sha256, robot.locked, robot.joint_names) != (
-        texts["urdf_sha256"],
-        texts["locked"],
-        tuple(name[4:] for name in texts["state_names"] if name.startswith("q_m.")),
-    ):
-        raise InputError(f"'{robot.name}' is not the robot that the batch is of")
-    return LinearBatch(**rows, **texts, _columns=columns, _system=robot)
+    return {**rows, **texts, "_columns": columns}

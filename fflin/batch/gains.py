@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.base.design import Design
 from fflin.base.errors import FflinError, InputError
+from fflin.base.record import Design
 from fflin.base.validation import Array, vector
+from fflin.batch.files import is_constant
 from fflin.batch.joint_columns import joint_columns, positions
-from fflin.batch.linear_batch import LinearBatch, is_constant
+from fflin.batch.linear_batch import LinearBatch
 from fflin.batch.riccati import gains_at_rest
 from fflin.control.lqr import lqr
 from fflin.control.policies import StateFeedback

@@ -11,7 +11,10 @@ from typing import TYPE_CHECKING, Any, NoReturn, overload
 import numpy as np
 
 from fflin.base.errors import InputError
+from fflin.base.record import NOT_VERIFIED
 from fflin.base.validation import Array, number
+from fflin.base.writing import as_path
+from fflin.batch.files import header, is_constant, read_batch, write_batch
 from fflin.batch.joint_columns import away, positions
 from fflin.linear.model import LinearModel
 
@@ -55,6 +58,9 @@ class LinearBatch:
         Name of the robot.
     urdf_sha256, fflin_version, pinocchio_version : str
     locked : tuple of str
+    verified : bool
+        Whether it is as it was made; False of a file that has no digest to tell damage by, or
+        that was not held against it.
     """
 
     A: Array
@@ -89,6 +95,7 @@ class LinearBatch:
     _ignorable: tuple[str, ...] | None
     _columns: tuple[tuple[int, int], ...]
     _system: Robot | None
+    verified: bool = True
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -107,6 +114,9 @@ class LinearBatch:
             f"LinearBatch('{self.robot}', {len(self)} points, nx={2 * nv}, nu={nu}, "
             f"frame='{self.frame}')"
         )
+
+    def __str__(self) -> str:
+        return repr(self) if self.verified else f"{self!r}\n{NOT_VERIFIED}"
 
     @overload
     def __getitem__(self, index: int) -> LinearModel: ...
@@ -152,6 +162,11 @@ class LinearBatch:
     def y0(self) -> Array:
         """Outputs at the points (N, ny)."""
         return self.x0 if self._y0 is None else self._y0
+
+    @property
+    def columns(self) -> tuple[tuple[int, int], ...]:
+        """Where each joint stands in q: (index, -1), or those of (cos, sin)."""
+        return self._columns
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -221,13 +236,12 @@ class LinearBatch:
         MissingPackageError
             If h5py is needed and not installed.
         """
-        from fflin.base.writing import as_path
-        from fflin.batch.files import save_batch
-
-        save_batch(self, as_path(path))
+        if not len(self):
+            raise InputError("the batch has no points; there is nothing to save")
+        write_batch(as_path(path), self._arrays(), header(self, len(self)))
 
     @staticmethod
-    def load(path: str | Path, robot: Robot | None = None) -> LinearBatch:
+    def load(path: str | Path, robot: Robot | None = None, *, verify: bool = True) -> LinearBatch:
         """Read a batch that `save` or `sweep` wrote; every figure is the same to the last bit.
 
         Parameters
@@ -235,20 +249,27 @@ class LinearBatch:
         path : str or Path
         robot : Robot, optional
             Whose it is, which the inertia M and the certificate of its models need.
+        verify : bool
+            Whether the rows are held against their SHA-256, for which all of them are read. If
+            not, a file of HDF5 is there at once, and the batch is not `verified`.
 
         Raises
         ------
         FileError
-            If the file cannot be read or is no such batch.
+            If the file cannot be read, is damaged or is no such batch.
         InputError
             If the robot is another.
         MissingPackageError
             If h5py is needed and not installed.
         """
-        from fflin.base.writing import as_path
-        from fflin.batch.files import load_batch
-
-        return load_batch(as_path(path), robot)
+        batch = LinearBatch(**read_batch(as_path(path), verify=verify), _system=robot)
+        if robot is not None and (robot.urdf_sha256, robot.locked, robot.joint_names) != (
+            batch.urdf_sha256,
+            batch.locked,
+            batch.joint_names,
+        ):
+            raise InputError(f"'{robot.name}' is not the robot that the batch is of")
+        return batch
 
     def _arrays(self) -> dict[str, Array]:
         """Return the arrays that are held, all with N rows, by the fields' names."""
@@ -284,12 +305,12 @@ class LinearBatch:
             for item in fields(self)
             if not item.name.startswith("_") and item.name not in rows and item.name != "B_lower"
         }
-        return LinearModel._from_fields(
+        return LinearModel.from_fields(
             rows
             | names
             | {"B": B, "x0": x0, "y0": x0 if y0 is None else y0, "dt": 0.0}
             | {"_inertia": inertia, "_certify": certify, "_drift": rows.get("_drift")}
-            | {"_ignorable": ignorable}
+            | {"_ignorable": ignorable, "_source": None}
         )
 
     def _rest_states(self, rows: slice) -> Array:
@@ -308,11 +329,6 @@ class LinearBatch:
             if name not in self.joint_names:
                 raise unknown("joint", name, self.joint_names)
         return {self.joint_names.index(name): value for name, value in joints.items()}
-
-
-def is_constant(array: Array) -> bool:
-    """Whether all rows of an array of a batch are one row, held once."""
-    return array.strides[0] == 0
 
 
 def _carried(root: Array, base: Array) -> Array:

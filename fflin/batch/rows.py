@@ -10,7 +10,7 @@ import numpy as np
 from fflin.base.errors import FflinError, InputError
 from fflin.base.validation import NORM_TOLERANCE, Array, as_double, dimension
 from fflin.batch.configurations import follow_rows
-from fflin.robot.robot import _ROUND_OFF, Robot
+from fflin.robot.robot import ROUND_OFF, Robot
 
 _BLOCK = 2048  # rows that are checked at once, so that what that takes is small
 
@@ -24,7 +24,7 @@ def checked_configurations(robot: Robot, q: Any) -> Array:
         If the shape is wrong or a row is no configuration; the message names it.
     """
     rows = _rows("q", q, robot.nq, "a configuration in Pinocchio's order each")
-    unbounded = list(robot._unbounded)
+    unbounded = list(robot.unbounded)
     for start in range(0, len(rows), _BLOCK):
         block = rows[start : start + _BLOCK]
         with np.errstate(all="ignore"):
@@ -34,7 +34,7 @@ def checked_configurations(robot: Robot, q: Any) -> Array:
             # The sum tells at once where all are finite.
             finite = np.isfinite(block.sum()) or np.isfinite(block).all(axis=1)
         # Written so that NaN is among them.
-        doubtful = ~((excess <= _ROUND_OFF) & finite)
+        doubtful = ~((excess <= ROUND_OFF) & finite)
         if robot.followers:
             followed = block.copy()
             follow_rows(robot, followed)

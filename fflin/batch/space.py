@@ -8,6 +8,9 @@ from pathlib import Path
 
 from fflin.base.errors import FileError, InputError
 
+# Of a file beside its rows: names, what is the same at all points, digests [bytes].
+_OVERHEAD = 2**16
+
 
 def check_room(count: int, size: int, path: Path | None) -> None:
     """Raise where so many points with a result of so many bytes do not fit.
@@ -42,11 +45,14 @@ def check_room(count: int, size: int, path: Path | None) -> None:
         if needed > (free := shutil.disk_usage(path.parent).free):
             needs = ", and .npz needs twice that on the way" if path.suffix == ".npz" else ""
             raise FileError(f"{said}{needs}: only {readable(free)} are free in {path.parent}")
+        if size + _OVERHEAD > (most := _largest_file()):
+            raise FileError(f"{said}: a file may have no more than {readable(most)} (ulimit -f)")
 
 
 def part_of(path: Path) -> Path:
-    """Return the file that a result grows in until it is whole."""
-    return path.with_name(path.name + ".part")
+    """Return the file that a result grows in until it is whole, beside what a link leads to."""
+    real = Path(os.path.realpath(path)) if os.path.islink(path) else path
+    return real.with_name(real.name + ".part")
 
 
 def readable(size: float) -> str:
@@ -55,6 +61,15 @@ def readable(size: float) -> str:
         if size >= scale:
             return f"{size / scale:,.1f} {unit}"
     return f"{size / 1e3:.1f} kB"
+
+
+def _largest_file() -> float:
+    try:
+        import resource
+    except ImportError:  # not on this system
+        return float("inf")
+    most = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return float("inf") if most == resource.RLIM_INFINITY else float(most)
 
 
 def _memory() -> float:

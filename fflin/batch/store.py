@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fflin.base.errors import FileError
+from fflin.base.record import SEAL
 from fflin.base.validation import Array
-from fflin.batch.files import CHECKED, hdf5
+from fflin.base.writing import check_place, install, reason, reserve
+from fflin.batch.files import CHECKED, CHUNK_SEALS, batch_seal, chunk_seal, hdf5
 from fflin.batch.space import part_of
 
 
@@ -54,8 +53,9 @@ class MemoryStore:
 class FileStore:
     """Arrays in an HDF5 file, NAME.part until it is whole.
 
-    Their place in the file is fixed from the start, so that a crash in the middle of a chunk
-    harms no other; a chunk counts as finished once its hash stands beside it.
+    Their place in the file is fixed and reserved from the start, so that a crash in the middle of
+    a chunk harms no other, and the disk does not fill up under it; a chunk counts as finished once
+    its hash stands beside it.
 
     Parameters
     ----------
@@ -67,6 +67,10 @@ class FileStore:
         Points, and points in a chunk.
     shapes : mapping
         Shape of each array for one point.
+    constants : mapping
+        Arrays that are the same at all points.
+    texts : mapping
+        Attributes of the file.
 
     Attributes
     ----------
@@ -90,22 +94,23 @@ class FileStore:
         count: int,
         chunk: int,
         shapes: Mapping[str, tuple[int, ...]],
+        constants: Mapping[str, Array],
+        texts: Mapping[str, str],
     ) -> None:
         self.path, self.part = path, part_of(path)
         self.chunk, self.names = chunk, tuple(shapes)
+        self._constants, self._texts = constants, texts
+        check_place(path)
+        check_place(self.part)
         self.resumed = self.part.exists()
         h5py = hdf5()
         try:
-            if self.path.is_dir():
-                raise FileError(f"{path}: is a folder; give the name of a file")
             self._file = h5py.File(self.part, "r+" if self.resumed else "x", libver=CHECKED)
-        except FileError:
-            raise
         except OSError as error:
             if self.resumed and "unable to lock" in str(error):
                 raise FileError(f"{self.part} is in use by another run; wait for it") from None
             hint = "; remove it to begin anew" * self.resumed
-            raise FileError(f"{self.part}: cannot be opened: {_short(error)}{hint}") from None
+            raise FileError(f"{self.part}: cannot be opened: {reason(error)}{hint}") from None
         if self.resumed:
             try:
                 self._go_on(request)
@@ -116,19 +121,29 @@ class FileStore:
         try:
             for key, shape in shapes.items():
                 _fixed(h5py, self._file, key, (count, *shape), np.float64)
-            _fixed(h5py, self._file, "finished", (-(-count // chunk), 32), np.uint8)
-            self._file["finished"][:] = 0
-            self._file.attrs["chunk"] = chunk
-            self._file.attrs["request"] = request
+            for key, value in constants.items():
+                self._file.create_dataset(key, data=value)
+            self._file[CHUNK_SEALS] = np.zeros((-(-count // chunk), 32), np.uint8)
+            self._file[SEAL] = np.zeros(32, np.uint8)
+            self._file.attrs.update({**texts, "chunk": chunk, "request": request})
             self._file.flush()
+            reserve(self.part)
         except OSError as error:
             self.discard()
-            raise FileError(f"{self.part}: cannot be written: {_short(error)}") from None
+            raise FileError(f"{self.part}: cannot be written: {reason(error)}") from None
 
     def _go_on(self, request: str) -> None:
         with self._readable():
             found = self._file.attrs.get("request")
             self.chunk = int(self._file.attrs.get("chunk", self.chunk))
+            if found == request:
+                for key, value in self._constants.items():
+                    if not np.array_equal(self._file[key][()], value):
+                        raise ValueError(f"{key} is another")
+                if any(self._file.attrs[key] != value for key, value in self._texts.items()):
+                    raise ValueError("its names are others")
+                if self._file[SEAL].shape != (32,):
+                    raise ValueError("its digest is none")
         if found != request:
             raise FileError(
                 f"{self.part} is what another sweep left behind; remove it, or choose another name"
@@ -145,8 +160,8 @@ class FileStore:
     def finished(self, start: int, stop: int) -> bool:
         """Whether a chunk is there, and is what was written."""
         with self._readable():
-            kept = self._file["finished"][start // self.chunk]
-            return bool(kept.any()) and kept.tobytes() == self._hash(
+            kept = self._file[CHUNK_SEALS][start // self.chunk]
+            return bool(kept.any()) and kept.tobytes() == chunk_seal(
                 {key: self._file[key][start:stop] for key in self.names}
             )
 
@@ -159,25 +174,24 @@ class FileStore:
             for key in self.names:
                 self._file[key][start:stop] = arrays[key]
             self._file.flush()
-            digest = np.frombuffer(self._hash(arrays), dtype=np.uint8)
-            self._file["finished"][start // self.chunk] = digest
+            seal = chunk_seal({key: arrays[key] for key in self.names})
+            self._file[CHUNK_SEALS][start // self.chunk] = np.frombuffer(seal, np.uint8)
             self._file.flush()
         except OSError as error:
-            raise FileError(f"{self.part}: cannot be written: {_short(error)}") from None
+            raise FileError(f"{self.part}: cannot be written: {reason(error)}") from None
 
-    def complete(self, constants: Mapping[str, Array], header: str, *, keep_name: bool) -> None:
-        """Add what is the same at all points, and, unless it is to be kept, change the name."""
+    def complete(self, *, keep_name: bool) -> None:
+        """Add the hash of all and, unless the name is to be kept, take the target's place."""
         try:
-            del self._file["finished"], self._file.attrs["request"], self._file.attrs["chunk"]
-            for key, value in constants.items():
-                self._file.create_dataset(key, data=value)
-            self._file.attrs["header"] = header
-            self._file.attrs["constant"] = json.dumps(list(constants))
+            seals = self._file[CHUNK_SEALS][:]
+            self._file[SEAL][:] = batch_seal(self._texts, self.chunk, seals, self._constants)
             self._file.close()
             if not keep_name:
-                os.replace(self.part, self.path)
+                install(self.part, self.path)
+        except FileError:
+            raise
         except OSError as error:
-            raise FileError(f"{self.path}: cannot be written: {_short(error)}") from None
+            raise FileError(f"{self.path}: cannot be written: {reason(error)}") from None
 
     def discard(self) -> None:
         """Leave nothing behind."""
@@ -187,12 +201,6 @@ class FileStore:
     def close(self) -> None:
         """Leave what there is for another run."""
         self._file.close()
-
-    def _hash(self, arrays: Mapping[str, Array]) -> bytes:
-        digest = sha256()
-        for key in self.names:
-            digest.update(np.ascontiguousarray(arrays[key]).data)
-        return digest.digest()
 
 
 def _fixed(h5py: Any, file: Any, name: str, shape: tuple[int, ...], dtype: Any) -> None:
@@ -204,7 +212,3 @@ def _fixed(h5py: Any, file: Any, name: str, shape: tuple[int, ...], dtype: Any) 
     kind = h5py.h5t.py_create(np.dtype(dtype), logical=True)
     space = h5py.h5s.create_simple(shape)
     h5py.h5d.create(file.id, name.encode(), kind, space, properties)
-
-
-def _short(error: OSError) -> str:
-    return error.strerror or " ".join(str(error).split())

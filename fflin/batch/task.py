@@ -34,7 +34,7 @@ class SweepTask:
     def __init__(self, job: ChunkJob, configurations: Configurations, v: Any, u: Any) -> None:
         self.job, self.robot = job, job.linearizer.robot
         self.configurations, self.count = configurations, len(configurations)
-        names = job.linearizer._actuation.names
+        names = job.linearizer.prepared.actuation.names
         self.v = None if v is None else checked_velocities(self.robot, v, self.count)
         self.u = None if u is None else checked_inputs(names, u, self.count)
 
@@ -52,19 +52,19 @@ class SweepTask:
 
     def constants(self, varying: Iterable[str]) -> dict[str, Array]:
         """Return what is the same at all points, a row of each."""
-        linearizer = self.job.linearizer
-        common, root = linearizer._common, self.robot.model.jointPlacements[ROOT]
+        prepared, root = self.job.linearizer.prepared, self.robot.model.jointPlacements[ROOT]
         rows: dict[str, Array] = {
-            "A": linearizer._A_rest,
-            "C": common["C"],
-            "D": common["D"],
-            "f0": linearizer._zero_x,
-            "u0": linearizer._zero_u if self.u is None else self.u[0],
-            "v": linearizer._zero_v if self.v is None else self.v[0],
+            **prepared.rest,
+            "C": prepared.common["C"],
+            "D": prepared.common["D"],
             "_root": _NOWHERE if root.isIdentity(0.0) else pin.SE3ToXYZQUAT(root),
         }
-        if not linearizer._own_reference:
-            rows["_reference"] = linearizer._reference
+        if self.u is not None:
+            rows["u0"] = self.u[0]
+        if self.v is not None:
+            rows["v"] = self.v[0]
+        if not prepared.own_reference:
+            rows["_reference"] = prepared.reference
         return {key: value for key, value in rows.items() if key not in varying}
 
     def batch(self, arrays: Mapping[str, Array]) -> LinearBatch:
@@ -74,7 +74,7 @@ class SweepTask:
             key: np.broadcast_to(value, (count, *value.shape))
             for key, value in self.constants(arrays).items()
         }
-        common = self.job.linearizer._common
+        common = self.job.linearizer.prepared.common
         absent: dict[str, Any] = dict.fromkeys(("_x0", "_y0", "_reference", "_drift"))
         return LinearBatch(
             **absent | rows | dict(arrays),
@@ -87,20 +87,20 @@ class SweepTask:
     @property
     def request(self) -> str:
         """Hash of all that the result depends on."""
-        robot, linearizer = self.robot, self.job.linearizer
+        robot, prepared = self.robot, self.job.linearizer.prepared
         model = robot.model
         digest = sha256(
             repr(
                 [getattr(robot, key) for key in _OF_THE_ROBOT]
                 + [dict(getattr(robot, key)) for key in ("stiffness", "damping", "rest")]
-                + [linearizer._map.frame, linearizer._moving, linearizer._own_reference]
+                + [prepared.map.frame, prepared.moving, prepared.own_reference]
                 + [self.job.only_inertia, __version__, pin.__version__]
             ).encode()
         )
         for inertia, placement in zip(model.inertias, model.jointPlacements, strict=True):
             digest.update(inertia.toDynamicParameters().tobytes())
             digest.update(placement.homogeneous.tobytes())
-        digest.update(linearizer._reference.tobytes())
+        digest.update(prepared.reference.tobytes())
         digest.update(f"{self.count} {self.configurations.fingerprint}".encode())
         for rows in (self.v, self.u):
             digest.update(b"none" if rows is None else np.ascontiguousarray(rows).data)

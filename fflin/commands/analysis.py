@@ -1,4 +1,4 @@
-"""The commands that say what a linear model is worth: its structure, and how far it reaches."""
+"""The commands that say what a linear model is worth: structure, modes, and how far it reaches."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fflin.base.errors import InputError
 from fflin.commands import DONE
 from fflin.commands.arguments import Commands, add_point, command, number
 from fflin.commands.points import linear_model
-from fflin.commands.regulator import add_weights, gain_of
+from fflin.commands.regulator import add_weights, gain_of, regulated_part
 from fflin.commands.visual import check_figure
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: Commands) -> None:
-    """Add analyze and validity."""
+    """Add analyze, modes and validity."""
     analyze = command(
         commands,
         "analyze",
@@ -28,6 +28,14 @@ def add_commands(commands: Commands) -> None:
         "fflin analyze servicer_7dof --stiffness panel_left=100 --output joints",
     )
     add_point(analyze)
+    modes = command(
+        commands,
+        "modes",
+        _modes,
+        "show natural frequencies, damping ratios and time constants",
+        "fflin modes servicer_7dof --stiffness panel_left=100 --stiffness panel_right=100",
+    )
+    add_point(modes)
     validity = command(
         commands,
         "validity",
@@ -37,35 +45,16 @@ def add_commands(commands: Commands) -> None:
     )
     add_point(validity)
     add_weights(validity)
-    validity.add_argument(
-        "--reduce",
-        action="store_true",
-        help="judge the part that the inputs can hold where momentum is conserved",
-    )
-    for name, default, what in (
-        ("attitude", 90.0, "largest turn of the base [deg]"),
-        ("offset", 0.5, "largest displacement of the base [m]"),
-        ("spread", 1.0, "largest displacement of a joint [rad|m]"),
+    for name, metavar, read, default, what in (
+        ("attitude", "X", number, 90.0, "largest turn of the base [deg]"),
+        ("offset", "X", number, 0.5, "largest displacement of the base [m]"),
+        ("spread", "X", number, 1.0, "largest displacement of a joint [rad|m]"),
+        ("samples", "N", int, 100, "random runs"),
+        ("seed", "N", int, 0, "seed of the random runs"),
+        ("jobs", "N", int, 1, "processes, at most one for each core"),
     ):
-        validity.add_argument(
-            f"--{name}",
-            metavar="X",
-            type=number,
-            default=default,
-            help=f"{what}; {default:g} by default",
-        )
-    for name, default, what in (
-        ("samples", 100, "random runs"),
-        ("seed", 0, "seed of the random runs"),
-        ("jobs", 1, "processes, at most one for each core"),
-    ):
-        validity.add_argument(
-            f"--{name}",
-            metavar="N",
-            type=int,
-            default=default,
-            help=f"{what}; {default} by default",
-        )
+        help = f"{what}; {default:g} by default"
+        validity.add_argument(f"--{name}", metavar=metavar, type=read, default=default, help=help)
     validity.add_argument(
         "--plot", metavar="FILE", type=Path, help="draw it into FILE: .png, .pdf or .svg"
     )
@@ -84,6 +73,14 @@ def _analyze(arguments: argparse.Namespace) -> int:
         "outputs": str(observability(lin)),
     }
     print("\n\n".join(f"{title}\n{'-' * len(title)}\n{text}" for title, text in parts.items()))
+    return DONE
+
+
+def _modes(arguments: argparse.Namespace) -> int:
+    from fflin.analysis.modes import modes
+
+    _, lin = linear_model(arguments)
+    print(modes(lin))
     return DONE
 
 
@@ -110,17 +107,16 @@ def _momentum(lin: LinearModel) -> str:
 
 
 def _validity(arguments: argparse.Namespace) -> int:
-    from fflin.analysis.momentum import momentum_reduction
     from fflin.analysis.validity import validity
     from fflin.base.progress import Progress
     from fflin.batch.workers import OwnWorkers
 
     if arguments.jobs < 1:
         raise InputError(f"--jobs is {arguments.jobs}, expected at least 1")
+    robot, lin = linear_model(arguments)
     if arguments.plot:
         check_figure(arguments.plot)
-    robot, lin = linear_model(arguments)
-    lin = momentum_reduction(lin) if arguments.reduce else lin
+    lin = regulated_part(lin, arguments)
     gain = gain_of(lin, arguments)
     judged = lin.discretize(arguments.dt) if arguments.dt else lin
     bar = Progress()

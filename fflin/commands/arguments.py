@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
+Container: TypeAlias = "argparse._ActionsContainer"
 
 
 def number(text: str) -> float:
@@ -60,20 +61,40 @@ def command(
     return command
 
 
+def add_values(
+    command: Container,
+    option: str,
+    help: str,
+    *,
+    metavar: str = "NAME=VALUE",
+    read: Callable[[str], Any] = assignment,
+) -> None:
+    """Add an option that may be given several times; none by default."""
+    command.add_argument(
+        option, metavar=metavar, type=read, action="append", default=[], help=f"{help} (repeatable)"
+    )
+
+
+def _add_vector(
+    command: Container, option: str, entries: str, help: str, default: Any = (0.0, 0.0, 0.0)
+) -> None:
+    """Add an option of three numbers, which its help calls by these letters."""
+    command.add_argument(
+        option, nargs=3, type=number, default=default, metavar=tuple(entries), help=help
+    )
+
+
 def add_robot(command: argparse.ArgumentParser) -> None:
     """Add ROBOT and --lock."""
     command.add_argument(
-        "robot",
-        metavar="ROBOT",
-        help="a name of `fflin robots`, or the path of a URDF",
+        "robot", metavar="ROBOT", help="a name of `fflin robots`, or the path of a URDF"
     )
-    command.add_argument(
+    add_values(
+        command,
         "--lock",
+        "weld a joint, at VALUE [rad|m] or at neutral",
         metavar="NAME[=VALUE]",
-        type=lock,
-        action="append",
-        default=[],
-        help="weld a joint, at VALUE [rad|m] or at neutral (repeatable)",
+        read=lock,
     )
 
 
@@ -83,6 +104,11 @@ def add_point(command: argparse.ArgumentParser) -> None:
     add_pose(command)
     add_system(command)
     add_inputs_there(command)
+    add_reference(command)
+
+
+def add_reference(command: argparse.ArgumentParser) -> None:
+    """Add what attitude and position are relative to."""
     command.add_argument(
         "--reference",
         choices=("base", "world"),
@@ -94,50 +120,21 @@ def add_point(command: argparse.ArgumentParser) -> None:
 
 def add_pose(command: argparse.ArgumentParser) -> None:
     """Add what says where the robot is and how it moves."""
-    command.add_argument(
-        "--joint",
-        metavar="NAME=VALUE",
-        type=assignment,
-        action="append",
-        default=[],
-        help="put a joint at VALUE [rad|m] (repeatable); the others are at neutral",
-    )
-    command.add_argument(
-        "--rpy",
-        nargs=3,
-        type=number,
-        default=(0.0, 0.0, 0.0),
-        metavar=("R", "P", "Y"),
-        help="base attitude: roll, pitch, yaw [deg] about fixed axes",
-    )
-    command.add_argument(
-        "--position",
-        nargs=3,
-        type=number,
-        default=(0.0, 0.0, 0.0),
-        metavar=("X", "Y", "Z"),
-        help="base position [m]",
-    )
-    command.add_argument(
+    add_values(command, "--joint", "put a joint at VALUE [rad|m]; the others are at neutral")
+    _add_vector(command, "--rpy", "RPY", "base attitude: roll, pitch, yaw [deg] about fixed axes")
+    _add_vector(command, "--position", "XYZ", "base position [m]")
+    add_values(
+        command,
         "--velocity",
-        metavar="NAME=VALUE",
-        type=assignment,
-        action="append",
-        default=[],
-        help="a velocity at the point (repeatable): the rate [rad/s|m/s] of a joint or "
-        "wheel, or omega_b.x ... v_b.z of the base in base axes",
+        "a velocity at the point: the rate [rad/s|m/s] of a joint or wheel, or omega_b.x ... "
+        "v_b.z of the base in base axes",
     )
 
 
 def add_inputs_there(command: argparse.ArgumentParser) -> None:
     """Add what says the inputs at the point."""
-    command.add_argument(
-        "--effort",
-        metavar="NAME=VALUE",
-        type=assignment,
-        action="append",
-        default=[],
-        help="an input at the point (repeatable), by its name in u, such as tau_m.joint_1",
+    add_values(
+        command, "--effort", "an input at the point, by its name in u, such as tau_m.joint_1"
     )
     command.add_argument(
         "--equilibrium",
@@ -150,21 +147,20 @@ def add_inputs_there(command: argparse.ArgumentParser) -> None:
 def add_system(command: argparse.ArgumentParser) -> None:
     """Add what acts on the robot, what is watched of it, and in which axes."""
     for name, unit in (("stiffness", "N m/rad|N/m"), ("damping", "N m s/rad|N s/m")):
-        command.add_argument(
+        add_values(
+            command,
             f"--{name}",
-            metavar="[NAME=]VALUE",
-            type=passive,
-            action="append",
-            default=[],
-            help=f"{name} of a joint [{unit}] (repeatable), or one value for all joints"
+            f"{name} of a joint [{unit}], or one value for all joints"
             + ("; `urdf`: what the URDF says" if name == "damping" else ""),
+            metavar="[NAME=]VALUE",
+            read=passive,
         )
-    command.add_argument(
+    _add_vector(
+        command,
         "--gravity",
-        nargs=3,
-        type=number,
-        metavar=("X", "Y", "Z"),
-        help="uniform gravity in world axes [m/s^2]; none by default",
+        "XYZ",
+        "uniform gravity in world axes [m/s^2]; none by default",
+        default=None,
     )
     command.add_argument(
         "--inputs",
@@ -173,14 +169,14 @@ def add_system(command: argparse.ArgumentParser) -> None:
         "bundled one; `joints` or `base`: those alone; by default torque and force on the base "
         "and every joint's",
     )
-    command.add_argument(
+    add_values(
+        command,
         "--output",
+        "what is watched: state (default), base, joints, rates, com, momentum, frame:NAME (pose "
+        "and velocity), pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME; "
+        "relative:NAME:TO, as another frame sees it",
         metavar="SPEC",
-        action="append",
-        default=[],
-        help="what is watched (repeatable): state (default), base, joints, rates, com, momentum, "
-        "frame:NAME (pose and velocity), pose:NAME, velocity:NAME, gyroscope:NAME, "
-        "accelerometer:NAME; relative:NAME:TO, as another frame sees it",
+        read=str,
     )
     command.add_argument(
         "--frame",

@@ -18,7 +18,6 @@ from fflin.commands import (
     DONE,
     analysis,
     models,
-    modes,
     regulator,
     simulation,
     sweeps,
@@ -95,7 +94,6 @@ def _parser() -> argparse.ArgumentParser:
     models.add_commands(commands)
     analysis.add_commands(commands)
     regulator.add_commands(commands)
-    modes.add_commands(commands)
     simulation.add_commands(commands)
     visual.add_commands(commands)
     sweeps.add_commands(commands)

@@ -83,14 +83,15 @@ def _info(arguments: argparse.Namespace) -> int:
 
 def _linearize(arguments: argparse.Namespace) -> int:
     if arguments.output_file:
-        from fflin.linear.files import check_format, save_model
+        from fflin.base.writing import check_place
+        from fflin.linear.files import FORMATS
 
-        check_format(arguments.output_file)
-    robot, lin = linear_model(arguments)
+        check_place(arguments.output_file, FORMATS)
+    _, lin = linear_model(arguments)
     if arguments.dt is not None:
         lin = lin.discretize(arguments.dt)
     if arguments.output_file:
-        save_model(lin, arguments.output_file, spare=robot.urdf)
+        lin.save(arguments.output_file)
         print(f"wrote {arguments.output_file}: {lin.B.shape[0]} states, {lin.B.shape[1]} inputs")
     else:
         from fflin.commands.model_text import model_report

@@ -33,7 +33,7 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
             fields[name] = for_all[0] if for_all else once(f"--{name}", values)
     if getattr(arguments, "gravity", None):
         fields["gravity"] = arguments.gravity
-    if getattr(arguments, "inputs", None):
+    if getattr(arguments, "inputs", None) is not None:
         inputs = _inputs(robot, arguments.inputs)
         try:
             robot = robot.replace(inputs=inputs)
@@ -83,7 +83,7 @@ def placed(
     robot: Robot, option: str, pairs: list[tuple[str, Any]], base: pin.SE3 | None = None
 ) -> Array:
     """Return the configuration (nq,) with the joints that an option says; warn beyond limits."""
-    from fflin.robot.robot import configuration
+    from fflin.dynamics.points import configuration
 
     joints = once(option, pairs)
     q = configuration(robot, joints, base)

@@ -12,7 +12,7 @@ from fflin.commands.arguments import (
     Commands,
     add_output_file,
     add_point,
-    assignment,
+    add_values,
     command,
     number,
 )
@@ -35,42 +35,29 @@ def add_commands(commands: Commands) -> None:
     )
     add_point(lqr)
     add_weights(lqr)
-    lqr.add_argument(
-        "--reduce",
-        action="store_true",
-        help="design on the part that the inputs can hold where momentum is conserved",
-    )
     add_output_file(lqr, "save the gain to FILE: .npz, .mat or .json")
 
 
 def add_weights(command: argparse.ArgumentParser) -> None:
-    """Add what says the cost of a regulator: --q, --r, --bryson and --dt."""
-    command.add_argument(
+    """Add what is regulated and at which cost: --q, --r, --bryson, --dt and --reduce."""
+    add_values(
+        command,
         "--q",
+        "weight on a state or a group of them, such as q_b or q_m.joint_1; 1 by default; without "
+        "any weight the cost is on states and accelerations, 1 on each",
         metavar="NAME=W",
-        type=assignment,
-        action="append",
-        default=[],
-        help="weight on a state or a group of them, such as q_b or q_m.joint_1 (repeatable); "
-        "1 by default; without any weight the cost is on states and accelerations, 1 on each",
     )
-    command.add_argument(
+    add_values(
+        command,
         "--r",
+        "weight on an input or a group of them, such as tau_b; by default the squares of the "
+        "accelerations that a unit of it gives the coordinates, each taken alone",
         metavar="NAME=W",
-        type=assignment,
-        action="append",
-        default=[],
-        help="weight on an input or a group of them, such as tau_b (repeatable); by default the "
-        "squares of the accelerations that a unit of it gives the coordinates, each taken alone",
     )
-    command.add_argument(
+    add_values(
+        command,
         "--bryson",
-        metavar="NAME=VALUE",
-        type=assignment,
-        action="append",
-        default=[],
-        help="largest acceptable value of a state, an input or a group (repeatable): its weight "
-        "is 1/VALUE^2",
+        "largest acceptable value of a state, an input or a group: its weight is 1/VALUE^2",
     )
     command.add_argument(
         "--dt",
@@ -78,6 +65,20 @@ def add_weights(command: argparse.ArgumentParser) -> None:
         type=number,
         help="design for inputs held over H [s]; the cost stays the continuous one",
     )
+    command.add_argument(
+        "--reduce",
+        action="store_true",
+        help="regulate the part that the inputs can hold where momentum is conserved",
+    )
+
+
+def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearModel:
+    """Return the model that a regulator is designed for: with --reduce, the part it can hold."""
+    if not arguments.reduce:
+        return lin
+    from fflin.analysis.momentum import momentum_reduction
+
+    return momentum_reduction(lin)
 
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
@@ -137,16 +138,13 @@ def _weights(lin: LinearModel, arguments: argparse.Namespace) -> tuple[Array, Ar
 
 
 def _lqr(arguments: argparse.Namespace) -> int:
-    if arguments.output_file:
-        from fflin.base.design_files import check_design_format
-
-        check_design_format(arguments.output_file)
     _, lin = linear_model(arguments)
-    if arguments.reduce:
-        import fflin
+    if arguments.output_file:
+        from fflin.base.record import FORMATS
+        from fflin.base.writing import check_place
 
-        lin = fflin.momentum_reduction(lin)
-    gain = gain_of(lin, arguments)
+        check_place(arguments.output_file, FORMATS)
+    gain = gain_of(regulated_part(lin, arguments), arguments)
     if arguments.output_file:
         gain.save(arguments.output_file)
     print(gain)

@@ -16,12 +16,12 @@ from fflin.commands.arguments import (
     add_pose,
     add_robot,
     add_system,
-    assignment,
+    add_values,
     command,
     number,
 )
 from fflin.commands.points import configuration_of, inputs_at, load_robot, once, placed, velocity_of
-from fflin.commands.regulator import add_weights, gain_of
+from fflin.commands.regulator import add_weights, gain_of, regulated_part
 from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
 
 if TYPE_CHECKING:
@@ -43,22 +43,13 @@ def add_commands(commands: Commands) -> None:
     add_robot(simulate)
     add_pose(simulate)
     add_system(simulate)
-    simulate.add_argument(
+    add_values(
+        simulate,
         "--target-joint",
-        metavar="NAME=VALUE",
-        type=assignment,
-        action="append",
-        default=[],
-        help="where a joint is to go [rad|m] (repeatable); the others go to neutral, the base to "
-        "the world's origin",
+        "where a joint is to go [rad|m]; the others go to neutral, the base to the world's origin",
     )
     add_inputs_there(simulate)
     add_weights(simulate)
-    simulate.add_argument(
-        "--reduce",
-        action="store_true",
-        help="control the part that the inputs can hold where momentum is conserved",
-    )
     simulate.add_argument(
         "--allocate",
         action="store_true",
@@ -75,17 +66,10 @@ def add_commands(commands: Commands) -> None:
         "--step", metavar="H", type=number, help="step of the integration [s]; chosen by default"
     )
     simulate.add_argument(
-        "--method",
-        default="cf4",
-        help="cf4 (default), rkmk4 or semi_implicit_euler",
+        "--method", default="cf4", help="cf4 (default), rkmk4 or semi_implicit_euler"
     )
-    simulate.add_argument(
-        "--limit",
-        metavar="NAME=VALUE",
-        type=assignment,
-        action="append",
-        default=[],
-        help="largest magnitude of an input or of a group of them, such as tau_m (repeatable)",
+    add_values(
+        simulate, "--limit", "largest magnitude of an input or of a group of them, such as tau_m"
     )
     simulate.add_argument(
         "--delay",
@@ -105,15 +89,15 @@ def add_commands(commands: Commands) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
-    from fflin.base.writing import check_place
-    from fflin.simulation.motion import check_motion_format, motion_report
+    from fflin.simulation.motion import FORMATS, motion_report
 
+    robot = load_robot(arguments)
     if arguments.output_file:
-        check_motion_format(arguments.output_file)
-        check_place(arguments.output_file)
+        from fflin.base.writing import check_place
+
+        check_place(arguments.output_file, FORMATS)
     if arguments.plot:
         check_figure(arguments.plot)
-    robot = load_robot(arguments)
     check_pictures(robot, arguments)
     motion = simulated(robot, arguments)
 
@@ -209,9 +193,4 @@ def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
 
     q = placed(robot, "--target-joint", arguments.target_joint)
     u = inputs_at(robot, q, None, arguments)
-    lin = linearize(robot, q, None, u, frame=arguments.frame)
-    if arguments.reduce:
-        from fflin.analysis.momentum import momentum_reduction
-
-        lin = momentum_reduction(lin)
-    return lin
+    return regulated_part(linearize(robot, q, None, u, frame=arguments.frame), arguments)

@@ -16,9 +16,10 @@ from fflin.commands.arguments import (
     Commands,
     add_output_file,
     add_pose,
+    add_reference,
     add_robot,
     add_system,
-    assignment,
+    add_values,
     command,
     number,
 )
@@ -48,14 +49,13 @@ def add_commands(commands: Commands) -> None:
     )
     add_robot(sweep)
     points = sweep.add_argument_group("points", "one of these; at rest, unless --velocity says so")
-    points.add_argument(
+    add_values(
+        points,
         "--grid",
+        "N values of a joint [rad|m] from LO to HI; of several joints all combinations, the last "
+        "one varies fastest",
         metavar="JOINT=LO:HI:N",
-        type=_axis,
-        action="append",
-        default=[],
-        help="N values of a joint [rad|m] from LO to HI (repeatable: all combinations, the last "
-        "joint varies fastest)",
+        read=_axis,
     )
     points.add_argument(
         "--random", metavar="N", type=_count, help="N points drawn evenly from the joints' limits"
@@ -70,31 +70,17 @@ def add_commands(commands: Commands) -> None:
     points.add_argument(
         "--seed", metavar="S", type=_whole, default=0, help="of --random; 0 by default"
     )
-    points.add_argument(
+    add_values(
+        points,
         "--range",
+        "of --random: range of a joint in place of its limits",
         metavar="JOINT=LO:HI",
-        type=_range,
-        action="append",
-        default=[],
-        help="of --random: range of a joint in place of its limits (repeatable)",
+        read=_range,
     )
     add_pose(sweep)
-    sweep.add_argument(
-        "--effort",
-        metavar="NAME=VALUE",
-        type=assignment,
-        action="append",
-        default=[],
-        help="an input at all points (repeatable), by its name in u, such as tau_m.joint_1",
-    )
+    add_values(sweep, "--effort", "an input at all points, by its name in u, such as tau_m.joint_1")
     add_system(sweep)
-    sweep.add_argument(
-        "--reference",
-        choices=("base", "world"),
-        default="base",
-        help="what attitude and position are relative to: the base where it stands (default), "
-        "or the world",
-    )
+    add_reference(sweep)
     sweep.add_argument(
         "--workers",
         metavar="N",
@@ -114,12 +100,17 @@ def add_commands(commands: Commands) -> None:
     )
 
 
-def _axis(text: str) -> tuple[str, tuple[float, float, int]]:
-    """Read JOINT=LO:HI:N."""
+def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
+    """Split JOINT=A:B:... into its name and as many values as its form has."""
     name, _, values = text.rpartition("=")
     parts = values.split(":")
-    if not name or len(parts) != 3:
-        raise argparse.ArgumentTypeError(f"'{text}' is not JOINT=LO:HI:N, as in joint_1=-1:1:21")
+    if not name or len(parts) != len(form.split(":")):
+        raise argparse.ArgumentTypeError(f"'{text}' is not {form}, as in {example}")
+    return name, parts
+
+
+def _axis(text: str) -> tuple[str, tuple[float, float, int]]:
+    name, parts = _parts(text, "JOINT=LO:HI:N", "joint_1=-1:1:21")
     low, high, count = number(parts[0]), number(parts[1]), _count(parts[2])
     if not (low < high or (count == 1 and low == high)):
         raise argparse.ArgumentTypeError(f"'{text}' is empty: LO must be less than HI")
@@ -127,12 +118,8 @@ def _axis(text: str) -> tuple[str, tuple[float, float, int]]:
 
 
 def _range(text: str) -> tuple[str, tuple[float, float]]:
-    """Read JOINT=LO:HI."""
-    name, _, values = text.rpartition("=")
-    parts = values.split(":")
-    if not name or len(parts) != 2:
-        raise argparse.ArgumentTypeError(f"'{text}' is not JOINT=LO:HI, as in joint_1=-1:1")
-    return name, (number(parts[0]), number(parts[1]))
+    name, (low, high) = _parts(text, "JOINT=LO:HI", "joint_1=-1:1")
+    return name, (number(low), number(high))
 
 
 def _whole(text: str) -> int:
@@ -207,8 +194,9 @@ class _Announcement:
 
     def __call__(self, count: int, *, at_rest: bool) -> None:
         from fflin.batch.space import check_room, part_of, readable
-        from fflin.batch.sweep import planned_bytes
+        from fflin.batch.sweep import output_path, planned_bytes
 
+        output_path(self._path)  # once more, when the inputs are known
         size = planned_bytes(self._robot, count, at_rest=at_rest, **self._options)
         said = f"{count:,} points of '{self._robot.name}', {readable(size)}"
         if size > _LARGE and not self._agreed:
@@ -246,8 +234,6 @@ def _points(
             raise InputError("--joint and --configurations both place joints; give either")
         if any(arguments.rpy) or any(arguments.position):
             raise InputError("--rpy, --position and --configurations all place the base; give one")
-        if arguments.configurations.resolve() == arguments.output_file.resolve():
-            raise FileError(f"{arguments.output_file} is what --configurations reads; name another")
         given = _given(arguments.configurations)
         for name, value in (("v", v), ("u", u)):
             if name in given and value is not None:
@@ -286,17 +272,23 @@ def _base(robot: Robot, q: Array) -> Any:
 
 
 def _given(path: Path) -> dict[str, Array]:
-    import zipfile
+    import io
+    import warnings
 
     import numpy as np
 
+    from fflin.base.writing import read_input, reason
+
+    content = io.BytesIO(read_input(path, ".npz"))
     try:
-        with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
-            given = {key: file[key] for key in ("q", "v", "u") if key in file.files}
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except (ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile):
-        raise FileError(f"{path}: not an npz file as numpy.savez writes it") from None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers that damage makes look old
+            with np.load(content, allow_pickle=False) as file:
+                given = {key: file[key] for key in ("q", "v", "u") if key in file.files}
+    except Exception as error:  # each decoder of what may stand in a zip archive has its own
+        raise FileError(
+            f"{path}: not an npz file as numpy.savez writes it ({reason(error)})"
+        ) from None
     if "q" not in given:
         raise FileError(f"{path}: has no array named q, the configurations (N, nq)")
     if given["q"].ndim != 2:

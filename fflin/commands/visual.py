@@ -80,25 +80,19 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
 
 def check_figure(path: Path) -> None:
     """Refuse a figure that cannot be drawn or written, before anything is done for it."""
-    from fflin.base.figures import check_figure_format, require_matplotlib
+    from fflin.base.figures import FORMATS, require_matplotlib
     from fflin.base.writing import check_place
 
-    check_figure_format(path)
-    check_place(path)
+    check_place(path, FORMATS)
     require_matplotlib()
 
 
 def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
     """Refuse what `show_motion` would, before a motion is made for it."""
-    from fflin.base.writing import check_place
     from fflin.view.visualize import check_outputs, check_rates, check_times, check_tool
 
-    files = {f".{name}": getattr(arguments, name) for name in _FILES}
-    outputs = check_outputs(files, robot.urdf)
-    if not outputs:
+    if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
         return
-    for path in outputs.values():
-        check_place(path)
     check_tool(robot, arguments.tool)
     check_rates(arguments.fps, arguments.speed, arguments.duration)
     if arguments.times:

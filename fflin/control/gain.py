@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.base.design import Design
+from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import grid, matrix, width
 from fflin.base.validation import Array
 from fflin.control.margins import Margins, input_margins
@@ -96,7 +96,8 @@ class Gain(Design):
                 f"K ({nu} x {nx}): norms of its blocks; a file holds all of it\n\n{_blocks(self)}"
             )
         figures = textwrap.fill(_figures(self), width())
-        return "\n\n".join((head, body, _poles(self), figures))
+        parts = [head, body, _poles(self), figures]
+        return "\n\n".join(parts if self.verified else [*parts, NOT_VERIFIED])
 
     @property
     def closed_loop(self) -> Array:

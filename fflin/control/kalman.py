@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.base.design import Design
 from fflin.base.errors import DetectabilityError, InputError, MissingPackageError
+from fflin.base.record import Design
 from fflin.base.validation import Array
 from fflin.control.gain import Gain
 from fflin.control.lqr import require_fixed_point

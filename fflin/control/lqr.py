@@ -106,7 +106,7 @@ def require_fixed_point(lin: LinearModel) -> None:
         )
     if lin.is_equilibrium():
         return
-    rate = lin.f0 if lin._drift is None else lin._drift
+    rate = lin.f0 if lin.drift is None else lin.drift
     judged = [name not in lin.ignorable for name in lin.state_names]
     rows = [i for i in np.argsort(-np.abs(rate)) if judged[i] and abs(rate[i]) > 1e-9]
     shown = ", ".join(

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from fflin.base.design import Design
 from fflin.base.errors import InputError
+from fflin.base.record import Design
 from fflin.base.validation import Array, number
 from fflin.control.differential_riccati import NODES, Coefficients, step_back
 from fflin.control.weights import Weight, weight

@@ -48,8 +48,8 @@ class Actuation:
     """
 
     def __init__(self, state: StateMap) -> None:
-        self._state, robot, nv = state, state.robot, 6 + state.robot.n
-        self._model = robot.model
+        robot, nv = state.robot, 6 + state.robot.n
+        self._state, self._model = state, robot.model
         names: list[str] = []
         units: list[str] = []
         kinds: list[str] = []
@@ -96,7 +96,7 @@ class Actuation:
             kind: np.flatnonzero([kind == other for other in kinds])
             for kind in dict.fromkeys(kinds)
         }
-        self.held = tuple(held)
+        self.held, self._held = tuple(held), tuple(vector.columns for vector in held)
         self._fixed = np.column_stack(columns) if columns else np.zeros((nv, 0))
         self.default = self._fixed.shape == (nv, nv) and bool((self._fixed == identity).all())
         self._carried = [
@@ -138,12 +138,14 @@ class Actuation:
 
     def in_base_axes(self, chart: Chart, u: Array) -> Array:
         """Return u (.., nu) with what is held in reference axes in base axes."""
-        if not self.held:
+        if not self._held:
             return u
-        u = u.copy()
-        for held in self.held:
-            u[..., held.columns] = (chart.R.mT @ u[..., held.columns, None])[..., 0]
-        return u
+        in_base: Array = chart.to_base(self._held, u[..., None])[..., 0]
+        return in_base
+
+    def over_inputs(self, chart: Chart, by_u: Array, *, out: Array | None = None) -> Array:
+        """Return slopes (.., k, nu) over `in_base_axes` as slopes over u: F_u^T of (4.7)."""
+        return chart.to_reference(self._held, by_u.mT, out=None if out is None else out.mT).mT
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
         """Return the wrench of thrusters and wheels on every joint, in its frame, if there is any.

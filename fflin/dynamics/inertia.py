@@ -91,13 +91,19 @@ class Inertia:
             # Written so that NaN, from a pivot that is zero, fails too.
             if self.least_coupling < bounds.dot(self._inverse_diagonal) < _QUICK_COUPLING:
                 return
-        M = self._state.project(_crba(self._model, self._data, still).T)
-        if self._constrained or len(M) > _DENSE_SIZE:
+        upper = _crba(self._model, self._data, still)
+        if self._constrained or len(upper) > _DENSE_SIZE:
+            M = self._state.project(upper.T)
             _invert_dense(M, out)
+            coupling = M.diagonal().dot(out.diagonal())
         else:
             _decompose(self._model, self._data)
-            self._state.project(_invert_factor(self._model, self._data), out)
-        self._judge(M.diagonal().dot(out.diagonal()), M)
+            inverse = _invert_factor(self._model, self._data)
+            self._state.project(inverse, out)
+            coupling = upper.diagonal().dot(inverse.diagonal())
+        # Written so that NaN, from a pivot that is zero, fails too.
+        if not self.least_coupling < coupling < _WARNING_COUPLING:
+            self._judge(coupling, self._state.project(upper.T))
 
     def _within_stroke(self, q: Array) -> bool:
         return all(abs(q[index]) <= STROKE for index in self._slides)

@@ -1,15 +1,56 @@
-"""Velocities and inputs of a point by name."""
+"""Configurations, velocities and inputs of a point by name."""
 
 from collections.abc import Mapping
 
 import numpy as np
+import pinocchio as pin
 
-from fflin.base.errors import unknown
-from fflin.base.validation import Array, by_name, number
+from fflin.base.errors import InputError, unknown
+from fflin.base.validation import Array, by_name, number, placement
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.inputs import named_wheels
-from fflin.robot.robot import Robot
+from fflin.robot.robot import ROOT, Robot
+
+
+def configuration(
+    robot: Robot,
+    joints: Mapping[str, float] | None = None,
+    base: pin.SE3 | None = None,
+) -> Array:
+    """Build a Pinocchio configuration.
+
+    Parameters
+    ----------
+    robot : Robot
+    joints : mapping, optional
+        {joint: value [rad|m]} of independent joints; the others stay at neutral.
+    base : pin.SE3, optional
+        Placement of the base in the world; the identity by default.
+
+    Returns
+    -------
+    ndarray (nq,)
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such joint.
+    InputError
+        If a value is not a finite number, or a joint mimics another.
+    """
+    if not isinstance(robot, Robot):
+        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
+    q = pin.neutral(robot.model)
+    if base is not None:
+        root = robot.model.jointPlacements[ROOT]
+        q[:7] = pin.SE3ToXYZQUAT(root.actInv(placement("base", base)))
+    if joints is not None and not isinstance(joints, Mapping):
+        raise InputError(f"joints is a {type(joints).__name__}, expected {{joint: value}}")
+    for name, value in (joints or {}).items():
+        robot.joint(name).place(q, number(f"joint '{name}'", value))
+    robot.follow(q)
+    return robot.checked_configuration(q)
 
 
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:

@@ -1,5 +1,6 @@
 """The state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, names, frames and chart."""
 
+from itertools import compress
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -67,6 +68,8 @@ class StateMap:
         Slices of q_b, r_b, q_m, omega_b, v_b, qdot_m in the state.
     axes : tuple of bool
         Whether (omega_b, v_b) stand in reference axes.
+    in_reference : tuple of slice
+        Rows of those that do, in any (6 + n) velocity or wrench.
     S : ndarray (nv, 6 + n) or None
         With v = S nu, where joints mimic others; None where v is nu in another order.
 
@@ -95,6 +98,7 @@ class StateMap:
         self.robot = robot
         self.frame: Frame = frame
         self.axes = _IN_REFERENCE_AXES[frame]
+        self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
         self.nx = 12 + 2 * n
         self.groups = Groups(
             slice(0, 3),
@@ -122,6 +126,9 @@ class StateMap:
         )
         # Index in Pinocchio's v of each velocity of the state, and in a flat (nv, nv) array.
         self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
+        # And back; what a joint that mimics another has is written after.
+        self._place = np.zeros(robot.nv, dtype=np.intp)
+        self._place[self._order] = np.arange(6 + n)
         self._flat = self._order[:, None] * robot.nv + self._order
         # v = S nu; where no joint mimics another S is the permutation above.
         self.S: Array | None = None
@@ -220,18 +227,16 @@ class StateMap:
 
     def read(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
         """Do as `to_state` for arguments that are valid."""
-        chart = self.chart(q)
-        x = np.empty(self.nx)
-        g = self.groups
-        x[g.q_b] = chart.q_b
-        x[g.r_b] = self.positions(q)
-        x[g.q_m] = self.joint_positions(q)
+        q_m, nu = self.joint_positions(q), self.velocities(v)
+        x = self.compose(self.chart(q), self.positions(q), q_m, nu)
         if near is not None:
             self._unwrap(x, near)
-        nu = self.velocities(v)
-        self.to_frame(chart, nu)
-        x[6 + self.robot.n :] = nu
         return x
+
+    def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
+        """Return the state (.., nx) of its parts, velocities nu (.., 6 + n) in base axes."""
+        in_frame = self.to_frame(chart, nu[..., None])[..., 0]
+        return np.concatenate((chart.q_b, r_b, q_m, in_frame), -1)
 
     def to_pinocchio(self, x: Array) -> tuple[Array, Array]:
         """Convert a state to a Pinocchio configuration and velocity.
@@ -270,9 +275,8 @@ class StateMap:
         q[self._cos] = np.cos(angles[self._unbounded])
         q[self._sin] = np.sin(angles[self._unbounded])
         self.robot.follow(q)
-        nu = x[6 + self.robot.n :].copy()
-        self.to_base(Chart(q_b, float(relative[3]), rotation_matrix(relative)), nu)
-        return q, self.spread(nu)
+        chart = Chart(q_b, float(relative[3]), rotation_matrix(relative))
+        return q, self.spread(self.to_base(chart, x[6 + self.robot.n :, None])[:, 0])
 
     def velocities(self, v: Array) -> Array:
         """Return (omega_b, v_b, qdot_m) (.., 6 + n) in base axes of Pinocchio's v (.., nv)."""
@@ -280,8 +284,7 @@ class StateMap:
 
     def spread(self, nu: Array) -> Array:
         """Return Pinocchio's v (nv,) of (omega_b, v_b, qdot_m) in base axes: v = S nu."""
-        v = np.empty(self.robot.nv)
-        v[self._order] = nu
+        v = nu.take(self._place)
         for joint, leader, multiplier, _ in self.robot.followers:
             v[joint.idx_v] = multiplier * v[leader.idx_v]
         return v
@@ -307,17 +310,13 @@ class StateMap:
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
         return matrix.take(self._flat, out=out, mode="clip")
 
-    def to_frame(self, chart: Chart, vectors: Array) -> None:
-        """Turn velocities or wrenches (6 + n, ...) in place from base axes to the frame's."""
-        for rows, turned in zip((ANGULAR, LINEAR), self.axes, strict=True):
-            if turned:
-                vectors[rows] = chart.R @ vectors[rows]
+    def to_frame(self, chart: Chart, vectors: Array) -> Array:
+        """Turn velocities or wrenches (.., 6 + n, k) from base axes to the frame's: F of (4.6)."""
+        return chart.to_reference(self.in_reference, vectors)
 
-    def to_base(self, chart: Chart, vectors: Array) -> None:
-        """Turn velocities or wrenches (6 + n, ...) in place from the frame's axes to the base's."""
-        for rows, turned in zip((ANGULAR, LINEAR), self.axes, strict=True):
-            if turned:
-                vectors[rows] = chart.R.T @ vectors[rows]
+    def to_base(self, chart: Chart, vectors: Array) -> Array:
+        """Turn velocities or wrenches (.., 6 + n, k) from the frame's axes to the base's: F^T."""
+        return chart.to_base(self.in_reference, vectors)
 
     def joint_positions(self, q: Array) -> Array:
         """Return q_m (.., n), one angle or length a joint, of valid configurations (.., nq)."""

@@ -71,7 +71,7 @@ class Points(NamedTuple):
     u: Array
 
 
-class Rates(NamedTuple):
+class Written(NamedTuple):
     """What the kernel writes of every point, each with a row for it; all in base axes.
 
     Attributes
@@ -118,7 +118,7 @@ class BatchRates:
         self.carried = self._loads.input
         self._layout = _layout(tree, len(self.carried))
 
-    def evaluate(self, points: Points, out: Rates) -> None:
+    def evaluate(self, points: Points, out: Written) -> None:
         """Write the rates of all points, of which there are as many as lanes at least."""
         space = np.empty(self._layout.size + LANES)
         # Its vectors are 64 bytes; where they begin at such an address it is faster.

@@ -232,8 +232,7 @@ def inertia_matrix(robot: Robot, lin: LinearModel) -> Array:
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     M = state.project(pin.crba(robot.model, robot.create_data(), lin.q).T)
     chart = state.chart(lin.q)
-    state.to_frame(chart, M)
-    state.to_frame(chart, M.T)
+    M = state.to_frame(chart, state.to_frame(chart, M).T).T
     M.setflags(write=False)
     return M
 
@@ -244,6 +243,4 @@ def inverse_inertia(state: StateMap, lin: LinearModel) -> Array:
     inverse: Array = np.empty((nv, nv))
     Inertia(state, state.robot.create_data()).invert(lin.q, inverse)
     chart = state.chart(lin.q)
-    state.to_frame(chart, inverse)
-    state.to_frame(chart, inverse.T)
-    return inverse
+    return state.to_frame(chart, state.to_frame(chart, inverse).T).T

@@ -177,10 +177,8 @@ def check(robot: Robot, lin: LinearModel) -> Check:
 
 
 def _in_base_axes(state: StateMap, M: Array, q: Array) -> Array:
-    chart, M = state.chart(q), M.copy()
-    state.to_base(chart, M)
-    state.to_base(chart, M.T)
-    return M
+    chart = state.chart(q)
+    return state.to_base(chart, state.to_base(chart, M).T).T
 
 
 def _point_errors(

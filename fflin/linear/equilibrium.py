@@ -121,7 +121,7 @@ def equilibrium(
     (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974, chapter 23).
     """
     lin = Linearizer(robot, moving=True)(q, v)
-    drift = lin._drift
+    drift = lin.drift
     assert drift is not None
     _require_steady(lin, drift)
     state = StateMap(robot, frame=frame, reference=reference)

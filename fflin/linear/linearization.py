@@ -5,31 +5,23 @@ from __future__ import annotations
 from functools import partial
 from math import hypot
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.rotation import skew
-from fflin.base.validation import Array, truth, vector
-from fflin.base.version import __version__
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.chart import Chart
+from fflin.base.validation import Array, vector
+from fflin.dynamics.chart import Chart, Standing
 from fflin.dynamics.rnea import Accelerations, Rates
-from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap, unknown_frame
-from fflin.linear.certificate import certify, inertia_matrix
-from fflin.linear.ignorable import ignorable_states
+from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
-from fflin.linear.state_equations import STANDING, Point, at_rest, ride_along, state_equations
+from fflin.linear.prepared import frozen, prepare
+from fflin.linear.state_equations import assemble, drift
 from fflin.robot.frames import ROOT
-from fflin.robot.massless import require_inertia
-from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from fflin.dynamics.outputs import Sensing
 
 # Sum of squares beyond which a matrix counts as not finite: its eigenvalues would not be. Up to
 # velocities and inputs of the other size nothing overflows on the way to it.
@@ -50,7 +42,7 @@ class Linearizer:
     Elsewhere :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is differentiated in base axes as
     :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)` and carried to the chart and frame.
     The dynamics do not depend on the base's position and linear velocity (Galilei), so they are
-    evaluated without them: an orbit costs no digits.
+    evaluated without them: an orbit costs no digits. docs/derivation.md has the equations.
 
     Parameters
     ----------
@@ -76,6 +68,12 @@ class Linearizer:
         If Pinocchio's Data for the robot would pass 1 GiB, or its model was changed after the
         robot was made.
 
+    Attributes
+    ----------
+    robot : Robot
+    prepared : Prepared
+        What is the same about all points.
+
     References
     ----------
     Y. Yang, J. Aerospace Engineering 25(3), 2012. J. Carpentier and N. Mansard, Analytical
@@ -91,63 +89,23 @@ class Linearizer:
         moving: bool = False,
     ) -> None:
         self.robot = robot
-        moving = truth("moving", moving)
-        if frame is None:
-            frame = "local" if moving else "hybrid"
-        elif not isinstance(frame, str):  # nor one whose comparison below is an array
-            raise unknown_frame(frame)
-        if moving and (reference is not None or frame != "local"):
-            raise InputError(
-                "moving=True takes the error in the moving base's own axes: leave out the "
-                "reference, and the frame or make it 'local'"
-            )
-        self._moving = moving
-        self._map = StateMap(robot, reference=reference, frame=frame)
-        self._own_reference = reference is None
-        require_inertia(robot)
+        self.prepared = ready = prepare(robot, frame=frame, reference=reference, moving=moving)
         self._data = robot.create_data()
         self._lock = Lock()  # of the work space
-        self._actuation = Actuation(self._map)
-        self._accelerations = Accelerations(self._map, self._actuation, self._data)
-        self._sensing: Sensing | None = None
-        if robot.outputs != (FullState(),):
-            from fflin.dynamics.outputs import Sensing
-
-            self._sensing = Sensing(
-                self._map,
-                robot.outputs,
-                gravity=np.array(robot.gravity),
-                own_reference=self._own_reference,
-            )
-        # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
-        self._free = (
-            self._sensing is None
-            and not self._moving
-            and not any(robot.gravity)
-            and not robot.stored_momentum
-            and not any(values.any() for values in robot.passive)
-        )
-        self._plain = self._free and self._actuation.default
+        self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
+        self._standing: Chart = Standing()
+        nv, nx = ready.map.nx // 2, ready.map.nx
+        self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
         given = hypot(*robot.gravity, *np.concatenate(robot.passive).tolist())
         self._moderate = given < _MODERATE
-        nv, nx = 6 + robot.n, self._map.nx
-        self._zero_v, self._zero_u, self._zero_x = (
-            _frozen(np.zeros(size)) for size in (robot.nv, len(self._actuation.names), nx)
-        )
-        self._A_rest = _frozen(at_rest(self._map))
-        self._nu = len(self._actuation.names)
-        self._shape_B, self._lower = (nx, self._nu), slice(nv, nx)
-        self._rooted = robot.model.jointPlacements[ROOT].isIdentity(0.0)
-        self._reference = _frozen(pin.SE3ToXYZQUAT(self._map.reference))
-        self._common = self._common_fields()
-        self._at_rest_fields = self._common | {
-            "A": self._A_rest,
-            "f0": self._zero_x,
-            "u0": self._zero_u,
-            "v": self._zero_v,
+        # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
+        self._known = ready.free and ready.own_reference and ready.actuation.default
+        self._at_rest_fields = {
+            **ready.common,
+            **ready.rest,
             "_when_asked": {
-                "x0": partial(_state_at_rest, self._map),
-                "y0": partial(_state_at_rest, self._map),
+                "x0": partial(_state_at_rest, ready.map),
+                "y0": partial(_state_at_rest, ready.map),
                 "_reference": partial(_own_reference, robot),
             },
         }
@@ -182,15 +140,15 @@ class Linearizer:
         robot = self.robot
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
         q.setflags(write=False)
-        if v is None and u is None and self._own_reference and self._plain:
+        if v is None and u is None and self._known:
             with self._lock:
                 return self._at_rest(q)
         if v is not None:
-            v = _frozen(robot.checked_velocity(v).copy())
+            v = frozen(robot.checked_velocity(v).copy())
         if u is not None:
-            u = _frozen(vector("u", u, self._nu, "the robot's inputs").copy())
-        v = self._zero_v if v is None else v
-        u = self._zero_u if u is None else u
+            u = frozen(vector("u", u, self._shape_B[1], "the robot's inputs").copy())
+        v = self.prepared.rest["v"] if v is None else v
+        u = self.prepared.rest["u0"] if u is None else u
         with self._lock:
             if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
                 return self._anywhere(q, v, u)
@@ -200,96 +158,65 @@ class Linearizer:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A copy, in this process or another, needs a work space of its own.
-        reference = None if self._own_reference else self._map.reference
-        return _rebuilt, (self.robot, self._map.frame, reference, self._moving)
+        ready = self.prepared
+        reference = None if ready.own_reference else ready.map.reference
+        return _rebuilt, (self.robot, ready.map.frame, reference, ready.moving)
 
     def _at_rest(self, q: Array) -> LinearModel:
         B = np.zeros(self._shape_B)
         self._accelerations.invert(q, B[self._lower])
         B.setflags(write=False)
-        return LinearModel._from_fields(self._at_rest_fields | {"B": B, "q": q})
+        return LinearModel.from_fields(self._at_rest_fields | {"B": B, "q": q})
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
-        state, groups = self._map, self._map.groups
-        chart = STANDING if self._own_reference else state.chart(q)
+        ready = self.prepared
+        state = ready.map
+        chart, r_b = self._standing, self._standing.q_b
+        if not ready.own_reference:
+            chart, r_b = state.chart(q), state.positions(q)
         nu, q_m = state.velocities(v), state.joint_positions(q)
-        u_base = u if chart is STANDING else self._actuation.in_base_axes(chart, u)
+        u_base = ready.actuation.in_base_axes(chart, u)
         rates = self._accelerations.rates(q, v, nu, q_m, u_base)
-        A, B = self._A_rest.copy(), np.zeros(self._shape_B)
-        A[self._lower, groups.q_m] = rates.by_q_m
-        A[self._lower, self._lower] = rates.by_nu
-        B[self._lower] = rates.by_u
-        point = Point(nu, u_base, rates.c, rates.gravity)
-        f0 = state_equations(state, self._actuation, chart, point, A, B[self._lower])
-        x0: Array = np.zeros(state.nx)
-        if chart is STANDING:
-            x0[groups.q_m] = q_m
-            x0[self._lower] = nu
-        else:
-            x0 = state.to_state(q, v)
-        drift = ride_along(state, point, A, f0) if self._moving else None
-        C, D, y0 = self._seen(chart, rates, q, v, u_base, x0)
-        for array in (A, B, f0) if self._sensing is None else (A, B, f0, C, D, y0):
+        A, B = ready.rest["A"].copy(), np.zeros(self._shape_B)
+        f0 = assemble(
+            *(state, ready.actuation, chart, nu, u_base, rates, A, B[self._lower]),
+            moving=ready.moving,
+        )
+        x0 = state.compose(chart, r_b, q_m, nu)
+        C, D, y0 = self._seen(chart, rates, q, v, nu, u_base, x0)
+        for array in (A, B, f0) if ready.sensing is None else (A, B, f0, C, D, y0):
             flat = array.ravel()
             if not flat.dot(flat) < LARGEST:  # nor NaN
                 raise InputError("q, v or u is so large that the model is not finite")
             array.setflags(write=False)
         x0.setflags(write=False)
-        fields = {"A": A, "B": B, "C": C, "D": D, "f0": f0}
-        fields |= {"x0": x0, "y0": y0, "u0": u, "q": q, "v": v}
-        fields["_reference"] = self._reference_of(q)
-        if drift is not None:
-            fields["_drift"] = _frozen(drift)
-        return LinearModel._from_fields(self._common | fields)
+        values = {"A": A, "B": B, "C": C, "D": D, "f0": f0, "x0": x0, "u0": u, "y0": y0}
+        fields = {**ready.common, **values, "q": q, "v": v, "_reference": self._reference_of(q)}
+        if ready.moving:
+            own_rate = frozen(drift(state, f0, rates.gravity))
+            fields |= {"f0": ready.rest["f0"], "_drift": own_rate}
+        return LinearModel.from_fields(fields)
 
     def _seen(
-        self, chart: Chart, rates: Rates, q: Array, v: Array, u: Array, x0: Array
+        self, chart: Chart, rates: Rates, q: Array, v: Array, nu: Array, u: Array, x0: Array
     ) -> tuple[Array, Array, Array]:
-        """Return C, D and y0; `u` (nu,) in base axes."""
-        sensing, state = self._sensing, self._map
+        """Return C, D and y0; `nu` (6 + n,) and `u` (nu,) in base axes."""
+        sensing, state = self.prepared.sensing, self.prepared.map
         if sensing is None:
-            return self._common["C"], self._common["D"], x0
-        nu = state.velocities(v)
+            return self.prepared.common["C"], self.prepared.common["D"], x0
         a = rates.c.copy()
         if sensing.needs_acceleration:
-            a[LINEAR] += rates.gravity - skew(nu[ANGULAR]).dot(nu[LINEAR])
+            a[LINEAR] += rates.gravity - skew(nu[ANGULAR]).dot(nu[LINEAR])  # (3.2)
         sensed = sensing.evaluate(self._data, q, v, state.spread(a))
-        C, D = output_equations(state, self._actuation, chart, sensed, rates, nu, u)
+        C, D = output_equations(state, self.prepared.actuation, chart, sensed, rates, nu, u)
         for row, index in sensing.states:
             C[row, index] = 1.0
             sensed.y[row] = x0[index]
         return C, D, sensed.y
 
     def _reference_of(self, q: Array) -> Array:
-        if not self._own_reference:
-            return self._reference
-        return q[:7] if self._rooted else _own_reference(self.robot, q)
-
-    def _common_fields(self) -> dict[str, Any]:
-        robot, state = self.robot, self._map
-        names, units = self._actuation.names, self._actuation.units
-        seen = self._sensing or state
-        return {
-            "C": _frozen(np.eye(state.nx)),
-            "D": _frozen(np.zeros((state.nx, len(names)))),
-            "dt": 0.0,
-            "state_names": state.names,
-            "input_names": names,
-            "output_names": seen.names,
-            "state_units": state.units,
-            "input_units": units,
-            "output_units": seen.units,
-            "frame": state.frame,
-            "moving": self._moving,
-            "robot": robot.name,
-            "urdf_sha256": robot.urdf_sha256,
-            "locked": robot.locked,
-            "fflin_version": __version__,
-            "pinocchio_version": pin.__version__,
-            "_inertia": partial(inertia_matrix, robot),
-            "_certify": partial(certify, robot),
-            "_ignorable": partial(ignorable_states, robot),
-        }
+        ready = self.prepared
+        return _own_reference(self.robot, q) if ready.own_reference else ready.reference
 
 
 def linearize(
@@ -349,16 +276,11 @@ def _rebuilt(robot: Robot, frame: Frame, reference: pin.SE3 | None, moving: bool
 def _state_at_rest(state: StateMap, q: Array) -> Array:
     x0: Array = np.zeros(state.nx)
     x0[state.groups.q_m] = state.joint_positions(q)
-    return _frozen(x0)
+    return frozen(x0)
 
 
 def _own_reference(robot: Robot, q: Array) -> Array:
     root = robot.model.jointPlacements[ROOT]
     if root.isIdentity(0.0):
         return q[:7]
-    return _frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q[:7])))
-
-
-def _frozen(array: Array) -> Array:
-    array.setflags(write=False)
-    return array
+    return frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q[:7])))

@@ -84,6 +84,8 @@ class LinearModel:
         "joint=value" [rad|m] of the joints that are welded in it.
     fflin_version, pinocchio_version : str
         What made the model.
+    verified : bool
+        Whether it is as it was made; False of a file that has no digest to tell damage by.
     """
 
     A: Array
@@ -114,12 +116,11 @@ class LinearModel:
     _inertia: Callable[[LinearModel], Array] = field()
     _certify: Callable[[LinearModel], Certificate] = field()
     _ignorable: Callable[[LinearModel], tuple[str, ...]] | None = None
-    # Of a moving reference, whose f0 is zero by construction: its own rate (nx,), that of its
-    # attitude without turns about gravity. None otherwise.
     _drift: Array | None = None
     # Of a sampled model: its own fingerprint and the continuous model that it was made of, whose
     # structure no exponential has blurred.
     _source: tuple[str, LinearModel] | None = None
+    verified: bool = True
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -130,7 +131,15 @@ class LinearModel:
                 object.__setattr__(self, item.name, value)
 
     @classmethod
-    def _from_fields(cls, values: dict[str, Any]) -> LinearModel:
+    def from_fields(cls, values: dict[str, Any]) -> LinearModel:
+        """Return a model whose fields are given; its arrays must be read-only and stay so.
+
+        Parameters
+        ----------
+        values : dict
+            Every field by its name. What it has under ``_when_asked`` is {name of a field:
+            function of q} for those that are made when they are asked for.
+        """
         # The generated __init__ sets two dozen frozen fields one by one, which costs as much
         # as the dynamics of a small robot. The caller passes read-only arrays of its own.
         lin = _new(cls)
@@ -149,12 +158,30 @@ class LinearModel:
         time = f"dt={self.dt:g} s" if self.dt else "continuous"
         return f"LinearModel('{self.robot}', nx={nx}, nu={nu}, frame='{self.frame}', {time})"
 
+    def __str__(self) -> str:
+        from fflin.base.record import NOT_VERIFIED
+
+        return repr(self) if self.verified else f"{self!r}\n{NOT_VERIFIED}"
+
     @property
     def reference(self) -> pin.SE3:
         """Placement oMref that attitude and position are relative to."""
         import pinocchio as pin
 
-        return pin.XYZQUATToSE3(self._reference)
+        return pin.XYZQUATToSE3(self.placement)
+
+    @property
+    def placement(self) -> Array:
+        """`reference` (7,) as its position [m] and quaternion x, y, z, w."""
+        return self._reference
+
+    @property
+    def drift(self) -> Array | None:
+        """Own rate (nx,) of a moving reference, whose f0 is zero by construction; else None.
+
+        That of its attitude is without turns about gravity, which change nothing.
+        """
+        return self._drift
 
     @cached_property
     def M(self) -> Array:
@@ -215,7 +242,7 @@ class LinearModel:
         tol : float
             What no rate may exceed, in SI units; those of ignorable coordinates may.
         """
-        rate = self.f0 if self._drift is None else self._drift
+        rate = self.f0 if self.drift is None else self.drift
         judged = [name not in self.ignorable for name in self.state_names]
         return bool(np.abs(rate[judged]).max(initial=0.0) <= number("tol", tol))
 
@@ -311,11 +338,13 @@ class LinearModel:
         ------
         FileError
             If the ending is another or the file cannot be written.
+        InputError
+            If a figure is not finite.
         """
         from fflin.base.writing import as_path
-        from fflin.linear.files import save_model
+        from fflin.linear.files import record_of, write_model
 
-        save_model(self, as_path(path))
+        write_model(as_path(path), record_of(self))
 
     @staticmethod
     def load(path: str | Path) -> LinearModel:
@@ -324,12 +353,19 @@ class LinearModel:
         Raises
         ------
         FileError
-            If the file cannot be read or is not such a model.
+            If the file cannot be read, is damaged or is not such a model.
         """
         from fflin.base.writing import as_path
-        from fflin.linear.files import load_model
+        from fflin.linear.files import read_model
 
-        return load_model(as_path(path))
+        values, certificate = read_model(as_path(path))
+        given: Any = partial(_given, Certificate(**certificate))
+        lin = LinearModel(**values, _certify=given)
+        return replace(lin, _certify=partial(_same_certificate, lin, lin.fingerprint))
+
+
+def _given(certificate: Certificate, _: LinearModel) -> Certificate:
+    return certificate
 
 
 def _same_M(continuous: LinearModel, _: LinearModel) -> Array:

@@ -53,13 +53,12 @@ class Nonlinear:
         rate = state.velocities(a)
         if state.axes[1]:
             rate[3:6] += np.cross(angular, linear)  # of the velocity's reference-axis components
-        state.to_frame(chart, rate)
         return np.concatenate(
             (
                 0.5 * (chart.q0 * angular + np.cross(chart.q_b, angular)),
                 chart.R @ linear,
                 state.velocities(v)[6:],
-                rate,
+                state.to_frame(chart, rate[:, None])[:, 0],
             )
         )
 

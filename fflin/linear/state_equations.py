@@ -1,184 +1,128 @@
-"""A: the kinematics, and the accelerations' slopes carried into the chart and the frame."""
+"""A, B and f0 of the accelerations and their slopes, at a point or at many.
 
-from typing import NamedTuple
+Numbers of equations are those of docs/derivation.md.
+"""
+
+from functools import partial
 
 import numpy as np
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.chart import Chart
+from fflin.dynamics.chart import Chart, times
+from fflin.dynamics.rnea import Rates
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
 
 
-class Point(NamedTuple):
-    """A point or many, each with a leading axis of them; all in base axes.
-
-    Attributes
-    ----------
-    nu : ndarray (.., 6 + n)
-        Velocity.
-    u : ndarray (.., nu)
-        Input.
-    c : ndarray (.., 6 + n)
-        Acceleration of the base origin and the joints, without gravity and omega x v_b.
-    gravity : ndarray (3,) or (.., 3)
-    """
-
-    nu: Array
-    u: Array
-    c: Array
-    gravity: Array
-
-
-# Of a base that stands at the reference.
-STANDING = Chart(np.zeros(3), 1.0, np.eye(3))
-
-
 def at_rest(state: StateMap) -> Array:
-    """Return A (nx, nx) where nothing moves, pulls or pushes: N in its upper right block."""
-    nv = 6 + state.robot.n
+    """Return A (nx, nx) where nothing moves, pulls or pushes: N in its upper right block (2.1)."""
+    nv = state.nx // 2
     A: Array = np.zeros((state.nx, state.nx))
     A[:nv, nv:] = np.diag([0.5] * 3 + [1.0] * (nv - 3))
     return A
 
 
-def state_equations(
+def assemble(
     state: StateMap,
     actuation: Actuation,
     chart: Chart,
-    point: Point,
+    nu: Array,
+    u: Array,
+    rates: Rates,
     A: Array,
     B_lower: Array,
+    *,
+    moving: bool,
 ) -> Array:
-    """Complete A and B in place with the kinematics, chart and frame, and return f0 (.., nx).
+    """Write A and the lower half of B, and return f0 (.., nx).
 
-    All arguments may be of many points, each with a leading axis of them.
+    All arrays may be of many points, each with a leading axis of them.
 
     Parameters
     ----------
     state : StateMap
     actuation : Actuation
     chart : Chart
-    point : Point
+    nu : ndarray (.., 6 + n)
+        Velocity in base axes.
+    u : ndarray (.., nu)
+        Input in base axes.
+    rates : Rates
+        The slopes may be views of where they belong in A and B.
     A : ndarray (.., nx, nx)
-        In its upper half that at rest; in its lower the slopes of c over q_m and the velocities in
-        base axes, and zeros for q_b and r_b.
+        A at rest; what is not written here stays.
     B_lower : ndarray (.., 6 + n, nu)
-        The slopes of c over the inputs in base axes.
+    moving : bool
+        Whether the reference moves along, with its base where the robot's is.
     """
-    groups, nv = state.groups, state.nx // 2
-    nu, u, c = point.nu, point.u, point.c.copy()
-    _set_kinematics(A, state, chart, nu)
-    lower = A[..., nv:, :]
-    _set_turning(lower, B_lower, state, actuation, chart, (nu, u, c), point.gravity)
-    f0 = np.concatenate((nu, c), axis=-1)
-    f0[..., groups.q_b] *= 0.5
-    if chart is not STANDING:
-        f0[..., groups.q_b] = turned(chart.Q, f0[..., groups.q_b])
-        f0[..., groups.r_b] = turned(chart.R, f0[..., groups.r_b])
-        for rows in (f0[..., nv:, None], lower, lower[..., nv:].mT, B_lower):
-            _to_frame(state, chart, rows)
-        for columns, _ in actuation.held:
-            B_lower[..., columns] = B_lower[..., columns] @ chart.R.mT
-    return f0
+    g, dot = state.groups, slice(state.nx // 2, state.nx)
+    omega_in_reference, v_in_reference = state.axes
+    w, v = nu[..., ANGULAR], nu[..., LINEAR]
+    W = skew(w)
+    by_turn = _over_turns(state, actuation, nu, u, rates)
+    F = partial(chart.to_reference, state.in_reference)
+
+    # Attitude and position.
+    # Q R^T = Q^T.
+    A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N  # (4.1)
+    by_q_b = chart.rate_over_q_b(w, W)
+    if omega_in_reference:
+        by_q_b += chart.over_q_b(chart.N @ W)
+    A[..., g.q_b, g.q_b] = by_q_b  # (4.2)
+    if not v_in_reference:
+        V = skew(v)
+        A[..., g.r_b, g.q_b] = -chart.over_q_b(chart.R @ V)  # (4.3)
+        A[..., g.r_b, g.v_b] = chart.R
+    if moving:
+        A[..., g.q_b, g.q_b] = -W  # (5.2)
+        A[..., g.r_b, g.r_b] = -W  # (5.3)
+
+    # Accelerations.
+    F(chart.over_q_b(by_turn), out=A[..., dot, g.q_b])  # (4.6)
+    F(rates.by_q_m, out=A[..., dot, g.q_m])
+    F(F(rates.by_nu.mT, out=A[..., dot, dot].mT).mT, out=A[..., dot, dot])
+    F(actuation.over_inputs(chart, rates.by_u, out=B_lower), out=B_lower)  # (4.7)
+    a = rates.c.copy()
+    a[..., LINEAR] += rates.gravity
+    if not v_in_reference:
+        A[..., g.v_b, g.omega_b] += V  # (4.5)
+        A[..., g.v_b, g.v_b] -= W
+        a[..., LINEAR] -= times(W, v)  # (3.2)
+
+    f0 = chart.rate(w), chart.rotated(v), nu[..., 6:], F(a[..., None])[..., 0]  # (4.8)
+    return np.concatenate(f0, -1)
 
 
-def turned(matrices: Array, vectors: Array) -> Array:
-    """Return matrices (.., 3, 3) times vectors (.., 3)."""
-    product: Array = (matrices @ vectors[..., None])[..., 0]
-    return product
-
-
-def _turned_columns(chart: Chart, by_turn: Array) -> Array:
-    """Return slopes (.., k, 3) over turns of the base as slopes over q_b."""
-    return 2.0 * by_turn if chart is STANDING else by_turn @ chart.J
-
-
-def _to_frame(state: StateMap, chart: Chart, vectors: Array) -> None:
-    """Turn velocities or wrenches (.., 6 + n, k) in place from base axes to the frame's."""
-    for rows, held in zip((ANGULAR, LINEAR), state.axes, strict=True):
-        if held:
-            vectors[..., rows, :] = chart.R @ vectors[..., rows, :]
-
-
-def ride_along(state: StateMap, point: Point, A: Array, f0: Array) -> Array:
-    """Make A (.., nx, nx) and f0 (.., nx) those of the error from a reference that moves along.
-
-    The reference turns and flies with the point, so that the error does not.
-
-    Returns
-    -------
-    ndarray (.., nx)
-        The reference's own rate, that of its attitude without turns about gravity.
-    """
-    groups = state.groups
-    turning = skew(point.nu[..., ANGULAR])
-    A[..., groups.q_b, groups.q_b] = A[..., groups.r_b, groups.r_b] = -turning
-    drift: Array = f0.copy()
-    weight = (point.gravity * point.gravity).sum(axis=-1, keepdims=True)
-    if weight.any():
-        rate = drift[..., groups.q_b]
-        along = (rate * point.gravity).sum(axis=-1, keepdims=True) / weight
-        rate -= along * point.gravity
-    f0[...] = 0.0
-    return drift
-
-
-def _set_kinematics(A: Array, state: StateMap, chart: Chart, nu: Array) -> None:
-    """Set what the motion changes in the rows of q_b and r_b; `nu` (.., 6 + n) in base axes."""
-    g, (turned_angular, turned_linear) = state.groups, state.axes
-    w, Q, J, R = nu[..., ANGULAR], chart.Q, chart.J, chart.R
-    turning = skew(w)
-    slope = -0.5 * turning
-    if chart is not STANDING:
-        slope -= 0.5 * w[..., :, None] * (chart.q_b / chart.q0)[..., None, :]
-        A[..., g.q_b, g.omega_b] = 0.5 * (Q @ R.mT if turned_angular else Q)
-    if turned_angular:
-        slope += 0.5 * (Q @ turning @ J)
-    A[..., g.q_b, g.q_b] = slope
-    if not turned_linear:
-        A[..., g.r_b, g.v_b] = R
-        A[..., g.r_b, g.q_b] = -_turned_columns(chart, R @ skew(nu[..., LINEAR]))
-
-
-def _set_turning(
-    lower: Array,
-    B_lower: Array,
-    state: StateMap,
-    actuation: Actuation,
-    chart: Chart,
-    rates: tuple[Array, Array, Array],
-    gravity: Array,
-) -> None:
-    r"""Complete the velocity rows (.., 6 + n, nx) for what is held in which axes.
-
-    `rates` is (nu, u, c): velocity (.., 6 + n) and input (.., nu) in base axes, and the
-    acceleration (.., 6 + n) of the base origin and the joints in base axes, without gravity.
+def _over_turns(state: StateMap, actuation: Actuation, nu: Array, u: Array, rates: Rates) -> Array:
+    r"""Return the slopes of the rates over turns of the base, Theta (.., 6 + n, 3) of (4.4).
 
     A turn :math:`\delta\theta` of the base under a vector s held in reference axes
     changes its base components by :math:`[s]_\times \delta\theta`: so the velocities,
-    inputs and gravity that are held in reference axes change, and the accelerations turn
-    back. A v_b in base axes has the rate :math:`c + g - \omega \times v_b`. The rate in the
-    frame is left in `c`.
+    inputs and gravity that are held in reference axes change, and the rates turn back.
     """
-    groups = state.groups
-    turned_angular, turned_linear = state.axes
-    nu, u, c = rates
-    w, v = nu[..., ANGULAR], nu[..., LINEAR]
-    turn = np.zeros((*nu.shape, 3))
+    omega_in_reference, v_in_reference = state.axes
+    by_turn = np.zeros((*nu.shape, 3))
     for columns, _ in actuation.held:
-        turn += B_lower[..., columns] @ skew(u[..., columns])
-    if turned_angular:
-        turn += lower[..., groups.omega_b] @ skew(w)
-        turn[..., ANGULAR, :] -= skew(c[..., ANGULAR])
-    if turned_linear:
-        turn[..., LINEAR, :] -= skew(c[..., LINEAR])
+        by_turn += rates.by_u[..., columns] @ skew(u[..., columns])
+    if omega_in_reference:
+        by_turn += rates.by_nu[..., ANGULAR] @ skew(nu[..., ANGULAR])
+        by_turn[..., ANGULAR, :] -= skew(rates.c[..., ANGULAR])
+    if v_in_reference:
+        by_turn[..., LINEAR, :] -= skew(rates.c[..., LINEAR])
     else:
-        turning = skew(w)
-        lower[..., LINEAR, groups.omega_b] += skew(v)
-        lower[..., LINEAR, groups.v_b] -= turning
-        turn[..., LINEAR, :] += skew(gravity)
-        c[..., LINEAR] -= turned(turning, v)
-    c[..., LINEAR] += gravity
-    lower[..., groups.q_b] = _turned_columns(chart, turn)
+        by_turn[..., LINEAR, :] += skew(rates.gravity)
+    return by_turn
+
+
+def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
+    """Return the own rate (.., nx) of a reference that moves along, after (5.3).
+
+    That of its attitude is without turns about gravity, which change nothing.
+    """
+    rate: Array = f0.copy()
+    weight = (gravity * gravity).sum(axis=-1, keepdims=True)
+    if weight.any():
+        turning = rate[..., state.groups.q_b]
+        turning -= (turning * gravity).sum(axis=-1, keepdims=True) / weight * gravity
+    return rate

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from fflin.base.errors import FflinError, InputError, UnknownNameError, unknown
+from fflin.base.writing import read_input
 from fflin.robot.catalog import find_inputs
 from fflin.robot.inputs import KINDS, Input
-from fflin.robot.urdf.reader import read_file
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -112,7 +112,7 @@ class _Document:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        content = read_file(path, "TOML", _SIZE_LIMIT)
+        content = read_input(path, "TOML", _SIZE_LIMIT)
         try:
             text = content.decode("utf-8-sig").replace("\r\n", "\n")
         except UnicodeDecodeError as error:

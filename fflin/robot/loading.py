@@ -14,7 +14,7 @@ from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
 from fflin.base.validation import Array, number
 from fflin.robot.catalog import find_robot
 from fflin.robot.joints import Follower, Joint
-from fflin.robot.massless import massless_note
+from fflin.robot.massless import idle_coordinates, massless_note
 from fflin.robot.model_checks import check_model
 from fflin.robot.robot import ROOT, Robot
 from fflin.robot.urdf.joints import Mimic
@@ -71,10 +71,11 @@ def load(
     description = read_urdf(found.path, found.prune)
     loaded = _robot(description.model, found.name, lock, description.mimics)
     notes = description.notes
-    if loaded.idle:
-        notes = (*notes, massless_note(loaded))
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
+    if idle_coordinates(loaded):
+        # No warning: whatever needs the inverse of M refuses with this.
+        notes = (*notes, massless_note(loaded))
     loaded = replace(
         loaded,
         urdf=found.path,

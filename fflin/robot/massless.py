@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pinocchio as pin
@@ -11,10 +11,9 @@ import pinocchio as pin
 from fflin.base.errors import SingularInertiaError, listed
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.robot.frames import ROOT
+from fflin.robot.robot import ROOT, Robot
 
-if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
+_FOUND: WeakKeyDictionary[Robot, tuple[str, ...]] = WeakKeyDictionary()
 
 # Of singular values: rounding leaves 1e-15 of the largest; links 1e7 m apart, 1e-7 of it.
 _ZERO = 1e-12
@@ -42,6 +41,12 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     -------
     tuple of str
     """
+    if robot not in _FOUND:
+        _FOUND[robot] = _idle(robot)
+    return _FOUND[robot]
+
+
+def _idle(robot: Robot) -> tuple[str, ...]:
     bodies = robot.model.inertias.tolist()[ROOT:]
     moments = [np.linalg.eigh(body.inertia) for body in bodies]
     if all(
@@ -60,7 +65,7 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
         moved = _moved(robot, q, moments) @ columns
         moved /= np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
         _, sizes, modes = np.linalg.svd(np.linalg.qr(moved, mode="r"))
-        rank = int(np.count_nonzero(sizes > _ZERO * sizes[0]))
+        rank = int(np.count_nonzero(sizes > _ZERO * sizes.max(initial=0.0)))
         involved = np.linalg.norm(modes[rank:], axis=0) > _INVOLVED
         idle = tuple(dict.fromkeys(names[involved].tolist()))
         if not idle:
@@ -75,9 +80,10 @@ def coordinate_names(robot: Robot) -> list[str]:
 
 def massless_note(robot: Robot) -> str:
     """Say what of a robot can move without moving mass, and what to do about it."""
+    idle = listed(idle_coordinates(robot))
     return (
-        f"M of '{robot.name}' cannot be inverted at any configuration: {listed(robot.idle)} can "
-        "move without moving mass; give the links an inertia, or lock what needs none"
+        f"M of '{robot.name}' cannot be inverted at any configuration: {idle} can move without "
+        "moving mass; give the links an inertia, or lock what needs none"
     )
 
 
@@ -86,7 +92,7 @@ def require_inertia(robot: Robot) -> None:
 
     The rounding of its factors may hide it.
     """
-    if robot.idle:
+    if idle_coordinates(robot):
         raise SingularInertiaError(massless_note(robot))
 
 

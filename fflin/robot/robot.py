@@ -13,12 +13,11 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError, ModelError, unknown
-from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, number, placement, vector
+from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, vector
 from fflin.robot.fields import validated_fields, validated_inputs
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.inputs import Input, default_inputs, named_wheels
-from fflin.robot.joints import Follower, Joint
-from fflin.robot.massless import idle_coordinates
+from fflin.robot.joints import Follower, Joint, check_followers_rates, followed
 from fflin.robot.model_checks import change_in
 from fflin.robot.outputs import FullState, Output
 from fflin.robot.wheels import stored_momentum, with_wheels
@@ -26,7 +25,7 @@ from fflin.robot.wheels import stored_momentum, with_wheels
 _CONFIGURATION = "a configuration in Pinocchio's order"
 
 # What renormalising a unit quaternion leaves: two ulp of unity.
-_ROUND_OFF = 2.0 * float(np.finfo(float).eps)
+ROUND_OFF = 2.0 * float(np.finfo(float).eps)
 
 # Data holds a third-order tensor of nv^3 entries among others: about 32 nv^3 bytes in all.
 _DATA_BYTES_PER_NV3 = 32
@@ -196,11 +195,6 @@ class Robot:
         """Size of Pinocchio's velocity: 6 + n, and one for each mimic joint."""
         return int(self.model.nv)
 
-    @cached_property
-    def idle(self) -> tuple[str, ...]:
-        """What can move together without moving mass, so that M is singular everywhere."""
-        return idle_coordinates(self)
-
     @property
     def mass(self) -> float:
         """Total mass in kg."""
@@ -242,8 +236,8 @@ class Robot:
 
     def follow(self, q: Array) -> None:
         """Put the mimic joints of a configuration where their leaders say."""
-        for joint, leader, multiplier, offset in self.followers:
-            joint.place(q, multiplier * leader.value(q) + offset)
+        for follower in self.followers:
+            follower.place(q)
 
     def checked_configuration(self, q: Array) -> Array:
         """Return `q` as a valid configuration of this robot.
@@ -277,19 +271,19 @@ class Robot:
                 f"the base quaternion q[3:7] has length {np.linalg.norm(q[3:7]):.9g}, expected 1; "
                 "normalise it (x, y, z, w)"
             )
-        for index in self._unbounded:
+        for index in self.unbounded:
             c, s = entries[index], entries[index + 1]
             excess = abs(c * c + s * s - 1.0)
             if excess > worst:
                 worst = excess
                 if excess > NORM_TOLERANCE:
                     raise InputError(
-                        f"(cos, sin) of continuous joint '{self._unbounded[index]}', "
+                        f"(cos, sin) of continuous joint '{self.unbounded[index]}', "
                         f"q[{index}:{index + 2}], has length {np.hypot(c, s):.9g}, expected 1"
                     )
-        if worst > _ROUND_OFF:
+        if worst > ROUND_OFF:
             q = pin.normalize(self.model, q)
-        return self._followed(q) if self.followers else q
+        return followed(self.followers, q) if self.followers else q
 
     def checked_velocity(self, v: Array) -> Array:
         """Return `v` as a valid velocity (nv,), never modified.
@@ -301,13 +295,7 @@ class Robot:
             leader makes it.
         """
         v = vector("v", v, self.nv, "a velocity in Pinocchio's order")
-        for joint, leader, multiplier, _ in self.followers:
-            expected = multiplier * v[leader.idx_v]
-            if abs(v[joint.idx_v] - expected) > NORM_TOLERANCE * max(1.0, abs(expected)):
-                raise InputError(
-                    f"v[{joint.idx_v}] of joint '{joint.name}' is {v[joint.idx_v]:.9g}, but it "
-                    f"mimics '{leader.name}', which makes it {expected:.9g}"
-                )
+        check_followers_rates(self.followers, v)
         return v
 
     def _with_inputs(self, inputs: Any) -> Robot:
@@ -366,60 +354,7 @@ class Robot:
         return (self.nq,)
 
     @cached_property
-    def _unbounded(self) -> dict[int, str]:
+    def unbounded(self) -> dict[int, str]:
+        """{index of the cosine in q: joint} of the joints that turn without end."""
         joints = (*self.joints, *(follower.joint for follower in self.followers))
         return {joint.idx_q: joint.name for joint in joints if joint.unbounded}
-
-    def _followed(self, q: Array) -> Array:
-        followed = q.copy()
-        self.follow(followed)
-        for joint, leader, *_ in self.followers:
-            part = slice(joint.idx_q, joint.idx_q + 1 + joint.unbounded)
-            error = np.abs(followed[part] - q[part]).max()
-            if error > NORM_TOLERANCE * max(1.0, np.abs(followed[part]).max()):
-                raise InputError(
-                    f"joint '{joint.name}' is at {joint.value(q):.9g}, but it mimics "
-                    f"'{leader.name}', which puts it at {joint.value(followed):.9g}; "
-                    "`configuration` places mimic joints"
-                )
-        return followed
-
-
-def configuration(
-    robot: Robot,
-    joints: Mapping[str, float] | None = None,
-    base: pin.SE3 | None = None,
-) -> Array:
-    """Build a Pinocchio configuration.
-
-    Parameters
-    ----------
-    robot : Robot
-    joints : mapping, optional
-        {joint: value [rad|m]} of independent joints; the others stay at neutral.
-    base : pin.SE3, optional
-        Placement of the base in the world; the identity by default.
-
-    Returns
-    -------
-    ndarray (nq,)
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such joint.
-    InputError
-        If a value is not a finite number, or a joint mimics another.
-    """
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
-    q = pin.neutral(robot.model)
-    if base is not None:
-        root = robot.model.jointPlacements[ROOT]
-        q[:7] = pin.SE3ToXYZQUAT(root.actInv(placement("base", base)))
-    if joints is not None and not isinstance(joints, Mapping):
-        raise InputError(f"joints is a {type(joints).__name__}, expected {{joint: value}}")
-    for name, value in (joints or {}).items():
-        robot.joint(name).place(q, number(f"joint '{name}'", value))
-    robot.follow(q)
-    return robot.checked_configuration(q)

@@ -12,10 +12,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.design import Design
-from fflin.base.errors import FileError, InputError
+from fflin.base import record
+from fflin.base.errors import InputError
+from fflin.base.record import Design
 from fflin.base.tables import grid, width
 from fflin.base.validation import Array
+from fflin.base.writing import as_path, check_ending, write_whole
+
+FORMATS = (*record.FORMATS, ".csv")
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -87,6 +91,8 @@ class Motion(Design):
             len(each) not in (0, len(self.t)) for each in may_lack
         ):
             raise InputError("the rows of the motion are not as many as its times")
+        if not len(self.prediction):  # of json, which knows no empty matrices
+            object.__setattr__(self, "prediction", np.zeros((0, self.x.shape[1])))
         super().__post_init__()
 
     def __repr__(self) -> str:
@@ -135,15 +141,12 @@ class Motion(Design):
         FileError
             If the ending is another or the file cannot be written.
         """
-        from fflin.base.writing import as_path, write_whole
-
         target = as_path(path)
-        check_motion_format(target)
+        check_ending(target, FORMATS)
         if target.suffix != ".csv":
             super().save(target)
             return
-        if not all(np.isfinite(each).all() for each in (self.t, self.x, self.u)):
-            raise InputError("the motion has entries that are not finite; it is not saved")
+        record.require_finite({"t": self.t, "x": self.x, "u": self.u})
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow(["t", *self.state_names, *(f"u.{name}" for name in self.input_names)])
@@ -153,15 +156,6 @@ class Motion(Design):
     def plot(self, path: str | Path | None = None, **options: Any) -> Any:
         """Draw the motion, see `plot_motion`; into a file where a path is given."""
         return plot_motion(self, path, **options)
-
-
-def check_motion_format(path: Path) -> None:
-    """Raise `FileError` where a motion cannot be saved under that name."""
-    from fflin.base.design_files import FORMATS
-
-    if path.suffix not in (*FORMATS, ".csv"):
-        expected = ", ".join((*FORMATS, ".csv"))
-        raise FileError(f"'{path}' ends in '{path.suffix}', expected one of {expected}")
 
 
 def require_motion(motion: Any) -> Motion:

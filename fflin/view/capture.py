@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import io
 import json
@@ -10,12 +9,11 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
+import threading
 import time
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +26,16 @@ _NAMES = (
 
 # WebGL without a graphics card, and nothing that asks the network.
 _ARGUMENTS = (
-    *("--headless=new", "--remote-debugging-port=0", "--hide-scrollbars", "--mute-audio"),
+    *("--headless=new", "--remote-debugging-pipe", "--hide-scrollbars", "--mute-audio"),
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
     *("--disable-background-networking", "--disable-quic", "--no-first-run"),
     *("--no-default-browser-check", "--disable-component-update", "--disable-sync"),
     *("--disable-dev-shm-usage", "--disable-extensions"),
 )
+
+# It is told what to do through descriptor 3 and answers through 4. It ends when they are closed,
+# so that nothing of it outlives this process, however that ends.
+_WITH_PIPES = 'exec "$0" "$@" 3<&0 4>&1 </dev/null >/dev/null'
 
 _PATIENCE = 120.0  # seconds for a slow machine without a graphics card
 
@@ -114,150 +116,125 @@ def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[in
 
 def _film(page: Path, times: Sequence[float], size: tuple[int, int], *, plain: bool) -> list[bytes]:
     """Return a PNG of the page at each time."""
-    started: list[subprocess.Popen[bytes]] = []
-    # In a notebook this thread has an event loop already.
-    with ThreadPoolExecutor(1) as other:
-        film = other.submit(lambda: asyncio.run(_browse(page, times, size, plain, started)))
-        try:
-            return film.result()
-        except BaseException:
-            # At Ctrl-C the browser is there or about to be, and the other thread would go on.
-            while not (started or film.done()):
-                time.sleep(0.01)
-            for process in started:
-                _end(process)
-            raise
-
-
-async def _browse(
-    page: Path,
-    times: Sequence[float],
-    size: tuple[int, int],
-    plain: bool,
-    started: list[subprocess.Popen[bytes]],
-) -> list[bytes]:
     program = find_chromium()
-    # Where there is such a thing, it ends with this process, however that ends.
-    guard = shutil.which("setpriv")
-    guarded = [guard, "--pdeathsig", "TERM"] if guard and sys.platform == "linux" else []
+    try:
+        with _browser(program, _PATIENCE + 3.0 * len(times)) as browser:
+            return list(_shots(browser, page, times, size, plain))
+    except (OSError, _BrowserError) as error:
+        raise FileError(f"{program} takes no picture of {page}: {error}") from None
+
+
+def _shots(
+    browser: _Browser, page: Path, times: Sequence[float], size: tuple[int, int], plain: bool
+) -> Iterator[bytes]:
+    browser.open_tab()
+    metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
+    browser.tell("Emulation.setDeviceMetricsOverride", **metrics)
+    browser.tell("Page.navigate", url=page.resolve().as_uri() + "#pause")
+    while not browser.evaluate("Boolean(window.fflin && window.fflin.ready)"):
+        time.sleep(0.05)
+    if plain:
+        browser.evaluate("fflin.plain(true)")
+    for moment in times:
+        # Two frames: one that draws, one after which it is on the screen.
+        browser.evaluate(
+            f"fflin.seek({float(moment)!r}); new Promise(done => requestAnimationFrame(() => "
+            "requestAnimationFrame(() => done(1))))"
+        )
+        yield base64.b64decode(browser.tell("Page.captureScreenshot", format="png")["data"])
+
+
+@contextmanager
+def _browser(program: str, patience: float) -> Iterator[_Browser]:
+    """Run a browser, for so many seconds at the most, and leave nothing of it behind."""
     with tempfile.TemporaryDirectory(prefix="fflin-", ignore_cleanup_errors=True) as folder:
         root = ["--no-sandbox"] if getattr(os, "geteuid", lambda: 1)() == 0 else []
+        command = [program, *_ARGUMENTS, *root, f"--user-data-dir={folder}", "about:blank"]
         process = subprocess.Popen(
-            [*guarded, program, *_ARGUMENTS, *root, f"--user-data-dir={folder}", "about:blank"],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
+            ["sh", "-c", _WITH_PIPES, *command],
+            bufsize=0,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             # What it leaves behind goes with the folder, unless the path of its socket, which may
             # have some hundred letters, got too long by that.
             env={**os.environ, **({"TMPDIR": folder} if len(folder) < 56 else {})},
             start_new_session=True,
         )
-        started.append(process)
-        patience = 0.0  # with what was broken off, which may be busy with a picture for long
-        try:
-            pictures = await asyncio.wait_for(
-                _shoot(Path(folder, "DevToolsActivePort"), page, times, size, plain),
-                _PATIENCE + 3.0 * len(times),
-            )
-            patience = 5.0
-            return pictures
-        except (asyncio.TimeoutError, OSError, _BrowserError) as error:
-            raise FileError(
-                f"{program} takes no picture of {page}: {str(error) or 'it does not answer'}"
-            ) from None
-        finally:
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(patience)
-            _end(process)
+        timer = threading.Timer(patience, _kill, [process])
+        timer.daemon = True
+        with process:
+            try:
+                timer.start()
+                browser = _Browser(process)
+                yield browser
+                with suppress(_BrowserError, subprocess.TimeoutExpired):
+                    browser.quit()
+                    process.wait(5.0)
+            finally:
+                timer.cancel()
+                _kill(process)
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
+def _kill(process: subprocess.Popen[bytes]) -> None:
     """End the browser and all that it started."""
-    if hasattr(os, "killpg"):
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-    else:
-        process.kill()
-    process.wait()
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
 
 
 class _BrowserError(Exception):
     """What the browser answers where it does not do as it is told."""
 
 
-async def _shoot(
-    ready: Path, page: Path, times: Sequence[float], size: tuple[int, int], plain: bool
-) -> list[bytes]:
-    from tornado.websocket import WebSocketClosedError, websocket_connect
+class _Browser:
+    """A browser, and one tab of it, told what to do by the DevTools protocol."""
 
-    while not (ready.is_file() and len(ready.read_text().split()) == 2):
-        await asyncio.sleep(0.05)
-    port, path = ready.read_text().split()
-    socket = await websocket_connect(f"ws://127.0.0.1:{port}{path}", max_message_size=2**28)
-    try:
-        return await _Tab(socket).shoot(page, times, size, plain)
-    finally:
-        # Told to go it clears up behind itself, which it does not when it is ended.
-        with suppress(WebSocketClosedError):
-            await socket.write_message(json.dumps({"id": 0, "method": "Browser.close"}))
-        socket.close()
-        while await asyncio.wait_for(socket.read_message(), 10.0) is not None:
-            pass
-
-
-class _Tab:
-    """One page of a browser, told what to do by the DevTools protocol."""
-
-    def __init__(self, socket: Any) -> None:
-        self._socket = socket
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        assert process.stdin and process.stdout
+        self._commands, self._answers = process.stdin, process.stdout
+        self._rest = b""
         self._number = 0
         self._session: dict[str, str] = {}
 
-    async def tell(self, method: str, **parameters: Any) -> dict[str, Any]:
+    def tell(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Give a command and return what it is answered by."""
         self._number += 1
         command = {"id": self._number, "method": method, "params": parameters, **self._session}
-        await self._socket.write_message(json.dumps(command))
-        while True:
-            message = await self._socket.read_message()
-            if message is None:
-                raise _BrowserError("the connection is lost")
-            answer = json.loads(message)
-            if answer.get("id") == self._number:
-                if "error" in answer:
-                    raise _BrowserError(answer["error"].get("message"))
-                result: dict[str, Any] = answer["result"]
-                return result
+        with suppress(BrokenPipeError):  # seen when it is read
+            self._commands.write(json.dumps(command).encode() + b"\0")
+        while (answer := self._message()).get("id") != self._number:
+            pass  # what it tells unasked
+        if "error" in answer:
+            raise _BrowserError(answer["error"].get("message"))
+        result: dict[str, Any] = answer["result"]
+        return result
 
-    async def evaluate(self, expression: str) -> Any:
-        answer = await self.tell(
+    def _message(self) -> dict[str, Any]:
+        pieces = [self._rest]
+        while b"\0" not in pieces[-1]:
+            pieces.append(self._answers.read(2**20))
+            if not pieces[-1]:
+                raise _BrowserError("it does not answer")
+        text, _, self._rest = b"".join(pieces).partition(b"\0")
+        message: dict[str, Any] = json.loads(text)
+        return message
+
+    def open_tab(self) -> None:
+        """Open a tab, which all further commands are for."""
+        target = self.tell("Target.createTarget", url="about:blank")
+        attached = self.tell("Target.attachToTarget", targetId=target["targetId"], flatten=True)
+        self._session = {"sessionId": attached["sessionId"]}
+
+    def quit(self) -> None:
+        """Tell it to go: then it clears up behind itself, which it does not when it is ended."""
+        self._session = {}
+        self.tell("Browser.close")
+
+    def evaluate(self, expression: str) -> Any:
+        """Return the value of an expression of JavaScript, or of its promise."""
+        answer = self.tell(
             "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
         )
         if "exceptionDetails" in answer:
             raise _BrowserError(answer["exceptionDetails"].get("text"))
         return answer["result"].get("value")
-
-    async def shoot(
-        self, page: Path, times: Sequence[float], size: tuple[int, int], plain: bool
-    ) -> list[bytes]:
-        target = await self.tell("Target.createTarget", url="about:blank")
-        attached = await self.tell(
-            "Target.attachToTarget", targetId=target["targetId"], flatten=True
-        )
-        self._session = {"sessionId": attached["sessionId"]}
-        metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
-        await self.tell("Emulation.setDeviceMetricsOverride", **metrics)
-        await self.tell("Page.navigate", url=page.resolve().as_uri() + "#pause")
-        while not await self.evaluate("Boolean(window.fflin && window.fflin.ready)"):
-            await asyncio.sleep(0.05)
-        if plain:
-            await self.evaluate("fflin.plain(true)")
-        pictures = []
-        for moment in times:
-            # Two frames: one that draws, one after which it is on the screen.
-            await self.evaluate(
-                f"fflin.seek({float(moment)!r}); new Promise(done => requestAnimationFrame(() => "
-                "requestAnimationFrame(() => done(1))))"
-            )
-            picture = await self.tell("Page.captureScreenshot", format="png")
-            pictures.append(base64.b64decode(picture["data"]))
-        return pictures

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from fflin.base.validation import Array
-from fflin.view.collada import Indices, read_collada
 from fflin.view.shapes import Color
+
+Indices: TypeAlias = "np.ndarray[Any, np.dtype[np.integer[Any]]]"
 
 # Details smaller than this part of a mesh's extent are not drawn; it halves most CAD exports.
 _RESOLUTION = 1.0 / 400.0
@@ -54,9 +56,8 @@ def load_mesh(path: Path) -> tuple[Mesh, ...]:
     ValueError
         If it cannot be read.
     """
-    parts = read_collada(path) if path.suffix.lower() == ".dae" else None
-    if not parts:
-        parts = [(*_triangles(path), None)]
+    parts = _colored(path) if path.suffix.lower() == ".dae" else []
+    parts = parts or [(*_triangles(path), None)]
     corners = np.concatenate([vertices[faces].reshape(-1, 3) for vertices, faces, _ in parts])
     if not corners.size or not np.isfinite(corners).all():
         raise ValueError(f"{path}: has no triangles")
@@ -70,6 +71,29 @@ def load_mesh(path: Path) -> tuple[Mesh, ...]:
         if sum(len(mesh.faces) for mesh in welded) <= _LARGEST or resolution > 0.02:
             return tuple(mesh for mesh in welded if len(mesh.faces))
         resolution *= 1.5
+
+
+def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
+    """Return vertices, faces and plain colour of each part of a COLLADA file, in metres.
+
+    Pinocchio's loader makes one part of them all. None where the file is not understood.
+    """
+    import trimesh
+
+    try:
+        scene = trimesh.load_scene(path, process=False)
+        meshes = [mesh for mesh in scene.convert_units("meters").dump() if hasattr(mesh, "faces")]
+        return [(mesh.vertices, mesh.faces, _color(mesh)) for mesh in meshes]
+    except Exception:  # a malformed file may raise anything
+        return []
+
+
+def _color(mesh: Any) -> Color | None:
+    color = getattr(getattr(mesh.visual, "material", None), "baseColorFactor", None)
+    if color is None:
+        return None  # a texture, or nothing
+    r, g, b, a = (float(x) / 255.0 for x in color)
+    return r, g, b, a or 1.0
 
 
 def _triangles(path: Path) -> tuple[Array, Indices]:

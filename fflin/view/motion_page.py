@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.tables import counted
 from fflin.base.validation import Array
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import find_frame
@@ -57,8 +58,8 @@ def motion_page(
     moving = [(drawing, film.poses)]
     data = robot.model.createData()
     Drawing(robot, scenery["target"], "ghost", sent).place(body_poses(robot, data, target))
-    predicted = _predicted(state, motion, shown)
-    if predicted is not None:
+    if motion.linear is not None:
+        predicted = [state.to_pinocchio(x)[0] for x in motion.linear[shown]]
         poses = np.array([body_poses(robot, data, each) for each in predicted])
         moving.append((Drawing(robot, scenery["linear"], "linear", sent), poses))
     clips = []
@@ -89,7 +90,7 @@ def motion_page(
         "speed": speed,
         "follow": follow,
         "points": rounded(shown_points, info["size"]),
-        "legend": legend(info, ghost=ghost, linear=predicted is not None),
+        "legend": legend(info, ghost=ghost, linear=motion.linear is not None),
     }
     return build_page(info, window.commands()), drawing.notes
 
@@ -99,28 +100,16 @@ def chart_of(robot: Robot, motion: Motion) -> StateMap:
     return StateMap(robot, reference=motion.reference, frame=cast("Frame", motion.frame))
 
 
-def _predicted(state: StateMap, motion: Motion, shown: Array) -> Array | None:
-    """Return the configurations (N, nq) that the linear model predicts, where it was asked."""
-    if motion.linear is None:
-        return None
-    return np.array([state.to_pinocchio(x)[0] for x in motion.linear[shown]])
-
-
 def subtitle(robot: Robot) -> str:
     """Return what the page says of a robot below its name."""
     wheels = len(robot.wheels)
-    joints = robot.n - wheels
-    parts = [f"{joints} joint{'s' * (joints != 1)}"]
-    if wheels:
-        parts.append(f"{wheels} wheel{'s' * (wheels != 1)}")
+    parts = [counted(robot.n - wheels, "joint"), *[counted(wheels, "wheel")] * bool(wheels)]
     return ", ".join([*parts, f"{robot.mass:.4g} kg"])
 
 
-def frame_points(
-    drawing: Drawing, film: Playback, size: float, *, follow: bool = False, most: int = 24
-) -> Array:
+def frame_points(drawing: Drawing, film: Playback, size: float, *, follow: bool = False) -> Array:
     """Return corners of all that moves and tips of forces (M, 3) at some frames, for a camera."""
-    chosen = np.unique(np.linspace(0, len(film.t) - 1, most).astype(int))
+    chosen = np.unique(np.linspace(0, len(film.t) - 1, 24).astype(int))
     strongest = np.linalg.norm(film.force, axis=1).max() or 1.0
     points = []
     for index in chosen:

@@ -17,8 +17,6 @@ from fflin.robot.robot import ROOT, Robot
 # More frames than this and a file grows for nothing that an eye could see.
 _MOST_FRAMES = 3000
 
-_ORIGIN = np.zeros(3)
-
 
 @dataclass(frozen=True)
 class Playback:
@@ -109,37 +107,25 @@ def play_back(
     """
     model, data = robot.model, robot.model.createData()
     tool_id = frame_index(model, tool) if tool else None
-    actuation = Actuation(state)
-    poses: list[Array] = []
-    com: list[Array] = []
-    tools: list[Array] = []
-    force: list[Array] = []
-    torque: list[Array] = []
-    for q_k, u_k in zip(q, u, strict=True):
-        poses.append(body_poses(robot, data, q_k))
-        com.append(pin.centerOfMass(model, data, q_k).copy())
+    groups = Actuation(state).groups
+
+    def frame(q_k: Array, u_k: Array) -> tuple[Array, ...]:
+        poses = body_poses(robot, data, q_k)
+        com = pin.centerOfMass(model, data, q_k).copy()
         base = data.oMi[ROOT]
-        if tool_id is not None:
-            tools.append(pin.updateFramePlacement(model, data, tool_id).translation.copy())
-        else:
-            tools.append(base.translation.copy())
-        for kind, turned, found in (
-            ("tau_b", state.axes[0], torque),
-            ("F_b", state.axes[1], force),
-        ):
-            rows = actuation.groups.get(kind)
-            axes = state.reference.rotation if turned else base.rotation
-            found.append(_ORIGIN if rows is None else axes @ u_k[rows])
-    thrust = actuation.groups.get("thrust", np.zeros(0, dtype=int))
-    return Playback(
-        t,
-        np.array(poses),
-        np.array(com),
-        np.array(tools),
-        np.array(force),
-        np.array(torque),
-        u[:, thrust],
-    )
+        end = base if tool_id is None else pin.updateFramePlacement(model, data, tool_id)
+        force, torque = (
+            (state.reference if relative else base).rotation @ u_k[groups[kind]]
+            if kind in groups
+            else np.zeros(3)
+            for kind, relative in (("F_b", state.axes[1]), ("tau_b", state.axes[0]))
+        )
+        return poses, com, end.translation.copy(), force, torque
+
+    frames = [frame(q_k, u_k) for q_k, u_k in zip(q, u, strict=True)]
+    thrust = u[:, groups.get("thrust", np.zeros(0, dtype=int))]
+    poses, com, tools, force, torque = map(np.array, zip(*frames, strict=True))
+    return Playback(t, poses, com, tools, force, torque, thrust)
 
 
 def thrusters(robot: Robot) -> list[tuple[int, Array, Array]]:

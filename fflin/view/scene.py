@@ -15,8 +15,7 @@ import umsgpack
 from fflin.base.validation import Array
 from fflin.robot.robot import ROOT, Robot
 from fflin.robot.urdf.xml import named
-from fflin.view.collada import Indices
-from fflin.view.meshes import Mesh, load_mesh
+from fflin.view.meshes import Indices, Mesh, load_mesh
 from fflin.view.shapes import PLAIN, Shape, shapes
 
 with warnings.catch_warnings():
@@ -124,7 +123,9 @@ class Drawing:
             notes += (f"{robot.name}: {named('mesh file', unreadable)} cannot be read; not drawn",)
         self.notes = notes
         self.bodies = list(corners)
-        self.corners = [_bounds(np.concatenate(boxes)) for boxes in corners.values()]
+        self.corners = [
+            _box_corners(np.eye(4), _bounds(np.concatenate(boxes))) for boxes in corners.values()
+        ]
 
     def place(self, poses: Array) -> None:
         """Put every body at its pose, (njoints - 1, 7) of x, y, z and quaternion x, y, z, w."""
@@ -164,37 +165,31 @@ def typed(array: Array | Indices, kind: str = "<f4") -> Any:
 
 
 def _pieces(shape: Shape) -> list[tuple[dict[str, Any], Array, Any, Array]]:
-    """Return geometry, matrix, colour and half of the bounding box's sides of each piece."""
+    """Return geometry, matrix, colour and the bounding box's two corners of each piece."""
     unit = np.eye(4)
     if shape.kind == "mesh":
         assert shape.mesh is not None
         scale = np.diag((*shape.size, 1.0))
         return [
-            (*_triangles(mesh, scale), shape.color or mesh.color or PLAIN, _mesh_box(mesh))
+            (_triangles(mesh), scale, shape.color or mesh.color or PLAIN, _bounds(mesh.vertices))
             for mesh in load_mesh(shape.mesh)
         ]
     color = shape.color or PLAIN
     if shape.kind == "box":
-        names = ("width", "height", "depth")
-        box = {"uuid": "box", "type": "BoxGeometry", **dict(zip(names, shape.size, strict=True))}
-        return [(box, unit, color, _symmetric(np.array(shape.size) / 2.0))]
+        width, height, depth = shape.size
+        sides = {"width": width, "height": height, "depth": depth}
+        box = {"uuid": "box", "type": "BoxGeometry", **sides}
+        return [(box, unit, color, _symmetric(width / 2.0, height / 2.0, depth / 2.0))]
     radius = shape.size[0]
-    ball = {
-        "uuid": "sphere",
-        "type": "SphereGeometry",
-        "radius": radius,
-        **{"widthSegments": 32, "heightSegments": 20},
-    }
-    around = _symmetric(np.full(3, radius))
+    fineness: dict[str, Any] = {"widthSegments": 32, "heightSegments": 20}
+    ball = {"uuid": "sphere", "type": "SphereGeometry", "radius": radius, **fineness}
+    around = _symmetric(radius, radius, radius)
     if shape.kind == "sphere":
         return [(ball, unit, color, around)]
     length = shape.size[1]
-    tube = {
-        "uuid": "cylinder",
-        "type": "CylinderGeometry",
-        **{"radiusTop": radius, "radiusBottom": radius, "height": length, "radialSegments": 40},
-    }
-    pieces = [(tube, _Y_TO_Z, color, _symmetric(np.array([radius, length / 2.0, radius])))]
+    sides = {"radiusTop": radius, "radiusBottom": radius, "height": length}
+    tube = {"uuid": "cylinder", "type": "CylinderGeometry", **sides, "radialSegments": 40}
+    pieces = [(tube, _Y_TO_Z, color, _symmetric(radius, length / 2.0, radius))]
     if shape.kind == "capsule":
         for end in (-length / 2.0, length / 2.0):
             lifted = unit.copy()
@@ -203,40 +198,30 @@ def _pieces(shape: Shape) -> list[tuple[dict[str, Any], Array, Any, Array]]:
     return pieces
 
 
-def _triangles(mesh: Mesh, matrix: Array) -> tuple[dict[str, Any], Array]:
+def _triangles(mesh: Mesh) -> dict[str, Any]:
     kind = "<u2" if len(mesh.vertices) < 2**16 else "<u4"
     digest = sha1(mesh.vertices.tobytes() + mesh.faces.tobytes(), usedforsecurity=False)
-    geometry = {
+    corners = {"itemSize": 3, "type": "Float32Array", "array": typed(mesh.vertices)}
+    return {
         "uuid": digest.hexdigest(),
         "type": "BufferGeometry",
         "data": {
             "index": {"type": _TYPED[kind][1], "array": typed(mesh.faces, kind)},
-            "attributes": {
-                "position": {
-                    "itemSize": 3,
-                    "type": "Float32Array",
-                    "array": typed(mesh.vertices),
-                    "normalized": False,
-                }
-            },
+            "attributes": {"position": {**corners, "normalized": False}},
         },
     }
-    return geometry, matrix
 
 
-def _symmetric(half: Array) -> Array:
-    return np.stack((-half, half))
-
-
-def _mesh_box(mesh: Mesh) -> Array:
-    return np.stack((mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)))
-
-
-def _box_corners(matrix: Array, box: Array) -> Array:
-    choice = np.array([[i & 1, i >> 1 & 1, i >> 2 & 1] for i in range(8)])
-    corners = np.take_along_axis(box, choice, axis=0)
-    return corners @ matrix[:3, :3].T + matrix[:3, 3]
+def _symmetric(*half: float) -> Array:
+    return np.array([np.negative(half), half])
 
 
 def _bounds(points: Array) -> Array:
-    return _box_corners(np.eye(4), np.stack((points.min(axis=0), points.max(axis=0))))
+    return np.stack((points.min(axis=0), points.max(axis=0)))
+
+
+def _box_corners(matrix: Array, box: Array) -> Array:
+    """Return the eight corners (8, 3) of a box (2, 3) that a matrix (4, 4) puts in its place."""
+    choice = np.array([[i & 1, i >> 1 & 1, i >> 2 & 1] for i in range(8)])
+    corners = np.take_along_axis(box, choice, axis=0)
+    return corners @ matrix[:3, :3].T + matrix[:3, 3]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +12,12 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinError
+from fflin.base.writing import shown
 from fflin.robot.robot import ROOT, Robot
-from fflin.robot.urdf.reader import read_file
+from fflin.robot.urdf.links import read_pose
+from fflin.robot.urdf.reader import read_document
 from fflin.robot.urdf.xacro import expand, first_xacro
-from fflin.robot.urdf.xml import Element, decimal, named, parse
+from fflin.robot.urdf.xml import Element, named, parse
 
 Color = tuple[float, float, float, float]
 
@@ -111,7 +113,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
             if mesh is not None:
                 file = find_mesh(mesh, path, robot.package_dirs)
                 if file is None:
-                    missing.append(mesh)
+                    missing.append(shown(mesh))
                     continue
             yield Shape(frame.parentJoint, kind, size, placement, color, finish, file)
     if missing:
@@ -126,7 +128,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
 
 
 def _document(path: Path) -> Element:
-    document = read_file(path)
+    document = read_document(path)
     root = parse(document, str(path))
     first = first_xacro(root)
     if path.suffix == ".xacro" or first:
@@ -137,26 +139,24 @@ def _document(path: Path) -> Element:
 def _geometry(visual: Element) -> tuple[str, tuple[float, ...], str | None]:
     (geometry,) = visual.find_all("geometry")
     (shape,) = geometry.children
+    of = f"<{shape.tag}>"
     if shape.tag == "box":
-        return "box", _numbers(shape.attributes["size"], 3), None
+        return "box", shape.vector("size", of, 3), None
     if shape.tag == "sphere":
-        return "sphere", _numbers(shape.attributes["radius"], 1), None
+        return "sphere", (shape.number("radius", of),), None
     if shape.tag in ("cylinder", "capsule"):
-        size = f"{shape.attributes['radius']} {shape.attributes['length']}"
-        return shape.tag, _numbers(size, 2), None
+        return shape.tag, (shape.number("radius", of), shape.number("length", of)), None
     if shape.tag == "mesh":
-        scale = _numbers(shape.attributes.get("scale", "1 1 1"), 3)
-        return "mesh", scale, shape.attributes["filename"]
+        scale = shape.vector("scale", of, 3) if "scale" in shape.attributes else (1.0, 1.0, 1.0)
+        return "mesh", scale, shape.text("filename", of)
     raise ValueError(shape.tag)
 
 
 def _placement(visual: Element) -> pin.SE3:
-    origins = visual.find_all("origin")
-    if not origins:
-        return pin.SE3.Identity()
-    xyz = _numbers(origins[0].attributes.get("xyz", "0 0 0"), 3)
-    rpy = _numbers(origins[0].attributes.get("rpy", "0 0 0"), 3)
-    return pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
+    pose = read_pose(visual, "<visual>")
+    if pose.quaternion is not None:
+        return pin.XYZQUATToSE3(np.array([*pose.xyz, *pose.quaternion]))
+    return pin.SE3(pin.rpy.rpyToMatrix(*pose.rpy), np.array(pose.xyz))
 
 
 def _material(visual: Element, colors: Mapping[str, Color], kind: str) -> tuple[Color | None, str]:
@@ -172,15 +172,8 @@ def _color(material: Element) -> Color | None:
     found = material.find_all("color")
     if not found:
         return None
-    r, g, b, a = (min(max(x, 0.0), 1.0) for x in _numbers(found[0].attributes["rgba"], 4))
+    r, g, b, a = (min(max(x, 0.0), 1.0) for x in found[0].vector("rgba", "<color>", 4))
     return r, g, b, a
-
-
-def _numbers(text: str, count: int) -> tuple[float, ...]:
-    values = tuple(decimal(word) for word in text.split())
-    if len(values) != count or not all(map(math.isfinite, values)):
-        raise ValueError(text)
-    return values
 
 
 def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
@@ -205,7 +198,8 @@ def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None
         candidates = [folder / rest for folder in (*package_dirs, *urdf.resolve().parents)]
         # A package's own folder may have been given, or be called otherwise.
         candidates += [folder / inside for folder in (*package_dirs, *urdf.resolve().parents)]
-    return next((path for path in candidates if path.is_file()), None)
+    # Unlike Path.is_file, this takes a name that is too long for one that does not exist.
+    return next((path for path in candidates if os.path.isfile(path)), None)
 
 
 def _inertia_boxes(robot: Robot) -> Iterator[Shape]:

@@ -11,7 +11,7 @@ from warnings import warn
 
 from fflin.base.errors import FflinWarning, FileError, InputError
 from fflin.base.validation import Array, number, truth
-from fflin.base.writing import as_path, write_whole
+from fflin.base.writing import as_path, check_place, write_whole
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import find_frame
@@ -129,9 +129,20 @@ def visualize(
     if motion is None:
         if any(file is not None for file in (html, png, gif)):
             raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
+        _check_port(port)
         start = robot.neutral() if q is None else _configuration(robot, "q", q)
-        return _live(robot, start, opened is not False, scene, tool, bool(follow), speed, port)
-    outputs = check_outputs({".html": html, ".png": png, ".gif": gif}, robot.urdf)
+        from fflin.view.live import Live
+
+        pace = _speed(speed, 1.0)
+        live = Live(
+            robot, start, scene=scene, tool=tool, follow=bool(follow), speed=pace, port=port
+        )
+        for note in live.notes:
+            warn(note, FflinWarning, stacklevel=2)
+        if opened is not False:
+            live.open()
+        return live
+    outputs = check_outputs({".html": html, ".png": png, ".gif": gif})
     _check_motion(robot, motion)
     fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
     from fflin.view.motion_page import chart_of, motion_page
@@ -164,35 +175,13 @@ def visualize(
     return shown
 
 
-def _live(
-    robot: Robot,
-    q: Array,
-    open: bool,
-    scene: str,
-    tool: str | None,
-    follow: bool,
-    speed: float | None,
-    port: int,
-) -> Live:
+def _check_port(port: Any) -> None:
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port < 2**16:
         raise InputError(f"port is {port!r}, expected 0 to 65535 (0: one that is free)")
-    from fflin.view.live import Live
-
-    live = Live(
-        robot, q, scene=scene, tool=tool, follow=follow, speed=_speed(speed, 1.0), port=port
-    )
-    for note in live.notes:
-        warn(note, FflinWarning, stacklevel=3)
-    if open:
-        live.open()
-    return live
 
 
-def check_outputs(files: dict[str, Any], spare: Path | None = None) -> dict[str, Path]:
-    """Return {ending: path} of the files that are named, or raise where one cannot be written.
-
-    `spare` is a file that must not be overwritten, such as the robot's own.
-    """
+def check_outputs(files: dict[str, Any]) -> dict[str, Path]:
+    """Return {ending: path} of the files that are named, or raise where one cannot be written."""
     outputs = {}
     for ending, file in files.items():
         if file is None:
@@ -200,12 +189,7 @@ def check_outputs(files: dict[str, Any], spare: Path | None = None) -> dict[str,
         path = as_path(file)
         if path.suffix.lower() != ending:
             raise FileError(f"'{path}' ends in '{path.suffix}', expected {ending}")
-        if not path.absolute().parent.is_dir():
-            raise FileError(f"{path}: cannot be written: there is no folder {path.parent}")
-        if path.is_dir():
-            raise FileError(f"{path}: is a folder; give the name of a file")
-        if spare and path.resolve() == spare.resolve():
-            raise FileError(f"{path} is the robot's own file; name another to write")
+        check_place(path)
         outputs[ending] = path
     if ".png" in outputs or ".gif" in outputs:
         from fflin.view.capture import find_chromium

@@ -1,19 +1,14 @@
 """Controllability against closed forms and exact rational arithmetic, and the names it gives."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.linalg import null_space
 
 import fflin
-from fflin import BaseForce, BaseTorque, JointTorque
+from fflin import BaseForce, BaseTorque
 from tests.support import exact
+from tests.support.mechanisms import mechanical, motors
 from tests.support.robots import BUNDLED, random_tree
-
-
-def motors(robot, count=None):
-    return [JointTorque(name) for name in robot.joint_names[:count]]
 
 
 def selection(lin):
@@ -21,28 +16,6 @@ def selection(lin):
     S = np.round(lin.M @ lin.B[len(lin.M) :])
     assert set(np.unique(S)) <= {0.0, 1.0}
     return S
-
-
-def mechanical(M, K, D, S, like):
-    """A linear model of M a + D v + K q = S u."""
-    nv = len(M)
-    A = np.zeros((2 * nv, 2 * nv))
-    # Positions that change at other rates than the velocities, as half the rotation does.
-    N = np.diag(1.0 / (1.0 + np.arange(nv) % 3))
-    A[:nv, nv:] = N
-    A[nv:] = -np.linalg.solve(M, np.hstack((K @ np.linalg.inv(N), D)))
-    B = np.vstack((np.zeros_like(S), np.linalg.solve(M, S)))
-    names = tuple(f"u_{i}" for i in range(S.shape[1]))
-    return replace(
-        like,
-        A=A,
-        B=B,
-        D=np.zeros((2 * nv, len(names))),
-        input_names=names,
-        input_units=names,
-        u0=np.zeros(len(names)),
-        _inertia=lambda _: M,
-    )
 
 
 def holds_together(lin, found):

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import fflin
-from tests.analysis.test_controllability import mechanical, motors
 from tests.support import decisions
+from tests.support.mechanisms import mechanical, motors
 from tests.support.robots import random_tree
 
 CORES = ("", "Haswell", "Nehalem", "Prescott", "Sandybridge")

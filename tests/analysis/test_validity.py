@@ -18,7 +18,7 @@ from fflin.analysis.closed_loop import Loop
 from fflin.analysis.validity import _LEVELS, _clopper_pearson, _crossing, _slope
 from fflin.batch.workers import OwnWorkers
 from fflin.control.weights import default_weights
-from tests.commands.test_cli import refused, run
+from tests.support.commands import refused, run
 
 
 def held(robot, dt=0.0, reduce=False):

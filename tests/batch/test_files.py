@@ -11,7 +11,8 @@ import pytest
 
 import fflin
 from fflin.batch.store import FileStore
-from tests.batch.test_sweep import assert_same, points
+from tests.support.robots import singular_at
+from tests.support.sweeps import assert_same, points
 
 h5py = pytest.importorskip("h5py")
 
@@ -222,8 +223,6 @@ def test_a_killed_run_goes_on(robot, tmp_path):
 
 
 def test_a_failed_chunk_leaves_the_others_in_the_file(tmp_path):
-    from tests.batch.test_sweep import singular_at
-
     robot = singular_at(0.5)
     configurations = fflin.grid(robot, {"slide": np.arange(64) / 64.0})
     for _ in range(2):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import fflin
-from tests.batch.test_sweep import points
 from tests.support.robots import BUNDLED
+from tests.support.sweeps import points
 
 
 @pytest.mark.parametrize("name", BUNDLED)

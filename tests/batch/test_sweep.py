@@ -1,6 +1,5 @@
 """Sweeps: each of their models is the one that `linearize` makes."""
 
-import dataclasses
 import math
 from concurrent.futures import ThreadPoolExecutor
 
@@ -9,27 +8,8 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from tests.support.robots import BUNDLED, random_point, random_pose, random_tree
-
-
-def points(robot, count, seed=0):
-    """Random (q, v, u) rows."""
-    rng = np.random.default_rng(seed)
-    return tuple(map(np.array, zip(*(random_point(robot, rng) for _ in range(count)), strict=True)))
-
-
-def assert_same(one, other, tolerance=0.0):
-    """Two linear models agree in every field, arrays within a relative tolerance."""
-    assert set(one.__dict__) >= {field.name for field in dataclasses.fields(one)}
-    for field in dataclasses.fields(one):
-        left, right = getattr(one, field.name), getattr(other, field.name)
-        if isinstance(left, np.ndarray):
-            assert left.shape == right.shape, field.name
-            assert not left.flags.writeable, field.name
-            scale = np.abs(right).max(initial=0.0)
-            assert np.abs(left - right).max(initial=0.0) <= tolerance * scale, field.name
-        elif not callable(left):
-            assert left == right, field.name
+from tests.support.robots import BUNDLED, random_pose, random_tree, singular_at
+from tests.support.sweeps import assert_same, points
 
 
 @pytest.mark.parametrize("name", BUNDLED)
@@ -258,19 +238,6 @@ def test_what_has_no_room_is_refused_before_it_is_begun(robots, tmp_path):
         with pytest.raises(fflin.FileError, match=r"points are 1,928.0 PB.* only .* are free in"):
             fflin.sweep(robot, many, out=tmp_path / name)
     assert not list(tmp_path.iterdir())
-
-
-def singular_at(value):
-    """A robot whose M is singular where its last joint is at a value: a point mass on its axis."""
-    model = pin.Model()
-    model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
-    model.appendBodyToJoint(1, pin.Inertia(5.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
-    joint = model.addJoint(1, pin.JointModelRZ(), pin.SE3.Identity(), "turn")
-    slide = model.addJoint(joint, pin.JointModelPX(), pin.SE3.Identity(), "slide")
-    model.appendBodyToJoint(
-        slide, pin.Inertia(1.0, np.array([-value, 0.0, 0.0]), np.zeros((3, 3))), pin.SE3.Identity()
-    )
-    return fflin.from_model(model, name="singular")
 
 
 @pytest.mark.parametrize("parallel", [False, True])

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.commands.test_cli import refused, run
+from tests.support.commands import refused, run
 
 JOINTS = "\n".join(f'[[input]]\ntype = "joint_torque"\njoint = "joint_{i}"' for i in range(1, 7))
 

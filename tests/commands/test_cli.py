@@ -13,34 +13,8 @@ import pytest
 import fflin
 from fflin.base.tables import matrix
 from fflin.robot.catalog import bundled_directory
-from tests.support.patience import PATIENCE
+from tests.support.commands import refused, run, without_warnings
 from tests.support.robots import BUNDLED
-
-
-def run(*arguments, cwd=None, **environment):
-    """Run fflin; return exit code, stdout, and stderr without its warnings, a line each."""
-    done = subprocess.run(
-        [sys.executable, "-m", "fflin", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        env={**os.environ, **environment},
-        timeout=PATIENCE,
-        check=False,
-    )
-    return done.returncode, done.stdout, without_warnings(done.stderr)
-
-
-def without_warnings(err):
-    return "".join(x for x in err.splitlines(True) if not x.startswith("fflin: warning: "))
-
-
-def refused(*arguments, cwd=None):
-    """Run what must be refused: exit 2, nothing on stdout, one line on stderr, which it returns."""
-    code, out, err = run(*arguments, cwd=cwd)
-    assert code == 2 and not out
-    assert err.startswith("fflin: error: ") and err.count("\n") == 1 and err.endswith("\n")
-    return err
 
 
 def test_robots_lists_all_with_n_mass_and_origin():
@@ -260,7 +234,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
         ("check", "ets_vii", "--output", "pose:tol"): "no frame named 'tol'; did you mean tool",
         ("check", "ets_vii", "--output", "base", "--output", "state"): "is asked for twice",
         ("linearize", "ets_vii", "--out", "m.mat"): "ambiguous option: --out could match",
-        ("check", "romeo"): "cannot be inverted: joint 'LHand'",
+        ("check", "romeo"): "cannot be inverted at any configuration: joint 'LHand'",
         ("check", "cubesat", "--rpy", 180, 0, 0, "--reference", "world"): "turned by 180 deg",
         ("check",): "the following arguments are required: ROBOT",
         ("dance",): "invalid choice: 'dance'",
@@ -282,11 +256,11 @@ def test_robots_own_file_is_never_the_output(tmp_path):
     robot = tmp_path / "robot.json"
     robot.write_bytes((Path(__file__).parents[2] / "robots" / "cubesat.urdf").read_bytes())
     before = robot.read_bytes()
-    assert "is the robot's own file" in refused("linearize", robot, "-o", robot)
+    assert "is the input file" in refused("linearize", robot, "-o", robot)
     assert robot.read_bytes() == before
     sibling = tmp_path / "arm.A.csv"
     sibling.write_bytes(before)
-    assert "is the robot's own file" in refused("linearize", sibling, "-o", tmp_path / "arm.csv")
+    assert "is the input file" in refused("linearize", sibling, "-o", tmp_path / "arm.csv")
     assert sibling.read_bytes() == before
 
 

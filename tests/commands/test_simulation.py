@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fflin
-from tests.commands.test_cli import refused, run
+from tests.support.commands import refused, run
 
 
 def test_a_loop_settles_is_saved_and_drawn(tmp_path):

@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from tests.commands.test_cli import refused, run
+from tests.support.commands import refused, run
 from tests.support.patience import PATIENCE
 
 pytest.importorskip("h5py")
@@ -90,7 +90,7 @@ def test_what_is_missing_or_damaged_is_one_line(tmp_path, robots):
     q[4, 8] = 0.0
     np.savez(tmp_path / "q.npz", q=q)
     error = refused("sweep", "ets_vii", "--configurations", "q.npz", "-o", "q.npz", cwd=tmp_path)
-    assert "q.npz is what --configurations reads" in error
+    assert "q.npz is the input file" in error
     assert [entry.name for entry in tmp_path.iterdir()] == ["q.npz"]
     assert np.array_equal(np.load(tmp_path / "q.npz")["q"], q)
 

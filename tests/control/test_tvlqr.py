@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 import fflin
 from fflin.control.differential_riccati import Coefficients, step_back
-from tests.linear.test_trajectory import motion
+from tests.support.motions import motion
 
 
 @pytest.fixture(scope="module")

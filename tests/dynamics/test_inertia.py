@@ -9,7 +9,7 @@ import pytest
 
 import fflin
 from fflin.dynamics.inertia_bounds import STROKE, inertia_bounds
-from tests.support.robots import BUNDLED, random_tree
+from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
 
 
 def chain(*inertias):
@@ -159,23 +159,6 @@ def test_massless_base_is_refused_where_its_m_is_singular():
     model.appendBodyToJoint(joint, pin.Inertia.Random(), pin.SE3.Random())
     with pytest.raises(fflin.SingularInertiaError, match=r"joint 'joint'"):
         fflin.linearize(fflin.from_model(model))
-
-
-MIMIC = """<robot name="gripper">
-  <link name="base"><inertial><mass value="3"/>
-    <inertia ixx="1" ixy="0" ixz="0" iyy="1.1" iyz="0" izz="1.2"/></inertial></link>
-  {links}
-  <joint name="a" type="{a}"><parent link="base"/><child link="la"/><origin xyz="0 .1 0"/>
-    <axis xyz="0 1 0"/><limit lower="-9" upper="9" effort="1" velocity="1"/>{mimic}</joint>
-  <joint name="b" type="{b}"><parent link="{parent}"/><child link="lb"/>
-    <origin xyz=".2 -.1 .3" rpy=".3 .2 .1"/><axis xyz="0 0 1"/>
-    <limit lower="-9" upper="9" effort="1" velocity="1"/></joint>
-</robot>"""
-LINKS = "".join(
-    f"""<link name="{name}"><inertial><origin xyz=".1 .2 .05"/><mass value="{mass}"/>
-    <inertia ixx=".1" ixy="0" ixz="0" iyy=".1" iyz="0" izz=".1"/></inertial></link>"""
-    for name, mass in (("la", 1.5), ("lb", 0.7))
-)
 
 
 @pytest.mark.parametrize("parent", ["base", "la"])

@@ -77,7 +77,7 @@ def test_csv_names_rows_and_columns(lin, tmp_path):
 
 def test_nothing_is_left_behind_where_writing_fails(lin, tmp_path, monkeypatch):
     for ending in FORMATS:
-        with pytest.raises(fflin.FileError, match="cannot be written: No such file"):
+        with pytest.raises(fflin.FileError, match="cannot be written: there is no folder"):
             lin.save(tmp_path / "missing" / f"m{ending}")
         target = tmp_path / f"old{ending}"
         target.write_text("precious")

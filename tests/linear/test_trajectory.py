@@ -1,50 +1,12 @@
 """The linear model along a motion."""
 
-from itertools import pairwise
-
 import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.integrate import solve_ivp
 
 import fflin
-from fflin.dynamics.aba import Aba
-from tests.support.robots import random_point
-
-
-def motion(robot, start=None, duration=0.4, knots=81):
-    """A motion of the robot under inputs that change slowly, to 1e-10."""
-    q0, v0, u0 = random_point(robot, np.random.default_rng(1))
-    v0 = 0.3 * v0
-    if start is not None:
-        q0, v0 = start
-    state = fflin.StateMap(robot, frame="local")
-    aba = Aba(state)
-    t = np.linspace(0.0, duration, knots)
-
-    def inputs(time):
-        return 0.1 * u0 * np.cos(3 * time)
-
-    def rate(time, y):
-        # In the tangent at the beginning of each interval the motion is short: no singularity.
-        q = pin.integrate(robot.model, rate.q, y[: robot.nv])
-        v = y[robot.nv :]
-        slope = pin.dDifference(robot.model, rate.q, q, pin.ArgumentPosition.ARG1) @ v
-        return np.concatenate((slope, aba.acceleration(q, v, inputs(time))))
-
-    q, v = [q0], [v0]
-    for before, after in pairwise(t):
-        rate.q = q[-1]
-        y = solve_ivp(
-            rate,
-            (before, after),
-            np.concatenate((np.zeros(robot.nv), v[-1])),
-            rtol=1e-11,
-            atol=1e-12,
-        ).y[:, -1]
-        q.append(pin.integrate(robot.model, q[-1], y[: robot.nv]))
-        v.append(y[robot.nv :])
-    return t, np.array(q), np.array(v), np.array([inputs(time) for time in t])
+from tests.support.motions import motion
 
 
 def test_knots_are_the_moving_models_and_errors_are_carried_along():

@@ -5,6 +5,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.robot.massless import idle_coordinates
 from tests.support.robots import random_tree
 
 JOINTS = {
@@ -44,8 +45,8 @@ def test_a_massless_base_under_joints_of_its_own_is_refused_at_every_configurati
                 fflin.linearize(made, q)
         with pytest.raises(fflin.SingularInertiaError, match="at any configuration"):
             fflin.simulate(robot, q0=q, duration=0.1)
-        assert robot.idle[0] == "the base"
-        assert not {"joint 'shoulder'", "joint 'elbow'"} & set(robot.idle)
+        assert idle_coordinates(robot)[0] == "the base"
+        assert not {"joint 'shoulder'", "joint 'elbow'"} & set(idle_coordinates(robot))
 
 
 def test_a_massless_base_that_two_arms_determine_is_none_of_these():
@@ -57,7 +58,7 @@ def test_a_massless_base_that_two_arms_determine_is_none_of_these():
         arm = model.addJoint(root, pin.JointModelRX(), pin.SE3.Random(), side)
         model.appendBodyToJoint(arm, pin.Inertia.Random(), pin.SE3.Random())
     robot = fflin.from_model(model)
-    assert robot.idle == ()
+    assert idle_coordinates(robot) == ()
     assert fflin.check(robot, fflin.linearize(robot)).ok
 
 
@@ -66,7 +67,7 @@ def test_light_and_point_like_bodies_count():
     model = robot.model.copy()
     for index in (2, 4):
         model.inertias[index] = pin.Inertia(1e-9, np.array([0.1, 0.2, 0.3]), np.zeros((3, 3)))
-    assert fflin.from_model(model).idle == ()
+    assert idle_coordinates(fflin.from_model(model)) == ()
 
 
 def test_an_armature_counts_as_mass():
@@ -74,9 +75,9 @@ def test_an_armature_counts_as_mass():
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
     model.appendBodyToJoint(1, pin.Inertia.Random(), pin.SE3.Identity())
     model.addJoint(1, pin.JointModelRZ(), pin.SE3.Random(), "ghost")
-    assert fflin.from_model(model).idle == ("joint 'ghost'",)
+    assert idle_coordinates(fflin.from_model(model)) == ("joint 'ghost'",)
     model.armature[-1:] = 1e-6
-    assert fflin.from_model(model).idle == ()
+    assert idle_coordinates(fflin.from_model(model)) == ()
 
 
 def test_a_mass_on_an_axis_is_named_where_it_stands_so_alone():
@@ -89,7 +90,7 @@ def test_a_mass_on_an_axis_is_named_where_it_stands_so_alone():
         slide, pin.Inertia(1.0, np.zeros(3), np.zeros((3, 3))), pin.SE3.Identity()
     )
     robot = fflin.from_model(model)
-    assert robot.idle == ()
+    assert idle_coordinates(robot) == ()
     with pytest.raises(fflin.SingularInertiaError, match=r"joint 'turn' can move.*another config"):
         fflin.linearize(robot)
     fflin.linearize(robot, fflin.configuration(robot, {"slide": 0.3}))
@@ -108,7 +109,7 @@ def joint(name, kind, parent, child):
     )
 
 
-def test_a_file_with_a_massless_root_on_a_joint_is_warned_of_and_loads_with_it_locked(tmp_path):
+def test_a_file_with_a_massless_root_on_a_joint_says_so_and_loads_with_it_locked(tmp_path):
     path = tmp_path / "craft.urdf"
     path.write_text(
         '<robot name="craft"><link name="world"/>'
@@ -116,9 +117,10 @@ def test_a_file_with_a_massless_root_on_a_joint_is_warned_of_and_loads_with_it_l
         f"{joint('mount', 'continuous', 'world', 'hull')}"
         f"{joint('shoulder', 'continuous', 'hull', 'arm')}</robot>"
     )
-    with pytest.warns(fflin.FflinWarning, match="the base, joint 'mount' can move without"):
-        robot = fflin.load(path)
-    assert any("joint 'mount'" in note for note in robot.notes)
+    robot = fflin.load(path)
+    assert "the base, joint 'mount' can move without moving mass" in robot.notes[-1]
+    with pytest.raises(fflin.SingularInertiaError, match="joint 'mount' can move without"):
+        fflin.linearize(robot)
     locked = fflin.load(path, lock=["mount"])
     assert not locked.notes
     assert fflin.check(locked, fflin.linearize(locked)).ok

@@ -8,34 +8,8 @@ import pytest
 
 import fflin
 from fflin.control.weights import default_weights
-from tests.support.robots import BUNDLED
-
-
-def free_body(inertia, name="body"):
-    """A body that floats free, as a robot without joints."""
-    model = pin.Model()
-    root = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
-    model.addJointFrame(root)
-    body = pin.Inertia(50.0, np.zeros(3), np.diag(inertia))
-    model.appendBodyToJoint(root, body, pin.SE3.Identity())
-    model.addBodyFrame("base", root, pin.SE3.Identity(), -1)
-    return fflin.from_model(model, name=name)
-
-
-def regulated(name, **fields):
-    robot = fflin.load(name, **fields)
-    lin = fflin.linearize(robot)
-    return robot, lin, fflin.lqr(lin, *default_weights(lin))
-
-
-def displaced(lin, degrees=30.0, offset=0.5, spread=0.3):
-    """A state that is turned, moved and bent from the point."""
-    n = len(lin.x0) // 2 - 6
-    x = lin.x0.copy()
-    x[:3] = math.sin(math.radians(degrees) / 2.0) * np.array([2.0, -1.0, 2.0]) / 3.0
-    x[3:6] = offset * np.array([1.0, 2.0, -2.0]) / 3.0
-    x[6 : 6 + n] += spread
-    return x
+from tests.support.motions import displaced, regulated
+from tests.support.robots import BUNDLED, free_body
 
 
 def tumbling(robot, seed=0, size=0.4):

@@ -12,7 +12,8 @@ import pytest
 
 import fflin
 from fflin.control.weights import default_weights
-from tests.simulation.test_simulate import displaced, free_body, regulated
+from tests.support.motions import displaced, regulated
+from tests.support.robots import free_body
 
 
 def finite(motion):

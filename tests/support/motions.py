@@ -1,17 +1,27 @@
-"""Motions for the tests of pages, made up: any poses and inputs will do for what is drawn."""
+"""Motions that several test files share, and what starts them."""
+
+import math
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
+from scipy.integrate import solve_ivp
 
 import fflin
+from fflin.control.weights import default_weights
+from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
 from fflin.simulation.motion import Motion
+from tests.support.robots import random_point
 
 HOME = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), np.array([0.2, 0.1, -0.3]))
 
 
 def settling(robot, duration, *, reference=HOME, predicted=False):
-    """A motion that settles to the reference's placement with the joints at neutral."""
+    """A motion that settles to the reference's placement with the joints at neutral.
+
+    Made up: any poses and inputs will do for what is drawn.
+    """
     state = fflin.StateMap(robot, reference=reference)
     actuation = Actuation(state)
     t = np.linspace(0, duration, 2001)
@@ -51,3 +61,54 @@ def settling(robot, duration, *, reference=HOME, predicted=False):
         urdf_sha256=robot.urdf_sha256,
         stopped="",
     )
+
+
+def motion(robot, start=None, duration=0.4, knots=81):
+    """A motion of the robot under inputs that change slowly, to 1e-10."""
+    q0, v0, u0 = random_point(robot, np.random.default_rng(1))
+    v0 = 0.3 * v0
+    if start is not None:
+        q0, v0 = start
+    state = fflin.StateMap(robot, frame="local")
+    aba = Aba(state)
+    t = np.linspace(0.0, duration, knots)
+
+    def inputs(time):
+        return 0.1 * u0 * np.cos(3 * time)
+
+    def rate(time, y):
+        # In the tangent at the beginning of each interval the motion is short: no singularity.
+        q = pin.integrate(robot.model, rate.q, y[: robot.nv])
+        v = y[robot.nv :]
+        slope = pin.dDifference(robot.model, rate.q, q, pin.ArgumentPosition.ARG1) @ v
+        return np.concatenate((slope, aba.acceleration(q, v, inputs(time))))
+
+    q, v = [q0], [v0]
+    for before, after in pairwise(t):
+        rate.q = q[-1]
+        y = solve_ivp(
+            rate,
+            (before, after),
+            np.concatenate((np.zeros(robot.nv), v[-1])),
+            rtol=1e-11,
+            atol=1e-12,
+        ).y[:, -1]
+        q.append(pin.integrate(robot.model, q[-1], y[: robot.nv]))
+        v.append(y[robot.nv :])
+    return t, np.array(q), np.array(v), np.array([inputs(time) for time in t])
+
+
+def regulated(name, **fields):
+    robot = fflin.load(name, **fields)
+    lin = fflin.linearize(robot)
+    return robot, lin, fflin.lqr(lin, *default_weights(lin))
+
+
+def displaced(lin, degrees=30.0, offset=0.5, spread=0.3):
+    """A state that is turned, moved and bent from the point."""
+    n = len(lin.x0) // 2 - 6
+    x = lin.x0.copy()
+    x[:3] = math.sin(math.radians(degrees) / 2.0) * np.array([2.0, -1.0, 2.0]) / 3.0
+    x[3:6] = offset * np.array([1.0, 2.0, -2.0]) / 3.0
+    x[6 : 6 + n] += spread
+    return x

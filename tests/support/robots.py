@@ -52,3 +52,45 @@ def random_tree(rng, n, *, prismatic=True):
         branch.append(model.addJoint(branch[-1], joint, pin.SE3.Random(), f"joint_{index}"))
         model.appendBodyToJoint(branch[-1], pin.Inertia.Random(), pin.SE3.Random())
     return fflin.from_model(model, name=f"tree_{n}")
+
+
+def free_body(inertia, name="body"):
+    """A body that floats free, as a robot without joints."""
+    model = pin.Model()
+    root = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
+    model.addJointFrame(root)
+    body = pin.Inertia(50.0, np.zeros(3), np.diag(inertia))
+    model.appendBodyToJoint(root, body, pin.SE3.Identity())
+    model.addBodyFrame("base", root, pin.SE3.Identity(), -1)
+    return fflin.from_model(model, name=name)
+
+
+def singular_at(value):
+    """A robot whose M is singular where its last joint is at a value: a point mass on its axis."""
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
+    model.appendBodyToJoint(1, pin.Inertia(5.0, np.zeros(3), np.eye(3)), pin.SE3.Identity())
+    joint = model.addJoint(1, pin.JointModelRZ(), pin.SE3.Identity(), "turn")
+    slide = model.addJoint(joint, pin.JointModelPX(), pin.SE3.Identity(), "slide")
+    model.appendBodyToJoint(
+        slide, pin.Inertia(1.0, np.array([-value, 0.0, 0.0]), np.zeros((3, 3))), pin.SE3.Identity()
+    )
+    return fflin.from_model(model, name="singular")
+
+
+# A gripper to be filled in: LINKS, types of its joints a and b, parent of b, what a mimics.
+MIMIC = """<robot name="gripper">
+  <link name="base"><inertial><mass value="3"/>
+    <inertia ixx="1" ixy="0" ixz="0" iyy="1.1" iyz="0" izz="1.2"/></inertial></link>
+  {links}
+  <joint name="a" type="{a}"><parent link="base"/><child link="la"/><origin xyz="0 .1 0"/>
+    <axis xyz="0 1 0"/><limit lower="-9" upper="9" effort="1" velocity="1"/>{mimic}</joint>
+  <joint name="b" type="{b}"><parent link="{parent}"/><child link="lb"/>
+    <origin xyz=".2 -.1 .3" rpy=".3 .2 .1"/><axis xyz="0 0 1"/>
+    <limit lower="-9" upper="9" effort="1" velocity="1"/></joint>
+</robot>"""
+LINKS = "".join(
+    f"""<link name="{name}"><inertial><origin xyz=".1 .2 .05"/><mass value="{mass}"/>
+    <inertia ixx=".1" ixy="0" ixz="0" iyy=".1" iyz="0" izz=".1"/></inertial></link>"""
+    for name, mass in (("la", 1.5), ("lb", 0.7))
+)

@@ -7,7 +7,7 @@ import re
 import sys
 from dataclasses import dataclass
 
-from fflin.robot.urdf.links import Pose, bounded, read_pose, refuse_near_miss
+from fflin.robot.urdf.links import Pose, bounded_number, read_pose, refuse_near_miss
 from fflin.robot.urdf.xml import Element, decimal, quoted
 
 # Degrees of freedom of the types of joint.
@@ -100,11 +100,8 @@ def read_joint(element: Element) -> JointElement:
         raise element.error(
             f"{of} is of the unknown type {quoted(kind)}; known: {', '.join(FREEDOM)}; {advice}"
         )
-    refuse_near_miss(
-        element,
-        of,
-        ("parent", "child", "origin", "axis", "limit", "dynamics", "mimic"),
-    )
+    known = ("parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
+    refuse_near_miss(element, of, known)
     for child in element.children:
         prefix, _, local = child.tag.rpartition(":")
         if prefix and local == "mimic":
@@ -194,7 +191,7 @@ def _dynamics(element: Element, of: str, kind: str) -> tuple[float, float]:
             found.note(f"{name} of {of} is empty; taken as 0")
             values.append(0.0)
             continue
-        value = bounded(found, name, of, found.number(name, f"<dynamics> of {of}", 0.0))
+        value = bounded_number(found, name, of, 0.0)
         if value < 0.0:
             raise found.error(f"{name} of {of} is {value:g}; it cannot be negative")
         values.append(value)
@@ -206,9 +203,8 @@ def _mimic(element: Element, of: str) -> Mimic | None:
     if found is None:
         return None
     found.allow_only("joint", "multiplier", "offset", of=of)
-    what = f"<mimic> of {of}"
     return Mimic(
-        found.text("joint", what),
-        bounded(found, "multiplier", of, found.number("multiplier", what, 1.0)),
-        bounded(found, "offset", of, found.number("offset", what, 0.0)),
+        found.text("joint", f"<mimic> of {of}"),
+        bounded_number(found, "multiplier", of, 1.0),
+        bounded_number(found, "offset", of, 0.0),
     )

@@ -88,9 +88,7 @@ def read_link(element: Element) -> Link:
     inertia = inertial.require("inertia", f"<inertial> of {of}")
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     inertia.allow_only(*names, of=of)
-    moments = tuple(
-        bounded(inertia, entry, of, inertia.number(entry, f"<inertia> of {of}")) for entry in names
-    )
+    moments = tuple(bounded_number(inertia, entry, of) for entry in names)
     return Link(name, element, mass, read_pose(inertial, of), moments)
 
 
@@ -118,6 +116,12 @@ def read_pose(element: Element, of: str) -> Pose:
     if not abs(length - 1.0) <= _QUATERNION_SLACK:
         raise origin.error(f"quat_xyzw of {what} has length {length:g}, expected 1; normalise it")
     return Pose(xyz, rpy, tuple(float(entry / length) for entry in quaternion))
+
+
+def bounded_number(element: Element, name: str, of: str, default: float | None = None) -> float:
+    """Return an attribute that is one number, not absurdly large."""
+    value = element.number(name, f"<{element.tag}> of {of}", default)
+    return bounded(element, name, of, value)
 
 
 def bounded(element: Element, what: str, of: str, value: float) -> float:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import stat
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -12,7 +10,8 @@ from pathlib import Path
 
 import pinocchio as pin
 
-from fflin.base.errors import FileError, UrdfError
+from fflin.base.errors import UrdfError
+from fflin.base.writing import read_input
 from fflin.robot.urdf.inertias import inertia_notes
 from fflin.robot.urdf.joints import Mimic
 from fflin.robot.urdf.mimics import counted_leaders, resolve_mimics
@@ -82,7 +81,7 @@ def read_urdf(path: Path, prune: Sequence[str] = ()) -> Description:
     UnknownNameError
         If there is no such joint to prune.
     """
-    return describe(read_file(path), path, prune)
+    return describe(read_document(path), path, prune)
 
 
 def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Description:
@@ -93,7 +92,8 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     if path.suffix == ".xacro" or first:
         expanded, notes = expand(path, document, first)
         root = parse(expanded, f"{path} as expanded by xacro")
-        _check_expanded(root)
+        if left := first_xacro(root):
+            raise left.error(f"xacro is left in <{left.tag}>; is a macro missing?")
     urdf = read_description(root, prune)
     mimics = resolve_mimics(urdf.joints)
     model = _build(urdf, path, root, counted_leaders(urdf.joints, mimics))
@@ -119,32 +119,9 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     )
 
 
-def read_file(path: Path, kind: str = "URDF", limit: int = _SIZE_LIMIT) -> bytes:
-    """Return what a regular file of at most `limit` bytes holds, or raise `FileError`."""
-    try:
-        # Without O_NONBLOCK, opening a pipe would wait for somebody to write into it.
-        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-        if path.is_dir():
-            raise FileError(f"{path}: is a folder; give the path of a {kind} file")
-        with open(os.open(path, flags | getattr(os, "O_CLOEXEC", 0)), "rb") as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise FileError(f"{path}: is not a regular file; give the path of a {kind} file")
-            document = file.read(limit + 1)
-    except FileError:
-        raise
-    except (OSError, ValueError) as error:
-        what = error.strerror if isinstance(error, OSError) else str(error)
-        raise FileError(f"{path}: cannot be read: {what}") from None
-    if len(document) > limit:
-        size = f"{limit >> 20} MiB" if limit >> 20 else f"{limit >> 10} KiB"
-        raise FileError(f"{path}: is larger than {size}, too large for a {kind} file")
-    return document
-
-
-def _check_expanded(root: Element) -> None:
-    left = first_xacro(root)
-    if left:
-        raise left.error(f"xacro is left in <{left.tag}>; is a macro missing?")
+def read_document(path: Path) -> bytes:
+    """Return what the file of a URDF holds, or raise `FileError`."""
+    return read_input(path, "URDF", _SIZE_LIMIT)
 
 
 def _build(urdf: Urdf, path: Path, root: Element, counted: Collection[str]) -> pin.Model:
@@ -180,22 +157,12 @@ def _with_stack(depth: int, call: Callable[[], pin.Model]) -> pin.Model:
     """Make a call that recurses along the tree on a stack that holds it."""
     if depth <= _SHALLOW:
         return call()
-    results: list[pin.Model] = []
-    errors: list[Exception] = []
+    from concurrent.futures import ThreadPoolExecutor
 
-    def run() -> None:
+    with ThreadPoolExecutor(1) as other:
+        usual = threading.stack_size(_STACK)
         try:
-            results.append(call())
-        except Exception as error:  # carried over to the thread that waits
-            errors.append(error)
-
-    usual = threading.stack_size(_STACK)
-    try:
-        thread = threading.Thread(target=run)
-        thread.start()
-    finally:
-        threading.stack_size(usual)
-    thread.join()
-    if errors:
-        raise errors[0]
-    return results[0]
+            built = other.submit(call)
+        finally:
+            threading.stack_size(usual)
+        return built.result()

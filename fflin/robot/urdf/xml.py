@@ -234,16 +234,6 @@ class _Builder:
         self._unread = False
 
     def parse(self, document: bytes) -> None:
-        self._parse(document)
-        # Where declarations are not read, expat drops entities that it does not know from
-        # attributes in silence. Without its zeros, UTF-16 is ASCII where it matters.
-        if self._unread and _ENTITY.search(document.replace(b"\0", b"")):
-            raise UrdfError(
-                f"{self.root.origin}: uses an entity that it does not declare itself; write what "
-                "it stands for in its place"
-            )
-
-    def _parse(self, document: bytes) -> None:
         # In pieces, for expat's time for one tag grows faster than its length.
         parser, step = self.parser, _TAG_LIMIT // 4
         for begin in range(0, len(document), step):
@@ -254,6 +244,13 @@ class _Builder:
                     f"than {_TAG_LIMIT} bytes; mend it"
                 )
         parser.Parse(b"", True)
+        # Where declarations are not read, expat drops entities that it does not know from
+        # attributes in silence. Without its zeros, UTF-16 is ASCII where it matters.
+        if self._unread and _ENTITY.search(document.replace(b"\0", b"")):
+            raise UrdfError(
+                f"{self.root.origin}: uses an entity that it does not declare itself; write what "
+                "it stands for in its place"
+            )
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         element = Element(

@@ -1,34 +1,21 @@
 """Files and pictures: written whole or not at all, and one line for what cannot be done."""
 
 import base64
-import contextlib
 import json
 import os
-import shutil
-import signal
 import subprocess
 import sys
-import tempfile
 import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import fflin
 from fflin.commands.cli import main
 from fflin.view.playback import default_tool, frame_indices
 from tests.support.motions import settling
-from tests.support.patience import PATIENCE, wait_until
-
-needs_chromium = pytest.mark.skipif(not shutil.which("chromium"), reason="no chromium")
-
-
-@pytest.fixture(scope="module")
-def motion(robots):
-    return settling(robots["planar_detumble"], duration=4.0)
 
 
 def test_nothing_is_left_behind_by_bad_input(robots, motion, tmp_path):
@@ -110,41 +97,6 @@ def test_the_tool_is_the_end_of_the_longest_chain(robots):
     assert panda.model.frames[panda.model.getFrameId(name)].parentJoint == panda.model.njoints - 1
 
 
-@needs_chromium
-def test_pictures(robots, motion, tmp_path):
-    robot = robots["planar_detumble"]
-    strip, film = tmp_path / "m.png", tmp_path / "m.gif"
-    assert fflin.visualize(robot, motion, png=strip, gif=film, speed=8) is None
-    with Image.open(strip) as image:
-        assert image.size == (4 * 640, 480)
-        frames = np.split(np.asarray(image.convert("RGB"), dtype=int), 4, axis=1)
-    for frame in frames:
-        assert (frame.max(axis=2) > 90).mean() > 0.02
-    assert (np.abs(frames[0] - frames[3]).max(axis=2) > 30).mean() > 0.01
-    with Image.open(film) as image:
-        assert image.n_frames == 6 and image.size == (640, 400)
-    with pytest.raises(fflin.InputError, match="times are"):
-        fflin.visualize(robot, motion, png=strip, times=[9.0])
-
-
-def test_without_chromium_one_line_says_how(robots, motion, tmp_path, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(fflin.MissingPackageError, match="apt install chromium") as caught:
-        fflin.visualize(robots["planar_detumble"], motion, png=tmp_path / "m.png")
-    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
-
-
-def test_a_chromium_that_does_not_answer_is_one_line(robots, motion, tmp_path, monkeypatch):
-    program = tmp_path / "chromium"
-    program.write_text("#!/bin/sh\nexec sleep 60\n")
-    program.chmod(0o755)
-    monkeypatch.setattr("fflin.view.capture.find_chromium", lambda: str(program))
-    monkeypatch.setattr("fflin.view.capture._PATIENCE", 1.0)
-    with pytest.raises(fflin.FileError, match="does not answer"):
-        fflin.visualize(robots["planar_detumble"], motion, png=tmp_path / "m.png", times=[0.0])
-    assert not (tmp_path / "m.png").exists()
-
-
 def test_a_page_is_opened_where_no_file_is_named(robots, motion, monkeypatch):
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
@@ -222,61 +174,6 @@ def test_simulate_on_the_command_line(capsys, tmp_path, monkeypatch):
     assert left == ["folder.html", "loop.html"]
 
 
-@needs_chromium
-def test_films(robots, motion, tmp_path, monkeypatch):
-    """Whenever a motion begins all of it is shown, and nothing is left behind."""
-    folder = tmp_path / "t"  # a longer path is too long for Chromium's sockets
-    folder.mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(folder))
-    monkeypatch.setenv("TMPDIR", str(folder))
-    later = replace(motion, t=motion.t + 100.0)
-    fflin.visualize(robots["planar_detumble"], later, gif=tmp_path / "m.gif", speed=8.0)
-    with Image.open(tmp_path / "m.gif") as image:
-        first = np.asarray(image.convert("RGB"), dtype=int)
-        image.seek(image.n_frames - 1)
-        last = np.asarray(image.convert("RGB"), dtype=int)
-    assert (np.abs(first - last).max(axis=2) > 30).mean() > 0.01
-    assert not list(folder.iterdir())
-
-
-@needs_chromium
-@pytest.mark.skipif(not shutil.which("setpriv"), reason="no setpriv")
-@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
-def test_the_browser_ends_with_the_one_who_films(tmp_path, sent, code):
-    """At once, and not when the film is done."""
-    folder = Path(tempfile.mkdtemp(dir="/tmp"))  # Chromium's sockets need a short name
-    # A film that takes minutes, so that a machine that is busy for seconds makes no difference.
-    command = ["simulate", "cubesat", "--rpy", "10", "0", "0", "--duration", "300"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "fflin", *command, "--gif", str(tmp_path / "m.gif")],
-        env={**os.environ, "TMPDIR": str(folder)},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    browsing = f"--user-data-dir={folder}".encode()
-    try:
-        wait_until(lambda: list(folder.glob("*/DevToolsActivePort")))
-        assert running(browsing)
-        process.send_signal(sent)
-        _, error = process.communicate(timeout=PATIENCE)
-        assert process.returncode == code and "Traceback" not in error
-        wait_until(lambda: not running(browsing))
-        assert not (tmp_path / "m.gif").exists()
-        assert sent == signal.SIGKILL or not list(folder.iterdir())
-    finally:
-        process.kill()
-        process.communicate()
-        # What dies of a signal may still write for a moment.
-        wait_until(lambda: removed(folder))
-
-
-def removed(folder):
-    shutil.rmtree(folder, ignore_errors=True)
-    return not folder.exists()
-
-
 def test_files_are_written_even_where_nobody_reads_what_is_said(tmp_path):
     page = tmp_path / "m.html"
     command = ["simulate", "cubesat", "--rpy", "10", "0", "0", "--duration", "1"]
@@ -292,15 +189,6 @@ def test_files_are_written_even_where_nobody_reads_what_is_said(tmp_path):
     assert (done.returncode, done.stderr) == (0, b"") and page.is_file()
 
 
-def running(argument):
-    """Whether a process has an argument that begins so."""
-    for file in Path("/proc").glob("[0-9]*/cmdline"):
-        with contextlib.suppress(OSError):
-            if any(each.startswith(argument) for each in file.read_bytes().split(b"\0")):
-                return True
-    return False
-
-
 def test_a_name_that_is_no_files_name_does_no_harm(robots, monkeypatch):
     robot = fflin.from_model(robots["planar_detumble"].model, name="../a/b \u2603" * 99)
     with pytest.warns(fflin.FflinWarning, match="boxes"):
@@ -310,5 +198,5 @@ def test_a_name_that_is_no_files_name_does_no_harm(robots, monkeypatch):
 
 
 def test_assets_are_part_of_the_package():
-    names = {path.name for path in Path(fflin.__file__).parent.joinpath("assets").iterdir()}
+    names = {path.name for path in Path(fflin.__file__).parent.joinpath("view", "assets").iterdir()}
     assert {"page.html", "style.css", "main.js", "sky.js"} <= names

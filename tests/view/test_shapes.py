@@ -1,6 +1,4 @@
-"""Shapes of URDFs against Pinocchio's reader, inertia boxes, meshes, and the recorder."""
-
-import importlib
+"""Shapes of URDFs against Pinocchio's reader, inertia boxes, and where meshes are found."""
 
 import numpy as np
 import pinocchio as pin
@@ -10,8 +8,6 @@ from scipy.spatial import cKDTree
 
 import fflin
 from fflin.robot.catalog import find_robot
-from fflin.view.collada import read_collada
-from fflin.view.meshes import _triangles, load_mesh
 from fflin.view.shapes import find_mesh, shapes
 
 URDF = """<robot name="r">
@@ -113,6 +109,17 @@ def test_a_material_gives_colour_and_opacity(tmp_path):
     assert other.mesh == mesh and other.color is None
 
 
+def test_a_quaternion_turns_a_visual_as_it_turns_a_link(tmp_path):
+    more = (
+        '<visual><origin xyz="1 0 0" quat_xyzw="0 0 0.6 0.8"/>'
+        '<geometry><box size="1 1 1"/></geometry></visual>'
+    )
+    (_, turned), _ = shapes(fflin.load(write(tmp_path, more=more)))
+    expected = pin.Quaternion(np.array([0.0, 0.0, 0.6, 0.8])).matrix()
+    np.testing.assert_allclose(turned.placement.rotation, expected, atol=1e-15)
+    np.testing.assert_allclose(turned.placement.translation, [1, 0, 0])
+
+
 def test_a_missing_mesh_and_a_malformed_visual_leave_the_rest(tmp_path):
     more = "<visual><geometry><sphere radius='x'/></geometry></visual><visual/>"
     found, notes = shapes(fflin.load(write(tmp_path, "package://nowhere/a.stl", more)))
@@ -136,75 +143,6 @@ def test_meshes_are_found_where_urdfs_say(tmp_path):
     assert not shapes(robot)[1]
     with pytest.raises(fflin.InputError, match="package_dirs is"):
         fflin.load("cubesat", package_dirs="meshes")
-
-
-def area(vertices, faces):
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("robot", ["panda", "anymal", "kinova"])
-def test_collada_has_the_triangles_of_pinocchios_loader(robot):
-    paths = {s.mesh for s in shapes(fflin.load(robot))[0] if s.mesh}
-    assert paths
-    for path in paths:
-        parts = read_collada(path)
-        assert parts is not None, path
-        vertices, faces = _triangles(path)
-        corners = np.concatenate([v[f].reshape(-1, 3) for v, f, _ in parts])
-        # Assimp leaves out triangles without area.
-        assert len(corners) / 3 == pytest.approx(len(faces), rel=1e-3)
-        for ours, theirs in ((corners.min(0), vertices.min(0)), (corners.max(0), vertices.max(0))):
-            np.testing.assert_allclose(ours, theirs, atol=1e-6)
-        if len(parts) == 1:  # of several, coal 3.0 mixes up the vertices
-            whole = area(*parts[0][:2])
-            assert whole == pytest.approx(area(vertices, faces), rel=1e-5), path
-    assert any(color for path in paths for _, _, color in read_collada(path))
-
-
-COLLADA = """<?xml version="1.0"?>
-<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
-<asset><unit name="centimeter" meter="0.01"/><up_axis>Y_UP</up_axis></asset>
-<library_effects><effect id="e"><profile_COMMON><technique sid="t"><phong>
-<diffuse><color>1 0.5 0 1</color></diffuse></phong></technique></profile_COMMON></effect>
-</library_effects>
-<library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
-<library_geometries><geometry id="g"><mesh>
-<source id="p"><float_array id="a" count="12">0 0 0 1 0 0 0 2 0 0 0 3</float_array>
-<technique_common><accessor source="#a" count="4" stride="3"><param name="X" type="float"/>
-<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
-<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
-<polylist material="s" count="2"><input semantic="VERTEX" source="#v" offset="0"/>
-<vcount>3 4</vcount><p>0 2 1 0 1 2 3</p></polylist></mesh></geometry></library_geometries>
-<library_visual_scenes><visual_scene id="w"><node id="n1">
-<translate>1 2 3</translate><rotate>0 0 1 90</rotate><node id="n2"><rotate>1 0 0 30</rotate>
-<scale>1 2 3</scale><instance_geometry url="#g"><bind_material><technique_common>
-<instance_material symbol="s" target="#m"/></technique_common></bind_material>
-</instance_geometry></node></node></visual_scene></library_visual_scenes>
-<scene><instance_visual_scene url="#w"/></scene></COLLADA>"""
-
-
-def test_collada_composes_the_transforms_of_its_nodes(tmp_path):
-    path = tmp_path / "m.dae"
-    path.write_text(COLLADA)
-    ((vertices, faces, color),) = read_collada(path)
-    assert color == (1.0, 0.5, 0.0, 1.0) and len(faces) == 3
-    theirs = 0.01 * _triangles(path)[0]  # Pinocchio's loader pays no heed to the unit either
-    assert {tuple(x) for x in np.round(vertices, 6)} == {tuple(x) for x in np.round(theirs, 6)}
-
-
-def test_welding_keeps_a_mesh_within_its_grid():
-    path = next(s.mesh for s in shapes(fflin.load("solo12"))[0] if s.mesh)
-    vertices, faces = _triangles(path)
-    (mesh,) = load_mesh(path)
-    extent = np.ptp(vertices, axis=0).max()
-    distance, _ = cKDTree(mesh.vertices).query(vertices[np.unique(faces)])
-    assert distance.max() < extent / 400.0 * np.sqrt(3.0)
-    assert 0 < len(mesh.faces) <= len(faces)
-    assert area(mesh.vertices.astype(float), mesh.faces) == pytest.approx(
-        area(vertices, faces), rel=0.03
-    )
 
 
 def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
@@ -232,31 +170,3 @@ def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
     ours = vertices @ matrix[:3, :3].T + matrix[:3, 3]
     np.testing.assert_allclose(cKDTree(ours).query(theirs)[0], 0.0, atol=1e-6)
     np.testing.assert_allclose(cKDTree(theirs).query(ours)[0], 0.0, atol=1e-6)
-
-
-def test_the_recorder_keeps_the_last_value_of_a_property_per_path():
-    from fflin.view.recorder import Recorder
-    from fflin.view.scene import Visualizer
-
-    g = importlib.import_module("meshcat.geometry")  # after fflin.scene, which quiets it
-
-    forwarded = []
-    window = Recorder(forwarded.append)
-    scene = Visualizer(window=window)
-    for shift in range(5):
-        scene["a"].set_transform(pin.SE3(np.eye(3), np.full(3, shift)).homogeneous)
-        scene["a"].set_property("visible", bool(shift % 2))
-        scene["a"].set_object(g.Box([1, 1, shift + 1]))
-        scene["b/c"].set_object(g.Sphere(1))
-    kept = [umsgpack.unpackb(command) for command in window.commands()]
-    assert [(c["type"], c["path"]) for c in kept] == [
-        ("set_object", "/meshcat/a"),
-        ("set_transform", "/meshcat/a"),
-        ("set_property", "/meshcat/a"),
-        ("set_object", "/meshcat/b/c"),
-    ]
-    assert kept[0]["object"]["geometries"][0]["depth"] == 5
-    assert kept[1]["matrix"][12:15] == [4, 4, 4] and kept[2]["value"] is False
-    assert len(forwarded) == 20
-    scene["b"].delete()
-    assert len(list(window.commands())) == 3

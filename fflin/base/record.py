@@ -1,0 +1,294 @@
+"""Records on disk: names with arrays, texts, lists of texts, figures, and groups of figures.
+
+Models, gains, schedules, filters and motions are such records, and whoever reads .npz, .mat or
+.json can read them. Each file carries a SHA-256 of its content, so that one that was damaged or
+edited is refused: the entry ``sha256`` of .npz (of the other entries) and .json (of the text
+before it), the header's text of .mat (of all that follows). One without it is read as it is, and
+what is made of it is not ``verified``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import re
+import warnings
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import MISSING, Field, dataclass, field, fields
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+
+from fflin.base.errors import FileError, InputError
+from fflin.base.writing import as_path, check_ending, read_file, reason, shown, write_whole
+
+FORMATS = (".npz", ".mat", ".json")
+SEAL = "sha256"
+
+Record = dict[str, Any]
+Kind = TypeVar("Kind", bound="Design")
+
+DAMAGED = f"its content is not what its {SEAL} says: it was damaged or edited"
+NOT_VERIFIED = f"not verified: read from a file without a {SEAL}, which could tell damage"
+
+_BLOCK = 2**22
+_JSON_SEAL = re.compile(rb',\n"sha256": "([0-9a-f]{64})"\n}\n\Z')
+_MAT_TEXT, _MAT_SEAL = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
+
+
+def write_record(path: Path, record: Mapping[str, Any]) -> None:
+    """Write a record, in the format that the ending says.
+
+    Raises
+    ------
+    FileError
+        If the ending is no known one or the file cannot be written.
+    InputError
+        If a figure is not finite.
+    """
+    check_ending(path, FORMATS)
+    require_finite(record)
+    encode = {".npz": _to_npz, ".mat": _to_mat, ".json": _to_json}[path.suffix]
+    write_whole({path: encode(record)})
+
+
+def read_record(path: Path) -> tuple[Record, bool]:
+    """Return the record in a file, and whether it is verified.
+
+    Arrays may have other shapes of the same order: .mat knows no vectors, .json no empty matrices.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    ValueError or another
+        If it is not one of records, or is damaged; `reading` tells it.
+    """
+    check_ending(path, FORMATS)
+    decode = {".npz": _from_npz, ".mat": _from_mat, ".json": _from_json}[path.suffix]
+    return decode(read_file(path, path.suffix))
+
+
+@contextmanager
+def reading(path: Path, what: str) -> Iterator[None]:
+    """Turn what is raised while a file is read into one `FileError`."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers that damage makes look old
+            yield
+    except FileError:
+        raise
+    except FileNotFoundError:
+        raise FileError(f"{path}: cannot be read: No such file or directory") from None
+    except Exception as error:  # each decoder has its own dozen
+        raise FileError(f"{shown(path)}: not a {what} saved by fflin ({reason(error)})") from None
+
+
+def require_finite(record: Mapping[str, Any]) -> None:
+    """Raise `InputError` where a figure is not finite."""
+    for key, value in record.items():
+        if isinstance(value, np.ndarray | float) and not np.isfinite(value).all():
+            raise InputError(f"{key} has entries that are not finite; it is not saved")
+
+
+def text(value: Any) -> str:
+    """Return a text of a record."""
+    return value if isinstance(value, str) else str(np.asarray(value).item())
+
+
+def texts(value: Any) -> tuple[str, ...]:
+    """Return a list of texts of a record; a text alone is a list of one."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    return (value,) if isinstance(value, str) else tuple(map(text, value))
+
+
+def figure(value: Any) -> float:
+    """Return a figure of a record."""
+    return float(np.asarray(value).item())
+
+
+def figures(value: Any) -> dict[str, float]:
+    """Return a group of figures of a record."""
+    group = value if isinstance(value, dict) else json.loads(text(value))
+    return {key: figure(x) for key, x in group.items()}
+
+
+def content_digest(entries: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of arrays with their names, kinds and shapes, 4 MiB by 4 MiB."""
+    digest = hashlib.sha256()
+    with ThreadPoolExecutor() as pool:
+        for key, value in sorted(entries.items()):
+            array = np.asarray(value)
+            digest.update(f"{key} {array.dtype.str} {array.shape}\n".encode())
+            data = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
+            blocks = [data[at : at + _BLOCK] for at in range(0, len(data), _BLOCK)]
+            # Hashing lets other threads run.
+            digest.update(b"".join((pool.map if len(blocks) > 1 else map)(_sha256, blocks)))
+    return digest.hexdigest()
+
+
+def _sha256(data: Any) -> bytes:
+    return hashlib.sha256(data).digest()
+
+
+def _to_npz(record: Mapping[str, Any]) -> bytes:
+    buffer = io.BytesIO()
+    plain: dict[str, Any] = {
+        key: np.asarray(json.dumps(value) if isinstance(value, dict) else value)
+        for key, value in record.items()
+    }
+    plain[SEAL] = content_digest(plain)
+    np.savez(buffer, **plain)
+    return buffer.getvalue()
+
+
+def _from_npz(content: bytes) -> tuple[Record, bool]:
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        record = {key: file[key] for key in file.files}
+    return record, check_seal(record)
+
+
+def check_seal(record: Record) -> bool:
+    """Take the digest out of the entries of .npz; return whether there is one, and it holds."""
+    seal = record.pop(SEAL, None)
+    if seal is not None and text(seal) != content_digest(record):
+        raise ValueError(DAMAGED)
+    return seal is not None
+
+
+def _to_mat(record: Mapping[str, Any]) -> bytes:
+    from scipy.io import savemat
+
+    buffer = io.BytesIO()
+    cells = {k: np.array(v, dtype=object) for k, v in record.items() if isinstance(v, list)}
+    savemat(buffer, {**record, **cells}, oned_as="column")
+    body = buffer.getvalue()[_MAT_TEXT:]
+    head = _MAT_SEAL + hashlib.sha256(body).hexdigest().encode()
+    return head.ljust(_MAT_TEXT) + body
+
+
+def _from_mat(content: bytes) -> tuple[Record, bool]:
+    from fflin.base.mat5 import read_mat
+
+    sealed = content.startswith(_MAT_SEAL)
+    if sealed:
+        seal = content[len(_MAT_SEAL) : _MAT_TEXT].rstrip().decode()
+        if seal != hashlib.sha256(content[_MAT_TEXT:]).hexdigest():
+            raise ValueError(DAMAGED)
+    return read_mat(content), sealed
+
+
+def _to_json(record: Mapping[str, Any]) -> bytes:
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray) and value.dtype.kind == "c":
+            return {"real": value.real.tolist(), "imag": value.imag.tolist()}
+        return value.tolist() if isinstance(value, np.ndarray) else value
+
+    lines = (f"{json.dumps(k)}: {json.dumps(plain(v), allow_nan=False)}" for k, v in record.items())
+    body = ("{\n" + ",\n".join(lines)).encode()
+    return body + f',\n"{SEAL}": "{hashlib.sha256(body).hexdigest()}"\n}}\n'.encode()
+
+
+def _from_json(content: bytes) -> tuple[Record, bool]:
+    found = _JSON_SEAL.search(content[-100:])
+    if found:
+        body = content[: len(content) - len(found.group())]
+        if hashlib.sha256(body).hexdigest().encode() != found.group(1):
+            raise ValueError(f"{DAMAGED}; without the line {SEAL} it is read as it is")
+    record: Record = json.loads(content)
+    if record.pop(SEAL, None) is not None and not found:
+        raise ValueError(f"its {SEAL} does not stand as it was written; take it out")
+    return record, bool(found)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Design:
+    """A result of arrays, names and figures that saves and loads; the arrays are read-only.
+
+    Attributes
+    ----------
+    verified : bool
+        Whether it is as it was made; False of a file that has no digest to tell damage by.
+    """
+
+    # Names of the arrays of one dimension, which Matlab does not know.
+    VECTORS: ClassVar[tuple[str, ...]] = ()
+
+    verified: bool = field(default=True, kw_only=True)
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                value = value.copy()
+                value.setflags(write=False)
+                object.__setattr__(self, item.name, value)
+
+    def __str__(self) -> str:
+        return repr(self) if self.verified else f"{self!r}\n{NOT_VERIFIED}"
+
+    def save(self, path: str | Path) -> None:
+        """Write it to a .npz, .mat or .json file, whole or not at all.
+
+        Raises
+        ------
+        FileError
+            If the ending is another or the file cannot be written.
+        InputError
+            If a figure is not finite.
+        """
+        record: Record = {"kind": type(self).__name__}
+        for item in _saved(type(self)):
+            value = getattr(self, item.name)
+            record[item.name] = list(value) if isinstance(value, tuple) else value
+        write_record(as_path(path), record)
+
+    @classmethod
+    def load(cls: type[Kind], path: str | Path) -> Kind:
+        """Read what `save` wrote; every figure is the same to the last bit.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read, is damaged or is another thing.
+        """
+        source, name = as_path(path), cls.__name__
+        with reading(source, name):
+            record, verified = read_record(source)
+            if text(record["kind"]) != name:
+                raise ValueError(f"it is a {text(record['kind'])}")
+            # What has a default came later than some files.
+            stored = [
+                item
+                for item in _saved(cls)
+                if item.name in record or item.default_factory is MISSING
+            ]
+            values = {item.name: _value(cls, item, record[item.name]) for item in stored}
+            return cls(**values, verified=verified)
+
+
+def _saved(cls: type[Design]) -> list[Field[Any]]:
+    return [item for item in fields(cls) if item.name != "verified"]
+
+
+def _value(cls: type[Design], item: Field[Any], raw: Any) -> Any:
+    """Return a field's value; its annotation says what it is."""
+    kind = str(item.type)
+    if kind == "float":
+        return figure(raw)
+    if kind == "str":
+        return text(raw)
+    if kind.startswith("tuple"):
+        return texts(raw)
+    if isinstance(raw, dict):
+        raw = np.array(raw["real"]) + 1j * np.array(raw["imag"])
+    array = np.asarray(raw)
+    if array.dtype.kind not in "fiuc" or not np.isfinite(array).all():
+        raise ValueError(f"{item.name} is not an array of finite numbers")
+    array = array.astype(complex if array.dtype.kind == "c" else float)
+    return array.ravel() if item.name in cls.VECTORS else array

@@ -1,0 +1,138 @@
+"""What is the same about all points: prepared once, read by `Linearizer` and by sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, truth
+from fflin.base.version import __version__
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import Frame, StateMap, unknown_frame
+from fflin.linear.certificate import certify, inertia_matrix
+from fflin.linear.ignorable import ignorable_states
+from fflin.linear.state_equations import at_rest
+from fflin.robot.massless import require_inertia
+from fflin.robot.outputs import FullState
+from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from fflin.dynamics.outputs import Sensing
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What is the same about all points that a robot is linearised about; arrays are read-only.
+
+    Attributes
+    ----------
+    robot : Robot
+    map : StateMap
+        With the reference and the frame.
+    actuation : Actuation
+    sensing : Sensing or None
+        None where the outputs are the state.
+    moving : bool
+        Whether the reference moves through the point.
+    own_reference : bool
+        Whether the reference is the base's own placement at each point, not that of `map`.
+    reference : ndarray (7,)
+        The placement of `map`: position [m] and quaternion x, y, z, w.
+    free : bool
+        Whether nothing but u acts at rest and the outputs are the state, so that there all of the
+        model but M^-1 is in `common` and `rest`.
+    common : mapping
+        Fields of a `LinearModel` that are the same about all points; C and D where the outputs
+        are the state.
+    rest : mapping
+        Its A, f0, u0 and v where nothing moves, pulls or pushes.
+    """
+
+    robot: Robot
+    map: StateMap
+    actuation: Actuation
+    sensing: Sensing | None
+    moving: bool
+    own_reference: bool
+    reference: Array
+    free: bool
+    common: Mapping[str, Any]
+    rest: Mapping[str, Array]
+
+
+def prepare(
+    robot: Robot, *, frame: Frame | None, reference: pin.SE3 | None, moving: bool
+) -> Prepared:
+    """Prepare a robot; arguments and errors are those of `Linearizer`."""
+    moving = truth("moving", moving)
+    if frame is None:
+        frame = "local" if moving else "hybrid"
+    elif not isinstance(frame, str):  # nor one whose comparison below is an array
+        raise unknown_frame(frame)
+    if moving and (reference is not None or frame != "local"):
+        raise InputError(
+            "moving=True takes the error in the moving base's own axes: leave out the "
+            "reference, and the frame or make it 'local'"
+        )
+    state = StateMap(robot, reference=reference, frame=frame)
+    require_inertia(robot)
+    actuation = Actuation(state)
+    sensing = None
+    if robot.outputs != (FullState(),):
+        from fflin.dynamics.outputs import Sensing
+
+        sensing = Sensing(
+            state, robot.outputs, gravity=np.array(robot.gravity), own_reference=reference is None
+        )
+    acts = any(robot.gravity) or robot.stored_momentum or any(x.any() for x in robot.passive)
+    nu = len(actuation.names)
+    seen = sensing or state
+    return Prepared(
+        robot=robot,
+        map=state,
+        actuation=actuation,
+        sensing=sensing,
+        moving=moving,
+        own_reference=reference is None,
+        reference=frozen(pin.SE3ToXYZQUAT(state.reference)),
+        free=sensing is None and not moving and not acts,
+        common={
+            "C": frozen(np.eye(state.nx)),
+            "D": frozen(np.zeros((state.nx, nu))),
+            "dt": 0.0,
+            "state_names": state.names,
+            "input_names": actuation.names,
+            "output_names": seen.names,
+            "state_units": state.units,
+            "input_units": actuation.units,
+            "output_units": seen.units,
+            "frame": state.frame,
+            "moving": moving,
+            "robot": robot.name,
+            "urdf_sha256": robot.urdf_sha256,
+            "locked": robot.locked,
+            "fflin_version": __version__,
+            "pinocchio_version": pin.__version__,
+            "_inertia": partial(inertia_matrix, robot),
+            "_certify": partial(certify, robot),
+            "_ignorable": partial(ignorable_states, robot),
+        },
+        rest={
+            "A": frozen(at_rest(state)),
+            "f0": frozen(np.zeros(state.nx)),
+            "u0": frozen(np.zeros(nu)),
+            "v": frozen(np.zeros(robot.nv)),
+        },
+    )
+
+
+def frozen(array: Array) -> Array:
+    """Return the array itself, read-only."""
+    array.setflags(write=False)
+    return array

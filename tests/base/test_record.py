@@ -1,0 +1,287 @@
+"""Every kind of record in every format: exact, told from a damaged one, and never a crash."""
+
+import hashlib
+import io
+import json
+import re
+from dataclasses import fields, replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.base.mat5 import read_mat
+from fflin.base.record import NOT_VERIFIED, content_digest
+
+FLIPS = 150
+
+
+_DESIGNS = {"gain": fflin.lqr, "estimator": fflin.kalman}
+
+
+@cache
+def made(kind):
+    """A thing of a kind that is saved, small."""
+    robot = fflin.load("cubesat" if kind == "schedule" else "astrobee_arm")
+    lin = fflin.linearize(robot)
+    if kind == "schedule":
+        rows = [np.tile(x, (3, 1)) for x in (lin.q, lin.v, lin.u0)]
+        trajectory = fflin.linearize_trajectory(robot, [0.0, 0.1, 0.2], *rows)
+        return fflin.tvlqr(trajectory, 1e-3, 1e3, 1e-3)
+    if kind in ("batch", "gains"):
+        batch = fflin.sweep(robot, fflin.random_configurations(robot, 6, seed=1))
+        return batch if kind == "batch" else fflin.lqr_batch(batch, 1.0, 1.0)
+    if kind == "motion":
+        return fflin.simulate(robot, duration=0.05, dt=0.01)
+    return lin if kind == "model" else _DESIGNS[kind](lin, 1.0, 1.0)
+
+
+FORMATS = {
+    "model": (".npz", ".mat", ".json", ".csv"),
+    "batch": (".npz", ".h5"),
+} | dict.fromkeys(("gain", "schedule", "estimator", "motion", "gains"), (".npz", ".mat", ".json"))
+CASES = [(kind, ending) for kind, endings in FORMATS.items() for ending in endings]
+
+
+def content(thing):
+    """All that a thing holds, bit for bit, but for whether it is verified."""
+    held = {}
+    for field in fields(thing):
+        value = getattr(thing, field.name)
+        if field.name == "verified" or callable(value) or field.name == "_system":
+            continue
+        held[field.name] = (
+            (value.shape, np.ascontiguousarray(value).tobytes())
+            if isinstance(value, np.ndarray)
+            else value
+        )
+    if isinstance(thing, fflin.LinearModel):
+        held |= {"M": thing.M.tobytes(), "certificate": thing.certificate}
+        held["ignorable"] = thing.ignorable
+    held.pop("_ignorable", None)
+    return held
+
+
+def files_of(path):
+    return sorted(path.parent.glob(f"{path.stem}.*"))
+
+
+@pytest.mark.parametrize(("kind", "ending"), CASES)
+def test_no_flipped_bit_is_silent_or_a_crash(kind, ending, tmp_path):
+    thing, path = made(kind), tmp_path / f"x{ending}"
+    thing.save(path)
+    load = type(thing).load
+    whole = load(path)
+    assert whole.verified and content(whole) == content(thing) and NOT_VERIFIED not in str(whole)
+    rng = np.random.default_rng(sum(map(ord, kind + ending)))
+    files = {file: file.read_bytes() for file in files_of(path)}
+    sizes = np.array([len(data) for data in files.values()])
+    refused = 0
+    for _ in range(FLIPS):
+        file = list(files)[rng.choice(len(sizes), p=sizes / sizes.sum())]
+        damaged = bytearray(files[file])
+        damaged[rng.integers(len(damaged))] ^= 1 << rng.integers(8)
+        file.write_bytes(damaged)
+        try:
+            read = load(path)
+        except fflin.FileError as error:
+            refused += 1
+            assert "\n" not in str(error)
+        else:
+            # In padding, or in the digest's own name, after which it is said to be unverified.
+            assert content(read) == content(thing)
+        file.write_bytes(files[file])
+    assert refused > 0.5 * FLIPS
+
+
+@pytest.mark.parametrize("kind", ["model", "gain"])
+def test_every_bit_of_what_stands_before_the_figures_of_a_mat(kind, tmp_path):
+    """Header and digest, where a flip is the likeliest to be taken for a file of another."""
+    thing, path = made(kind), tmp_path / "x.mat"
+    thing.save(path)
+    whole = path.read_bytes()
+    for bit in range(0, 8 * 136, 3):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        try:
+            read = type(thing).load(path)
+        except fflin.FileError:
+            continue
+        assert content(read) == content(thing)
+        assert not read.verified and NOT_VERIFIED in str(read)
+
+
+def unsealed(path):
+    """Write a file anew as others, and earlier versions, write it: without a digest."""
+    data = b"" if path.suffix == ".csv" else path.read_bytes()
+    if path.suffix == ".npz":
+        with np.load(io.BytesIO(data)) as file:
+            np.savez(path, **{key: file[key] for key in file.files if key != "sha256"})
+    elif path.suffix == ".mat":
+        path.write_bytes(b"MATLAB 5.0 MAT-file, Platform: GLNXA64".ljust(116) + data[116:])
+    elif path.suffix == ".json":
+        record = json.loads(data)
+        assert record.pop("sha256")
+        path.write_text(json.dumps(record))
+    elif path.suffix == ".h5":
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "r+") as file:
+            del file["sha256"], file["chunk_sha256"], file.attrs["chunk"]
+    else:
+        info = path.with_suffix(".info.csv")
+        info.write_text(re.sub("sha256,[0-9a-f]{64}\n$", "", info.read_text()))
+
+
+@pytest.mark.parametrize(("kind", "ending"), CASES)
+def test_a_file_without_a_digest_is_read_and_said_to_be_unverified(kind, ending, tmp_path):
+    if ending == ".h5":
+        pytest.importorskip("h5py")
+    thing, path = made(kind), tmp_path / f"x{ending}"
+    thing.save(path)
+    unsealed(path)
+    read = type(thing).load(path)
+    assert not read.verified and content(read) == content(thing)
+    assert str(read).endswith(NOT_VERIFIED)
+    if kind == "batch":
+        assert not read[0].verified
+    # Saved anew it has one of its own.
+    read.save(path)
+    assert type(thing).load(path).verified
+
+
+@pytest.mark.parametrize("ending", [".mat", ".npz", ".json"])
+def test_a_damaged_file_without_a_digest_is_no_crash(ending, tmp_path):
+    thing, path = made("gain"), tmp_path / f"x{ending}"
+    thing.save(path)
+    unsealed(path)
+    whole, rng = path.read_bytes(), np.random.default_rng(5)
+    for trial in range(6 * FLIPS):
+        damaged = bytearray(whole)
+        for _ in range(1 + trial % 3):
+            damaged[rng.integers(len(damaged) if trial % 2 else 400)] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged if trial % 5 else damaged[: rng.integers(len(damaged))])
+        try:
+            assert not fflin.Gain.load(path).verified
+        except fflin.FileError as error:
+            assert "\n" not in str(error)
+
+
+def test_an_edited_file_is_refused_and_says_what_to_do(tmp_path):
+    path = tmp_path / "x.json"
+    made("model").save(path)
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps(record))
+    with pytest.raises(fflin.FileError, match="take it out"):
+        fflin.LinearModel.load(path)
+    made("model").save(path)
+    path.write_text(path.read_text().replace('"dt": 0.0', '"dt": 0.1'))
+    with pytest.raises(fflin.FileError, match="damaged or edited; without the line sha256"):
+        fflin.LinearModel.load(path)
+    made("model").save(tmp_path / "x.csv")
+    table = tmp_path / "x.B.csv"
+    table.write_text(table.read_text().replace("1", "2"))
+    with pytest.raises(fflin.FileError, match="without that line of the info table"):
+        fflin.LinearModel.load(tmp_path / "x.csv")
+
+
+def test_the_digest_is_what_the_documents_say(tmp_path):
+    """Others can make and check it."""
+    for ending in (".npz", ".mat", ".json", ".csv"):
+        made("model").save(tmp_path / f"x{ending}")
+    text = (tmp_path / "x.json").read_text()
+    body, _, seal = text.partition(',\n"sha256": "')
+    assert seal == hashlib.sha256(body.encode()).hexdigest() + '"\n}\n'
+    data = (tmp_path / "x.mat").read_bytes()
+    assert data[:116].split()[-1].decode() == hashlib.sha256(data[116:]).hexdigest()
+    with np.load(tmp_path / "x.npz") as file:
+        others = {key: file[key] for key in file.files if key != "sha256"}
+        assert str(file["sha256"]) == content_digest(others)
+    one = {"a": np.array([[1.0, 2.0]])}
+    inner = hashlib.sha256(one["a"].tobytes()).digest()
+    assert content_digest(one) == hashlib.sha256(b"a <f8 (1, 2)\n" + inner).hexdigest()
+    # In blocks, whatever the number of threads.
+    large = np.arange(3 * 2**19 + 5, dtype=float)
+    parts = [large.tobytes()[at : at + 2**22] for at in range(0, large.nbytes, 2**22)]
+    inner = b"".join(hashlib.sha256(part).digest() for part in parts)
+    expected = hashlib.sha256(f"a <f8 {large.shape}\n".encode() + inner).hexdigest()
+    assert content_digest({"a": large}) == expected
+
+
+def test_matlab_files_of_others_are_read_as_scipy_reads_them(tmp_path):
+    from scipy.io import loadmat, savemat
+    from scipy.sparse import eye
+
+    rng = np.random.default_rng(2)
+    record = {
+        "A": rng.normal(size=(3, 4)),
+        "wide": np.asfortranarray(rng.normal(size=(2, 3, 4))),
+        "z": rng.normal(size=(2, 2)) + 1j,
+        "f": np.float32([[1.5, 2.5]]),
+        "i": np.int16([[1], [-2]]),
+        "yes": True,
+        "text": "größe",
+        "rows": np.array(["ab", "cde"]),
+        "cells": np.array(["one", "", "three"], dtype=object),
+        "group": {"x": 1.5, "name": "n"},
+        "sparse": eye(3).tocsc(),
+    }
+    for compressed in (False, True):
+        savemat(tmp_path / "x.mat", record, do_compression=compressed)
+        ours = read_mat((tmp_path / "x.mat").read_bytes())
+        theirs = loadmat(tmp_path / "x.mat", chars_as_strings=True)
+        for key in ("A", "wide", "z", "f", "i", "yes"):
+            assert ours[key].shape == theirs[key].shape and (ours[key] == theirs[key]).all(), key
+        assert ours["text"] == "größe" and ours["rows"] == ["ab", "cde"]
+        assert ours["cells"] == ["one", "", "three"]
+        assert ours["group"]["x"].item() == 1.5 and ours["group"]["name"] == "n"
+        assert "sparse" not in ours
+    swapped = bytearray(128) + b"\0\0\0\16" + b"\0\0\0\70"
+    swapped[124:128] = b"\1\0MI"
+    swapped += b"\0\0\0\6\0\0\0\10\0\0\0\6\0\0\0\0" + b"\0\0\0\5\0\0\0\10\0\0\0\1\0\0\0\1"
+    swapped += b"\0\1\0\1x\0\0\0" + b"\0\0\0\11\0\0\0\10" + np.array([2.5], ">f8").tobytes()
+    assert read_mat(bytes(swapped))["x"].item() == 2.5
+    for version in (b"\0\2IM", b"abcd"):
+        with pytest.raises(ValueError, match="not a MATLAB file of level 5"):
+            read_mat(bytes(124) + version)
+
+
+def test_plain_numpy_and_scipy_read_what_is_saved(tmp_path):
+    from scipy.io import loadmat
+
+    gain = made("gain")
+    gain.save(tmp_path / "g.npz")
+    gain.save(tmp_path / "g.mat")
+    with np.load(tmp_path / "g.npz") as file:
+        assert (file["K"] == gain.K).all() and tuple(file["state_names"]) == gain.state_names
+    mat = loadmat(tmp_path / "g.mat", simplify_cells=True)
+    assert (mat["K"] == gain.K).all() and tuple(mat["state_names"]) == gain.state_names
+
+
+def test_verified_is_kept_where_a_thing_is_changed(tmp_path):
+    path = tmp_path / "x.json"
+    made("model").save(path)
+    unsealed(path)
+    read = fflin.LinearModel.load(path)
+    assert not read.discretize(0.1).verified and not replace(read, u0=read.u0 + 1.0).verified
+    assert all(made(kind).verified for kind in FORMATS)
+
+
+def test_a_batch_that_is_not_held_against_its_digest_says_so(tmp_path):
+    pytest.importorskip("h5py")
+    for ending in (".npz", ".h5"):
+        path = tmp_path / f"b{ending}"
+        made("batch").save(path)
+        assert fflin.LinearBatch.load(path).verified
+        assert not fflin.LinearBatch.load(path, verify=False).verified
+
+
+def test_a_text_that_claims_more_rows_than_it_has_is_refused():
+    from scipy.io import savemat
+
+    buffer = io.BytesIO()
+    savemat(buffer, {"x": np.array(["ab", "cd"])})
+    damaged = buffer.getvalue().replace(b"\2\0\0\0\2\0\0\0", b"\0\0\0\x7f\2\0\0\0", 1)
+    with pytest.raises(ValueError, match="a text of shape"):
+        read_mat(damaged)

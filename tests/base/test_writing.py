@@ -1,0 +1,219 @@
+"""The one rule for files: a regular one or a new name, never an input, whole or not at all."""
+
+import json
+import os
+import re
+import shutil
+import stat
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.base.writing import check_place, replacing, write_whole
+from fflin.robot.catalog import bundled_directory
+
+# What each command writes, with the option that names it.
+WRITERS = {
+    "m.npz": ("linearize", "-o"),
+    "m.mat": ("linearize", "-o"),
+    "m.json": ("linearize", "-o"),
+    "m.csv": ("linearize", "-o"),
+    "g.npz": ("lqr", "--reduce", "-o"),
+    "b.npz": ("sweep", "--random", "5", "-o"),
+    "b.h5": ("sweep", "--random", "5", "-o"),
+    "s.npz": ("simulate", "--duration", "0.1", "--free", "-o"),
+    "s.csv": ("simulate", "--duration", "0.1", "--free", "-o"),
+    "s.html": ("simulate", "--duration", "0.1", "--free", "--html"),
+    "s.png": ("simulate", "--duration", "0.1", "--free", "--plot"),
+}
+
+
+@pytest.fixture
+def urdf(tmp_path):
+    return Path(shutil.copy(bundled_directory() / "astrobee_arm.urdf", tmp_path / "own.urdf"))
+
+
+def fflin_main(capsys, *arguments):
+    from fflin.commands.cli import main
+
+    with warnings.catch_warnings():  # main shows them in its own way
+        shown = warnings.showwarning
+        code = main([str(argument) for argument in arguments])
+        warnings.showwarning = shown
+    return code, capsys.readouterr().err
+
+
+def written(name):
+    """The file that a name leads to: of csv models a table."""
+    return "m.B.csv" if name == "m.csv" else name
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_an_input_is_never_written_to_whatever_its_name(name, urdf, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command, *options = WRITERS[name]
+    target, before = tmp_path / written(name), urdf.read_bytes()
+    for link in (os.symlink, os.link):
+        link(urdf, target)
+        code, error = fflin_main(capsys, command, urdf, *options, name)
+        assert code == 2 and "is the input file" in error and "\n" == error[-1]
+        assert urdf.read_bytes() == before and target.samefile(urdf)
+        assert sorted(path.name for path in tmp_path.iterdir()) == sorted(("own.urdf", target.name))
+        target.unlink()
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_pipe_is_never_written_to(name, urdf, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command, *options = WRITERS[name]
+    target = tmp_path / written(name)
+    os.mkfifo(target)
+    code, error = fflin_main(capsys, command, urdf, *options, name)
+    assert code == 2 and "not a regular file" in error
+    assert stat.S_ISFIFO(target.stat().st_mode) and len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_link_is_followed_and_modes_are_kept(name, urdf, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command, *options = WRITERS[name]
+    (tmp_path / "there").mkdir()
+    old, target = tmp_path / "there" / "old", tmp_path / written(name)
+    old.write_text("old")
+    old.chmod(0o640)
+    target.symlink_to(old)
+    code, error = fflin_main(capsys, command, urdf, *options, name)
+    assert code == 0, error
+    assert target.is_symlink() and len(old.read_bytes()) > 100
+    assert old.stat().st_mode & 0o777 == 0o640
+    target.unlink()
+    before = os.umask(0o027)
+    try:
+        assert fflin_main(capsys, command, urdf, *options, name)[0] == 0
+    finally:
+        os.umask(before)
+    assert target.stat().st_mode & 0o777 == 0o640
+    assert not list(tmp_path.glob("**/.fflin*")) and not list(tmp_path.glob("**/*.part"))
+
+
+def test_an_unfinished_file_is_under_the_rule(urdf, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = urdf.read_bytes()
+    (tmp_path / "x.h5.part").symlink_to(urdf)
+    code, error = fflin_main(capsys, "sweep", urdf, "--random", "5", "-o", "x.h5")
+    assert code == 2 and "is the input file" in error and urdf.read_bytes() == before
+    (tmp_path / "x.h5.part").unlink()
+    os.mkfifo(tmp_path / "x.h5.part")
+    code, error = fflin_main(capsys, "sweep", urdf, "--random", "5", "-o", "x.h5")
+    assert code == 2 and "not a regular file" in error
+
+
+def test_other_inputs_are_protected_too(urdf, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "in.json").write_text('[[input]]\ntype = "base_torque"\n')
+    command = ("linearize", urdf, "--inputs", "in.json", "-o", "in.json")
+    code, error = fflin_main(capsys, *command)
+    assert code == 2 and "is the input file" in error
+    robot = fflin.load(urdf)
+    np.savez("q.npz", q=np.tile(robot.neutral(), (3, 1)))
+    for name in ("q.npz", "q.h5"):
+        if name == "q.h5":
+            os.link("q.npz", name)
+        command = ("sweep", urdf, "--configurations", "q.npz", "-o", name)
+        code, error = fflin_main(capsys, *command)
+        assert code == 2 and "is the input file" in error and error.count("\n") == 1
+    # The library knows what it has read as well as the command line does.
+    os.symlink(urdf, "z.json")
+    with pytest.raises(fflin.FileError, match=r"z\.json is the input file"):
+        fflin.linearize(robot).save("z.json")
+
+
+def test_a_device_is_refused():
+    with pytest.raises(fflin.FileError, match="not a regular file; give the name of a file"):
+        write_whole({Path("/dev/null"): b"x"})
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+
+
+def test_whatever_fails_leaves_all_as_it_was(tmp_path):
+    old, new = tmp_path / "old.npz", tmp_path / "new.npz"
+    old.write_text("old")
+    with pytest.raises(ZeroDivisionError), replacing(old, new) as files:
+        files[0].write_text("half")
+        raise ZeroDivisionError
+    assert old.read_text() == "old" and list(tmp_path.iterdir()) == [old]
+    with pytest.raises(fflin.FileError, match="File name too long") as caught:
+        check_place(tmp_path / ("a" * 5000 + ".npz"))
+    assert len(str(caught.value)) < 400
+    with pytest.raises(fflin.FileError, match="there is no folder"):
+        check_place(tmp_path / "none" / "x.npz")
+    loop = tmp_path / "loop.npz"
+    loop.symlink_to(loop)
+    with pytest.raises(fflin.FileError, match="cannot be written"):
+        check_place(loop)
+
+
+_LIMITED = """
+import json, resource, sys
+from fflin.commands.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024))
+for command in json.loads(sys.argv[1]):
+    print(main(command), file=sys.stderr)
+"""
+
+
+def test_a_limit_of_the_size_of_a_file_is_one_line(tmp_path):
+    """As where the disk is full; all in one process, which must outlive them."""
+    writers = {**WRITERS, "large.h5": ("sweep", "--random", "2000", "-o")}
+    commands = [[first, "astrobee_arm", *rest, name] for name, (first, *rest) in writers.items()]
+    done = subprocess.run(
+        [sys.executable, "-c", _LIMITED, json.dumps(commands)],
+        cwd=tmp_path,
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    said = [line for line in done.stderr.splitlines() if "warning" not in line]
+    assert done.returncode == 0 and said[1::2] == ["2"] * len(commands), done.stderr
+    for line in said[::2]:
+        assert re.match(r"fflin: error: .*(File too large|no more than 1\.0 kB)", line), line
+    assert not list(tmp_path.iterdir())
+
+
+def test_room_that_is_not_there_is_told_before_work(tmp_path, monkeypatch):
+    """The disk is full although it said that it has room, as with quotas."""
+    pytest.importorskip("h5py")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    robot = fflin.load("cubesat")
+    begun = []
+    with pytest.raises(fflin.FileError, match=r"x\.h5\.part: cannot be written: No space left"):
+        fflin.sweep(
+            robot,
+            fflin.random_configurations(robot, 50),
+            out=tmp_path / "x.h5",
+            progress=lambda *counts: begun.append(counts),
+        )
+    assert not begun and not list(tmp_path.iterdir())
+
+
+def test_the_room_of_a_sweep_is_its_own_from_the_start(tmp_path):
+    pytest.importorskip("h5py")
+    robot = fflin.load("cubesat")
+    held = []
+
+    def look(done, _):
+        if not held:
+            found = os.stat(tmp_path / "x.h5.part")
+            held.append(found.st_blocks * 512 / found.st_size)
+
+    points = fflin.random_configurations(robot, 20_000)
+    fflin.sweep(robot, points, out=tmp_path / "x.h5", chunk=1000, progress=look, threads=1)
+    assert held[0] >= 1.0
