@@ -19,7 +19,7 @@ from fflin.linear.model import Certificate, LinearModel
 from fflin.robot.frames import frame_index
 from fflin.robot.robot import Robot
 
-# f0 outside of what the reduced state can follow, relative to f0.
+# Largest part of f0, relative to it, that the reduced state may leave out.
 _DRIFT = 1e-9
 
 
@@ -103,8 +103,7 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
         )
     S = np.zeros((len(z), len(T)))
     S[np.arange(len(z)), z] = 1.0
-    rates = T[len(lin.M) :, len(held.kept) :]
-    M = rates.T @ lin.M @ rates
+    M = held.rates.T @ lin.M @ held.rates
     M.setflags(write=False)
     values = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
     values |= {
@@ -159,7 +158,8 @@ def generalized_inertia(lin: LinearModel) -> Array:
     Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
     """
     lin = checked(lin)
-    if len(lin.A) != 12 + 2 * _joints(lin):
+    joints = sum(name.startswith("q_m.") for name in lin.state_names)
+    if len(lin.A) != 12 + 2 * joints:
         raise InputError("the base is not among the states; take the model before its reduction")
     M = lin.M
     inertia: Array = M[6:, 6:] + M[6:, :6] @ _following(M)
@@ -211,10 +211,6 @@ def _following(M: Array) -> Array:
     """Return G (6, n), what the free base does when the joints move."""
     G: Array = -np.linalg.solve(M[:6, :6], M[:6, 6:])
     return G
-
-
-def _joints(lin: LinearModel) -> int:
-    return sum(name.startswith("q_m.") for name in lin.state_names)
 
 
 def _given(value: Any, _: LinearModel) -> Any:

@@ -20,7 +20,7 @@ from fflin.commands.points import linear_model, once
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array
-    from fflin.control.lqr import Gain
+    from fflin.control.gain import Gain
     from fflin.linear.model import LinearModel
 
 

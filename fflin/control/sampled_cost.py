@@ -76,5 +76,5 @@ def sampled_cost(
         W[:nx, nx:], W[nx:, :nx] = cross, cross.T
     total = held_cost(F, W, h)
     if not np.isfinite(total).all():
-        raise InputError(f"dt is {h:g} s, over which the model grows beyond all numbers")
+        raise InputError(f"dt is {h:g} s, over which the model overflows")
     return SampledCost(total[:nx, :nx], total[nx:, nx:], total[:nx, nx:])
