@@ -69,7 +69,7 @@ def _warn_of_doubts(notes: tuple[str, ...]) -> None:
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
     """Raise `InputError` that names the modes on the boundary of stability that Q leaves out."""
     missed = "Q does not weigh {}, which do not settle by themselves; weigh them"
-    _warn_of_doubts(_checked_reach(lin, A.T, Q, "weighed by Q", missed))
+    _warn_of_doubts(_checked_reach(lin, A.T, _root(Q), "weighed by Q", missed))
 
 
 def require_disturbed(lin: LinearModel, W: Array) -> None:
@@ -78,7 +78,20 @@ def require_disturbed(lin: LinearModel, W: Array) -> None:
         "W does not disturb {}, which do not settle by themselves: a steady filter would not "
         "correct them; give them an intensity"
     )
-    _warn_of_doubts(_checked_reach(lin, lin.A, W, "disturbed by W", missed))
+    _warn_of_doubts(_checked_reach(lin, lin.A, _root(W), "disturbed by W", missed))
+
+
+def _root(W: Array) -> Array:
+    """Return a factor L (m, m) with W = L L^T, of a semidefinite matrix of unlike units.
+
+    It has the square root of W's condition, and so reaches what W reaches with less doubt.
+    """
+    size = np.sqrt(W.diagonal())
+    size = np.where(size > 0.0, size, 1.0)
+    values, vectors = np.linalg.eigh(W / np.outer(size, size))
+    rounding = len(W) * np.finfo(float).eps * values[-1:].max(initial=0.0)
+    root: Array = size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
+    return root
 
 
 def _checked_reach(
