@@ -102,8 +102,8 @@ def _checked_reach(
         margin &= decision
     doubts = tuple(
         f"undecided: {_dominant(at[None], lin.state_names)} "
-        f"{'counts' if change < 0 else 'does not count'} as {what}, by {ratio:.1g} times its "
-        "rounding; it may be the other way"
+        f"{'counts' if change < 0 else 'does not count'} as {what}, by {ratio:.2g} times its "
+        "rounding; on another machine it may be decided otherwise"
         for ratio, at, change in margin.doubts
     )
     if missed:

@@ -51,14 +51,14 @@ def output_equations(
         by_u = by_rate.dot(rates.by_u)
         for columns, _ in actuation.held:
             turn += by_u[:, columns].dot(skew(u[columns]))
-        D[:] = actuation.over_inputs(chart, by_u)  # (8.2)
+        D[:] = actuation.over_inputs(chart, by_u)  # (8.3)
     for turned, part in zip(state.axes, (ANGULAR, LINEAR), strict=True):
         if turned:
             turn += by_nu[:, part].dot(skew(nu[part]))
 
     C = np.zeros((len(by_q), state.nx))
-    C[:, g.q_b] = chart.over_q_b(turn)  # (8.1)
+    C[:, g.q_b] = chart.over_q_b(turn)  # (8.2)
     C[:, g.r_b] = by_q[:, LINEAR].dot(chart.R.T)
-    C[:, g.q_m] = by_q_m  # (8.2)
+    C[:, g.q_m] = by_q_m  # (8.3)
     C[:, -len(nu) :] = state.to_frame(chart, by_nu.T).T
     return C, D

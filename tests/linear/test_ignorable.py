@@ -238,3 +238,16 @@ def test_files_from_before_are_read(tmp_path):
         loaded = fflin.LinearModel.load(tmp_path / f"m{ending}")
         assert loaded.ignorable == () and loaded.drift is None and not loaded.verified
         assert not loaded.is_equilibrium() and (loaded.A == lin.A).all()
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_a_rotor_that_is_looked_from_or_at_is_not_ignorable(reverse):
+    robot = wheeled()
+    frames = ["rim", "hub"][:: -1 if reverse else 1]
+    model = robot.model.copy()
+    for name, joint in (("rim", model.getJointId("wheel")), ("hub", 1)):
+        model.addFrame(pin.Frame(name, joint, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
+    robot = fflin.from_model(model)
+    assert "q_m.wheel" in fflin.linearize(robot).ignorable
+    seen = robot.replace(outputs=[fflin.RelativePose(*frames)])
+    assert "q_m.wheel" not in fflin.linearize(seen).ignorable
