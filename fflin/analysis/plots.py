@@ -1,4 +1,4 @@
-"""Figures of linear models: poles, patterns and reach, with matplotlib."""
+"""Figures of linear models: poles, the pattern of A and B, and how far they are valid."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtrs
 
 from fflin.base.validation import Array
-from fflin.control.lyapunov import ModalMatrix, one_of_each, real_columns
+from fflin.control.lyapunov import ModalMatrix, modes_of, scaled
 
 
 class OptimalLoop(NamedTuple):
@@ -80,16 +80,13 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalL
         return None
     C = np.zeros((nx, nx))
     C[:m, m:], C[m:, :m], C[m:, m:] = G.T, -G, D
-    squares, W = one_of_each(*np.linalg.eig(C))
+    squares, W = modes_of(C)
     if ((squares.imag == 0.0) & (squares.real <= 0.0)).any():
         return None
-    poles, alone = -np.sqrt(squares), (squares.imag == 0.0).sum()
+    poles = -np.sqrt(squares)
     # The lower half of w is a = mu p.
-    W = W[m:]
-    motion, a = (
-        real_columns(np.concatenate((W / squares, W / poles)), alone),
-        real_columns(W, alone),
-    )
+    a = W[m:]
+    motion = np.concatenate((scaled(a, 1.0 / squares), scaled(a, 1.0 / poles)))
     if not plain:
         a -= F @ motion[:m] + H @ motion[m:]
     cost = motion.T @ weight @ motion + a.T @ a

@@ -5,22 +5,33 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.linalg.lapack import dgeev
 
 from fflin.base.validation import Array
 
 
-def real_columns(modes: Any, alone: int) -> Array:
-    """Return modes (m, k), one of each complex pair after `alone` real ones, as real (m, n).
+def modes_of(F: Array) -> tuple[Any, Array]:
+    """Return the poles (k,) of a real matrix and its modes (n, n) as real columns.
 
-    A pair takes two columns: the real parts of all pairs stand before their imaginary parts.
+    Of each complex pair one pole stands after the real ones, and two columns: the real parts of
+    the eigenvectors of all pairs stand before their imaginary parts.
     """
-    return np.hstack((modes.real, modes.imag[:, alone:]))
+    if not np.isfinite(F).all():
+        raise np.linalg.LinAlgError("the matrix is not finite")
+    real, imag, _, V, failed = dgeev(F, compute_vl=0)
+    if failed:
+        raise np.linalg.LinAlgError("the eigenvalues did not converge")
+    alone, pairs = np.flatnonzero(imag == 0.0), np.flatnonzero(imag > 0.0)
+    first = np.concatenate((alone, pairs))
+    return real[first] + 1j * imag[first], V[:, np.concatenate((first, pairs + 1))]
 
 
-def one_of_each(values: Any, vectors: Any) -> tuple[Any, Any]:
-    """Return the eigenpairs with an imaginary part of zero, and then the positive ones."""
-    order = np.concatenate((np.flatnonzero(values.imag == 0.0), np.flatnonzero(values.imag > 0.0)))
-    return values[order], vectors[:, order]
+def scaled(modes: Array, factors: Any) -> Array:
+    """Multiply modes (m, n) by a number (k,) for each pole."""
+    k = len(factors)
+    alone = 2 * k - modes.shape[1]
+    pairs = (modes[:, alone:k] + 1j * modes[:, k:]) * factors[alone:]
+    return np.hstack((modes[:, :alone] * factors[:alone].real, pairs.real, pairs.imag))
 
 
 class ModalMatrix:
@@ -34,7 +45,7 @@ class ModalMatrix:
     poles : ndarray (k,) of complex
         Eigenvalues of F: the real ones, and then one of each complex pair.
     V : ndarray (n, n)
-        Eigenvectors, as `real_columns`.
+        Modes as real columns, as `modes_of` returns them.
     discrete : bool
 
     Attributes
@@ -49,7 +60,7 @@ class ModalMatrix:
     """
 
     def __init__(self, poles: Any, V: Array, discrete: bool) -> None:
-        alone = (poles.imag == 0.0).sum()
+        alone = 2 * len(poles) - len(V)
         self.V, self.inverse = V, np.linalg.inv(V)
         self._pairs = slice(alone, len(poles)), slice(len(poles), None)
         left = self.values = np.concatenate((poles, poles[alone:].conj()))
@@ -58,8 +69,7 @@ class ModalMatrix:
     @classmethod
     def of(cls, F: Array, discrete: bool) -> ModalMatrix:
         """Compute the modes of a matrix."""
-        poles, modes = one_of_each(*np.linalg.eig(F))
-        return cls(poles, real_columns(modes, (poles.imag == 0.0).sum()), discrete)
+        return cls(*modes_of(F), discrete)
 
     def lyapunov(self, r: Array) -> Array:
         """Solve F' D + D F = -r, or where discrete F' D F - D = -r, for a symmetric r (n, n)."""

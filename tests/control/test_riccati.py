@@ -8,7 +8,7 @@ import scipy.linalg as sl
 
 import fflin
 from fflin.control.half_size import second_order_loop
-from fflin.control.lyapunov import ModalMatrix, real_columns
+from fflin.control.lyapunov import ModalMatrix, scaled
 from fflin.control.riccati import Riccati, _bilinear, _finished, _general, half_size, solve
 from tests.support.robots import BUNDLED, random_point, random_tree
 
@@ -141,11 +141,8 @@ def test_half_size_loops_are_loops_of_the_model_and_optimal_without_odd_powers(r
         V, poles = loop.modes.V, loop.modes.values
         assert poles.real.max() < 0.0
         # The inputs make what is missing of V' = A V, in the velocities alone.
-        alone = int(np.sum(poles.imag == 0.0))
-        half = (len(poles) + alone) // 2
-        W = V[:, :half].astype(complex)
-        W[:, alone:] += 1j * V[:, half:]
-        missing = real_columns(W * poles[:half], alone) - lin.A @ V
+        pairs = int(np.sum(poles.imag != 0.0)) // 2
+        missing = scaled(V, poles[: len(poles) - pairs]) - lin.A @ V
         assert np.abs(missing[:m]).max() < 1e-10 * np.abs(lin.A @ V).max()
         U = np.linalg.solve(lin.B[m:], missing[m:])
         cost = V.T @ Q @ V + U.T @ R @ U
