@@ -10,8 +10,7 @@ from fflin.base.errors import InputError
 from fflin.base.tables import grid, width
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.output_values import Measuring
-from fflin.dynamics.outputs import Sensing
+from fflin.dynamics.outputs import Measuring, Sensing
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
 from fflin.linear.certificate import (
     aba_route,

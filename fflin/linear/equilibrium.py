@@ -141,7 +141,7 @@ def equilibrium(
     allowed = _TOLERANCE * float(np.linalg.norm(target))
     allowed += float(np.linalg.norm(mobility * _rounding(robot, lin)))
     pushes = {f"tau_b.{x}": "N m" for x in "xyz"} | {f"F_b.{x}": "N" for x in "xyz"}
-    pushes |= {f"tau_m.{j.name}": "N" if j.prismatic else "N m" for j in robot.joints}
+    pushes |= {f"tau_m.{joint.name}": joint.force_unit for joint in robot.joints}
     residual = left / mobility
     if float(np.linalg.norm(left)) > allowed:
         raise _unbalanced(robot, residual, np.abs(left), pushes)

@@ -87,9 +87,7 @@ def prepare(
     if robot.outputs != (FullState(),):
         from fflin.dynamics.outputs import Sensing
 
-        sensing = Sensing(
-            state, robot.outputs, gravity=np.array(robot.gravity), own_reference=reference is None
-        )
+        sensing = Sensing(state, robot.outputs, own_reference=reference is None)
     acts = any(robot.gravity) or robot.stored_momentum or any(x.any() for x in robot.passive)
     nu = len(actuation.names)
     seen = sensing or state

@@ -12,7 +12,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, truth
 from fflin.control.channel import limits_of
 from fflin.dynamics.state import StateMap
-from fflin.dynamics.state_rows import states_of
+from fflin.dynamics.state_rows import state_history
 from fflin.linear.model import LinearModel
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.motion import Motion
@@ -189,7 +189,7 @@ def _motion(
     conserved = Conserved(robot, plan.q)
     record = go(plan, plant, conserved, progress)
 
-    x = states_of(state, record.q, record.v, near)
+    x = state_history(state, record.q, record.v, near)
     history = conserved.histories(record.q, record.v)
     return Motion(
         t=record.t,

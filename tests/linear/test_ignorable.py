@@ -211,23 +211,24 @@ def test_files_keep_what_is_ignorable(ending, moving, tmp_path):
 
 
 def test_files_from_before_are_read(tmp_path):
-    """Nothing is ignorable in them."""
+    """Nothing is ignorable in them, and no digest stands in them."""
     robot = wheeled()
     lin = fflin.linearize(robot, None, fflin.velocity(robot, {"wheel": 5.0}))
     for ending in (".json", ".npz", ".mat", ".csv"):
         lin.save(tmp_path / f"m{ending}")
     record = json.loads((tmp_path / "m.json").read_text())
-    del record["ignorable"], record["drift"]
+    del record["ignorable"], record["drift"], record["sha256"]
     (tmp_path / "m.json").write_text(json.dumps(record))
+    later = ("ignorable", "drift", "sha256")
     with np.load(tmp_path / "m.npz") as file:
-        arrays = {key: file[key] for key in file.files if key not in ("ignorable", "drift")}
+        arrays = {key: file[key] for key in file.files if key not in later}
     np.savez(tmp_path / "m.npz", **arrays)
     from scipy.io import loadmat, savemat
 
     mat = loadmat(tmp_path / "m.mat")
-    kept = {k: x for k, x in mat.items() if k not in ("ignorable", "drift") and k[0] != "_"}
+    kept = {k: x for k, x in mat.items() if k not in later and k[0] != "_"}
     savemat(tmp_path / "m.mat", kept)
-    for table, key in (("info", "ignorable"), ("point", "drift")):
+    for table, key in (("info", ("ignorable", "sha256")), ("point", "drift")):
         path = tmp_path / f"m.{table}.csv"
         lines = path.read_text().splitlines(keepends=True)
         path.write_text("".join(line for line in lines if not line.startswith(key)))
