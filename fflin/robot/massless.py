@@ -54,7 +54,11 @@ def _idle(robot: Robot) -> tuple[str, ...]:
         for body, (values, _) in zip(bodies, moments, strict=True)
     ):
         return ()
-    columns = _independent(robot)
+    # v = columns nu: joints that mimic others follow them.
+    columns = np.eye(robot.nv)
+    for joint, leader, multiplier, _ in robot.followers:
+        columns[joint.idx_v, leader.idx_v] = multiplier
+    columns = columns[:, [*range(6), *(joint.idx_v for joint in robot.joints)]]
     names = np.array(coordinate_names(robot))
     rng = np.random.default_rng(0)
     idle: tuple[str, ...] = ()
@@ -94,15 +98,6 @@ def require_inertia(robot: Robot) -> None:
     """
     if idle_coordinates(robot):
         raise SingularInertiaError(massless_note(robot))
-
-
-def _independent(robot: Robot) -> Array:
-    """Return (nv, 6 + n) with v = columns nu, in Pinocchio's order; mimics follow."""
-    columns = np.eye(robot.nv)
-    for joint, leader, multiplier, _ in robot.followers:
-        columns[joint.idx_v, leader.idx_v] = multiplier
-    kept = [*range(6), *(joint.idx_v for joint in robot.joints)]
-    return columns[:, kept]
 
 
 def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Array:
