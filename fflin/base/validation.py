@@ -124,11 +124,15 @@ def placement(name: str, value: Any) -> pin.SE3:
         raise InputError(f"{name} is a {type(value).__name__}, expected a pin.SE3 (placement)")
     if not np.isfinite(value.homogeneous).all():
         raise InputError(f"{name} has entries that are not finite")
-    rotation = value.rotation
-    skewed = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if skewed > NORM_TOLERANCE or np.linalg.det(rotation) < 0.0:
+    if not is_rotation(value.rotation):
         raise InputError(f"the rotation of {name} is not one: R^T R and det R must be 1")
-    return pin.SE3(pin.Quaternion(rotation).normalized().matrix(), value.translation)
+    return pin.SE3(pin.Quaternion(value.rotation).normalized().matrix(), value.translation)
+
+
+def is_rotation(R: Array) -> bool:
+    """Whether R (3, 3) is a rotation within 1e-6."""
+    skewed = float(np.abs(R.T @ R - np.eye(3)).max())
+    return skewed <= NORM_TOLERANCE and float(np.linalg.det(R)) > 0.0
 
 
 def as_double(name: str, value: ArrayLike) -> Array:

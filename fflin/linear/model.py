@@ -351,16 +351,11 @@ class LinearModel:
             If the file cannot be read, is damaged or is not such a model.
         """
         from fflin.base.writing import as_path
-        from fflin.linear.files import read_model
+        from fflin.linear.files import given, read_model
 
         values, certificate = read_model(as_path(path))
-        given: Any = partial(_given, Certificate(**certificate))
-        lin = LinearModel(**values, _certify=given)
+        lin = LinearModel(**values, _certify=partial(given, Certificate(**certificate)))
         return replace(lin, _certify=partial(_same_certificate, lin, lin.fingerprint))
-
-
-def _given(certificate: Certificate, _: LinearModel) -> Certificate:
-    return certificate
 
 
 def _same_M(continuous: LinearModel, _: LinearModel) -> Array:
