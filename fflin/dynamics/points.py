@@ -75,7 +75,7 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
         If a value is not a finite number.
     """
     state = StateMap(robot)
-    base = [f"{group}.{axis}" for group in ("omega_b", "v_b") for axis in "xyz"]
+    base = state.names[state.groups.omega_b] + state.names[state.groups.v_b]
     nu = np.zeros(6 + robot.n)
     for name, value in by_name("values", values, "velocity").items():
         if name in base:

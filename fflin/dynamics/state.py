@@ -1,7 +1,7 @@
-"""The state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, names, frames and chart."""
+"""The state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, frames and chart."""
 
 from itertools import compress
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import pinocchio as pin
@@ -10,6 +10,7 @@ from fflin.base.errors import ChartError, InputError
 from fflin.base.rotation import conjugate, quaternion_product, rotation_matrix
 from fflin.base.validation import Array, placement, vector
 from fflin.dynamics.chart import SMALLEST_Q0, Chart
+from fflin.dynamics.names import groups_of, states_of
 from fflin.robot.robot import ROOT, Robot
 
 Frame = Literal["hybrid", "local", "world"]
@@ -31,17 +32,6 @@ PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 def unknown_frame(frame: object) -> InputError:
     """Build the error for what is no frame of velocities."""
     return InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
-
-
-class Groups(NamedTuple):
-    """Slices of the six groups of the state."""
-
-    q_b: slice
-    r_b: slice
-    q_m: slice
-    omega_b: slice
-    v_b: slice
-    qdot_m: slice
 
 
 class StateMap:
@@ -104,29 +94,10 @@ class StateMap:
         self.axes = _IN_REFERENCE_AXES[frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
         self.nx = 12 + 2 * n
-        self.groups = Groups(
-            slice(0, 3),
-            slice(3, 6),
-            slice(6, 6 + n),
-            slice(6 + n, 9 + n),
-            slice(9 + n, 12 + n),
-            slice(12 + n, 12 + 2 * n),
-        )
+        self.groups = groups_of(n)
+        states = states_of(robot)
+        self.names, self.units = tuple(states), tuple(states.values())
         joints = robot.joints
-        self.names = (
-            *_named("q_b", "xyz"),
-            *_named("r_b", "xyz"),
-            *_named("q_m", robot.joint_names),
-            *_named("omega_b", "xyz"),
-            *_named("v_b", "xyz"),
-            *_named("qdot_m", robot.joint_names),
-        )
-        self.units = (
-            *("1", "1", "1", "m", "m", "m"),
-            *(joint.unit for joint in joints),
-            *("rad/s", "rad/s", "rad/s", "m/s", "m/s", "m/s"),
-            *(f"{joint.unit}/s" for joint in joints),
-        )
         # Index in Pinocchio's v of each velocity of the state, and in a flat (nv, nv) array.
         self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
         # And back; what a joint that mimics another has is written after.
@@ -339,7 +310,3 @@ class StateMap:
     def positions(self, q: Array) -> Array:
         """Return r_b (.., 3) at valid configurations (.., nq)."""
         return self._position + q[..., :3] @ self._rotation.T
-
-
-def _named(group: str, members: str | tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(f"{group}.{member}" for member in members)

@@ -11,7 +11,7 @@ from fflin.base.tables import grid, width
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.outputs import Measuring, Sensing
-from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.dynamics.state import StateMap
 from fflin.linear.certificate import (
     aba_route,
     compare,
@@ -23,7 +23,7 @@ from fflin.linear.certificate import (
     scaled_condition,
 )
 from fflin.linear.model import LinearModel
-from fflin.linear.nonlinear import ErrorDynamics, Nonlinear, flow_error, jacobian
+from fflin.linear.nonlinear import ErrorDynamics, Nonlinear, difference_steps, flow_error, jacobian
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
@@ -201,27 +201,10 @@ def _point_errors(
 
 def _differences(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
     """Return A and B by central differences of the nonlinear model."""
-    step, push = _steps(model, lin, M)
+    step, push = difference_steps(model.state, lin, M)
     A = jacobian(lambda x: model(x, lin.u0), lin.x0, step)
     B = jacobian(lambda u: model(lin.x0, u), lin.u0, push)
     return A, B
-
-
-def _steps(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
-    """Return the steps of differences in x and u."""
-    groups = model.state.groups
-    nv = len(M)
-    # Small against the angles over which accelerations change where light links line up.
-    step = np.full(model.state.nx, 2e-4)
-    # Well inside the chart, whose edge |q_b| = 1 the model feels long before.
-    step[groups.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[groups.q_b]))
-    # f is quadratic in the velocities and linear in the input: no truncation at any step.
-    speed = np.abs(lin.x0[-nv:])
-    step[-nv:] = 0.1 * max(1.0, float(speed[ANGULAR].max()), float(speed[6:].max(initial=0.0)))
-    step[groups.v_b] = 0.1 * max(1.0, float(speed[LINEAR].max()))
-    mobility, input_mobility = mobilities(M, lin.B)
-    push = max(1.0, float(np.abs(lin.f0[-nv:] / mobility).max())) / input_mobility
-    return step, push
 
 
 def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float) -> list[Row]:
@@ -241,7 +224,7 @@ def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float)
     def y(x: Array, u: Array) -> Array:
         return measuring(x, *model.acceleration(x, u))
 
-    step_x, step_u = _steps(model, lin, M)
+    step_x, step_u = difference_steps(model.state, lin, M)
     here = y(lin.x0, lin.u0)
     C = jacobian(lambda x: y(x, lin.u0), lin.x0, step_x)
     D = jacobian(lambda u: y(lin.x0, u), lin.u0, step_u)

@@ -11,6 +11,7 @@ import pinocchio as pin
 from fflin.base.errors import EquilibriumError, listed
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.names import forces_of
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
@@ -140,8 +141,7 @@ def equilibrium(
     u, left = _least_norm(scaled, target, one_sided)
     allowed = _TOLERANCE * float(np.linalg.norm(target))
     allowed += float(np.linalg.norm(mobility * _rounding(robot, lin)))
-    pushes = {f"tau_b.{x}": "N m" for x in "xyz"} | {f"F_b.{x}": "N" for x in "xyz"}
-    pushes |= {f"tau_m.{joint.name}": joint.force_unit for joint in robot.joints}
+    pushes = forces_of(robot)
     residual = left / mobility
     if float(np.linalg.norm(left)) > allowed:
         raise _unbalanced(robot, residual, np.abs(left), pushes)

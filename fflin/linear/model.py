@@ -13,12 +13,12 @@ import numpy as np
 
 from fflin.base.errors import InputError, MissingPackageError
 from fflin.base.validation import Array, number
+from fflin.linear.sampling import held_exponential
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
     from fflin.dynamics.state import Frame
-
 
 _new, _set = object.__new__, object.__setattr__
 
@@ -269,25 +269,11 @@ class LinearModel:
             raise InputError(f"dt is {dt:g} s, expected a positive sampling time")
         if self.dt:
             raise InputError(f"the model is sampled already, at dt = {self.dt:g} s")
-        nx, nu = self.B.shape
-        driven = np.column_stack((self.B, self.f0))
-        # What overflows is refused below, and not warned of.
-        with np.errstate(over="ignore", invalid="ignore"):
-            if not (self.A @ self.A).any():
-                Ad = np.eye(nx) + self.A * dt
-                held = driven * dt + self.A @ driven * (dt * dt / 2.0)
-            else:
-                from scipy.linalg import expm
-
-                block = np.zeros((nx + nu + 1, nx + nu + 1))
-                block[:nx, :nx] = self.A
-                block[:nx, nx:] = driven
-                exponential = expm(block * dt)
-                Ad, held = exponential[:nx, :nx], exponential[:nx, nx:]
+        Ad, held = held_exponential(self.A, np.column_stack((self.B, self.f0)), dt)
         if not (np.isfinite(Ad).all() and np.isfinite(held).all()):
             raise InputError(f"dt is {dt:g} s, over which the model grows beyond all numbers")
         sampled = replace(
-            self, A=Ad, B=held[:, :nu], f0=held[:, nu], dt=dt, _inertia=partial(_same_M, self)
+            self, A=Ad, B=held[:, :-1], f0=held[:, -1], dt=dt, _inertia=partial(_same_M, self)
         )
         certify = partial(_same_certificate, self, sampled.fingerprint)
         return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))

@@ -9,7 +9,8 @@ import pinocchio as pin
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR, StateMap
+from fflin.linear.certificate import mobilities
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import ROOT, Robot
 
@@ -31,7 +32,7 @@ class Nonlinear:
     def __init__(self, state: StateMap, lin: LinearModel) -> None:
         self.state = state
         self.aba = Aba(state)
-        observer = rotation_matrix(lin.q[3:7]) @ lin.v[:3]
+        observer = rotation_matrix(lin.q[3:7]) @ lin.v[PIN_LINEAR]
         self._observer = observer if np.linalg.norm(observer) > _FAST else np.zeros(3)
 
     def acceleration(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
@@ -39,9 +40,9 @@ class Nonlinear:
         q, v = self.state.to_pinocchio(x)
         u = self.aba.actuation.in_base_axes(self.state.chart(q), u)
         seen, observer = v.copy(), rotation_matrix(q[3:7]).T @ self._observer
-        seen[:3] -= observer
+        seen[PIN_LINEAR] -= observer
         a = self.aba.acceleration(q, seen, u).copy()
-        a[:3] -= np.cross(v[3:6], observer)
+        a[PIN_LINEAR] -= np.cross(v[PIN_ANGULAR], observer)
         return q, v, a
 
     def __call__(self, x: Array, u: Array) -> Array:
@@ -49,10 +50,10 @@ class Nonlinear:
         state = self.state
         q, v, a = self.acceleration(x, u)
         chart = state.chart(q)
-        linear, angular = v[:3], v[3:6]
+        linear, angular = v[PIN_LINEAR], v[PIN_ANGULAR]
         rate = state.velocities(a)
         if state.axes[1]:
-            rate[3:6] += np.cross(angular, linear)  # of the velocity's reference-axis components
+            rate[LINEAR] += np.cross(angular, linear)  # of the velocity's reference-axis components
         return np.concatenate(
             (
                 0.5 * (chart.q0 * angular + np.cross(chart.q_b, angular)),
@@ -89,14 +90,27 @@ class ErrorDynamics(Nonlinear):
 
 def jacobian(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:
     """Return the slopes of f at a point by sixth-order central differences of the given steps."""
-    columns = []
-    for along, step in zip(np.diag(steps), steps, strict=True):
-        columns.append(_derivative(partial(_along, f, point, along)) / step)
-    return np.column_stack(columns)
+
+    def slope(along: Array) -> Array:
+        return _derivative(lambda t: f(point + t * along))
+
+    return np.column_stack([slope(along) for along in np.diag(steps)]) / steps
 
 
-def _along(f: Callable[[Array], Array], point: Array, along: Array, t: float) -> Array:
-    return f(point + t * along)
+def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array, Array]:
+    """Return the steps for differences in x (nx,) and u (nu,) at a model's point."""
+    groups, nv = state.groups, len(M)
+    # Small against the angles over which accelerations change where light links line up.
+    step = np.full(state.nx, 2e-4)
+    # Well inside the chart, whose edge |q_b| = 1 the model feels long before.
+    step[groups.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[groups.q_b]))
+    # f is quadratic in the velocities and linear in the input: no truncation at any step.
+    speed = np.abs(lin.x0[-nv:])
+    step[-nv:] = 0.1 * max(1.0, float(speed[ANGULAR].max()), float(speed[6:].max(initial=0.0)))
+    step[groups.v_b] = 0.1 * max(1.0, float(speed[LINEAR].max()))
+    mobility, input_mobility = mobilities(M, lin.B)
+    push = max(1.0, float(np.abs(lin.f0[-nv:] / mobility).max())) / input_mobility
+    return step, push
 
 
 def _derivative(f: Callable[[float], Array]) -> Array:
