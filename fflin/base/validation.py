@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 else:
     Array = np.ndarray  # numpy.typing takes a tenth of the command line's start
 
-# A quaternion or a (cos, sin) pair this far from unit length is renormalised without a word;
-# farther off it is taken for a mistake.
+# A quaternion or a (cos, sin) pair whose squared length misses 1 by up to this has only been
+# rounded and is renormalised; one that misses it by more is taken for a mistake.
 NORM_TOLERANCE = 1e-6
 
-# Native double precision; NumPy makes one such object, so that identity tells it.
+# Native double precision. NumPy has one such object, so that `is` does instead of a comparison.
 DOUBLE = np.dtype(np.float64)
 
 

@@ -12,10 +12,11 @@ from fflin.dynamics.state import StateMap
 from fflin.robot.massless import coordinate_names
 from fflin.robot.robot import Robot
 
-# M_ii (M^-1)_ii is 1 for a decoupled coordinate, more for any other, and grows as a coordinate
-# loses inertia of its own; times the rounding unit it is the relative error of (M^-1)_ii. Of the
-# sum over the coordinates: beyond the second figure less than two digits of M^-1 are left, beyond
-# the first less than nine, and a sum below their number comes of pivots that are round-off.
+# The coupling of a coordinate, M_ii (M^-1)_ii, is 1 where it is decoupled and grows as it loses
+# inertia of its own; times the rounding unit it is the relative error of (M^-1)_ii. Where the sum
+# over all coordinates is beyond the first figure, fewer than nine digits of M^-1 are left; beyond
+# the second, fewer than two. A sum below the number of coordinates comes from pivots that are
+# round-off.
 _EPS = float(np.finfo(float).eps)
 _WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
@@ -140,7 +141,7 @@ def _invert_dense(M: Array, out: Array) -> None:
     out.flat[:: len(M) + 1] *= 0.5
 
 
-# Of the robots that are alive, which do not change.
+# Robots do not change, so each is bounded once.
 _BOUNDS: WeakKeyDictionary[Robot, Array | None] = WeakKeyDictionary()
 
 

@@ -11,7 +11,8 @@ from fflin.base.rotation import conjugate, quaternion_product, rotation_matrix
 from fflin.base.validation import Array, placement, vector
 from fflin.dynamics.chart import SMALLEST_Q0, Chart
 from fflin.dynamics.names import groups_of, states_of
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.frames import ROOT
+from fflin.robot.robot import Robot
 
 Frame = Literal["hybrid", "local", "world"]
 

@@ -19,8 +19,8 @@ from fflin.linear.certificate import (
     inertia_residual,
     inverse_inertia,
     mobilities,
-    motion,
     scaled_condition,
+    speeds,
 )
 from fflin.linear.model import LinearModel
 from fflin.linear.nonlinear import ErrorDynamics, Nonlinear, difference_steps, flow_error, jacobian
@@ -40,7 +40,7 @@ _DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING = 1e-8, 1e4 * _EPS
 # From the residual of an inverse to the error of what it multiplies.
 _ROUTE_SAFETY = 10.0
 
-# Beyond two digits nothing is confirmed, however badly M is conditioned.
+# A tolerance beyond this would confirm less than two digits, however badly M is conditioned.
 _LOOSEST = 1e-2
 
 
@@ -169,7 +169,7 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     rows.append(Row("inertia", "M", _relative(lin.M, M, floor=0.0), route))
     inverse = inverse_inertia(state, lin)
     if model.aba.actuation.default:
-        inverse = lin.B[-len(M) :]  # which is all of it
+        inverse = lin.B[-len(M) :]  # all of it stands in B
     rows.append(Row("inertia", "M M^-1 = E", inertia_residual(M, inverse), route))
     rows += [Row("inertia", name, error, 1e-12) for name, error in _positive_definite(inverse)]
     return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, cond(M) {condition:.1e}")
@@ -187,7 +187,7 @@ def _point_errors(
     state = model.state
     mobility, input_mobility = mobilities(M, lin.B)
     rate = model(lin.x0, lin.u0)
-    _, rate_of_turn, momentum = motion(state, v)
+    _, rate_of_turn, momentum = speeds(state, v)
     push = float((np.abs(lin.u0) * input_mobility).max(initial=0.0))
     push += rate_of_turn**2 * float((1.0 / mobility).max())
     push += rate_of_turn * momentum * float(mobility.max())
@@ -228,7 +228,7 @@ def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float)
     here = y(lin.x0, lin.u0)
     C = jacobian(lambda x: y(x, lin.u0), lin.x0, step_x)
     D = jacobian(lambda u: y(lin.x0, u), lin.u0, step_u)
-    # What cannot be told from the rounding of y in its step is not compared any closer.
+    # A slope below the rounding of y divided by the step is noise, and not compared more closely.
     scale = _ULPS * np.maximum(1.0, np.abs(here))[:, None]
     rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]
     for name, given, expected, step in (("C", lin.C, C, step_x), ("D", lin.D, D, step_u)):

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _EPS = float(np.finfo(float).eps)
 
-# Of the forces that are balanced, this share may be left.
+# Largest share of the forces to be balanced that may be left over.
 _TOLERANCE = 1e-9
 
 # Round-off of M a and of the accelerations themselves, relative to the terms that they sum.
@@ -208,7 +208,7 @@ def _pseudo_solve(C: Array, d: Array) -> Array:
     """Return the u of least norm among those with the least ``|C u - d|``."""
     u: Array = np.linalg.lstsq(C, d, rcond=None)[0]
     u += np.linalg.lstsq(C, d - C @ u, rcond=None)[0]
-    # Nothing is known of what is below the rounding of the largest.
+    # An input below the rounding of the largest one is noise: it counts as zero.
     u[np.abs(u) <= 16.0 * _EPS * float(np.abs(u).max(initial=0.0))] = 0.0
     return u
 

@@ -23,8 +23,8 @@ from fflin.linear.state_equations import assemble, drift
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
-# Sum of squares beyond which a matrix counts as not finite: its eigenvalues would not be. Up to
-# velocities and inputs of the other size nothing overflows on the way to it.
+# A matrix whose squares add up to more than the first counts as not finite, since its eigenvalues
+# would overflow. With velocities and inputs below the second nothing overflows in between.
 LARGEST, _MODERATE = 1e200, 1e50
 
 
@@ -152,7 +152,8 @@ class Linearizer:
         with self._lock:
             if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
                 return self._anywhere(q, v, u)
-            # What overflows is refused, and not warned of. Every call of NumPy costs more here.
+            # An overflow is refused below, so NumPy need not warn of it. Not always done, since
+            # every call of NumPy costs more in here.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
 

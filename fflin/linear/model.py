@@ -140,14 +140,14 @@ class LinearModel:
             Every field by its name. What it has under ``_when_asked`` is {name of a field:
             function of q} for those that are made when they are asked for.
         """
-        # The generated __init__ sets two dozen frozen fields one by one, which costs as much
-        # as the dynamics of a small robot. The caller passes read-only arrays of its own.
+        # The generated __init__ sets two dozen frozen fields one by one, which takes as long
+        # as the dynamics of a small robot.
         lin = _new(cls)
         _set(lin, "__dict__", values)
         return lin
 
     def __getattr__(self, name: str) -> Any:
-        # Of a model at rest: what costs as much as its dynamics is made when it is asked for.
+        # At rest some fields take as long to make as the dynamics, so they wait until asked for.
         make = vars(self).get("_when_asked", {}).get(name)
         if make is None:
             raise AttributeError(f"'LinearModel' object has no attribute '{name}'")

@@ -12,9 +12,10 @@ from fflin.dynamics.aba import Aba
 from fflin.dynamics.state import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR, StateMap
 from fflin.linear.certificate import mobilities
 from fflin.linear.model import LinearModel
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.frames import ROOT
+from fflin.robot.robot import Robot
 
-# Where the base flies faster than this [m/s], the digits of its speed would drown the rest.
+# Where the base flies faster than this [m/s], the rounding of its speed would hide the rest.
 _FAST = 100.0
 
 # Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. Its error is
