@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import EquilibriumError, listed
+from fflin.base.frozen import FrozenArrays
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.names import forces_of
@@ -31,7 +32,7 @@ _ROUNDING = 1e3 * _EPS
 
 
 @dataclass(frozen=True, eq=False)
-class Equilibrium:
+class Equilibrium(FrozenArrays):
     """The inputs of least norm that hold a robot, and what they leave.
 
     Attributes
@@ -52,10 +53,6 @@ class Equilibrium:
     input_units: tuple[str, ...]
     force_names: tuple[str, ...]
     force_units: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        self.u.setflags(write=False)
-        self.residual.setflags(write=False)
 
     def __str__(self) -> str:
         from fflin.base.tables import signals

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.frozen import frozen
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, vector
 from fflin.dynamics.chart import Chart, Standing
@@ -18,7 +19,7 @@ from fflin.dynamics.rnea import Accelerations, Rates
 from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
-from fflin.linear.prepared import frozen, prepare
+from fflin.linear.prepared import prepare
 from fflin.linear.state_equations import assemble, drift
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot

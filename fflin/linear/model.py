@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fflin.base.errors import InputError, MissingPackageError
+from fflin.base.frozen import FrozenArrays
 from fflin.base.validation import Array, number
 from fflin.linear.sampling import held_exponential
 
@@ -48,7 +49,7 @@ class Certificate:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearModel:
+class LinearModel(FrozenArrays):
     r"""A linear model about a point, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
     The output is ``y = y0 + C (x - x0) + D (u - u0)``. For ``dt > 0`` the left side is the next
@@ -121,14 +122,6 @@ class LinearModel:
     # structure no exponential has blurred.
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, np.ndarray) and value.flags.writeable:
-                value = value.copy()
-                value.setflags(write=False)
-                object.__setattr__(self, item.name, value)
 
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> LinearModel:

@@ -46,6 +46,12 @@ class Nonlinear:
         a[PIN_LINEAR] -= np.cross(v[PIN_ANGULAR], observer)
         return q, v, a
 
+    def passing(self, x: Array, motion: tuple[Array, Array, Array], t: float) -> Array:
+        """Return the state a time t after x on a motion that has (q, v, a) there."""
+        q, v, a = motion
+        after = pin.integrate(self.state.robot.model, q, t * v)
+        return self.state.to_state(after, v + t * a, near=x)
+
     def __call__(self, x: Array, u: Array) -> Array:
         """Return dx/dt (nx,)."""
         state = self.state
@@ -74,8 +80,21 @@ class ErrorDynamics(Nonlinear):
 
     def __init__(self, state: StateMap, lin: LinearModel) -> None:
         super().__init__(state, lin)
-        self._v = lin.v
+        self._q, self._v = lin.q.copy(), lin.v
+        self._q[:3] = 0.0
         self._a = state.velocities(self.acceleration(lin.x0, lin.u0)[2])
+
+    def passing(self, x: Array, motion: tuple[Array, Array, Array], t: float) -> Array:
+        """Return the error when reference and robot, at x, have both moved on for a time t."""
+        error = super().passing(x, motion, t)
+        robot = self.state.robot
+        q, v, _ = motion
+        q_star = pin.integrate(robot.model, self._q, t * self._v)
+        reference = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(q_star[:7])
+        moved = StateMap(robot, reference=reference, frame="local")
+        error[:6] = moved.to_state(pin.integrate(robot.model, q, t * v), v)[:6]
+        error[6:] -= t * np.concatenate((self.state.velocities(self._v)[6:], self._a))
+        return error
 
     def __call__(self, x: Array, u: Array) -> Array:
         """Return the rate of the error (nx,)."""
@@ -93,7 +112,7 @@ def jacobian(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:
     """Return the slopes of f at a point by sixth-order central differences of the given steps."""
 
     def slope(along: Array) -> Array:
-        return _derivative(lambda t: f(point + t * along))
+        return _derivative(lambda t: f(point + t * along), 1.0)
 
     return np.column_stack([slope(along) for along in np.diag(steps)]) / steps
 
@@ -114,10 +133,10 @@ def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array
     return step, push
 
 
-def _derivative(f: Callable[[float], Array]) -> Array:
-    """Return df/dt at 0 by differences at t = -3 ... 3."""
-    differences = [f(k) - f(-k) for k in range(1, 1 + len(_WEIGHTS))]
-    return np.tensordot(_WEIGHTS, differences, axes=1)
+def _derivative(f: Callable[[float], Array], h: float) -> Array:
+    """Return df/dt at 0 by differences at t = -3 h ... 3 h."""
+    differences = [f(k * h) - f(-k * h) for k in range(1, 1 + len(_WEIGHTS))]
+    return np.tensordot(_WEIGHTS, differences, axes=1) / h
 
 
 def flow_error(robot: Robot, lin: LinearModel) -> float:
@@ -135,39 +154,11 @@ def flow_error(robot: Robot, lin: LinearModel) -> float:
         x[state.groups.r_b] = 0.0
         if unit is not None:
             x[6 + robot.n + unit] += 1.0
-        q, v, a = model.acceleration(x, lin.u0)
-        h = 1e-2 * state.chart(q).q0 / (1.0 + float(np.abs(v[3:]).max()))
-        rate = _derivative(partial(_moved, state, x, q, h * v, v, h * a)) / h
-        if lin.moving:
-            q_star = lin.q.copy()
-            q_star[:3] = 0.0
-            back = partial(_moved_error, robot, q_star, h * lin.v, q, h * v)
-            rate[:6] = _derivative(back) / h
-            rate[6:] -= _motion_of_reference(model, lin)
+        motion = _, v, _ = model.acceleration(x, lin.u0)
+        h = 1e-2 * float(state.chart(motion[0]).q0) / (1.0 + float(np.abs(v[3:]).max()))
+        rate = _derivative(partial(model.passing, x, motion), h)
         floor = 1.0 + float(np.abs(v).max())
         expected = model(x, lin.u0)
         scale = max(floor, float(np.abs(expected).max()))
         worst = max(worst, float(np.abs(expected - rate).max()) / scale)
     return worst
-
-
-def _moved(
-    state: StateMap, near: Array, q: Array, dq: Array, v: Array, dv: Array, t: float
-) -> Array:
-    return state.to_state(pin.integrate(state.robot.model, q, t * dq), v + t * dv, near=near)
-
-
-def _moved_error(robot: Robot, q: Array, dq: Array, q1: Array, dq1: Array, t: float) -> Array:
-    """Return (q_b, r_b) of the error when reference and robot have both moved on."""
-    reference = pin.integrate(robot.model, q, t * dq)
-    root = robot.model.jointPlacements[ROOT]
-    moved = StateMap(robot, reference=root * pin.XYZQUATToSE3(reference[:7]), frame="local")
-    now = pin.integrate(robot.model, q1, t * dq1)
-    return moved.to_state(now, np.zeros(robot.nv))[:6]
-
-
-def _motion_of_reference(model: Nonlinear, lin: LinearModel) -> Array:
-    """Return d(q_m, omega_b, v_b, qdot_m)/dt of the reference itself."""
-    state = model.state
-    _, v, a = model.acceleration(lin.x0, lin.u0)
-    return np.concatenate((state.velocities(v)[6:], state.velocities(a)))

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.frozen import frozen
 from fflin.base.validation import Array, truth
 from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
@@ -128,9 +129,3 @@ def prepare(
             "v": frozen(np.zeros(robot.nv)),
         },
     )
-
-
-def frozen(array: Array) -> Array:
-    """Return the array itself, read-only."""
-    array.setflags(write=False)
-    return array

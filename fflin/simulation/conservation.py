@@ -135,7 +135,7 @@ class Conserved:
             energy += 0.5 * (np.array(positions) - rest) ** 2 @ stiffness
         return Histories(energy, momentum, center, of_base)
 
-    def drift(self, history: Histories, expected: Array) -> Array:
+    def momentum_drift(self, history: Histories, expected: Array) -> Array:
         """Return how far the momentum is from what is expected (N, 6), relative (N,).
 
         To the largest sum of what base, joints and wheels add to it; about a fixed point the

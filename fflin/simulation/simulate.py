@@ -197,7 +197,7 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         prediction=predict(plan, x, run.steps),
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
-        momentum_drift=conserved.drift(history, run.momentum),
+        momentum_drift=conserved.momentum_drift(history, run.momentum),
         com_drift=np.linalg.norm(history.center - run.center, axis=1),
         placement=pin.SE3ToXYZQUAT(state.reference),
         state_names=state.names,
