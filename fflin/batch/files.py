@@ -74,7 +74,7 @@ def header(batch: Any, count: int) -> str:
     """Return what of a `LinearBatch` of so many points is text, as JSON."""
     texts = {key: getattr(batch, key) for key in _TEXTS}
     texts["_ignorable"] = batch[0].ignorable
-    return json.dumps({**texts, "points": count, "columns": batch._columns})
+    return json.dumps({**texts, "points": count, "columns": batch.columns})
 
 
 def write_batch(path: Path, arrays: Mapping[str, Array], header: str) -> None:

@@ -164,6 +164,11 @@ class LinearBatch:
         return self.x0 if self._y0 is None else self._y0
 
     @property
+    def columns(self) -> tuple[tuple[int, int], ...]:
+        """Where each joint stands in q: (index, -1), or those of (cos, sin)."""
+        return self._columns
+
+    @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the n independent joints in state order."""
         return tuple(
@@ -305,7 +310,7 @@ class LinearBatch:
             | names
             | {"B": B, "x0": x0, "y0": x0 if y0 is None else y0, "dt": 0.0}
             | {"_inertia": inertia, "_certify": certify, "_drift": rows.get("_drift")}
-            | {"_ignorable": ignorable}
+            | {"_ignorable": ignorable, "_source": None}
         )
 
     def _rest_states(self, rows: slice) -> Array:

@@ -119,11 +119,11 @@ def times_of(
     delay: float,
 ) -> Times:
     """Return the times of a simulation, whose arguments are those of `simulate`."""
-    if sample is None:
-        sample = getattr(getattr(policy, "lin", None), "dt", None) or None
-    fastest = 0.0 if sample else _fastest_pole(policy)
     if sample is not None:
         sample = _positive("sample", sample)
+    else:
+        sample = getattr(getattr(policy, "lin", None), "dt", None) or None
+    fastest = 0.0 if sample else _fastest_pole(policy)
     duration, delay = _positive("duration", duration), number("delay", delay)
     if not 0.0 <= delay <= _LONGEST:
         raise InputError(f"delay is {delay:g} s, expected 0 to {_LONGEST:g} s")
