@@ -72,7 +72,7 @@ class Actuation:
                     held.append(Held(slice(at, at + 3), rows))
             elif isinstance(item, JointTorque):
                 index = robot.joints.index(robot.joint(item.joint))
-                unit = "N" if robot.joints[index].prismatic else unit
+                unit = robot.joints[index].force_unit
                 names.append(f"{kind}.{item.joint}")
                 columns.append(identity[6 + index])
             elif isinstance(item, ReactionWheel) and item.inertia:
