@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 import pickle
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from functools import cached_property
+from collections.abc import Mapping
+from functools import cached_property, partial
 from threading import Lock
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +15,7 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinError, FflinWarning
 from fflin.base.validation import Array
-from fflin.batch.inertia import BatchInertia, Rows
+from fflin.dynamics.inertia import Inertia
 from fflin.kernel.compiled import pays
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
@@ -24,10 +23,6 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from fflin.batch.equations import BatchEquations
     from fflin.dynamics.state import Frame
-
-
-# Of a linear model, by the names that a batch has for them.
-_ATTRIBUTES = {"_x0": "x0", "_y0": "y0"}
 
 
 class Points(NamedTuple):
@@ -43,6 +38,10 @@ class Chunk(NamedTuple):
 
     arrays: dict[str, Array]
     notes: list[str]
+
+
+# Python's filters of warnings are the whole process's, so that threads take turns.
+_TURN = Lock()
 
 
 class ChunkJob:
@@ -69,14 +68,17 @@ class ChunkJob:
         at_rest: bool,
         count: int,
     ) -> None:
-        self._arguments = (robot, frame, reference, moving, at_rest, count)
+        options: Any = {"frame": frame, "reference": reference, "moving": moving}
+        self._again = partial(type(self), robot, **options, at_rest=at_rest, count=count)
         self._count = count
-        self.linearizer = Linearizer(robot, frame=frame, reference=reference, moving=moving)
-        # There all but M^-1 is known beforehand.
-        self.only_inertia = at_rest and reference is None and self.linearizer.prepared.free
+        self.linearizer = Linearizer(robot, **options)
+        prepared = self.linearizer.prepared
+        # Then the model is known beforehand, but for M^-1.
+        self.only_inertia = at_rest and prepared.own_reference and prepared.free
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuilt, self._arguments
+        # A worker makes a work space of its own.
+        return self._again, ()
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -109,106 +111,55 @@ class ChunkJob:
         FflinError
             If there is no model about one of them; the message names it.
         """
+        count = len(points.q)
         if out is None:
-            out = {key: np.empty((len(points.q), *shape)) for key, shape in self.shapes.items()}
-        if self.only_inertia:
-            return Chunk(dict(out), self._at_rest(points.q, start, out["B_lower"]))
-        return Chunk(dict(out), self._anywhere(points, start, out))
-
-    def _at_rest(self, q: Array, start: int, out: Array) -> list[str]:
-        actuation, nv = self.linearizer.prepared.actuation, 6 + self.linearizer.robot.n
-        inverse = out
-        if not actuation.default:
-            inverse = np.empty((len(q), nv, nv))
-        # Without joints M is the same everywhere.
-        rigid = not self.linearizer.robot.n
-        left: Rows = np.arange(1) if rigid else self._inertia.compiled(q, inverse)
-        notes: list[warnings.WarningMessage] = []
-        if len(left):
-            try:
-                with _caught() as notes:
-                    self._inertia.loop(q, inverse, left)
-            except FflinError as error:
-                raise _renumbered(error, start) from None
-        if rigid:
-            inverse[1:] = inverse[0]
-        if inverse is not out and not actuation.carried:
-            np.matmul(inverse, actuation.fixed, out=out)
-        elif inverse is not out:
-            data = self.linearizer.robot.create_data()
-            for row, point in enumerate(q):
-                # What pushes depends on no base position, and would lose digits to it.
-                still = point.copy()
-                still[:3] = 0.0
-                np.matmul(inverse[row], actuation.columns(data, still), out=out[row])
-        return [str(note.message) for note in notes]
-
-    def _anywhere(self, points: Points, start: int, out: Mapping[str, Array]) -> list[str]:
-        nv = 6 + self.linearizer.robot.n
-        left: Rows = np.arange(len(points.q))
-        if self._equations is not None:
-            left = self._equations.write(*points, out)
+            out = {key: np.empty((count, *shape)) for key, shape in self.shapes.items()}
+        left = self.compiled.write(*points, out) if self.compiled else np.arange(count)
         if not len(left):
-            return []
-        with _caught() as notes:
+            return Chunk(dict(out), [])
+        with _TURN, warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", FflinWarning)
             for row in left.tolist():
-                q, v, u = (None if rows is None else rows[row] for rows in points)
                 try:
-                    lin = self.linearizer(q, v, u)
+                    values = self._values(*(None if x is None else x[row] for x in points))
                 except FflinError as error:
                     raise type(error)(f"configuration {start + row}: {error}") from None
-                for key, array in out.items():
-                    array[row] = (
-                        lin.B[nv:] if key == "B_lower" else getattr(lin, _ATTRIBUTES.get(key, key))
-                    )
-        return [str(note.message) for note in notes]
+                for key, value in values.items():
+                    out[key][row] = value
+        return Chunk(dict(out), [str(note.message) for note in caught])
 
-    @property
-    def parallel(self) -> bool:
-        """Whether threads do chunks at the same time."""
-        return self.only_inertia or self._equations is not None
+    def _values(self, q: Any, v: Array | None, u: Array | None) -> dict[str, Array]:
+        """Return what differs from point to point at one of them."""
+        nv, actuation = 6 + self.linearizer.robot.n, self.linearizer.prepared.actuation
+        if self.only_inertia:
+            inertia, data = self._inertia
+            inverse = np.empty((nv, nv))
+            inertia.invert(q, inverse)
+            if actuation.default:
+                return {"B_lower": inverse}
+            # What pushes depends on no base position, and would lose digits to it.
+            still = q.copy()
+            still[:3] = 0.0
+            return {"B_lower": inverse @ actuation.columns(data, still)}
+        lin = self.linearizer(q, v, u)
+        others = {
+            key: getattr(lin, key.removeprefix("_")) for key in self.shapes.keys() - {"B_lower"}
+        }
+        return {"B_lower": lin.B[nv:], **others}
 
     @cached_property
-    def _equations(self) -> BatchEquations | None:
-        from fflin.batch.equations import BatchEquations
+    def compiled(self) -> BatchEquations | None:
+        """The kernel's equations where it pays and knows the robot; threads do them together."""
+        from fflin.batch.equations import batch_equations
 
-        if not (pays(self._count) and BatchEquations.possible(self.linearizer)):
+        if not pays(self._count):
             return None
-        return BatchEquations(self.linearizer)
+        return batch_equations(self.linearizer.prepared, only_inertia=self.only_inertia)
 
     @cached_property
-    def _inertia(self) -> BatchInertia:
-        return BatchInertia(self.linearizer.robot, compiled=pays(self._count))
-
-
-# Python's filters of warnings are the whole process's, so that threads take turns.
-_TURN = Lock()
-
-
-@contextmanager
-def _caught() -> Iterator[list[warnings.WarningMessage]]:
-    """Collect what is warned of."""
-    with _TURN, warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", FflinWarning)
-        yield caught
-
-
-def _renumbered(error: FflinError, start: int) -> FflinError:
-    number, _, rest = str(error).removeprefix("configuration ").partition(":")
-    return type(error)(f"configuration {start + int(number)}:{rest}")
-
-
-def _rebuilt(
-    robot: Robot,
-    frame: Frame | None,
-    reference: pin.SE3 | None,
-    moving: bool,
-    at_rest: bool,
-    count: int,
-) -> ChunkJob:
-    return ChunkJob(
-        robot, frame=frame, reference=reference, moving=moving, at_rest=at_rest, count=count
-    )
+    def _inertia(self) -> tuple[Inertia, pin.Data]:
+        data = self.linearizer.robot.create_data()
+        return Inertia(self.linearizer.prepared.map, data), data
 
 
 class Parcel(NamedTuple):

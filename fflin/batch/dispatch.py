@@ -1,8 +1,9 @@
-"""Chunks of a sweep on the workers of an executor, of which some may die."""
+"""Chunks of a sweep in this process, or on the workers of an executor, of which some may die."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -10,12 +11,15 @@ from concurrent.futures import (
     Executor,
     Future,
     ProcessPoolExecutor,
+    ThreadPoolExecutor,
     wait,
 )
 from typing import Any, NamedTuple
 
 from fflin.base.errors import FflinError
-from fflin.batch.chunks import Chunk, ChunkJob, Parcel, Points, packed, work
+from fflin.base.validation import Array
+from fflin.batch.chunks import Chunk, Parcel, packed, work
+from fflin.batch.task import Span, SweepTask
 from fflin.batch.workers import NoWorkers, WorkerDied
 
 # A chunk whose worker dies is given to others; what kills this many is not.
@@ -31,13 +35,6 @@ _GLANCE = 1.0
 _UNKNOWN_WORKERS = 16
 
 
-class Span(NamedTuple):
-    """The points of a chunk, start up to but not including stop."""
-
-    start: int
-    stop: int
-
-
 class Done(NamedTuple):
     """A chunk that came to an end: its result, or why there is none."""
 
@@ -46,22 +43,62 @@ class Done(NamedTuple):
     reason: str
 
 
-def dispatch(
-    job: ChunkJob,
+def run_here(
+    task: SweepTask,
     spans: Sequence[Span],
-    points: Callable[[Span], Points],
-    workers: Executor,
+    place: Callable[[int, int], Mapping[str, Array] | None],
+    threads: int,
 ) -> Iterator[Done]:
+    """Do chunks in this process, several at a time where the kernel does them.
+
+    Parameters
+    ----------
+    task : SweepTask
+    spans : sequence of Span
+    place : callable
+        Returns the arrays that a chunk is written to, or None for new ones.
+    threads : int
+
+    Yields
+    ------
+    Done
+        Each span once.
+    """
+
+    def run(span: Span) -> Done:
+        rows = place(*span)
+        out = None if rows is None else {key: rows[key] for key in task.job.shapes}
+        try:
+            return Done(span, task.job.run(task.points(span), span.start, out), "")
+        except FflinError as error:
+            return Done(span, None, str(error))
+
+    if threads == 1 or len(spans) == 1 or not task.job.compiled:
+        yield from map(run, spans)
+        return
+    pool, begun = ThreadPoolExecutor(threads), deque[Future[Done]]()
+    try:
+        for span in spans:
+            begun.append(pool.submit(run, span))
+            # Not far ahead of what takes the results, which would fill the memory.
+            if len(begun) > threads:
+                yield begun.popleft().result()
+        while begun:
+            yield begun.popleft().result()
+    finally:
+        # Ctrl-C does not wait for what they compile.
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def dispatch(task: SweepTask, spans: Sequence[Span], workers: Executor) -> Iterator[Done]:
     """Do chunks on workers and yield them as they are finished.
 
     The job is sent with the first chunks only, and again to a worker that says it has none.
 
     Parameters
     ----------
-    job : ChunkJob
+    task : SweepTask
     spans : sequence of Span
-    points : callable
-        Makes the points of a span.
     workers : Executor
 
     Yields
@@ -69,7 +106,7 @@ def dispatch(
     Done
         Each span once.
     """
-    work_place = _WorkPlace(packed(job), spans, points, workers)
+    work_place = _WorkPlace(task, spans, workers)
     try:
         while work_place.waiting or work_place.running:
             work_place.begin()
@@ -84,18 +121,12 @@ def dispatch(
 class _WorkPlace:
     """The chunks that wait and those that run, how often each was begun, and the workers."""
 
-    def __init__(
-        self,
-        parcel: Parcel,
-        spans: Sequence[Span],
-        points: Callable[[Span], Points],
-        workers: Executor,
-    ) -> None:
+    def __init__(self, task: SweepTask, spans: Sequence[Span], workers: Executor) -> None:
         self.waiting = list(reversed(spans))
         self.running: dict[Future[Chunk | None], Span] = {}
         self.broken: BaseException | None = None
         self._attempts: dict[Span, int] = {}
-        self._parcel, self._points, self._workers = parcel, points, workers
+        self._task, self._parcel, self._workers = task, packed(task.job), workers
         self._ahead = _QUEUED * _count(workers)
         self._known = False
 
@@ -155,7 +186,7 @@ class _WorkPlace:
 
     def _submit(self, span: Span, content: bytes | None) -> None:
         """Begin a chunk, or put it back where the executor is dead."""
-        arguments = Parcel(self._parcel.key, content), self._points(span), span.start
+        arguments = Parcel(self._parcel.key, content), self._task.points(span), span.start
         try:
             future = self._workers.submit(work, *arguments)
         except Exception as error:  # broken, shut down, or of its own

@@ -154,23 +154,20 @@ def _from_npz(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, str
 def _from_hdf5(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, str], bool]:
     with hdf5().File(path, "r") as file:
         texts = {key: str(file.attrs[key]) for key in ("header", "constant")}
-        arrays = {key: mapped(path, file[key]) for key in file}
+        arrays = {key: _mapped(path, file[key]) for key in file}
         chunk = int(file.attrs.get("chunk", 0))
     seal, seals = arrays.pop(SEAL, None), arrays.pop(CHUNK_SEALS, None)
     if seal is None or seals is None or not verify:
         return arrays, texts, False
     constants = {key: arrays[key] for key in json.loads(texts["constant"])}
     varying = {key: value for key, value in arrays.items() if key not in constants}
-    if (
-        chunk < 1
-        or not np.array_equal(seal, batch_seal(texts, chunk, seals, constants))
-        or not np.array_equal(seals, chunk_seals(varying, len(arrays["q"]), chunk))
-    ):
+    whole = chunk > 0 and np.array_equal(seal, batch_seal(texts, chunk, seals, constants))
+    if not whole or not np.array_equal(seals, chunk_seals(varying, len(arrays["q"]), chunk)):
         raise ValueError(DAMAGED)
     return arrays, texts, True
 
 
-def mapped(path: Path, dataset: Any) -> Array:
+def _mapped(path: Path, dataset: Any) -> Array:
     """Return a contiguous dataset as an array that is read as it is used."""
     offset = dataset.id.get_offset()
     if offset is None or not dataset.size:

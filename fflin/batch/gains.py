@@ -12,9 +12,9 @@ from fflin.base.errors import FflinError, InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, vector
 from fflin.batch.files import is_constant
-from fflin.batch.joint_columns import joint_columns, positions
 from fflin.batch.linear_batch import LinearBatch
 from fflin.batch.riccati import gains_at_rest
+from fflin.batch.rows import column, positions
 from fflin.control.lqr import lqr
 from fflin.control.policies import StateFeedback
 from fflin.control.weights import weight
@@ -242,10 +242,8 @@ class ScheduledFeedback:
         lin, gains = self.lin, self.gains
         # Refuses another robot.
         StateFeedback(lin, np.zeros(lin.B.T.shape)).bind(robot)
-        state, columns = (
-            StateMap(robot, reference=lin.reference, frame=lin.frame),
-            joint_columns(robot),
-        )
+        state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+        columns = [column(joint) for joint in robot.joints]
 
         def policy(_: float, q: Array, v: Array) -> Array:
             K = gains._between(positions(q[None], columns)[0])
