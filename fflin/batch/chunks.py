@@ -33,14 +33,14 @@ class Points(NamedTuple):
     u: Array | None
 
 
-class Chunk(NamedTuple):
-    """What a chunk came to: its arrays by name, and what was warned of."""
+class ChunkResult(NamedTuple):
+    """The result of a chunk: its arrays by name, and the warnings on the way."""
 
     arrays: dict[str, Array]
     notes: list[str]
 
 
-# Python's filters of warnings are the whole process's, so that threads take turns.
+# Python has one set of warning filters for the whole process, so that threads take turns.
 _TURN = Lock()
 
 
@@ -73,7 +73,7 @@ class ChunkJob:
         self._count = count
         self.linearizer = Linearizer(robot, **options)
         prepared = self.linearizer.prepared
-        # Then the model is known beforehand, but for M^-1.
+        # There every field of a model but B is known without computing it.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -95,7 +95,9 @@ class ChunkJob:
                 shapes |= {"C": (ny, nx), "D": (ny, nu), "_y0": (ny,)}
         return shapes
 
-    def run(self, points: Points, start: int, out: Mapping[str, Array] | None = None) -> Chunk:
+    def run(
+        self, points: Points, start: int, out: Mapping[str, Array] | None = None
+    ) -> ChunkResult:
         """Linearise about the points of a chunk; threads may share a job.
 
         Parameters
@@ -116,7 +118,7 @@ class ChunkJob:
             out = {key: np.empty((count, *shape)) for key, shape in self.shapes.items()}
         left = self.compiled.write(*points, out) if self.compiled else np.arange(count)
         if not len(left):
-            return Chunk(dict(out), [])
+            return ChunkResult(dict(out), [])
         with _TURN, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", FflinWarning)
             for row in left.tolist():
@@ -126,7 +128,7 @@ class ChunkJob:
                     raise type(error)(f"configuration {start + row}: {error}") from None
                 for key, value in values.items():
                     out[key][row] = value
-        return Chunk(dict(out), [str(note.message) for note in caught])
+        return ChunkResult(dict(out), [str(note.message) for note in caught])
 
     def _values(self, q: Any, v: Array | None, u: Array | None) -> dict[str, Array]:
         """Return what differs from point to point at one of them."""
@@ -137,7 +139,7 @@ class ChunkJob:
             inertia.invert(q, inverse)
             if actuation.default:
                 return {"B_lower": inverse}
-            # What pushes depends on no base position, and would lose digits to it.
+            # The columns do not depend on the base's position, and would lose digits to it.
             still = q.copy()
             still[:3] = 0.0
             return {"B_lower": inverse @ actuation.columns(data, still)}
@@ -169,18 +171,18 @@ class Parcel(NamedTuple):
     content: bytes | None
 
 
-def packed(job: ChunkJob) -> Parcel:
-    """Return a job as it is sent."""
+def pack(job: ChunkJob) -> Parcel:
+    """Pickle a job under the hash of its content."""
     content = pickle.dumps(job)
     return Parcel(hashlib.sha256(content).hexdigest(), content)
 
 
-# What this worker was sent; the least recent goes first.
+# The jobs that this worker has received; the oldest is dropped first.
 _JOBS: dict[str, ChunkJob] = {}
 _KEPT = 4
 
 
-def work(parcel: Parcel, points: Points, start: int) -> Chunk | None:
+def work(parcel: Parcel, points: Points, start: int) -> ChunkResult | None:
     """Do a chunk in a worker, or return None where the worker does not have the job."""
     job = _JOBS.get(parcel.key)
     if job is None:

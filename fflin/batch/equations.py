@@ -24,7 +24,7 @@ from fflin.robot.frames import ROOT
 # The kernel has sines of angles up to here [rad].
 _FARTHEST = 1e6
 
-Rows: TypeAlias = NDArray[np.integer[Any]]
+RowNumbers: TypeAlias = NDArray[np.integer[Any]]
 Mask: TypeAlias = NDArray[np.bool_]
 
 
@@ -45,7 +45,9 @@ class BatchEquations(ABC):
         self._prepared, self._tree = prepared, tree
         self._least_coupling = 0.999 * (6 + prepared.robot.n)
 
-    def write(self, q: Array, v: Array | None, u: Array | None, out: Mapping[str, Array]) -> Rows:
+    def write(
+        self, q: Array, v: Array | None, u: Array | None, out: Mapping[str, Array]
+    ) -> RowNumbers:
         """Write what differs from point to point, and return the rows that are left.
 
         Left are those that the linearizer refuses or warns of: where M is singular or nearly so,
@@ -104,10 +106,13 @@ class RestEquations(BatchEquations):
     ) -> Mask:
         B, actuation, nv = out["B_lower"], self._prepared.actuation, self._prepared.map.nx // 2
         inverse = B if actuation.default else np.empty((len(q), nv, nv))
-        couplings = inverse_inertias(self._tree, q, inverse)
+        # Without joints M is the same everywhere.
+        first = len(q) if self._prepared.robot.n else LANES
+        couplings = inverse_inertias(self._tree, q[:first], inverse[:first])
+        inverse[first:] = inverse[0]
         if not actuation.default:
             np.matmul(inverse, actuation.fixed, out=B)
-        return self._regular(q, couplings)
+        return self._regular(q, np.resize(couplings, len(q)))
 
 
 class PointEquations(BatchEquations):

@@ -23,14 +23,14 @@ from fflin.base.writing import check_ending, replacing
 
 FORMATS = (".npz", ".h5")
 
-# The version of HDF5 from which the file's own records have checksums: without them, a damaged
-# file can take the process with it.
+# From this version on HDF5 has checksums of its own metadata, without which reading a damaged file
+# can crash the process.
 CHECKED = ("v108", "v108")
 
 CHUNK_SEALS = f"chunk_{SEAL}"
 _CHUNK_BYTES = 2**22
 
-# Fields of a batch that are text or lists of it; they stand in the file as one JSON document.
+# Fields of a batch that are texts or lists of texts; a file has them as one JSON document.
 _TEXTS = (
     *("state_names", "input_names", "output_names"),
     *("state_units", "input_units", "output_units"),

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from fflin.control.weights import Weight
     from fflin.robot.robot import Robot
 
-# Models whose gains are computed at once; what that takes is small.
+# Models whose gains are computed at once, which bounds the memory of their eigenproblems.
 _BLOCK = 256
 
-# Of a Riccati equation, relative; a gain beyond is computed again alone, and refined.
+# Largest relative residual of a Riccati equation; a gain beyond it is computed by `lqr` instead.
 _SOUND = 1e-11
 
 

@@ -15,7 +15,8 @@ from fflin.robot.robot import ROUND_OFF, Robot
 # Where a joint stands in q: (index, -1), or, where it is stored so, those of (cos, sin).
 Column: TypeAlias = tuple[int, int]
 
-_BLOCK = 2048  # rows that are checked at once, so that what that takes is small
+# Rows that are checked at once, which bounds the memory of what is computed on the way.
+_BLOCK = 2048
 
 
 def column(joint: Joint) -> Column:

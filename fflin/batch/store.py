@@ -17,7 +17,7 @@ from fflin.base.validation import Array
 from fflin.base.writing import as_path, check_place, install, reason, reserve
 from fflin.batch.files import CHECKED, CHUNK_SEALS, batch_seal, check_format, chunk_seal, hdf5
 
-# Of a file beside its rows: names, what is the same at all points, digests [bytes].
+# Allowance for what a file has besides its rows: names, constant arrays, digests [bytes].
 _OVERHEAD = 2**16
 
 

@@ -217,18 +217,16 @@ def _collect(
     notes: list[str] = []
     if progress and count:
         progress(min(count, task.count), task.count)
-    for result in done:
-        if result.chunk is None:
-            failed.append(result)
+    for span, result, reason in done:
+        if result is None:
+            failed.append(Done(span, None, reason))
         else:
-            points = task.points(result.span)
+            points = task.points(span)
             rows: dict[str, Any] = {"q": points.q, "v": points.v, "u0": points.u}
-            arrays = {
-                key: rows[key] if key in rows else result.chunk.arrays[key] for key in store.names
-            }
-            store.write(*result.span, arrays)
-            notes += result.chunk.notes
-        count += result.span.stop - result.span.start
+            arrays = {key: rows[key] if key in rows else result.arrays[key] for key in store.names}
+            store.write(*span, arrays)
+            notes += result.notes
+        count += span.stop - span.start
         if progress:
             progress(min(count, task.count), task.count)
     if notes:

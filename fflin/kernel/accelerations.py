@@ -10,7 +10,7 @@ from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.kernel.compiled import kernel
-from fflin.kernel.tree import LANES, Tree
+from fflin.kernel.tree import LANES, PIN_ANGULAR, PIN_LINEAR, Tree
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
@@ -149,8 +149,9 @@ def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
         for number, column in zip(numbers.tolist(), columns.T, strict=True):
             body.append(joint - ROOT)
             inputs.append(number)
-            # Pinocchio has the force first.
-            wrenches.append(np.concatenate((turned @ column[3:], turned @ column[:3])))
+            wrenches.append(
+                np.concatenate((turned @ column[PIN_ANGULAR], turned @ column[PIN_LINEAR]))
+            )
     stored = [(joint - ROOT, momentum) for joint, momentum in robot.stored_momentum]
     return Loads(
         np.array(body, dtype=np.intp),

@@ -114,7 +114,7 @@ def _carry(work, at, above, place):
 
 
 @numba.njit(forceinline=True)
-def turning_inertia(work, at, w):
+def inertia_times(work, at, w):
     """Return I w of the inertia at `at`."""
     xx, xy, xz = get3(work, at + 4 * LANES)
     yy, yz, zz = get3(work, at + 7 * LANES)
@@ -127,7 +127,7 @@ def _momentum(work, at, axis, turns, slides):
     m, turns, slides = load(work, at), splat(turns), splat(slides)
     lever = cross(get3(work, at + LANES), axis)
     return (
-        plus(times(turning_inertia(work, at, axis), turns), times(lever, slides)),
+        plus(times(inertia_times(work, at, axis), turns), times(lever, slides)),
         minus(times(times(axis, m), slides), times(lever, turns)),
     )
 

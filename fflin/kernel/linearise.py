@@ -7,7 +7,7 @@ import numba
 from fflin.kernel.crba import inwards, outwards
 from fflin.kernel.factor import factorise, multiply, unpack
 from fflin.kernel.lanes import gather, load, splat, store
-from fflin.kernel.rnea import accelerate_bodies, collect, load_bodies, move
+from fflin.kernel.rnea import accelerate_bodies, collect, load_bodies, move_bodies
 from fflin.kernel.slopes import differentiate
 from fflin.kernel.tree import LANES
 from fflin.kernel.vectors import get6, minus6, put6, times6
@@ -79,7 +79,7 @@ def linearise(tree, layout, loads, points, out, work):
         # The last are the last there are, some of them for the second time.
         first = min(block, count - LANES)
         outwards(work, tree, flat, first * stride, stride)
-        move(work, tree, layout, nu, first)
+        move_bodies(work, tree, layout, nu, first)
         load_bodies(work, tree, layout, loads, u, first)
         inwards(work, tree)
         collect(work, tree, layout)

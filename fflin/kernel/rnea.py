@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numba
 
-from fflin.kernel.crba import turning_inertia
+from fflin.kernel.crba import inertia_times
 from fflin.kernel.lanes import gather, load, splat, store
 from fflin.kernel.tree import INERTIA, LANES, PLACE
 from fflin.kernel.vectors import (
@@ -51,18 +51,18 @@ def joint_axis(work, tree, body):
 
 
 @numba.njit(forceinline=True)
-def crossed(velocity, along):
+def motion_cross(velocity, along):
     """Return the rate of a motion vector `along` that is carried by a velocity."""
     w, v = velocity
     return cross(w, along[0]), plus(cross(w, along[1]), cross(v, along[0]))
 
 
 @numba.njit(forceinline=True)
-def weighed(work, at, motion):
+def spatial_inertia_times(work, at, motion):
     """Return inertia times a motion vector, moment and force."""
     m, h = load(work, at), get3(work, at + LANES)
     w, v = motion
-    moment = plus(turning_inertia(work, at, w), cross(h, v))
+    moment = plus(inertia_times(work, at, w), cross(h, v))
     return moment, plus(times(v, m), cross(w, h))
 
 
@@ -80,7 +80,7 @@ def at_parent(work, place, force):
 
 
 @numba.njit(forceinline=True)
-def move(work, tree, layout, nu, first):
+def move_bodies(work, tree, layout, nu, first):
     """Write the velocities, and the accelerations without c, outwards; the base does not slide."""
     stride = nu.shape[1]
     flat = nu.reshape(-1)
@@ -98,7 +98,7 @@ def move(work, tree, layout, nu, first):
         rate = gather(flat, start + tree.coordinate[body], stride)
         axis = joint_axis(work, tree, body)
         velocity = at_joint(work, above + VELOCITY, place)
-        psi = crossed(velocity, axis)
+        psi = motion_cross(velocity, axis)
         bias = at_joint(work, above + BIAS, place)
         put6(work, at + VELOCITY, plus6(velocity, times6(axis, rate)))
         put6(work, at + PSI, psi)
@@ -117,7 +117,7 @@ def _load_bodies(work, tree, layout):
         inertia = tree.inertias + body * INERTIA * LANES
         w, v = get6(work, moving + VELOCITY)
         h = get3(work, inertia + LANES)
-        turning, p = weighed(work, inertia, (w, v))
+        turning, p = spatial_inertia_times(work, inertia, (w, v))
         for entry in range(LOAD):
             store(work, at + entry * LANES, zero)
         put3(work, at + MOMENTUM, p)
@@ -131,7 +131,7 @@ def _load_bodies(work, tree, layout):
         put3(work, at + MOMENTS, plus(times(v, h[0]), cross(w, x)))
         put3(work, at + MOMENTS + 3 * LANES, plus(times(v, h[1]), cross(w, y)))
         put3(work, at + MOMENTS + 6 * LANES, plus(times(v, h[2]), cross(w, z)))
-        moment, force = weighed(work, inertia, get6(work, moving + BIAS))
+        moment, force = spatial_inertia_times(work, inertia, get6(work, moving + BIAS))
         moment = plus(moment, plus(cross(w, turning), cross(v, p)))
         put6(work, at + FORCE, (moment, plus(force, cross(w, p))))
 
@@ -226,7 +226,7 @@ def accelerate_bodies(work, tree, layout):
         acceleration = plus6(added, at_joint(work, above + BIAS, place))
         velocity = at_joint(work, above + VELOCITY, place)
         psi = get6(work, at + PSI)
-        put6(work, at + PSI2, plus6(crossed(acceleration, axis), crossed(velocity, psi)))
+        put6(work, at + PSI2, plus6(motion_cross(acceleration, axis), motion_cross(velocity, psi)))
         put6(work, at + ADDED, plus6(added, times6(axis, rate)))
     for body in range(len(tree.parent) - 1, 0, -1):
         at = layout.load + body * LOAD * LANES
@@ -234,9 +234,9 @@ def accelerate_bodies(work, tree, layout):
         place = tree.places + body * PLACE * LANES
         above = layout.motion + tree.parent[body] * MOTION * LANES
         rate = load(work, layout.c + tree.coordinate[body] * LANES)
-        own = weighed(work, inertia, times6(joint_axis(work, tree, body), rate))
+        own = spatial_inertia_times(work, inertia, times6(joint_axis(work, tree, body), rate))
         carried = plus6(get6(work, at + CARRIED), own)
-        shared = weighed(work, inertia, at_joint(work, above + ADDED, place))
+        shared = spatial_inertia_times(work, inertia, at_joint(work, above + ADDED, place))
         add6(work, at + FORCE, plus6(carried, shared))
         if tree.parent[body] > 0:
             to = layout.load + tree.parent[body] * LOAD * LANES + CARRIED

@@ -36,7 +36,7 @@ from fflin.kernel.rnea import (
     STORED,
     at_parent,
     joint_axis,
-    weighed,
+    spatial_inertia_times,
 )
 from fflin.kernel.tree import INERTIA, LANES, PLACE
 from fflin.kernel.vectors import (
@@ -112,13 +112,13 @@ def _joint_slopes(work, tree, layout):
         column = tree.coordinate[body]
         axis = joint_axis(work, tree, body)
         psi, psi2 = get6(work, moving + PSI), get6(work, moving + PSI2)
-        momentum = weighed(work, inertia, axis)
+        momentum = spatial_inertia_times(work, inertia, axis)
         coriolis = _coriolis_transposed(work, at, axis)
         moment, force = get6(work, at + FORCE)
-        by_q = plus6(_coriolis(work, at, psi[0]), weighed(work, inertia, psi2))
+        by_q = plus6(_coriolis(work, at, psi[0]), spatial_inertia_times(work, inertia, psi2))
         turned = plus(cross(axis[0], moment), cross(axis[1], force)), cross(axis[0], force)
         by_q = plus6(by_q, turned)
-        weight = weighed(work, inertia, psi)
+        weight = spatial_inertia_times(work, inertia, psi)
         by_v = plus6(_coriolis(work, at, axis[0]), plus6(weight, weight))
         own = layout.lower + column * width * LANES
         q, v = column * LANES, (column + 6 + n) * LANES
@@ -155,7 +155,7 @@ def _base_slopes(work, tree, layout):
     axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for index in range(3):
         e = axes[index]
-        weight = weighed(work, tree.inertias, (cross(spin, e), (zero, zero, zero)))
+        weight = spatial_inertia_times(work, tree.inertias, (cross(spin, e), (zero, zero, zero)))
         moment, force = plus6(_coriolis(work, layout.load, e), weight)
         for axis in range(3):
             row = layout.lower + (axis * width + 6 + n + index) * LANES
