@@ -13,6 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # What these packages keep stays in the checkout, and out of the home directory.
 os.environ.setdefault("MPLCONFIGDIR", str(Path(__file__).parents[1] / ".pytest_cache/matplotlib"))
 os.environ.setdefault("DASK_CONFIG", str(Path(__file__).parents[1] / ".pytest_cache/dask"))
+os.environ.setdefault("DASK_TEMPORARY_DIRECTORY", os.environ["DASK_CONFIG"])
 
 import pytest
 import scipy.linalg  # noqa: F401 - whose OpenBLAS is another than NumPy's

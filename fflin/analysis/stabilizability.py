@@ -98,8 +98,8 @@ def require_disturbed(lin: LinearModel, W: Array) -> None:
 def _boundary_doubts(lin: LinearModel, margin: Margin, what: str) -> tuple[str, ...]:
     return tuple(
         f"undecided: {_dominant(at[None], lin.state_names)} "
-        f"{'counts' if change < 0 else 'does not count'} as {what}, by {ratio:.1g} times its "
-        "rounding; it may be the other way"
+        f"{'counts' if change < 0 else 'does not count'} as {what}, by {ratio:.2g} times its "
+        "rounding; on another machine it may be decided otherwise"
         for ratio, at, change in margin.doubts
     )
 

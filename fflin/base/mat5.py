@@ -135,6 +135,8 @@ def _rows(text: str, shape: tuple[int, ...]) -> str | list[str]:
     """Return the text of a char array, or of each of its rows where it has several."""
     if shape[0] <= 1:
         return text
+    if len(text) != math.prod(shape):
+        raise ValueError(f"a text of shape {shape} has {len(text)} characters")
     return [text[row :: shape[0]].rstrip() for row in range(shape[0])]
 
 

@@ -1,4 +1,4 @@
 """Many points at once: points, workers, files, gains between points.
 
-Imports `base`, `robot`, `dynamics`, `linear` and `control`; `batch.kernel` is the compiled part.
+Imports `base`, `robot`, `dynamics`, `kernel`, `linear` and `control`.
 """

@@ -74,7 +74,7 @@ def header(batch: Any, count: int) -> str:
     """Return what of a `LinearBatch` of so many points is text, as JSON."""
     texts = {key: getattr(batch, key) for key in _TEXTS}
     texts["_ignorable"] = batch[0].ignorable
-    return json.dumps({**texts, "points": count, "columns": batch._columns})
+    return json.dumps({**texts, "points": count, "columns": batch.columns})
 
 
 def write_batch(path: Path, arrays: Mapping[str, Array], header: str) -> None:
@@ -199,4 +199,4 @@ def _fields(
     for key, shape in shapes.items():
         if rows[key].shape[1:] != shape:
             raise ValueError(f"{key} has shape {rows[key].shape[1:]} a point, expected {shape}")
-    return {**rows, **texts, "_columns": columns}
+    return {**rows, **texts, "columns": columns}

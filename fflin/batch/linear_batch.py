@@ -56,6 +56,8 @@ class LinearBatch:
         Name of the robot.
     urdf_sha256, fflin_version, pinocchio_version : str
     locked : tuple of str
+    columns : tuple of (int, int)
+        Where each joint stands in q: (index, -1), or those of its (cos, sin).
     verified : bool
         Whether it is as it was made; False of a file that has no digest to tell damage by, or
         that was not held against it.
@@ -82,6 +84,7 @@ class LinearBatch:
     locked: tuple[str, ...]
     fflin_version: str
     pinocchio_version: str
+    columns: tuple[Column, ...]
     # At rest x0 is told by q; elsewhere y0 is x0 where the outputs are the full state.
     _x0: Array | None
     _y0: Array | None
@@ -91,7 +94,6 @@ class LinearBatch:
     _drift: Array | None
     # Of a file; else found on the robot when it is asked for.
     _ignorable: tuple[str, ...] | None
-    _columns: tuple[Column, ...]
     _system: Robot | None
     verified: bool = True
 
@@ -171,7 +173,7 @@ class LinearBatch:
     @property
     def joint_positions(self) -> Array:
         """Angles, in (-pi, pi] of continuous joints, and lengths (N, n) of the joints."""
-        return positions(self.q, self._columns)
+        return positions(self.q, self.columns)
 
     def nearest(self, joints: Mapping[str, float]) -> LinearModel:
         """Return the model whose joints are nearest to the values [rad|m], the others left out.
@@ -186,7 +188,7 @@ class LinearBatch:
         distance = np.zeros(len(self))
         for index, value in self._named(joints).items():
             target = number(f"joint '{self.joint_names[index]}'", value)
-            distance += away(self.q, self._columns[index], target) ** 2
+            distance += away(self.q, self.columns[index], target) ** 2
         return self[int(distance.argmin())]
 
     def select(self, joints: Mapping[str, float | tuple[float, float]]) -> LinearBatch:
@@ -206,10 +208,10 @@ class LinearBatch:
                 if len(value) != 2:
                     raise InputError(f"{what} is {value!r}, expected a value or (low, high)")
                 low, high = (number(what, end) for end in value)
-                at = values(self.q, self._columns[index])
+                at = values(self.q, self.columns[index])
                 mask &= (at >= low - _SAME) & (at <= high + _SAME)
             else:
-                mask &= away(self.q, self._columns[index], number(what, value)) <= _SAME
+                mask &= away(self.q, self.columns[index], number(what, value)) <= _SAME
         if not mask.any():
             raise InputError(f"no point of the batch has {dict(joints)}; `nearest` finds the next")
         return self[mask]
@@ -268,8 +270,8 @@ class LinearBatch:
 
     def _model(self, index: int) -> LinearModel:
         arrays = self._arrays()
-        named = [item.name for item in fields(self) if not item.name.startswith("_")]
-        common = {name: getattr(self, name) for name in named if name not in arrays}
+        held = vars(self)
+        common = {item.name: held.get(item.name) for item in fields(LinearModel)}
         # A row of a file is read here, so that no model keeps the file open.
         rows = {key: np.asarray(array[index]) for key, array in arrays.items()}
         lower, root = rows.pop("B_lower"), rows.pop("_root")
@@ -278,14 +280,14 @@ class LinearBatch:
         x0 = rows.pop("_x0", None)
         if x0 is None:
             x0 = self._states_at_rest(rows["q"][None])[0]
-        made = {"B": B, "x0": x0, "y0": rows.pop("_y0", x0), "dt": 0.0, "_source": None}
+        made = {"B": B, "x0": x0, "y0": rows.pop("_y0", x0), "dt": 0.0}
         if "_reference" not in rows:
             made["_reference"] = own_reference(root, rows["q"][:7])
         asked = functions_of(self._system, self.robot, self._ignorable)
-        return LinearModel.from_fields({**common, "_drift": None, **rows, **made, **asked})
+        return LinearModel.from_fields({**common, **rows, **made, **asked})
 
     def _states_at_rest(self, q: Array) -> Array:
-        q_m = positions(q, self._columns)
+        q_m = positions(q, self.columns)
         x0 = np.zeros((len(q), len(self.state_names)))
         x0[:, 6 : 6 + q_m.shape[1]] = q_m
         x0.setflags(write=False)

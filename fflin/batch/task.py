@@ -89,7 +89,7 @@ class SweepTask:
             **absent | rows | dict(arrays),
             **{key: common[key] for key in common if key not in _OF_MODELS},
             _ignorable=None,
-            _columns=tuple(map(column, self.robot.joints)),
+            columns=tuple(map(column, self.robot.joints)),
             _system=self.robot,
         )
 

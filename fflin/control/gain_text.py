@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from fflin.base.record import NOT_VERIFIED
 from fflin.base.tables import grid, matrix, width
 
-if TYPE_CHECKING:
-    from typing import Any
-
-    from fflin.control.lqr import Gain
-
 # A gain of more entries, of more than three joints, is shown by the norms of its blocks.
 _LARGE = 9 * 18
 
 
-def gain_report(gain: Gain) -> str:
-    """Show a gain, its poles, and the figures that prove it."""
+def gain_report(gain: Any) -> str:
+    """Show a `Gain`, its poles, and the figures that prove it."""
     nu, nx = gain.K.shape
     time = f"sampled at {gain.dt:g} s" if gain.dt else "continuous"
     head = textwrap.fill(
@@ -36,7 +31,7 @@ def gain_report(gain: Gain) -> str:
     return "\n\n".join(parts if gain.verified else [*parts, NOT_VERIFIED])
 
 
-def _blocks(gain: Gain) -> str:
+def _blocks(gain: Any) -> str:
     rows, columns = _groups(gain.input_names), _groups(gain.state_names)
     values = np.array(
         [[np.linalg.norm(gain.K[np.ix_(i, j)]) for j in columns.values()] for i in rows.values()]
@@ -51,7 +46,7 @@ def _groups(names: Sequence[str]) -> dict[str, list[int]]:
     return groups
 
 
-def _poles(gain: Gain) -> str:
+def _poles(gain: Any) -> str:
     poles: Any = gain.poles[gain.poles.imag >= 0.0]
     if gain.dt:
         order, heads = np.argsort(-np.abs(poles)), ["pole", "modulus", "frequency [rad/s]"]
@@ -74,7 +69,7 @@ def _pole(pole: complex) -> str:
     return f"{pole.real:.5g}" + (f" +- {pole.imag:.5g}i" if pole.imag else "")
 
 
-def _figures(gain: Gain) -> str:
+def _figures(gain: Any) -> str:
     margins = gain.margins
     slowest = "1 - largest modulus" if gain.dt else "slowest decay [1/s]"
     low, high = margins.gain

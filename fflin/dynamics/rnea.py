@@ -1,4 +1,7 @@
-"""The accelerations at a point and their slopes, from CRBA's M and the derivatives of RNEA."""
+"""The accelerations at a point and their slopes, from CRBA's M and the derivatives of RNEA.
+
+Numbers of equations are those of docs/derivation.md.
+"""
 
 from typing import NamedTuple
 
@@ -19,16 +22,19 @@ _TURNING = slice(3, 6)
 class Rates(NamedTuple):
     r"""The acceleration of the base origin and the joints, in base axes, and what it depends on.
 
+    Of many points each has a leading axis of them.
+
     Attributes
     ----------
-    c : ndarray (6 + n,)
-        Without gravity and :math:`\omega \times v_b`.
-    by_q_m : ndarray (6 + n, n)
-    by_nu : ndarray (6 + n, 6 + n)
-        Without the base's linear velocity, on which it does not depend.
-    by_u : ndarray (6 + n, nu)
-        `u` held in base axes.
-    gravity : ndarray (3,)
+    c : ndarray (.., 6 + n)
+        Of (3.1): without gravity and :math:`\omega \times v_b`.
+    by_q_m : ndarray (.., 6 + n, n)
+        D_m of (3.3).
+    by_nu : ndarray (.., 6 + n, 6 + n)
+        D_nu of (3.3), zero over the base's linear velocity.
+    by_u : ndarray (.., 6 + n, nu)
+        D_u of (3.3), `u` held in base axes.
+    gravity : ndarray (3,) or (.., 3)
         In base axes.
     """
 

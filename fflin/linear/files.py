@@ -35,8 +35,8 @@ FORMATS = (*record.FORMATS, ".csv")
 def record_of(lin: Any) -> Record:
     """Return what a file holds of a `LinearModel`."""
     entries: Record = {key: getattr(lin, key) for key in (*_MATRICES, *_VECTORS[:-1])}
-    entries["reference"] = lin._reference
-    entries["drift"] = np.zeros(0) if lin._drift is None else lin._drift
+    entries["reference"] = lin.placement
+    entries["drift"] = np.zeros(0) if lin.drift is None else lin.drift
     entries |= {key: list(getattr(lin, key)) for key in _LISTS}
     entries |= {key: getattr(lin, key) for key in _TEXTS}
     entries["dt"], entries["moving"] = float(lin.dt), float(lin.moving)

@@ -28,7 +28,7 @@ def rotor_names(robot: Robot) -> tuple[str, ...]:
     """Return the names of the joints that are rotors, as `ignorable_states` says."""
     model = robot.model
     index_of = {joint.name: model.getJointId(joint.name) for joint in robot.joints}
-    named = {getattr(item, "frame", None) for item in (*robot.inputs, *robot.outputs)} - {None}
+    named = set(robot.used_frames)
     # What carries another joint, leads one, has a spring, or has something fixed on it.
     busy = set(model.parents.tolist())
     busy |= {index_of[follower.leader.name] for follower in robot.followers}

@@ -168,7 +168,12 @@ class LinearModel:
         """Placement oMref that attitude and position are relative to."""
         import pinocchio as pin
 
-        return pin.XYZQUATToSE3(self._reference)
+        return pin.XYZQUATToSE3(self.placement)
+
+    @property
+    def placement(self) -> Array:
+        """`reference` (7,) as its position [m] and quaternion x, y, z, w."""
+        return self._reference
 
     @property
     def drift(self) -> Array | None:

@@ -64,6 +64,7 @@ def assemble(
     F = partial(chart.to_reference, state.in_reference)
 
     # Attitude and position.
+    # Q R^T = Q^T.
     A[..., g.q_b, g.omega_b] = chart.N.mT if omega_in_reference else chart.N  # (4.1)
     by_q_b = chart.rate_over_q_b(w, W)
     if omega_in_reference:

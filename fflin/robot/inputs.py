@@ -31,6 +31,11 @@ class Input:
     GROUP: ClassVar[str]
     UNIT: ClassVar[str] = "N m"
 
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The frames of the model that it is fixed in."""
+        return ()
+
 
 class WrenchInput(Input, ABC):
     """An input that pushes or turns a link by a wrench that is constant in a frame.
@@ -42,6 +47,11 @@ class WrenchInput(Input, ABC):
     """
 
     frame: str | None
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The frames of the model that it is fixed in."""
+        return () if self.frame is None else (self.frame,)
 
     @property
     @abstractmethod

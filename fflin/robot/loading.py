@@ -71,10 +71,11 @@ def load(
     description = read_urdf(found.path, found.prune)
     loaded = _robot(description.model, found.name, lock, description.mimics)
     notes = description.notes
-    if idle_coordinates(loaded):
-        notes = (*notes, massless_note(loaded))
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
+    if idle_coordinates(loaded):
+        # No warning: whatever needs the inverse of M refuses with this.
+        notes = (*notes, massless_note(loaded))
     loaded = replace(
         loaded,
         urdf=found.path,

@@ -65,7 +65,7 @@ def _idle(robot: Robot) -> tuple[str, ...]:
         moved = _moved(robot, q, moments) @ columns
         moved /= np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
         _, sizes, modes = np.linalg.svd(np.linalg.qr(moved, mode="r"))
-        rank = int(np.count_nonzero(sizes > _ZERO * sizes[0]))
+        rank = int(np.count_nonzero(sizes > _ZERO * sizes.max(initial=0.0)))
         involved = np.linalg.norm(modes[rank:], axis=0) > _INVOLVED
         idle = tuple(dict.fromkeys(names[involved].tolist()))
         if not idle:

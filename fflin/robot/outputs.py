@@ -31,7 +31,7 @@ class Output:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The frames of the model that it is of."""
+        """The frames of the model that it measures, or measures from."""
         return ()
 
     @property
@@ -46,7 +46,7 @@ class FrameOutput(Output):
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """The frames of the model that it is of."""
+        """The frames of the model that it measures, or measures from."""
         return tuple(getattr(self, item.name) for item in fields(self))
 
 

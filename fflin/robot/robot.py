@@ -148,11 +148,15 @@ class Robot:
             robot = self._with_inputs(fields.pop("inputs"))
         own = (robot._wheelless or robot).joint_names
         robot = replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
-        for item in (*robot.inputs, *robot.outputs):
-            frame = getattr(item, "frame", None)
-            if frame is not None:
-                find_frame(robot.model, frame)
+        for name in robot.used_frames:
+            find_frame(robot.model, name)
         return robot
+
+    @property
+    def used_frames(self) -> tuple[str, ...]:
+        """The frames of the model that inputs and outputs are fixed in."""
+        of_inputs = [name for item in self.inputs for name in item.frames]
+        return (*of_inputs, *(name for item in self.outputs for name in item.frames))
 
     @cached_property
     def wheels(self) -> dict[str, float]:

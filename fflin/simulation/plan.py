@@ -102,11 +102,11 @@ def times_of(
     width: int,
 ) -> Times:
     """Return the times of a simulation that records so many numbers in a row."""
-    if sample is None:
-        sample = getattr(getattr(policy, "lin", None), "dt", None) or None
-    fastest = 0.0 if sample else _fastest_pole(policy)
     if sample is not None:
         sample = _positive("sample", sample)
+    else:
+        sample = getattr(getattr(policy, "lin", None), "dt", None) or None
+    fastest = 0.0 if sample else _fastest_pole(policy)
     duration, delay = _positive("duration", duration), number("delay", delay)
     if not 0.0 <= delay <= _LONGEST:
         raise InputError(f"delay is {delay:g} s, expected 0 to {_LONGEST:g} s")

@@ -13,12 +13,14 @@ from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
 from fflin.view.page import packed
 
+# Titles of inputs of a group and a unit; of another group its own name.
 _TITLES = {
-    "tau_b": ("base torque", "N m"),
-    "F_b": ("base force", "N"),
-    "tau_m": ("joint torques", "N m"),
-    "thrust": ("thrusters", "N"),
-    "wheel": ("wheel torques", "N m"),
+    ("tau_b", "N m"): "base torque",
+    ("F_b", "N"): "base force",
+    ("tau_m", "N m"): "joint torques",
+    ("tau_m", "N"): "joint forces",
+    ("thrust", "N"): "thrusters",
+    ("wheel", "N m"): "wheel torques",
 }
 
 
@@ -87,13 +89,17 @@ def panel(
         _plot("attitude error", "°", [("", found["attitude"])]),
         _plot("position error", "m", [("", found["position"])]),
     ]
-    for kind, columns in Actuation(state).groups.items():
-        if kind not in _TITLES or not np.any(u[:, columns]):
-            continue
-        labels = ["x", "y", "z"] if len(columns) == 3 and kind in ("tau_b", "F_b") else None
-        title, unit = _TITLES[kind]
-        lines = [(labels[k] if labels else "", u[:, column]) for k, column in enumerate(columns)]
-        plots.append(_plot(title, unit, lines))
+    actuation = Actuation(state)
+    for kind, indices in actuation.groups.items():
+        labels = "xyz" if kind in ("tau_b", "F_b") else [""] * len(indices)
+        for unit in dict.fromkeys(actuation.units[index] for index in indices):
+            lines = [
+                (label, u[:, index])
+                for label, index in zip(labels, indices, strict=True)
+                if actuation.units[index] == unit
+            ]
+            if any(values.any() for _, values in lines):
+                plots.append(_plot(_TITLES.get((kind, unit), kind), unit, lines))
     return {
         "readouts": [
             {"label": label, "unit": unit, "values": packed(values)}

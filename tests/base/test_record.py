@@ -275,3 +275,13 @@ def test_a_batch_that_is_not_held_against_its_digest_says_so(tmp_path):
         made("batch").save(path)
         assert fflin.LinearBatch.load(path).verified
         assert not fflin.LinearBatch.load(path, verify=False).verified
+
+
+def test_a_text_that_claims_more_rows_than_it_has_is_refused():
+    from scipy.io import savemat
+
+    buffer = io.BytesIO()
+    savemat(buffer, {"x": np.array(["ab", "cd"])})
+    damaged = buffer.getvalue().replace(b"\2\0\0\0\2\0\0\0", b"\0\0\0\x7f\2\0\0\0", 1)
+    with pytest.raises(ValueError, match="a text of shape"):
+        read_mat(damaged)

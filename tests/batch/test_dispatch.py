@@ -355,7 +355,7 @@ def test_a_singular_configuration_is_named_by_processes_too(pool):
         fflin.sweep(robot, configurations, chunk=10, executor=pool)
 
 
-def test_dask(robot, tmp_path):
+def test_dask(robot):
     """A local cluster of two processes, of which one is killed on the way."""
     distributed = pytest.importorskip("distributed")
     import dask
@@ -363,7 +363,6 @@ def test_dask(robot, tmp_path):
     waits = ("connect", "tcp")
     with (
         dask.config.set({f"distributed.comm.timeouts.{each}": f"{PATIENCE} s" for each in waits}),
-        dask.config.set({"temporary-directory": str(tmp_path)}),
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
         ) as cluster,

@@ -50,7 +50,7 @@ def agreement(robot, count=11, **options):
         lin = linearizer(q[row], v[row], u[row])
         condition = lin.certificate.condition
         expected = {"A": lin.A, "B_lower": lin.B[nv:], "f0": lin.f0, "_x0": lin.x0}
-        expected["_drift"] = lin._drift
+        expected["_drift"] = lin.drift
         for key, array in out.items():
             scale = max(1e-3, np.abs(expected[key]).max(initial=0.0)) * condition
             worst = max(worst, np.abs(array[row] - expected[key]).max(initial=0.0) / scale)

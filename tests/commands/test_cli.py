@@ -234,7 +234,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
         ("check", "ets_vii", "--output", "pose:tol"): "no frame named 'tol'; did you mean tool",
         ("check", "ets_vii", "--output", "base", "--output", "state"): "is asked for twice",
         ("linearize", "ets_vii", "--out", "m.mat"): "ambiguous option: --out could match",
-        ("check", "romeo"): "cannot be inverted: joint 'LHand'",
+        ("check", "romeo"): "cannot be inverted at any configuration: joint 'LHand'",
         ("check", "cubesat", "--rpy", 180, 0, 0, "--reference", "world"): "turned by 180 deg",
         ("check",): "the following arguments are required: ROBOT",
         ("dance",): "invalid choice: 'dance'",

@@ -109,7 +109,7 @@ def joint(name, kind, parent, child):
     )
 
 
-def test_a_file_with_a_massless_root_on_a_joint_is_warned_of_and_loads_with_it_locked(tmp_path):
+def test_a_file_with_a_massless_root_on_a_joint_says_so_and_loads_with_it_locked(tmp_path):
     path = tmp_path / "craft.urdf"
     path.write_text(
         '<robot name="craft"><link name="world"/>'
@@ -117,9 +117,10 @@ def test_a_file_with_a_massless_root_on_a_joint_is_warned_of_and_loads_with_it_l
         f"{joint('mount', 'continuous', 'world', 'hull')}"
         f"{joint('shoulder', 'continuous', 'hull', 'arm')}</robot>"
     )
-    with pytest.warns(fflin.FflinWarning, match="the base, joint 'mount' can move without"):
-        robot = fflin.load(path)
-    assert any("joint 'mount'" in note for note in robot.notes)
+    robot = fflin.load(path)
+    assert "the base, joint 'mount' can move without moving mass" in robot.notes[-1]
+    with pytest.raises(fflin.SingularInertiaError, match="joint 'mount' can move without"):
+        fflin.linearize(robot)
     locked = fflin.load(path, lock=["mount"])
     assert not locked.notes
     assert fflin.check(locked, fflin.linearize(locked)).ok

@@ -144,3 +144,8 @@ def test_pose_of_the_base_link_is_the_base_pose():
     assert lin.y0[:3] == pytest.approx(lin.x0[3:6], abs=1e-15)
     chart = fflin.StateMap(robot).chart(q)
     assert lin.C[3:6, :3] == pytest.approx(chart.J, rel=1e-13)
+
+
+def test_both_frames_of_an_output_must_be_there(robots):
+    with pytest.raises(fflin.UnknownNameError, match="no frame named 'nope'"):
+        robots["servicer_7dof"].replace(outputs=[fflin.RelativePose("tool", "nope")])

@@ -246,11 +246,11 @@ refuse(
     "a point mass on the axis",
     arm(child=inertial("1", moments(0, 0, 0, 0, 0, 0))),
     "'hinge'",
-    "no mass",
+    "without moving mass",
 )
-refuse("massless leaf", arm(child=link("arm", "")), "'hinge'", "no mass")
+refuse("massless leaf", arm(child=link("arm", "")), "'hinge'", "without moving mass")
 refuse("massless leaf with zeros", arm(child=inertial("0", moments(0, 0, 0, 0, 0, 0))), "'hinge'")
-refuse("massless robot", robot(link("base", "")), "the base", "no mass")
+refuse("massless robot", robot(link("base", "")), "the base", "without moving mass")
 accept("massless root", robot(link("root", ""), link("base"), joint("j", "root", "base", "fixed")))
 accept(
     "massless link amid a chain",

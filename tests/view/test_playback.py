@@ -9,7 +9,7 @@ from fflin.robot.robot import ROOT
 from fflin.view.motion_page import subtitle
 from fflin.view.panel import errors, panel
 from fflin.view.playback import play_back, thrusters
-from tests.support.robots import random_point, random_pose
+from tests.support.robots import random_point, random_pose, random_tree
 
 FRAMES = ("hybrid", "local", "world")
 
@@ -133,3 +133,17 @@ def test_a_free_flyer_alone_has_no_joint_error(robots):
     shown = panel(robot, fflin.StateMap(robot), q[None], np.zeros((1, 15)), q, np.zeros(1))
     assert not any("joint" in each["label"] for each in shown["readouts"])
     assert subtitle(robot) == "0 joints, 3 wheels, 3.5 kg"
+
+
+def test_plots_of_inputs_have_the_units_of_the_model():
+    """Sliding joints are pushed, turning ones turned: never on one axis."""
+    robot = random_tree(np.random.default_rng(2), 6)
+    assert {joint.prismatic for joint in robot.joints} == {True, False}
+    state = fflin.StateMap(robot)
+    q, u = robot.neutral()[None].repeat(2, axis=0), np.ones((2, 12))
+    shown = panel(robot, state, q, u, q[0], np.zeros(2))["plots"]
+    expected = {("base torque", "N m"), ("base force", "N")}
+    expected |= {("joint torques", "N m"), ("joint forces", "N")}
+    assert {(plot["title"], plot["unit"]) for plot in shown[2:]} == expected
+    lines = {plot["title"]: len(plot["lines"]) for plot in shown}
+    assert lines["joint forces"] == sum(joint.prismatic for joint in robot.joints)
