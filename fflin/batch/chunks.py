@@ -116,6 +116,11 @@ class ChunkJob:
         count = len(points.q)
         if out is None:
             out = {key: np.empty((count, *shape)) for key, shape in self.shapes.items()}
+        if self.only_inertia and not self.linearizer.robot.n and count > 1:
+            # Without joints M is the same everywhere.
+            one = self.run(Points(points.q[:1], None, None), start)
+            out["B_lower"][:] = one.arrays["B_lower"]
+            return ChunkResult(dict(out), one.notes)
         left = self.compiled.write(*points, out) if self.compiled else np.arange(count)
         if not len(left):
             return ChunkResult(dict(out), [])
@@ -123,31 +128,33 @@ class ChunkJob:
             warnings.simplefilter("always", FflinWarning)
             for row in left.tolist():
                 try:
-                    values = self._values(*(None if x is None else x[row] for x in points))
+                    if self.only_inertia:
+                        self._write_at_rest(points.q[row], out["B_lower"][row])
+                    else:
+                        self._write(row, points, out)
                 except FflinError as error:
                     raise type(error)(f"configuration {start + row}: {error}") from None
-                for key, value in values.items():
-                    out[key][row] = value
         return ChunkResult(dict(out), [str(note.message) for note in caught])
 
-    def _values(self, q: Any, v: Array | None, u: Array | None) -> dict[str, Array]:
-        """Return what differs from point to point at one of them."""
-        nv, actuation = 6 + self.linearizer.robot.n, self.linearizer.prepared.actuation
-        if self.only_inertia:
-            inertia, data = self._inertia
-            inverse = np.empty((nv, nv))
-            inertia.invert(q, inverse)
-            if actuation.default:
-                return {"B_lower": inverse}
-            # The columns do not depend on the base's position, and would lose digits to it.
-            still = q.copy()
-            still[:3] = 0.0
-            return {"B_lower": inverse @ actuation.columns(data, still)}
+    def _write(self, row: int, points: Points, out: Mapping[str, Array]) -> None:
+        q, v, u = (None if rows is None else rows[row] for rows in points)
         lin = self.linearizer(q, v, u)
-        others = {
-            key: getattr(lin, key.removeprefix("_")) for key in self.shapes.keys() - {"B_lower"}
-        }
-        return {"B_lower": lin.B[nv:], **others}
+        for key, array in out.items():
+            lower = key == "B_lower"
+            array[row] = lin.B[len(lin.B) // 2 :] if lower else getattr(lin, key.removeprefix("_"))
+
+    def _write_at_rest(self, q: Array, B_lower: Array) -> None:
+        (inertia, data), actuation = self._inertia, self.linearizer.prepared.actuation
+        if actuation.default:
+            inertia.invert(q, B_lower)
+            return
+        nv = len(B_lower)
+        inverse = np.empty((nv, nv))
+        inertia.invert(q, inverse)
+        # The columns do not depend on the base's position, and would lose digits to it.
+        still = q.copy()
+        still[:3] = 0.0
+        np.matmul(inverse, actuation.columns(data, still), out=B_lower)
 
     @cached_property
     def compiled(self) -> BatchEquations | None:

@@ -19,10 +19,11 @@ from fflin.dynamics.points import configuration
 from fflin.robot.joints import Joint
 from fflin.robot.robot import Robot
 
-# Random rows are drawn in blocks of this many, so that they do not depend on how they are read.
+# Random rows are drawn in blocks of this size, each with a seed of its own, so that a row does not
+# depend on the chunk that it is read in.
 _DRAWN = 4096
 
-# A joint that turns without limits is drawn from one turn.
+# Range of a joint that turns without limits [rad].
 _TURN = (-math.pi, math.pi)
 
 

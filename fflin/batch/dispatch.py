@@ -80,13 +80,13 @@ def run_here(
     try:
         for span in spans:
             begun.append(pool.submit(run, span))
-            # Not far ahead of what takes the results, which would fill the memory.
+            # Results that nobody has taken yet would fill the memory.
             if len(begun) > threads:
                 yield begun.popleft().result()
         while begun:
             yield begun.popleft().result()
     finally:
-        # Ctrl-C does not wait for what they compile.
+        # Without waiting, so that Ctrl-C ends a compilation too.
         pool.shutdown(wait=False, cancel_futures=True)
 
 

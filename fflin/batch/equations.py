@@ -21,7 +21,7 @@ from fflin.linear.prepared import Prepared
 from fflin.linear.state_equations import assemble, drift
 from fflin.robot.frames import ROOT
 
-# The kernel has sines of angles up to here [rad].
+# Up to this angle the kernel's sines and cosines are exact to rounding [rad].
 _FARTHEST = 1e6
 
 RowNumbers: TypeAlias = NDArray[np.integer[Any]]
@@ -75,7 +75,7 @@ class BatchEquations(ABC):
             return left[left < count]
         good = np.zeros(count, dtype=bool)
         for start in range(0, count, self.BLOCK):
-            # The last block has as many points as lanes, some of them for the second time.
+            # The last block begins early enough to fill the lanes; some points are done twice.
             rows = slice(min(start, count - LANES), start + self.BLOCK)
             place = {key: array[rows] for key, array in out.items()}
             point = q[rows], None if v is None else v[rows], None if u is None else u[rows]
@@ -91,13 +91,13 @@ class BatchEquations(ABC):
 
     def _regular(self, q: Array, couplings: Array) -> Mask:
         """Return where M is far from singular, and the angles are such that their sines are."""
-        # Written so that NaN, from a pivot that is zero, is not among them.
+        # NaN, from a pivot that is zero, compares false.
         good = (self._least_coupling < couplings) & (couplings < Inertia.warning_coupling)
         return good & (np.abs(q[:, 7:]) < _FARTHEST).all(axis=1)
 
 
 class RestEquations(BatchEquations):
-    """M^-1 times the inputs' columns, where nothing but u acts and no input is carried about."""
+    """B = [0; M^-1 F] at rest, where only u acts, through columns F that do not depend on q."""
 
     BLOCK = 2**16
 
@@ -106,13 +106,10 @@ class RestEquations(BatchEquations):
     ) -> Mask:
         B, actuation, nv = out["B_lower"], self._prepared.actuation, self._prepared.map.nx // 2
         inverse = B if actuation.default else np.empty((len(q), nv, nv))
-        # Without joints M is the same everywhere.
-        first = len(q) if self._prepared.robot.n else LANES
-        couplings = inverse_inertias(self._tree, q[:first], inverse[:first])
-        inverse[first:] = inverse[0]
+        couplings = inverse_inertias(self._tree, q, inverse)
         if not actuation.default:
             np.matmul(inverse, actuation.fixed, out=B)
-        return self._regular(q, np.resize(couplings, len(q)))
+        return self._regular(q, couplings)
 
 
 class PointEquations(BatchEquations):
@@ -155,7 +152,7 @@ class PointEquations(BatchEquations):
         for key in values.keys() & out.keys():
             out[key][:] = values[key]
         good = within & self._regular(q, found.couplings)
-        # What is not finite shows in these, NaN too.
+        # NaN compares false.
         for array in (lower, B, values["f0"][:, None]):
             good &= np.einsum("ijk,ijk->i", array, array) < LARGEST
         return good

@@ -116,7 +116,7 @@ def chunk_seals(varying: Mapping[str, Array], count: int, chunk: int) -> NDArray
     def seal(start: int) -> bytes:
         return chunk_seal({key: value[start : start + chunk] for key, value in varying.items()})
 
-    # Hashing lets other threads run.
+    # hashlib releases the interpreter's lock, so that threads hash at the same time.
     with ThreadPoolExecutor() as pool:
         seals = b"".join(pool.map(seal, range(0, count, chunk)))
     return np.frombuffer(seals, np.uint8).reshape(-1, 32)
@@ -143,7 +143,7 @@ def read_batch(path: Path, *, verify: bool = True) -> dict[str, Any]:
 
 
 def _from_npz(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, str], bool]:
-    # Opened here, since NumPy leaves a damaged file open.
+    # Opened here, since NumPy does not close a file that it finds damaged.
     with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
         entries = {key: file[key] for key in file.files}
     verified = verify and check_seal(entries)

@@ -182,7 +182,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
                 K[rows], residual[rows], margin[rows] = gains_at_rest(
                     rates, batch.B_lower[rows], Q, R
                 )
-    # Written so that NaN is among them.
+    # NaN compares false, so that it is among them.
     for index in np.flatnonzero(~(residual <= _SOUND)).tolist():
         try:
             gain = lqr(batch[index], Q, R)

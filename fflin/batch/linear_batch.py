@@ -85,14 +85,14 @@ class LinearBatch:
     fflin_version: str
     pinocchio_version: str
     columns: tuple[Column, ...]
-    # At rest x0 is told by q; elsewhere y0 is x0 where the outputs are the full state.
+    # None where x0 follows from q, at rest, and where y0 is x0, since the outputs are the state.
     _x0: Array | None
     _y0: Array | None
-    # None where it is the base's own at each point; the free-flyer joint stands at the root.
+    # None where it is the base's own placement, which q gives in the frame that _root places.
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    # Of a file; else found on the robot when it is asked for.
+    # As a file has it; None where it is found on the robot.
     _ignorable: tuple[str, ...] | None
     _system: Robot | None
     verified: bool = True
@@ -269,11 +269,9 @@ class LinearBatch:
         return {name: value for name, value in held if isinstance(value, np.ndarray)}
 
     def _model(self, index: int) -> LinearModel:
-        arrays = self._arrays()
-        held = vars(self)
-        common = {item.name: held.get(item.name) for item in fields(LinearModel)}
+        common = {item.name: vars(self).get(item.name) for item in fields(LinearModel)}
         # A row of a file is read here, so that no model keeps the file open.
-        rows = {key: np.asarray(array[index]) for key, array in arrays.items()}
+        rows = {key: np.asarray(array[index]) for key, array in self._arrays().items()}
         lower, root = rows.pop("B_lower"), rows.pop("_root")
         B = np.concatenate((np.zeros_like(lower), lower))
         B.setflags(write=False)

@@ -67,9 +67,9 @@ def checked_configurations(robot: Robot, q: Any) -> Array:
             excess = np.abs(np.einsum("ij,ij->i", block[:, 3:7], block[:, 3:7]) - 1.0)
             for at in robot.unbounded:
                 excess = np.maximum(excess, np.abs(block[:, at] ** 2 + block[:, at + 1] ** 2 - 1.0))
-            # The sum tells at once where all are finite.
+            # A finite sum tells at once that all are finite.
             finite = np.isfinite(block.sum()) or np.isfinite(block).all(axis=1)
-        # Written so that NaN is among them.
+        # NaN compares false, so that it is among them.
         doubtful = ~((excess <= ROUND_OFF) & finite)
         if robot.followers:
             followed = block.copy()

@@ -261,7 +261,7 @@ def check_room(count: int, size: int, path: Path | None) -> None:
                 f"{said}, and the machine has {readable(memory)} of memory; write them to a file "
                 "with out='NAME.h5', or choose fewer points"
             )
-    # What stands in an unfinished file has its room already.
+    # An unfinished file has reserved its room already.
     elif path.parent.is_dir() and not part_of(path).exists():
         # An .npz is made from the unfinished file.
         twice = path.suffix == ".npz"

@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
     from fflin.dynamics.state import Frame
 
-# A chunk's result is about this large, so that what it costs to send is small against it and a
-# handful of them fit in memory.
+# Size of a chunk's result: large enough that sending it costs little beside computing it, small
+# enough that a handful of them fit in memory.
 _CHUNK_BYTES, _LEAST_CHUNK_BYTES = 4 * 2**20, 2**21
 _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
 
-# So many chunks where workers share them, so that all end at about the same time.
+# Number of chunks that workers share, so that all workers end at about the same time.
 _SHARES = 32
 
 _log = logging.getLogger("fflin")
