@@ -57,7 +57,7 @@ def _cosine_and_sine(x):
     p = splat(4.16666666666666019037e-02) + z * p
     one = splat(1.0)
     cosine = (one - splat(0.5) * z) + z * z * p
-    # By quarter turns back: (1, 0), (0, 1), (-1, 0), (0, -1).
+    # Add the quarter turns again, whose cosine and sine are (1, 0), (0, 1), (-1, 0) or (0, -1).
     half = floor(turns * splat(0.5))
     odd = turns - half - half
     sign = one - splat(2.0) * (half - splat(2.0) * floor(half * splat(0.5)))
@@ -181,14 +181,14 @@ def inwards(work, tree):
             value = value + splat(tree.slides[above]) * dot(z, force)
             add(work, packed + tree.target[pair] * LANES, splat(tree.share[pair]) * value)
             pair += 1
-            # From here on about the joint of the parent.
+            # The moment about the parent's joint.
             moment = plus(moment, cross(get3(work, place + 9 * LANES), force))
             above = tree.parent[above]
         start, share = packed + tree.target[pair] * LANES, splat(tree.share[pair])
         pair += 1
         add3(work, start, times(moment, share))
         add3(work, start + 3 * LANES, times(force, share))
-    # Of the base: I, [m c]x, m, in the rows of a chain of six.
+    # The base's block (I, [m c]x, m), packed as the rows of a chain of six coordinates.
     m = load(work, inertias)
     hx, hy, hz = get3(work, inertias + LANES)
     xx, xy, xz = get3(work, inertias + 4 * LANES)

@@ -76,7 +76,7 @@ def linearise(tree, layout, loads, points, out, work):
     size = len(tree.row)
     lower = 2 * size * size
     for block in range(0, count, LANES):
-        # The last are the last there are, some of them for the second time.
+        # The last block begins early enough to fill the lanes; some points are done twice.
         first = min(block, count - LANES)
         outwards(work, tree, flat, first * stride, stride)
         move_bodies(work, tree, layout, nu, first)

@@ -18,8 +18,8 @@ LANES = 8  # configurations that the kernel does at once
 # Rows of Pinocchio's spatial vectors, whose linear part comes first.
 PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 
-# Doubles of a body's place: x, y, z axes, and where it is from its parent; and of its inertia: m,
-# m c, I (xx xy xz yy yz zz).
+# How many numbers are a body's place (x, y and z axes, and its origin from its parent's) and its
+# inertia (m, m c, I as xx xy xz yy yz zz).
 PLACE, INERTIA = 12, 10
 
 
@@ -229,7 +229,7 @@ def _common(paths: list[list[int]]) -> NDArray[np.intp]:
     common = np.zeros((len(paths), len(paths)), dtype=np.intp)
     for index, path in enumerate(paths):
         if len(path) > 1:
-            # No path of an earlier one has this one in it.
+            # No path of an earlier coordinate has this one in it.
             common[index, :index] = common[:index, index] = common[path[-2], :index]
         common[index, index] = len(path)
     return common
