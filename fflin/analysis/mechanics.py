@@ -125,7 +125,7 @@ def rates_of_positions(X: Array) -> Array:
 
 
 def conserved(lin: LinearModel) -> ConservedMomenta:
-    r"""Find the conserved momenta: :math:`W M [A_{21}, A_{22}, B_2] = 0`.
+    r"""Find the conserved momenta (9.2): :math:`W M [A_{21}, A_{22}, B_2] = 0`.
 
     The generalised forces of states and inputs are compared in units of
     :math:`\sqrt{M_{ii}}` and each is scaled to unit length, so that neither newton against

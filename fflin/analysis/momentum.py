@@ -65,6 +65,8 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
         \nu_b = G \dot q_m, \quad M^* \ddot q_m = \tau_m - K q_m - D \dot q_m, \quad
         M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}.
 
+    Equations (9.2) and (9.3) of docs/derivation.md.
+
     Where attitude or position is actuated as well, its states are kept and the others left out.
     Without springs the result is minimal; a vibration that no input drives stays in it. From
     inputs to joint states it has the transfer function of the whole model.
@@ -134,7 +136,7 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
 
 
 def generalized_inertia(lin: LinearModel) -> Array:
-    r"""Return the inertia of the joints with the base free to follow.
+    r"""Return the generalized inertia: that of the joints with the base free to follow (9.3).
 
     .. math:: M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}
 
@@ -167,7 +169,7 @@ def generalized_inertia(lin: LinearModel) -> Array:
 
 
 def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") -> Array:
-    r"""Return the velocity of a frame per joint rate, with the momentum of the robot zero.
+    r"""Return the generalized Jacobian: a frame's velocity per joint rate at zero momentum (9.3).
 
     .. math:: J^* = J_m + J_b G, \qquad G = -M_{bb}^{-1} M_{bm}
 

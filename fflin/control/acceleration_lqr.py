@@ -36,7 +36,8 @@ def acceleration_lqr(
 
     With the accelerations :math:`a = L u` as inputs, where L is the lower block of B, a model at
     rest is one double integrator a coordinate, :math:`\ddot q_i = s_i a_i` with s = 1/2 for
-    attitude and 1 else. Diagonal weights then decouple, and for continuous time
+    attitude and 1 else. Diagonal weights then decouple, and for continuous time, (10.2) of
+    docs/derivation.md,
 
     .. math:: k_p = \sqrt{q_p/r_a},\quad k_d = \sqrt{q_v/r_a + 2 s k_p},\quad
               u = u_0 - L^{-1} [\operatorname{diag} k_p, \operatorname{diag} k_d]\,(x - x_0),

@@ -131,6 +131,8 @@ class Accelerations:
     ) -> tuple[Array, Array]:
         """Return the slopes of M a + b - B u + passive forces over q_m (.., n) and nu, a held.
 
+        They are those of (3.3), with springs and dampers (7.1).
+
         The wrenches of thrusters are constant in the frames of their links, so that RNEA's
         derivatives with them hold -d(B u)/dq.
         """
@@ -152,7 +154,7 @@ class Accelerations:
         """Return the torques of stored momentum, their wrenches with those of the inputs.
 
         With the angular Jacobian J of a link in its own axes, omega = J v, the torque
-        h x omega is the generalised force J^T [h]x J v.
+        h x omega is the generalised force J^T [h]x J v (6.3).
         """
         model, data, nv = self._model, self._data, len(v)
         wrenches = self._actuation.wrenches(u)

@@ -286,7 +286,7 @@ class StateMap:
         return matrix.take(self._order, axis=1) if self.S is None else matrix @ self.S
 
     def project(self, matrix: Array, out: Array | None = None) -> Array:
-        """Take a matrix (nv, nv) over Pinocchio's v to state order: S^T matrix S."""
+        """Take a matrix (nv, nv) over Pinocchio's v to state order: S^T matrix S (7.3)."""
         if self.S is not None:
             return np.matmul(self.S.T @ matrix, self.S, out=out)
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.

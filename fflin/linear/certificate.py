@@ -73,7 +73,7 @@ def aba_route(
 
     They are built in base axes and carried to the frame by the change of coordinates
     :math:`x_f = T x_l`: :math:`A_f = (T A_l + \dot T) T^{-1}`, :math:`B_f = T B_l`, to which the
-    turning of a force held in reference axes is added.
+    turning of a force held in reference axes is added: (4.9) and (4.10) of docs/derivation.md.
 
     Returns
     -------

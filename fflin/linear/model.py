@@ -245,7 +245,8 @@ class LinearModel(FrozenArrays):
         .. math::
             A_d = e^{A h}, \quad [B_d, f_d] = \int_0^h e^{A s}\,ds\,[B, f_0]
 
-        At rest A^2 = 0, and the series ends: :math:`A_d = E + A h`, :math:`B_d = B h + A B h^2/2`.
+        At rest A^2 = 0, and the series ends: :math:`A_d = E + A h`, :math:`B_d = B h + A B h^2/2`,
+        (2.2) of docs/derivation.md.
 
         Parameters
         ----------

@@ -175,8 +175,8 @@ class Course:
 
     .. math:: H(t) = H(0) + \int w\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
 
-    where w is summed with the weights of the integrator's stages, and p with those of its
-    positions.
+    (11.2) of docs/derivation.md, where w is summed with the weights of the integrator's stages, and
+    p with those of its positions.
 
     Attributes
     ----------
