@@ -32,12 +32,12 @@ from fflin.kernel.vectors import (
     turned,
 )
 
-# Where the motion vectors of every body begin: velocity, Psi', acceleration without c, that of c alone,
-# and Psi''.
+# Where the motion vectors of every body begin: velocity, Psi', acceleration without c, that of c
+# alone, and Psi''.
 VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6 * LANES, 12 * LANES, 18 * LANES, 24 * LANES
 MOTION = 30
-# Where these begin, of all that its joint carries: momentum p, columns of G, stored momentum h, moment
-# and force without c, and those of c on what is carried.
+# Where these begin, of all that its joint carries: momentum p, columns of G, stored momentum h,
+# moment and force without c, and those of c on what is carried.
 MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3 * LANES, 12 * LANES, 15 * LANES, 21 * LANES
 LOAD = 27
 
