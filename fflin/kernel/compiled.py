@@ -13,8 +13,8 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-# Fewest points for which the kernel is quicker than the loop, where numba is loaded and where it
-# is not. To load it takes half a second, which a sweep of that size does not win back but the next
+# Fewest points for which the kernel is quicker than the loop, where numba is loaded and where it is
+# not. To load it takes half a second, which a sweep of that size does not win back but the next
 # ones do: sweeps are seldom alone.
 _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
 
