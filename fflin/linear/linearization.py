@@ -193,7 +193,8 @@ class Linearizer:
             array.setflags(write=False)
         x0.setflags(write=False)
         values = {"A": A, "B": B, "C": C, "D": D, "f0": f0, "x0": x0, "u0": u, "y0": y0}
-        fields = {**ready.common, **values, "q": q, "v": v, "_reference": self._reference_of(q)}
+        reference = _own_reference(self.robot, q) if ready.own_reference else ready.reference
+        fields = {**ready.common, **values, "q": q, "v": v, "_reference": reference}
         if ready.moving:
             own_rate = frozen(drift(state, f0, rates.gravity))
             fields |= {"f0": ready.rest["f0"], "_drift": own_rate}
@@ -215,10 +216,6 @@ class Linearizer:
             C[row, index] = 1.0
             sensed.y[row] = x0[index]
         return C, D, sensed.y
-
-    def _reference_of(self, q: Array) -> Array:
-        ready = self.prepared
-        return _own_reference(self.robot, q) if ready.own_reference else ready.reference
 
 
 def linearize(

@@ -74,20 +74,20 @@ class LinearTrajectory:
 
     def matrices(self, t: float) -> tuple[Array, Array]:
         """Return A (nx, nx) and B (nx, nu) at a time, linear between the knots."""
-        index, share = self._place(t)
-        A, B = (
-            (1.0 - share) * knots[index] + share * knots[index + 1] for knots in (self.A, self.B)
-        )
+        A, B = self._between(t, self.A, self.B)
         return A, B
 
     def point(self, t: float) -> tuple[Array, Array, Array]:
         """Return (q, v, u) at a time: q along the manifold, v and u linear between the knots."""
         index, share = self._place(t)
         q = pin.interpolate(self.robot.model, self.q[index], self.q[index + 1], share)
-        v, u = (
-            (1.0 - share) * knots[index] + share * knots[index + 1] for knots in (self.v, self.u)
-        )
+        v, u = self._between(t, self.v, self.u)
         return q, v, u
+
+    def _between(self, t: float, *of_knots: Array) -> list[Array]:
+        """Return what is linear between the knots at a time."""
+        index, share = self._place(t)
+        return [(1.0 - share) * knots[index] + share * knots[index + 1] for knots in of_knots]
 
     def _place(self, t: float) -> tuple[int, float]:
         t = number("t", t)
