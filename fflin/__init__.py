@@ -29,7 +29,7 @@ _PUBLIC = {
     "FramePose": "robot.outputs",
     "FrameVelocity": "robot.outputs",
     "FullState": "robot.outputs",
-    "Gain": "control.lqr",
+    "Gain": "control.gain",
     "GainBatch": "batch.gains",
     "GainSchedule": "control.tvlqr",
     "Gramians": "analysis.gramians",
@@ -141,8 +141,9 @@ if TYPE_CHECKING:
     from fflin.batch.linear_batch import LinearBatch
     from fflin.batch.sweep import sweep
     from fflin.control.acceleration_lqr import acceleration_lqr
+    from fflin.control.gain import Gain
     from fflin.control.kalman import Compensator, Estimator, kalman, lqg
-    from fflin.control.lqr import Gain, lqr
+    from fflin.control.lqr import lqr
     from fflin.control.output_feedback import OutputFeedback
     from fflin.control.policies import Allocation, StateFeedback, TrajectoryFeedback
     from fflin.control.sampled_cost import sampled_cost

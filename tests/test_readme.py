@@ -27,6 +27,7 @@ def test_python_examples_run(tmp_path, page):
         [sys.executable, "example.py"], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+    assert "undecided" not in done.stderr
 
 
 def test_inputs_of_the_guide_are_read(tmp_path):

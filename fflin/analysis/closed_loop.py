@@ -1,18 +1,21 @@
-"""The nonlinear robot under a state feedback, in the chart, beside what the linear model says."""
+"""The nonlinear robot under a state feedback, and the motion that the linear model predicts."""
 
 from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import count, pairwise
+from typing import Any
 
 import numpy as np
 
 from fflin.base.errors import ChartError, InputError
 from fflin.base.rotation import quaternion_product
-from fflin.base.validation import Array
+from fflin.base.validation import Array, as_double
+from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.nonlinear import Nonlinear
@@ -22,29 +25,16 @@ from fflin.robot.robot import Robot
 # function, and has diverged where it is this many times as large.
 SETTLED, DIVERGED = 1e-3, 1e3
 
-# 1 - |q_b|^2 where a run is taken to have left the chart: 4 degrees before its end.
+# A run has left the chart where 1 - |q_b|^2 is less: within 4 degrees of a turn of 180.
 _EDGE = 1e-3
+
+# The prediction is measured over so many time constants of the slowest pole, integrated to this
+# relative error; a random run may take as many times what the slowest pole needs to settle.
+_FORESIGHT, _PRECISION, _PATIENCE = 3.0, 1e-9, 3.0
+_STEPS = 60
 
 # Evaluations of the dynamics that a run may take; a loop that settles takes a tenth.
 _MOST_EVALUATIONS = 60_000
-
-
-class _TooLongError(Exception):
-    """A run took more evaluations than it may."""
-
-
-class _Dynamics:
-    """The nonlinear model of one run, which has a work space of its own and may not take long."""
-
-    def __init__(self, loop: Loop) -> None:
-        self._model = Nonlinear(loop.state, loop.lin)
-        self._left = _MOST_EVALUATIONS
-
-    def __call__(self, x: Array, u: Array) -> Array:
-        self._left -= 1
-        if self._left < 0:
-            raise _TooLongError
-        return self._model(x, u)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +68,7 @@ class Loop:
 
     @cached_property
     def rate(self) -> Array:
-        """A - B K."""
+        """State matrix of the linear loop, A - B K."""
         closed: Array = self.lin.A - self.lin.B @ self.K
         return closed
 
@@ -116,7 +106,7 @@ class Loop:
         state, lin = self.state, self.lin
         g = state.groups
         x = state.to_state(lin.q, lin.v)
-        axis, along = _direction(rng, 3), _direction(rng, 3)
+        axis, along = _direction(rng), _direction(rng)
         turn = np.radians(attitude) / 2.0
         q0 = np.sqrt(1.0 - float(x[g.q_b] @ x[g.q_b]))
         relative = np.array((*(np.sin(turn) * axis), np.cos(turn)))
@@ -128,6 +118,29 @@ class Loop:
         moved[g.q_m] += joint * spread / np.abs(spread).max(initial=1e-300)
         x[self.watched] = moved[self.watched]
         return x
+
+    def prediction_error(self, x: Array) -> float:
+        """Return the largest error of the linear loop from a state on, relative to its deviation.
+
+        NaN where the nonlinear loop ends before it settles.
+        """
+        times = self._times(_FORESIGHT / self.decay)
+        _, motion = self.run(x, times, _PRECISION)
+        foreseen = self.linear(motion[0], times)[: len(motion)]
+        first, last = self.size(motion[0]), self.size(motion[-1])
+        if len(motion) < len(times) and last > SETTLED * first:
+            return np.nan
+        return max(map(self.size, motion - foreseen)) / first
+
+    def outcome(self, x: Array) -> str:
+        """Return the outcome of a run with time enough to settle, as `run` names it."""
+        return self.run(x, self._times(_PATIENCE * np.log(1.0 / SETTLED) / self.decay), 1e-6)[0]
+
+    def _times(self, horizon: float) -> Array:
+        """Return the times of a run: its samples, or even steps."""
+        if self.lin.dt:
+            return self.lin.dt * np.arange(1.0 + np.ceil(horizon / self.lin.dt))
+        return np.linspace(0.0, horizon, _STEPS + 1)
 
     def run(self, x: Array, times: Array, precision: float) -> tuple[str, Array]:
         """Follow the nonlinear loop from a state.
@@ -143,40 +156,47 @@ class Loop:
         follow = self._sampled if self.lin.dt else self._continuous
         motion = [x[self.watched] - self.lin.x0]
         try:
-            # What overflows is told as a divergence.
+            # A run that overflows counts as diverged; NumPy and SciPy need not warn of it.
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 outcome = follow(x, times, precision, motion)
         except ChartError:
             outcome = "chart"
-        except (InputError, _TooLongError):  # not finite, or spinning ever faster
+        except InputError:  # an overflow, or a spin that takes too many evaluations
             outcome = "diverged"
         return outcome, np.array(motion)
+
+    def _dynamics(self) -> Callable[[Array, Array], Array]:
+        """Return the nonlinear model of one run, with a work space and a count of its own."""
+        model, evaluations = Nonlinear(self.state, self.lin), count()
+
+        def rate(x: Array, u: Array) -> Array:
+            if next(evaluations) >= _MOST_EVALUATIONS:
+                raise InputError(f"the run takes more than {_MOST_EVALUATIONS} evaluations")
+            return model(x, u)
+
+        return rate
 
     def _continuous(self, x: Array, times: Array, precision: float, motion: list[Array]) -> str:
         from scipy.integrate import solve_ivp
 
-        first, dynamics = self.size(motion[0]), _Dynamics(self)
-
-        def rate(_: float, x: Array) -> Array:
-            return dynamics(x, self._input(x))
+        first, dynamics = self.size(motion[0]), self._dynamics()
 
         def ended(_: float, x: Array) -> float:
             return float(self._outcome(x, first) == "slow") - 0.5
 
         ended.terminal = True  # type: ignore[attr-defined]
-        # Fast poles of the loop make it stiff; LSODA switches by itself.
+        # A loop with fast poles is stiff; LSODA finds that out and changes its method.
         found = solve_ivp(
-            rate,
+            lambda _, x: dynamics(x, self._input(x)),
             (times[0], times[-1]),
             x,
             method="LSODA",
             t_eval=times,
             events=ended,
-            rtol=precision,
-            atol=1e-3 * precision * (1.0 + np.abs(x)),
+            **_tolerances(x, precision),
         )
-        motion += [column[self.watched] - self.lin.x0 for column in found.y.T[1:]]
+        motion += list(found.y.T[1:, self.watched] - self.lin.x0)
         if found.t_events[0].size:
             return self._outcome(found.y_events[0][-1], first, slack=1e-3)
         return "slow" if found.success else "diverged"
@@ -184,16 +204,16 @@ class Loop:
     def _sampled(self, x: Array, times: Array, precision: float, motion: list[Array]) -> str:
         from scipy.integrate import solve_ivp
 
-        first, dynamics = self.size(motion[0]), _Dynamics(self)
-        for start, end in pairwise(times.tolist()):
-            held = self._input(x)
+        first, dynamics = self.size(motion[0]), self._dynamics()
+        outcome = "slow"
+        for span in pairwise(times.tolist()):
             found = solve_ivp(
-                lambda _, x, held=held: dynamics(x, held),
-                (start, end),
+                lambda _, x, held: dynamics(x, held),
+                span,
                 x,
                 method="DOP853",
-                rtol=precision,
-                atol=1e-3 * precision * (1.0 + np.abs(x)),
+                args=(self._input(x),),
+                **_tolerances(x, precision),
             )
             if not found.success:
                 return "diverged"
@@ -201,8 +221,8 @@ class Loop:
             motion.append(x[self.watched] - self.lin.x0)
             outcome = self._outcome(x, first)
             if outcome != "slow":
-                return outcome
-        return "slow"
+                break
+        return outcome
 
     def _input(self, x: Array) -> Array:
         u: Array = self.lin.u0 - self.K @ (x[self.watched] - self.lin.x0)
@@ -218,7 +238,7 @@ class Loop:
         return "slow" if now < (1.0 - slack) * DIVERGED * first else "diverged"
 
     def linear(self, error: Array, times: Array) -> Array:
-        """Return the deviations (len(times), nz) that the linear model foresees."""
+        """Return the deviations (len(times), nz) that the linear model predicts."""
         from scipy.linalg import expm
 
         step = self.rate if self.lin.dt else expm(self.rate * (times[1] - times[0]))
@@ -228,6 +248,32 @@ class Loop:
         return np.array(motion)
 
 
-def _direction(rng: np.random.Generator, size: int) -> Array:
-    vector = rng.normal(size=size)
+def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
+    """Return the loop of a gain, or raise `InputError` where it cannot settle at the point."""
+    if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
+        raise InputError("expected a fflin.Robot, its fflin.LinearModel and a gain")
+    K = as_double("gain", getattr(gain, "K", gain))
+    if K.shape != lin.B.T.shape or not np.isfinite(K).all():
+        raise InputError(f"K has shape {K.shape}, expected {lin.B.T.shape} of finite numbers")
+    loop = Loop(robot, lin, K)
+    if Actuation(loop.state).names != lin.input_names or not len(loop.watched):
+        raise InputError(
+            f"the model's inputs are not those of '{robot.name}'; give the robot with its inputs"
+        )
+    if lin.moving or not lin.is_equilibrium() or lin.v.any():
+        raise InputError("the point is no fixed point at rest; its loop cannot settle there")
+    if not loop.decay > 0.0:
+        raise InputError(
+            f"the linear loop is not stable: its slowest pole grows with {-loop.decay:.3g} 1/s; "
+            "design the gain with fflin.lqr"
+        )
+    return loop
+
+
+def _tolerances(x: Array, precision: float) -> dict[str, Any]:
+    return {"rtol": precision, "atol": 1e-3 * precision * (1.0 + np.abs(x))}
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    vector = rng.normal(size=3)
     return vector / np.linalg.norm(vector)

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import textwrap
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fflin.analysis.mechanics import (
-    Conserved,
+    ConservedMomenta,
     at_rest,
     checked,
     conserved,
-    fixed_poles,
     rates_of_positions,
-    scaled,
     second_order,
     slopes,
+    state_sizes,
 )
 from fflin.analysis.names import (
     combination,
@@ -27,10 +25,10 @@ from fflin.analysis.names import (
     unsettled,
     with_rates,
 )
-from fflin.analysis.ranks import Margin, echelon, null_space, reached_by, split, unit_columns
-from fflin.analysis.second_order import Noisy, SecondOrder, aliased, hidden
-from fflin.analysis.vibrations import vibration_rows
-from fflin.base.tables import width
+from fflin.analysis.pbh import split_by_poles
+from fflin.analysis.ranks import FixedPoles, Margin, Noisy, echelon, image, null_space, unit_columns
+from fflin.analysis.second_order import Hidden, SecondOrder, hidden
+from fflin.base.tables import folded
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 
@@ -101,7 +99,7 @@ class Controllability:
             placed = [f"{what} in {count}" for what, count in self.reach.items()]
             lines.append(f"directions that the inputs move: {', '.join(placed)}")
         lines += [f"note: {note}" for note in self.notes]
-        return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
+        return folded(lines)
 
 
 def controllability(lin: LinearModel) -> Controllability:
@@ -151,94 +149,80 @@ def controllability(lin: LinearModel) -> Controllability:
     lin = checked(lin)
     held = conserved(lin)
     part = _split_kept(lin, held)
+    fixed, size = part.fixed, state_sizes(lin)
     others: Array = np.zeros((len(part.rows), len(lin.A)))
     others[:, held.selected] = part.rows
-    rows = np.vstack((held.momenta, held.coordinates, others))
-    names = (*momentum_names(lin, held), *part.names)
-    size = _state_sizes(lin)
-    spanned = held.T @ part.reached
-    basis, pivots = echelon(spanned, size, _driven_states(lin))
+    # States are named after the coordinates that an input pushes on directly, where possible.
+    driven = second_order(lin.generator or lin).S.values.any(axis=1)
+    basis, pivots = echelon(held.T @ part.reached, size, np.tile(driven, 2))
     zero = np.full(2 * len(held.weights), 1.0 if lin.dt else 0.0)
-    margin = held.margin & part.margin
-    notes = (*_notes(lin, held), *undecided(lin, margin, "controllable", basis.shape[1]))
+    margin = held.margin & fixed.margin
+    doubts = undecided(lin, margin, "controllable", basis.shape[1])
     if not len(zero):
-        notes += unsettled(lin, part.settling, "stabilizable")
+        doubts += unsettled(lin, fixed.settling, "stabilizable")
     return Controllability(
         dimension=basis.shape[1],
         controllable=tuple(lin.state_names[i] for i in pivots),
-        uncontrollable=names,
-        rows=rows,
+        uncontrollable=(*momentum_names(lin, held), *part.names),
+        rows=np.vstack((held.momenta, held.coordinates, others)),
         basis=basis,
-        fixed_poles=np.concatenate((zero, part.poles)),
-        stabilizable=not len(zero) and part.decays,
+        fixed_poles=np.concatenate((zero, fixed.poles)),
+        stabilizable=not len(zero) and fixed.decays,
         reach=_reach(lin, basis * size[:, None]),
         method=part.method,
         margin=margin,
-        notes=notes,
+        notes=(*_notes(lin, held), *doubts),
         robot=lin.robot,
     )
 
 
-@dataclass(frozen=True)
-class _Part:
+class _Part(NamedTuple):
     """The split of what is left without the conserved momenta, in its own coordinates."""
 
     reached: Array
     rows: Array
     names: tuple[str, ...]
-    poles: Any
-    decays: bool
     method: str
-    margin: Margin
-    settling: Margin
+    fixed: FixedPoles
 
 
-def _split_kept(lin: LinearModel, held: Conserved) -> _Part:
-    source = at_rest(lin)
-    if source is not None:
-        r, nv = len(held.kept), len(lin.M)
-        R = held.T[nv:, r:]
-        system = second_order(source).restricted(R)
-        to_s = np.linalg.inv((rates_of_positions(slopes(source)) @ R)[held.kept])
-        part = _by_second_order(lin, system, to_s, held)
-        if part is not None:
-            return part
-    return _by_eigenvalues(lin, held)
+def _split_kept(lin: LinearModel, held: ConservedMomenta) -> _Part:
+    part = _by_second_order(lin, held)
+    if part is not None:
+        return part
+    z, R = held.selected, held.rates
+    found = split_by_poles(slopes(lin)[z] @ held.T, lin.B[z], R.T @ lin.M @ R, lin.dt)
+    rows, names = _labels(lin, found.rows, held)
+    return _Part(found.reached, rows, names, "eigenvalues", found.fixed.seen(R))
 
 
-def _by_second_order(
-    lin: LinearModel, system: SecondOrder, to_s: Array, held: Conserved
-) -> _Part | None:
-    r, names = len(system.M), tuple(np.array(lin.state_names)[held.selected])
-    acting = system.K.values.any() or system.D.values.any()
-    idle, margin = null_space(system.S.T @ np.diag(1.0 / system.size))
-    margin = margin.seen(held.T[len(lin.M) :, r:] / system.size)
-    everything = np.eye(2 * r)
-    if not acting or (not idle.shape[1] and not lin.dt):
-        # What is not conserved is pushed.
-        return _Part(
-            everything, everything[:0], (), np.zeros(0), True, "closed form", margin, Margin()
-        )
-    if not system.symmetric or (lin.dt and aliased(system.poles[0], lin.dt)):
+def _by_second_order(lin: LinearModel, held: ConservedMomenta) -> _Part | None:
+    source, R = at_rest(lin), held.rates
+    if source is None:
         return None
-    found = hidden(system, system.S.T, Noisy(*np.zeros_like(system.S.T)))
-    if not found.simple:
+    system, r = second_order(source).restricted(R), len(held.kept)
+    idle, margin = null_space(system.S.T @ np.diag(1.0 / system.size))
+    if not system.acting or (not idle.shape[1] and not lin.dt):
+        # Inputs reach every momentum that is not conserved, and so the coordinates.
+        everything, fixed = np.eye(2 * r), FixedPoles(margin=margin.seen(R / system.size))
+        return _Part(everything, everything[:0], (), "closed form", fixed)
+    found = hidden(system, system.S.T, Noisy.exact(np.zeros_like(system.S.values.T)), lin.dt)
+    if found is None:
         return None
     # By symmetry a motion (s, v) that S^T s does not show is a row that no input moves.
     s, v = np.split(found.motions, 2)
     pushed = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
-    reached = _across(pushed / np.tile(system.size, 2)) / np.tile(system.size, 2)[:, None]
+    size = np.tile(system.size, 2)
+    reached = _across(pushed / size) / size[:, None]
+    to_s = np.linalg.inv((rates_of_positions(slopes(source)) @ R)[held.kept])
     reached[:r] = np.linalg.solve(to_s, reached[:r])
     if system.D.values.any():
-        rows, labels = _labels(lin, np.hstack((pushed[:, :r] @ to_s, pushed[:, r:])), held)
+        rows, names = _labels(lin, np.hstack((pushed[:, :r] @ to_s, pushed[:, r:])), held)
         method = "eigenvalues"
     else:
-        rows, labels = vibration_rows(found, system.M, to_s, names)
+        rows, names = _vibration_rows(found, system, to_s, lin, held)
         method = "modes"
-    R = held.T[len(lin.M) :, r:]
-    margin, settling = found.margin.seen(R), found.settling.seen(R)
-    poles = np.exp(found.poles * lin.dt) if lin.dt else found.poles
-    return _Part(reached, rows, labels, poles, found.decays, method, margin, settling)
+    return _Part(reached, rows, names, method, found.fixed.seen(R))
 
 
 def _across(rows: Array) -> Array:
@@ -248,52 +232,25 @@ def _across(rows: Array) -> Array:
     return basis
 
 
-def _by_eigenvalues(lin: LinearModel, held: Conserved) -> _Part:
-    z, nv = held.selected, len(lin.M)
-    rates = held.T[nv:, len(held.kept) :]
-    pair = scaled(slopes(lin)[z] @ held.T, rates.T @ lin.M @ rates, lin.dt)
-    drive = unit_columns(pair.from_x @ lin.B[z])
-    reached, rest, F, margin = reached_by(pair.A, drive, pair.tolerance)
-    rows, labels = _labels(lin, rest.T @ pair.from_x, held)
-    poles, decays, lost, settling = fixed_poles(F, rest, pair, lin.dt)
-    margin = margin.halved().seen(pair.to_x[len(rates.T) :, len(rates.T) :]) & lost
-    margin, settling = margin.seen(rates), settling.seen(rates)
-    method = "eigenvalues"
-    return _Part(pair.to_x @ reached, rows, labels, poles, decays, method, margin, settling)
-
-
-def _labels(lin: LinearModel, rows: Array, held: Conserved) -> tuple[Array, tuple[str, ...]]:
-    if not len(rows):
-        return rows, ()
+def _labels(lin: LinearModel, rows: Array, held: ConservedMomenta) -> tuple[Array, tuple[str, ...]]:
+    """Return the same rows in echelon form, and their names."""
     names = tuple(np.array(lin.state_names)[held.selected])
-    size = 1.0 / _state_sizes(lin)[held.selected]
-    echeloned = echelon(rows.T, size)[0].T
-    return echeloned, tuple(combination(row, names, size) for row in echeloned)
-
-
-def _state_sizes(lin: LinearModel) -> Array:
-    """Weights (nx,) that make states comparable, by their inertia."""
-    return np.tile(np.sqrt(lin.M.diagonal()), 2)
-
-
-def _driven_states(lin: LinearModel) -> Array:
-    """Return the states of coordinates that an input pushes on directly."""
-    return np.tile(second_order(lin.generator or lin).S.values.any(axis=1), 2)
+    size = 1.0 / state_sizes(lin)[held.selected]
+    rows = echelon(rows.T, size)[0].T
+    return rows, tuple(combination(row, names, size) for row in rows)
 
 
 def _reach(lin: LinearModel, weighted: Array) -> dict[str, int]:
-    nv = len(lin.M)
-    groups = [name.split(".", 1)[0] for name in lin.state_names[:nv]]
+    groups = [name.partition(".")[0] for name in lin.state_names[: len(lin.M)]]
     titles = {"q_b": "base attitude", "r_b": "base position", "q_m": "joints"}
-    reach = {}
-    for group, title in titles.items():
-        rows = [i for i, other in enumerate(groups) if other == group]
-        if rows:
-            reach[title] = split(unit_columns(weighted[rows]), 1e-8)[0].shape[1]
-    return reach
+    rows = {title: np.array(groups) == group for group, title in titles.items() if group in groups}
+    return {
+        title: image(unit_columns(weighted[: len(groups)][chosen]), 1e-8)[0].shape[1]
+        for title, chosen in rows.items()
+    }
 
 
-def _notes(lin: LinearModel, held: Conserved) -> tuple[str, ...]:
+def _notes(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
     notes = []
     turned = any("angular momentum" in name for name in momentum_names(lin, held))
     if turned and any(lin.state_names[i].startswith("q_m.") for i in held.kept):
@@ -303,3 +260,26 @@ def _notes(lin: LinearModel, held: Conserved) -> tuple[str, ...]:
     if not lin.is_equilibrium():
         notes.append("the point is not a fixed point: this speaks of the frozen A and B")
     return tuple(notes)
+
+
+def _vibration_rows(
+    found: Hidden, system: SecondOrder, to_s: Array, lin: LinearModel, held: ConservedMomenta
+) -> tuple[Array, tuple[str, ...]]:
+    """Return the rows that read the undriven modes of an undamped model, and their names."""
+    r = len(system.M)
+    rows, labels = [np.zeros((0, 2 * r))], []
+    rates = (lin.state_names[len(lin.M) + i] for i in held.kept)
+    members = tuple(name.split(".", 1)[-1] for name in rates)
+    for pole, missed in found.shapes:
+        if pole.real < 0.0:  # the positive one of the pair has the same shapes
+            continue
+        shapes = missed.real
+        momenta = shapes.T @ system.M
+        zero = np.zeros_like(momenta)
+        rows += [np.hstack((momenta @ to_s, zero)), np.hstack((zero, momenta))]
+        kind = "vibration" if pole.imag else "instability"
+        for what in ("", "rate of "):
+            for s in shapes.T * system.size:
+                shape = combination(s / np.abs(s).max(), members, np.ones(r))
+                labels.append(f"{what}{kind} at {abs(pole):.4g} rad/s ({shape})")
+    return np.vstack(rows), tuple(labels)

@@ -11,7 +11,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, number
 from fflin.linear.model import LinearModel
 
-# Below this decay, relative to the fastest, a pole may be one at zero moved by rounding.
+# A pole that decays less, relative to the fastest, may be one at zero that rounding moved.
 _DECAY = 1e-7
 
 
@@ -77,7 +77,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     pairs = ((lin.A, lin.B), (lin.A.T, lin.C.T))
     if duration is None:
         _require_decay(lin)
-        reach, show = (_symmetric(_endless(A, B @ B.T, lin.dt)) for A, B in pairs)
+        found = [_endless(A, B @ B.T, lin.dt) for A, B in pairs]
+        reach, show = (0.5 * (W + W.T) for W in found)
         return Gramians(reach, show, np.inf)
     duration = number("duration", duration)
     if duration <= 0.0:
@@ -85,8 +86,8 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     with np.errstate(over="ignore", invalid="ignore"):
         found = [_finite(A, B @ B.T, lin.dt, duration) for A, B in pairs]
     if not all(np.isfinite(W).all() for W in found):
-        raise InputError(f"duration is {duration:g} s, over which the model grows beyond numbers")
-    reach, show = map(_symmetric, found)
+        raise InputError(f"duration is {duration:g} s, over which the model overflows")
+    reach, show = (0.5 * (W + W.T) for W in found)
     return Gramians(reach, show, duration)
 
 
@@ -132,14 +133,10 @@ def _summed(A: Array, Q: Array, steps: int) -> Array:
     return W
 
 
-def _symmetric(W: Array) -> Array:
-    return (W + W.T) / 2.0
-
-
 def held_cost(F: Array, W: Array, h: float) -> Array:
     """Return the integral of e^(F' t) W e^(F t) over [0, h].
 
-    W is taken as of the size of F: the exponential rounds relative to the larger.
+    The exponential rounds relative to its largest block, so that W is scaled to the size of F.
     """
     square = F @ F
     if not (square @ F).any():

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.analysis.zero_eigenvalues import nonzero_eigenpairs
+from fflin.analysis.eigenpairs import natural_modes
 from fflin.base.errors import InputError
 from fflin.base.tables import counted, grid, width
 from fflin.base.validation import Array
@@ -18,12 +18,6 @@ from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-_EPS = float(np.finfo(float).eps)
-
-# A stiffness this far below the largest, both scaled to unit inertias, is taken for none: modes
-# of less than 3e-7 of the highest frequency count as rigid.
-_NO_STIFFNESS = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +118,7 @@ class Modes:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Of which modes it hangs on rounding whether they grow or decay."""
+        """Modes of which rounding decides whether they grow or decay."""
         return tuple(
             f"undecided: whether the mode at {mode.frequency:.4g} rad/s grows or decays; its real "
             f"part is {mode.margin:.1g} times its rounding"
@@ -182,125 +176,26 @@ def modes(lin: LinearModel) -> Modes:
     nx, nv = len(lin.A), len(lin.M)
     if nx != 2 * nv:
         raise InputError(f"the model has {nx} states, expected {nv} positions and their velocities")
-    inertia = np.sqrt(lin.M.diagonal())
-    A = _significant(lin)
-    weight, fastest = _scales(A, inertia)
-    found = _free_free(A, lin.M, inertia)
-    if found is None:
-        found = _general(A, weight, fastest)
-    triples, rigid_body, zeros = found
-    triples.sort(key=lambda triple: (abs(triple[0]), triple[0].real))
-    residual = 0.0
-    for pole, shape, _ in triples:
-        left = weight * (A @ shape - pole * shape) / fastest
-        residual = max(residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape)))
+    found = natural_modes(lin)
     return Modes(
         tuple(
-            Mode(pole, _normalised(shape), margin > 1.0, margin) for pole, shape, margin in triples
+            Mode(pole, _normalised(shape), margin > 1.0, margin)
+            for pole, shape, margin in sorted(
+                found.triples, key=lambda triple: (abs(triple[0]), triple[0].real)
+            )
         ),
-        rigid_body,
-        zeros,
-        residual,
+        found.rigid_body,
+        found.zeros,
+        found.residual,
         lin.is_equilibrium(),
         lin.state_names,
         lin.robot,
     )
 
 
-# A pole, its shape, and its real part as a multiple of rounding.
-_Found = tuple[list[tuple[complex, Any, float]], int, int]
-
-
-def _significant(lin: LinearModel) -> Array:
-    """Return A without slopes that are the rounding of inputs that cancel each other."""
-    nv, A = len(lin.M), lin.A.copy()
-    slopes = A[nv:, :nv]
-    pushed = np.abs(lin.B[nv:]) @ np.abs(lin.u0)
-    slopes[np.abs(slopes) <= 1e2 * _EPS * pushed[:, None]] = 0.0
-    return A
-
-
-def _free_free(A: Array, M: Array, inertia: Array) -> _Found | None:
-    """Return the modes of a body at rest with symmetric stiffness; None for any other model."""
-    from scipy.linalg import eigh
-
-    nv = len(M)
-    N, slope = A[:nv, nv:], A[nv:, :nv] @ A[:nv, nv:]
-    if A[:nv, :nv].any() or A[nv:, nv:].any():
-        return None
-    # Over s with p = N s, ds/dt = nu; scaled to a unit diagonal of M.
-    unit = M / np.outer(inertia, inertia)
-    by_s = slope * inertia[:, None] / inertia
-    K = -unit @ by_s
-    size = float(np.abs(K).max(initial=0.0))
-    rounding = 1e2 * _EPS * float(np.linalg.cond(unit))
-    if not np.abs(K - K.T).max(initial=0.0) <= rounding * size:
-        return None
-    felt = np.flatnonzero(by_s.any(axis=0))
-    if not felt.size:
-        return [], nv, 2 * nv
-    free = np.setdiff1d(np.arange(nv), felt)
-    across = unit[np.ix_(free, felt)]
-    M_star = unit[np.ix_(felt, felt)] - across.T @ np.linalg.solve(unit[np.ix_(free, free)], across)
-    K = -M_star @ by_s[np.ix_(felt, felt)]
-    squares, vectors = eigh((K + K.T) / 2.0, (M_star + M_star.T) / 2.0)
-    squares, vectors = _polished(by_s[np.ix_(felt, felt)], squares, vectors)
-    found: list[tuple[complex, Any, float]] = []
-    for square, vector in zip(squares.tolist(), vectors.T, strict=True):
-        if abs(square) <= _NO_STIFFNESS * len(felt) * float(np.abs(squares).max()):
-            continue
-        # All that floats follows: -omega^2 s = (d nudot/ds) s, of any size.
-        s = by_s[:, felt] @ vector / inertia
-        root = abs(square) ** 0.5
-        for pole in [1j * root] if square > 0.0 else [complex(root), complex(-root)]:
-            shape = np.concatenate((N @ s, pole * s))
-            found.append((pole, shape, math.copysign(math.inf, pole.real) if pole.real else 0.0))
-    counted = sum(2 if pole.imag else 1 for pole, *_ in found)
-    return found, nv - counted // 2, 2 * nv - counted
-
-
-def _polished(by_s: Array, squares: Array, vectors: Array) -> tuple[Array, Array]:
-    """Return the pairs of -by_s, after one Newton step from those of its symmetric pencil.
-
-    The Schur complement rounds by the conditioning of M, A itself is right to the last digits.
-    """
-    defect = -np.linalg.solve(vectors, by_s @ vectors) - np.diag(squares)
-    gaps = squares - squares[:, None]
-    # Equal ones stay as they are: any of their combinations will do.
-    apart = np.abs(defect) < 1e-3 * np.abs(gaps)
-    mixed = np.divide(defect, gaps, out=np.zeros_like(defect), where=apart)
-    return squares + defect.diagonal(), vectors + vectors @ mixed
-
-
-def _scales(A: Array, inertia: Array) -> tuple[Array, float]:
-    """Return weights of the states and a rate, over which the entries of A are of order 1.
-
-    Velocities are weighed by sqrt(M_ii), and positions by the rate as well.
-    """
-    nv = len(inertia)
-    rates = np.abs(np.tile(inertia, 2)[:, None] * A / np.tile(inertia, 2))
-    turning = max(float(rates[nv:, nv:].max()), float(rates[:nv, :nv].max()))
-    fastest = max(float(rates[nv:, :nv].max()) ** 0.5, turning) or 1.0
-    return np.concatenate((fastest * inertia, inertia)), fastest
-
-
-def _general(A: Array, weight: Array, fastest: float) -> _Found:
-    """Return the modes of any model, by the eigenvalues of A."""
-    scaled = weight[:, None] * A / weight / fastest
-    found, nullity = nonzero_eigenpairs(scaled, _NO_STIFFNESS)
-    listed: list[tuple[complex, Any, float]] = []
-    for pole, vector, error in found:
-        if pole.imag < 0.0:
-            continue
-        real = 0.0 if abs(pole.real) <= error and pole.imag else pole.real
-        value = complex(real, pole.imag) * fastest
-        listed.append((value, vector / weight, pole.real / error))
-    return listed, nullity, len(weight) - len(found)
-
-
 def _normalised(shape: Array) -> NDArray[np.complexfloating[Any]]:
     positions = np.abs(shape[: len(shape) // 2])
-    # Of equals, such as two panels in symmetry, the first.
+    # Of several that move equally, such as symmetric panels, the first.
     largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
     return np.asarray(shape / shape[largest], dtype=complex)
 

@@ -19,7 +19,7 @@ from fflin.linear.model import Certificate, LinearModel
 from fflin.robot.frames import frame_index
 from fflin.robot.robot import Robot
 
-# f0 outside of what the reduced state can follow, relative to f0.
+# Largest part of f0, relative to it, that the reduced state may leave out.
 _DRIFT = 1e-9
 
 
@@ -65,6 +65,8 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
         \nu_b = G \dot q_m, \quad M^* \ddot q_m = \tau_m - K q_m - D \dot q_m, \quad
         M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}.
 
+    Equations (9.2) and (9.3) of docs/derivation.md.
+
     Where attitude or position is actuated as well, its states are kept and the others left out.
     Without springs the result is minimal; a vibration that no input drives stays in it. From
     inputs to joint states it has the transfer function of the whole model.
@@ -103,8 +105,7 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
         )
     S = np.zeros((len(z), len(T)))
     S[np.arange(len(z)), z] = 1.0
-    rates = T[len(lin.M) :, len(held.kept) :]
-    M = rates.T @ lin.M @ rates
+    M = held.rates.T @ lin.M @ held.rates
     M.setflags(write=False)
     values = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
     values |= {
@@ -135,7 +136,7 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
 
 
 def generalized_inertia(lin: LinearModel) -> Array:
-    r"""Return the inertia of the joints with the base free to follow.
+    r"""Return the generalized inertia: that of the joints with the base free to follow (9.3).
 
     .. math:: M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}
 
@@ -159,7 +160,8 @@ def generalized_inertia(lin: LinearModel) -> Array:
     Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
     """
     lin = checked(lin)
-    if len(lin.A) != 12 + 2 * _joints(lin):
+    joints = sum(name.startswith("q_m.") for name in lin.state_names)
+    if len(lin.A) != 12 + 2 * joints:
         raise InputError("the base is not among the states; take the model before its reduction")
     M = lin.M
     inertia: Array = M[6:, 6:] + M[6:, :6] @ _following(M)
@@ -167,7 +169,7 @@ def generalized_inertia(lin: LinearModel) -> Array:
 
 
 def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") -> Array:
-    r"""Return the velocity of a frame per joint rate, with the momentum of the robot zero.
+    r"""Return the generalized Jacobian: a frame's velocity per joint rate at zero momentum (9.3).
 
     .. math:: J^* = J_m + J_b G, \qquad G = -M_{bb}^{-1} M_{bm}
 
@@ -211,10 +213,6 @@ def _following(M: Array) -> Array:
     """Return G (6, n), what the free base does when the joints move."""
     G: Array = -np.linalg.solve(M[:6, :6], M[:6, 6:])
     return G
-
-
-def _joints(lin: LinearModel) -> int:
-    return sum(name.startswith("q_m.") for name in lin.state_names)
 
 
 def _given(value: Any, _: LinearModel) -> Any:

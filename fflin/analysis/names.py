@@ -4,33 +4,35 @@ from __future__ import annotations
 
 import numpy as np
 
-from fflin.analysis.mechanics import Conserved
+from fflin.analysis.mechanics import ConservedMomenta
 from fflin.analysis.ranks import Margin
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 
-_MOMENTUM = {"omega_b": "angular momentum {}", "v_b": "linear momentum {}"}
-_COORDINATE = {"omega_b": "base attitude {}", "v_b": "base position {}"}
+# Of each group of velocities: its momenta, and the coordinates that these drive.
+_CONSERVED = {
+    "omega_b": ("angular momentum", "base attitude"),
+    "v_b": ("linear momentum", "base position"),
+}
+_OTHER = ("momentum of", "position of")
 
 
-def momentum_names(lin: LinearModel, held: Conserved) -> tuple[str, ...]:
+def momentum_names(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
     """Name the conserved momenta, and then the coordinates that they drive."""
     nv = len(lin.M)
-    size = 1.0 / np.sqrt(lin.M.diagonal())
+    size = np.sqrt(lin.M.diagonal())
     rates = [name.split(".", 1) for name in lin.state_names[nv:]]
-    momenta = tuple(
-        _MOMENTUM.get(group, "momentum of {}").format(member) for group, member in rates
+    momenta, driven = (
+        tuple(f"{_CONSERVED.get(group, _OTHER)[i]} {member}" for group, member in rates)
+        for i in (0, 1)
     )
-    driven = tuple(
-        _COORDINATE.get(group, "position of {}").format(member) for group, member in rates
-    )
-    # What the coordinates are counted from: without it every one of them can be moved.
+    # A coordinate cannot be moved while the others are held; with them it can.
     only_joints = all(rates[i][0] == "qdot_m" for i in held.kept)
     of_base = all(not row[i] for row in held.weights for i in range(nv) if rates[i][0] == "qdot_m")
     rest = "the joints" if only_joints and of_base else "the rest"
     return (
-        *(combination(row, momenta, 1.0 / size) for row in held.weights),
-        *(f"{combination(row, driven, 1.0 / size)} with {rest} held" for row in held.weights),
+        *(combination(row, momenta, size) for row in held.weights),
+        *(f"{combination(row, driven, size)} with {rest} held" for row in held.weights),
     )
 
 
@@ -56,7 +58,7 @@ _RATES = {"q_b": "omega_b", "r_b": "v_b", "q_m": "qdot_m"}
 
 
 def with_rates(names: tuple[str, ...]) -> str:
-    """List names in a sentence; rates that come with their positions are said once."""
+    """List names in a sentence; a position and its rate are named together."""
     pairs = {}
     for name in names:
         group, _, member = name.partition(".")
@@ -93,7 +95,7 @@ def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[
 
 
 def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
-    """Say where it hangs on rounding whether the slowest motion decays."""
+    """Say where rounding decides whether the slowest motion decays."""
     return tuple(
         f"undecided: whether {shape(lin, at)} settles by itself, at {ratio:.1g} times its "
         f"rounding; {what} or not {what}"

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import textwrap
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from fflin.analysis.mechanics import (
     at_rest,
     checked,
-    fixed_poles,
     rates_of_positions,
-    scaled,
     second_order,
     slopes,
+    state_sizes,
 )
 from fflin.analysis.names import combination, undecided, unsettled, with_rates
-from fflin.analysis.ranks import EPS, Margin, echelon, reached_by, unit_columns
-from fflin.analysis.second_order import Noisy, aliased, hidden, without_rounding
-from fflin.base.tables import width
+from fflin.analysis.pbh import split_by_poles
+from fflin.analysis.ranks import EPS, FixedPoles, Margin, Noisy, echelon, without_rounding
+from fflin.analysis.second_order import hidden
+from fflin.base.tables import folded
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 
@@ -74,7 +73,7 @@ class Observability:
         if self.unobservable:
             lines.append(f"unobservable: {with_rates(self.unobservable)}")
         lines += [f"note: {note}" for note in self.notes]
-        return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
+        return folded(lines)
 
 
 def observability(lin: LinearModel) -> Observability:
@@ -100,69 +99,42 @@ def observability(lin: LinearModel) -> Observability:
         If `lin` is no linear model of positions and their rates.
     """
     lin = checked(lin)
-    part = _by_second_order(lin) or _by_eigenvalues(lin)
-    size = np.tile(np.sqrt(lin.M.diagonal()), 2)
-    basis, _ = echelon(part.motions, size)
+    motions, fixed, method = _unobservable(lin)
+    size = state_sizes(lin)
+    basis, _ = echelon(motions, size)
     scaled_basis = np.linalg.qr(basis * size[:, None], mode="complete")[0]
     return Observability(
         dimension=len(basis) - basis.shape[1],
         unobservable=tuple(combination(column, lin.state_names, size) for column in basis.T),
         basis=basis,
         rows=scaled_basis[:, basis.shape[1] :].T * size,
-        fixed_poles=part.poles,
-        detectable=part.decays,
-        method=part.method,
-        margin=part.margin,
+        fixed_poles=fixed.poles,
+        detectable=fixed.decays,
+        method=method,
+        margin=fixed.margin,
         notes=(
-            *undecided(lin, part.margin, "observable", len(basis) - basis.shape[1]),
-            *unsettled(lin, part.settling, "detectable"),
+            *undecided(lin, fixed.margin, "observable", len(basis) - basis.shape[1]),
+            *unsettled(lin, fixed.settling, "detectable"),
         ),
         robot=lin.robot,
     )
 
 
-class _Part(NamedTuple):
-    """The motions (nx, k) that the outputs do not show."""
-
-    motions: Array
-    poles: Any
-    decays: bool
-    method: str
-    margin: Margin
-    settling: Margin
-
-
-def _by_second_order(lin: LinearModel) -> _Part | None:
-    source = at_rest(lin)
-    if source is None:
-        return None
-    system, nv = second_order(source), len(lin.M)
-    if not system.symmetric or (lin.dt and aliased(system.poles[0], lin.dt)):
-        return None
-    N = rates_of_positions(slopes(source))
-    C = np.hstack((lin.C[:, :nv] @ N, lin.C[:, nv:]))
-    size = np.tile(system.size, 2)
-    each = np.linalg.norm(C / size, axis=1)
-    noise = 4.0 * EPS * np.abs(C)
-    shown = without_rounding(Noisy(C, noise), np.where(each > 0.0, each, 1.0), size)
-    position, velocity = (
-        Noisy(shown.values[:, half], shown.noise[:, half])
-        for half in (slice(0, nv), slice(nv, None))
-    )
-    found = hidden(system, position, velocity)
-    if not found.simple:
-        return None
-    acting = system.K.values.any() or system.D.values.any()
-    motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
-    poles = np.exp(found.poles * lin.dt) if lin.dt else found.poles
-    method = "eigenvalues" if acting else "closed form"
-    return _Part(motions, poles, found.decays, method, found.margin, found.settling)
-
-
-def _by_eigenvalues(lin: LinearModel) -> _Part:
-    pair, nv = scaled(slopes(lin), lin.M, lin.dt), len(lin.M)
-    seen = unit_columns((lin.C @ pair.to_x).T)
-    _, rest, F, margin = reached_by(pair.A.T, seen, pair.tolerance)
-    poles, decays, lost, settling = fixed_poles(F, rest, pair, lin.dt)
-    margin = margin.halved().seen(pair.to_x[nv:, nv:]) & lost
-    return _Part(pair.to_x @ rest, poles, decays, "eigenvalues", margin, settling)
+def _unobservable(lin: LinearModel) -> tuple[Array, FixedPoles, str]:
+    """Return the motions (nx, k) that the outputs miss, their poles, and the method."""
+    source, nv = at_rest(lin), len(lin.M)
+    if source is not None:
+        system, N = second_order(source), rates_of_positions(slopes(source))
+        C = np.hstack((lin.C[:, :nv] @ N, lin.C[:, nv:]))
+        size = np.tile(system.size, 2)
+        each = np.linalg.norm(C / size, axis=1)
+        C_noisy = Noisy(C, 4.0 * EPS * np.abs(C))
+        shown = without_rounding(C_noisy, np.where(each > 0.0, each, 1.0), size)
+        position, velocity = shown.columns(slice(0, nv)), shown.columns(slice(nv, None))
+        found = hidden(system, position, velocity, lin.dt)
+        if found is not None:
+            method = "eigenvalues" if system.acting else "closed form"
+            motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
+            return motions, found.fixed, method
+    part = split_by_poles(slopes(lin), lin.C.T, lin.M, lin.dt, dual=True)
+    return part.rest, part.fixed, "eigenvalues"

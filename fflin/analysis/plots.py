@@ -1,4 +1,4 @@
-"""Figures of linear models: poles, patterns and reach, with matplotlib."""
+"""Figures of linear models: poles, the pattern of A and B, and how far they are valid."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
         axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})
         entries = np.abs(np.hstack((lin.A, lin.B)))
         top = float(np.log10(entries.max() or 1.0))
-        # What is below the rounding of the largest entry would take all the colours.
+        # Entries below the rounding of the largest would use up the range of colours.
         least = max(top - 12.0, float(np.log10(entries[entries > 0.0].min(initial=10.0**top))))
         for ax, values, name, columns in zip(
             axes, (lin.A, lin.B), "AB", (lin.state_names, lin.input_names), strict=True
@@ -134,7 +134,8 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     MissingPackageError, FileError
         As in `plot_motion`.
     """
-    from fflin.analysis.validity import TRUSTED, Validity, shown
+    from fflin.analysis.displacement import shown
+    from fflin.analysis.validity import TRUSTED, Validity
 
     if not isinstance(validity, Validity):
         raise InputError(

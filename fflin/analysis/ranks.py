@@ -1,7 +1,8 @@
-"""Rank decisions, echelon forms and controllable subspaces, each with its distance from doubt."""
+"""Rank decisions, each with its distance from doubt, and echelon forms."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,69 +11,76 @@ from fflin.base.validation import Array
 
 EPS = float(np.finfo(float).eps)
 
-# What an echelon form leaves of a coefficient that is zero, relative to a pivot of 1.
+# A coefficient of an echelon form that is smaller, relative to a pivot of 1, is rounding.
 _CLEAN = 1e-10
 
-# An eigenvector that inputs of unit length see by less than this, or that has a neighbour this
-# near, is decided by singular values; the others are seen without doubt.
-_SUSPICIOUS = 1e-3
-
-# A tolerance is this many times the rounding, and singular values between these parts of it are
-# within doubt.
+# A tolerance is SAFETY times the rounding; singular values between LOST and CLEAR times the
+# tolerance are in doubt.
 SAFETY, CLEAR, LOST = 10.0, 30.0, 0.01
 
-# Eigenvalues nearer than this are one: a defective one moves by the root of round-off. The
-# Rayleigh quotient of the singular vector converges quadratically to it.
-_SAME_POLE, _REFINEMENTS = 1e-9, 4
+# A force below _FLOOR times the largest of its kind, per unit of energy, may be rounding; below
+# the part _ROUNDING of that it is taken for it.
+_FLOOR, _ROUNDING = 1e3 * EPS, 0.3
 
 
-class Margin(NamedTuple):
-    """How far rank decisions are from doubt, as ratios to their tolerances.
+class Decision(NamedTuple):
+    """Whether a singular value counts: where its ratio to the tolerance is above 1.
 
     Attributes
     ----------
-    kept : float
-        The smallest singular value that counted; infinite where there was none to decide.
-    dropped : float
-        The largest that did not; zero where there was none.
-    kept_at, dropped_at : ndarray or None
-        The directions of these.
-    kept_count, dropped_count : int
-        How many states hang on each: two on a pair of poles, or a momentum and what it drives.
+    ratio : float
+    at : ndarray or None
+        Its direction; None where there was nothing to decide.
+    states : int
+        How many states hang on it: two on a pair of poles, or a momentum and what it drives.
     """
 
-    kept: float = np.inf
-    dropped: float = 0.0
-    kept_at: Any = None
-    dropped_at: Any = None
-    kept_count: int = 1
-    dropped_count: int = 1
+    ratio: float
+    at: Any = None
+    states: int = 1
+
+
+class Margin(NamedTuple):
+    """How far rank decisions are from doubt: the nearest of those that counted, and of the others.
+
+    Attributes
+    ----------
+    counted, left_out : Decision
+        Of ratios infinity and zero where there was none to decide.
+    """
+
+    counted: Decision = Decision(np.inf)
+    left_out: Decision = Decision(0.0)
+
+    @property
+    def kept(self) -> float:
+        """The smallest singular value that counted, relative to its tolerance."""
+        return self.counted.ratio
+
+    @property
+    def dropped(self) -> float:
+        """The largest that did not count, relative to its tolerance."""
+        return self.left_out.ratio
 
     def __and__(self, other: Margin) -> Margin:
         """Return the nearer to doubt of two."""
-        kept = self if self.kept <= other.kept else other
-        dropped = self if self.dropped >= other.dropped else other
+        counted, left_out = zip(self, other, strict=True)
         return Margin(
-            *(kept.kept, dropped.dropped, kept.kept_at, dropped.dropped_at),
-            *(kept.kept_count, dropped.dropped_count),
+            min(counted, key=lambda decision: decision.ratio),
+            max(left_out, key=lambda decision: decision.ratio),
         )
 
-    def seen(self, change: Array, count: int | None = None) -> Margin:
+    def moved(self, change: Callable[[Any], Any]) -> Margin:
+        """Return it with its directions changed."""
+        return Margin(*(d if d.at is None else d._replace(at=change(d.at)) for d in self))
+
+    def seen(self, change: Array) -> Margin:
         """Return it with the directions in other coordinates, ``change * v`` or ``change @ v``."""
-        kept, dropped = (
-            v if v is None else change * v if change.ndim == 1 else change @ v
-            for v in (self.kept_at, self.dropped_at)
-        )
-        changed = self._replace(kept_at=kept, dropped_at=dropped)
-        return changed._replace(kept_count=count, dropped_count=count) if count else changed
+        return self.moved(lambda v: change * v if change.ndim == 1 else change @ v)
 
     def halved(self) -> Margin:
         """Return it with the positions or the rates of the directions, whichever are larger."""
-        kept, dropped = (
-            v if v is None else max(np.split(v, 2), key=np.linalg.norm)
-            for v in (self.kept_at, self.dropped_at)
-        )
-        return self._replace(kept_at=kept, dropped_at=dropped)
+        return self.moved(lambda v: max(np.split(v, 2), key=np.linalg.norm))
 
     @property
     def doubts(self) -> tuple[tuple[float, Any, int], ...]:
@@ -80,79 +88,136 @@ class Margin(NamedTuple):
 
         The last is negative where less would count.
         """
-        kept = (self.kept, self.kept_at, -self.kept_count)
-        dropped = (self.dropped, self.dropped_at, self.dropped_count)
-        return (kept,) * int(self.kept < CLEAR) + (dropped,) * int(self.dropped > LOST)
+        found = []
+        if self.kept < CLEAR:
+            found.append((self.kept, self.counted.at, -self.counted.states))
+        if self.dropped > LOST:
+            found.append((self.dropped, self.left_out.at, self.left_out.states))
+        return tuple(found)
 
 
-def decided(ratio: float, direction: Any, count: int = 1) -> Margin:
-    """Return the margin of one decision: of what counts where the ratio is above 1."""
-    if ratio > 1.0:
-        return Margin(kept=ratio, kept_at=direction, kept_count=count)
-    return Margin(dropped=ratio, dropped_at=direction, dropped_count=count)
+def decided(ratio: float, direction: Any, states: int = 1) -> Margin:
+    """Return the margin of one decision."""
+    one = Decision(ratio, direction, states)
+    return Margin(counted=one) if ratio > 1.0 else Margin(left_out=one)
 
 
-def even_rows(values: Any, noise: Array) -> tuple[Any, float]:
-    """Return rows of unit length, or shorter so that none has more rounding, and a tolerance.
+class FixedPoles(NamedTuple):
+    """The poles of what inputs do not reach, or outputs do not show.
 
-    None hides behind another, and none that is rounding itself hides the others.
+    Attributes
+    ----------
+    poles : ndarray (k,)
+        [1/s], or of the sampled model.
+    decays : bool
+        Whether all of them do, beyond rounding.
+    margin, settling : Margin
+        Of what is reached or shown, and of whether the slowest of these poles decays.
     """
-    least = values.shape[1] * EPS
-    sizes, spread = np.linalg.norm(values, axis=1), np.linalg.norm(noise, axis=1)
+
+    poles: Any = np.zeros(0)
+    decays: bool = True
+    margin: Margin = Margin()
+    settling: Margin = Margin()
+
+    def seen(self, change: Array) -> FixedPoles:
+        """Return it with the directions of its margins in other coordinates."""
+        margin, settling = self.margin.seen(change), self.settling.seen(change)
+        return self._replace(margin=margin, settling=settling)
+
+
+class Noisy(NamedTuple):
+    """A matrix and what rounding may have done to each of its entries."""
+
+    values: Any
+    noise: Array
+
+    @classmethod
+    def exact(cls, values: Array) -> Noisy:
+        """Return a matrix without rounding."""
+        return cls(values, np.zeros_like(values))
+
+    def columns(self, part: slice) -> Noisy:
+        """Return some of its columns."""
+        return Noisy(self.values[:, part], self.noise[:, part])
+
+    def __matmul__(self, right: Array) -> Noisy:
+        return Noisy(self.values @ right, self.noise @ np.abs(right))
+
+    def after(self, left: Array) -> Noisy:
+        """Return ``left @ self``."""
+        return Noisy(left @ self.values, np.abs(left) @ self.noise)
+
+    @property
+    def T(self) -> Noisy:
+        """The transpose."""
+        return Noisy(self.values.T, self.noise.T)
+
+
+def stacked(rows: list[list[Noisy]]) -> Noisy:
+    """Join matrices as `numpy.block` does."""
+    return Noisy(
+        np.block([[m.values for m in row] for row in rows]),
+        np.block([[m.noise for m in row] for row in rows]),
+    )
+
+
+def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
+    """Put to zero the entries that are rounding, also beside the largest, in units of energy.
+
+    What is in doubt stays, with that much noise.
+    """
+    units = rows[:, None] * columns
+    size = np.abs(forces.values)
+    least = np.maximum(forces.noise, _FLOOR * (size / units).max(initial=0.0) * units)
+    real = size > _ROUNDING * least
+    noise = np.where(size < CLEAR * least, np.maximum(forces.noise, least / SAFETY), forces.noise)
+    return Noisy(np.where(real, forces.values, 0.0), np.where(real, noise, 0.0))
+
+
+def right_vectors(matrix: Noisy, states: int = 1) -> tuple[Array, Any, int, Margin]:
+    """Return n singular values, right vectors (n, n), the rank, and its margin.
+
+    Rows are brought to unit length, or shorter so that none has more rounding: none hides behind
+    another, and none that is rounding itself hides the others.
+    """
+    n = matrix.values.shape[1]
+    sizes, spread = (np.linalg.norm(entries, axis=1) for entries in matrix)
     real = sizes > 0.0
-    sizes, spread = sizes[real], spread[real]
-    weights = 1.0 / np.maximum(sizes, spread / least)
-    tolerance = SAFETY * max(least, float(np.linalg.norm(spread * weights)))
-    return values[real] * weights[:, None], tolerance
-
-
-def right_vectors(values: Any, noise: Array, count: int = 1) -> tuple[Array, Any, int, Margin]:
-    """Return n singular values of `even_rows`, right vectors (n, n), the rank, and its margin."""
-    n = values.shape[1]
-    rows, tolerance = even_rows(values, noise)
-    if not n or not len(rows):
+    if not n or not real.any():
         return np.zeros(n), np.eye(n), 0, Margin()
+    least = n * EPS
+    weights = 1.0 / np.maximum(sizes[real], spread[real] / least)
+    tolerance = SAFETY * max(least, float(np.linalg.norm(spread[real] * weights)))
+    rows = matrix.values[real] * weights[:, None]
     rows = rows if np.imag(rows).any() else np.real(rows)
     _, singular, right = np.linalg.svd(rows, full_matrices=len(rows) < n)
     singular = np.pad(singular, (0, n - len(singular)))
     rank, vectors = int((singular > tolerance).sum()), right.conj().T
-    return singular, vectors, rank, judged(singular / tolerance, vectors, rank, count)
+    return singular, vectors, rank, judged(singular / tolerance, vectors, rank, states)
 
 
-def judged(ratios: Array, vectors: Any, rank: int, count: int = 1) -> Margin:
+def judged(ratios: Array, vectors: Any, rank: int, states: int = 1) -> Margin:
     """Return the margin of a rank, of singular values as ratios to the tolerance."""
     margin = Margin()
     for index in range(max(rank - 1, 0), min(rank + 1, len(ratios))):
-        margin &= decided(float(ratios[index]), vectors[:, index], count)
+        margin &= decided(float(ratios[index]), vectors[:, index], states)
     return margin
 
 
-def null_space(matrix: tuple[Array, Array]) -> tuple[Array, Margin]:
-    """Return the null space (n, k) of a matrix, orthonormal, with bounds of its entries' rounding.
-
-    Rows are scaled by `even_rows`.
-    """
-    _, vectors, rank, margin = right_vectors(*matrix)
+def null_space(matrix: Noisy, states: int = 1) -> tuple[Array, Margin]:
+    """Return the null space (n, k) of a matrix, orthonormal; see `right_vectors`."""
+    _, vectors, rank, margin = right_vectors(matrix, states)
     return vectors[:, rank:], margin
 
 
-def split(matrix: Array, tolerance: float) -> tuple[Array, Array, Margin]:
-    """Split the space of a matrix's columns by singular values.
-
-    Returns
-    -------
-    image, rest : ndarray (m, r), (m, m - r)
-        Orthonormal: what the columns span, and what is orthogonal to it.
-    margin : Margin
-    """
-    rows = len(matrix)
+def image(matrix: Array, tolerance: float) -> tuple[Array, Array]:
+    """Return orthonormal bases of what columns (m, k) span (m, r), and of its complement."""
     if not matrix.size:
-        return np.zeros((rows, 0)), np.eye(rows), Margin()
+        return np.zeros((len(matrix), 0)), np.eye(len(matrix))
     U, values, _ = np.linalg.svd(matrix)
     rank = int((values > tolerance).sum())
-    kept = float(values[rank - 1]) if rank else np.inf
-    dropped = float(values[rank]) if rank < len(values) else 0.0
-    return U[:, :rank], U[:, rank:], Margin(kept / float(tolerance), dropped / float(tolerance))
+    return U[:, :rank], U[:, rank:]
 
 
 def unit_columns(matrix: Array) -> Array:
@@ -186,7 +251,7 @@ def echelon(columns: Array, weights: Array, preferred: Array | None = None) -> t
     if not size:
         return columns.copy(), np.zeros(0, dtype=np.intp)
     weighted = np.linalg.qr(columns * weights[:, None])[0]
-    # A preferred row is a thousand times as good as another: less than what a bad pivot costs.
+    # A preferred row counts a thousand times; more would cost digits by bad pivots.
     graded = weighted if preferred is None else weighted * np.where(preferred, 1e3, 1.0)[:, None]
     pivots = np.sort(qr(graded.T, mode="r", pivoting=True)[1][:size])
     basis = np.linalg.solve(columns[pivots].T, columns.T).T
@@ -194,86 +259,3 @@ def echelon(columns: Array, weights: Array, preferred: Array | None = None) -> t
     basis[relative < _CLEAN] = 0.0
     basis[pivots] = np.eye(size)
     return basis, pivots
-
-
-def reached_by(A: Array, B: Array, tolerance: float) -> tuple[Array, Array, Array, Margin]:
-    """Split the state space of (A, B), eigenvalue by eigenvalue (Popov, Belevitch, Hautus).
-
-    The left vectors with ``w [A - s E, B] = 0`` are found at every eigenvalue s as singular
-    vectors, and split off by an orthogonal transformation, until there are none: so that the
-    whole of a defective eigenvalue goes. A staircase would carry the rounding of a weak step into
-    the next.
-
-    Parameters
-    ----------
-    A : ndarray (m, m)
-        Of size about 1.
-    B : ndarray (m, k)
-        With columns of unit length.
-    tolerance : float
-        Size of a perturbation of (A, B) that is taken for rounding.
-
-    Returns
-    -------
-    reached : ndarray (m, d)
-        Orthonormal basis of the controllable subspace.
-    rest : ndarray (m, m - d)
-        Orthonormal; ``rest.T @ x`` is what no input acts on.
-    F : ndarray (m - d, m - d)
-        Its dynamics.
-    margin : Margin
-    """
-    inside, margin = np.eye(len(A)), Margin()
-    split_off: Array = np.zeros((len(A), 0))
-    while inside.shape[1]:
-        lost, found = _left_vectors(inside.T @ A @ inside, inside.T @ B, tolerance)
-        margin &= found.seen(inside)
-        if not lost.shape[1]:
-            break
-        split_off = np.hstack((split_off, inside @ lost))
-        inside = inside @ split(lost, 0.5)[1]
-    return inside, split_off, split_off.T @ A @ split_off, margin
-
-
-def _left_vectors(A: Array, B: Array, tolerance: float) -> tuple[Array, Margin]:
-    """Return an orthonormal real basis (m, k) of the left eigenvectors that B does not see."""
-    from scipy.linalg import eig
-
-    poles, left = eig(A, left=True, right=False)
-    unseen = np.linalg.norm(left.conj().T @ B, axis=1) < _SUSPICIOUS
-    distances = np.abs(poles[:, None] - poles) + np.eye(len(A))
-    near = unseen | (distances.min(axis=1) < _SUSPICIOUS)
-    # A defective zero splits into poles of the root of rounding: it is tested itself, and first.
-    candidates = [0j, *poles[(poles.imag >= 0.0) & near]]
-    found: Array = np.zeros((len(A), 0))
-    margin, known = Margin(), np.zeros(0, dtype=complex)
-    for pole in candidates:
-        vectors, at, decision = _at_pole(A, B, complex(pole), tolerance)
-        if (np.abs(known - at) < _SAME_POLE).any():
-            continue
-        margin &= decision
-        if not vectors.shape[1]:
-            continue
-        known = np.append(known, at)
-        parts = np.hstack((vectors.real, vectors.imag)) if abs(at.imag) > _SAME_POLE else vectors
-        parts = np.real(parts)
-        # Of poles that were told apart only by rounding the vectors are the same.
-        new = parts - found @ (found.T @ parts)
-        found = np.hstack((found, split(new, _SUSPICIOUS)[0]))
-    return found, margin
-
-
-def _at_pole(A: Array, B: Array, pole: complex, tolerance: float) -> tuple[Array, complex, Margin]:
-    """Return the left vectors (m, k) at a pole, the pole itself, and the margin."""
-    size = len(A)
-    for _ in range(_REFINEMENTS):
-        shift = pole.real if abs(pole.imag) < _SAME_POLE else pole
-        U, values, _ = np.linalg.svd(np.hstack((A - shift * np.eye(size), B)))
-        last = U[:, -1]
-        refined = complex(last.conj() @ A @ last)
-        if not pole or abs(refined - pole) < EPS or values[-1] > _SUSPICIOUS:
-            break
-        pole = refined
-    rank = int((values > tolerance).sum())
-    count = 2 if abs(shift.imag) > _SAME_POLE else 1
-    return U[:, rank:], complex(shift), judged(values / tolerance, U, rank, count)

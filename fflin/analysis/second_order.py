@@ -1,4 +1,4 @@
-"""M a + D v + K s = S u: a model at rest as matrices of forces, and what a reading misses."""
+"""M a + D v + K s = S u: a model at rest by its forces, and the motions that stay hidden."""
 
 from __future__ import annotations
 
@@ -8,66 +8,32 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.analysis.ranks import CLEAR, EPS, SAFETY, Margin, decided, null_space, right_vectors
+from fflin.analysis.ranks import (
+    EPS,
+    Decision,
+    FixedPoles,
+    Margin,
+    Noisy,
+    decided,
+    null_space,
+    right_vectors,
+    stacked,
+)
 from fflin.base.validation import Array
 
-# A force this small beside the largest of its kind, per unit of energy, may be rounding; less
-# than this part of it is.
-_FLOOR, _ROUNDING = 1e3 * EPS, 0.3
-
-# Relative asymmetry of springs or dampers that is more than rounding.
+# Springs or dampers with a larger relative asymmetry are not symmetric.
 _SYMMETRIC = 1e-8
 
-# Poles whose distance is less than this part of them are judged as one; poles that move this
-# much faster than the matrices are defective, and no eigenvectors tell them apart.
+# Poles at a relative distance below _SAME_POLE are one; below _DEFECTIVE they are taken for
+# defective, of which eigenvectors say too little.
 _SAME_POLE, _DEFECTIVE = 1e-9, 1e-5
 
-# Logarithms of sampled poles that are this near may hide what the continuous model shows.
+# Poles that sampling brings this near to each other may hide what the continuous model shows.
 _ALIASED = 1e-6
 
-# Above it a singular value is no approximate zero; a shape moves a pole that it belongs to by
-# less than this part.
+# A larger singular value is not zero even roughly. A pole is refined in a few steps, each by
+# less than this part of it.
 _SUSPICIOUS, _NEAR, _REFINEMENTS = 1e-3, 0.1, 8
-
-
-class Noisy(NamedTuple):
-    """A matrix and what rounding may have done to each of its entries."""
-
-    values: Array
-    noise: Array
-
-    def __matmul__(self, right: Array) -> Noisy:
-        return Noisy(self.values @ right, self.noise @ np.abs(right))
-
-    def after(self, left: Array) -> Noisy:
-        """Return ``left @ self``."""
-        return Noisy(left @ self.values, np.abs(left) @ self.noise)
-
-    @property
-    def T(self) -> Noisy:
-        """The transpose."""
-        return Noisy(self.values.T, self.noise.T)
-
-
-def stacked(rows: list[list[Noisy]]) -> Noisy:
-    """Join matrices as `numpy.block` does."""
-    return Noisy(
-        np.block([[m.values for m in row] for row in rows]),
-        np.block([[m.noise for m in row] for row in rows]),
-    )
-
-
-def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
-    """Put to zero the entries that are rounding, also beside the largest, in units of energy.
-
-    What may be rounding and may be not stays, with that much of noise.
-    """
-    units = rows[:, None] * columns
-    size = np.abs(forces.values)
-    least = np.maximum(forces.noise, _FLOOR * (size / units).max(initial=0.0) * units)
-    real = size > _ROUNDING * least
-    noise = np.where(size < CLEAR * least, np.maximum(forces.noise, least / SAFETY), forces.noise)
-    return Noisy(np.where(real, forces.values, 0.0), np.where(real, noise, 0.0))
 
 
 @dataclass(frozen=True)
@@ -97,6 +63,11 @@ class SecondOrder:
         K, D = ((forces @ R).after(R.T) for forces in (self.K, self.D))
         return SecondOrder(M, K, D, self.S.after(R.T))
 
+    @property
+    def acting(self) -> bool:
+        """Whether there are springs or dampers."""
+        return bool(self.K.values.any() or self.D.values.any())
+
     @cached_property
     def symmetric(self) -> bool:
         """Whether springs are symmetric, and dampers are and all take energy, or all give it."""
@@ -110,25 +81,24 @@ class SecondOrder:
 
     @cached_property
     def poles(self) -> tuple[Any, Margin]:
-        """The poles that are not zero, one of each pair, as far as eigenvalues tell them."""
+        """The poles that are not zero, one of each pair, as eigenvalues approximate them."""
         rigid, margin = self._null(self.K, self.D)
         still, other = self._null(self.K)
-        R = null_space(Noisy(rigid.T @ self.M / self.size, np.zeros(rigid.T.shape)))[0]
+        R = null_space(Noisy.exact(rigid.T @ self.M / self.size))[0]
         part = self.restricted(R / self.size[:, None])
         r = len(part.M)
         if not r:
             return np.zeros(0, dtype=complex), margin & other
         L = np.linalg.inv(np.linalg.cholesky(part.M))
         K, D = L @ part.K.values @ L.T, L @ part.D.values @ L.T
-        fastest = max(np.linalg.norm(K, 2) ** 0.5, np.linalg.norm(D, 2))
-        A = np.block([[np.zeros((r, r)), np.eye(r)], [-K / fastest**2, -D / fastest]])
-        if not D.any():
-            squares = np.linalg.eigvalsh((K + K.T) / 2.0).astype(complex)
-            found = np.concatenate((np.sqrt(-squares), -np.sqrt(-squares)))
-            zeros = 2 * (still.shape[1] - rigid.shape[1])
-        else:
+        zeros = still.shape[1] - rigid.shape[1]
+        if D.any():
+            fastest = max(np.linalg.norm(K, 2) ** 0.5, np.linalg.norm(D, 2))
+            A = np.block([[np.zeros((r, r)), np.eye(r)], [-K / fastest**2, -D / fastest]])
             found = np.linalg.eigvals(A) * fastest
-            zeros = still.shape[1] - rigid.shape[1]
+        else:
+            roots = np.sqrt(-np.linalg.eigvalsh((K + K.T) / 2.0).astype(complex))
+            found, zeros = np.concatenate((roots, -roots)), 2 * zeros
         found = found[np.argsort(np.abs(found))][zeros:]
         return found[found.imag >= 0.0], margin & other
 
@@ -145,27 +115,17 @@ class Hidden(NamedTuple):
     ----------
     motions : ndarray (2 nv, k)
         Basis of the unobservable subspace, (s, ds/dt).
-    poles : ndarray (k,)
     shapes : tuple of (complex, ndarray (nv, m))
-        Of the poles that are not zero, one of each pair.
-    decays : bool
-        Whether all of them do, beyond rounding.
-    margin, settling : Margin
-        Of what is missed, and of whether the slowest of it decays.
-    simple : bool
-        Whether the eigenvectors tell them apart; what is defective must be judged otherwise.
+        Of the continuous poles that are not zero, one of each pair.
+    fixed : FixedPoles
     """
 
     motions: Array
-    poles: Any
     shapes: tuple[tuple[complex, Any], ...]
-    decays: bool
-    margin: Margin
-    settling: Margin
-    simple: bool
+    fixed: FixedPoles
 
 
-def hidden(system: SecondOrder, position: Noisy, velocity: Noisy) -> Hidden:
+def hidden(system: SecondOrder, position: Noisy, velocity: Noisy, dt: float) -> Hidden | None:
     r"""Find the motions that ``position @ s + velocity @ ds/dt`` does not show.
 
     At a pole p they are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]`. Every row is
@@ -176,10 +136,18 @@ def hidden(system: SecondOrder, position: Noisy, velocity: Noisy) -> Hidden:
 
     What hides from the inputs are the left vectors, which by symmetry are found with
     :math:`C_s = S^T, C_v = 0`.
+
+    Returns
+    -------
+    Hidden or None
+        None where K or D are of another kind, where sampling every `dt` takes two poles for one,
+        and where a pole is defective, so that eigenvectors do not tell what belongs to it.
     """
+    if not system.symmetric or (dt and _aliased(system.poles[0], dt)):
+        return None
     still, margin = _still(system, position, velocity)
-    vectors, poles = [still], [0j] * still.shape[1]
-    settling, simple = Margin(), True
+    motions, poles = [still], [0j] * still.shape[1]
+    slowest = Decision(np.inf)
     starts, decided_zero = system.poles
     margin &= decided_zero
     missed: list[tuple[complex, Any]] = []
@@ -190,38 +158,31 @@ def hidden(system: SecondOrder, position: Noisy, velocity: Noisy) -> Hidden:
         margin &= judged
         if not shapes.shape[1]:
             continue
+        if not _simple(system, shapes, pole):
+            return None
         missed.append((pole, shapes))
-        simple = simple and _simple(system, shapes, pole)
         motion = np.vstack((shapes, pole * shapes))
-        if pole.imag:
-            motion = np.hstack((motion.real, motion.imag))
-            poles += [pole] * shapes.shape[1] + [pole.conjugate()] * shapes.shape[1]
-        else:
-            poles += [pole] * shapes.shape[1]
-        vectors.append(np.real(motion))
-        slow = -pole.real / abs(pole) / (1e2 * EPS * len(system.M))
-        settling = min(settling, decided(max(slow, 0.0), shapes[:, 0]), key=_least)
+        pair = [pole, pole.conjugate()] if pole.imag else [pole]
+        motions += [motion.real, motion.imag][: len(pair)]
+        poles += [each for each in pair for _ in shapes.T]
+        slow = max(-pole.real / abs(pole) / (1e2 * EPS * len(system.M)), 0.0)
+        slowest = min(slowest, Decision(slow, shapes[:, 0]), key=lambda decision: decision.ratio)
     known = [pole for pole, _ in missed]
     near = [abs(a - b) < _DEFECTIVE * abs(a) for i, a in enumerate(known) for b in known[:i]]
     near += [0.0 < pole.imag < _DEFECTIVE * abs(pole) for pole in known]
-    return Hidden(
-        motions=np.hstack(vectors),
-        poles=np.array(poles),
-        shapes=tuple(missed),
-        decays=not still.shape[1] and _least(settling) > 1.0,
+    if any(near):
+        return None
+    fixed = FixedPoles(
+        poles=np.exp(np.array(poles) * dt) if dt else np.array(poles),
+        decays=not still.shape[1] and slowest.ratio > 1.0,
         margin=margin,
-        settling=Margin() if still.shape[1] else settling,
-        simple=simple and not any(near),
+        settling=Margin() if still.shape[1] else decided(slowest.ratio, slowest.at),
     )
-
-
-def _least(margin: Margin) -> float:
-    return margin.dropped if margin.dropped_at is not None else margin.kept
+    return Hidden(np.hstack(motions), tuple(missed), fixed)
 
 
 def _still(system: SecondOrder, position: Noisy, velocity: Noisy) -> tuple[Array, Margin]:
-    none = Noisy(np.zeros_like(system.M), np.zeros_like(system.M))
-    empty = Noisy(np.zeros_like(position.values), np.zeros_like(position.values))
+    none, empty = (Noisy.exact(np.zeros_like(m)) for m in (system.M, position.values))
     rows = [[system.K, none], [none, system.K], [none, system.D], [empty, position]]
     fast, slow = np.abs(velocity.values).max(initial=0.0), np.abs(position.values).max(initial=0.0)
     unit = slow / fast if fast and slow else 1.0
@@ -247,8 +208,8 @@ def _at_pole(
         noise = (position.noise + size * velocity.noise) / weight
         pencil = (s * s * M + s * D + K) / units
         seen = (position.values + s * velocity.values) / weight
-        stack, noise = np.vstack((pencil, seen)), np.vstack((spread, noise))
-        values, vectors, rank, margin = right_vectors(stack, noise, 2 if pole.imag else 1)
+        stack = Noisy(np.vstack((pencil, seen)), np.vstack((spread, noise)))
+        values, vectors, rank, margin = right_vectors(stack, 2 if pole.imag else 1)
         shapes = vectors / weight[:, None]
         refined = _root(system, shapes[:, -1], pole)
         moved = abs(refined - pole) / size
@@ -262,7 +223,7 @@ def _root(system: SecondOrder, shape: Any, near: complex) -> complex:
     """Return the root of the scalar equation of a shape that is nearest to a pole."""
     left = shape
     if abs(shape @ system.M @ shape) < 0.1 * abs(shape.conj() @ system.M @ shape):
-        left = shape.conj()  # of equal poles a shape may be orthogonal to itself
+        left = shape.conj()  # where poles are equal, shape^T M shape may vanish
     a, b, c = (left @ X @ shape for X in (system.M, system.D.values, system.K.values))
     root = np.sqrt(complex(b * b - 4.0 * a * c))
     q = -(b + (root if (np.conj(b) * root).real >= 0.0 else -root)) / 2.0
@@ -276,7 +237,7 @@ def _root(system: SecondOrder, shape: Any, near: complex) -> complex:
 
 
 def _simple(system: SecondOrder, shapes: Any, pole: complex) -> bool:
-    """Whether as many eigenvectors belong to a pole as it has places, beyond rounding."""
+    """Whether a pole has as many eigenvectors as its multiplicity, beyond rounding."""
     change = shapes.T @ (2.0 * pole * system.M + system.D.values) @ shapes
     size = np.abs(shapes).T @ (2.0 * abs(pole) * np.abs(system.M) + np.abs(system.D.values))
     least = np.linalg.svd(change, compute_uv=False)[-1]
@@ -284,8 +245,8 @@ def _simple(system: SecondOrder, shapes: Any, pole: complex) -> bool:
     return simple
 
 
-def aliased(poles: Any, dt: float) -> bool:
-    """Whether sampling takes two poles for one, or a vibration for what stands."""
+def _aliased(poles: Any, dt: float) -> bool:
+    """Whether sampling maps two poles to one, or a vibration to a pole at rest."""
     s = np.concatenate((poles, np.conj(poles), [0.0])) * dt
     apart = s[:, None] - s
     turns = np.round(apart.imag / (2.0 * np.pi))

@@ -8,7 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fflin.analysis.ranks import Margin, decided
+from fflin.analysis.controllability import controllability
+from fflin.analysis.mechanics import conserved
+from fflin.analysis.names import grouped, with_rates
+from fflin.analysis.observability import observability
+from fflin.analysis.ranks import Margin, judged
 from fflin.base.errors import (
     DetectabilityError,
     FflinWarning,
@@ -21,17 +25,13 @@ from fflin.base.validation import Array
 if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
 
-# Of the smallest singular value of an equilibrated Popov-Belevitch-Hautus matrix: what computed
-# eigenvalues are off by where they are repeated.
+# A relative singular value of the equilibrated Popov-Belevitch-Hautus matrix below this counts as
+# zero: repeated eigenvalues are computed with such errors.
 _RANK = 1e-7
 
 
 def require_stabilizable(lin: LinearModel) -> None:
     """Raise `StabilizabilityError` that names what no input can hold."""
-    from fflin.analysis.controllability import controllability
-    from fflin.analysis.mechanics import conserved
-    from fflin.analysis.names import grouped
-
     found = controllability(lin)
     if not found.stabilizable:
         weights = conserved(lin).weights
@@ -43,24 +43,8 @@ def require_stabilizable(lin: LinearModel) -> None:
     _warn_of_doubts(found.notes)
 
 
-def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
-    """Raise `InputError` that names the modes on the boundary of stability that Q leaves out."""
-    hidden, margin = hidden_modes(A.T, Q, bool(lin.dt))
-    doubts = _boundary_doubts(lin, margin, "weighed by Q")
-    if hidden:
-        words = _dominant(np.vstack(hidden), lin.state_names)
-        raise InputError(
-            f"Q does not weigh {words}, which do not settle by themselves; weigh them"
-            f"{_doubts(doubts)}"
-        )
-    _warn_of_doubts(doubts)
-
-
 def require_detectable(lin: LinearModel) -> None:
     """Raise `DetectabilityError` that names what no output shows and what does not settle."""
-    from fflin.analysis.names import with_rates
-    from fflin.analysis.observability import observability
-
     found = observability(lin)
     if not found.detectable:
         error = DetectabilityError(
@@ -82,55 +66,63 @@ def _warn_of_doubts(notes: tuple[str, ...]) -> None:
             warnings.warn(note, FflinWarning, stacklevel=4)
 
 
+def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
+    """Raise `InputError` that names the modes on the boundary of stability that Q leaves out."""
+    missed = "Q does not weigh {}, which do not settle by themselves; weigh them"
+    _warn_of_doubts(_checked_reach(lin, A.T, _root(Q), "weighed by Q", missed))
+
+
 def require_disturbed(lin: LinearModel, W: Array) -> None:
     """Raise `InputError` that names the modes on the boundary that no disturbance reaches."""
-    hidden, margin = hidden_modes(lin.A, W, bool(lin.dt))
-    doubts = _boundary_doubts(lin, margin, "disturbed by W")
-    if hidden:
-        words = _dominant(np.vstack(hidden), lin.state_names)
-        raise InputError(
-            f"W does not disturb {words}, which do not settle by themselves: a steady filter "
-            f"would not correct them; give them an intensity{_doubts(doubts)}"
-        )
-    _warn_of_doubts(doubts)
+    missed = (
+        "W does not disturb {}, which do not settle by themselves: a steady filter would not "
+        "correct them; give them an intensity"
+    )
+    _warn_of_doubts(_checked_reach(lin, lin.A, _root(W), "disturbed by W", missed))
 
 
-def _boundary_doubts(lin: LinearModel, margin: Margin, what: str) -> tuple[str, ...]:
-    return tuple(
+def _root(W: Array) -> Array:
+    """Return a factor L (m, m) with W = L L^T, of a semidefinite matrix of unlike units.
+
+    It has the square root of W's condition, and so reaches what W reaches with less doubt.
+    """
+    size = np.sqrt(W.diagonal())
+    size = np.where(size > 0.0, size, 1.0)
+    values, vectors = np.linalg.eigh(W / np.outer(size, size))
+    rounding = len(W) * np.finfo(float).eps * values[-1:].max(initial=0.0)
+    root: Array = size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
+    return root
+
+
+def _checked_reach(
+    lin: LinearModel, A: Array, B: Array, what: str, complaint: str
+) -> tuple[str, ...]:
+    """Return what is undecided; raise `InputError` where B misses a mode on the boundary."""
+    discrete = bool(lin.dt)
+    poles = np.linalg.eigvals(A)
+    size = max(float(np.abs(poles - discrete).max()), 1e-300)
+    beyond = np.abs(poles) - 1.0 if discrete else poles.real
+    # Rounding moves a Jordan block of four by its fourth root.
+    candidates = [complex(discrete)]
+    for pole in poles[(np.abs(beyond) <= 1e-3 * size) & (poles.imag >= 0.0)]:
+        if all(abs(pole - other) > 1e-3 * size for other in candidates):
+            candidates.append(complex(pole))
+    missed, margin = [], Margin()
+    for pole in candidates:
+        shifted = A - (pole if pole.imag else pole.real) * np.eye(len(A))
+        vectors, decision = _left_null(np.column_stack((shifted, B)))
+        missed += list(vectors)
+        margin &= decision
+    doubts = tuple(
         f"undecided: {_dominant(at[None], lin.state_names)} "
         f"{'counts' if change < 0 else 'does not count'} as {what}, by {ratio:.2g} times its "
         "rounding; on another machine it may be decided otherwise"
         for ratio, at, change in margin.doubts
     )
-
-
-def hidden_modes(A: Array, B: Array, discrete: bool) -> tuple[list[Array], Margin]:
-    """Return left eigenvectors (k, nx) that B misses, of eigenvalues that neither decay nor grow.
-
-    Beside them the margin of these decisions.
-
-    Parameters
-    ----------
-    A : ndarray (nx, nx)
-    B : ndarray (nx, nu)
-    discrete : bool
-    """
-    poles = np.linalg.eigvals(A)
-    size = max(float(np.abs(poles - discrete).max()), 1e-300)
-    beyond = np.abs(poles) - 1.0 if discrete else poles.real
-    # A block of four moves by the fourth root of rounding.
-    still, near = complex(discrete), np.abs(beyond) <= 1e-3 * size
-    candidates = [still]
-    for pole in poles[near & (poles.imag >= 0.0)]:
-        if all(abs(pole - other) > 1e-3 * size for other in candidates):
-            candidates.append(complex(pole))
-    found, margin = [], Margin()
-    for pole in candidates:
-        shifted = A - (pole if pole.imag else pole.real) * np.eye(len(A))
-        vectors, judged = _left_null(np.column_stack((shifted, B)))
-        found.append(vectors)
-        margin &= judged
-    return [vectors for vectors in found if len(vectors)], margin
+    if missed:
+        words = _dominant(np.array(missed), lin.state_names)
+        raise InputError(f"{complaint.format(words)}{_doubts(doubts)}")
+    return doubts
 
 
 def _left_null(matrix: Array) -> tuple[Array, Margin]:
@@ -146,10 +138,9 @@ def _left_null(matrix: Array) -> tuple[Array, Margin]:
     left, values, _ = np.linalg.svd(scaled)
     vectors: Array = left.conj().T * rows
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    margin = Margin()
-    for value, vector in zip(values[-2:] / (_RANK * values[0]), vectors[-2:], strict=True):
-        margin &= decided(float(value), vector)
-    return vectors[values <= _RANK * values[0]], margin
+    ratios = values / (_RANK * values[0])
+    rank = int((ratios > 1.0).sum())
+    return vectors[rank:], judged(ratios, vectors.T, rank)
 
 
 def _forces_missing(lin: LinearModel, weights: Array) -> str | None:

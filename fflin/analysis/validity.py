@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, as_completed
@@ -12,27 +11,23 @@ from typing import Any
 
 import numpy as np
 
-from fflin.analysis.closed_loop import SETTLED, Loop
+from fflin.analysis.closed_loop import Loop, checked_loop
+from fflin.analysis.displacement import checked_displacement, scaled, shown
 from fflin.base.errors import FflinError, InputError
-from fflin.base.tables import width
-from fflin.base.validation import Array, as_double, number, whole
-from fflin.dynamics.actuation import Actuation
+from fflin.base.tables import folded
+from fflin.base.validation import Array, number, whole
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
-# Displacements, as shares of the largest, at which the prediction is measured, and directions.
+# The prediction is measured at these shares of the largest displacement, in so many directions.
 _LEVELS = 2.0 ** np.arange(-6.0, 1.0)
 _DIRECTIONS = 4
 
-# Time constants of the slowest pole over which the prediction is measured, and of a run.
-_FORESIGHT, _PATIENCE = 3.0, 3.0
-_STEPS = 60
+# Random runs at most.
+_MOST = 1_000_000
 
-# Random runs at most, and displacement [m], [rad].
-_MOST, _FARTHEST = 1_000_000, 1e6
-
-# Relative error of the integration, and prediction errors too small to be told from it.
-_PRECISION, _ROUNDING = 1e-9, 1e-7
+# Smaller prediction errors are those of the integration.
+_ROUNDING = 1e-7
 
 # Relative prediction error up to which the linear model is called trusted.
 TRUSTED = 0.1
@@ -116,7 +111,7 @@ class Validity:
             f"between {100.0 * low:.1f} and {100.0 * high:.1f} % do ({sure} confidence)"
             + (f"; {failures}" if failures else ""),
         ]
-        return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
+        return folded(lines)
 
 
 _ENDS = {
@@ -157,7 +152,7 @@ def validity(
         K, which makes the linear loop stable.
     attitude, position, joint : float
         Largest displacement of the base [deg], [m], and of the joint displaced most [rad|m]. What
-        is not among the states of a reduced model is not displaced, and told as 0.
+        is not among the states of a reduced model is not displaced, and given as 0.
     samples : int
         Number of random runs.
     seed : int
@@ -186,31 +181,13 @@ def validity(
     C. J. Clopper and E. S. Pearson, The use of confidence or fiducial limits illustrated in the
     case of the binomial, Biometrika 26(4), 1934.
     """
-    loop = _checked(robot, lin, gain)
-    largest = {"attitude": attitude, "position": position, "joint": joint}
-    largest = {key: number(key, value) for key, value in largest.items()}
+    loop = checked_loop(robot, lin, gain)
+    largest = checked_displacement(lin, attitude, position, joint)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = number("confidence", confidence)
     if not 0.0 < confidence < 1.0:
         raise InputError(f"confidence is {confidence:g}, expected a share between 0 and 1")
-    if not 0.0 <= largest["attitude"] < 175.0 or min(largest.values()) < 0.0:
-        raise InputError(
-            f"the displacements are {shown(largest)}; expected none negative, and an attitude "
-            "below 175 deg, where the chart ends"
-        )
-    if max(largest.values()) > _FARTHEST:
-        raise InputError(
-            f"the displacements are {shown(largest)}; expected none beyond {_FARTHEST:g}, where no "
-            "loop settles"
-        )
-    there = {name.partition(".")[0] for name in lin.state_names}
-    groups = {"attitude": "q_b", "position": "r_b", "joint": "q_m"}
-    largest = {key: largest[key] if groups[key] in there else 0.0 for key in groups}
-    if not any(largest.values()):
-        raise InputError(
-            "the model has none of the coordinates that are displaced; give others than 0"
-        )
-    # Of each run its own stream, so that it does not matter who does which.
+    # Each run has its own random stream, so that results do not depend on the order.
     streams = np.random.SeedSequence(seed).spawn(samples + _DIRECTIONS)
     levels = (np.arange(samples) + 0.5) / samples
     if executor is not None and not isinstance(executor, Executor):
@@ -238,10 +215,10 @@ def validity(
         levels=_LEVELS,
         prediction_error=worst,
         slope=_slope(worst),
-        trusted=_scaled(largest, _crossing(worst)),
+        trusted=scaled(largest, _crossing(worst)),
         sampled=levels,
         outcomes=outcomes,
-        holds=_scaled(largest, reach),
+        holds=scaled(largest, reach),
         inside=inside,
         inside_rate=(1.0 - confidence) ** (1.0 / inside) if inside else 0.0,
         rate=_clopper_pearson(settled, samples, confidence),
@@ -267,61 +244,19 @@ def _each(runs: list[Callable[[], Any]], executor: Executor | None) -> Iterator[
             future.cancel()
 
 
-def _checked(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
-    if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
-        raise InputError("expected a fflin.Robot, its fflin.LinearModel and a gain")
-    K = as_double("gain", getattr(gain, "K", gain))
-    if K.shape != lin.B.T.shape or not np.isfinite(K).all():
-        raise InputError(f"K has shape {K.shape}, expected {lin.B.T.shape} of finite numbers")
-    loop = Loop(robot, lin, K)
-    if Actuation(loop.state).names != lin.input_names or not len(loop.watched):
-        raise InputError(
-            f"the model's inputs are not those of '{robot.name}'; give the robot with its inputs"
-        )
-    if lin.moving or not lin.is_equilibrium() or lin.v.any():
-        raise InputError("the point is no fixed point at rest; its loop cannot settle there")
-    if not loop.decay > 0.0:
-        raise InputError(
-            f"the linear loop is not stable: its slowest pole grows with {-loop.decay:.3g} 1/s; "
-            "design the gain with fflin.lqr"
-        )
-    return loop
-
-
-def _times(loop: Loop, horizon: float) -> Array:
-    """Return the times of a run: its samples, or even steps."""
-    if loop.lin.dt:
-        return loop.lin.dt * np.arange(1.0 + np.ceil(horizon / loop.lin.dt))
-    return np.linspace(0.0, horizon, _STEPS + 1)
-
-
 def _foreseen(loop: Loop, largest: dict[str, float], stream: np.random.SeedSequence) -> Array:
     """Return the relative prediction error at each level along one direction."""
-    times = _times(loop, _FORESIGHT / loop.decay)
-    errors = []
-    for level in _LEVELS:
-        x = loop.displaced(np.random.default_rng(stream), **_scaled(largest, float(level)))
-        _, motion = loop.run(x, times, _PRECISION)
-        foreseen = loop.linear(motion[0], times)[: len(motion)]
-        worst = max(loop.size(one - two) for one, two in zip(motion, foreseen, strict=True))
-        complete = len(motion) == len(times) or loop.size(motion[-1]) <= SETTLED * loop.size(
-            motion[0]
-        )
-        errors.append(worst / loop.size(motion[0]) if complete else np.nan)
-    return np.array(errors)
+    starts = (
+        loop.displaced(np.random.default_rng(stream), **scaled(largest, float(level)))
+        for level in _LEVELS
+    )
+    return np.array([loop.prediction_error(x) for x in starts])
 
 
 def _outcome(
     loop: Loop, largest: dict[str, float], level: float, stream: np.random.SeedSequence
 ) -> str:
-    rng = np.random.default_rng(stream)
-    x = loop.displaced(rng, **_scaled(largest, level))
-    horizon = _PATIENCE * np.log(1.0 / SETTLED) / loop.decay
-    return loop.run(x, _times(loop, horizon), 1e-6)[0]
-
-
-def _scaled(largest: dict[str, float], level: float) -> dict[str, float]:
-    return {key: level * value for key, value in largest.items()}
+    return loop.outcome(loop.displaced(np.random.default_rng(stream), **scaled(largest, level)))
 
 
 def _slope(errors: Array) -> float:
@@ -355,10 +290,3 @@ def _clopper_pearson(successes: int, count: int, confidence: float) -> tuple[flo
     low = betaincinv(successes, failures + 1, tail) if successes else 0.0
     high = betaincinv(successes + 1, failures, 1.0 - tail) if failures else 1.0
     return float(low), float(high)
-
-
-def shown(displacement: dict[str, float]) -> str:
-    """Say in words what of a displacement is not zero."""
-    units = {"attitude": "deg", "position": "m", "joint": "rad|m"}
-    words = [f"{displacement[key]:.3g} {unit}" for key, unit in units.items() if displacement[key]]
-    return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:]))) or "0"

@@ -24,6 +24,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from fflin.base.errors import FileError, InputError
+from fflin.base.frozen import FrozenArrays
 from fflin.base.writing import as_path, check_ending, read_file, reason, shown, write_whole
 
 FORMATS = (".npz", ".mat", ".json")
@@ -207,7 +208,7 @@ def _from_json(content: bytes) -> tuple[Record, bool]:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Design:
+class Design(FrozenArrays):
     """A result of arrays, names and figures that saves and loads; the arrays are read-only.
 
     Attributes
@@ -220,14 +221,6 @@ class Design:
     VECTORS: ClassVar[tuple[str, ...]] = ()
 
     verified: bool = field(default=True, kw_only=True)
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, np.ndarray) and value.flags.writeable:
-                value = value.copy()
-                value.setflags(write=False)
-                object.__setattr__(self, item.name, value)
 
     def __str__(self) -> str:
         return repr(self) if self.verified else f"{self!r}\n{NOT_VERIFIED}"

@@ -6,7 +6,7 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -19,6 +19,11 @@ _EPS = sys.float_info.epsilon
 def width() -> int:
     """Columns to fill: the terminal's, or 80 where the output goes elsewhere."""
     return shutil.get_terminal_size((80, 24)).columns if _on_terminal() else 80
+
+
+def folded(lines: Iterable[str]) -> str:
+    """Fold each line to the width; what does not fit goes on below, indented."""
+    return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
 
 
 def dim(text: str) -> str:

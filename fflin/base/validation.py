@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 else:
     Array = np.ndarray  # numpy.typing takes a tenth of the command line's start
 
-# A quaternion or a (cos, sin) pair this far from unit length is renormalised without a word;
-# farther off it is taken for a mistake.
+# A quaternion or a (cos, sin) pair whose squared length misses 1 by up to this has only been
+# rounded and is renormalised; one that misses it by more is taken for a mistake.
 NORM_TOLERANCE = 1e-6
 
-# Native double precision; NumPy makes one such object, so that identity tells it.
+# Native double precision. NumPy has one such object, so that `is` does instead of a comparison.
 DOUBLE = np.dtype(np.float64)
 
 
@@ -124,11 +124,15 @@ def placement(name: str, value: Any) -> pin.SE3:
         raise InputError(f"{name} is a {type(value).__name__}, expected a pin.SE3 (placement)")
     if not np.isfinite(value.homogeneous).all():
         raise InputError(f"{name} has entries that are not finite")
-    rotation = value.rotation
-    skewed = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if skewed > NORM_TOLERANCE or np.linalg.det(rotation) < 0.0:
+    if not is_rotation(value.rotation):
         raise InputError(f"the rotation of {name} is not one: R^T R and det R must be 1")
-    return pin.SE3(pin.Quaternion(rotation).normalized().matrix(), value.translation)
+    return pin.SE3(pin.Quaternion(value.rotation).normalized().matrix(), value.translation)
+
+
+def is_rotation(R: Array) -> bool:
+    """Whether R (3, 3) is a rotation within 1e-6."""
+    skewed = float(np.abs(R.T @ R - np.eye(3)).max())
+    return skewed <= NORM_TOLERANCE and float(np.linalg.det(R)) > 0.0
 
 
 def as_double(name: str, value: ArrayLike) -> Array:

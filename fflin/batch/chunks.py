@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 import pickle
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from functools import cached_property
+from collections.abc import Mapping
+from functools import cached_property, partial
 from threading import Lock
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +15,7 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinError, FflinWarning
 from fflin.base.validation import Array
-from fflin.batch.inertia import BatchInertia, Rows
+from fflin.dynamics.inertia import Inertia
 from fflin.kernel.compiled import pays
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
@@ -24,10 +23,6 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from fflin.batch.equations import BatchEquations
     from fflin.dynamics.state import Frame
-
-
-# Of a linear model, by the names that a batch has for them.
-_ATTRIBUTES = {"_x0": "x0", "_y0": "y0"}
 
 
 class Points(NamedTuple):
@@ -38,11 +33,15 @@ class Points(NamedTuple):
     u: Array | None
 
 
-class Chunk(NamedTuple):
-    """What a chunk came to: its arrays by name, and what was warned of."""
+class ChunkResult(NamedTuple):
+    """The result of a chunk: its arrays by name, and the warnings on the way."""
 
     arrays: dict[str, Array]
     notes: list[str]
+
+
+# Python has one set of warning filters for the whole process, so that threads take turns.
+_TURN = Lock()
 
 
 class ChunkJob:
@@ -69,14 +68,17 @@ class ChunkJob:
         at_rest: bool,
         count: int,
     ) -> None:
-        self._arguments = (robot, frame, reference, moving, at_rest, count)
+        options: Any = {"frame": frame, "reference": reference, "moving": moving}
+        self._again = partial(type(self), robot, **options, at_rest=at_rest, count=count)
         self._count = count
-        self.linearizer = Linearizer(robot, frame=frame, reference=reference, moving=moving)
-        # There all but M^-1 is known beforehand.
-        self.only_inertia = at_rest and reference is None and self.linearizer.prepared.free
+        self.linearizer = Linearizer(robot, **options)
+        prepared = self.linearizer.prepared
+        # There every field of a model but B is known without computing it.
+        self.only_inertia = at_rest and prepared.own_reference and prepared.free
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuilt, self._arguments
+        # A worker makes a work space of its own.
+        return self._again, ()
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -93,7 +95,9 @@ class ChunkJob:
                 shapes |= {"C": (ny, nx), "D": (ny, nu), "_y0": (ny,)}
         return shapes
 
-    def run(self, points: Points, start: int, out: Mapping[str, Array] | None = None) -> Chunk:
+    def run(
+        self, points: Points, start: int, out: Mapping[str, Array] | None = None
+    ) -> ChunkResult:
         """Linearise about the points of a chunk; threads may share a job.
 
         Parameters
@@ -109,106 +113,62 @@ class ChunkJob:
         FflinError
             If there is no model about one of them; the message names it.
         """
+        count = len(points.q)
         if out is None:
-            out = {key: np.empty((len(points.q), *shape)) for key, shape in self.shapes.items()}
-        if self.only_inertia:
-            return Chunk(dict(out), self._at_rest(points.q, start, out["B_lower"]))
-        return Chunk(dict(out), self._anywhere(points, start, out))
-
-    def _at_rest(self, q: Array, start: int, out: Array) -> list[str]:
-        actuation, nv = self.linearizer.prepared.actuation, 6 + self.linearizer.robot.n
-        inverse = out
-        if not actuation.default:
-            inverse = np.empty((len(q), nv, nv))
-        # Without joints M is the same everywhere.
-        rigid = not self.linearizer.robot.n
-        left: Rows = np.arange(1) if rigid else self._inertia.compiled(q, inverse)
-        notes: list[warnings.WarningMessage] = []
-        if len(left):
-            try:
-                with _caught() as notes:
-                    self._inertia.loop(q, inverse, left)
-            except FflinError as error:
-                raise _renumbered(error, start) from None
-        if rigid:
-            inverse[1:] = inverse[0]
-        if inverse is not out and not actuation.carried:
-            np.matmul(inverse, actuation.fixed, out=out)
-        elif inverse is not out:
-            data = self.linearizer.robot.create_data()
-            for row, point in enumerate(q):
-                # What pushes depends on no base position, and would lose digits to it.
-                still = point.copy()
-                still[:3] = 0.0
-                np.matmul(inverse[row], actuation.columns(data, still), out=out[row])
-        return [str(note.message) for note in notes]
-
-    def _anywhere(self, points: Points, start: int, out: Mapping[str, Array]) -> list[str]:
-        nv = 6 + self.linearizer.robot.n
-        left: Rows = np.arange(len(points.q))
-        if self._equations is not None:
-            left = self._equations.write(*points, out)
+            out = {key: np.empty((count, *shape)) for key, shape in self.shapes.items()}
+        if self.only_inertia and not self.linearizer.robot.n and count > 1:
+            # Without joints M is the same everywhere.
+            one = self.run(Points(points.q[:1], None, None), start)
+            out["B_lower"][:] = one.arrays["B_lower"]
+            return ChunkResult(dict(out), one.notes)
+        left = self.compiled.write(*points, out) if self.compiled else np.arange(count)
         if not len(left):
-            return []
-        with _caught() as notes:
+            return ChunkResult(dict(out), [])
+        with _TURN, warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", FflinWarning)
             for row in left.tolist():
-                q, v, u = (None if rows is None else rows[row] for rows in points)
                 try:
-                    lin = self.linearizer(q, v, u)
+                    if self.only_inertia:
+                        self._write_at_rest(points.q[row], out["B_lower"][row])
+                    else:
+                        self._write(row, points, out)
                 except FflinError as error:
                     raise type(error)(f"configuration {start + row}: {error}") from None
-                for key, array in out.items():
-                    array[row] = (
-                        lin.B[nv:] if key == "B_lower" else getattr(lin, _ATTRIBUTES.get(key, key))
-                    )
-        return [str(note.message) for note in notes]
+        return ChunkResult(dict(out), [str(note.message) for note in caught])
 
-    @property
-    def parallel(self) -> bool:
-        """Whether threads do chunks at the same time."""
-        return self.only_inertia or self._equations is not None
+    def _write(self, row: int, points: Points, out: Mapping[str, Array]) -> None:
+        q, v, u = (None if rows is None else rows[row] for rows in points)
+        lin = self.linearizer(q, v, u)
+        for key, array in out.items():
+            lower = key == "B_lower"
+            array[row] = lin.B[len(lin.B) // 2 :] if lower else getattr(lin, key.removeprefix("_"))
+
+    def _write_at_rest(self, q: Array, B_lower: Array) -> None:
+        (inertia, data), actuation = self._inertia, self.linearizer.prepared.actuation
+        if actuation.default:
+            inertia.invert(q, B_lower)
+            return
+        nv = len(B_lower)
+        inverse = np.empty((nv, nv))
+        inertia.invert(q, inverse)
+        # The columns do not depend on the base's position, and would lose digits to it.
+        still = q.copy()
+        still[:3] = 0.0
+        np.matmul(inverse, actuation.columns(data, still), out=B_lower)
 
     @cached_property
-    def _equations(self) -> BatchEquations | None:
-        from fflin.batch.equations import BatchEquations
+    def compiled(self) -> BatchEquations | None:
+        """The kernel's equations where it pays and knows the robot; threads do them together."""
+        from fflin.batch.equations import batch_equations
 
-        if not (pays(self._count) and BatchEquations.possible(self.linearizer)):
+        if not pays(self._count):
             return None
-        return BatchEquations(self.linearizer)
+        return batch_equations(self.linearizer.prepared, only_inertia=self.only_inertia)
 
     @cached_property
-    def _inertia(self) -> BatchInertia:
-        return BatchInertia(self.linearizer.robot, compiled=pays(self._count))
-
-
-# Python's filters of warnings are the whole process's, so that threads take turns.
-_TURN = Lock()
-
-
-@contextmanager
-def _caught() -> Iterator[list[warnings.WarningMessage]]:
-    """Collect what is warned of."""
-    with _TURN, warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", FflinWarning)
-        yield caught
-
-
-def _renumbered(error: FflinError, start: int) -> FflinError:
-    number, _, rest = str(error).removeprefix("configuration ").partition(":")
-    return type(error)(f"configuration {start + int(number)}:{rest}")
-
-
-def _rebuilt(
-    robot: Robot,
-    frame: Frame | None,
-    reference: pin.SE3 | None,
-    moving: bool,
-    at_rest: bool,
-    count: int,
-) -> ChunkJob:
-    return ChunkJob(
-        robot, frame=frame, reference=reference, moving=moving, at_rest=at_rest, count=count
-    )
+    def _inertia(self) -> tuple[Inertia, pin.Data]:
+        data = self.linearizer.robot.create_data()
+        return Inertia(self.linearizer.prepared.map, data), data
 
 
 class Parcel(NamedTuple):
@@ -218,18 +178,18 @@ class Parcel(NamedTuple):
     content: bytes | None
 
 
-def packed(job: ChunkJob) -> Parcel:
-    """Return a job as it is sent."""
+def pack(job: ChunkJob) -> Parcel:
+    """Pickle a job under the hash of its content."""
     content = pickle.dumps(job)
     return Parcel(hashlib.sha256(content).hexdigest(), content)
 
 
-# What this worker was sent; the least recent goes first.
+# The jobs that this worker has received; the oldest is dropped first.
 _JOBS: dict[str, ChunkJob] = {}
 _KEPT = 4
 
 
-def work(parcel: Parcel, points: Points, start: int) -> Chunk | None:
+def work(parcel: Parcel, points: Points, start: int) -> ChunkResult | None:
     """Do a chunk in a worker, or return None where the worker does not have the job."""
     job = _JOBS.get(parcel.key)
     if job is None:

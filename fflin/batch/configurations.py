@@ -5,43 +5,26 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
 from hashlib import sha256
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array, number, whole
+from fflin.batch.rows import checked_configurations, follow_rows
 from fflin.dynamics.points import configuration
 from fflin.robot.joints import Joint
 from fflin.robot.robot import Robot
 
-# Random rows are drawn in blocks of this many, so that they do not depend on how they are read.
+# Random rows are drawn in blocks of this size, each with a seed of its own, so that a row does not
+# depend on the chunk that it is read in.
 _DRAWN = 4096
 
-# More than these cannot even be counted.
-_MOST = sys.maxsize
-
-# A joint that turns without limits is drawn from one turn.
+# Range of a joint that turns without limits [rad].
 _TURN = (-math.pi, math.pi)
-
-
-class Configurations(Protocol):
-    """What `sweep` takes in place of an array: rows that are made when they are asked for."""
-
-    def __len__(self) -> int: ...
-
-    def rows(self, start: int, stop: int) -> Array:
-        """Return the configurations (stop - start, nq), valid ones."""
-        ...
-
-    @property
-    def fingerprint(self) -> str:
-        """Hash of all rows."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,14 +59,6 @@ class Grid:
             name: axis[pick] for (name, axis), pick in zip(self.axes.items(), picks, strict=True)
         }
         return _placed(self.robot, self.start, stop - start, values)
-
-    @cached_property
-    def fingerprint(self) -> str:
-        """Hash of all rows."""
-        digest = sha256(self.start.tobytes())
-        for name, values in self.axes.items():
-            digest.update(name.encode() + b"\0" + values.tobytes())
-        return digest.hexdigest()
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,12 +96,6 @@ class RandomConfigurations:
         values = dict(zip(self.ranges, drawn.T, strict=True))
         return _placed(self.robot, self.start, stop - start, values)
 
-    @cached_property
-    def fingerprint(self) -> str:
-        """Hash of all rows."""
-        drawn = f"{self.count} {self.seed} {dict(self.ranges)!r}"
-        return sha256(drawn.encode() + self.start.tobytes()).hexdigest()
-
 
 @dataclass(frozen=True, eq=False)
 class GivenConfigurations:
@@ -147,10 +116,9 @@ class GivenConfigurations:
         """Return the configurations (stop - start, nq)."""
         return self.q[start:stop]
 
-    @cached_property
-    def fingerprint(self) -> str:
-        """Hash of all rows."""
-        return sha256(self.q.tobytes()).hexdigest()
+
+# What `sweep` takes in place of an array: rows that are made when they are asked for.
+Configurations: TypeAlias = Grid | RandomConfigurations | GivenConfigurations
 
 
 def grid(
@@ -200,7 +168,9 @@ def grid(
             raise InputError(f"grid of joint '{name}' must be finite numbers that increase")
         axis.setflags(write=False)
         checked[name] = axis
-    _countable(math.prod(len(axis) for axis in checked.values()))
+    count = math.prod(map(len, checked.values()))
+    if count > sys.maxsize:
+        raise InputError(f"{count:,} points are too many; choose fewer")
     start.setflags(write=False)
     return Grid(robot, checked, start)
 
@@ -241,10 +211,7 @@ def random_configurations(
         If the count or seed is no whole number, a range is empty, or a joint that slides has no
         limits and no range.
     """
-    for what, value, least in (("count", count, 1), ("seed", seed, 0)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-            raise InputError(f"{what} is {value!r}, expected a whole number from {least} on")
-    _countable(int(count))
+    count, seed = whole("count", count, 1), whole("seed", seed, 0)
     start = configuration(robot, base=base)
     if not (ranges is None or isinstance(ranges, Mapping)):
         raise InputError(f"ranges is {ranges!r}, expected {{joint: (low, high)}}")
@@ -253,12 +220,42 @@ def random_configurations(
         robot.joint(name)
     checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
     start.setflags(write=False)
-    return RandomConfigurations(robot, int(count), int(seed), checked, start)
+    return RandomConfigurations(robot, count, seed, checked, start)
 
 
-def _countable(count: int) -> None:
-    if count > _MOST:
-        raise InputError(f"{count:,} points are too many; choose fewer")
+def as_configurations(robot: Robot, q: Any) -> Configurations:
+    """Return the points that `sweep` is given as rows of this robot.
+
+    Raises
+    ------
+    InputError
+        If they are none, or of another robot.
+    """
+    if not isinstance(robot, Robot):
+        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
+    if isinstance(q, GivenConfigurations):  # checked already
+        return q
+    if not isinstance(q, Grid | RandomConfigurations):
+        return GivenConfigurations(checked_configurations(robot, q))
+    # The same robot with other inputs or outputs will do.
+    if q.robot.joints != robot.joints:
+        raise InputError(
+            f"q is of '{q.robot.name}', whose joints are others than those of '{robot.name}'"
+        )
+    return replace(q, robot=robot)
+
+
+def fingerprint(configurations: Configurations) -> str:
+    """Return a hash of what all rows are made of."""
+    digest = sha256(type(configurations).__name__.encode())
+    for item in fields(configurations):
+        value = getattr(configurations, item.name)
+        if item.name != "robot":
+            parts = value.items() if isinstance(value, Mapping) else [(item.name, value)]
+            for name, numbers in parts:
+                digest.update(f" {name} {np.shape(numbers)} ".encode())
+                digest.update(np.ascontiguousarray(numbers).data)
+    return digest.hexdigest()
 
 
 def _range(robot: Robot, joint: Joint, given: Any) -> tuple[float, float]:
@@ -287,32 +284,10 @@ def _range(robot: Robot, joint: Joint, given: Any) -> tuple[float, float]:
     return low, high
 
 
-def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Array]) -> Array:
+def _placed(robot: Robot, start: Array, count: int, values: Mapping[str, Any]) -> Array:
     """Return rows (count, nq) that differ from `start` in the joints that are named."""
-    q = np.empty((count, robot.nq))
-    q[:] = start
+    q = np.tile(start, (count, 1))
     for name, column in values.items():
-        _place(robot.joint(name), q, column)
+        robot.joint(name).place(q.T, column)
     follow_rows(robot, q)
     return q
-
-
-def follow_rows(robot: Robot, q: Array) -> None:
-    """Put the mimic joints of configurations (N, nq) where their leaders say."""
-    for joint, leader, multiplier, offset in robot.followers:
-        _place(joint, q, multiplier * joint_values(leader, q) + offset)
-
-
-def joint_values(joint: Joint, q: Array) -> Array:
-    """Return a joint's angle or length (N,) of configurations (N, nq)."""
-    if joint.unbounded:
-        angles: Array = np.arctan2(q[:, joint.idx_q + 1], q[:, joint.idx_q])
-        return angles
-    return q[:, joint.idx_q]
-
-
-def _place(joint: Joint, q: Array, values: Array) -> None:
-    if joint.unbounded:
-        q[:, joint.idx_q], q[:, joint.idx_q + 1] = np.cos(values), np.sin(values)
-    else:
-        q[:, joint.idx_q] = values

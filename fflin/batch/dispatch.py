@@ -1,8 +1,9 @@
-"""Chunks of a sweep on the workers of an executor, of which some may die."""
+"""Chunks of a sweep in this process, or on the workers of an executor, of which some may die."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -10,58 +11,94 @@ from concurrent.futures import (
     Executor,
     Future,
     ProcessPoolExecutor,
+    ThreadPoolExecutor,
     wait,
 )
 from typing import Any, NamedTuple
 
 from fflin.base.errors import FflinError
-from fflin.batch.chunks import Chunk, ChunkJob, Parcel, Points, packed, work
+from fflin.base.validation import Array
+from fflin.batch.chunks import ChunkResult, Parcel, pack, work
+from fflin.batch.task import Span, SweepTask
 from fflin.batch.workers import NoWorkers, WorkerDied
 
-# A chunk whose worker dies is given to others; what kills this many is not.
+# A chunk whose worker dies is given to another, up to this many times.
 _ATTEMPTS = 3
 
-# Chunks that wait at each worker, so that none stands idle.
+# Chunks that are submitted for each worker at a time, so that none is idle between two.
 _QUEUED = 2
 
-# How long nothing is finished before the workers are looked at [s].
+# How often the worker processes are checked while no chunk is finished [s].
 _GLANCE = 1.0
 
-# Of an executor that does not say how many workers it has.
+# Assumed of an executor that does not tell how many workers it has.
 _UNKNOWN_WORKERS = 16
-
-
-class Span(NamedTuple):
-    """The points of a chunk, start up to but not including stop."""
-
-    start: int
-    stop: int
 
 
 class Done(NamedTuple):
     """A chunk that came to an end: its result, or why there is none."""
 
     span: Span
-    chunk: Chunk | None
+    result: ChunkResult | None
     reason: str
 
 
-def dispatch(
-    job: ChunkJob,
+def run_here(
+    task: SweepTask,
     spans: Sequence[Span],
-    points: Callable[[Span], Points],
-    workers: Executor,
+    place: Callable[[int, int], Mapping[str, Array] | None],
+    threads: int,
 ) -> Iterator[Done]:
+    """Do chunks in this process, several at a time where the kernel does them.
+
+    Parameters
+    ----------
+    task : SweepTask
+    spans : sequence of Span
+    place : callable
+        Returns the arrays that a chunk is written to, or None for new ones.
+    threads : int
+
+    Yields
+    ------
+    Done
+        Each span once.
+    """
+
+    def run(span: Span) -> Done:
+        rows = place(*span)
+        out = None if rows is None else {key: rows[key] for key in task.job.shapes}
+        try:
+            return Done(span, task.job.run(task.points(span), span.start, out), "")
+        except FflinError as error:
+            return Done(span, None, str(error))
+
+    if threads == 1 or len(spans) == 1 or not task.job.compiled:
+        yield from map(run, spans)
+        return
+    pool, begun = ThreadPoolExecutor(threads), deque[Future[Done]]()
+    try:
+        for span in spans:
+            begun.append(pool.submit(run, span))
+            # Results that nobody has taken yet would fill the memory.
+            if len(begun) > threads:
+                yield begun.popleft().result()
+        while begun:
+            yield begun.popleft().result()
+    finally:
+        # Without waiting, so that Ctrl-C ends a compilation too.
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def dispatch(task: SweepTask, spans: Sequence[Span], workers: Executor) -> Iterator[Done]:
     """Do chunks on workers and yield them as they are finished.
 
     The job is sent with the first chunks only, and again to a worker that says it has none.
 
     Parameters
     ----------
-    job : ChunkJob
+    task : SweepTask
     spans : sequence of Span
-    points : callable
-        Makes the points of a span.
     workers : Executor
 
     Yields
@@ -69,38 +106,32 @@ def dispatch(
     Done
         Each span once.
     """
-    work_place = _WorkPlace(packed(job), spans, points, workers)
+    state = _Dispatch(task, spans, workers)
     try:
-        while work_place.waiting or work_place.running:
-            work_place.begin()
-            yield from work_place.finished()
-            if work_place.broken is not None:
-                yield from work_place.lost()
+        while state.waiting or state.running:
+            state.begin()
+            yield from state.finished()
+            if state.broken is not None:
+                yield from state.lost()
     finally:
-        for future in work_place.running:
+        for future in state.running:
             future.cancel()
 
 
-class _WorkPlace:
+class _Dispatch:
     """The chunks that wait and those that run, how often each was begun, and the workers."""
 
-    def __init__(
-        self,
-        parcel: Parcel,
-        spans: Sequence[Span],
-        points: Callable[[Span], Points],
-        workers: Executor,
-    ) -> None:
+    def __init__(self, task: SweepTask, spans: Sequence[Span], workers: Executor) -> None:
         self.waiting = list(reversed(spans))
-        self.running: dict[Future[Chunk | None], Span] = {}
+        self.running: dict[Future[ChunkResult | None], Span] = {}
         self.broken: BaseException | None = None
         self._attempts: dict[Span, int] = {}
-        self._parcel, self._points, self._workers = parcel, points, workers
+        self._task, self._parcel, self._workers = task, pack(task.job), workers
         self._ahead = _QUEUED * _count(workers)
         self._known = False
 
     def begin(self) -> None:
-        """Give the workers what they have room for."""
+        """Submit as many chunks as the workers can take."""
         while self.waiting and len(self.running) < self._ahead and self.broken is None:
             self._submit(self.waiting.pop(), None if self._known else self._parcel.content)
 
@@ -127,7 +158,7 @@ class _WorkPlace:
                 self.broken = self.broken or error
                 self.waiting.append(span)
             except Exception as error:
-                # Of the executor's own, such as a scheduler that gave up on a worker.
+                # Executors have errors of their own, such as of a scheduler that lost a worker.
                 yield from self._lost(span, f"{type(error).__name__}: {error}")
             else:
                 if chunk is None:
@@ -138,14 +169,14 @@ class _WorkPlace:
                     yield Done(span, chunk, "")
 
     def lost(self) -> Iterator[Done]:
-        """Yield what is lost with an executor that died."""
+        """Yield the chunks that an executor took with it when it died."""
         error, self.broken = self.broken, None
         running, self.running = self.running, {}
         reason = f"the executor died: {type(error).__name__}: {error}".rstrip(": ")
         if isinstance(error, NoWorkers):
             reason = str(error)
         for future, span in running.items():
-            # Some are finished and not lost with it.
+            # Some were finished before it died.
             good = future.done() and not future.cancelled() and future.exception() is None
             chunk = future.result() if good else None
             yield Done(span, chunk, "" if chunk is not None else reason)
@@ -155,7 +186,7 @@ class _WorkPlace:
 
     def _submit(self, span: Span, content: bytes | None) -> None:
         """Begin a chunk, or put it back where the executor is dead."""
-        arguments = Parcel(self._parcel.key, content), self._points(span), span.start
+        arguments = Parcel(self._parcel.key, content), self._task.points(span), span.start
         try:
             future = self._workers.submit(work, *arguments)
         except Exception as error:  # broken, shut down, or of its own

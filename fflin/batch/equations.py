@@ -2,50 +2,52 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fflin.base.rotation import product_matrix, rotation_matrices
 from fflin.base.validation import Array
-from fflin.batch.inertia import FARTHEST, Rows
 from fflin.dynamics.chart import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.rnea import Rates
-from fflin.kernel.accelerations import BatchRates, Points, Written
-from fflin.kernel.tree import LANES, batch_tree
-from fflin.linear.linearization import LARGEST, Linearizer
+from fflin.kernel.accelerations import BatchAccelerations, inverse_inertias
+from fflin.kernel.tree import LANES, Tree, batch_tree
+from fflin.linear.linearization import LARGEST
+from fflin.linear.prepared import Prepared
 from fflin.linear.state_equations import assemble, drift
 from fflin.robot.frames import ROOT
 
-# Points that are done at a time, so that what is computed on the way stays in the cache.
-_BLOCK = 256
+# Up to this angle the kernel's sines and cosines are exact to rounding [rad].
+_FARTHEST = 1e6
+
+RowNumbers: TypeAlias = NDArray[np.integer[Any]]
+Mask: TypeAlias = NDArray[np.bool_]
 
 
-class BatchEquations:
-    """A, B and f0 about many points, as a `Linearizer` of the robot has them about each.
+class BatchEquations(ABC):
+    """What differs from point to point of a robot's linear models, about many points.
 
     Parameters
     ----------
-    linearizer : Linearizer
-        Without outputs but the state; see `possible`.
+    prepared : Prepared
+        Without outputs but the state; see `batch_equations`.
+    tree : Tree
+        Of the same robot.
     """
 
-    def __init__(self, linearizer: Linearizer) -> None:
-        self._prepared = linearizer.prepared
-        self._state, self._actuation = self._prepared.map, self._prepared.actuation
-        self._rates = BatchRates(self._state, self._actuation)
-        robot = linearizer.robot
-        self._root = robot.model.jointPlacements[ROOT].rotation
-        self._least_coupling = 0.999 * (6 + robot.n)
+    BLOCK: ClassVar[int]  # points that are done at a time
 
-    @staticmethod
-    def possible(linearizer: Linearizer) -> bool:
-        """Whether the kernel knows the robot's joints, and no output is to be differentiated."""
-        return linearizer.prepared.sensing is None and batch_tree(linearizer.robot) is not None
+    def __init__(self, prepared: Prepared, tree: Tree) -> None:
+        self._prepared, self._tree = prepared, tree
+        self._least_coupling = 0.999 * (6 + prepared.robot.n)
 
-    def write(self, q: Array, v: Array | None, u: Array | None, out: Mapping[str, Array]) -> Rows:
+    def write(
+        self, q: Array, v: Array | None, u: Array | None, out: Mapping[str, Array]
+    ) -> RowNumbers:
         """Write what differs from point to point, and return the rows that are left.
 
         Left are those that the linearizer refuses or warns of: where M is singular or nearly so,
@@ -56,96 +58,143 @@ class BatchEquations:
         q, v, u : ndarray (N, nq), (N, nv), (N, nu)
             Valid points; None for rest and no input.
         out : mapping
-            A, B_lower, f0, _x0 and, with a moving reference, _drift, each with N rows.
+            B_lower and, but at rest, A, f0, _x0 and with a moving reference _drift, each with N
+            rows.
         """
-        nv, nu = self._state.nx // 2, len(self._actuation.names)
-        good = np.zeros(len(q), dtype=bool)
-        for start in range(0, len(q), _BLOCK):
-            rows = slice(start, start + _BLOCK)
-            count = len(q[rows])
-            velocities: Array = np.zeros((count, nv))
-            if v is not None:
-                velocities = self._state.velocities(v[rows])
-            inputs: Array = np.zeros((count, nu)) if u is None else u[rows]
+        count = len(q)
+        if count < LANES:
+            filled = (
+                _filled(q),
+                None if v is None else _filled(v),
+                None if u is None else _filled(u),
+            )
+            more = {key: np.empty((LANES, *array.shape[1:])) for key, array in out.items()}
+            left = self.write(*filled, more)
+            for key, array in out.items():
+                array[:] = more[key][:count]
+            return left[left < count]
+        good = np.zeros(count, dtype=bool)
+        for start in range(0, count, self.BLOCK):
+            # The last block begins early enough to fill the lanes; some points are done twice.
+            rows = slice(min(start, count - LANES), start + self.BLOCK)
             place = {key: array[rows] for key, array in out.items()}
+            point = q[rows], None if v is None else v[rows], None if u is None else u[rows]
             with np.errstate(all="ignore"):
-                good[rows] = self._block(q[rows], velocities, inputs, place)
+                good[rows] = self._write_block(*point, place)
         return np.flatnonzero(~good)
 
-    def _block(self, q: Array, nu: Array, u: Array, out: Mapping[str, Array]) -> NDArray[np.bool_]:
-        state, groups, nv = self._state, self._state.groups, self._state.nx // 2
+    @abstractmethod
+    def _write_block(
+        self, q: Array, v: Array | None, u: Array | None, out: Mapping[str, Array]
+    ) -> Mask:
+        """Do the points of a block and return which of them are good."""
+
+    def _regular(self, q: Array, couplings: Array) -> Mask:
+        """Return where M is far from singular, and the angles are such that their sines are."""
+        # NaN, from a pivot that is zero, compares false.
+        good = (self._least_coupling < couplings) & (couplings < Inertia.warning_coupling)
+        return good & (np.abs(q[:, 7:]) < _FARTHEST).all(axis=1)
+
+
+class RestEquations(BatchEquations):
+    """B = [0; M^-1 F] at rest, where only u acts, through columns F that do not depend on q."""
+
+    BLOCK = 2**16
+
+    def _write_block(
+        self, q: Array, v: Array | None, u: Array | None, out: Mapping[str, Array]
+    ) -> Mask:
+        B, actuation, nv = out["B_lower"], self._prepared.actuation, self._prepared.map.nx // 2
+        inverse = B if actuation.default else np.empty((len(q), nv, nv))
+        couplings = inverse_inertias(self._tree, q, inverse)
+        if not actuation.default:
+            np.matmul(inverse, actuation.fixed, out=B)
+        return self._regular(q, couplings)
+
+
+class PointEquations(BatchEquations):
+    """A, B and f0 about any points."""
+
+    BLOCK = 256  # what is computed on the way stays in the cache
+
+    def __init__(self, prepared: Prepared, tree: Tree) -> None:
+        super().__init__(prepared, tree)
+        self._accelerations = BatchAccelerations(prepared.map, prepared.actuation, tree)
+        self._root = prepared.robot.model.jointPlacements[ROOT].rotation
+
+    def _write_block(
+        self, q: Array, v: Array | None, u: Array | None, out: Mapping[str, Array]
+    ) -> Mask:
+        prepared, state, actuation = self._prepared, self._prepared.map, self._prepared.actuation
+        count, nv, groups = len(q), state.nx // 2, state.groups
+        nu: Array = np.zeros((count, nv)) if v is None else state.velocities(v)
+        if u is None:
+            u = np.zeros((count, len(actuation.names)))
         q_m = state.joint_positions(q)
         chart, r_b, within = self._place(q)
-        u_base = self._actuation.in_base_axes(chart, u)
+        u_base = actuation.in_base_axes(chart, u)
         stiffness, damping, rest = state.robot.passive
-        forces = u_base @ self._actuation.fixed.T
+        forces = u_base @ actuation.fixed.T
         forces[:, 6:] -= stiffness * (q_m - rest) + damping * nu[:, 6:]
-        A, B = out["A"], out["B_lower"]
-        A[:] = self._prepared.rest["A"]
-        written = self._evaluate(Points(q, nu, forces, u_base), A)
-        self._set_inputs(written, B)
+        A = out["A"] if "A" in out else np.empty((count, state.nx, state.nx))
+        B = out["B_lower"]
+        A[:] = prepared.rest["A"]
+        found = self._accelerations.rates(q, nu, forces, u_base, A)
+        B[:] = found.inverse if actuation.default else found.inverse @ actuation.fixed
+        if actuation.carried:
+            B[:, :, self._accelerations.carried] = found.inverse @ found.columns
         lower = A[:, nv:]
-        rates = Rates(written.c, lower[..., groups.q_m], lower[..., nv:], B, self._gravity(q))
-        moving = self._prepared.moving
-        f0 = assemble(state, self._actuation, chart, nu, u_base, rates, A, B, moving=moving)
-        if moving:
-            out["_drift"][:] = drift(state, f0, rates.gravity)
-        out["f0"][:] = 0.0 if moving else f0
-        out["_x0"][:] = state.compose(chart, r_b, q_m, nu)
-        good = within & (np.abs(q[:, 7:]) < FARTHEST).all(axis=1)
-        good &= self._least_coupling < written.couplings
-        good &= written.couplings < Inertia.warning_coupling
-        # What is not finite shows in these, NaN too.
-        for array in (A[:, nv:], B, out["f0"][:, None]):
+        rates = Rates(found.c, lower[..., groups.q_m], lower[..., nv:], B, self._gravity(q))
+        f0 = assemble(state, actuation, chart, nu, u_base, rates, A, B, moving=prepared.moving)
+        values = {"_x0": state.compose(chart, r_b, q_m, nu), "f0": f0}
+        if prepared.moving:
+            values |= {"_drift": drift(state, f0, rates.gravity), "f0": np.zeros_like(f0)}
+        for key in values.keys() & out.keys():
+            out[key][:] = values[key]
+        good = within & self._regular(q, found.couplings)
+        # NaN compares false.
+        for array in (lower, B, values["f0"][:, None]):
             good &= np.einsum("ijk,ijk->i", array, array) < LARGEST
         return good
 
-    def _evaluate(self, points: Points, A: Array) -> Written:
-        """Return the rates, their slopes in the lower half of A."""
-        count, nv = points.nu.shape
-        carried = len(self._rates.carried)
-        if count < LANES:
-            filled = Points(*(np.pad(x, ((0, LANES - count), (0, 0)), mode="edge") for x in points))
-            slopes: Array = np.zeros((LANES, *A.shape[1:]))
-            rates = self._evaluate(filled, slopes)
-            A[:, nv:] = slopes[:count, nv:]
-            return Written(*(array[:count] for array in rates))
-        rates = Written(
-            np.empty((count, nv, nv)),
-            np.empty((count, nv)),
-            A.reshape(count, -1),
-            np.empty((count, nv * carried)),
-            np.empty(count),
-        )
-        self._rates.evaluate(points, rates)
-        return rates
-
-    def _set_inputs(self, rates: Written, B: Array) -> None:
-        if self._actuation.default:
-            B[:] = rates.inverse
-            return
-        np.matmul(rates.inverse, self._actuation.fixed, out=B)
-        carried = self._rates.carried
-        if len(carried):
-            columns = rates.columns.reshape(len(B), -1, len(carried))
-            B[:, :, carried] = rates.inverse @ columns
-
-    def _place(self, q: Array) -> tuple[Chart, Array, NDArray[np.bool_]]:
+    def _place(self, q: Array) -> tuple[Chart, Array, Mask]:
         """Return the chart and the base's position, and where the chart reaches."""
         if self._prepared.own_reference:
             chart: Chart = Standing(len(q))
             return chart, chart.q_b, np.ones(len(q), dtype=bool)
-        quaternions = q[:, 3:7] @ product_matrix(self._state.origin_quaternion).T
+        state = self._prepared.map
+        quaternions = q[:, 3:7] @ product_matrix(state.origin_quaternion).T
         quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
         quaternions[quaternions[:, 3] < 0.0] *= -1.0
         q0 = quaternions[:, 3:]
         chart = Chart(quaternions[:, :3], q0, rotation_matrices(quaternions))
-        return chart, self._state.positions(q), q0[:, 0] >= SMALLEST_Q0
+        return chart, state.positions(q), q0[:, 0] >= SMALLEST_Q0
 
     def _gravity(self, q: Array) -> Array:
-        gravity = np.array(self._state.robot.gravity)
+        gravity = np.array(self._prepared.robot.gravity)
         if not gravity.any():
             return gravity
-        rotations = rotation_matrices(q[:, 3:7])
-        components: Array = (self._root.T @ gravity) @ rotations
+        components: Array = (self._root.T @ gravity) @ rotation_matrices(q[:, 3:7])
         return components
+
+
+def _filled(rows: Array) -> Array:
+    """Return as many rows as lanes, the last of them repeated."""
+    return np.pad(rows, ((0, LANES - len(rows)), (0, 0)), mode="edge")
+
+
+def batch_equations(prepared: Prepared, *, only_inertia: bool) -> BatchEquations | None:
+    """Return the equations of a robot, or None where the kernel does not know them.
+
+    Parameters
+    ----------
+    prepared : Prepared
+        The kernel differentiates no outputs, and knows joints that are screws about fixed axes.
+    only_inertia : bool
+        Whether all but B is known beforehand.
+    """
+    tree = batch_tree(prepared.robot)
+    if tree is None or prepared.sensing is not None:
+        return None
+    simple = only_inertia and not prepared.actuation.carried
+    return (RestEquations if simple else PointEquations)(prepared, tree)

@@ -23,14 +23,14 @@ from fflin.base.writing import check_ending, replacing
 
 FORMATS = (".npz", ".h5")
 
-# The version of HDF5 from which the file's own records have checksums: without them, a damaged
-# file can take the process with it.
+# From this version on HDF5 has checksums of its own metadata, without which reading a damaged file
+# can crash the process.
 CHECKED = ("v108", "v108")
 
 CHUNK_SEALS = f"chunk_{SEAL}"
 _CHUNK_BYTES = 2**22
 
-# Fields of a batch that are text or lists of it; they stand in the file as one JSON document.
+# Fields of a batch that are texts or lists of texts; a file has them as one JSON document.
 _TEXTS = (
     *("state_names", "input_names", "output_names"),
     *("state_units", "input_units", "output_units"),
@@ -116,7 +116,7 @@ def chunk_seals(varying: Mapping[str, Array], count: int, chunk: int) -> NDArray
     def seal(start: int) -> bytes:
         return chunk_seal({key: value[start : start + chunk] for key, value in varying.items()})
 
-    # Hashing lets other threads run.
+    # hashlib releases the interpreter's lock, so that threads hash at the same time.
     with ThreadPoolExecutor() as pool:
         seals = b"".join(pool.map(seal, range(0, count, chunk)))
     return np.frombuffer(seals, np.uint8).reshape(-1, 32)
@@ -143,7 +143,7 @@ def read_batch(path: Path, *, verify: bool = True) -> dict[str, Any]:
 
 
 def _from_npz(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, str], bool]:
-    # Opened here, since NumPy leaves a damaged file open.
+    # Opened here, since NumPy does not close a file that it finds damaged.
     with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
         entries = {key: file[key] for key in file.files}
     verified = verify and check_seal(entries)
@@ -154,23 +154,20 @@ def _from_npz(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, str
 def _from_hdf5(path: Path, verify: bool) -> tuple[dict[str, Array], dict[str, str], bool]:
     with hdf5().File(path, "r") as file:
         texts = {key: str(file.attrs[key]) for key in ("header", "constant")}
-        arrays = {key: mapped(path, file[key]) for key in file}
+        arrays = {key: _mapped(path, file[key]) for key in file}
         chunk = int(file.attrs.get("chunk", 0))
     seal, seals = arrays.pop(SEAL, None), arrays.pop(CHUNK_SEALS, None)
     if seal is None or seals is None or not verify:
         return arrays, texts, False
     constants = {key: arrays[key] for key in json.loads(texts["constant"])}
     varying = {key: value for key, value in arrays.items() if key not in constants}
-    if (
-        chunk < 1
-        or not np.array_equal(seal, batch_seal(texts, chunk, seals, constants))
-        or not np.array_equal(seals, chunk_seals(varying, len(arrays["q"]), chunk))
-    ):
+    whole = chunk > 0 and np.array_equal(seal, batch_seal(texts, chunk, seals, constants))
+    if not whole or not np.array_equal(seals, chunk_seals(varying, len(arrays["q"]), chunk)):
         raise ValueError(DAMAGED)
     return arrays, texts, True
 
 
-def mapped(path: Path, dataset: Any) -> Array:
+def _mapped(path: Path, dataset: Any) -> Array:
     """Return a contiguous dataset as an array that is read as it is used."""
     offset = dataset.id.get_offset()
     if offset is None or not dataset.size:
@@ -202,4 +199,4 @@ def _fields(
     for key, shape in shapes.items():
         if rows[key].shape[1:] != shape:
             raise ValueError(f"{key} has shape {rows[key].shape[1:]} a point, expected {shape}")
-    return {**rows, **texts, "_columns": columns}
+    return {**rows, **texts, "columns": columns}

@@ -12,9 +12,9 @@ from fflin.base.errors import FflinError, InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, vector
 from fflin.batch.files import is_constant
-from fflin.batch.joint_columns import joint_columns, positions
 from fflin.batch.linear_batch import LinearBatch
 from fflin.batch.riccati import gains_at_rest
+from fflin.batch.rows import column, positions
 from fflin.control.lqr import lqr
 from fflin.control.policies import StateFeedback
 from fflin.control.weights import weight
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from fflin.control.weights import Weight
     from fflin.robot.robot import Robot
 
-# Models whose gains are computed at once; what that takes is small.
+# Models whose gains are computed at once, which bounds the memory of their eigenproblems.
 _BLOCK = 256
 
-# Of a Riccati equation, relative; a gain beyond is computed again alone, and refined.
+# Largest relative residual of a Riccati equation; a gain beyond it is computed by `lqr` instead.
 _SOUND = 1e-11
 
 
@@ -182,7 +182,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
                 K[rows], residual[rows], margin[rows] = gains_at_rest(
                     rates, batch.B_lower[rows], Q, R
                 )
-    # Written so that NaN is among them.
+    # NaN compares false, so that it is among them.
     for index in np.flatnonzero(~(residual <= _SOUND)).tolist():
         try:
             gain = lqr(batch[index], Q, R)
@@ -242,10 +242,8 @@ class ScheduledFeedback:
         lin, gains = self.lin, self.gains
         # Refuses another robot.
         StateFeedback(lin, np.zeros(lin.B.T.shape)).bind(robot)
-        state, columns = (
-            StateMap(robot, reference=lin.reference, frame=lin.frame),
-            joint_columns(robot),
-        )
+        state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+        columns = [column(joint) for joint in robot.joints]
 
         def policy(_: float, q: Array, v: Array) -> Array:
             K = gains._between(positions(q[None], columns)[0])

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from fflin.base.errors import InputError
+from fflin.base.errors import InputError, unknown
 from fflin.base.record import NOT_VERIFIED
 from fflin.base.validation import Array, number
 from fflin.base.writing import as_path
 from fflin.batch.files import header, is_constant, read_batch, write_batch
-from fflin.batch.joint_columns import away, positions
+from fflin.batch.robot_functions import functions_of, own_reference
+from fflin.batch.rows import Column, away, positions, values
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 # Two joint values are the same where they differ by no more than this [rad|m].
 _SAME = 1e-9
-
-_NOWHERE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -58,6 +56,8 @@ class LinearBatch:
         Name of the robot.
     urdf_sha256, fflin_version, pinocchio_version : str
     locked : tuple of str
+    columns : tuple of (int, int)
+        Where each joint stands in q: (index, -1), or those of its (cos, sin).
     verified : bool
         Whether it is as it was made; False of a file that has no digest to tell damage by, or
         that was not held against it.
@@ -84,16 +84,16 @@ class LinearBatch:
     locked: tuple[str, ...]
     fflin_version: str
     pinocchio_version: str
-    # At rest x0 is told by q; elsewhere y0 is x0 where the outputs are the full state.
+    columns: tuple[Column, ...]
+    # None where x0 follows from q, at rest, and where y0 is x0, since the outputs are the state.
     _x0: Array | None
     _y0: Array | None
-    # None where it is the base's own at each point; the free-flyer joint stands at the root.
+    # None where it is the base's own placement, which q gives in the frame that _root places.
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    # Of a file; else found on the robot when it is asked for.
+    # As a file has it; None where it is found on the robot.
     _ignorable: tuple[str, ...] | None
-    _columns: tuple[tuple[int, int], ...]
     _system: Robot | None
     verified: bool = True
 
@@ -156,17 +156,12 @@ class LinearBatch:
     @property
     def x0(self) -> Array:
         """States at the points (N, nx); at rest made anew at each call."""
-        return self._rest_states(slice(None)) if self._x0 is None else self._x0
+        return self._states_at_rest(self.q) if self._x0 is None else self._x0
 
     @property
     def y0(self) -> Array:
         """Outputs at the points (N, ny)."""
         return self.x0 if self._y0 is None else self._y0
-
-    @property
-    def columns(self) -> tuple[tuple[int, int], ...]:
-        """Where each joint stands in q: (index, -1), or those of (cos, sin)."""
-        return self._columns
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -178,7 +173,7 @@ class LinearBatch:
     @property
     def joint_positions(self) -> Array:
         """Angles, in (-pi, pi] of continuous joints, and lengths (N, n) of the joints."""
-        return positions(self.q, self._columns)
+        return positions(self.q, self.columns)
 
     def nearest(self, joints: Mapping[str, float]) -> LinearModel:
         """Return the model whose joints are nearest to the values [rad|m], the others left out.
@@ -193,7 +188,7 @@ class LinearBatch:
         distance = np.zeros(len(self))
         for index, value in self._named(joints).items():
             target = number(f"joint '{self.joint_names[index]}'", value)
-            distance += away(self.q, self._columns[index], target) ** 2
+            distance += away(self.q, self.columns[index], target) ** 2
         return self[int(distance.argmin())]
 
     def select(self, joints: Mapping[str, float | tuple[float, float]]) -> LinearBatch:
@@ -213,10 +208,10 @@ class LinearBatch:
                 if len(value) != 2:
                     raise InputError(f"{what} is {value!r}, expected a value or (low, high)")
                 low, high = (number(what, end) for end in value)
-                at = positions(self.q, self._columns[index : index + 1])[:, 0]
+                at = values(self.q, self.columns[index])
                 mask &= (at >= low - _SAME) & (at <= high + _SAME)
             else:
-                mask &= away(self.q, self._columns[index], number(what, value)) <= _SAME
+                mask &= away(self.q, self.columns[index], number(what, value)) <= _SAME
         if not mask.any():
             raise InputError(f"no point of the batch has {dict(joints)}; `nearest` finds the next")
         return self[mask]
@@ -263,98 +258,43 @@ class LinearBatch:
             If h5py is needed and not installed.
         """
         batch = LinearBatch(**read_batch(as_path(path), verify=verify), _system=robot)
-        if robot is not None and (robot.urdf_sha256, robot.locked, robot.joint_names) != (
-            batch.urdf_sha256,
-            batch.locked,
-            batch.joint_names,
-        ):
+        made_of = batch.urdf_sha256, batch.locked, batch.joint_names
+        if robot is not None and (robot.urdf_sha256, robot.locked, robot.joint_names) != made_of:
             raise InputError(f"'{robot.name}' is not the robot that the batch is of")
         return batch
 
     def _arrays(self) -> dict[str, Array]:
         """Return the arrays that are held, all with N rows, by the fields' names."""
-        values = ((item.name, getattr(self, item.name)) for item in fields(self))
-        return {name: value for name, value in values if isinstance(value, np.ndarray)}
+        held = ((item.name, getattr(self, item.name)) for item in fields(self))
+        return {name: value for name, value in held if isinstance(value, np.ndarray)}
 
     def _model(self, index: int) -> LinearModel:
-        rows = {key: _row(value, index) for key, value in self._arrays().items()}
-        lower = rows.pop("B_lower")
-        B = np.zeros((2 * len(lower), lower.shape[1]))
-        B[len(lower) :] = lower
-        if "_x0" not in rows:
-            rows["_x0"] = self._rest_states(slice(index, index + 1))[0]
-        x0, y0 = rows.pop("_x0"), rows.pop("_y0", None)
-        root = rows.pop("_root")
-        if "_reference" not in rows:
-            rows["_reference"] = _carried(root, rows["q"][:7])
-        certify: Any = partial(_no_robot, "certificate", self.robot)
-        inertia: Any = partial(_no_robot, "inertia M", self.robot)
-        ignorable: Any = partial(_given, self._ignorable)
-        limits: Any = dict
-        if self._system is not None:
-            from fflin.linear.certificate import certify as certified
-            from fflin.linear.certificate import inertia_matrix
-            from fflin.linear.ignorable import ignorable_states
-            from fflin.robot.limits import joint_limits
-
-            ignorable = partial(ignorable_states, self._system)
-            limits = partial(joint_limits, self._system)
-            certify = partial(certified, self._system)
-            inertia = partial(inertia_matrix, self._system)
+        common = {item.name: vars(self).get(item.name) for item in fields(LinearModel)}
+        # A row of a file is read here, so that no model keeps the file open.
+        rows = {key: np.asarray(array[index]) for key, array in self._arrays().items()}
+        lower, root = rows.pop("B_lower"), rows.pop("_root")
+        B = np.concatenate((np.zeros_like(lower), lower))
         B.setflags(write=False)
-        names = {
-            item.name: getattr(self, item.name)
-            for item in fields(self)
-            if not item.name.startswith("_") and item.name not in rows and item.name != "B_lower"
-        }
-        return LinearModel.from_fields(
-            rows
-            | names
-            | {"B": B, "x0": x0, "y0": x0 if y0 is None else y0, "dt": 0.0}
-            | {"_inertia": inertia, "_certify": certify, "_drift": rows.get("_drift")}
-            | {"_ignorable": ignorable, "_limits": limits, "_source": None}
-        )
+        x0 = rows.pop("_x0", None)
+        if x0 is None:
+            x0 = self._states_at_rest(rows["q"][None])[0]
+        made = {"B": B, "x0": x0, "y0": rows.pop("_y0", x0), "dt": 0.0}
+        if "_reference" not in rows:
+            made["_reference"] = own_reference(root, rows["q"][:7])
+        asked = functions_of(self._system, self.robot, self._ignorable)
+        return LinearModel.from_fields({**common, **rows, **made, **asked})
 
-    def _rest_states(self, rows: slice) -> Array:
-        q_m = positions(self.q[rows], self._columns)
-        x0 = np.zeros((len(q_m), len(self.state_names)))
+    def _states_at_rest(self, q: Array) -> Array:
+        q_m = positions(q, self.columns)
+        x0 = np.zeros((len(q), len(self.state_names)))
         x0[:, 6 : 6 + q_m.shape[1]] = q_m
         x0.setflags(write=False)
         return x0
 
     def _named(self, joints: Mapping[str, Any]) -> dict[int, Any]:
-        from fflin.base.errors import unknown
-
         if not isinstance(joints, Mapping) or not joints:
             raise InputError(f"joints is {joints!r}, expected {{joint: value}}")
         for name in joints:
             if name not in self.joint_names:
                 raise unknown("joint", name, self.joint_names)
         return {self.joint_names.index(name): value for name, value in joints.items()}
-
-
-def _carried(root: Array, base: Array) -> Array:
-    """Return the placement (7,) of a base that is placed relative to the root."""
-    import pinocchio as pin
-
-    if (root == _NOWHERE).all():
-        return base
-    placement = pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(root) * pin.XYZQUATToSE3(base))
-    placement.setflags(write=False)
-    return placement
-
-
-def _row(array: Array, index: int) -> Array:
-    # A row of a file is read here; a plain array's keeps no file open.
-    return np.asarray(array[index])
-
-
-def _given(value: Any, _: LinearModel) -> Any:
-    return value
-
-
-def _no_robot(what: str, name: str, _: LinearModel) -> NoReturn:
-    raise InputError(
-        f"the {what} needs the robot: load the batch with LinearBatch.load(path, robot) where "
-        f"robot is '{name}' as it was"
-    )

@@ -4,10 +4,10 @@ import numpy as np
 
 from fflin.base.validation import Array
 
-# Steps of Newton's method along the motions that the eigenproblem gave.
+# Newton steps that refine P, in the coordinates of the closed loop's motions.
 _REFINEMENTS = 2
 
-# Odd powers of the poles' equation this small, relative, are rounding.
+# Relative size of the odd coefficients, up to which they are rounding errors of zero.
 _ODD = 1e-12
 
 

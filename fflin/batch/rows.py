@@ -1,18 +1,55 @@
-"""Checks of the rows of q, v and u that a caller passes in, many at a time."""
+"""Many configurations, velocities and inputs, a row each: the joints' values, and checks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from fflin.base.errors import FflinError, InputError
-from fflin.base.validation import NORM_TOLERANCE, Array, as_double, dimension
-from fflin.batch.configurations import follow_rows
+from fflin.base.validation import NORM_TOLERANCE, Array, as_double, dimension, vector
+from fflin.robot.joints import Joint
 from fflin.robot.robot import ROUND_OFF, Robot
 
-_BLOCK = 2048  # rows that are checked at once, so that what that takes is small
+# Where a joint stands in q: (index, -1), or, where it is stored so, those of (cos, sin).
+Column: TypeAlias = tuple[int, int]
+
+# Rows that are checked at once, which bounds the memory of what is computed on the way.
+_BLOCK = 2048
+
+
+def column(joint: Joint) -> Column:
+    """Return where a joint stands in q."""
+    return joint.idx_q, joint.idx_q + 1 if joint.unbounded else -1
+
+
+def values(q: Array, column: Column) -> Array:
+    """Return a joint's angle or length (N,) at configurations (N, nq)."""
+    first, second = column
+    at: Array = q[:, first] if second < 0 else np.arctan2(q[:, second], q[:, first])
+    return at
+
+
+def positions(q: Array, columns: Sequence[Column]) -> Array:
+    """Return the angles and lengths (N, joints) at configurations (N, nq)."""
+    found = [values(q, column) for column in columns]
+    return np.column_stack(found) if found else np.empty((len(q), 0))
+
+
+def away(q: Array, column: Column, value: float) -> Array:
+    """Return how far a joint is from a value (N,), the short way round where it has no stop."""
+    distance = values(q, column) - value
+    if column[1] >= 0:
+        distance -= 2.0 * np.pi * np.round(distance / (2.0 * np.pi))
+    return np.abs(distance)
+
+
+def follow_rows(robot: Robot, q: Array) -> None:
+    """Put the mimic joints of configurations (N, nq) where their leaders say."""
+    for joint, leader, multiplier, offset in robot.followers:
+        at: Any = multiplier * values(q, column(leader)) + offset
+        joint.place(q.T, at)
 
 
 def checked_configurations(robot: Robot, q: Any) -> Array:
@@ -24,23 +61,22 @@ def checked_configurations(robot: Robot, q: Any) -> Array:
         If the shape is wrong or a row is no configuration; the message names it.
     """
     rows = _rows("q", q, robot.nq, "a configuration in Pinocchio's order each")
-    unbounded = list(robot.unbounded)
     for start in range(0, len(rows), _BLOCK):
         block = rows[start : start + _BLOCK]
         with np.errstate(all="ignore"):
             excess = np.abs(np.einsum("ij,ij->i", block[:, 3:7], block[:, 3:7]) - 1.0)
-            for at in unbounded:
+            for at in robot.unbounded:
                 excess = np.maximum(excess, np.abs(block[:, at] ** 2 + block[:, at + 1] ** 2 - 1.0))
-            # The sum tells at once where all are finite.
+            # A finite sum tells at once that all are finite.
             finite = np.isfinite(block.sum()) or np.isfinite(block).all(axis=1)
-        # Written so that NaN is among them.
+        # NaN compares false, so that it is among them.
         doubtful = ~((excess <= ROUND_OFF) & finite)
         if robot.followers:
             followed = block.copy()
             follow_rows(robot, followed)
             doubtful |= ~(np.abs(followed - block) <= NORM_TOLERANCE).all(axis=1)
         for row in np.flatnonzero(doubtful).tolist():
-            block[row] = _named(
+            block[row] = _checked(
                 robot.checked_configuration, "configuration", start + row, block[row]
             )
         if robot.followers:
@@ -62,7 +98,7 @@ def checked_velocities(robot: Robot, v: Any, count: int) -> Array:
     rows = _rows("v", v, robot.nv, "a velocity in Pinocchio's order each", count)
     doubtful = ~np.isfinite(rows).all(axis=1) | bool(robot.followers)
     for row in np.flatnonzero(doubtful).tolist():
-        _named(robot.checked_velocity, "velocity", row, rows[row])
+        _checked(robot.checked_velocity, "velocity", row, rows[row])
     rows.setflags(write=False)
     return rows
 
@@ -75,19 +111,14 @@ def checked_inputs(names: tuple[str, ...], u: Any, count: int) -> Array:
     InputError
         If the shape is wrong or an entry is not finite.
     """
-    one = dimension("u", u) == 1
-    rows = _rows(
-        "u",
-        as_double("u", u)[None] if one else u,
-        len(names),
-        "the robot's inputs each",
-        1 if one else count,
-    )
-    for row in np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist():
-        index = int(np.flatnonzero(~np.isfinite(rows[row]))[0])
+    nu = len(names)
+    if dimension("u", u) == 1:
+        return np.broadcast_to(vector("u", u, nu, "the robot's inputs").copy(), (count, nu))
+    rows = _rows("u", u, nu, "the robot's inputs each", count)
+    for row, index in np.argwhere(~np.isfinite(rows)).tolist():
         raise InputError(f"u[{row}, {index}] is {rows[row, index]}; every entry must be finite")
     rows.setflags(write=False)
-    return np.broadcast_to(rows[0], (count, len(names))) if one else rows
+    return rows
 
 
 def _rows(name: str, value: Any, size: int, of_what: str, count: int | None = None) -> Array:
@@ -100,7 +131,7 @@ def _rows(name: str, value: Any, size: int, of_what: str, count: int | None = No
     return np.ascontiguousarray(array)
 
 
-def _named(check: Callable[[Array], Array], what: str, row: int, value: Array) -> Array:
+def _checked(check: Callable[[Array], Array], what: str, row: int, value: Array) -> Array:
     try:
         return check(value)
     except FflinError as error:

@@ -1,7 +1,9 @@
-"""The result of a sweep as it grows: in memory, or in a file that outlives a crash."""
+"""The result of a sweep as it grows, in memory or in a file that outlives a crash, and its room."""
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from fflin.base.errors import FileError
+from fflin.base.errors import FileError, InputError
 from fflin.base.record import SEAL
 from fflin.base.validation import Array
-from fflin.base.writing import check_place, install, reason, reserve
-from fflin.batch.files import CHECKED, CHUNK_SEALS, batch_seal, chunk_seal, hdf5
-from fflin.batch.space import part_of
+from fflin.base.writing import as_path, check_place, install, reason, reserve
+from fflin.batch.files import CHECKED, CHUNK_SEALS, batch_seal, check_format, chunk_seal, hdf5
+
+# Allowance for what a file has besides its rows: names, constant arrays, digests [bytes].
+_OVERHEAD = 2**16
 
 
 class MemoryStore:
@@ -60,7 +64,7 @@ class FileStore:
     Parameters
     ----------
     path : Path
-        Of the file as it will be called.
+        Of the file as it will be called; one that is not .h5 is made of the unfinished file.
     request : str
         Hash of all that the result depends on.
     count, chunk : int
@@ -100,62 +104,70 @@ class FileStore:
         self.path, self.part = path, part_of(path)
         self.chunk, self.names = chunk, tuple(shapes)
         self._constants, self._texts = constants, texts
-        check_place(path)
-        check_place(self.part)
         self.resumed = self.part.exists()
-        h5py = hdf5()
         try:
-            self._file = h5py.File(self.part, "r+" if self.resumed else "x", libver=CHECKED)
+            mode = "r+" if self.resumed else "x"
+            self._file = hdf5().File(self.part, mode, libver=CHECKED)
         except OSError as error:
             if self.resumed and "unable to lock" in str(error):
                 raise FileError(f"{self.part} is in use by another run; wait for it") from None
             hint = "; remove it to begin anew" * self.resumed
             raise FileError(f"{self.part}: cannot be opened: {reason(error)}{hint}") from None
-        if self.resumed:
-            try:
-                self._go_on(request)
-            except BaseException:
-                self.close()
-                raise
-            return
         try:
+            if self.resumed:
+                self._go_on(request)
+            else:
+                self._begin(request, count, shapes)
+        except BaseException:
+            (self.close if self.resumed else self.discard)()
+            raise
+
+    def _begin(self, request: str, count: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        with self._writable():
             for key, shape in shapes.items():
-                _fixed(h5py, self._file, key, (count, *shape), np.float64)
-            for key, value in constants.items():
+                _reserve(self._file, key, (count, *shape))
+            for key, value in self._constants.items():
                 self._file.create_dataset(key, data=value)
-            self._file[CHUNK_SEALS] = np.zeros((-(-count // chunk), 32), np.uint8)
+            self._file[CHUNK_SEALS] = np.zeros((-(-count // self.chunk), 32), np.uint8)
             self._file[SEAL] = np.zeros(32, np.uint8)
-            self._file.attrs.update({**texts, "chunk": chunk, "request": request})
+            self._file.attrs.update({**self._texts, "chunk": self.chunk, "request": request})
             self._file.flush()
             reserve(self.part)
-        except OSError as error:
-            self.discard()
-            raise FileError(f"{self.part}: cannot be written: {reason(error)}") from None
 
     def _go_on(self, request: str) -> None:
         with self._readable():
-            found = self._file.attrs.get("request")
+            if self._file.attrs.get("request") != request:
+                raise FileError(
+                    f"{self.part} is what another sweep left behind; remove it, or choose another "
+                    "name"
+                )
             self.chunk = int(self._file.attrs.get("chunk", self.chunk))
-            if found == request:
-                for key, value in self._constants.items():
-                    if not np.array_equal(self._file[key][()], value):
-                        raise ValueError(f"{key} is another")
-                if any(self._file.attrs[key] != value for key, value in self._texts.items()):
-                    raise ValueError("its names are others")
-                if self._file[SEAL].shape != (32,):
-                    raise ValueError("its digest is none")
-        if found != request:
-            raise FileError(
-                f"{self.part} is what another sweep left behind; remove it, or choose another name"
-            )
+            for key, value in self._constants.items():
+                if not np.array_equal(self._file[key][()], value):
+                    raise ValueError(f"{key} is another")
+            if any(self._file.attrs[key] != value for key, value in self._texts.items()):
+                raise ValueError("its names are others")
+            if self._file[SEAL].shape != (32,):
+                raise ValueError("its digest is none")
 
     @contextmanager
     def _readable(self) -> Iterator[None]:
         try:
             yield
+        except FileError:
+            raise
         except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
             said = " ".join(str(error).split()).strip("'\"")
             raise FileError(f"{self.part} is damaged ({said}); remove it to begin anew") from None
+
+    @contextmanager
+    def _writable(self) -> Iterator[None]:
+        try:
+            yield
+        except FileError:
+            raise
+        except OSError as error:
+            raise FileError(f"{self.part}: cannot be written: {reason(error)}") from None
 
     def finished(self, start: int, stop: int) -> bool:
         """Whether a chunk is there, and is what was written."""
@@ -170,28 +182,22 @@ class FileStore:
 
     def write(self, start: int, stop: int, arrays: Mapping[str, Array]) -> None:
         """Keep a finished chunk."""
-        try:
+        with self._writable():
             for key in self.names:
                 self._file[key][start:stop] = arrays[key]
             self._file.flush()
             seal = chunk_seal({key: arrays[key] for key in self.names})
             self._file[CHUNK_SEALS][start // self.chunk] = np.frombuffer(seal, np.uint8)
             self._file.flush()
-        except OSError as error:
-            raise FileError(f"{self.part}: cannot be written: {reason(error)}") from None
 
-    def complete(self, *, keep_name: bool) -> None:
-        """Add the hash of all and, unless the name is to be kept, take the target's place."""
-        try:
+    def complete(self) -> None:
+        """Add the hash of all and, where the target is HDF5 too, take its place."""
+        with self._writable():
             seals = self._file[CHUNK_SEALS][:]
             self._file[SEAL][:] = batch_seal(self._texts, self.chunk, seals, self._constants)
             self._file.close()
-            if not keep_name:
+            if self.path.suffix == ".h5":
                 install(self.part, self.path)
-        except FileError:
-            raise
-        except OSError as error:
-            raise FileError(f"{self.path}: cannot be written: {reason(error)}") from None
 
     def discard(self) -> None:
         """Leave nothing behind."""
@@ -203,12 +209,88 @@ class FileStore:
         self._file.close()
 
 
-def _fixed(h5py: Any, file: Any, name: str, shape: tuple[int, ...], dtype: Any) -> None:
-    """Create a dataset whose place in the file is settled and that is not filled."""
+def _reserve(file: Any, name: str, shape: tuple[int, ...]) -> None:
+    """Create a dataset of doubles whose place in the file is settled and that is not filled."""
+    h5py = hdf5()
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     properties.set_layout(h5py.h5d.CONTIGUOUS)
     properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     properties.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-    kind = h5py.h5t.py_create(np.dtype(dtype), logical=True)
-    space = h5py.h5s.create_simple(shape)
+    kind, space = h5py.h5t.py_create(np.dtype(np.float64)), h5py.h5s.create_simple(shape)
     h5py.h5d.create(file.id, name.encode(), kind, space, properties)
+
+
+def output_path(out: str | Path) -> Path:
+    """Return where a batch can be written, or raise `FileError` or `MissingPackageError`."""
+    path = as_path(out)
+    check_format(path)
+    check_place(path)
+    check_place(part_of(path))
+    return path
+
+
+def part_of(path: Path) -> Path:
+    """Return the file that a result grows in until it is whole, beside what a link leads to."""
+    real = Path(os.path.realpath(path)) if os.path.islink(path) else path
+    return real.with_name(real.name + ".part")
+
+
+def check_room(count: int, size: int, path: Path | None) -> None:
+    """Raise where so many points with a result of so many bytes do not fit.
+
+    Parameters
+    ----------
+    count : int
+        Points.
+    size : int
+        Of the result [bytes].
+    path : Path or None
+        File that is to be written; None keeps the result in memory.
+
+    Raises
+    ------
+    FileError
+        If the disk has not so much free.
+    InputError
+        If the machine has not so much memory.
+    """
+    said = f"{count:,} points are {readable(size)}"
+    if path is None:
+        if size > (memory := _memory()):
+            raise InputError(
+                f"{said}, and the machine has {readable(memory)} of memory; write them to a file "
+                "with out='NAME.h5', or choose fewer points"
+            )
+    # An unfinished file has reserved its room already.
+    elif path.parent.is_dir() and not part_of(path).exists():
+        # An .npz is made from the unfinished file.
+        twice = path.suffix == ".npz"
+        if size * (1 + twice) > (free := shutil.disk_usage(path.parent).free):
+            needs = ", and .npz needs twice that on the way" * twice
+            raise FileError(f"{said}{needs}: only {readable(free)} are free in {path.parent}")
+        if size + _OVERHEAD > (most := _largest_file()):
+            raise FileError(f"{said}: a file may have no more than {readable(most)} (ulimit -f)")
+
+
+def readable(size: float) -> str:
+    """Show a number of bytes."""
+    for unit, scale in (("PB", 1e15), ("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if size >= scale:
+            return f"{size / scale:,.1f} {unit}"
+    return f"{size / 1e3:.1f} kB"
+
+
+def _largest_file() -> float:
+    try:
+        import resource
+    except ImportError:  # not on this system
+        return float("inf")
+    most = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return float("inf") if most == resource.RLIM_INFINITY else float(most)
+
+
+def _memory() -> float:
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):  # not on this system
+        return float("inf")

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import warnings
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable
+from concurrent.futures import Executor
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,16 +15,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
-from fflin.base.writing import as_path, check_place
+from fflin.base.errors import FflinWarning, InputError, SweepError, listed
+from fflin.base.validation import whole
 from fflin.batch.chunks import ChunkJob
-from fflin.batch.configurations import Configurations, GivenConfigurations
-from fflin.batch.dispatch import Done, Span, dispatch
-from fflin.batch.files import check_format, header
+from fflin.batch.configurations import Configurations, as_configurations
+from fflin.batch.dispatch import Done, dispatch, run_here
 from fflin.batch.linear_batch import LinearBatch
-from fflin.batch.space import check_room, part_of
-from fflin.batch.store import FileStore, MemoryStore
-from fflin.batch.task import SweepTask, as_configurations
+from fflin.batch.store import FileStore, MemoryStore, check_room, output_path
+from fflin.batch.task import Span, SweepTask
 from fflin.batch.workers import OwnWorkers
 from fflin.kernel.compiled import available_cores
 from fflin.robot.robot import Robot
@@ -36,12 +32,12 @@ if TYPE_CHECKING:
 
     from fflin.dynamics.state import Frame
 
-# A chunk's result is about this large, so that what it costs to send is small against it and a
-# handful of them fit in memory.
+# Size of a chunk's result: large enough that sending it costs little beside computing it, small
+# enough that a handful of them fit in memory.
 _CHUNK_BYTES, _LEAST_CHUNK_BYTES = 4 * 2**20, 2**21
 _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
 
-# So many chunks where workers share them, so that all end at about the same time.
+# Number of chunks that workers share, so that all workers end at about the same time.
 _SHARES = 32
 
 _log = logging.getLogger("fflin")
@@ -127,9 +123,8 @@ def sweep(
             f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
         )
     for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
-        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        if value is not None and (not whole or value < 1):
-            raise InputError(f"{name} is {value!r}, expected a whole number from 1 on")
+        if value is not None:
+            whole(name, value, 1)
     if progress is not None and not callable(progress):
         raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
     path = None if out is None else output_path(out)
@@ -154,11 +149,10 @@ def sweep(
     others = own or executor
     try:
         left = [span for span in spans if not store.finished(*span)]
-        done: Iterable[Done] = (
-            _here(task, left, store, threads)
-            if others is None
-            else dispatch(job, left, task.points, others)
-        )
+        if others is None:
+            done = run_here(task, left, store.place, threads)
+        else:
+            done = dispatch(task, left, others)
         failed = _collect(task, done, store, (len(spans) - len(left)) * size, progress)
         if failed:
             raise _failure(task, store, failed, len(spans))
@@ -197,63 +191,18 @@ def _chunk_size(task: SweepTask, shares: int, threads: int) -> int:
     return math.ceil(task.count / chunks / _LEAST_CHUNK) * _LEAST_CHUNK
 
 
-def output_path(out: str | Path) -> Path:
-    """Return where a batch can be written, or raise `FileError` or `MissingPackageError`."""
-    path = as_path(out)
-    check_format(path)
-    check_place(path)
-    check_place(part_of(path))
-    return path
-
-
 def _store(task: SweepTask, path: Path | None, size: int) -> FileStore | MemoryStore:
-    shapes = dict(task.job.shapes)
+    given, shapes = task.given(), {**task.job.shapes, "q": (task.robot.nq,)}
     if path is None or (path.suffix == ".npz" and find_spec("h5py") is None):
-        if not isinstance(task.configurations, GivenConfigurations):
-            shapes["q"] = (task.robot.nq,)
-        return MemoryStore(task.count, size, shapes)
-    shapes |= {"q": (task.robot.nq,)}
-    shapes |= {key: rows.shape[1:] for key, rows in task.varying().items()}
+        held = {key: shape for key, shape in shapes.items() if key not in given}
+        return MemoryStore(task.count, size, held)
+    shapes |= {key: rows.shape[1:] for key, rows in given.items()}
     constants = task.constants(shapes)
-    one = task.points(Span(0, 1)).q
-    example = task.batch(
-        {"q": one} | {key: np.empty((1, *s)) for key, s in task.job.shapes.items()}
-    )
-    texts = {"header": header(example, task.count), "constant": json.dumps(list(constants))}
+    texts = task.texts(constants)
     store = FileStore(path, task.request, task.count, size, shapes, constants, texts)
     if store.resumed:
         _log.info("going on with %s", store.part)
     return store
-
-
-def _here(
-    task: SweepTask, spans: Sequence[Span], store: FileStore | MemoryStore, threads: int
-) -> Iterator[Done]:
-    """Do chunks in this process, several at a time where the kernel does them."""
-
-    def run(span: Span) -> Done:
-        place = store.place(*span)
-        out = place and {key: place[key] for key in task.job.shapes}
-        try:
-            return Done(span, task.job.run(task.points(span), span.start, out), "")
-        except FflinError as error:
-            return Done(span, None, str(error))
-
-    if threads == 1 or len(spans) == 1 or not task.job.parallel:
-        yield from map(run, spans)
-        return
-    pool, begun = ThreadPoolExecutor(threads), deque[Future[Done]]()
-    try:
-        for span in spans:
-            begun.append(pool.submit(run, span))
-            # Not far ahead of what takes the results, which would fill the memory.
-            if len(begun) > threads:
-                yield begun.popleft().result()
-        while begun:
-            yield begun.popleft().result()
-    finally:
-        # Ctrl-C does not wait for what they compile.
-        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _collect(
@@ -268,18 +217,16 @@ def _collect(
     notes: list[str] = []
     if progress and count:
         progress(min(count, task.count), task.count)
-    for result in done:
-        if result.chunk is None:
-            failed.append(result)
+    for span, result, reason in done:
+        if result is None:
+            failed.append(Done(span, None, reason))
         else:
-            points = task.points(result.span)
+            points = task.points(span)
             rows: dict[str, Any] = {"q": points.q, "v": points.v, "u0": points.u}
-            arrays = {
-                key: rows[key] if key in rows else result.chunk.arrays[key] for key in store.names
-            }
-            store.write(*result.span, arrays)
-            notes += result.chunk.notes
-        count += result.span.stop - result.span.start
+            arrays = {key: rows[key] if key in rows else result.arrays[key] for key in store.names}
+            store.write(*span, arrays)
+            notes += result.notes
+        count += span.stop - span.start
         if progress:
             progress(min(count, task.count), task.count)
     if notes:
@@ -298,32 +245,31 @@ def _failure(
         f"{failed[0].reason}"
     )
     batch = None
-    if isinstance(store, FileStore):
-        if len(failed) == chunks:
+    if len(failed) == chunks:
+        if isinstance(store, FileStore):
             store.discard()
-            return SweepError(said, tuple((*span, reason) for span, _, reason in failed), None)
+    elif isinstance(store, FileStore):
         said += f"; the others are in {store.part}, and the same call goes on from them"
-    elif len(failed) < chunks:
+    else:
         kept = np.ones(task.count, dtype=bool)
         for (start, stop), *_ in failed:
             kept[start:stop] = False
-        batch = task.batch(task.varying() | store.arrays)[kept]
+        batch = task.batch(task.given() | store.arrays)[kept]
         said += "; the others are in the `batch` of this error"
     return SweepError(said, tuple((*span, reason) for span, _, reason in failed), batch)
 
 
 def _finish(task: SweepTask, store: FileStore | MemoryStore, path: Path | None) -> LinearBatch:
     if isinstance(store, MemoryStore):
-        batch = task.batch(task.varying() | store.arrays)
+        batch = task.batch(task.given() | store.arrays)
         if path is not None:
             batch.save(path)
         return batch
-    assert path is not None
-    store.complete(keep_name=path.suffix != ".h5")
-    if path.suffix == ".npz":
-        _written(store.part, task).save(path)
+    store.complete()
+    if store.path.suffix == ".npz":
+        _written(store.part, task).save(store.path)
         store.part.unlink()
-    return _written(path, task)
+    return _written(store.path, task)
 
 
 def _written(path: Path, task: SweepTask) -> LinearBatch:

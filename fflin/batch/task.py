@@ -2,30 +2,39 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from hashlib import sha256
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.base.version import __version__
 from fflin.batch.chunks import ChunkJob, Points
-from fflin.batch.configurations import (
-    Configurations,
-    GivenConfigurations,
-    Grid,
-    RandomConfigurations,
-)
-from fflin.batch.dispatch import Span
-from fflin.batch.joint_columns import joint_columns
+from fflin.batch.configurations import Configurations, GivenConfigurations, fingerprint
+from fflin.batch.files import header
 from fflin.batch.linear_batch import LinearBatch
-from fflin.batch.rows import checked_configurations, checked_inputs, checked_velocities
+from fflin.batch.robot_functions import AT_ROOT
+from fflin.batch.rows import checked_inputs, checked_velocities, column
 from fflin.robot.frames import ROOT
-from fflin.robot.robot import Robot
+
+# Fields of a linear model that a batch has as arrays, or not at all.
+_OF_MODELS = ("C", "D", "dt", "_inertia", "_certify", "_ignorable", "_limits")
+
+# Attributes of a robot that, with its model and its mappings, tell it from others.
+_OF_THE_ROBOT = (
+    *("name", "urdf_sha256", "locked", "joints", "followers"),
+    *("inputs", "outputs", "gravity"),
+)
+
+
+class Span(NamedTuple):
+    """The points of a chunk, start up to but not including stop."""
+
+    start: int
+    stop: int
 
 
 class SweepTask:
@@ -43,7 +52,7 @@ class SweepTask:
         v, u = (None if rows is None else rows[slice(*span)] for rows in (self.v, self.u))
         return Points(self.configurations.rows(*span), v, u)
 
-    def varying(self) -> dict[str, Array]:
+    def given(self) -> dict[str, Array]:
         """Return the arrays of points that differ from point to point and are there already."""
         rows = {"v": self.v, "u0": self.u}
         if isinstance(self.configurations, GivenConfigurations):
@@ -57,7 +66,7 @@ class SweepTask:
             **prepared.rest,
             "C": prepared.common["C"],
             "D": prepared.common["D"],
-            "_root": _NOWHERE if root.isIdentity(0.0) else pin.SE3ToXYZQUAT(root),
+            "_root": AT_ROOT if root.isIdentity(0.0) else pin.SE3ToXYZQUAT(root),
         }
         if self.u is not None:
             rows["u0"] = self.u[0]
@@ -80,63 +89,35 @@ class SweepTask:
             **absent | rows | dict(arrays),
             **{key: common[key] for key in common if key not in _OF_MODELS},
             _ignorable=None,
-            _columns=joint_columns(self.robot),
+            columns=tuple(map(column, self.robot.joints)),
             _system=self.robot,
         )
+
+    def texts(self, constants: Iterable[str]) -> dict[str, str]:
+        """Return what a file of the batch has beside its arrays."""
+        one = {key: np.empty((1, *shape)) for key, shape in self.job.shapes.items()}
+        example = self.batch(one | {"q": self.points(Span(0, 1)).q})
+        return {"header": header(example, self.count), "constant": json.dumps(list(constants))}
 
     @property
     def request(self) -> str:
         """Hash of all that the result depends on."""
         robot, prepared = self.robot, self.job.linearizer.prepared
-        model = robot.model
         digest = sha256(
             repr(
                 [getattr(robot, key) for key in _OF_THE_ROBOT]
                 + [dict(getattr(robot, key)) for key in ("stiffness", "damping", "rest")]
                 + [prepared.map.frame, prepared.moving, prepared.own_reference]
                 + [self.job.only_inertia, __version__, pin.__version__]
+                + [self.count, fingerprint(self.configurations)]
             ).encode()
         )
-        for inertia, placement in zip(model.inertias, model.jointPlacements, strict=True):
+        for inertia, placement in zip(
+            robot.model.inertias, robot.model.jointPlacements, strict=True
+        ):
             digest.update(inertia.toDynamicParameters().tobytes())
             digest.update(placement.homogeneous.tobytes())
         digest.update(prepared.reference.tobytes())
-        digest.update(f"{self.count} {self.configurations.fingerprint}".encode())
         for rows in (self.v, self.u):
             digest.update(b"none" if rows is None else np.ascontiguousarray(rows).data)
         return digest.hexdigest()
-
-
-# Fields of a linear model that a batch has as arrays, or not at all.
-_OF_MODELS = ("C", "D", "dt", "_inertia", "_certify", "_ignorable", "_limits")
-
-# What the robot is, beside what its model and its mappings hold.
-_OF_THE_ROBOT = (
-    *("name", "urdf_sha256", "locked", "joints", "followers"),
-    *("inputs", "outputs", "gravity"),
-)
-_NOWHERE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-
-
-def as_configurations(robot: Robot, q: Any) -> Configurations:
-    """Return the points that `sweep` is given as rows of this robot.
-
-    Raises
-    ------
-    InputError
-        If they are none, or of another robot.
-    """
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
-    if isinstance(q, GivenConfigurations):  # checked already
-        return q
-    if not isinstance(q, Grid | RandomConfigurations):
-        return GivenConfigurations(checked_configurations(robot, q))
-    if q.robot is robot:
-        return q
-    # The same robot with other inputs or outputs will do.
-    if q.robot.joints != robot.joints:
-        raise InputError(
-            f"q is of '{q.robot.name}', whose joints are others than those of '{robot.name}'"
-        )
-    return replace(q, robot=robot)

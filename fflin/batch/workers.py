@@ -16,7 +16,7 @@ from typing import Any
 from fflin.base.errors import FflinWarning
 from fflin.kernel.compiled import available_cores
 
-# How long a process is given to end when it is told to [s].
+# How long a process that was terminated may take to end, before it is killed [s].
 _PATIENCE = 5.0
 
 
@@ -75,23 +75,23 @@ class OwnWorkers(Executor):
                 process.terminate()
         self._threads.shutdown(wait=wait, cancel_futures=True)
         for process in list(self._processes):
-            self._bury(process)
+            self._end(process)
 
     def _do(self, task: Any) -> Any:
-        process = getattr(self._mine, "process", None) or self._hire()
+        process = getattr(self._mine, "process", None) or self._start()
         pipe = self._processes[process]
         try:
             pipe.send(task)
             error, result = pipe.recv()
         except (EOFError, OSError):
             self._mine.process = None
-            self._bury(process)
+            self._end(process)
             raise WorkerDied("its worker died each time") from None
         if error is not None:
             raise error
         return result
 
-    def _hire(self) -> Any:
+    def _start(self) -> Any:
         """Start a process for this thread and wait until it is there."""
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_serve, args=(theirs,), daemon=True)
@@ -99,7 +99,7 @@ class OwnWorkers(Executor):
             if self._closed:
                 raise NoWorkers("the workers are shut down")
             try:
-                with _deaf():
+                with _deaf_to_ctrl_c():
                     process.start()
             except OSError as error:
                 raise NoWorkers(f"no worker can be started: {error}") from None
@@ -108,14 +108,14 @@ class OwnWorkers(Executor):
         try:
             ours.recv()
         except (EOFError, OSError):
-            self._bury(process)
+            self._end(process)
             raise NoWorkers(
                 'a worker did not start; call sweep under `if __name__ == "__main__":`'
             ) from None
         self._mine.process = process
         return process
 
-    def _bury(self, process: Any) -> None:
+    def _end(self, process: Any) -> None:
         self._processes.pop(process).close()
         process.join(_PATIENCE)
         if process.is_alive():
@@ -125,14 +125,14 @@ class OwnWorkers(Executor):
 
 
 @contextmanager
-def _deaf() -> Iterator[None]:
-    """Let what is started now not hear Ctrl-C, which is the caller's, who then ends it."""
+def _deaf_to_ctrl_c() -> Iterator[None]:
+    """Block Ctrl-C in the processes that are started: their caller gets it too, and ends them."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
     from multiprocessing import resource_tracker
 
-    # Where it starts with a process, it takes the mask away.
+    # Started together with a process it would unblock the signal.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -142,7 +142,7 @@ def _deaf() -> Iterator[None]:
 
 
 def _serve(pipe: Connection) -> None:
-    """Do tasks until the pipe ends, with the caller or at its word."""
+    """Do tasks until the caller closes the pipe or ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_the_caller, daemon=True).start()
     try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import textwrap
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -87,7 +86,7 @@ def _modes(arguments: argparse.Namespace) -> int:
 
 def _momentum(lin: LinearModel) -> str:
     from fflin.analysis.momentum import momentum_reduction
-    from fflin.base.tables import width
+    from fflin.base.tables import folded
 
     try:
         reduced = momentum_reduction(lin)
@@ -104,8 +103,7 @@ def _momentum(lin: LinearModel) -> str:
         elif not lin.is_equilibrium():
             text = "none can be split off: the model is one of a point that moves on"
         text = "\n".join((text, *(f"note: {note}" for note in reduced.notes)))
-    lines = (textwrap.fill(line, width(), subsequent_indent="  ") for line in text.splitlines())
-    return "\n".join(lines)
+    return folded(text.splitlines())
 
 
 def _validity(arguments: argparse.Namespace) -> int:

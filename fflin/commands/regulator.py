@@ -26,7 +26,7 @@ from fflin.commands.arguments import (
 from fflin.commands.points import linear_model, once
 
 if TYPE_CHECKING:
-    from fflin.control.lqr import Gain
+    from fflin.control.gain import Gain
     from fflin.linear.model import LinearModel
 
 
@@ -94,7 +94,7 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     """Return the regulator that the weights say, and warn of one that bears little."""
-    from fflin.control.gain_text import fragility
+    from fflin.control.gain import fragility
     from fflin.control.lqr import lqr, require_fixed_point
 
     try:

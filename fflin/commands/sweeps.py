@@ -140,8 +140,8 @@ def _sweep(arguments: argparse.Namespace) -> int:
     import pinocchio as pin
 
     from fflin.base.progress import Progress
-    from fflin.batch.space import part_of
-    from fflin.batch.sweep import output_path, sweep
+    from fflin.batch.store import output_path, part_of
+    from fflin.batch.sweep import sweep
     from fflin.dynamics.points import effort
 
     path = arguments.output_file
@@ -193,8 +193,8 @@ class _Announcement:
         self._said = ""
 
     def __call__(self, count: int, *, at_rest: bool) -> None:
-        from fflin.batch.space import check_room, part_of, readable
-        from fflin.batch.sweep import output_path, planned_bytes
+        from fflin.batch.store import check_room, output_path, part_of, readable
+        from fflin.batch.sweep import planned_bytes
 
         output_path(self._path)  # once more, when the inputs are known
         size = planned_bytes(self._robot, count, at_rest=at_rest, **self._options)
@@ -221,8 +221,7 @@ def _points(
     """Return q, v and u of the points."""
     import numpy as np
 
-    from fflin.batch.configurations import grid, random_configurations
-    from fflin.batch.task import as_configurations
+    from fflin.batch.configurations import as_configurations, grid, random_configurations
 
     kinds = [bool(arguments.grid), arguments.random is not None, bool(arguments.configurations)]
     if sum(kinds) != 1:

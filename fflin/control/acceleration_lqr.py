@@ -7,15 +7,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.analysis.stabilizability import require_stabilizable
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.validation import Array, dimension
-from fflin.control.lqr import Gain, make_gain, require_fixed_point
+from fflin.control.gain import Gain, make_gain
+from fflin.control.lqr import require_fixed_point
 from fflin.control.riccati import Riccati, Solution
 from fflin.control.weights import Weight, weight
 from fflin.linear.model import LinearModel
 
-_BEYOND = "the weights or dt are beyond what numbers hold: scale Qp, Qv and Ra nearer to each other"
+_BEYOND = "the weights or dt make the solution overflow: scale Qp, Qv and Ra nearer to each other"
 
 
 class _Channel(NamedTuple):
@@ -36,7 +36,8 @@ def acceleration_lqr(
 
     With the accelerations :math:`a = L u` as inputs, where L is the lower block of B, a model at
     rest is one double integrator a coordinate, :math:`\ddot q_i = s_i a_i` with s = 1/2 for
-    attitude and 1 else. Diagonal weights then decouple, and for continuous time
+    attitude and 1 else. Diagonal weights then decouple, and for continuous time, (10.2) of
+    docs/derivation.md,
 
     .. math:: k_p = \sqrt{q_p/r_a},\quad k_d = \sqrt{q_v/r_a + 2 s k_p},\quad
               u = u_0 - L^{-1} [\operatorname{diag} k_p, \operatorname{diag} k_d]\,(x - x_0),
@@ -91,17 +92,15 @@ def acceleration_lqr(
     )
     with np.errstate(all="ignore"):
         channel = _sampled(rates, qp, qv, ra, lin.dt) if lin.dt else _continuous(rates, qp, qv, ra)
-    _require_sound(channel, lin.dt)
+    stable = np.abs(channel.poles) < 1.0 if lin.dt else channel.poles.real < 0.0
+    if not stable.all() or not all(np.isfinite(part).all() for part in channel):
+        raise InputError(_BEYOND)
     inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
     K = inverse @ np.hstack((np.diag(channel.kp), np.diag(channel.kd)))
-    P = np.block(
-        [
-            [np.diag(channel.p11), np.diag(channel.p12)],
-            [np.diag(channel.p12), np.diag(channel.p22)],
-        ]
-    )
+    p12 = np.diag(channel.p12)
+    P = np.block([[np.diag(channel.p11), p12], [p12, np.diag(channel.p22)]])
     Q = np.diag(np.concatenate((qp, qv)))
-    # The same equation with the accelerations as inputs.
+    # The residual is that of the same equation with accelerations as inputs.
     hold = np.vstack((np.diag(0.5 * lin.dt**2 * rates), lin.dt * np.eye(m)))
     by_acceleration = hold if lin.dt else np.vstack((np.zeros((m, m)), np.eye(m)))
     equation = Riccati(lin.A, by_acceleration, Q, np.diag(ra), None, lin.dt)
@@ -115,13 +114,6 @@ def acceleration_lqr(
     return make_gain(lin, solution, Q, 0.5 * (R + R.T), None)
 
 
-def _require_sound(channel: _Channel, dt: float) -> None:
-    poles = channel.poles
-    stable = np.abs(poles) < 1.0 if dt else poles.real < 0.0
-    if not stable.all() or not all(np.isfinite(part).all() for part in channel):
-        raise InputError(_BEYOND)
-
-
 def _integrators(lin: LinearModel) -> tuple[Array, Array]:
     """Return s (m,) and L (m, nu) of a model of double integrators."""
     nx = len(lin.A)
@@ -133,7 +125,7 @@ def _integrators(lin: LinearModel) -> tuple[Array, Array]:
     expected = np.zeros((nx, nx))
     expected[:m, m:] = np.diag(s)
     top = 0.5 * lin.dt * s[:, None] * L
-    # Division by the sampling time rounds.
+    # A tolerance, since the division by the sampling time rounds.
     if (
         nx != 2 * m
         or not np.allclose(slope, expected, rtol=1e-12, atol=0.0)
@@ -145,6 +137,8 @@ def _integrators(lin: LinearModel) -> tuple[Array, Array]:
         )
     sizes = np.abs(L).max(axis=1, keepdims=True)
     if not sizes.all() or np.linalg.matrix_rank(L / sizes, tol=1e-10) < m:
+        from fflin.analysis.stabilizability import require_stabilizable
+
         require_stabilizable(lin)
         raise StabilizabilityError("the inputs do not accelerate every coordinate; use lqr")
     return s, L

@@ -39,7 +39,7 @@ def limits_of(actuation: Actuation, limits: Any) -> tuple[Array, Array]:
         given = limits
     else:
         given = dict.fromkeys(groups, limits)
-    # A single name goes before its group's, whichever stands first.
+    # A limit for a single name overrides that of its group, whatever the order.
     for name in sorted(given, key=lambda name: name in names):
         if name not in names and name not in groups:
             raise unknown("input", str(name), (*groups, *names))
@@ -62,7 +62,7 @@ def limits_of(actuation: Actuation, limits: Any) -> tuple[Array, Array]:
 
 
 class Law:
-    """A policy of which nothing but inputs is taken, and that shares no memory with the robot.
+    """A policy whose commands are checked, and which gets copies of q and v.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from fflin.base.validation import Array
 
 # Weights of the commutator-free method of order four, and its Gauss nodes.
 _HEAVY, _LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0
-_NODES = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
+NODES = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
 
 
 class Coefficients(NamedTuple):
@@ -55,7 +55,7 @@ def _passage(coefficients: Coefficients, h: float) -> _Passage:
     """Return an interval of constant coefficients: a short exponential, doubled."""
     A, S, Q = coefficients
     n = len(A)
-    # Costates in units in which the equations of both halves are of one size.
+    # The costate is scaled so that Q and S are of the same size.
     unit = math.sqrt(max(_size(Q), 1e-300) / max(_size(S), 1e-300))
     H = np.block([[A, -S * unit], [-Q / unit, -A.T]])
     doublings = max(0, math.ceil(math.log2(max(4.0 * h * _size(H), 1.0))))
@@ -89,7 +89,7 @@ def step_back(start: Coefficients, end: Coefficients, S: Array, P: Array, h: flo
         Coefficients(*((1.0 - c) * a + c * b for a, b in zip(start, end, strict=True)))._replace(
             S=at_node
         )
-        for c, at_node in zip(_NODES, S, strict=True)
+        for c, at_node in zip(NODES, S, strict=True)
     )
     for first, second in ((late, early), (early, late)):
         mixed = Coefficients(*(_HEAVY * a + _LIGHT * b for a, b in zip(first, second, strict=True)))

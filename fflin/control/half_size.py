@@ -5,21 +5,21 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dgeev, dgeqrf, dpotrf, dtrtrs
+from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtrs
 
 from fflin.base.validation import Array
-from fflin.control.lyapunov import Modes, Spectrum
+from fflin.control.lyapunov import ModalMatrix, modes_of, scaled
 
 
-class Loop(NamedTuple):
+class OptimalLoop(NamedTuple):
     """A closed loop by its modes V, and V' (Q + K' R K) V of its gain."""
 
-    modes: Modes
+    modes: ModalMatrix
     cost: Array
 
 
-def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> Loop | None:
-    r"""Return a stable loop, optimal but for odd powers; None where the system is another.
+def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalLoop | None:
+    r"""Return a stable loop, optimal but for odd powers; None for a system of another form.
 
     A state (x1, x2) of m entries each with
 
@@ -56,13 +56,12 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> Loop | N
     if nx != 2 * m or B[:m].any():
         return None
     white = _lower(R_factor, B[m:].T)
-    # Of the inverse weight on forces, S = Ls Ls'; squaring it would square its condition.
+    # The inverse weight on forces is Ls Ls'; forming the product would square its condition.
     Ls: Array = np.triu(dgeqrf(white)[0][:m]).T
     sizes = np.abs(Ls.diagonal())
-    singular = len(white) < m or sizes.min() <= 1e-14 * sizes.max()
     A11, A12 = A[:m, :m], A[:m, m:]
     inverse = _inverse(A12)
-    if singular or inverse is None:
+    if len(white) < m or sizes.min() <= 1e-14 * sizes.max() or inverse is None:
         return None
     # x = T (p, dp/dt)
     T = np.zeros((nx, nx))
@@ -79,24 +78,19 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> Loop | N
     G, indefinite = dpotrf(S, lower=1)
     if indefinite:
         return None
-    C = np.zeros((nx, nx), order="F")
+    C = np.zeros((nx, nx))
     C[:m, m:], C[m:, :m], C[m:, m:] = G.T, -G, D
-    if not np.isfinite(C).all():
+    squares, W = modes_of(C)
+    if ((squares.imag == 0.0) & (squares.real <= 0.0)).any():
         return None
-    real, imag, _, W, failed = dgeev(C, compute_vl=0, overwrite_a=1)
-    if failed or ((imag == 0.0) & (real <= 0.0)).any():
-        return None
-    spectrum = Spectrum(real, imag)
-    poles = -np.sqrt(spectrum.values)
+    poles = -np.sqrt(squares)
     # The lower half of w is a = mu p.
-    a = W[m:, spectrum.order]
-    motion = np.concatenate(
-        (spectrum.scale(a, 1.0 / spectrum.values), spectrum.scale(a, 1.0 / poles))
-    )
+    a = W[m:]
+    motion = np.concatenate((scaled(a, 1.0 / squares), scaled(a, 1.0 / poles)))
     if not plain:
         a -= F @ motion[:m] + H @ motion[m:]
     cost = motion.T @ weight @ motion + a.T @ a
-    return Loop(Modes(T @ motion, spectrum, poles, discrete=False), cost)
+    return OptimalLoop(ModalMatrix(poles, T @ motion, discrete=False), cost)
 
 
 def _lower(factor: Array, right: Array) -> Array:

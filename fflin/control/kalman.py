@@ -10,7 +10,8 @@ import numpy as np
 from fflin.base.errors import DetectabilityError, InputError, MissingPackageError
 from fflin.base.record import Design
 from fflin.base.validation import Array
-from fflin.control.lqr import Gain, require_fixed_point
+from fflin.control.gain import Gain
+from fflin.control.lqr import require_fixed_point
 from fflin.control.weights import Weight, columns, weight
 from fflin.linear.model import LinearModel
 
@@ -200,20 +201,17 @@ def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -
         raise DetectabilityError(
             f"no stable filter was found ({error}); scale W and V, or add outputs"
         ) from None
-    L: Array = solution.K.T
+    L = L_update = solution.K.T
     if lin.dt:
-        innovation = C @ solution.P @ C.T + V
-        L_update = np.linalg.solve(innovation, C @ solution.P).T
-    else:
-        L_update = L
-    poles = solution.poles[np.lexsort((solution.poles.imag, solution.poles.real))]
+        L_update = np.linalg.solve(C @ solution.P @ C.T + V, C @ solution.P).T
+    poles, margin = solution.ordered(lin.dt)
     return Estimator(
         L,
         L_update,
         solution.P,
         poles,
         solution.residual,
-        float(1.0 - np.abs(poles).max() if lin.dt else -poles.real.max()),
+        margin,
         W=W,
         V=V,
         **{key: getattr(lin, key) for key in _FROM_MODEL},

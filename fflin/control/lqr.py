@@ -3,114 +3,28 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
-from fflin.base.record import Design
 from fflin.base.validation import Array
 from fflin.control.default_weights import rule_weights
+from fflin.control.gain import Gain, make_gain
 from fflin.control.weights import Weight, cost_weights
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from fflin.control.margins import Margins
-
 _SHOWN_RESIDUALS = 6
 
-# Relative residuals that a user should know of, and beyond which a gain means nothing.
+# A relative residual above _COARSE is worth a warning; above _USELESS the gain is wrong.
 _COARSE, _USELESS = 1e-8, 1e-3
 
-# A pole this near to the boundary of stability, relative to the others, may be one that Q leaves
-# on it, moved by rounding.
+# A pole that is nearer to the boundary of stability, relative to the others, may be one on it that
+# Q does not weigh and rounding moved.
 _STILL = 1e-6
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Gain(Design):
-    r"""A state feedback ``u = u0 - K (x - x0)`` with the figures that prove it.
-
-    Attributes
-    ----------
-    K : ndarray (nu, nx)
-    P : ndarray (nx, nx)
-        The cost from x on is ``(x - x0)' P (x - x0)``.
-    poles : ndarray (nx,) of complex
-        Eigenvalues of ``A - B K`` [1/s]; of a sampled model those of the step.
-    residual : float
-        Of the Riccati equation: its norm relative to the sum of the norms of its terms.
-    margin : float
-        Distance of the poles to the boundary of stability: the slowest decay [1/s]; of a sampled
-        model 1 less the largest modulus.
-    method : str
-        "structured" (half-size), "general" (SciPy) or "closed form".
-    A, B, Q, R, N : ndarray
-        The model and the weights on deviations; N is zero where there was none.
-    x0 : ndarray (nx,)
-    u0 : ndarray (nu,)
-    dt : float
-        Sampling time [s]; 0 for continuous time.
-    state_names, input_names, state_units, input_units : tuple of str
-    frame, robot : str
-        Of the model.
-    weights : str
-        The rule that made the weights, in words.
-    """
-
-    VECTORS: ClassVar = ("poles", "x0", "u0")
-
-    K: Array
-    P: Array
-    poles: Any
-    residual: float
-    margin: float
-    method: str
-    A: Array
-    B: Array
-    Q: Array
-    R: Array
-    N: Array
-    x0: Array
-    u0: Array
-    dt: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    state_units: tuple[str, ...]
-    input_units: tuple[str, ...]
-    frame: str
-    robot: str
-    weights: str = field(default_factory=str)
-
-    def __repr__(self) -> str:
-        nu, nx = self.K.shape
-        time = f"dt={self.dt:g} s" if self.dt else "continuous"
-        return (
-            f"Gain('{self.robot}', nx={nx}, nu={nu}, {time}, margin={self.margin:.3g}, "
-            f"residual={self.residual:.1e})"
-        )
-
-    def __str__(self) -> str:
-        from fflin.control.gain_text import gain_report
-
-        return gain_report(self)
-
-    @property
-    def closed_loop(self) -> Array:
-        """A - B K (nx, nx)."""
-        loop: Array = self.A - self.B @ self.K
-        return loop
-
-    @cached_property
-    def margins(self) -> Margins:
-        """Gain and phase that the inputs bear, computed when first asked for."""
-        from fflin.control.margins import input_margins
-
-        return input_margins(self.A, self.B, self.K, self.R, self.dt)
 
 
 def lqr(
@@ -213,37 +127,8 @@ def require_fixed_point(lin: LinearModel) -> None:
     )
 
 
-def make_gain(
-    lin: LinearModel,
-    solution: Any,
-    Q: Array,
-    R: Array,
-    N: Array | None,
-    weights: str = "as given",
-) -> Gain:
-    """Return a gain of a solution (P, K, poles, residual, method)."""
-    poles = solution.poles[np.lexsort((solution.poles.imag, solution.poles.real))]
-    margin = 1.0 - np.abs(poles).max() if lin.dt else -poles.real.max()
-    return Gain(
-        **{key: getattr(solution, key) for key in ("K", "P", "residual", "method")},
-        **{key: getattr(lin, key) for key in _FROM_MODEL},
-        poles=poles,
-        margin=float(margin),
-        Q=Q,
-        R=R,
-        N=np.zeros(lin.B.shape) if N is None else N,
-        weights=weights,
-    )
-
-
-_FROM_MODEL = (
-    *("A", "B", "x0", "u0", "dt", "frame", "robot"),
-    *("state_names", "input_names", "state_units", "input_units"),
-)
-
-
 def _difference(a: Array, b: Array, c: Array) -> Array:
-    """Return a - b c with zeros for what is rounding."""
+    """Return a - b c, with zeros where the difference is rounding."""
     rounding = 1e3 * np.finfo(float).eps * (np.abs(a) + np.abs(b) @ np.abs(c))
     difference = a - b @ c
     return np.where(np.abs(difference) > rounding, difference, 0.0)
@@ -257,14 +142,15 @@ def _still(poles: Any, dt: float) -> bool:
 
 
 def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
-    from fflin.analysis.stabilizability import require_stabilizable, require_weighed
     from fflin.control.riccati import half_size, solve
 
     arguments = (lin.A, lin.B, Q, R, N, lin.dt)
     structured = half_size(*arguments)
     if structured is not None and not _still(structured.poles, lin.dt):
         return structured
-    # Before a general solver fails without a word.
+    # A general solver would fail without saying which mode is to blame.
+    from fflin.analysis.stabilizability import require_stabilizable, require_weighed
+
     require_stabilizable(lin)
     free, A = Q, lin.A
     if N is not None:

@@ -13,7 +13,7 @@ _ACCURACY = 1e-5
 
 
 class Margins(NamedTuple):
-    """What every input at once bears, whatever the others do.
+    """Changes that every input tolerates at once, whatever the others do.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ def input_margins(A: Array, B: Array, K: Array, R: Array, dt: float) -> Margins:
     scale = np.sqrt(R.diagonal())
     F, G, H, D = A - B @ K, B / scale, -scale[:, None] * K, 0.5 * np.eye(len(K))
     if dt:
-        # s = (z - 1)/(z + 1) keeps the norm.
+        # The bilinear map s = (z - 1)/(z + 1) preserves the norm.
         inverse = np.linalg.inv(F + np.eye(len(F)))
         D = D - H @ inverse @ G
         F, G, H = inverse @ (F - np.eye(len(F))), 2.0**0.5 * inverse @ G, 2.0**0.5 * H @ inverse
@@ -69,8 +69,8 @@ def _norm(A: Array, B: Array, C: Array, D: Array) -> float:
         F = A + B @ inverse @ D.T @ C
         spread = C.T @ (np.eye(len(D)) + D @ inverse @ D.T) @ C
         crossings = np.linalg.eigvals(np.block([[F, B @ inverse @ B.T], [-spread, -F.T]]))
-        # At an eigenvalue on the imaginary axis the gain crosses the bound; taking one too many
-        # for such costs a look at it only.
+        # The gain crosses the bound at eigenvalues on the imaginary axis; one too many in this list
+        # costs only another evaluation.
         on_axis = np.abs(crossings.real) <= 1e-6 * np.abs(crossings)
         frequencies = np.sort(np.abs(crossings.imag[on_axis]))
         between = np.concatenate((frequencies, 0.5 * (frequencies[1:] + frequencies[:-1])))

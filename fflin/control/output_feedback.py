@@ -13,8 +13,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, vector
 from fflin.control.kalman import Compensator
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.output_values import Measuring
-from fflin.dynamics.outputs import Sensing
+from fflin.dynamics.outputs import Measuring, Sensing
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState

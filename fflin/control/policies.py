@@ -64,7 +64,14 @@ class StateFeedback:
             raise InputError(
                 "the model is about a moving reference; follow it with TrajectoryFeedback"
             )
-        object.__setattr__(self, "K", _gain(self.K, self.lin.B.shape[::-1]))
+        K, shape = as_double("K", self.K), self.lin.B.shape[::-1]
+        if K.shape != shape or not np.isfinite(K).all():
+            raise InputError(
+                f"K has shape {K.shape}, expected {shape} (nu, nx) and finite numbers; take the "
+                "gain that was designed for this model"
+            )
+        K.setflags(write=False)
+        object.__setattr__(self, "K", K)
 
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
@@ -206,8 +213,8 @@ class Allocation:
             size = float(np.linalg.norm(b))
             if size == 0.0:
                 return np.zeros(len(least))
-            # To unity, for the solver stops at absolute figures. Of the thrusts that do the
-            # same, the least: what is added is below rounding.
+            # Scaled to 1, as the solver stops at absolute figures. The added rows choose the
+            # least of the thrusts that do the same; their effect is below rounding.
             unit = float(np.linalg.norm(A))
             found = lsq_linear(
                 np.vstack((A / unit, 1e-7 * np.eye(len(least)))),
@@ -231,17 +238,6 @@ def bound(policy: Any, robot: Robot) -> Policy:
             "StateFeedback(lin, gain.K)"
         )
     return result
-
-
-def _gain(K: ArrayLike, shape: tuple[int, ...]) -> Array:
-    gain = as_double("K", K)
-    if gain.shape != shape or not np.isfinite(gain).all():
-        raise InputError(
-            f"K has shape {gain.shape}, expected {shape} (nu, nx) and finite numbers; take the "
-            "gain that was designed for this model"
-        )
-    gain.setflags(write=False)
-    return gain
 
 
 def require_same_robot(lin: LinearModel, robot: Robot, state: StateMap) -> None:

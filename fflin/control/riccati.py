@@ -1,4 +1,4 @@
-"""Algebraic Riccati equations: a solution with its residual, by half the size where it goes."""
+"""Algebraic Riccati equations: a solution with its residual, from half the size where possible."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from fflin.base.validation import Array
 from fflin.control.half_size import second_order_loop
-from fflin.control.lyapunov import Modes, eigenvalues
+from fflin.control.lyapunov import ModalMatrix
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 
-# A residual at which nothing is wrong with the solution but rounding.
+# A solution with a smaller residual is exact but for rounding.
 _SOUND = 1e-11
 _STEPS = 25
 
-# Of a residual: where what a step does not lower is rounding, and where Newton's method lowers it
-# at every step.
+# Residuals below _ROUNDED are rounding if a step does not lower them; below _NEAR every Newton step
+# lowers the residual.
 _ROUNDED = 1e-12
 _NEAR = 1e-3
 
@@ -34,6 +34,11 @@ class Solution(NamedTuple):
     poles: Any
     residual: float
     method: str
+
+    def ordered(self, dt: float) -> tuple[Any, float]:
+        """Return the poles in order, and how far they are from the boundary of stability."""
+        poles = self.poles[np.lexsort((self.poles.imag, self.poles.real))]
+        return poles, float(1.0 - np.abs(poles).max() if dt else -poles.real.max())
 
 
 class _Trial(NamedTuple):
@@ -61,7 +66,7 @@ class Riccati:
     def __init__(self, A: Array, B: Array, Q: Array, R: Array, N: Array | None, dt: float) -> None:
         self.A, self.B, self.Q, self.R, self.N = A, B, Q, R, N
         self.discrete = bool(dt)
-        # Of a sampled system only what A differs by from the identity counts.
+        # For a sampled system A - E, since the difference of P and A' P A would cancel.
         self.rate = A - np.eye(len(A)) if dt else A
         self.R_factor, indefinite = dpotrf(R, lower=1)
         self.definite = not indefinite
@@ -88,7 +93,7 @@ class Riccati:
             size += _norm(second)
         residual = _norm(defect) / max(size, _TINY)
         if not math.isfinite(residual + size):
-            raise np.linalg.LinAlgError("the weights or the model are beyond all numbers")
+            raise np.linalg.LinAlgError("the weights or the model overflow")
         return _Trial(P, defect, residual)
 
     def closed_loop(self, P: Array) -> Array:
@@ -146,12 +151,12 @@ def solve(
     D. L. Kleinman, IEEE Trans. Automatic Control 13(1), 1968.
     """
     equation = Riccati(A, B, Q, R, N, dt)
-    start = _attempt(equation)
+    start = _half_size(equation)
     if start is not None and start.residual <= _SOUND:
         return start
     found = [] if start is None else [start]
     for unit in (False, True):
-        # SciPy raises either where a pencil cannot be reordered.
+        # SciPy raises one or the other where it cannot reorder a pencil.
         with suppress(np.linalg.LinAlgError, ValueError), np.errstate(all="ignore"):
             refined = _refined(equation, _general(equation, unit), None)
             if (general := _finished(equation, *refined, "general")) is not None:
@@ -167,31 +172,27 @@ def half_size(
     A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
 ) -> Solution | None:
     """Solve as `solve` does by the half-size method; None where it falls short."""
-    solution = _attempt(Riccati(A, B, Q, R, N, dt))
+    solution = _half_size(Riccati(A, B, Q, R, N, dt))
     return solution if solution is not None and solution.residual <= _SOUND else None
 
 
-def _attempt(equation: Riccati) -> Solution | None:
-    with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
-        return _half_size(equation)
-    return None
-
-
 def _half_size(equation: Riccati) -> Solution | None:
-    source = _bilinear(equation) if equation.discrete else equation
-    if source is None:
-        return None
-    A, Q, cross = source.A, source.Q, source.cross
-    if cross is not None:
-        # The input is counted from -R^-1 N' x, from where the cost has no cross term.
-        A = A - source.B @ dtrtrs(source.R_factor, cross, lower=1, trans=1)[0]
-        Q = Q - cross.T @ cross
-    loop = second_order_loop(A, source.B, Q, source.R_factor)
-    if loop is None:
-        return None
-    P = loop.modes.lyapunov_modal(loop.cost)
-    modes = None if equation.discrete else loop.modes
-    return _finished(equation, *_refined(equation, P, modes), "structured")
+    with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
+        source = _bilinear(equation) if equation.discrete else equation
+        if source is None:
+            return None
+        A, Q, cross = source.A, source.Q, source.cross
+        if cross is not None:
+            # In terms of u + R^-1 N' x the cost has no cross term.
+            A = A - source.B @ dtrtrs(source.R_factor, cross, lower=1, trans=1)[0]
+            Q = Q - cross.T @ cross
+        loop = second_order_loop(A, source.B, Q, source.R_factor)
+        if loop is None:
+            return None
+        P = loop.modes.lyapunov_modal(loop.cost)
+        modes = None if equation.discrete else loop.modes
+        return _finished(equation, *_refined(equation, P, modes), "structured")
+    return None
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:
@@ -207,7 +208,7 @@ def _bilinear(equation: Riccati) -> Riccati | None:
     FB = F @ B
     R = equation.R - N.T @ FB - FB.T @ N + FB.T @ Q @ FB
     Bc = 2.0**0.5 * FB
-    # What rounding leaves of the zeros at most; Newton's method works on the true ones.
+    # Rows that should be zero are rounding; Newton's method uses the equation without this map.
     Bc[np.abs(Bc).max(axis=1) <= 1e-12 * np.abs(Bc).max()] = 0.0
     N = 2.0**0.5 * F.T @ (N - Q @ FB)
     continuous = Riccati(F @ equation.rate, Bc, 2.0 * F.T @ Q @ F, R, N, 0.0)
@@ -215,16 +216,18 @@ def _bilinear(equation: Riccati) -> Riccati | None:
 
 
 def _finished(
-    equation: Riccati, trial: _Trial, modes: Modes | None, method: str
+    equation: Riccati, trial: _Trial, modes: ModalMatrix | None, method: str
 ) -> Solution | None:
     K = equation.gain(trial.P)
     F = equation.A - equation.B @ K
-    poles = modes.poles(F) if modes else eigenvalues(F)
+    poles = modes.poles(F) if modes else np.linalg.eigvals(F).astype(complex)
     stable = np.abs(poles).max() < 1.0 if equation.discrete else poles.real.max() < 0.0
     return Solution(trial.P, K, poles, trial.residual, method) if stable else None
 
 
-def _refined(equation: Riccati, P: Array, modes: Modes | None) -> tuple[_Trial, Modes | None]:
+def _refined(
+    equation: Riccati, P: Array, modes: ModalMatrix | None
+) -> tuple[_Trial, ModalMatrix | None]:
     """Apply Newton steps; `modes` are those of a closed loop near that of P, where known."""
     enough = 0.5 * _EPS * len(P) ** 0.5
     trial = best = equation.trial(P)
@@ -233,10 +236,10 @@ def _refined(equation: Riccati, P: Array, modes: Modes | None) -> tuple[_Trial, 
         if best.residual <= enough:
             break
         if modes is None:
-            modes, fresh = Modes.of(equation.closed_loop(trial.P), equation.discrete), True
+            modes, fresh = ModalMatrix.of(equation.closed_loop(trial.P), equation.discrete), True
         better = equation.trial(trial.P + modes.lyapunov(trial.defect))
         gain = trial.residual / max(better.residual, _TINY)
-        # From afar the first steps may raise the residual; what they do to P is for the better.
+        # Far from the solution a first step may raise the residual and still improve P.
         if gain > 1.0 or (fresh and trial.residual > _NEAR):
             trial = better
         if trial.residual < best.residual:
@@ -245,7 +248,7 @@ def _refined(equation: Riccati, P: Array, modes: Modes | None) -> tuple[_Trial, 
             if gain < 2.0:
                 break
         elif gain < 10.0:
-            # These modes are those of another loop.
+            # Slow progress: the modes are those of a loop too far away.
             if fresh and trial is not better:
                 break
             modes = None
@@ -263,7 +266,7 @@ def _general(equation: Riccati, unit: bool) -> Array:
         N = None if N is None else dtrtrs(equation.R_factor, N.T, lower=1)[0].T
         R = np.eye(len(R))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of ill-conditioning: the residual is measured
+        warnings.simplefilter("ignore")  # ill-conditioning shows in the residual
         P: Array = solver(equation.A, B, equation.Q, R, s=N)
     return 0.5 * (P + P.T)
 

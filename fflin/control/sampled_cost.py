@@ -29,6 +29,8 @@ def sampled_cost(
 ) -> SampledCost:
     r"""Return the sum over samples that equals an integral cost under held inputs.
 
+    Equation (10.1) of docs/derivation.md:
+
     .. math:: \begin{bmatrix} Q_d & N_d \\ N_d^T & R_d \end{bmatrix} = \int_0^h e^{F^T t}
               \begin{bmatrix} Q & N \\ N^T & R \end{bmatrix} e^{F t}\,dt,\qquad
               F = \begin{bmatrix} A & B \\ 0 & 0 \end{bmatrix}
@@ -75,5 +77,5 @@ def sampled_cost(
         W[:nx, nx:], W[nx:, :nx] = cross, cross.T
     total = held_cost(F, W, h)
     if not np.isfinite(total).all():
-        raise InputError(f"dt is {h:g} s, over which the model grows beyond all numbers")
+        raise InputError(f"dt is {h:g} s, over which the model overflows")
     return SampledCost(total[:nx, :nx], total[nx:, nx:], total[:nx, nx:])

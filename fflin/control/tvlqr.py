@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -11,17 +12,18 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, number
+from fflin.control.differential_riccati import NODES, Coefficients, step_back
 from fflin.control.weights import Weight, weight
 
 if TYPE_CHECKING:
-    from fflin.control.differential_riccati import Coefficients
+    from scipy.interpolate import CubicHermiteSpline
+
     from fflin.linear.trajectory import LinearTrajectory
 
-# Between two knots P is a cubic; knots are put in until it holds to this, relative to P.
+# Between two knots P is a cubic; knots are added until it is this accurate, relative to P.
 _ACCURACY = 1e-7
 _KNOTS_LIMIT = 100_000
 _TOO_FAST = "P changes too fast at {}; give smaller weights or a larger R"
-_NODES = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,32 +76,31 @@ class GainSchedule(Design):
 
     def gain(self, t: float) -> Array:
         """Return K (nu, nx) at a time; InputError where it is not within the knots."""
-        index, share = self._place(t)
-        B = (1.0 - share) * self.B[index] + share * self.B[index + 1]
-        K: Array = np.linalg.solve(self.R, B.T @ self.cost_to_go(t))
+        P = self.cost_to_go(t)
+        i = min(int(np.searchsorted(self.t, t, side="right")) - 1, len(self.t) - 2)
+        share = (t - self.t[i]) / (self.t[i + 1] - self.t[i])
+        B = (1.0 - share) * self.B[i] + share * self.B[i + 1]
+        K: Array = np.linalg.solve(self.R, B.T @ P)
         return K
 
     def cost_to_go(self, t: float) -> Array:
         """Return P (nx, nx) at a time, a cubic between the knots with their values and slopes."""
-        index, share = self._place(t)
-        return self._cubic(index, share)[0]
-
-    def _cubic(self, index: int, share: float) -> tuple[Array, Array]:
-        """Return P and dP/dt in an interval."""
-        h = float(self.t[index + 1] - self.t[index])
-        slopes = []
-        for i in (index, index + 1):
-            drift = self.P[i] @ self.A[i]
-            spent = self.K[i].T @ self.R @ self.K[i]
-            slopes.append(spent - drift - drift.T - self.Q)
-        return cubic(share, h, self.P[index], self.P[index + 1], *slopes)
-
-    def _place(self, t: float) -> tuple[int, float]:
         t = number("t", t)
         if not self.t[0] <= t <= self.t[-1]:
             raise InputError(f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s")
-        index = min(int(np.searchsorted(self.t, t, side="right")) - 1, len(self.t) - 2)
-        return index, float((t - self.t[index]) / (self.t[index + 1] - self.t[index]))
+        P: Array = self._cubics(t)
+        return P
+
+    @cached_property
+    def _cubics(self) -> CubicHermiteSpline:
+        """P over time."""
+        from scipy.interpolate import CubicHermiteSpline
+
+        drift, across = self.P @ self.A, (0, 2, 1)
+        spent = self.K.transpose(across) @ self.R @ self.K
+        return CubicHermiteSpline(
+            self.t, self.P, spent - drift - drift.transpose(across) - self.Q, extrapolate=False
+        )
 
 
 def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSchedule:
@@ -153,7 +154,7 @@ def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSched
     Q, Qf = weight("Q", Q, names), weight("Qf", Qf, names)
     R = weight("R", R, traj.input_names, definite=True)
     try:
-        # What overflows is refused, and not warned of.
+        # A P that overflows is refused below, so that NumPy need not warn of it.
         with np.errstate(over="ignore", invalid="ignore"):
             t, P = _solve(traj, Q, R, Qf)
     except np.linalg.LinAlgError:
@@ -166,38 +167,18 @@ def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSched
     return replace(schedule, residual=_residual(schedule))
 
 
-def cubic(
-    share: float, h: float, start: Array, end: Array, start_rate: Array, end_rate: Array
-) -> tuple[Array, Array]:
-    """Return the cubic with given values and slopes at the ends, and its slope, within [0, h]."""
-    s = share
-    value = (
-        (1.0 + 2.0 * s) * (1.0 - s) ** 2 * start
-        + s * s * (3.0 - 2.0 * s) * end
-        + h * s * (1.0 - s) * ((1.0 - s) * start_rate - s * end_rate)
-    )
-    rate = (
-        6.0 * s * (1.0 - s) / h * (end - start)
-        + (1.0 - s) * (1.0 - 3.0 * s) * start_rate
-        - s * (2.0 - 3.0 * s) * end_rate
-    )
-    return value, rate
-
-
 def _solve(traj: LinearTrajectory, Q: Array, R: Array, Qf: Array) -> tuple[Array, Array]:
-    from fflin.control.differential_riccati import Coefficients, step_back
-
     def at(t: float) -> Coefficients:
         A, B = traj.matrices(t)
         return Coefficients(A, _spread(B, R), Q)
 
     def back(a: float, b: float, P: Array) -> Array:
-        nodes = np.array([_spread(traj.matrices(a + c * (b - a))[1], R) for c in _NODES])
+        nodes = np.array([_spread(traj.matrices(a + c * (b - a))[1], R) for c in NODES])
         return step_back(at(a), at(b), nodes, P, b - a)
 
     times, values = [float(traj.t[-1])], [Qf]
     for a in traj.t[-2::-1].tolist():
-        # Intervals to do, the latest last, each with P at its start by one step where known.
+        # Intervals left to do, the latest last; with P at the start from one step, where known.
         pending: list[tuple[float, float, Array | None]] = [(a, times[-1], None)]
         while pending:
             start, end, single = pending.pop()
@@ -207,7 +188,9 @@ def _solve(traj: LinearTrajectory, Q: Array, R: Array, Qf: Array) -> tuple[Array
             half = back(middle, end, P)
             double = back(start, middle, half)
             h = end - start
-            between, _ = cubic(0.5, h, double, P, at(start).rate(double), at(end).rate(P))
+            # The cubic with these values and slopes, midway.
+            bend = at(start).rate(double) - at(end).rate(P)
+            between = 0.5 * (double + P) + 0.125 * h * bend
             if max(_apart(single, double), _apart(between, half)) <= _ACCURACY:
                 times += [middle, start]
                 values += [half, double]
@@ -230,10 +213,9 @@ def _apart(first: Array, second: Array) -> float:
 
 def _residual(schedule: GainSchedule) -> float:
     worst = 0.0
-    for index in range(len(schedule.t) - 1):
-        P, rate = schedule._cubic(index, 0.5)
-        A = 0.5 * (schedule.A[index] + schedule.A[index + 1])
-        B = 0.5 * (schedule.B[index] + schedule.B[index + 1])
+    for i, t in enumerate(0.5 * (schedule.t[1:] + schedule.t[:-1])):
+        P, rate = schedule._cubics(t), schedule._cubics(t, 1)
+        A, B = (0.5 * (each[i] + each[i + 1]) for each in (schedule.A, schedule.B))
         drift, spent = P @ A, P @ _spread(B, schedule.R) @ P
         terms = np.array((rate, drift, drift.T, -spent, schedule.Q))
         size = float(np.linalg.norm(terms, axis=(1, 2)).sum())

@@ -9,7 +9,7 @@ import pinocchio as pin
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import PIN_ANGULAR, StateMap
 from fflin.robot.frames import ROOT
 
 
@@ -108,7 +108,7 @@ class Aba:
         pin.forwardKinematics(model, data, q, v)
         pin.computeJointJacobians(model, data, q)
         local = pin.ReferenceFrame.LOCAL
-        jacobian = pin.getJointJacobian(model, data, joint, local)[3:]
+        jacobian = pin.getJointJacobian(model, data, joint, local)[PIN_ANGULAR]
         turning = np.zeros_like(jacobian)
         for support in model.supports[joint].tolist()[ROOT + 1 :]:
             column, parent = model.idx_vs[support], model.parents[support]
@@ -140,9 +140,10 @@ class Aba:
     ) -> tuple[Array, Array, Array]:
         """Return the slopes where joints mimic others: S^T M a = S^T (tau - b).
 
-        The forces that keep them in step drop out of it. ABA wants M regular, which it need not
-        be where one of the joints carries no mass: they get a rotor's inertia as large as the
-        inertia that they share, in M' = M + rotor, whose part in S^T M' S is taken out again.
+        The forces that keep the joints in step drop out of this equation. ABA needs a regular M,
+        which it is not where one of these joints carries no mass. So each gets, as a rotor, an
+        inertia as large as the one that they share, M' = M + rotor, and what the rotors add to
+        S^T M' S is subtracted again.
         """
         state, data = self.state, self._data
         shared = S @ state.project(pin.crba(self._model, data, q)).diagonal()

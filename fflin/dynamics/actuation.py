@@ -72,7 +72,7 @@ class Actuation:
                     held.append(Held(slice(at, at + 3), rows))
             elif isinstance(item, JointTorque):
                 index = robot.joints.index(robot.joint(item.joint))
-                unit = "N" if robot.joints[index].prismatic else unit
+                unit = robot.joints[index].force_unit
                 names.append(f"{kind}.{item.joint}")
                 columns.append(identity[6 + index])
             elif isinstance(item, ReactionWheel) and item.inertia:
@@ -121,7 +121,7 @@ class Actuation:
         return bool(self._carried)
 
     def columns(self, data: pin.Data, q: Array) -> Array:
-        """Return the generalised force (6 + n, nu), in base axes, of a unit of each input.
+        """Return B_u (6 + n, nu), the generalised force in base axes of a unit of each input (6.1).
 
         Inputs that are held in reference axes are counted as if they were held in base axes.
         """

@@ -1,26 +1,30 @@
 """The joint-space inertia M in state order, and its inverse."""
 
 import warnings
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, SingularInertiaError, listed
 from fflin.base.validation import Array
-from fflin.dynamics.inertia_bounds import STROKE, inertia_bounds
 from fflin.dynamics.state import StateMap
 from fflin.robot.massless import coordinate_names
+from fflin.robot.robot import Robot
 
-# M_ii (M^-1)_ii is 1 for a decoupled coordinate, more for any other, and grows as a coordinate
-# loses inertia of its own; times the rounding unit it is the relative error of (M^-1)_ii. Of the
-# sum over the coordinates: beyond the second figure less than two digits of M^-1 are left, beyond
-# the first less than nine, and a sum below their number comes of pivots that are round-off.
+# The coupling of a coordinate, M_ii (M^-1)_ii, is 1 where it is decoupled and grows as it loses
+# inertia of its own; times the rounding unit it is the relative error of (M^-1)_ii. Where the sum
+# over all coordinates is beyond the first figure, fewer than nine digits of M^-1 are left; beyond
+# the second, fewer than two. A sum below the number of coordinates comes from pivots that are
+# round-off.
 _EPS = float(np.finfo(float).eps)
 _WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 
 # The same with the moments about the base's origin, where Pinocchio's articulated bodies are
 # added up, bounds their rounding; up to here they are taken, beyond it a factor of M.
 _QUICK_COUPLING = 1e-11 / _EPS
+
+STROKE = 1.0  # [m] that a sliding joint is taken to be out at most, for those moments
 
 # From this size on LAPACK is quicker than a sparse factor.
 _DENSE_SIZE = 64
@@ -57,19 +61,20 @@ class Inertia:
     warning_coupling = _WARNING_COUPLING
 
     def __init__(self, state: StateMap, data: pin.Data) -> None:
-        self._state = state
-        self._data = data
-        self._model = state.robot.model
+        robot = state.robot
+        self._state, self._model, self._data = state, robot.model, data
         # Views, since Pinocchio overwrites in place what they show.
         self._inverse = data.Minv
         self._inverse_diagonal = self._inverse.diagonal()
-        self._constrained = bool(state.robot.followers)
-        self._bounds = None if self._constrained else inertia_bounds(state.robot)
-        self._slides = [joint.idx_q for joint in state.robot.joints if joint.prismatic]
+        self._constrained = bool(robot.followers)
+        if robot not in _BOUNDS:
+            _BOUNDS[robot] = inertia_bounds(robot.model)
+        self._bounds = None if self._constrained else _BOUNDS[robot]
+        self._slides = [joint.idx_q for joint in robot.joints if joint.prismatic]
         # The base at the world's origin: M does not depend on where it is, but Pinocchio works in
         # world axes and would lose digits to a base far away.
-        self._still = pin.neutral(state.robot.model)
-        self.least_coupling = 0.999 * (6 + state.robot.n)
+        self._still = pin.neutral(robot.model)
+        self.least_coupling = 0.999 * (6 + robot.n)
 
     def invert(self, q: Array, out: Array, *, quick: bool = False) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array.
@@ -85,7 +90,7 @@ class Inertia:
         still = self._still
         still[7:] = q[7:]
         bounds = self._bounds if quick else None
-        if bounds is not None and (not self._slides or self._within_stroke(still)):
+        if bounds is not None and all(abs(still[index]) <= STROKE for index in self._slides):
             _compute_inverse(self._model, self._data, still)
             self._state.project(self._inverse, out)
             # Written so that NaN, from a pivot that is zero, fails too.
@@ -105,21 +110,26 @@ class Inertia:
         if not self.least_coupling < coupling < _WARNING_COUPLING:
             self._judge(coupling, self._state.project(upper.T))
 
-    def _within_stroke(self, q: Array) -> bool:
-        return all(abs(q[index]) <= STROKE for index in self._slides)
-
     def _judge(self, coupling: float, M: Array) -> None:
+        """Refuse or warn of an M whose inverse has lost its digits; name what moves with it."""
+        name, scale = self._state.robot.name, np.sqrt(np.maximum(M.diagonal(), 0.0))
+        scale[scale == 0.0] = 1.0
+        mode = np.linalg.eigh(M / scale / scale[:, None])[1][:, 0]
+        names = coordinate_names(self._state.robot)
+        involved = listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
         # Written so that NaN, from a pivot that is zero, fails too.
         if not self.least_coupling < coupling < _LARGEST_COUPLING:
-            raise _singular(self._state, M)
-        if coupling > _WARNING_COUPLING:
-            warnings.warn(
-                f"M of '{self._state.robot.name}' is ill-conditioned: A and B have a relative "
-                f"error of about {coupling * _EPS:.0e}; {_involved(self._state, M)} hardly move "
-                "mass against each other",
-                FflinWarning,
-                stacklevel=6,
+            raise SingularInertiaError(
+                f"M of '{name}' is singular at this configuration: {involved} can move together "
+                "without moving mass; choose another configuration, give the links an inertia, or "
+                "lock one of them"
             )
+        warnings.warn(
+            f"M of '{name}' is ill-conditioned: A and B have a relative error of about "
+            f"{coupling * _EPS:.0e}; {involved} hardly move mass against each other",
+            FflinWarning,
+            stacklevel=6,
+        )
 
 
 def _invert_dense(M: Array, out: Array) -> None:
@@ -131,18 +141,48 @@ def _invert_dense(M: Array, out: Array) -> None:
     out.flat[:: len(M) + 1] *= 0.5
 
 
-def _singular(state: StateMap, M: Array) -> SingularInertiaError:
-    return SingularInertiaError(
-        f"M of '{state.robot.name}' is singular at this configuration: {_involved(state, M)} can "
-        "move together without moving mass; choose another configuration, give the links an "
-        "inertia, or lock one of them"
-    )
+# Robots do not change, so each is bounded once.
+_BOUNDS: WeakKeyDictionary[Robot, Array | None] = WeakKeyDictionary()
 
 
-def _involved(state: StateMap, M: Array) -> str:
-    """Name the coordinates of the motion with the least inertia."""
-    diagonal = M.diagonal()
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    mode = np.linalg.eigh(scale[:, None] * M * scale)[1][:, 0]
-    names = coordinate_names(state.robot)
-    return listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
+def inertia_bounds(model: pin.Model) -> Array | None:
+    """Bound what each coordinate moves: its mass, or its moment about the base's origin.
+
+    A body's moment about an axis through that origin is at most its largest principal moment and
+    its mass times the square of the way to it, from joint to joint. M's diagonal is no larger.
+
+    Parameters
+    ----------
+    model : pin.Model
+        Its root joint is a free flyer.
+
+    Returns
+    -------
+    ndarray (nv,) or None
+        In Pinocchio's order, for sliding joints within `STROKE`; None where a joint neither turns
+        nor slides alone.
+    """
+    joints = model.joints.tolist()
+    slides = [joint.shortname().startswith("JointModelP") for joint in joints]
+    if not all(joint.shortname()[:11] in ("JointModelR", "JointModelP") for joint in joints[2:]):
+        return None
+    inertias, parents = model.inertias.tolist(), model.parents.tolist()
+    places = model.jointPlacements.tolist()
+    ways = [0.0] * len(joints)
+    for index in range(2, len(joints)):
+        step = float(np.linalg.norm(places[index].translation)) + STROKE * slides[index]
+        ways[index] = ways[parents[index]] + step
+    masses = [item.mass for item in inertias]
+    moments = [
+        # The largest sum of a row is no less than the largest principal moment.
+        item.mass * (way + float(np.linalg.norm(item.lever))) ** 2
+        + float(np.abs(item.inertia).sum(axis=0).max())
+        for item, way in zip(inertias, ways, strict=True)
+    ]
+    bounds: Array = np.empty(model.nv)
+    for index in range(len(joints) - 1, 1, -1):
+        bounds[joints[index].idx_v] = masses[index] if slides[index] else moments[index]
+        masses[parents[index]] += masses[index]
+        moments[parents[index]] += moments[index]
+    bounds[:3], bounds[3:6] = masses[1], moments[1]
+    return bounds

@@ -12,6 +12,7 @@ import pinocchio as pin
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
+from fflin.dynamics.state import PIN_ANGULAR, PIN_LINEAR
 from fflin.robot.outputs import (
     Accelerometer,
     CenterOfMass,
@@ -22,9 +23,6 @@ from fflin.robot.outputs import (
     Output,
     RelativePose,
 )
-
-# Rows of Pinocchio's spatial vectors, and of the base in its v.
-LINEAR, ANGULAR = slice(0, 3), slice(3, 6)
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 
@@ -144,15 +142,15 @@ def _momentum_slopes(at: Point, _: Sequence[Carried], to: Sensed) -> None:
     mass, still = pin.computeTotalMass(at.model), at.data.hg
     to.y[:3] = at.R.dot(still.angular)
     to.y[3:] = at.R.dot(still.linear + mass * at.v_b)
-    for part, rows in (slice(0, 3), ANGULAR), (slice(3, 6), LINEAR):
+    for part, rows in (slice(0, 3), PIN_ANGULAR), (slice(3, 6), PIN_LINEAR):
         to.by_q[part] = at.R.dot(by_q[rows])
         to.by_v[part] = at.R.dot(by_v[rows])
-    to.by_q[3:, ANGULAR] -= at.R.dot(skew(mass * at.v_b))
+    to.by_q[3:, PIN_ANGULAR] -= at.R.dot(skew(mass * at.v_b))
     for joint, stored in at.stored:
         jacobian = pin.getJointJacobian(at.model, at.data, joint, _LOCAL)
         R = at.R.dot(at.data.oMi[joint].rotation)
         to.y[:3] += R.dot(stored)
-        to.by_q[:3] -= R.dot(skew(stored)).dot(jacobian[ANGULAR])
+        to.by_q[:3] -= R.dot(skew(stored)).dot(jacobian[PIN_ANGULAR])
 
 
 def _momentum(world: World, *_: object) -> Array:
@@ -170,8 +168,8 @@ def _frame_pose_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> None
     placement = at.data.oMi[frame.joint] * frame.placement
     _, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     to.y[:3] = at.r_b + at.R.dot(placement.translation)
-    to.by_q[:3] = at.R.dot(placement.rotation).dot(jacobian[LINEAR])
-    to.by_q[3:] = jacobian[ANGULAR]
+    to.by_q[:3] = at.R.dot(placement.rotation).dot(jacobian[PIN_LINEAR])
+    to.by_q[3:] = jacobian[PIN_ANGULAR]
 
 
 def _frame_pose(world: World, frames: Sequence[Carried], before: Sequence[Array]) -> Array:
@@ -186,13 +184,13 @@ def _frame_velocity_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> 
     velocity = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL)
     R = at.R.dot((at.data.oMi[frame.joint] * frame.placement).rotation)
     to.y[:3] = velocity.angular
-    to.by_q[:3] = by_q[ANGULAR]
-    to.by_v[:3] = jacobian[ANGULAR]
+    to.by_q[:3] = by_q[PIN_ANGULAR]
+    to.by_v[:3] = jacobian[PIN_ANGULAR]
     # A velocity held in axes that turn turns with them: the frame's, and the base's.
     to.y[3:] = R.dot(velocity.linear) + at.R.dot(at.v_b)
-    to.by_q[3:] = R.dot(by_q[LINEAR] - skew(velocity.linear).dot(jacobian[ANGULAR]))
-    to.by_q[3:, ANGULAR] -= at.R.dot(skew(at.v_b))
-    to.by_v[3:] = R.dot(jacobian[LINEAR])
+    to.by_q[3:] = R.dot(by_q[PIN_LINEAR] - skew(velocity.linear).dot(jacobian[PIN_ANGULAR]))
+    to.by_q[3:, PIN_ANGULAR] -= at.R.dot(skew(at.v_b))
+    to.by_v[3:] = R.dot(jacobian[PIN_LINEAR])
 
 
 def _frame_velocity(world: World, frames: Sequence[Carried], _: Sequence[Array]) -> Array:
@@ -215,8 +213,10 @@ def _relative_pose_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> N
     relative = other.actInv(place)
     R, p = relative.rotation, relative.translation
     to.y[:3] = p
-    to.by_q[:3] = R.dot(jacobian[LINEAR]) - seeing[LINEAR] + skew(p).dot(seeing[ANGULAR])
-    to.by_q[3:] = jacobian[ANGULAR] - R.T.dot(seeing[ANGULAR])
+    to.by_q[:3] = (
+        R.dot(jacobian[PIN_LINEAR]) - seeing[PIN_LINEAR] + skew(p).dot(seeing[PIN_ANGULAR])
+    )
+    to.by_q[3:] = jacobian[PIN_ANGULAR] - R.T.dot(seeing[PIN_ANGULAR])
     to.by_q[:, :6] = 0.0  # the base carries both
 
 
@@ -231,8 +231,8 @@ def _gyroscope_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> None:
     (frame,) = frames
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     to.y[:] = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL).angular
-    to.by_q[:] = by_q[ANGULAR]
-    to.by_v[:] = jacobian[ANGULAR]
+    to.by_q[:] = by_q[PIN_ANGULAR]
+    to.by_v[:] = jacobian[PIN_ANGULAR]
 
 
 def _gyroscope(world: World, frames: Sequence[Carried], _: Sequence[Array]) -> Array:
@@ -249,9 +249,9 @@ def _accelerometer_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> N
     assert to.by_a is not None
     to.by_q[:], to.by_v[:], to.by_a[:] = by_q, by_v, by_a
     # The terms of that sum; gravity turns against the base.
-    of_base = by_a[:, LINEAR]
-    to.by_q[:, ANGULAR] -= of_base.dot(skew(at.g))
-    to.by_v[:, ANGULAR] -= of_base.dot(skew(at.v_b))
+    of_base = by_a[:, PIN_LINEAR]
+    to.by_q[:, PIN_ANGULAR] -= of_base.dot(skew(at.g))
+    to.by_v[:, PIN_ANGULAR] -= of_base.dot(skew(at.v_b))
 
 
 def _accelerometer(world: World, frames: Sequence[Carried], _: Sequence[Array]) -> Array:

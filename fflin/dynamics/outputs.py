@@ -1,4 +1,4 @@
-"""The outputs of a robot, prepared: their names and units, and their evaluation at a point."""
+"""The outputs of a robot, prepared: names and units, and evaluation by either route."""
 
 from collections.abc import Sequence
 
@@ -6,19 +6,12 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.rotation import quaternion_product, rotation_matrix, skew
+from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.output_kinds import ANGULAR, KINDS, LINEAR, Carried, Point, Sensed, Slopes
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.output_kinds import KINDS, Carried, Point, Sensed, Slopes, World
+from fflin.dynamics.state import PIN_ANGULAR, PIN_LINEAR, StateMap
 from fflin.robot.frames import ROOT, find_frame
-from fflin.robot.outputs import (
-    BasePose,
-    FullState,
-    JointPositions,
-    JointVelocities,
-    Output,
-)
-from fflin.robot.robot import Robot
+from fflin.robot.outputs import BasePose, FullState, JointPositions, JointVelocities, Output
 
 # Rotation and position of the base relative to itself.
 _STANDING: tuple[Array, Array] = (np.eye(3), np.zeros(3))
@@ -37,8 +30,6 @@ class Sensing:
     ----------
     state : StateMap
     outputs : sequence of Output
-    gravity : array_like (3,), optional
-        In world axes [m/s^2]; zero by default.
     own_reference : bool
         Whether the reference is the base's own placement at each point, not that of `state`.
 
@@ -64,21 +55,12 @@ class Sensing:
         state: StateMap,
         outputs: Sequence[Output],
         *,
-        gravity: Array | None = None,
         own_reference: bool = False,
     ) -> None:
         robot = state.robot
-        self._model, self._nv, self._stored = robot.model, robot.nv, robot.stored_momentum
-        self._gravity: Array = np.zeros(3) if gravity is None else np.array(gravity, dtype=float)
-        self._weighed = bool(self._gravity.any())
-        self._own_reference = own_reference
+        self._state, self._own_reference = state, own_reference
         # The free-flyer joint may itself stand somewhere in the world.
-        root = robot.model.jointPlacements[ROOT]
-        self._root_rotation = np.array(root.rotation)
-        self._home = pin.SE3ToXYZQUAT(root.inverse())
-        placement = pin.SE3ToXYZQUAT(state.reference.actInv(root))
-        self._position, self._quaternion = placement[:3], placement[3:]
-        self._rotation = rotation_matrix(self._quaternion)
+        self._home = pin.SE3ToXYZQUAT(robot.model.jointPlacements[ROOT].inverse())
 
         self.states: list[tuple[int, int]] = []
         self._kinds: list[tuple[slice, Slopes, tuple[Carried, ...]]] = []
@@ -86,11 +68,11 @@ class Sensing:
         for output in outputs:
             at = len(signals)
             if type(output) in KINDS:
-                frames = tuple(carried(robot, name) for name in output.frames)
+                frames = _carried(state, output)
                 signals += output.signals
                 self._kinds.append((slice(at, len(signals)), KINDS[type(output)][0], frames))
             else:
-                indices = states_of(state, output)
+                indices = state_indices(state, output)
                 self.states += enumerate(indices, start=at)
                 signals += [(state.names[index], state.units[index]) for index in indices]
         # Those of frames last: the others overwrite what these read.
@@ -121,44 +103,81 @@ class Sensing:
         -------
         Sensed
         """
-        ny, nv = len(self.names), self._nv
+        ny, nv = len(self.names), len(v)
         by_a = np.zeros((ny, nv)) if self.needs_acceleration else None
         sensed = Sensed(np.zeros(ny), np.zeros((ny, nv)), np.zeros((ny, nv)), by_a)
-        if len(self.states) == ny:
+        if not self._kinds:
             return sensed
         at = self._point(data, q, v)
         derived = False
         for rows, slopes, frames in self._kinds:
             if frames and not derived:
-                self._derive(data, at, v, a)
+                self._derive(at, v, a)
                 derived = True
             slopes(at, frames, sensed.part(rows))
         return sensed
 
-    def _derive(self, data: pin.Data, at: Point, v: Array, a: Array) -> None:
+    def _derive(self, at: Point, v: Array, a: Array) -> None:
         felt: tuple[Array, ...] = ()
         if self.needs_acceleration:
             rate = a.copy()
-            rate[LINEAR] += skew(v[ANGULAR]).dot(at.v_b) - at.g
+            rate[PIN_LINEAR] += skew(v[PIN_ANGULAR]).dot(at.v_b) - at.g
             felt = (rate,)
-        pin.computeForwardKinematicsDerivatives(self._model, data, at.q, at.v, *felt)
+        pin.computeForwardKinematicsDerivatives(at.model, at.data, at.q, at.v, *felt)
 
     def _point(self, data: pin.Data, q: Array, v: Array) -> Point:
+        state, robot = self._state, self._state.robot
         still_q, still_v = q.copy(), v.copy()
         still_q[:7] = self._home
-        still_v[LINEAR] = 0.0
+        still_v[PIN_LINEAR] = 0.0
         R, r_b = _STANDING
         if not self._own_reference:
-            R = rotation_matrix(quaternion_product(self._quaternion, q[3:7]))
-            r_b = self._position + self._rotation @ q[:3]
-        gravity = self._gravity
-        if self._weighed:
-            gravity = rotation_matrix(q[3:7]).T @ (self._root_rotation.T @ gravity)
-        v_b = v[LINEAR]
-        return Point(self._model, data, still_q, still_v, R, r_b, v_b, gravity, self._stored)
+            R, r_b = state.rotation(q), state.positions(q)
+        return Point(
+            *(robot.model, data, still_q, still_v, R, r_b),
+            *(v[PIN_LINEAR], state.gravity(q), robot.stored_momentum),
+        )
 
 
-def states_of(state: StateMap, output: Output) -> list[int]:
+class Measuring:
+    """The outputs y of the nonlinear robot, out of elementary kinematics in the world.
+
+    The route by which C and D are checked, and nothing of the one by which they are made.
+
+    Parameters
+    ----------
+    state : StateMap
+    q : ndarray (nq,)
+        The point, from which rotation vectors are counted.
+    """
+
+    def __init__(self, state: StateMap, q: Array) -> None:
+        self.state = state
+        robot = state.robot
+        self._world = world = World(
+            *(robot.model, robot.create_data(), state.reference),
+            *(np.array(robot.gravity), robot.stored_momentum),
+        )
+        pin.forwardKinematics(robot.model, world.data, q)
+        frames = [_carried(state, output) for output in robot.outputs]
+        attitudes = [[np.array(world.placement(f).rotation) for f in group] for group in frames]
+        self._outputs = tuple(zip(robot.outputs, frames, attitudes, strict=True))
+
+    def __call__(self, x: Array, q: Array, v: Array, a: Array) -> Array:
+        """Return y (ny,); `a` (nv,) is dv/dt as Pinocchio's ABA returns it."""
+        world = self._world
+        pin.forwardKinematics(world.model, world.data, q, v, a)
+        return np.concatenate(
+            [
+                KINDS[type(output)][1](world, frames, attitudes)
+                if type(output) in KINDS
+                else x[state_indices(self.state, output)]
+                for output, frames, attitudes in self._outputs
+            ]
+        )
+
+
+def state_indices(state: StateMap, output: Output) -> list[int]:
     """Return the indices of the states that an output is made of."""
     robot, groups = state.robot, state.groups
     if isinstance(output, FullState):
@@ -172,6 +191,6 @@ def states_of(state: StateMap, output: Output) -> list[int]:
     return [group.start + robot.joints.index(robot.joint(name)) for name in names]
 
 
-def carried(robot: Robot, name: str) -> Carried:
-    """Return where a frame is; a link's before a joint's of the same name."""
-    return Carried(*find_frame(robot.model, name))
+def _carried(state: StateMap, output: Output) -> tuple[Carried, ...]:
+    """Return where the frames of an output are; a link's before a joint's of the same name."""
+    return tuple(Carried(*find_frame(state.robot.model, name)) for name in output.frames)

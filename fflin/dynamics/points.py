@@ -9,8 +9,9 @@ from fflin.base.errors import InputError, unknown
 from fflin.base.validation import Array, by_name, number, placement
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
+from fflin.robot.frames import ROOT
 from fflin.robot.inputs import named_wheels
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.robot import Robot
 
 
 def configuration(
@@ -45,9 +46,7 @@ def configuration(
     if base is not None:
         root = robot.model.jointPlacements[ROOT]
         q[:7] = pin.SE3ToXYZQUAT(root.actInv(placement("base", base)))
-    if joints is not None and not isinstance(joints, Mapping):
-        raise InputError(f"joints is a {type(joints).__name__}, expected {{joint: value}}")
-    for name, value in (joints or {}).items():
+    for name, value in by_name("joints", {} if joints is None else joints, "joint").items():
         robot.joint(name).place(q, number(f"joint '{name}'", value))
     robot.follow(q)
     return robot.checked_configuration(q)
@@ -75,7 +74,7 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
         If a value is not a finite number.
     """
     state = StateMap(robot)
-    base = [f"{group}.{axis}" for group in ("omega_b", "v_b") for axis in "xyz"]
+    base = state.names[state.groups.omega_b] + state.names[state.groups.v_b]
     nu = np.zeros(6 + robot.n)
     for name, value in by_name("values", values, "velocity").items():
         if name in base:

@@ -8,15 +8,11 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.rotation import rotation_matrix, skew
+from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.inertia import Inertia
-from fflin.dynamics.state import LINEAR, StateMap
-from fflin.robot.frames import ROOT
-
-# Rows of the angular part of Pinocchio's spatial vectors.
-_TURNING = slice(3, 6)
+from fflin.dynamics.state import LINEAR, PIN_ANGULAR, StateMap
 
 
 class Rates(NamedTuple):
@@ -87,8 +83,6 @@ class Accelerations:
         self._passive = robot.passive
         self._resists = any(values.any() for values in robot.passive)
         self._joints = np.arange(6, self._nv)
-        self._gravity, self._falls = np.array(robot.gravity), any(robot.gravity)
-        self._root = robot.model.jointPlacements[ROOT].rotation
         self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
 
     def invert(self, q: Array, out: Array) -> None:
@@ -130,15 +124,14 @@ class Accelerations:
         by_nu = negative.dot(by_v)
         by_nu[:, LINEAR] = 0.0
         by_u = inverse if self._actuation.default else inverse.dot(columns)
-        gravity = self._gravity
-        if self._falls:
-            gravity = rotation_matrix(q[3:7]).T @ (self._root.T @ gravity)
-        return Rates(c, negative.dot(by_q), by_nu, by_u, gravity)
+        return Rates(c, negative.dot(by_q), by_nu, by_u, state.gravity(q))
 
     def _bias_slopes(
         self, q: Array, v: Array, c: Array, u: Array, gyroscopic: Gyroscopic | None
     ) -> tuple[Array, Array]:
         """Return the slopes of M a + b - B u + passive forces over q_m (.., n) and nu, a held.
+
+        They are those of (3.3), with springs and dampers (7.1).
 
         The wrenches of thrusters are constant in the frames of their links, so that RNEA's
         derivatives with them hold -d(B u)/dq.
@@ -161,7 +154,7 @@ class Accelerations:
         """Return the torques of stored momentum, their wrenches with those of the inputs.
 
         With the angular Jacobian J of a link in its own axes, omega = J v, the torque
-        h x omega is the generalised force J^T [h]x J v.
+        h x omega is the generalised force J^T [h]x J v (6.3).
         """
         model, data, nv = self._model, self._data, len(v)
         wrenches = self._actuation.wrenches(u)
@@ -171,7 +164,7 @@ class Accelerations:
         pin.computeForwardKinematicsDerivatives(model, data, q, v, np.zeros(nv))
         for joint, momentum in self._stored:
             turned, jacobian = (
-                part[_TURNING]
+                part[PIN_ANGULAR]
                 for part in pin.getJointVelocityDerivatives(
                     model, data, joint, pin.ReferenceFrame.LOCAL
                 )

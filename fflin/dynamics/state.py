@@ -1,7 +1,7 @@
-"""The state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, names, frames and chart."""
+"""The state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, frames and chart."""
 
 from itertools import compress
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import pinocchio as pin
@@ -10,7 +10,9 @@ from fflin.base.errors import ChartError, InputError
 from fflin.base.rotation import conjugate, quaternion_product, rotation_matrix
 from fflin.base.validation import Array, placement, vector
 from fflin.dynamics.chart import SMALLEST_Q0, Chart
-from fflin.robot.robot import ROOT, Robot
+from fflin.dynamics.names import groups_of, states_of
+from fflin.robot.frames import ROOT
+from fflin.robot.robot import Robot
 
 Frame = Literal["hybrid", "local", "world"]
 
@@ -22,24 +24,15 @@ _IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
     "world": (True, True),
 }
 
-# Rows of the base's angular and linear part in any (6 + n) velocity or wrench of state order.
+# Rows of the base's angular and linear part in any (6 + n) velocity or wrench of state order,
 ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
+# and in Pinocchio's v and spatial vectors.
+PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 
 
 def unknown_frame(frame: object) -> InputError:
     """Build the error for what is no frame of velocities."""
     return InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
-
-
-class Groups(NamedTuple):
-    """Slices of the six groups of the state."""
-
-    q_b: slice
-    r_b: slice
-    q_m: slice
-    omega_b: slice
-    v_b: slice
-    qdot_m: slice
 
 
 class StateMap:
@@ -72,6 +65,8 @@ class StateMap:
         Rows of those that do, in any (6 + n) velocity or wrench.
     S : ndarray (nv, 6 + n) or None
         With v = S nu, where joints mimic others; None where v is nu in another order.
+    unbounded : ndarray of int
+        Which of the n joints turn without end.
 
     Raises
     ------
@@ -100,30 +95,10 @@ class StateMap:
         self.axes = _IN_REFERENCE_AXES[frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
         self.nx = 12 + 2 * n
-        self.groups = Groups(
-            slice(0, 3),
-            slice(3, 6),
-            slice(6, 6 + n),
-            slice(6 + n, 9 + n),
-            slice(9 + n, 12 + n),
-            slice(12 + n, 12 + 2 * n),
-        )
+        self.groups = groups_of(n)
+        states = states_of(robot)
+        self.names, self.units = tuple(states), tuple(states.values())
         joints = robot.joints
-        length = ["m" if joint.prismatic else "rad" for joint in joints]
-        self.names = (
-            *_named("q_b", "xyz"),
-            *_named("r_b", "xyz"),
-            *_named("q_m", robot.joint_names),
-            *_named("omega_b", "xyz"),
-            *_named("v_b", "xyz"),
-            *_named("qdot_m", robot.joint_names),
-        )
-        self.units = (
-            *("1", "1", "1", "m", "m", "m"),
-            *length,
-            *("rad/s", "rad/s", "rad/s", "m/s", "m/s", "m/s"),
-            *(f"{unit}/s" for unit in length),
-        )
         # Index in Pinocchio's v of each velocity of the state, and in a flat (nv, nv) array.
         self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
         # And back; what a joint that mimics another has is written after.
@@ -135,8 +110,8 @@ class StateMap:
         if robot.followers:
             self.S = np.column_stack([self.spread(e) for e in np.eye(6 + n)])
         self._idx_q = np.array([joint.idx_q for joint in joints], dtype=np.intp)
-        self._unbounded = np.flatnonzero([joint.unbounded for joint in joints])
-        self._cos = self._idx_q[self._unbounded]
+        self.unbounded = np.flatnonzero([joint.unbounded for joint in joints])
+        self._cos = self._idx_q[self.unbounded]
         self._sin = self._cos + 1
         # The free-flyer joint may itself stand somewhere in the world.
         oMref = pin.SE3.Identity() if reference is None else placement("reference", reference)
@@ -146,6 +121,8 @@ class StateMap:
         self._position, self._quaternion = offset[:3], offset[3:]
         self._rotation = rotation_matrix(self._quaternion)
         self._aligned = bool((self._rotation == np.eye(3)).all())
+        root = robot.model.jointPlacements[ROOT].rotation
+        self._gravity, self._falls = root.T @ np.array(robot.gravity), any(robot.gravity)
 
     @property
     def reference(self) -> pin.SE3:
@@ -191,6 +168,10 @@ class StateMap:
         turned: Array = pin.XYZQUATToSE3(q[:7]).rotation
         return turned if self._aligned else self._rotation.dot(turned)
 
+    def gravity(self, q: Array) -> Array:
+        """Return the robot's gravity (3,) [m/s^2] in base axes at a valid configuration."""
+        return rotation_matrix(q[3:7]).T @ self._gravity if self._falls else self._gravity
+
     def scalar(self, q: Array) -> float:
         """Return q0 at a valid configuration, with the sign of the quaternion in q."""
         return float(quaternion_product(self._quaternion, q[3:7])[3])
@@ -229,8 +210,9 @@ class StateMap:
         """Do as `to_state` for arguments that are valid."""
         q_m, nu = self.joint_positions(q), self.velocities(v)
         x = self.compose(self.chart(q), self.positions(q), q_m, nu)
-        if near is not None:
-            self._unwrap(x, near)
+        if near is not None and self.unbounded.size:
+            index = 6 + self.unbounded
+            x[index] += 2.0 * np.pi * np.round((near[index] - x[index]) / (2.0 * np.pi))
         return x
 
     def compose(self, chart: Chart, r_b: Array, q_m: Array, nu: Array) -> Array:
@@ -272,8 +254,8 @@ class StateMap:
         q[3:7] = quaternion_product(conjugate(self._quaternion), relative)
         angles = x[g.q_m]
         q[self._idx_q] = angles
-        q[self._cos] = np.cos(angles[self._unbounded])
-        q[self._sin] = np.sin(angles[self._unbounded])
+        q[self._cos] = np.cos(angles[self.unbounded])
+        q[self._sin] = np.sin(angles[self.unbounded])
         self.robot.follow(q)
         chart = Chart(q_b, float(relative[3]), rotation_matrix(relative))
         return q, self.spread(self.to_base(chart, x[6 + self.robot.n :, None])[:, 0])
@@ -304,7 +286,7 @@ class StateMap:
         return matrix.take(self._order, axis=1) if self.S is None else matrix @ self.S
 
     def project(self, matrix: Array, out: Array | None = None) -> Array:
-        """Take a matrix (nv, nv) over Pinocchio's v to state order: S^T matrix S."""
+        """Take a matrix (nv, nv) over Pinocchio's v to state order: S^T matrix S (7.3)."""
         if self.S is not None:
             return np.matmul(self.S.T @ matrix, self.S, out=out)
         # mode="clip" lets NumPy write into `out` without a buffer; no index is out of range.
@@ -323,19 +305,9 @@ class StateMap:
         angles = q.take(self._idx_q, axis=-1)
         if self._cos.size:
             sines, cosines = q.take(self._sin, axis=-1), q.take(self._cos, axis=-1)
-            angles[..., self._unbounded] = np.arctan2(sines, cosines)
+            angles[..., self.unbounded] = np.arctan2(sines, cosines)
         return angles
 
     def positions(self, q: Array) -> Array:
         """Return r_b (.., 3) at valid configurations (.., nq)."""
         return self._position + q[..., :3] @ self._rotation.T
-
-    def _unwrap(self, x: Array, near: Array) -> None:
-        if not self._unbounded.size:
-            return
-        index = 6 + self._unbounded
-        x[index] += 2.0 * np.pi * np.round((near[index] - x[index]) / (2.0 * np.pi))
-
-
-def _named(group: str, members: str | tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(f"{group}.{member}" for member in members)

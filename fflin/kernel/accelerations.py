@@ -10,7 +10,7 @@ from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.kernel.compiled import kernel
-from fflin.kernel.tree import LANES, Tree, batch_tree
+from fflin.kernel.tree import LANES, PIN_ANGULAR, PIN_LINEAR, Tree
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
@@ -50,29 +50,8 @@ class Loads(NamedTuple):
     damping: Any
 
 
-class Points(NamedTuple):
-    """What the kernel reads of every point, each with a row for it.
-
-    Attributes
-    ----------
-    q : ndarray (N, nq)
-        Configurations.
-    nu : ndarray (N, 6 + n)
-        Velocities in state order and base axes.
-    forces : ndarray (N, 6 + n)
-        Those of inputs that are fixed to base and joints, of springs and of dampers.
-    u : ndarray (N, nu)
-        Inputs.
-    """
-
-    q: Array
-    nu: Array
-    forces: Array
-    u: Array
-
-
-class Written(NamedTuple):
-    """What the kernel writes of every point, each with a row for it; all in base axes.
+class BatchRates(NamedTuple):
+    """What the kernel finds about N points, all in base axes.
 
     Attributes
     ----------
@@ -80,9 +59,7 @@ class Written(NamedTuple):
         M^-1.
     c : ndarray (N, 6 + n)
         Acceleration of the base origin and the joints, without gravity and omega x v_b.
-    A : ndarray (N, ..)
-        Its last entries are the slopes of c, the lower half of A (6 + n, 12 + 2 n).
-    columns : ndarray (N, (6 + n) k)
+    columns : ndarray (N, 6 + n, k)
         Generalised force of a unit of each of the k inputs that are carried.
     couplings : ndarray (N,)
         Sums of M_ii (M^-1)_ii, which tell how singular M is.
@@ -90,43 +67,77 @@ class Written(NamedTuple):
 
     inverse: Array
     c: Array
-    A: Array
     columns: Array
     couplings: Array
 
 
-class BatchRates:
-    """The accelerations of a robot and their slopes, at eight points at a time.
+class BatchAccelerations:
+    """The accelerations of a robot and their slopes, about eight points at a time.
 
     Parameters
     ----------
     state : StateMap
     actuation : Actuation
+    tree : Tree
+        Of the same robot.
 
-    Raises
-    ------
-    ValueError
-        If the robot has a joint that the kernel does not know; see `batch_tree`.
+    Attributes
+    ----------
+    carried : ndarray (k,)
+        Numbers of the inputs whose generalised force depends on the configuration.
     """
 
-    def __init__(self, state: StateMap, actuation: Actuation) -> None:
-        robot = state.robot
-        tree = batch_tree(robot)
-        if tree is None:
-            raise ValueError(f"'{robot.name}' has a joint that is not a screw about a fixed axis")
-        self._tree, self._loads = tree, _loads(robot, actuation, tree)
+    def __init__(self, state: StateMap, actuation: Actuation, tree: Tree) -> None:
+        self._tree, self._loads = tree, _loads(state.robot, actuation, tree)
         self.carried = self._loads.input
         self._layout = _layout(tree, len(self.carried))
 
-    def evaluate(self, points: Points, out: Written) -> None:
-        """Write the rates of all points, of which there are as many as lanes at least."""
-        space = np.empty(self._layout.size + LANES)
-        # Its vectors are 64 bytes; where they begin at such an address it is faster.
-        space = space[-(space.ctypes.data // 8) % LANES :]
-        flat = out._replace(inverse=out.inverse.reshape(len(points.q), -1))
+    def rates(self, q: Array, nu: Array, forces: Array, u: Array, A: Array) -> BatchRates:
+        """Return the rates and write their slopes; N is the number of lanes at least.
+
+        Parameters
+        ----------
+        q : ndarray (N, nq)
+            Configurations.
+        nu : ndarray (N, 6 + n)
+            Velocities in state order and base axes.
+        forces : ndarray (N, 6 + n)
+            Those of inputs that are fixed to base and joints, of springs and of dampers.
+        u : ndarray (N, nu)
+            Inputs, in base axes.
+        A : ndarray (N, 12 + 2 n, 12 + 2 n)
+            Its lower half is written, the slopes of c.
+        """
+        (count, nv), carried = nu.shape, len(self.carried)
+        inverse, c, couplings = np.empty((count, nv * nv)), np.empty((count, nv)), np.empty(count)
+        columns = np.empty((count, nv * carried))
         kernel("linearise", "linearise")(
-            self._tree, self._layout, self._loads, tuple(points), tuple(flat), space
+            *(self._tree, self._layout, self._loads, (q, nu, forces, u)),
+            (inverse, c, A.reshape(count, -1), columns, couplings),
+            _work_space(self._layout.size),
         )
+        inverse, columns = inverse.reshape(count, nv, nv), columns.reshape(count, nv, carried)
+        return BatchRates(inverse, c, columns, couplings)
+
+
+def inverse_inertias(tree: Tree, q: Array, out: Array) -> Array:
+    """Write M^-1 (N, 6 + n, 6 + n) at configurations (N, nq), N the number of lanes at least.
+
+    Returns
+    -------
+    ndarray (N,)
+        Sums of M_ii (M^-1)_ii, which tell how singular M is.
+    """
+    couplings = np.empty(len(q))
+    flat = out.reshape(len(q), -1)
+    kernel("factor", "invert")(tree, q, flat, couplings, _work_space(tree.size))
+    return couplings
+
+
+def _work_space(size: int) -> Array:
+    space = np.empty(size + LANES)
+    # The kernel's vectors are 64 bytes; where they begin at such an address it is faster.
+    return space[-(space.ctypes.data // 8) % LANES :]
 
 
 def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
@@ -138,8 +149,9 @@ def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
         for number, column in zip(numbers.tolist(), columns.T, strict=True):
             body.append(joint - ROOT)
             inputs.append(number)
-            # Pinocchio has the force first.
-            wrenches.append(np.concatenate((turned @ column[3:], turned @ column[:3])))
+            wrenches.append(
+                np.concatenate((turned @ column[PIN_ANGULAR], turned @ column[PIN_LINEAR]))
+            )
     stored = [(joint - ROOT, momentum) for joint, momentum in robot.stored_momentum]
     return Loads(
         np.array(body, dtype=np.intp),
@@ -158,6 +170,6 @@ def _layout(tree: Tree, carried: int) -> Layout:
     size, bodies = len(tree.row), len(tree.parent)
     sizes = (
         *(bodies * MOTION, bodies * LOAD, size, size, size * carried),
-        *(size * 2 * size, size * 8),
+        *(size * 2 * size, size * 6),
     )
     return Layout(*(tree.size + int(x) * LANES for x in np.cumsum([0, *sizes])))

@@ -13,12 +13,13 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-# The kernel beats the loop from here on. To load numba takes half a second, once, which a sweep of
-# this size does not win back but the next ones do: they are seldom alone.
+# Fewest points for which the kernel is quicker than the loop, where numba is loaded and where it is
+# not. To load it takes half a second, which a sweep of that size does not win back but the next
+# ones do: sweeps are seldom alone.
 _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
 
-# Where Linux tells a container how much of each period [us] it may compute: version 2 of its
-# control groups, and version 1.
+# Files in which Linux tells a container's quota of computing time and its period [us], of version 2
+# and of version 1 of its control groups.
 _QUOTAS = (
     ("/sys/fs/cgroup/cpu.max",),
     ("/sys/fs/cgroup/cpu/cpu.cfs_quota_us", "/sys/fs/cgroup/cpu/cpu.cfs_period_us"),
@@ -61,7 +62,7 @@ def _prepared(module: str, name: str) -> Any:
     compiled = getattr(import_module(f"fflin.kernel.{module}"), name)
     folder = Path(compiled.stats.cache_path)
     kept = list(folder.glob(f"{module}.{name}-*.nbi"))
-    # numba looks at the file of the function alone, not at those that it calls.
+    # numba compares with the function's own file, not with those of the functions that it calls.
     source = max(file.stat().st_mtime for file in _sources())
     for entry in [entry for entry in kept if entry.stat().st_mtime < source]:
         entry.unlink(missing_ok=True)

@@ -17,14 +17,20 @@ import numpy as np
 
 from fflin.kernel.lanes import floor, gather, load, splat, store
 from fflin.kernel.tree import INERTIA, LANES, PLACE
-from fflin.kernel.vectors import add, add3, get3, put3
-
-
-@numba.njit(forceinline=True)
-def _turned(ax, ay, az, bx, by, bz, cx, cy, cz, x, y, z):
-    """Return the columns a, b, c of a rotation, times the constants x, y, z."""
-    x, y, z = splat(x), splat(y), splat(z)
-    return ax * x + bx * y + cx * z, ay * x + by * y + cy * z, az * x + bz * y + cz * z
+from fflin.kernel.vectors import (
+    add,
+    add3,
+    cross,
+    dot,
+    get3,
+    get_columns,
+    minus,
+    plus,
+    product,
+    put3,
+    times,
+    turned,
+)
 
 
 @numba.njit(forceinline=True)
@@ -51,7 +57,7 @@ def _cosine_and_sine(x):
     p = splat(4.16666666666666019037e-02) + z * p
     one = splat(1.0)
     cosine = (one - splat(0.5) * z) + z * z * p
-    # By quarter turns back: (1, 0), (0, 1), (-1, 0), (0, -1).
+    # Add the quarter turns again, whose cosine and sine are (1, 0), (0, 1), (-1, 0) or (0, -1).
     half = floor(turns * splat(0.5))
     odd = turns - half - half
     sign = one - splat(2.0) * (half - splat(2.0) * floor(half * splat(0.5)))
@@ -62,77 +68,67 @@ def _cosine_and_sine(x):
 @numba.njit(forceinline=True)
 def _place(work, at, parent, fixed, cosine, sine, shift):
     """Write the place of a body into `work` at `at`, that of its parent being at `parent`."""
-    ax, ay, az = get3(work, parent)
-    bx, by, bz = get3(work, parent + 3 * LANES)
-    cx, cy, cz = get3(work, parent + 6 * LANES)
-    ux, uy, uz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[0], fixed[3], fixed[6])
-    vx, vy, vz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[1], fixed[4], fixed[7])
-    zx, zy, zz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[2], fixed[5], fixed[8])
-    dx, dy, dz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, fixed[9], fixed[10], fixed[11])
-    x = cosine * ux + sine * vx, cosine * uy + sine * vy, cosine * uz + sine * vz
-    y = cosine * vx - sine * ux, cosine * vy - sine * uy, cosine * vz - sine * uz
-    put3(work, at, *x)
-    put3(work, at + 3 * LANES, *y)
-    put3(work, at + 6 * LANES, zx, zy, zz)
-    put3(work, at + 9 * LANES, dx + shift * zx, dy + shift * zy, dz + shift * zz)
+    axes = get_columns(work, parent)
+    x = turned(axes, fixed[0], fixed[3], fixed[6])
+    y = turned(axes, fixed[1], fixed[4], fixed[7])
+    z = turned(axes, fixed[2], fixed[5], fixed[8])
+    origin = turned(axes, fixed[9], fixed[10], fixed[11])
+    put3(work, at, plus(times(x, cosine), times(y, sine)))
+    put3(work, at + 3 * LANES, minus(times(y, cosine), times(x, sine)))
+    put3(work, at + 6 * LANES, z)
+    put3(work, at + 9 * LANES, plus(origin, times(z, shift)))
 
 
 @numba.njit(forceinline=True)
 def _inertia(work, at, place, body):
     """Write a body's inertia about its joint: m, m c, and R I R^T by way of the columns of R I."""
-    ax, ay, az = get3(work, place)
-    bx, by, bz = get3(work, place + 3 * LANES)
-    cx, cy, cz = get3(work, place + 6 * LANES)
-    hx, hy, hz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[1], body[2], body[3])
+    axes = get_columns(work, place)
     store(work, at, splat(body[0]))
-    put3(work, at + LANES, hx, hy, hz)
-    ux, uy, uz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[4], body[5], body[6])
-    vx, vy, vz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[5], body[7], body[8])
-    wx, wy, wz = _turned(ax, ay, az, bx, by, bz, cx, cy, cz, body[6], body[8], body[9])
-    xx, xy, xz = (
-        ux * ax + vx * bx + wx * cx,
-        ux * ay + vx * by + wx * cy,
-        ux * az + vx * bz + wx * cz,
-    )
-    yy, yz = uy * ay + vy * by + wy * cy, uy * az + vy * bz + wy * cz
-    zz = uz * az + vz * bz + wz * cz
-    put3(work, at + 4 * LANES, xx, xy, xz)
-    put3(work, at + 7 * LANES, yy, yz, zz)
+    put3(work, at + LANES, turned(axes, body[1], body[2], body[3]))
+    u = turned(axes, body[4], body[5], body[6])
+    v = turned(axes, body[5], body[7], body[8])
+    w = turned(axes, body[6], body[8], body[9])
+    _, yy, yz = product(axes, (u[1], v[1], w[1]))
+    zz = product(axes, (u[2], v[2], w[2]))[2]
+    put3(work, at + 4 * LANES, product(axes, (u[0], v[0], w[0])))
+    put3(work, at + 7 * LANES, (yy, yz, zz))
 
 
 @numba.njit(forceinline=True)
 def _carry(work, at, above, place):
     """Add a composite inertia, seen from the parent's joint, to the parent's."""
     m = load(work, at)
-    hx, hy, hz = get3(work, at + LANES)
+    h = get3(work, at + LANES)
     xx, xy, xz = get3(work, at + 4 * LANES)
     yy, yz, zz = get3(work, at + 7 * LANES)
-    dx, dy, dz = get3(work, place + 9 * LANES)
-    ex, ey, ez = hx + m * dx, hy + m * dy, hz + m * dz
-    px, py, pz = dx * (hx + ex), dy * (hy + ey), dz * (hz + ez)
+    d = get3(work, place + 9 * LANES)
+    e = plus(h, times(d, m))
+    px, py, pz = d[0] * (h[0] + e[0]), d[1] * (h[1] + e[1]), d[2] * (h[2] + e[2])
+    xy = xy - (d[0] * e[1] + h[0] * d[1])
+    xz = xz - (d[0] * e[2] + h[0] * d[2])
+    yz = yz - (d[1] * e[2] + h[1] * d[2])
     add(work, above, m)
-    add3(work, above + LANES, ex, ey, ez)
-    xx, xy, xz = xx + (py + pz), xy - (dx * ey + hx * dy), xz - (dx * ez + hx * dz)
-    add3(work, above + 4 * LANES, xx, xy, xz)
-    add3(work, above + 7 * LANES, yy + (px + pz), yz - (dy * ez + hy * dz), zz + (px + py))
+    add3(work, above + LANES, e)
+    add3(work, above + 4 * LANES, (xx + (py + pz), xy, xz))
+    add3(work, above + 7 * LANES, (yy + (px + pz), yz, zz + (px + py)))
 
 
 @numba.njit(forceinline=True)
-def momentum(work, at, x, y, z, turns, slides):
-    """Return the momentum (angular, linear) about its joint of an inertia that the joint moves."""
-    m = load(work, at)
-    hx, hy, hz = get3(work, at + LANES)
+def inertia_times(work, at, w):
+    """Return I w of the inertia at `at`."""
     xx, xy, xz = get3(work, at + 4 * LANES)
     yy, yz, zz = get3(work, at + 7 * LANES)
-    w, v = splat(turns), splat(slides)
-    kx, ky, kz = hy * z - hz * y, hz * x - hx * z, hx * y - hy * x
+    return dot((xx, xy, xz), w), dot((xy, yy, yz), w), dot((xz, yz, zz), w)
+
+
+@numba.njit(forceinline=True)
+def _momentum(work, at, axis, turns, slides):
+    """Return the momentum (angular, linear) about its joint of an inertia that the joint moves."""
+    m, turns, slides = load(work, at), splat(turns), splat(slides)
+    lever = cross(get3(work, at + LANES), axis)
     return (
-        w * (xx * x + xy * y + xz * z) + v * kx,
-        w * (xy * x + yy * y + yz * z) + v * ky,
-        w * (xz * x + yz * y + zz * z) + v * kz,
-        v * (m * x) - w * kx,
-        v * (m * y) - w * ky,
-        v * (m * z) - w * kz,
+        plus(times(inertia_times(work, at, axis), turns), times(lever, slides)),
+        minus(times(times(axis, m), slides), times(lever, turns)),
     )
 
 
@@ -142,9 +138,9 @@ def outwards(work, tree, q, first, stride):
     bodies = len(tree.parent)
     places, inertias = tree.places, tree.inertias
     one, zero = splat(1.0), splat(0.0)
-    put3(work, places, one, zero, zero)
-    put3(work, places + 3 * LANES, zero, one, zero)
-    put3(work, places + 6 * LANES, zero, zero, one)
+    put3(work, places, (one, zero, zero))
+    put3(work, places + 3 * LANES, (zero, one, zero))
+    put3(work, places + 6 * LANES, (zero, zero, one))
     _inertia(work, inertias, places, tree.bodies[0])
     for body in range(1, bodies):
         at = places + body * PLACE * LANES
@@ -174,37 +170,33 @@ def inwards(work, tree):
     for body in range(bodies - 1, 0, -1):
         at = inertias + body * INERTIA * LANES
         place = places + body * PLACE * LANES
-        x, y, z = get3(work, place + 6 * LANES)
-        nx, ny, nz, fx, fy, fz = momentum(work, at, x, y, z, tree.turns[body], tree.slides[body])
+        z = get3(work, place + 6 * LANES)
+        moment, force = _momentum(work, at, z, tree.turns[body], tree.slides[body])
         _carry(work, at, inertias + tree.parent[body] * INERTIA * LANES, place)
         above = body
         while above > 0:
             place = places + above * PLACE * LANES
-            x, y, z = get3(work, place + 6 * LANES)
-            value = splat(tree.turns[above]) * (x * nx + y * ny + z * nz)
-            value = value + splat(tree.slides[above]) * (x * fx + y * fy + z * fz)
+            z = get3(work, place + 6 * LANES)
+            value = splat(tree.turns[above]) * dot(z, moment)
+            value = value + splat(tree.slides[above]) * dot(z, force)
             add(work, packed + tree.target[pair] * LANES, splat(tree.share[pair]) * value)
             pair += 1
-            # From here on about the joint of the parent.
-            dx, dy, dz = get3(work, place + 9 * LANES)
-            nx = nx + (dy * fz - dz * fy)
-            ny = ny + (dz * fx - dx * fz)
-            nz = nz + (dx * fy - dy * fx)
+            # The moment about the parent's joint.
+            moment = plus(moment, cross(get3(work, place + 9 * LANES), force))
             above = tree.parent[above]
         start, share = packed + tree.target[pair] * LANES, splat(tree.share[pair])
         pair += 1
-        add3(work, start, share * nx, share * ny, share * nz)
-        add3(work, start + 3 * LANES, share * fx, share * fy, share * fz)
-    # Of the base: I, [m c]x, m, in the rows of a chain of six.
+        add3(work, start, times(moment, share))
+        add3(work, start + 3 * LANES, times(force, share))
+    # The base's block (I, [m c]x, m), packed as the rows of a chain of six coordinates.
     m = load(work, inertias)
     hx, hy, hz = get3(work, inertias + LANES)
-    rows = (
-        load(work, inertias + 4 * LANES),
-        load(work, inertias + 5 * LANES),
-        load(work, inertias + 7 * LANES),
-        load(work, inertias + 6 * LANES),
-        load(work, inertias + 8 * LANES),
-        load(work, inertias + 9 * LANES),
+    xx, xy, xz = get3(work, inertias + 4 * LANES)
+    yy, yz, zz = get3(work, inertias + 7 * LANES)
+    own = (xx, xy, yy, xz, yz, zz)
+    for index in range(6):
+        store(work, packed + index * LANES, own[index])
+    linear = (
         zero,
         hz,
         zero - hy,
@@ -221,8 +213,8 @@ def inwards(work, tree):
         zero,
         m,
     )
-    for index in range(21):
-        store(work, packed + index * LANES, rows[index])
+    for index in range(15):
+        store(work, packed + (6 + index) * LANES, linear[index])
     for index in range(len(tree.row)):
         at = packed + (tree.row[index] + tree.depth[index]) * LANES
         add(work, at, splat(tree.armature[index]))

@@ -106,7 +106,7 @@ def invert(tree, q, out, couplings, work):
     stride = q.shape[1]
     configurations = q.reshape(-1)
     for block in range(0, count, LANES):
-        # The last are the last there are, some of them for the second time.
+        # The last block begins early enough to fill the lanes; some points are done twice.
         first = min(block, count - LANES)
         outwards(work, tree, configurations, first * stride, stride)
         inwards(work, tree)

@@ -73,15 +73,27 @@ def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> A
     return builder.gep(data, [index])
 
 
+def _read(builder: Any, place: Any) -> Any:
+    value = builder.load(builder.bitcast(place, _VECTOR.as_pointer()))
+    value.align = _BYTES
+    return value
+
+
+def _write(builder: Any, value: Any, place: Any) -> None:
+    written = builder.store(value, builder.bitcast(place, _VECTOR.as_pointer()))
+    written.align = _BYTES
+
+
+def _stepped(builder: Any, first: Any, step: Any, times: int) -> Any:
+    return builder.add(first, builder.mul(step, ir.Constant(step.type, times)))
+
+
 @intrinsic
 def load(typing: Any, array: Any, index: Any) -> Any:
     """Read eight doubles of a contiguous array from an index on."""
 
     def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        place = _pointer(context, builder, array, *arguments)
-        value = builder.load(builder.bitcast(place, _VECTOR.as_pointer()))
-        value.align = _BYTES
-        return value
+        return _read(builder, _pointer(context, builder, array, *arguments))
 
     return lanes(array, numba.types.intp), generate
 
@@ -91,9 +103,7 @@ def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
     """Write eight doubles to a contiguous array from an index on."""
 
     def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        place = _pointer(context, builder, array, *arguments[:2])
-        written = builder.store(arguments[2], builder.bitcast(place, _VECTOR.as_pointer()))
-        written.align = _BYTES
+        _write(builder, arguments[2], _pointer(context, builder, array, *arguments[:2]))
         return context.get_dummy_value()
 
     return numba.types.void(array, numba.types.intp, lanes), generate
@@ -120,8 +130,8 @@ def gather(typing: Any, array: Any, index: Any, stride: Any) -> Any:
         values, first, step = arguments
         result = ir.Constant(_VECTOR, ir.Undefined)
         for lane in range(LANES):
-            shift = builder.mul(step, ir.Constant(step.type, lane))
-            place = _pointer(context, builder, array, values, builder.add(first, shift))
+            index = _stepped(builder, first, step, lane)
+            place = _pointer(context, builder, array, values, index)
             result = builder.insert_element(result, builder.load(place), _INT32(lane))
         return result
 
@@ -135,8 +145,8 @@ def scatter(typing: Any, array: Any, index: Any, stride: Any, value: Any) -> Any
     def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
         values, first, step, eight = arguments
         for lane in range(LANES):
-            shift = builder.mul(step, ir.Constant(step.type, lane))
-            place = _pointer(context, builder, array, values, builder.add(first, shift))
+            index = _stepped(builder, first, step, lane)
+            place = _pointer(context, builder, array, values, index)
             builder.store(builder.extract_element(eight, _INT32(lane)), place)
         return context.get_dummy_value()
 
@@ -169,10 +179,7 @@ def transpose(typing: Any, source: Any, index: Any, target: Any, start: Any, str
         rows = []
         for row in range(LANES):
             at = builder.add(first, ir.Constant(first.type, row * LANES))
-            place = _pointer(context, builder, source, values, at)
-            value = builder.load(builder.bitcast(place, _VECTOR.as_pointer()))
-            value.align = _BYTES
-            rows.append(value)
+            rows.append(_read(builder, _pointer(context, builder, source, values, at)))
         # Swap blocks of 1, 2 and 4 lanes between rows that lie as far apart.
         for size in (1, 2, 4):
             low = [lane if not lane & size else lane - size + LANES for lane in range(LANES)]
@@ -188,10 +195,8 @@ def transpose(typing: Any, source: Any, index: Any, target: Any, start: Any, str
                         builder.shuffle_vector(*pair, mask) for mask in masks
                     )
         for row, value in enumerate(rows):
-            shift = builder.mul(step, ir.Constant(step.type, row))
-            place = _pointer(context, builder, target, out, builder.add(begin, shift))
-            written = builder.store(value, builder.bitcast(place, _VECTOR.as_pointer()))
-            written.align = _BYTES
+            index = _stepped(builder, begin, step, row)
+            _write(builder, value, _pointer(context, builder, target, out, index))
         return context.get_dummy_value()
 
     index_type = numba.types.intp

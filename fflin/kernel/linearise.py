@@ -7,9 +7,10 @@ import numba
 from fflin.kernel.crba import inwards, outwards
 from fflin.kernel.factor import factorise, multiply, unpack
 from fflin.kernel.lanes import gather, load, splat, store
-from fflin.kernel.rnea import accelerate_bodies, collect, load_bodies, move
+from fflin.kernel.rnea import accelerate_bodies, collect, load_bodies, move_bodies
 from fflin.kernel.slopes import differentiate
 from fflin.kernel.tree import LANES
+from fflin.kernel.vectors import get6, minus6, put6, times6
 
 
 @numba.njit(forceinline=True)
@@ -29,55 +30,24 @@ def solve_accelerations(work, tree, layout, forces, first):
 
 
 @numba.njit(forceinline=True)
-def _load4(work, at):
-    return (
-        load(work, at),
-        load(work, at + LANES),
-        load(work, at + 2 * LANES),
-        load(work, at + 3 * LANES),
-    )
-
-
-@numba.njit(forceinline=True)
-def _subtract4(total, entry, values):
-    return (
-        total[0] - entry * values[0],
-        total[1] - entry * values[1],
-        total[2] - entry * values[2],
-        total[3] - entry * values[3],
-    )
-
-
-@numba.njit(forceinline=True)
-def _store4(work, at, values):
-    for index in range(4):
-        store(work, at + index * LANES, values[index])
-
-
-@numba.njit(forceinline=True)
 def solve_slopes(work, tree, layout):
-    """Turn the slopes, rows of the lower half of A, into -M^-1 slopes, eight columns at a time."""
+    """Turn the slopes, rows of the lower half of A, into -M^-1 slopes, six columns at a time."""
     size = len(tree.row)
     width = 2 * size
     zero = splat(0.0)
-    none = zero, zero, zero, zero
-    # The first columns, of q_b and r_b, are zeros that need no product.
-    for column in range(width % 8, width, 8):
+    none = (zero, zero, zero), (zero, zero, zero)
+    # The first six columns, of q_b and r_b, are zeros that need no product.
+    for column in range(width % 6 or 6, width, 6):
         slopes = layout.lower + column * LANES
         for k in range(size):
-            at, to = slopes + k * width * LANES, layout.held + k * 8 * LANES
-            _store4(work, to, _load4(work, at))
-            _store4(work, to + 4 * LANES, _load4(work, at + 4 * LANES))
+            put6(work, layout.held + k * 6 * LANES, get6(work, slopes + k * width * LANES))
         for row in range(size):
-            left, right = none, none
+            total = none
             for k in range(size):
                 entry = load(work, tree.square + (row * size + k) * LANES)
-                at = layout.held + k * 8 * LANES
-                left = _subtract4(left, entry, _load4(work, at))
-                right = _subtract4(right, entry, _load4(work, at + 4 * LANES))
-            at = slopes + row * width * LANES
-            _store4(work, at, left)
-            _store4(work, at + 4 * LANES, right)
+                held = get6(work, layout.held + k * 6 * LANES)
+                total = minus6(total, times6(held, entry))
+            put6(work, slopes + row * width * LANES, total)
 
 
 @numba.njit(nogil=True, cache=True, boundscheck=False)
@@ -106,10 +76,10 @@ def linearise(tree, layout, loads, points, out, work):
     size = len(tree.row)
     lower = 2 * size * size
     for block in range(0, count, LANES):
-        # The last are the last there are, some of them for the second time.
+        # The last block begins early enough to fill the lanes; some points are done twice.
         first = min(block, count - LANES)
         outwards(work, tree, flat, first * stride, stride)
-        move(work, tree, layout, nu, first)
+        move_bodies(work, tree, layout, nu, first)
         load_bodies(work, tree, layout, loads, u, first)
         inwards(work, tree)
         collect(work, tree, layout)

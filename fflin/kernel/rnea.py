@@ -1,6 +1,6 @@
 """Velocities, accelerations and forces of all bodies at eight points at once: RNEA in base axes.
 
-All vectors stand in base axes and all moments are about the joints, as in `batch_crba`.
+All vectors stand in base axes and all moments are about the joints, as in `kernel.crba`.
 
 References
 ----------
@@ -11,16 +11,33 @@ from __future__ import annotations
 
 import numba
 
+from fflin.kernel.crba import inertia_times
 from fflin.kernel.lanes import gather, load, splat, store
 from fflin.kernel.tree import INERTIA, LANES, PLACE
-from fflin.kernel.vectors import add, add3, cross, dot, get3, plus, put3, times, turned
+from fflin.kernel.vectors import (
+    add,
+    add3,
+    add6,
+    cross,
+    dot6,
+    get3,
+    get6,
+    get_columns,
+    plus,
+    plus6,
+    put3,
+    put6,
+    times,
+    times6,
+    turned,
+)
 
-# Of every body, in this order: velocity and Psi' (angular, linear); acceleration that forces and
-# motion cause without c, that of c alone; Psi''.
+# Where the motion vectors of every body begin: velocity, Psi', acceleration without c, that of c
+# alone, and Psi''.
 VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6 * LANES, 12 * LANES, 18 * LANES, 24 * LANES
 MOTION = 30
-# Of all that its joint carries: momentum p, columns of G, stored momentum h, moment and force
-# without c, and those of c on what is carried.
+# Where these begin, of all that its joint carries: momentum p, columns of G, stored momentum h,
+# moment and force without c, and those of c on what is carried.
 MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3 * LANES, 12 * LANES, 15 * LANES, 21 * LANES
 LOAD = 27
 
@@ -34,47 +51,36 @@ def joint_axis(work, tree, body):
 
 
 @numba.njit(forceinline=True)
-def crossed(angular, linear, along):
+def motion_cross(velocity, along):
     """Return the rate of a motion vector `along` that is carried by a velocity."""
-    return (
-        cross(angular, along[0]),
-        plus(cross(angular, along[1]), cross(linear, along[0])),
-    )
+    w, v = velocity
+    return cross(w, along[0]), plus(cross(w, along[1]), cross(v, along[0]))
 
 
 @numba.njit(forceinline=True)
-def weighed(work, at, angular, linear):
+def spatial_inertia_times(work, at, motion):
     """Return inertia times a motion vector, moment and force."""
     m, h = load(work, at), get3(work, at + LANES)
-    xx, xy, xz = get3(work, at + 4 * LANES)
-    yy, yz, zz = get3(work, at + 7 * LANES)
-    x, y, z = angular
-    turning = xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
-    return plus(turning, cross(h, linear)), plus(times(linear, m), cross(angular, h))
+    w, v = motion
+    moment = plus(inertia_times(work, at, w), cross(h, v))
+    return moment, plus(times(v, m), cross(w, h))
 
 
 @numba.njit(forceinline=True)
-def step_motion(work, at, place):
-    """Return a motion vector of the carrier at a joint's own origin, angular and linear."""
-    w = get3(work, at)
-    return w, plus(get3(work, at + 3 * LANES), cross(w, get3(work, place + 9 * LANES)))
+def at_joint(work, at, place):
+    """Return a motion vector of the carrier at a joint's own origin."""
+    w, v = get6(work, at)
+    return w, plus(v, cross(w, get3(work, place + 9 * LANES)))
 
 
 @numba.njit(forceinline=True)
-def write6(work, at, angular, linear):
-    """Write a motion or force vector."""
-    put3(work, at, angular[0], angular[1], angular[2])
-    put3(work, at + 3 * LANES, linear[0], linear[1], linear[2])
+def at_parent(work, place, force):
+    """Return a force at a joint's origin as one at its parent's."""
+    return plus(force[0], cross(get3(work, place + 9 * LANES), force[1])), force[1]
 
 
 @numba.njit(forceinline=True)
-def first_moments(work, at):
-    """Return the columns of G."""
-    return get3(work, at), get3(work, at + 3 * LANES), get3(work, at + 6 * LANES)
-
-
-@numba.njit(forceinline=True)
-def move(work, tree, layout, nu, first):
+def move_bodies(work, tree, layout, nu, first):
     """Write the velocities, and the accelerations without c, outwards; the base does not slide."""
     stride = nu.shape[1]
     flat = nu.reshape(-1)
@@ -91,13 +97,13 @@ def move(work, tree, layout, nu, first):
         place = tree.places + body * PLACE * LANES
         rate = gather(flat, start + tree.coordinate[body], stride)
         axis = joint_axis(work, tree, body)
-        w, v = step_motion(work, above + VELOCITY, place)
-        psi = crossed(w, v, axis)
-        alpha, a = step_motion(work, above + BIAS, place)
-        write6(work, at + VELOCITY, plus(w, times(axis[0], rate)), plus(v, times(axis[1], rate)))
-        write6(work, at + PSI, *psi)
-        write6(work, at + BIAS, plus(alpha, times(psi[0], rate)), plus(a, times(psi[1], rate)))
-        write6(work, at + ADDED, none, none)
+        velocity = at_joint(work, above + VELOCITY, place)
+        psi = motion_cross(velocity, axis)
+        bias = at_joint(work, above + BIAS, place)
+        put6(work, at + VELOCITY, plus6(velocity, times6(axis, rate)))
+        put6(work, at + PSI, psi)
+        put6(work, at + BIAS, plus6(bias, times6(psi, rate)))
+        put6(work, at + ADDED, (none, none))
 
 
 @numba.njit(forceinline=True)
@@ -109,27 +115,25 @@ def _load_bodies(work, tree, layout):
         at = layout.load + body * LOAD * LANES
         moving = layout.motion + body * MOTION * LANES
         inertia = tree.inertias + body * INERTIA * LANES
-        w, v = get3(work, moving), get3(work, moving + 3 * LANES)
+        w, v = get6(work, moving + VELOCITY)
         h = get3(work, inertia + LANES)
-        turning, p = weighed(work, inertia, w, v)
+        turning, p = spatial_inertia_times(work, inertia, (w, v))
         for entry in range(LOAD):
             store(work, at + entry * LANES, zero)
-        put3(work, at + MOMENTUM, p[0], p[1], p[2])
+        put3(work, at + MOMENTUM, p)
         # The second moments of mass are half the trace of I, less I.
         xx, xy, xz = get3(work, inertia + 4 * LANES)
         yy, yz, zz = get3(work, inertia + 7 * LANES)
         trace = half * (xx + yy + zz)
-        x = plus(times(v, h[0]), cross(w, (trace - xx, zero - xy, zero - xz)))
-        y = plus(times(v, h[1]), cross(w, (zero - xy, trace - yy, zero - yz)))
-        z = plus(times(v, h[2]), cross(w, (zero - xz, zero - yz, trace - zz)))
-        put3(work, at + MOMENTS, x[0], x[1], x[2])
-        put3(work, at + MOMENTS + 3 * LANES, y[0], y[1], y[2])
-        put3(work, at + MOMENTS + 6 * LANES, z[0], z[1], z[2])
-        moment, force = weighed(
-            work, inertia, get3(work, moving + BIAS), get3(work, moving + BIAS + 3 * LANES)
-        )
+        x = trace - xx, zero - xy, zero - xz
+        y = zero - xy, trace - yy, zero - yz
+        z = zero - xz, zero - yz, trace - zz
+        put3(work, at + MOMENTS, plus(times(v, h[0]), cross(w, x)))
+        put3(work, at + MOMENTS + 3 * LANES, plus(times(v, h[1]), cross(w, y)))
+        put3(work, at + MOMENTS + 6 * LANES, plus(times(v, h[2]), cross(w, z)))
+        moment, force = spatial_inertia_times(work, inertia, get6(work, moving + BIAS))
         moment = plus(moment, plus(cross(w, turning), cross(v, p)))
-        write6(work, at + FORCE, moment, plus(force, cross(w, p)))
+        put6(work, at + FORCE, (moment, plus(force, cross(w, p))))
 
 
 @numba.njit(forceinline=True)
@@ -138,12 +142,11 @@ def _load_stored(work, tree, layout, loads):
     for index in range(len(loads.stored_body)):
         body = loads.stored_body[index]
         at = layout.load + body * LOAD * LANES
-        vector = loads.stored[index]
-        place = tree.places + body * PLACE * LANES
-        h = turned(work, place, vector[0], vector[1], vector[2])
-        add3(work, at + STORED, h[0], h[1], h[2])
-        moment = cross(get3(work, layout.motion + body * MOTION * LANES), h)
-        add3(work, at + FORCE, moment[0], moment[1], moment[2])
+        stored = loads.stored[index]
+        axes = get_columns(work, tree.places + body * PLACE * LANES)
+        h = turned(axes, stored[0], stored[1], stored[2])
+        add3(work, at + STORED, h)
+        add3(work, at + FORCE, cross(get3(work, layout.motion + body * MOTION * LANES), h))
 
 
 @numba.njit(forceinline=True)
@@ -155,27 +158,22 @@ def _load_carried(work, tree, layout, loads, u, first):
     stride = u.shape[1]
     flat = u.reshape(-1)
     for index in range(len(loads.body)):
-        body, vector = loads.body[index], loads.wrench[index]
-        place = tree.places + body * PLACE * LANES
-        moment = turned(work, place, vector[0], vector[1], vector[2])
-        force = turned(work, place, vector[3], vector[4], vector[5])
+        body, unit = loads.body[index], loads.wrench[index]
+        axes = get_columns(work, tree.places + body * PLACE * LANES)
+        wrench = turned(axes, unit[0], unit[1], unit[2]), turned(axes, unit[3], unit[4], unit[5])
         pushed = zero - gather(flat, first * stride + loads.input[index], stride)
-        at = layout.load + body * LOAD * LANES + FORCE
-        add3(work, at, *times(moment, pushed))
-        add3(work, at + 3 * LANES, *times(force, pushed))
+        add6(work, layout.load + body * LOAD * LANES + FORCE, times6(wrench, pushed))
         while body > 0:
-            axis = joint_axis(work, tree, body)
             entry = tree.coordinate[body] * len(loads.body) + index
-            value = dot(axis[0], moment) + dot(axis[1], force)
+            value = dot6(joint_axis(work, tree, body), wrench)
             add(work, layout.columns + entry * LANES, value)
-            place = tree.places + body * PLACE * LANES
-            moment = plus(moment, cross(get3(work, place + 9 * LANES), force))
+            wrench = at_parent(work, tree.places + body * PLACE * LANES, wrench)
             body = tree.parent[body]
         for axis in range(3):
             entry = axis * len(loads.body) + index
-            store(work, layout.columns + entry * LANES, moment[axis])
+            store(work, layout.columns + entry * LANES, wrench[0][axis])
             entry += 3 * len(loads.body)
-            store(work, layout.columns + entry * LANES, force[axis])
+            store(work, layout.columns + entry * LANES, wrench[1][axis])
 
 
 @numba.njit(forceinline=True)
@@ -194,21 +192,19 @@ def collect(work, tree, layout):
     for body in range(len(tree.parent) - 1, 0, -1):
         at = layout.load + body * LOAD * LANES
         above = layout.load + tree.parent[body] * LOAD * LANES
-        d = get3(work, tree.places + (body * PLACE + 9) * LANES)
-        moment, force = get3(work, at + FORCE), get3(work, at + FORCE + 3 * LANES)
-        axis = joint_axis(work, tree, body)
-        value = dot(axis[0], moment) + dot(axis[1], force)
+        place = tree.places + body * PLACE * LANES
+        d = get3(work, place + 9 * LANES)
+        force = get6(work, at + FORCE)
+        value = dot6(joint_axis(work, tree, body), force)
         add(work, layout.bias + tree.coordinate[body] * LANES, value)
-        p, h = get3(work, at + MOMENTUM), get3(work, at + STORED)
-        add3(work, above + MOMENTUM, p[0], p[1], p[2])
-        add3(work, above + STORED, h[0], h[1], h[2])
-        columns = first_moments(work, at + MOMENTS)
+        p = get3(work, at + MOMENTUM)
+        add3(work, above + MOMENTUM, p)
+        add3(work, above + STORED, get3(work, at + STORED))
+        columns = get_columns(work, at + MOMENTS)
         for index in range(3):
             column = plus(columns[index], times(p, d[index]))
-            add3(work, above + MOMENTS + 3 * index * LANES, column[0], column[1], column[2])
-        moment = plus(moment, cross(d, force))
-        add3(work, above + FORCE, moment[0], moment[1], moment[2])
-        add3(work, above + FORCE + 3 * LANES, force[0], force[1], force[2])
+            add3(work, above + MOMENTS + 3 * index * LANES, column)
+        add6(work, above + FORCE, at_parent(work, place, force))
     at = layout.load + FORCE
     for index in range(6):
         add(work, layout.bias + index * LANES, load(work, at + index * LANES))
@@ -226,31 +222,22 @@ def accelerate_bodies(work, tree, layout):
         place = tree.places + body * PLACE * LANES
         rate = load(work, layout.c + tree.coordinate[body] * LANES)
         axis = joint_axis(work, tree, body)
-        alpha, a = step_motion(work, above + ADDED, place)
-        bias = step_motion(work, above + BIAS, place)
-        w, v = step_motion(work, above + VELOCITY, place)
-        psi = get3(work, at + PSI), get3(work, at + PSI + 3 * LANES)
-        first = crossed(plus(alpha, bias[0]), plus(a, bias[1]), axis)
-        second = crossed(w, v, psi)
-        write6(work, at + PSI2, plus(first[0], second[0]), plus(first[1], second[1]))
-        write6(work, at + ADDED, plus(alpha, times(axis[0], rate)), plus(a, times(axis[1], rate)))
+        added = at_joint(work, above + ADDED, place)
+        acceleration = plus6(added, at_joint(work, above + BIAS, place))
+        velocity = at_joint(work, above + VELOCITY, place)
+        psi = get6(work, at + PSI)
+        put6(work, at + PSI2, plus6(motion_cross(acceleration, axis), motion_cross(velocity, psi)))
+        put6(work, at + ADDED, plus6(added, times6(axis, rate)))
     for body in range(len(tree.parent) - 1, 0, -1):
         at = layout.load + body * LOAD * LANES
         inertia = tree.inertias + body * INERTIA * LANES
         place = tree.places + body * PLACE * LANES
         above = layout.motion + tree.parent[body] * MOTION * LANES
-        axis = joint_axis(work, tree, body)
         rate = load(work, layout.c + tree.coordinate[body] * LANES)
-        own = weighed(work, inertia, times(axis[0], rate), times(axis[1], rate))
-        moment = plus(get3(work, at + CARRIED), own[0])
-        force = plus(get3(work, at + CARRIED + 3 * LANES), own[1])
-        alpha, a = step_motion(work, above + ADDED, place)
-        shared = weighed(work, inertia, alpha, a)
-        whole = plus(moment, shared[0]), plus(force, shared[1])
-        add3(work, at + FORCE, whole[0][0], whole[0][1], whole[0][2])
-        add3(work, at + FORCE + 3 * LANES, whole[1][0], whole[1][1], whole[1][2])
+        own = spatial_inertia_times(work, inertia, times6(joint_axis(work, tree, body), rate))
+        carried = plus6(get6(work, at + CARRIED), own)
+        shared = spatial_inertia_times(work, inertia, at_joint(work, above + ADDED, place))
+        add6(work, at + FORCE, plus6(carried, shared))
         if tree.parent[body] > 0:
             to = layout.load + tree.parent[body] * LOAD * LANES + CARRIED
-            moment = plus(moment, cross(get3(work, place + 9 * LANES), force))
-            add3(work, to, moment[0], moment[1], moment[2])
-            add3(work, to + 3 * LANES, force[0], force[1], force[2])
+            add6(work, to, at_parent(work, place, carried))

@@ -34,21 +34,34 @@ from fflin.kernel.rnea import (
     PSI,
     PSI2,
     STORED,
-    first_moments,
+    at_parent,
     joint_axis,
-    weighed,
+    spatial_inertia_times,
 )
 from fflin.kernel.tree import INERTIA, LANES, PLACE
-from fflin.kernel.vectors import add, add3, cross, dot, get3, minus, plus, times
+from fflin.kernel.vectors import (
+    add,
+    add3,
+    cross,
+    dot,
+    dot6,
+    get3,
+    get6,
+    get_columns,
+    minus,
+    plus,
+    plus6,
+    product,
+    times,
+)
 
 
 @numba.njit(forceinline=True)
 def _coriolis(work, at, w):
     """Return 2 B w, moment and force, of what a joint carries."""
-    x, y, z = first_moments(work, at + MOMENTS)
-    trace = x[0] + y[1] + z[2]
-    carried = plus(plus(times(x, w[0]), times(y, w[1])), times(z, w[2]))
-    moment = minus(times(w, trace), carried)
+    G = get_columns(work, at + MOMENTS)
+    trace = G[0][0] + G[1][1] + G[2][2]
+    moment = minus(times(w, trace), product(G, w))
     moment = plus(plus(moment, moment), cross(w, get3(work, at + STORED)))
     force = cross(w, get3(work, at + MOMENTUM))
     return moment, plus(force, force)
@@ -57,10 +70,10 @@ def _coriolis(work, at, w):
 @numba.njit(forceinline=True)
 def _coriolis_transposed(work, at, along):
     """Return 2 B^T s of a motion vector s, which is a moment."""
-    x, y, z = first_moments(work, at + MOMENTS)
-    trace = x[0] + y[1] + z[2]
+    G = get_columns(work, at + MOMENTS)
+    trace = G[0][0] + G[1][1] + G[2][2]
     w = along[0]
-    carried = dot(x, w), dot(y, w), dot(z, w)
+    carried = dot(G[0], w), dot(G[1], w), dot(G[2], w)
     moment = plus(minus(times(w, trace), carried), cross(get3(work, at + MOMENTUM), along[1]))
     return plus(plus(moment, moment), cross(get3(work, at + STORED), w))
 
@@ -80,11 +93,11 @@ def _passive_slopes(work, tree, layout, loads):
 
 
 @numba.njit(forceinline=True)
-def _add_column(work, at, width, moment, force):
-    """Add to the rows of the base in a column."""
+def _add_column(work, at, width, force):
+    """Add a moment and force to the rows of the base in a column."""
     for index in range(3):
-        add(work, at + index * width * LANES, moment[index])
-        add(work, at + (3 + index) * width * LANES, force[index])
+        add(work, at + index * width * LANES, force[0][index])
+        add(work, at + (3 + index) * width * LANES, force[1][index])
 
 
 @numba.njit(forceinline=True)
@@ -98,66 +111,56 @@ def _joint_slopes(work, tree, layout):
         inertia = tree.inertias + body * INERTIA * LANES
         column = tree.coordinate[body]
         axis = joint_axis(work, tree, body)
-        psi = get3(work, moving + PSI), get3(work, moving + PSI + 3 * LANES)
-        psi2 = get3(work, moving + PSI2), get3(work, moving + PSI2 + 3 * LANES)
-        u, uf = weighed(work, inertia, axis[0], axis[1])
-        w = _coriolis_transposed(work, at, axis)
-        moment, force = get3(work, at + FORCE), get3(work, at + FORCE + 3 * LANES)
-        turning, pushing = _coriolis(work, at, psi[0])
-        weight, heft = weighed(work, inertia, psi2[0], psi2[1])
-        p = plus(plus(turning, weight), plus(cross(axis[0], moment), cross(axis[1], force)))
-        pf = plus(plus(pushing, heft), cross(axis[0], force))
-        turning, pushing = _coriolis(work, at, axis[0])
-        weight, heft = weighed(work, inertia, psi[0], psi[1])
-        v = plus(turning, plus(weight, weight))
-        vf = plus(pushing, plus(heft, heft))
+        psi, psi2 = get6(work, moving + PSI), get6(work, moving + PSI2)
+        momentum = spatial_inertia_times(work, inertia, axis)
+        coriolis = _coriolis_transposed(work, at, axis)
+        moment, force = get6(work, at + FORCE)
+        by_q = plus6(_coriolis(work, at, psi[0]), spatial_inertia_times(work, inertia, psi2))
+        turned = plus(cross(axis[0], moment), cross(axis[1], force)), cross(axis[0], force)
+        by_q = plus6(by_q, turned)
+        weight = spatial_inertia_times(work, inertia, psi)
+        by_v = plus6(_coriolis(work, at, axis[0]), plus6(weight, weight))
         own = layout.lower + column * width * LANES
-        by_q, by_v = column * LANES, (column + 6 + n) * LANES
+        q, v = column * LANES, (column + 6 + n) * LANES
         above = body
         while above > 0:
+            place = tree.places + above * PLACE * LANES
             other = tree.coordinate[above]
             axis = joint_axis(work, tree, above)
             row = layout.lower + other * width * LANES
-            add(work, row + by_q, dot(axis[0], p) + dot(axis[1], pf))
-            add(work, row + by_v, dot(axis[0], v) + dot(axis[1], vf))
+            add(work, row + q, dot6(axis, by_q))
+            add(work, row + v, dot6(axis, by_v))
             if above != body:
                 moving = layout.motion + above * MOTION * LANES
-                psi = get3(work, moving + PSI), get3(work, moving + PSI + 3 * LANES)
-                psi2 = get3(work, moving + PSI2), get3(work, moving + PSI2 + 3 * LANES)
-                value = dot(w, psi[0]) + (dot(u, psi2[0]) + dot(uf, psi2[1]))
+                psi, psi2 = get6(work, moving + PSI), get6(work, moving + PSI2)
+                value = dot(coriolis, psi[0]) + dot6(momentum, psi2)
                 add(work, own + other * LANES, value)
-                value = dot(u, psi[0]) + dot(uf, psi[1])
-                value = dot(w, axis[0]) + (value + value)
+                value = dot6(momentum, psi)
+                value = dot(coriolis, axis[0]) + (value + value)
                 add(work, own + (other + 6 + n) * LANES, value)
-            d = get3(work, tree.places + (above * PLACE + 9) * LANES)
-            u, p, v = plus(u, cross(d, uf)), plus(p, cross(d, pf)), plus(v, cross(d, vf))
+            momentum = at_parent(work, place, momentum)
+            by_q, by_v = at_parent(work, place, by_q), at_parent(work, place, by_v)
             above = tree.parent[above]
-        turning = plus(w, cross(u, spin))
-        add3(work, own + (6 + n) * LANES, turning[0], turning[1], turning[2])
-        _add_column(work, layout.lower + by_q, width, p, pf)
-        _add_column(work, layout.lower + by_v, width, v, vf)
+        add3(work, own + (6 + n) * LANES, plus(coriolis, cross(momentum[0], spin)))
+        _add_column(work, layout.lower + q, width, by_q)
+        _add_column(work, layout.lower + v, width, by_v)
 
 
 @numba.njit(forceinline=True)
 def _base_slopes(work, tree, layout):
     """Write those of the base's force over omega_b."""
     n, width = len(tree.row) - 6, 2 * len(tree.row)
-    zero = splat(0.0)
+    zero, one = splat(0.0), splat(1.0)
     spin = get3(work, layout.motion)
-    one = splat(1.0)
+    axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for index in range(3):
-        if index == 0:
-            e = one, zero, zero
-        elif index == 1:
-            e = zero, one, zero
-        else:
-            e = zero, zero, one
-        turning, pushing = _coriolis(work, layout.load, e)
-        weight, heft = weighed(work, tree.inertias, cross(spin, e), (zero, zero, zero))
+        e = axes[index]
+        weight = spatial_inertia_times(work, tree.inertias, (cross(spin, e), (zero, zero, zero)))
+        moment, force = plus6(_coriolis(work, layout.load, e), weight)
         for axis in range(3):
             row = layout.lower + (axis * width + 6 + n + index) * LANES
-            store(work, row, turning[axis] + weight[axis])
-            store(work, row + 3 * width * LANES, pushing[axis] + heft[axis])
+            store(work, row, moment[axis])
+            store(work, row + 3 * width * LANES, force[axis])
 
 
 @numba.njit(forceinline=True)

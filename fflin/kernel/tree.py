@@ -15,8 +15,11 @@ from fflin.robot.robot import Robot
 
 LANES = 8  # configurations that the kernel does at once
 
-# Doubles of a body's place: x, y, z axes, and where it is from its parent; and of its inertia: m,
-# m c, I (xx xy xz yy yz zz).
+# Rows of Pinocchio's spatial vectors, whose linear part comes first.
+PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
+
+# How many numbers are a body's place (x, y and z axes, and its origin from its parent's) and its
+# inertia (m, m c, I as xx xy xz yy yz zz).
 PLACE, INERTIA = 12, 10
 
 
@@ -83,7 +86,7 @@ class Tree(NamedTuple):
     size: int
 
 
-# Trees of the robots that are alive, which do not change.
+# By robot, as long as it is alive; robots do not change.
 _TREES: WeakKeyDictionary[Robot, Tree | None] = WeakKeyDictionary()
 
 
@@ -96,10 +99,12 @@ def batch_tree(robot: Robot) -> Tree | None:
 
 def _tree(robot: Robot) -> Tree | None:
     model = robot.model
-    places, turns, slides = _screws(model)
-    if places is None:
+    joints = model.joints.tolist()[ROOT:]
+    screws = [_screw(model, joint) for joint in joints[1:]]
+    if None in screws:
         return None
-    bodies = model.njoints - ROOT
+    places, turns, slides = zip((pin.SE3.Identity(), 0.0, 0.0), *screws, strict=True)
+    bodies = len(joints)
     parent = np.array([max(0, model.parents[ROOT + body] - ROOT) for body in range(bodies)])
     fixed, inertias = np.zeros((bodies, 12)), np.zeros((bodies, 10))
     for body in range(bodies):
@@ -110,7 +115,7 @@ def _tree(robot: Robot) -> Tree | None:
         inertia = places[body].actInv(model.inertias[ROOT + body])
         inertias[body, 0] = inertia.mass
         inertias[body, 1:4] = inertia.mass * inertia.lever
-        inertias[body, 4:] = inertia.matrix()[3:, 3:][np.triu_indices(3)]
+        inertias[body, 4:] = inertia.matrix()[PIN_ANGULAR, PIN_ANGULAR][np.triu_indices(3)]
     coordinate, factor = _coordinates(robot)
     paths = _paths(6 + robot.n, parent, coordinate)
     row = np.cumsum([0, *map(len, paths[:-1])])
@@ -130,14 +135,13 @@ def _tree(robot: Robot) -> Tree | None:
     entries = int(sum(map(len, paths)))
     sizes = (bodies * PLACE, bodies * INERTIA, entries, entries, size, size * size)
     starts = [int(x) for x in np.cumsum([0, *sizes]) * LANES]
-    joints = model.joints.tolist()[ROOT:]
     return Tree(
         parent,
         fixed,
         np.array([joint.idx_q for joint in joints]),
         np.array([joint.nq == 2 for joint in joints]),
-        turns,
-        slides,
+        np.array(turns),
+        np.array(slides),
         inertias,
         np.array([place.rotation for place in places]),
         np.array(coordinate),
@@ -154,32 +158,25 @@ def _tree(robot: Robot) -> Tree | None:
     )
 
 
-def _screws(model: pin.Model) -> tuple[list[pin.SE3] | None, Array, Array]:
-    """Return, for every body, the frame whose z is its joint's axis, and what a unit does."""
-    places = [pin.SE3.Identity()]
-    turns, slides = [0.0], [0.0]
-    for joint in model.joints.tolist()[ROOT + 1 :]:
-        data = joint.createData()
-        q = pin.neutral(model)
-        v = np.zeros(model.nv)
-        joint.calc(data, q)
-        subspace = np.asarray(data.S).reshape(6)
-        v[joint.idx_v] = 0.7
-        joint.calc(data, pin.integrate(model, q, v))
-        if not data.M.isApprox(pin.exp6(0.7 * subspace), 1e-12):
-            return None, np.empty(0), np.empty(0)
-        linear, angular = subspace[:3], subspace[3:]
-        turn = float(np.linalg.norm(angular))
-        axis = angular / turn if turn else linear / np.linalg.norm(linear)
-        slide = float(linear @ axis)
-        # A joint off its frame's origin is none that Pinocchio has.
-        if np.abs(linear - slide * axis).max() > 1e-12:
-            return None, np.empty(0), np.empty(0)
-        rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis)
-        places.append(pin.SE3(rotation.normalized().matrix(), np.zeros(3)))
-        turns.append(turn)
-        slides.append(slide)
-    return places, np.array(turns), np.array(slides)
+def _screw(model: pin.Model, joint: Any) -> tuple[pin.SE3, float, float] | None:
+    """Return the frame whose z is a joint's axis, and what a unit of it turns and slides."""
+    data = joint.createData()
+    q, v = pin.neutral(model), np.zeros(model.nv)
+    joint.calc(data, q)
+    subspace = np.asarray(data.S).reshape(6)
+    v[joint.idx_v] = 0.7
+    joint.calc(data, pin.integrate(model, q, v))
+    if not data.M.isApprox(pin.exp6(0.7 * subspace), 1e-12):
+        return None
+    linear, angular = subspace[PIN_LINEAR], subspace[PIN_ANGULAR]
+    turn = float(np.linalg.norm(angular))
+    axis = angular / turn if turn else linear / np.linalg.norm(linear)
+    slide = float(linear @ axis)
+    # Pinocchio has no joint whose axis misses its frame's origin.
+    if np.abs(linear - slide * axis).max() > 1e-12:
+        return None
+    rotation = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis)
+    return pin.SE3(rotation.normalized().matrix(), np.zeros(3)), turn, slide
 
 
 def _coordinates(robot: Robot) -> tuple[list[int], list[float]]:
@@ -195,7 +192,7 @@ def _armature(model: pin.Model, coordinate: list[int], factor: list[float]) -> A
     """Return what the rotors of all joints that move with each coordinate add to M."""
     of_joints = model.armature
     armature = np.zeros(1 + max(coordinate))
-    armature[:3], armature[3:6] = of_joints[3:6], of_joints[:3]
+    armature[:3], armature[3:6] = of_joints[PIN_ANGULAR], of_joints[PIN_LINEAR]
     joints = model.joints.tolist()[ROOT + 1 :]
     for joint, index, share in zip(joints, coordinate[1:], factor[1:], strict=True):
         armature[index] += share**2 * of_joints[joint.idx_v]
@@ -232,7 +229,7 @@ def _common(paths: list[list[int]]) -> NDArray[np.intp]:
     common = np.zeros((len(paths), len(paths)), dtype=np.intp)
     for index, path in enumerate(paths):
         if len(path) > 1:
-            # No path of an earlier one has this one in it.
+            # No path of an earlier coordinate has this one in it.
             common[index, :index] = common[:index, index] = common[path[-2], :index]
         common[index, index] = len(path)
     return common

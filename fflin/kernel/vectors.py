@@ -1,4 +1,7 @@
-"""Vectors of three in numba code, each entry eight doubles side by side."""
+"""Vectors of three and spatial vectors in numba code, each entry eight doubles side by side.
+
+A spatial vector is a pair of vectors: (angular, linear) velocity, or (moment, force).
+"""
 
 from __future__ import annotations
 
@@ -9,17 +12,17 @@ from fflin.kernel.tree import LANES
 
 
 @numba.njit(forceinline=True)
-def put3(work, at, x, y, z):
-    """Write a vector."""
-    store(work, at, x)
-    store(work, at + LANES, y)
-    store(work, at + 2 * LANES, z)
-
-
-@numba.njit(forceinline=True)
 def get3(work, at):
     """Read a vector."""
     return load(work, at), load(work, at + LANES), load(work, at + 2 * LANES)
+
+
+@numba.njit(forceinline=True)
+def put3(work, at, a):
+    """Write a vector."""
+    store(work, at, a[0])
+    store(work, at + LANES, a[1])
+    store(work, at + 2 * LANES, a[2])
 
 
 @numba.njit(forceinline=True)
@@ -29,11 +32,37 @@ def add(work, at, value):
 
 
 @numba.njit(forceinline=True)
-def add3(work, at, x, y, z):
+def add3(work, at, a):
     """Add to a vector."""
-    add(work, at, x)
-    add(work, at + LANES, y)
-    add(work, at + 2 * LANES, z)
+    add(work, at, a[0])
+    add(work, at + LANES, a[1])
+    add(work, at + 2 * LANES, a[2])
+
+
+@numba.njit(forceinline=True)
+def get6(work, at):
+    """Read a spatial vector."""
+    return get3(work, at), get3(work, at + 3 * LANES)
+
+
+@numba.njit(forceinline=True)
+def put6(work, at, s):
+    """Write a spatial vector."""
+    put3(work, at, s[0])
+    put3(work, at + 3 * LANES, s[1])
+
+
+@numba.njit(forceinline=True)
+def add6(work, at, s):
+    """Add to a spatial vector."""
+    add3(work, at, s[0])
+    add3(work, at + 3 * LANES, s[1])
+
+
+@numba.njit(forceinline=True)
+def get_columns(work, at):
+    """Read a matrix of three columns."""
+    return get3(work, at), get3(work, at + 3 * LANES), get3(work, at + 6 * LANES)
 
 
 @numba.njit(forceinline=True)
@@ -67,9 +96,36 @@ def times(a, value):
 
 
 @numba.njit(forceinline=True)
-def turned(work, place, x, y, z):
-    """Return constants x, y, z in the axes of a place as a vector in base axes."""
-    return plus(
-        plus(times(get3(work, place), splat(x)), times(get3(work, place + 3 * LANES), splat(y))),
-        times(get3(work, place + 6 * LANES), splat(z)),
-    )
+def product(columns, a):
+    """Return a matrix, given by its columns, times a vector."""
+    return plus(plus(times(columns[0], a[0]), times(columns[1], a[1])), times(columns[2], a[2]))
+
+
+@numba.njit(forceinline=True)
+def turned(axes, x, y, z):
+    """Return a rotation, given by its columns, times the constants x, y, z."""
+    return product(axes, (splat(x), splat(y), splat(z)))
+
+
+@numba.njit(forceinline=True)
+def dot6(s, t):
+    """Return the power of a force along a motion, or the other way round."""
+    return dot(s[0], t[0]) + dot(s[1], t[1])
+
+
+@numba.njit(forceinline=True)
+def plus6(s, t):
+    """Return s + t of spatial vectors."""
+    return plus(s[0], t[0]), plus(s[1], t[1])
+
+
+@numba.njit(forceinline=True)
+def minus6(s, t):
+    """Return s - t of spatial vectors."""
+    return minus(s[0], t[0]), minus(s[1], t[1])
+
+
+@numba.njit(forceinline=True)
+def times6(s, value):
+    """Return a spatial vector times eight numbers."""
+    return times(s[0], value), times(s[1], value)

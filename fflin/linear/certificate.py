@@ -15,7 +15,8 @@ from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
 from fflin.linear.model import Certificate, LinearModel
 from fflin.robot.robot import Robot
 
-# Of terms that drop out exactly: their rounding, 1e-16 of them, is to be far below the tolerance.
+# Terms that cancel exactly still leave their rounding, 1e-16 of their size. Counted with this
+# share they allow for it, and hide nothing larger.
 _ROUNDING_SHARE = 1e-3
 
 
@@ -72,7 +73,7 @@ def aba_route(
 
     They are built in base axes and carried to the frame by the change of coordinates
     :math:`x_f = T x_l`: :math:`A_f = (T A_l + \dot T) T^{-1}`, :math:`B_f = T B_l`, to which the
-    turning of a force held in reference axes is added.
+    turning of a force held in reference axes is added: (4.9) and (4.10) of docs/derivation.md.
 
     Returns
     -------
@@ -189,7 +190,7 @@ def _cancelling_terms(
     mobility, input_mobility = scales
     chart = state.chart(lin.q)
     steepness = _largest(chart.J) if column == "q_b" else 1.0
-    speed, rate, momentum = motion(state, lin.v)
+    speed, rate, momentum = speeds(state, lin.v)
     # What the momentum of wheels does to a turning link, in the units of the rows.
     spin = momentum * _largest(mobility[np.r_[ANGULAR, 6 : len(mobility)]])
     still = speed.copy()
@@ -210,7 +211,7 @@ def _cancelling_terms(
     )
 
 
-def motion(state: StateMap, v: Array) -> tuple[Array, float, float]:
+def speeds(state: StateMap, v: Array) -> tuple[Array, float, float]:
     """Return speeds (6 + n,) without those of wheels, the largest rate, and wheels' momentum.
 
     A wheel's speed matters as the momentum [N m s] that it carries, however fast it is.

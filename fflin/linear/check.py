@@ -10,9 +10,8 @@ from fflin.base.errors import InputError
 from fflin.base.tables import grid, width
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.output_values import Measuring
-from fflin.dynamics.outputs import Sensing
-from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.dynamics.outputs import Measuring, Sensing
+from fflin.dynamics.state import StateMap
 from fflin.linear.certificate import (
     aba_route,
     compare,
@@ -20,11 +19,11 @@ from fflin.linear.certificate import (
     inertia_residual,
     inverse_inertia,
     mobilities,
-    motion,
     scaled_condition,
+    speeds,
 )
 from fflin.linear.model import LinearModel
-from fflin.linear.nonlinear import ErrorDynamics, Nonlinear, flow_error, jacobian
+from fflin.linear.nonlinear import ErrorDynamics, Nonlinear, difference_steps, flow_error, jacobian
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
@@ -41,7 +40,7 @@ _DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING = 1e-8, 1e4 * _EPS
 # From the residual of an inverse to the error of what it multiplies.
 _ROUTE_SAFETY = 10.0
 
-# Beyond two digits nothing is confirmed, however badly M is conditioned.
+# A tolerance beyond this would confirm less than two digits, however badly M is conditioned.
 _LOOSEST = 1e-2
 
 
@@ -170,7 +169,7 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     rows.append(Row("inertia", "M", _relative(lin.M, M, floor=0.0), route))
     inverse = inverse_inertia(state, lin)
     if model.aba.actuation.default:
-        inverse = lin.B[-len(M) :]  # which is all of it
+        inverse = lin.B[-len(M) :]  # all of it stands in B
     rows.append(Row("inertia", "M M^-1 = E", inertia_residual(M, inverse), route))
     rows += [Row("inertia", name, error, 1e-12) for name, error in _positive_definite(inverse)]
     return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, cond(M) {condition:.1e}")
@@ -188,7 +187,7 @@ def _point_errors(
     state = model.state
     mobility, input_mobility = mobilities(M, lin.B)
     rate = model(lin.x0, lin.u0)
-    _, rate_of_turn, momentum = motion(state, v)
+    _, rate_of_turn, momentum = speeds(state, v)
     push = float((np.abs(lin.u0) * input_mobility).max(initial=0.0))
     push += rate_of_turn**2 * float((1.0 / mobility).max())
     push += rate_of_turn * momentum * float(mobility.max())
@@ -202,27 +201,10 @@ def _point_errors(
 
 def _differences(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
     """Return A and B by central differences of the nonlinear model."""
-    step, push = _steps(model, lin, M)
+    step, push = difference_steps(model.state, lin, M)
     A = jacobian(lambda x: model(x, lin.u0), lin.x0, step)
     B = jacobian(lambda u: model(lin.x0, u), lin.u0, push)
     return A, B
-
-
-def _steps(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
-    """Return the steps of differences in x and u."""
-    groups = model.state.groups
-    nv = len(M)
-    # Small against the angles over which accelerations change where light links line up.
-    step = np.full(model.state.nx, 2e-4)
-    # Well inside the chart, whose edge |q_b| = 1 the model feels long before.
-    step[groups.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[groups.q_b]))
-    # f is quadratic in the velocities and linear in the input: no truncation at any step.
-    speed = np.abs(lin.x0[-nv:])
-    step[-nv:] = 0.1 * max(1.0, float(speed[ANGULAR].max()), float(speed[6:].max(initial=0.0)))
-    step[groups.v_b] = 0.1 * max(1.0, float(speed[LINEAR].max()))
-    mobility, input_mobility = mobilities(M, lin.B)
-    push = max(1.0, float(np.abs(lin.f0[-nv:] / mobility).max())) / input_mobility
-    return step, push
 
 
 def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float) -> list[Row]:
@@ -242,11 +224,11 @@ def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float)
     def y(x: Array, u: Array) -> Array:
         return measuring(x, *model.acceleration(x, u))
 
-    step_x, step_u = _steps(model, lin, M)
+    step_x, step_u = difference_steps(model.state, lin, M)
     here = y(lin.x0, lin.u0)
     C = jacobian(lambda x: y(x, lin.u0), lin.x0, step_x)
     D = jacobian(lambda u: y(lin.x0, u), lin.u0, step_u)
-    # What cannot be told from the rounding of y in its step is not compared any closer.
+    # A slope below the rounding of y divided by the step is noise, and not compared more closely.
     scale = _ULPS * np.maximum(1.0, np.abs(here))[:, None]
     rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]
     for name, given, expected, step in (("C", lin.C, C, step_x), ("D", lin.D, D, step_u)):

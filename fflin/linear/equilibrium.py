@@ -9,8 +9,10 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import EquilibriumError, listed
+from fflin.base.frozen import FrozenArrays
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.names import forces_of
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 
 _EPS = float(np.finfo(float).eps)
 
-# Of the forces that are balanced, this share may be left.
+# Largest share of the forces to be balanced that may be left over.
 _TOLERANCE = 1e-9
 
 # Round-off of M a and of the accelerations themselves, relative to the terms that they sum.
@@ -30,7 +32,7 @@ _ROUNDING = 1e3 * _EPS
 
 
 @dataclass(frozen=True, eq=False)
-class Equilibrium:
+class Equilibrium(FrozenArrays):
     """The inputs of least norm that hold a robot, and what they leave.
 
     Attributes
@@ -51,10 +53,6 @@ class Equilibrium:
     input_units: tuple[str, ...]
     force_names: tuple[str, ...]
     force_units: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        self.u.setflags(write=False)
-        self.residual.setflags(write=False)
 
     def __str__(self) -> str:
         from fflin.base.tables import signals
@@ -140,8 +138,7 @@ def equilibrium(
     u, left = _least_norm(scaled, target, one_sided)
     allowed = _TOLERANCE * float(np.linalg.norm(target))
     allowed += float(np.linalg.norm(mobility * _rounding(robot, lin)))
-    pushes = {f"tau_b.{x}": "N m" for x in "xyz"} | {f"F_b.{x}": "N" for x in "xyz"}
-    pushes |= {f"tau_m.{j.name}": "N" if j.prismatic else "N m" for j in robot.joints}
+    pushes = forces_of(robot)
     residual = left / mobility
     if float(np.linalg.norm(left)) > allowed:
         raise _unbalanced(robot, residual, np.abs(left), pushes)
@@ -208,7 +205,7 @@ def _pseudo_solve(C: Array, d: Array) -> Array:
     """Return the u of least norm among those with the least ``|C u - d|``."""
     u: Array = np.linalg.lstsq(C, d, rcond=None)[0]
     u += np.linalg.lstsq(C, d - C @ u, rcond=None)[0]
-    # Nothing is known of what is below the rounding of the largest.
+    # An input below the rounding of the largest one is noise: it counts as zero.
     u[np.abs(u) <= 16.0 * _EPS * float(np.abs(u).max(initial=0.0))] = 0.0
     return u
 

@@ -15,27 +15,35 @@ from fflin.base import record
 from fflin.base.record import Record, figure, figures, text, texts
 from fflin.base.writing import check_ending, read_file, write_whole
 
-_MATRICES = ("A", "B", "C", "D", "M")
-_VECTORS = ("f0", "x0", "u0", "y0", "q", "v", "reference")
-_NAMES = (
-    *("state_names", "input_names", "output_names"),
-    *("state_units", "input_units", "output_units"),
+# Of what the rows and columns of each matrix are, and the entries of each vector.
+_MATRICES = {
+    "A": ("state", "state"),
+    "B": ("state", "input"),
+    "C": ("output", "state"),
+    "D": ("output", "input"),
+    "M": ("velocity", "velocity"),
+}
+_VECTORS = {"x0": "state", "f0": "state", "u0": "input", "y0": "output"}
+_SIGNALS = ("state", "input", "output")
+_POINT = ("q", "v", "reference", "drift", "limits")
+_LISTS = (
+    *(f"{signal}_{what}" for what in ("names", "units") for signal in _SIGNALS),
+    *("locked", "ignorable", "limit_names"),
 )
-_LISTS = (*_NAMES, "locked", "ignorable", "limit_names")
-# Which files once had not.
+# Which older files have not.
 _LATER: Record = {"ignorable": (), "drift": (), "limit_names": (), "limits": ()}
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version")
 _CERTIFICATE = ("condition", "inertia_residual", "route_A", "route_B", "f0")
 
 # Of csv, the last of which has the digest of all.
-_TABLES = (*_MATRICES, "states", "inputs", "outputs", "point", "info")
+_TABLES = (*_MATRICES, *(f"{signal}s" for signal in _SIGNALS), "point", "info")
 
 FORMATS = (*record.FORMATS, ".csv")
 
 
 def record_of(lin: Any) -> Record:
     """Return what a file holds of a `LinearModel`."""
-    entries: Record = {key: getattr(lin, key) for key in (*_MATRICES, *_VECTORS[:-1])}
+    entries: Record = {key: getattr(lin, key) for key in (*_MATRICES, *_VECTORS, "q", "v")}
     entries["reference"] = lin.placement
     entries["drift"] = np.zeros(0) if lin.drift is None else lin.drift
     entries["limits"] = np.array(list(lin.limits.values()))
@@ -78,32 +86,32 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, float]]:
 def _fields(entries: Record) -> dict[str, Any]:
     fields: dict[str, Any] = {key: texts(entries[key]) for key in _LISTS}
     fields |= {key: text(entries[key]) for key in _TEXTS}
-    sizes = nx, nu, ny = tuple(len(fields[key]) for key in _NAMES[:3])
-    for key, size in zip(_NAMES[3:], sizes, strict=True):
-        _check_size(key, len(fields[key]), size)
-    shapes: dict[str, tuple[int, ...]] = {"A": (nx, nx), "B": (nx, nu), "C": (ny, nx)}
-    shapes |= {"D": (ny, nu), "M": (nx // 2, nx // 2)}
-    for key, shape in shapes.items():
-        fields[key] = _numbers(key, entries[key]).reshape(shape)
-    expected = {"f0": nx, "x0": nx, "u0": nu, "y0": ny, "reference": 7}
-    expected["limits"] = len(fields["limit_names"])
-    for key in (*_VECTORS, "drift", "limits"):
-        fields[key] = _numbers(key, entries[key]).reshape(-1)
-        _check_size(key, fields[key].size, expected.get(key, fields[key].size))
     if fields["frame"] not in ("hybrid", "local", "world"):
         raise ValueError(f"unknown frame '{fields['frame']}'")
-    M, drift = fields.pop("M"), fields.pop("drift")
-    limits = dict(zip(fields.pop("limit_names"), fields.pop("limits").tolist(), strict=True))
-    _check_size("drift", drift.size, nx if drift.size else 0)
+    sizes = {signal: len(fields[f"{signal}_names"]) for signal in _SIGNALS}
+    sizes["velocity"] = sizes["state"] // 2
+    for signal in _SIGNALS:
+        _check_size(f"{signal}_units", len(fields[f"{signal}_units"]), sizes[signal])
+    for key, (rows, columns) in _MATRICES.items():
+        fields[key] = _numbers(key, entries[key]).reshape(sizes[rows], sizes[columns])
+    for key in (*_VECTORS, *_POINT):
+        fields[key] = _numbers(key, entries[key]).reshape(-1)
+    for key, signal in _VECTORS.items():
+        _check_size(key, fields[key].size, sizes[signal])
+    reference, drift, M = (fields.pop(key) for key in ("reference", "drift", "M"))
+    names, limits = fields.pop("limit_names"), fields.pop("limits")
+    _check_size("limits", limits.size, len(names))
+    _check_size("reference", reference.size, 7)
+    _check_size("drift", drift.size, sizes["state"] if drift.size else 0)
     M.setflags(write=False)
     return fields | {
         "dt": figure(entries["dt"]),
         "moving": bool(figure(entries["moving"])),
-        "_reference": fields.pop("reference"),
+        "_reference": reference,
         "_drift": drift if drift.size else None,
-        "_inertia": partial(_given, M),
-        "_ignorable": partial(_given, fields.pop("ignorable")),
-        "_limits": partial(_given, limits, None),
+        "_inertia": partial(given, M),
+        "_ignorable": partial(given, fields.pop("ignorable")),
+        "_limits": partial(dict, dict(zip(names, limits.tolist(), strict=True))),
     }
 
 
@@ -119,7 +127,8 @@ def _check_size(key: str, size: int, expected: int) -> None:
         raise ValueError(f"{key} has {size} entries, expected {expected}")
 
 
-def _given(value: Any, _: object) -> Any:
+def given(value: Any, _: object) -> Any:
+    """Return what a file holds, whichever model asks for it."""
     return value
 
 
@@ -128,42 +137,28 @@ def _given(value: Any, _: object) -> Any:
 
 
 def _tables(entries: Record) -> dict[str, list[list[Any]]]:
-    states, inputs, outputs = (entries[key] for key in _NAMES[:3])
-    velocities = states[-len(entries["M"]) :]
-    named = {
-        "A": (states, states),
-        "B": (states, inputs),
-        "C": (outputs, states),
-        "D": (outputs, inputs),
-        "M": (velocities, velocities),
-    }
+    names = {signal: entries[f"{signal}_names"] for signal in _SIGNALS}
+    names["velocity"] = names["state"][-len(entries["M"]) :]
     tables: dict[str, list[list[Any]]] = {}
-    for key, (left, top) in named.items():
-        body = [[name, *row] for name, row in zip(left, entries[key].tolist(), strict=True)]
-        tables[key] = [["", *top], *body]
-    for title, unit, vectors in (
-        ("state", "state_units", ("x0", "f0")),
-        ("input", "input_units", ("u0",)),
-        ("output", "output_units", ("y0",)),
-    ):
-        columns = [
-            entries[f"{title}_names"],
-            entries[unit],
-            *(entries[k].tolist() for k in vectors),
-        ]
-        rows = map(list, zip(*columns, strict=True))
-        tables[f"{title}s"] = [["name", "unit", *vectors], *rows]
-    point = [
-        [f"{key}[{i}]", x]
-        for key in ("q", "v", "reference", "drift", "limits")
-        for i, x in enumerate(entries[key].tolist())
-    ]
+    for key, (rows, columns) in _MATRICES.items():
+        body = zip(names[rows], entries[key].tolist(), strict=True)
+        tables[key] = [["", *names[columns]], *([name, *row] for name, row in body)]
+    for signal in _SIGNALS:
+        vectors = _vectors_of(signal)
+        values = (entries[key].tolist() for key in vectors)
+        lines = zip(names[signal], entries[f"{signal}_units"], *values, strict=True)
+        tables[f"{signal}s"] = [["name", "unit", *vectors], *map(list, lines)]
+    point = [[f"{key}[{i}]", x] for key in _POINT for i, x in enumerate(entries[key].tolist())]
     tables["point"] = [["name", "value"], *point]
     info = {key: entries[key] for key in (*_TEXTS, "dt", "moving")}
     info |= {key: ";".join(entries[key]) for key in _LISTS[-3:]}
     info |= {f"certificate.{key}": value for key, value in entries["certificate"].items()}
     tables["info"] = [["name", "value"], *map(list, info.items())]
     return tables
+
+
+def _vectors_of(signal: str) -> list[str]:
+    return [key for key, of in _VECTORS.items() if of == signal]
 
 
 def _seal(contents: dict[str, bytes]) -> str:
@@ -191,12 +186,13 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
     entries: Record = {
         key: [[float(x) for x in row[1:]] for row in tables[key]] for key in _MATRICES
     }
-    for title, vectors in (("state", ("x0", "f0")), ("input", ("u0",)), ("output", ("y0",))):
-        columns = list(zip(*tables[f"{title}s"], strict=True)) or [()] * (2 + len(vectors))
-        entries[f"{title}_names"], entries[f"{title}_units"] = columns[:2]
-        for vector, column in zip(vectors, columns[2:], strict=True):
-            entries[vector] = [float(x) for x in column]
-    for key in ("q", "v", "reference", "drift", "limits"):
+    for signal in _SIGNALS:
+        keys = (f"{signal}_names", f"{signal}_units", *_vectors_of(signal))
+        columns = list(zip(*tables[f"{signal}s"], strict=True)) or [()] * len(keys)
+        entries |= zip(keys, columns, strict=True)
+    for key in _VECTORS:
+        entries[key] = [float(x) for x in entries[key]]
+    for key in _POINT:
         entries[key] = [float(x) for name, x in tables["point"] if name.startswith(f"{key}[")]
     info = dict(tables["info"])
     prefix = "certificate."

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.frozen import frozen
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, vector
 from fflin.dynamics.chart import Chart, Standing
@@ -18,13 +19,13 @@ from fflin.dynamics.rnea import Accelerations, Rates
 from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
-from fflin.linear.prepared import frozen, prepare
+from fflin.linear.prepared import prepare
 from fflin.linear.state_equations import assemble, drift
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
-# Sum of squares beyond which a matrix counts as not finite: its eigenvalues would not be. Up to
-# velocities and inputs of the other size nothing overflows on the way to it.
+# A matrix whose squares add up to more than the first counts as not finite, since its eigenvalues
+# would overflow. With velocities and inputs below the second nothing overflows in between.
 LARGEST, _MODERATE = 1e200, 1e50
 
 
@@ -152,7 +153,8 @@ class Linearizer:
         with self._lock:
             if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
                 return self._anywhere(q, v, u)
-            # What overflows is refused, and not warned of. Every call of NumPy costs more here.
+            # An overflow is refused below, so NumPy need not warn of it. Not always done, since
+            # every call of NumPy costs more in here.
             with np.errstate(over="ignore", invalid="ignore"):
                 return self._anywhere(q, v, u)
 
@@ -191,7 +193,8 @@ class Linearizer:
             array.setflags(write=False)
         x0.setflags(write=False)
         values = {"A": A, "B": B, "C": C, "D": D, "f0": f0, "x0": x0, "u0": u, "y0": y0}
-        fields = {**ready.common, **values, "q": q, "v": v, "_reference": self._reference_of(q)}
+        reference = _own_reference(self.robot, q) if ready.own_reference else ready.reference
+        fields = {**ready.common, **values, "q": q, "v": v, "_reference": reference}
         if ready.moving:
             own_rate = frozen(drift(state, f0, rates.gravity))
             fields |= {"f0": ready.rest["f0"], "_drift": own_rate}
@@ -213,10 +216,6 @@ class Linearizer:
             C[row, index] = 1.0
             sensed.y[row] = x0[index]
         return C, D, sensed.y
-
-    def _reference_of(self, q: Array) -> Array:
-        ready = self.prepared
-        return _own_reference(self.robot, q) if ready.own_reference else ready.reference
 
 
 def linearize(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fflin.base.errors import InputError, MissingPackageError
+from fflin.base.frozen import FrozenArrays
 from fflin.base.validation import Array, number
+from fflin.linear.sampling import held_exponential
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
     from fflin.dynamics.state import Frame
-
 
 _new, _set = object.__new__, object.__setattr__
 
@@ -48,7 +49,7 @@ class Certificate:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearModel:
+class LinearModel(FrozenArrays):
     r"""A linear model about a point, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
     The output is ``y = y0 + C (x - x0) + D (u - u0)``. For ``dt > 0`` the left side is the next
@@ -123,14 +124,6 @@ class LinearModel:
     verified: bool = True
     _limits: Callable[[], Mapping[str, float]] | None = None
 
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, np.ndarray) and value.flags.writeable:
-                value = value.copy()
-                value.setflags(write=False)
-                object.__setattr__(self, item.name, value)
-
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> LinearModel:
         """Return a model whose fields are given; its arrays must be read-only and stay so.
@@ -141,14 +134,14 @@ class LinearModel:
             Every field by its name. What it has under ``_when_asked`` is {name of a field:
             function of q} for those that are made when they are asked for.
         """
-        # The generated __init__ sets two dozen frozen fields one by one, which costs as much
-        # as the dynamics of a small robot. The caller passes read-only arrays of its own.
+        # The generated __init__ sets two dozen frozen fields one by one, which takes as long
+        # as the dynamics of a small robot.
         lin = _new(cls)
         _set(lin, "__dict__", values)
         return lin
 
     def __getattr__(self, name: str) -> Any:
-        # Of a model at rest: what costs as much as its dynamics is made when it is asked for.
+        # At rest some fields take as long to make as the dynamics, so they wait until asked for.
         make = vars(self).get("_when_asked", {}).get(name)
         if make is None:
             raise AttributeError(f"'LinearModel' object has no attribute '{name}'")
@@ -262,7 +255,8 @@ class LinearModel:
         .. math::
             A_d = e^{A h}, \quad [B_d, f_d] = \int_0^h e^{A s}\,ds\,[B, f_0]
 
-        At rest A^2 = 0, and the series ends: :math:`A_d = E + A h`, :math:`B_d = B h + A B h^2/2`.
+        At rest A^2 = 0, and the series ends: :math:`A_d = E + A h`, :math:`B_d = B h + A B h^2/2`,
+        (2.2) of docs/derivation.md.
 
         Parameters
         ----------
@@ -284,25 +278,11 @@ class LinearModel:
             raise InputError(f"dt is {dt:g} s, expected a positive sampling time")
         if self.dt:
             raise InputError(f"the model is sampled already, at dt = {self.dt:g} s")
-        nx, nu = self.B.shape
-        driven = np.column_stack((self.B, self.f0))
-        # What overflows is refused below, and not warned of.
-        with np.errstate(over="ignore", invalid="ignore"):
-            if not (self.A @ self.A).any():
-                Ad = np.eye(nx) + self.A * dt
-                held = driven * dt + self.A @ driven * (dt * dt / 2.0)
-            else:
-                from scipy.linalg import expm
-
-                block = np.zeros((nx + nu + 1, nx + nu + 1))
-                block[:nx, :nx] = self.A
-                block[:nx, nx:] = driven
-                exponential = expm(block * dt)
-                Ad, held = exponential[:nx, :nx], exponential[:nx, nx:]
+        Ad, held = held_exponential(self.A, np.column_stack((self.B, self.f0)), dt)
         if not (np.isfinite(Ad).all() and np.isfinite(held).all()):
             raise InputError(f"dt is {dt:g} s, over which the model grows beyond all numbers")
         sampled = replace(
-            self, A=Ad, B=held[:, :nu], f0=held[:, nu], dt=dt, _inertia=partial(_same_M, self)
+            self, A=Ad, B=held[:, :-1], f0=held[:, -1], dt=dt, _inertia=partial(_same_M, self)
         )
         certify = partial(_same_certificate, self, sampled.fingerprint)
         return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))
@@ -366,16 +346,11 @@ class LinearModel:
             If the file cannot be read, is damaged or is not such a model.
         """
         from fflin.base.writing import as_path
-        from fflin.linear.files import read_model
+        from fflin.linear.files import given, read_model
 
         values, certificate = read_model(as_path(path))
-        given: Any = partial(_given, Certificate(**certificate))
-        lin = LinearModel(**values, _certify=given)
+        lin = LinearModel(**values, _certify=partial(given, Certificate(**certificate)))
         return replace(lin, _certify=partial(_same_certificate, lin, lin.fingerprint))
-
-
-def _given(certificate: Certificate, _: LinearModel) -> Certificate:
-    return certificate
 
 
 def _same_M(continuous: LinearModel, _: LinearModel) -> Array:

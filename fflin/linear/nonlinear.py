@@ -9,11 +9,13 @@ import pinocchio as pin
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR, StateMap
+from fflin.linear.certificate import mobilities
 from fflin.linear.model import LinearModel
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.frames import ROOT
+from fflin.robot.robot import Robot
 
-# Where the base flies faster than this [m/s], the digits of its speed would drown the rest.
+# Where the base flies faster than this [m/s], the rounding of its speed would hide the rest.
 _FAST = 100.0
 
 # Sixth-order central difference: weights of f(x + k h) - f(x - k h), k = 1, 2, 3. Its error is
@@ -31,7 +33,7 @@ class Nonlinear:
     def __init__(self, state: StateMap, lin: LinearModel) -> None:
         self.state = state
         self.aba = Aba(state)
-        observer = rotation_matrix(lin.q[3:7]) @ lin.v[:3]
+        observer = rotation_matrix(lin.q[3:7]) @ lin.v[PIN_LINEAR]
         self._observer = observer if np.linalg.norm(observer) > _FAST else np.zeros(3)
 
     def acceleration(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
@@ -39,20 +41,26 @@ class Nonlinear:
         q, v = self.state.to_pinocchio(x)
         u = self.aba.actuation.in_base_axes(self.state.chart(q), u)
         seen, observer = v.copy(), rotation_matrix(q[3:7]).T @ self._observer
-        seen[:3] -= observer
+        seen[PIN_LINEAR] -= observer
         a = self.aba.acceleration(q, seen, u).copy()
-        a[:3] -= np.cross(v[3:6], observer)
+        a[PIN_LINEAR] -= np.cross(v[PIN_ANGULAR], observer)
         return q, v, a
+
+    def passing(self, x: Array, motion: tuple[Array, Array, Array], t: float) -> Array:
+        """Return the state a time t after x on a motion that has (q, v, a) there."""
+        q, v, a = motion
+        after = pin.integrate(self.state.robot.model, q, t * v)
+        return self.state.to_state(after, v + t * a, near=x)
 
     def __call__(self, x: Array, u: Array) -> Array:
         """Return dx/dt (nx,)."""
         state = self.state
         q, v, a = self.acceleration(x, u)
         chart = state.chart(q)
-        linear, angular = v[:3], v[3:6]
+        linear, angular = v[PIN_LINEAR], v[PIN_ANGULAR]
         rate = state.velocities(a)
         if state.axes[1]:
-            rate[3:6] += np.cross(angular, linear)  # of the velocity's reference-axis components
+            rate[LINEAR] += np.cross(angular, linear)  # of the velocity's reference-axis components
         return np.concatenate(
             (
                 0.5 * (chart.q0 * angular + np.cross(chart.q_b, angular)),
@@ -72,8 +80,21 @@ class ErrorDynamics(Nonlinear):
 
     def __init__(self, state: StateMap, lin: LinearModel) -> None:
         super().__init__(state, lin)
-        self._v = lin.v
+        self._q, self._v = lin.q.copy(), lin.v
+        self._q[:3] = 0.0
         self._a = state.velocities(self.acceleration(lin.x0, lin.u0)[2])
+
+    def passing(self, x: Array, motion: tuple[Array, Array, Array], t: float) -> Array:
+        """Return the error when reference and robot, at x, have both moved on for a time t."""
+        error = super().passing(x, motion, t)
+        robot = self.state.robot
+        q, v, _ = motion
+        q_star = pin.integrate(robot.model, self._q, t * self._v)
+        reference = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(q_star[:7])
+        moved = StateMap(robot, reference=reference, frame="local")
+        error[:6] = moved.to_state(pin.integrate(robot.model, q, t * v), v)[:6]
+        error[6:] -= t * np.concatenate((self.state.velocities(self._v)[6:], self._a))
+        return error
 
     def __call__(self, x: Array, u: Array) -> Array:
         """Return the rate of the error (nx,)."""
@@ -89,20 +110,33 @@ class ErrorDynamics(Nonlinear):
 
 def jacobian(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:
     """Return the slopes of f at a point by sixth-order central differences of the given steps."""
-    columns = []
-    for along, step in zip(np.diag(steps), steps, strict=True):
-        columns.append(_derivative(partial(_along, f, point, along)) / step)
-    return np.column_stack(columns)
+
+    def slope(along: Array) -> Array:
+        return _derivative(lambda t: f(point + t * along), 1.0)
+
+    return np.column_stack([slope(along) for along in np.diag(steps)]) / steps
 
 
-def _along(f: Callable[[Array], Array], point: Array, along: Array, t: float) -> Array:
-    return f(point + t * along)
+def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array, Array]:
+    """Return the steps for differences in x (nx,) and u (nu,) at a model's point."""
+    groups, nv = state.groups, len(M)
+    # Small against the angles over which accelerations change where light links line up.
+    step = np.full(state.nx, 2e-4)
+    # Well inside the chart, whose edge |q_b| = 1 the model feels long before.
+    step[groups.q_b] = 1e-2 * (1.0 - np.linalg.norm(lin.x0[groups.q_b]))
+    # f is quadratic in the velocities and linear in the input: no truncation at any step.
+    speed = np.abs(lin.x0[-nv:])
+    step[-nv:] = 0.1 * max(1.0, float(speed[ANGULAR].max()), float(speed[6:].max(initial=0.0)))
+    step[groups.v_b] = 0.1 * max(1.0, float(speed[LINEAR].max()))
+    mobility, input_mobility = mobilities(M, lin.B)
+    push = max(1.0, float(np.abs(lin.f0[-nv:] / mobility).max())) / input_mobility
+    return step, push
 
 
-def _derivative(f: Callable[[float], Array]) -> Array:
-    """Return df/dt at 0 by differences at t = -3 ... 3."""
-    differences = [f(k) - f(-k) for k in range(1, 1 + len(_WEIGHTS))]
-    return np.tensordot(_WEIGHTS, differences, axes=1)
+def _derivative(f: Callable[[float], Array], h: float) -> Array:
+    """Return df/dt at 0 by differences at t = -3 h ... 3 h."""
+    differences = [f(k * h) - f(-k * h) for k in range(1, 1 + len(_WEIGHTS))]
+    return np.tensordot(_WEIGHTS, differences, axes=1) / h
 
 
 def flow_error(robot: Robot, lin: LinearModel) -> float:
@@ -120,39 +154,11 @@ def flow_error(robot: Robot, lin: LinearModel) -> float:
         x[state.groups.r_b] = 0.0
         if unit is not None:
             x[6 + robot.n + unit] += 1.0
-        q, v, a = model.acceleration(x, lin.u0)
-        h = 1e-2 * state.chart(q).q0 / (1.0 + float(np.abs(v[3:]).max()))
-        rate = _derivative(partial(_moved, state, x, q, h * v, v, h * a)) / h
-        if lin.moving:
-            q_star = lin.q.copy()
-            q_star[:3] = 0.0
-            back = partial(_moved_error, robot, q_star, h * lin.v, q, h * v)
-            rate[:6] = _derivative(back) / h
-            rate[6:] -= _motion_of_reference(model, lin)
+        motion = _, v, _ = model.acceleration(x, lin.u0)
+        h = 1e-2 * float(state.chart(motion[0]).q0) / (1.0 + float(np.abs(v[3:]).max()))
+        rate = _derivative(partial(model.passing, x, motion), h)
         floor = 1.0 + float(np.abs(v).max())
         expected = model(x, lin.u0)
         scale = max(floor, float(np.abs(expected).max()))
         worst = max(worst, float(np.abs(expected - rate).max()) / scale)
     return worst
-
-
-def _moved(
-    state: StateMap, near: Array, q: Array, dq: Array, v: Array, dv: Array, t: float
-) -> Array:
-    return state.to_state(pin.integrate(state.robot.model, q, t * dq), v + t * dv, near=near)
-
-
-def _moved_error(robot: Robot, q: Array, dq: Array, q1: Array, dq1: Array, t: float) -> Array:
-    """Return (q_b, r_b) of the error when reference and robot have both moved on."""
-    reference = pin.integrate(robot.model, q, t * dq)
-    root = robot.model.jointPlacements[ROOT]
-    moved = StateMap(robot, reference=root * pin.XYZQUATToSE3(reference[:7]), frame="local")
-    now = pin.integrate(robot.model, q1, t * dq1)
-    return moved.to_state(now, np.zeros(robot.nv))[:6]
-
-
-def _motion_of_reference(model: Nonlinear, lin: LinearModel) -> Array:
-    """Return d(q_m, omega_b, v_b, qdot_m)/dt of the reference itself."""
-    state = model.state
-    _, v, a = model.acceleration(lin.x0, lin.u0)
-    return np.concatenate((state.velocities(v)[6:], state.velocities(a)))

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.frozen import frozen
 from fflin.base.validation import Array, truth
 from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
@@ -88,9 +89,7 @@ def prepare(
     if robot.outputs != (FullState(),):
         from fflin.dynamics.outputs import Sensing
 
-        sensing = Sensing(
-            state, robot.outputs, gravity=np.array(robot.gravity), own_reference=reference is None
-        )
+        sensing = Sensing(state, robot.outputs, own_reference=reference is None)
     acts = any(robot.gravity) or robot.stored_momentum or any(x.any() for x in robot.passive)
     nu = len(actuation.names)
     seen = sensing or state
@@ -132,9 +131,3 @@ def prepare(
             "v": frozen(np.zeros(robot.nv)),
         },
     )
-
-
-def frozen(array: Array) -> Array:
-    """Return the array itself, read-only."""
-    array.setflags(write=False)
-    return array

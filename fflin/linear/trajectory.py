@@ -17,8 +17,8 @@ from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
-# Of the trapezoidal rule over an interval, relative to the largest rate of the motion: what
-# coarse knots leave, and what no motion of the robot leaves.
+# Error of the trapezoidal rule over an interval, relative to the largest rate of the motion: from
+# the first on the knots are called coarse, from the second on they are no motion of the robot.
 _COARSE, _NO_MOTION = 1e-2, 0.1
 
 # Round-off of positions, and of accelerations that are sums of terms that may cancel.
@@ -74,20 +74,20 @@ class LinearTrajectory:
 
     def matrices(self, t: float) -> tuple[Array, Array]:
         """Return A (nx, nx) and B (nx, nu) at a time, linear between the knots."""
-        index, share = self._place(t)
-        A, B = (
-            (1.0 - share) * knots[index] + share * knots[index + 1] for knots in (self.A, self.B)
-        )
+        A, B = self._between(t, self.A, self.B)
         return A, B
 
     def point(self, t: float) -> tuple[Array, Array, Array]:
         """Return (q, v, u) at a time: q along the manifold, v and u linear between the knots."""
         index, share = self._place(t)
         q = pin.interpolate(self.robot.model, self.q[index], self.q[index + 1], share)
-        v, u = (
-            (1.0 - share) * knots[index] + share * knots[index + 1] for knots in (self.v, self.u)
-        )
+        v, u = self._between(t, self.v, self.u)
         return q, v, u
+
+    def _between(self, t: float, *of_knots: Array) -> list[Array]:
+        """Return what is linear between the knots at a time."""
+        index, share = self._place(t)
+        return [(1.0 - share) * knots[index] + share * knots[index + 1] for knots in of_knots]
 
     def _place(self, t: float) -> tuple[int, float]:
         t = number("t", t)
@@ -167,10 +167,7 @@ def linearize_trajectory(
 
 
 def _rows(name: str, value: ArrayLike, count: int, size: int | None) -> NDArray[np.floating]:
-    try:
-        array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} is not an array of numbers, a row for each time") from None
+    array = as_double(name, value)
     if array.ndim != 2 or len(array) != count or (size is not None and array.shape[1] != size):
         expected = f"({count}, {'nu' if size is None else size})"
         raise InputError(f"{name} has shape {array.shape}, expected {expected}")
@@ -187,7 +184,7 @@ def _residual(robot: Robot, t: Array, models: list[LinearModel]) -> Array:
     h = np.diff(t)[:, None]
     moved = np.array([pin.difference(robot.model, *pair) for pair in pairwise(q)])
     for column in (joint.idx_v for joint in robot.joints if joint.unbounded):
-        # Of a fast wheel the knots tell the angle, and its speed how many turns.
+        # The knots have a fast wheel's angle only within a turn; its speed says how many turns.
         by_rate = 0.5 * h[:, 0] * (v[1:, column] + v[:-1, column])
         turns = np.round((by_rate - moved[:, column]) / (2.0 * np.pi))
         moved[:, column] += 2.0 * np.pi * turns

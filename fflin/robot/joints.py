@@ -31,6 +31,16 @@ class Joint(NamedTuple):
     unbounded: bool
     prismatic: bool
 
+    @property
+    def unit(self) -> str:
+        """Unit of its position; its rate has this per second."""
+        return "m" if self.prismatic else "rad"
+
+    @property
+    def force_unit(self) -> str:
+        """Unit of the force or torque that moves it."""
+        return "N" if self.prismatic else "N m"
+
     def place(self, q: Array, value: float) -> None:
         """Write this joint's angle [rad] or length [m] into a configuration."""
         if self.unbounded:

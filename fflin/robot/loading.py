@@ -13,10 +13,11 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
 from fflin.base.validation import Array, number
 from fflin.robot.catalog import find_robot
+from fflin.robot.frames import ROOT
 from fflin.robot.joints import Follower, Joint
 from fflin.robot.massless import idle_coordinates, massless_note
 from fflin.robot.model_checks import check_model
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
 from fflin.robot.urdf.reader import read_urdf
 

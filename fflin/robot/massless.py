@@ -11,17 +11,19 @@ import pinocchio as pin
 from fflin.base.errors import SingularInertiaError, listed
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.frames import ROOT
+from fflin.robot.robot import Robot
 
 _FOUND: WeakKeyDictionary[Robot, tuple[str, ...]] = WeakKeyDictionary()
 
-# Of singular values: rounding leaves 1e-15 of the largest; links 1e7 m apart, 1e-7 of it.
+# Singular values below this share of the largest are zero: rounding leaves 1e-15 of it, and the
+# least that is meant, of links 1e7 m apart, is 1e-7 of it.
 _ZERO = 1e-12
 
-# Of the principal moments of a body, what rounding leaves of zero.
+# A principal moment of a body below this share of its largest is zero.
 _NO_MOMENT = 1e-12
 
-# Share of a coordinate in a motion from which on it is named.
+# A coordinate is named where its share in a motion is larger than this.
 _INVOLVED = 0.1
 
 
@@ -54,11 +56,15 @@ def _idle(robot: Robot) -> tuple[str, ...]:
         for body, (values, _) in zip(bodies, moments, strict=True)
     ):
         return ()
-    columns = _independent(robot)
+    # v = columns nu: joints that mimic others follow them.
+    columns = np.eye(robot.nv)
+    for joint, leader, multiplier, _ in robot.followers:
+        columns[joint.idx_v, leader.idx_v] = multiplier
+    columns = columns[:, [*range(6), *(joint.idx_v for joint in robot.joints)]]
     names = np.array(coordinate_names(robot))
     rng = np.random.default_rng(0)
     idle: tuple[str, ...] = ()
-    # What is singular at two configurations taken at random is so at all.
+    # An M that is singular at two random configurations is singular at all.
     for _ in range(2):
         velocity = columns @ rng.uniform(-1.0, 1.0, columns.shape[1])
         q = pin.integrate(robot.model, robot.neutral(), velocity)
@@ -94,15 +100,6 @@ def require_inertia(robot: Robot) -> None:
     """
     if idle_coordinates(robot):
         raise SingularInertiaError(massless_note(robot))
-
-
-def _independent(robot: Robot) -> Array:
-    """Return (nv, 6 + n) with v = columns nu, in Pinocchio's order; mimics follow."""
-    columns = np.eye(robot.nv)
-    for joint, leader, multiplier, _ in robot.followers:
-        columns[joint.idx_v, leader.idx_v] = multiplier
-    kept = [*range(6), *(joint.idx_v for joint in robot.joints)]
-    return columns[:, kept]
 
 
 def _moved(robot: Robot, q: Array, moments: Sequence[tuple[Array, Array]]) -> Array:

@@ -13,7 +13,8 @@ from scipy.linalg.lapack import dposv
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.frames import ROOT
+from fflin.robot.robot import Robot
 from fflin.simulation.integrators import Integrator
 
 _crba = pin.crba
@@ -48,8 +49,8 @@ class Conserved:
         self._data = data = robot.create_data()
         self._M = data.M[:6]  # CRBA writes into it
         self._M_bb = self._M[:, :6]
-        # M_bb has -m [c]x beside m 1: where m c stands in M, and what makes -c of it.
-        # An index into the memory costs a fifth of one by rows and columns.
+        # M_bb has -m [c]x beside m 1. The three entries of M that are -m c are read by their places
+        # in its memory, which takes a fifth of the time of reading them by rows and columns.
         self._M_flat = data.M.ravel(order="K")
         self._lever = np.array(((1, 5), (2, 3), (0, 4))) @ data.M.strides // data.M.itemsize
         self._per_mass = np.full(3, -1.0 / robot.mass)
@@ -121,7 +122,7 @@ class Conserved:
         for i, (q_i, v_i) in enumerate(zip(q, v, strict=True)):
             energy[i] = pin.computeKineticEnergy(model, data, q_i, v_i)
             of_base[i] = pin.ccrba(model, data, q_i, v_i)[:, :6].dot(v_i[:6])
-            # What CCRBA has of it was summed about the origin, with more rounding.
+            # Not CCRBA's own sum, which is taken about the origin and rounds more.
             momentum[i] = pin.computeCentroidalMomentum(model, data, q_i, v_i).vector
             center[i] = data.com[0]
             if self._stored:
@@ -134,7 +135,7 @@ class Conserved:
             energy += 0.5 * (np.array(positions) - rest) ** 2 @ stiffness
         return Histories(energy, momentum, center, of_base)
 
-    def drift(self, history: Histories, expected: Array) -> Array:
+    def momentum_drift(self, history: Histories, expected: Array) -> Array:
         """Return how far the momentum is from what is expected (N, 6), relative (N,).
 
         To the largest sum of what base, joints and wheels add to it; about a fixed point the
@@ -174,8 +175,8 @@ class Course:
 
     .. math:: H(t) = H(0) + \int w\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
 
-    where w is summed with the weights of the integrator's stages, and p with those of its
-    positions.
+    (11.2) of docs/derivation.md, where w is summed with the weights of the integrator's stages, and
+    p with those of its positions.
 
     Attributes
     ----------

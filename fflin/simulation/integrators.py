@@ -46,7 +46,7 @@ class Integrator:
 
 
 class CommutatorFree4(Integrator):
-    r"""CF4 of Celledoni, Marthinsen and Owren: order 4, with two exponentials at the end.
+    r"""CF4 of Celledoni, Marthinsen and Owren: order 4, with two exponentials at the end (11.1).
 
     With the stages of the velocity put in, only accelerations :math:`l_i` are left to combine:
 

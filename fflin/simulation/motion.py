@@ -206,10 +206,10 @@ def plot_motion(motion: Motion, path: str | Path | None = None) -> Figure:
     )
 
 
-# Of an error relative to its largest, where a motion is taken to have settled.
+# A motion has settled once its error stays below this share of the largest.
 _SETTLED = 0.02
 
-# Below which an error is rounding, in SI units.
+# An error below this, in SI units, is rounding.
 _NOTHING = 1e-14
 
 

@@ -49,6 +49,19 @@ class Times(NamedTuple):
         """Square of the velocity up to which no turn within a step is too large."""
         return float((LARGEST_TURN / self.dt) ** 2)
 
+    def require_room(self, width: int, *, chosen: bool) -> None:
+        """Raise `InputError` where rows of so many numbers, or the steps, are too many.
+
+        `chosen` says that the step was chosen here and not given.
+        """
+        if self.rows * width > _MOST_ENTRIES or self.steps > _MOST_STEPS:
+            asked = f", which the loop's fastest pole at {self.fastest:.3g} 1/s asks for,"
+            raise InputError(
+                f"{self.steps * self.dt:g} s in steps of {self.dt:g} s"
+                f"{asked if chosen and self.dt < _STEP and self.fastest else ''} are "
+                f"{self.steps:.3g} steps and {self.rows:.3g} rows; take a larger dt or `every`"
+            )
+
 
 @dataclass(frozen=True, eq=False)
 class Plan:
@@ -66,6 +79,11 @@ class Plan:
     chart: StateMap | None  # that ends the run where the base leaves it
     events: tuple[Event, ...]
     callback: Callback | None
+    progress: bool | None  # whether a bar is shown; None shows it where the run takes long
+    near: Array | None  # the state (nx,) from which continuous joints count turns
+    target: Array | None  # the state (nx,) that is steered to; the initial one where there is none
+    linear: LinearModel | None  # predicts the motion under u = u0 - K (x - x0)
+    K: Array | None  # (nu, nx)
 
     def channel(self) -> Channel | None:
         """Return the way of the law's commands to the inputs, with nothing on it yet."""
@@ -99,9 +117,8 @@ def times_of(
     every: int,
     sample: float | None,
     delay: float,
-    width: int,
 ) -> Times:
-    """Return the times of a simulation that records so many numbers in a row."""
+    """Return the times of a simulation, whose arguments are those of `simulate`."""
     if sample is not None:
         sample = _positive("sample", sample)
     else:
@@ -110,7 +127,7 @@ def times_of(
     duration, delay = _positive("duration", duration), number("delay", delay)
     if not 0.0 <= delay <= _LONGEST:
         raise InputError(f"delay is {delay:g} s, expected 0 to {_LONGEST:g} s")
-    every, chosen = whole("every", every, 1), dt is None
+    every = whole("every", every, 1)
     if dt is None:
         dt = _STEP
         if fastest * dt > 1.0:
@@ -129,14 +146,6 @@ def times_of(
         dt = duration / steps
     if sample is None:
         sample = dt if delay else 0.0
-    rows = steps // every + 2
-    if rows * width > _MOST_ENTRIES or steps > _MOST_STEPS:
-        asked = f", which the loop's fastest pole at {fastest:.3g} 1/s asks for,"
-        raise InputError(
-            f"{duration:g} s in steps of {dt:g} s"
-            f"{asked if chosen and dt < _STEP and fastest else ''} are {steps:.3g} steps and "
-            f"{rows:.3g} rows; take a larger dt or `every`"
-        )
     samples, late = _whole(dt, sample=sample, delay=delay)
     return Times(dt, steps, every, samples, late, fastest)
 

@@ -10,24 +10,23 @@ from fflin.linear.model import LinearModel
 from fflin.simulation.plan import Plan
 
 
-def predict(lin: LinearModel, K: Array, plan: Plan, x: Array, steps: int) -> Array:
+def predict(plan: Plan, x: Array, steps: int) -> Array:
     """Return the states (N, nx) of the linear model in closed loop; no rows where it has none.
 
     Parameters
     ----------
-    lin : LinearModel
-        Continuous, or sampled with the time of the samples.
-    K : ndarray (nu, nx)
     plan : Plan
-        Whose limits and times hold.
+        Its model is continuous, or sampled with the time of the samples.
     x : ndarray (N, nx)
         The states of the nonlinear robot, where the first row begins.
     steps : int
         That are taken; the last one has a row in any case.
     """
+    if plan.linear is None or plan.K is None:
+        return x[:0]
     # A prediction that overflows is none.
     with np.errstate(over="ignore", invalid="ignore"):
-        found = _states(lin, K, plan, x[0], steps)[: len(x)]
+        found = _states(plan.linear, plan.K, plan, x[0], steps)[: len(x)]
     return found if len(found) == len(x) and np.isfinite(found).all() else x[:0]
 
 

@@ -22,7 +22,7 @@ Advance: TypeAlias = Callable[[float, Array, Array, Array], tuple[Array, Array]]
 _LOOK = 16  # steps between looks at the clock
 
 
-class Record(NamedTuple):
+class Recording(NamedTuple):
     """What a run went through: rows of time (N,), motion, inputs and what is conserved."""
 
     t: Array
@@ -35,9 +35,9 @@ class Record(NamedTuple):
     stopped: str  # why it ended before its time, if it did
 
 
-# A motion that diverges overflows before it is stopped.
+# A motion that diverges overflows before it is stopped: that is no reason to warn.
 @np.errstate(over="ignore", invalid="ignore")
-def go(plan: Plan, plant: Plant, conserved: Conserved, progress: bool | None = None) -> Record:
+def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
     """Run a plan to its end; `plant` and `conserved` are of the robot that moves."""
     times, q, v = plan.times, plan.q, plan.v
     dt, slow, channel = times.dt, times.slow, plan.channel()
@@ -58,7 +58,7 @@ def go(plan: Plan, plant: Plant, conserved: Conserved, progress: bool | None = N
 
     step, stopped, project = 0, "", plan.project
     ending, watched = _ending(plan), bool(plan.chart or plan.events)
-    bar = Progress(progress)
+    bar = Progress(plan.progress)
     try:
         for step in range(times.steps):
             t = step * dt
@@ -85,7 +85,7 @@ def go(plan: Plan, plant: Plant, conserved: Conserved, progress: bool | None = N
     if not stopped.startswith(("diverged", "interrupted")):
         record(t, u)
     q_of, v_of, u_of, momentum, center = (row[:count] for row in rows)
-    return Record(t_of[:count], q_of, v_of, u_of, momentum, center, step + 1, stopped)
+    return Recording(t_of[:count], q_of, v_of, u_of, momentum, center, step + 1, stopped)
 
 
 def _advance(

@@ -12,7 +12,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, truth
 from fflin.control.channel import limits_of
 from fflin.dynamics.state import StateMap
-from fflin.dynamics.state_rows import states_of
+from fflin.dynamics.state_rows import state_history
 from fflin.linear.model import LinearModel
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.motion import Motion
@@ -145,16 +145,18 @@ def simulate(
     plant = Plant(state, disturbance)
     predictor = _predictor(plant, K, lin, linear)
     q, v = start_of(state, x0, q0, v0)
-    width = robot.nq + robot.nv + 2 * state.nx
-    times = times_of(policy, duration, dt, every, sample, delay, width)
+    times = times_of(policy, duration, dt, every, sample, delay)
+    times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=dt is None)
     within = limits_of(plant.actuation, limits)
+    law = law_of(policy, plant, within, times)
     # The model's inputs are others where they are allocated to the robot's.
     same = lin is not None and lin.input_names == plant.actuation.names
+    target = None if lin is None else _target(state, lin)
     plan = Plan(
         q=q,
         v=v,
         times=times,
-        law=law_of(policy, plant, within, times),
+        law=law,
         initial=lin.u0 if lin is not None and same else np.zeros(len(within[0])),
         limits=within,
         method=method_of(method, times),
@@ -163,11 +165,14 @@ def simulate(
         chart=None if lin is None else state,
         events=events_of(events, callback),
         callback=callback,
+        progress=progress,
+        near=target if x0 is None else np.asarray(x0, dtype=float),
+        target=target,
+        linear=predictor,
+        K=K,
     )
-    target = None if lin is None else _target(state, lin)
-    near = target if x0 is None else np.asarray(x0, dtype=float)
     try:
-        return _motion(plant, plan, progress, target, near, predictor, K)
+        return _motion(plan, plant)
     except MemoryError:
         raise InputError(
             f"{times.steps // times.every} rows of '{robot.name}' do not fit into the memory; take "
@@ -175,34 +180,25 @@ def simulate(
         ) from None
 
 
-def _motion(
-    plant: Plant,
-    plan: Plan,
-    progress: bool | None,
-    target: Array | None,
-    near: Array | None,
-    predictor: LinearModel | None,
-    K: Any,
-) -> Motion:
+def _motion(plan: Plan, plant: Plant) -> Motion:
     """Return the motion that a plan leads to."""
     state, robot = plant.state, plant.robot
     conserved = Conserved(robot, plan.q)
-    record = go(plan, plant, conserved, progress)
-
-    x = states_of(state, record.q, record.v, near)
-    history = conserved.histories(record.q, record.v)
+    run = go(plan, plant, conserved)
+    x = state_history(state, run.q, run.v, plan.near)
+    history = conserved.histories(run.q, run.v)
     return Motion(
-        t=record.t,
-        q=record.q,
-        v=record.v,
+        t=run.t,
+        q=run.q,
+        v=run.v,
         x=x,
-        u=record.u,
-        target=x[0] if target is None else target,
-        prediction=x[:0] if predictor is None else predict(predictor, K, plan, x, record.steps),
+        u=run.u,
+        target=x[0] if plan.target is None else plan.target,
+        prediction=predict(plan, x, run.steps),
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
-        momentum_drift=conserved.drift(history, record.momentum),
-        com_drift=np.linalg.norm(history.center - record.center, axis=1),
+        momentum_drift=conserved.momentum_drift(history, run.momentum),
+        com_drift=np.linalg.norm(history.center - run.center, axis=1),
         placement=pin.SE3ToXYZQUAT(state.reference),
         state_names=state.names,
         input_names=plant.actuation.names,
@@ -211,7 +207,7 @@ def _motion(
         frame=state.frame,
         robot=robot.name,
         urdf_sha256=robot.urdf_sha256,
-        stopped=record.stopped,
+        stopped=run.stopped,
     )
 
 

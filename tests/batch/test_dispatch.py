@@ -100,7 +100,7 @@ class KillingJob(batch_chunks.ChunkJob):
     marker = None
 
     def __reduce__(self):
-        return _killing, (self.marker, *self._arguments)
+        return _killing, (self.marker, self._again)
 
     def run(self, points, start, out=None):
         if self.marker is not None:
@@ -108,10 +108,8 @@ class KillingJob(batch_chunks.ChunkJob):
         return super().run(points, start, out)
 
 
-def _killing(marker, robot, frame, reference, moving, at_rest, count):
-    job = KillingJob(
-        robot, frame=frame, reference=reference, moving=moving, at_rest=at_rest, count=count
-    )
+def _killing(marker, again):
+    job = again()
     job.marker = marker
     return job
 
@@ -259,7 +257,7 @@ class HalfSendingJob(batch_chunks.ChunkJob):
     here = os.getpid()
 
     def __reduce__(self):
-        return _half_sending, self._arguments
+        return _half_sending, (self._again,)
 
     def run(self, points, start, out=None):
         if start == 24 and os.getpid() != self.here:
@@ -267,10 +265,8 @@ class HalfSendingJob(batch_chunks.ChunkJob):
         return super().run(points, start, out)
 
 
-def _half_sending(robot, frame, reference, moving, at_rest, count):
-    job = HalfSendingJob(
-        robot, frame=frame, reference=reference, moving=moving, at_rest=at_rest, count=count
-    )
+def _half_sending(again):
+    job = again()
     job.here = None
     return job
 

@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.batch.equations import BatchEquations
+from fflin.batch.equations import batch_equations
 from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
 
 pytest.importorskip("numba")
@@ -43,7 +43,8 @@ def agreement(robot, count=11, **options):
     if options.get("moving"):
         shapes["_drift"] = (nx,)
     out = {key: np.full((count, *shape), np.nan) for key, shape in shapes.items()}
-    assert not len(BatchEquations(linearizer).write(q, v, u, out))
+    equations = batch_equations(linearizer.prepared, only_inertia=False)
+    assert not len(equations.write(q, v, u, out))
     worst = 0.0
     for row in range(count):
         lin = linearizer(q[row], v[row], u[row])
@@ -147,13 +148,13 @@ def test_angles_beyond_the_kernels_sines_are_left(robots):
     nv, nx = 6 + robot.n, 12 + 2 * robot.n
     out = {"A": (nx, nx), "B_lower": (nv, u.shape[1]), "f0": (nx,), "_x0": (nx,)}
     arrays = {key: np.zeros((20, *shape)) for key, shape in out.items()}
-    equations = BatchEquations(fflin.Linearizer(robot))
+    equations = batch_equations(fflin.Linearizer(robot).prepared, only_inertia=False)
     assert equations.write(q, v, u, arrays).tolist() == [3]
 
 
 def test_outputs_are_left_to_the_linearizer(robots):
     robot = robots["servicer_7dof"].replace(outputs=[fflin.FramePose("tool")])
-    assert not BatchEquations.possible(fflin.Linearizer(robot))
+    assert batch_equations(fflin.Linearizer(robot).prepared, only_inertia=False) is None
     q, v, u = operating_points(robot, 20)
     batch = fflin.sweep(robot, q, v, u)
     expected = fflin.linearize(robot, q[4], v[4], u[4])

@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.dynamics.inertia_bounds import STROKE, inertia_bounds
+from fflin.dynamics.inertia import STROKE, inertia_bounds
 from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
 
 
@@ -72,7 +72,7 @@ def test_bound_on_rounding_holds(name):
     """Of M's diagonal at any configuration, and of the error of the quick way to M^-1."""
     robot = fflin.load(name)
     order = [3, 4, 5, 0, 1, 2, *(joint.idx_v for joint in robot.joints)]
-    bounds = inertia_bounds(robot)[order]
+    bounds = inertia_bounds(robot.model)[order]
     rng = np.random.default_rng(0)
     for _ in range(3):
         joints = {
@@ -114,7 +114,7 @@ def test_long_chain_is_inverted_as_right_by_every_way(n):
     lin = fflin.linearize(robot)
     inverse = lin.B[6 + n :]
     mobility = np.sqrt(inverse.diagonal())
-    assert inertia_bounds(robot)[6:] @ mobility[6:] ** 2 > 4.6e5
+    assert inertia_bounds(robot.model)[6:] @ mobility[6:] ** 2 > 4.6e5
     scale = np.sqrt(lin.M.diagonal())
     residual = (lin.M @ inverse - np.eye(6 + n)) / scale[:, None] * scale
     assert np.abs(residual).max() < 8 * (6 + n) * np.finfo(float).eps * lin.certificate.condition

@@ -155,7 +155,8 @@ def assert_derivatives(robot, q, v, a, *, gravity=GRAVITY, tolerance=1e-9):
     """Compare y and all of its derivatives to the nonlinear measurement, output by output."""
     reference = random_pose(np.random.default_rng(3), 65.0)
     outputs = all_measured(robot)
-    sensing = Sensing(StateMap(robot, reference=reference), outputs, gravity=gravity)
+    falling = robot.replace(gravity=gravity)
+    sensing = Sensing(StateMap(falling, reference=reference), outputs)
     sensed = sensing.evaluate(robot.create_data(), q, v, a)
 
     def y(q_, v_, a_):
@@ -185,13 +186,13 @@ def test_rigid_body_closed_form():
     cubesat = fflin.load("cubesat").model.copy()
     cubesat.inertias[1] = pin.Inertia.Random()
     mount = random_pose(rng, 75.0)
-    robot = with_sensor(cubesat, 1, mount)
+    robot = with_sensor(cubesat, 1, mount).replace(gravity=GRAVITY)
     inertia = cubesat.inertias[1]
     m, J, c = inertia.mass, inertia.inertia, inertia.lever
     p, F = mount.translation, mount.rotation.T  # base axes to frame axes
     reference = random_pose(rng, 120.0)
     outputs = all_measured(robot)[:6]
-    sensing = Sensing(StateMap(robot, reference=reference), outputs, gravity=GRAVITY)
+    sensing = Sensing(StateMap(robot, reference=reference), outputs)
     for _ in range(3):
         q, v, a = point(robot, rng)
         refMb = reference.actInv(pin.XYZQUATToSE3(q[:7]))
@@ -251,7 +252,8 @@ def test_body_spinning_about_its_sensors_axis_by_numbers():
     assert sensed.y == pytest.approx([-2.0, 0.0, 0.0], abs=1e-14)
     assert sensed.by_v[0] == pytest.approx([0.0, -2.0, 0.0, 0.0, 0.0, -2.0], abs=1e-14)
     down = np.array([0.0, 0.0, -9.81])
-    standing = Sensing(state, [Accelerometer("imu")], gravity=down).evaluate(data, q, rest, rest)
+    state = StateMap(robot.replace(gravity=down))
+    standing = Sensing(state, [Accelerometer("imu")]).evaluate(data, q, rest, rest)
     assert standing.y == pytest.approx([0.0, 0.0, 9.81], abs=1e-14)
     # Rolled by d to the left about x, its y axis points up by d.
     assert standing.by_q[1, 3] == pytest.approx(9.81)
@@ -296,14 +298,13 @@ def test_laws(name):
 def test_free_fall_is_not_felt():
     """Under gravity and no forces an accelerometer reads what it reads without either."""
     robot = ROBOTS["servicer_7dof"]()
-    state = StateMap(robot)
     q, v, _ = point(robot, np.random.default_rng(4))
     model = robot.model.copy()
     sensed = []
     for g in (np.zeros(3), GRAVITY):
         model.gravity.linear = g
         a = pin.aba(model, model.createData(), q, v, np.zeros(robot.nv))
-        sensing = Sensing(state, [Accelerometer("imu")], gravity=g)
+        sensing = Sensing(StateMap(robot.replace(gravity=g)), [Accelerometer("imu")])
         sensed.append(sensing.evaluate(robot.create_data(), q, v, a).y)
     assert sensed[1] == pytest.approx(sensed[0], rel=1e-11)
 
@@ -334,10 +335,10 @@ def test_derivatives_at_orbital_speed(name):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_orbit_costs_no_digits(name):
     """Where the base is and how fast it moves along changes what it must, and no digit more."""
-    robot = ROBOTS[name]()
+    robot = ROBOTS[name]().replace(gravity=GRAVITY)
     rng = np.random.default_rng(7)
     state = StateMap(robot, reference=random_pose(rng, 30.0))
-    sensing = Sensing(state, all_measured(robot), gravity=GRAVITY)
+    sensing = Sensing(state, all_measured(robot))
     q, v, a = point(robot, rng)
     v[:3] = 0.0
     here = sensing.evaluate(robot.create_data(), q, v, a)
@@ -381,11 +382,11 @@ def test_orbit_costs_no_digits(name):
 
 
 def test_own_reference_is_the_base():
-    robot = ROBOTS["dual_arm"]()
+    robot = ROBOTS["dual_arm"]().replace(gravity=GRAVITY)
     q, v, a = point(robot, np.random.default_rng(8))
     base = pin.XYZQUATToSE3(q[:7])
-    own = Sensing(StateMap(robot), all_measured(robot), gravity=GRAVITY, own_reference=True)
-    told = Sensing(StateMap(robot, reference=base), all_measured(robot), gravity=GRAVITY)
+    own = Sensing(StateMap(robot), all_measured(robot), own_reference=True)
+    told = Sensing(StateMap(robot, reference=base), all_measured(robot))
     pairs = zip(
         own.evaluate(robot.create_data(), q, v, a),
         told.evaluate(robot.create_data(), q, v, a),

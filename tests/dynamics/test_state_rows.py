@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.dynamics.state_rows import readout, states_of
+from fflin.dynamics.state_rows import readout, state_history
 from fflin.simulation.integrators import integrator
 from tests.support.robots import BUNDLED, FRAMES, random_pose
 from tests.support.weights import unit_weights
@@ -42,7 +42,7 @@ def test_rows_of_a_motion_are_its_states(name, frame):
     state = fflin.StateMap(robot, reference=random_pose(rng, 20.0), frame=frame)
     q, v = map(np.array, zip(*(anywhere(robot, rng) for _ in range(12)), strict=True))
     near = 5.0 * rng.normal(size=state.nx)
-    rows = states_of(state, q, v, near)
+    rows = state_history(state, q, v, near)
     for row, q_i, v_i in zip(rows, q, v, strict=True):
         near = state.to_state(q_i, v_i, near=near)
         np.testing.assert_allclose(row, near, atol=1e-13)

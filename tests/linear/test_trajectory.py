@@ -70,7 +70,7 @@ def test_what_is_no_motion_is_refused_with_the_time():
         r"q has shape \(80, 19\), expected \(81, 19\)": (t, q[:-1], v, u),
         r"v has shape \(81, 11\), expected \(81, 12\)": (t, q, v[:, 1:], u),
         r"u has shape \(11,\), expected \(12,\)": (t, q, v, u[:, 1:]),
-        "not an array of numbers": (t, q, v, "none"),
+        "u holds": (t, q, v, "none"),
     }
     for words, arguments in cases.items():
         with pytest.raises(fflin.InputError, match=words):

@@ -5,7 +5,8 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.batch.inertia import BatchInertia
+from fflin.batch.equations import batch_equations
+from fflin.dynamics.inertia import Inertia
 from fflin.linear.certificate import inertia_matrix
 from tests.support.robots import BUNDLED, random_tree
 
@@ -23,12 +24,16 @@ def spread_configurations(robot, count, seed=0):
     return q
 
 
-def agreement(robot, q, **options):
+def agreement(robot, q):
     """Largest difference of kernel and loop, over what the conditioning of M lets round-off do."""
     size = 6 + robot.n
     kernel, loop = np.empty((2, len(q), size, size))
-    BatchInertia(robot, compiled=True).invert(q, kernel, **options)
-    BatchInertia(robot, compiled=False).invert(q, loop)
+    prepared = fflin.Linearizer(robot).prepared
+    equations = batch_equations(prepared, only_inertia=True)
+    assert not len(equations.write(q, None, None, {"B_lower": kernel}))
+    inertia = Inertia(prepared.map, robot.create_data())
+    for point, inverse in zip(q, loop, strict=True):
+        inertia.invert(point, inverse)
     worst = 0.0
     for fast, slow, point in zip(kernel, loop, q, strict=True):
         mobility = np.sqrt(slow.diagonal())

@@ -1,0 +1,205 @@
+"""Eigenpairs of a linear model: of its symmetric stiffness at rest, or of A without its zeros."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from fflin.analysis.ranks import EPS
+from fflin.base.validation import Array
+from fflin.linear.model import LinearModel
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Vector = NDArray[np.complexfloating[Any]]
+
+# A stiffness less than this part of the largest, both scaled to unit inertias, counts as zero:
+# modes below 3e-7 of the highest frequency are rigid.
+_NO_STIFFNESS = 1e-13
+
+
+class NaturalModes(NamedTuple):
+    """Eigenpairs of A.
+
+    Attributes
+    ----------
+    triples : list of (complex, ndarray (nx,), float)
+        Poles but zero, one of each pair, their shapes, and the real parts as multiples of rounding.
+    rigid_body : int
+        Independent displacements that nothing opposes.
+    zeros : int
+        Eigenvalues at zero.
+    residual : float
+        As in `Modes`.
+    """
+
+    triples: list[tuple[complex, Any, float]]
+    rigid_body: int
+    zeros: int
+    residual: float = 0.0
+
+
+def natural_modes(lin: LinearModel) -> NaturalModes:
+    """Find the natural modes of a continuous model of positions and their rates."""
+    inertia = np.sqrt(lin.M.diagonal())
+    A = _significant(lin)
+    weight, fastest = _scales(A, inertia)
+    found = _free_free(A, lin.M, inertia) or _general(A, weight, fastest)
+    residual = 0.0
+    for pole, shape, _ in found.triples:
+        left = weight * (A @ shape - pole * shape) / fastest
+        residual = max(residual, float(np.linalg.norm(left) / np.linalg.norm(weight * shape)))
+    return found._replace(residual=residual)
+
+
+def _significant(lin: LinearModel) -> Array:
+    """Return A without slopes that are the rounding of inputs that cancel each other."""
+    nv, A = len(lin.M), lin.A.copy()
+    slopes = A[nv:, :nv]
+    pushed = np.abs(lin.B[nv:]) @ np.abs(lin.u0)
+    slopes[np.abs(slopes) <= 1e2 * EPS * pushed[:, None]] = 0.0
+    return A
+
+
+def _free_free(A: Array, M: Array, inertia: Array) -> NaturalModes | None:
+    """Return the modes of a body at rest with symmetric stiffness; None for any other model."""
+    from scipy.linalg import eigh
+
+    nv = len(M)
+    N, slope = A[:nv, nv:], A[nv:, :nv] @ A[:nv, nv:]
+    if A[:nv, :nv].any() or A[nv:, nv:].any():
+        return None
+    # In quasi-coordinates s, with p = N s and ds/dt = nu, scaled to a unit diagonal of M.
+    unit = M / np.outer(inertia, inertia)
+    by_s = slope * inertia[:, None] / inertia
+    K = -unit @ by_s
+    size = float(np.abs(K).max(initial=0.0))
+    rounding = 1e2 * EPS * float(np.linalg.cond(unit))
+    if not np.abs(K - K.T).max(initial=0.0) <= rounding * size:
+        return None
+    felt = np.flatnonzero(by_s.any(axis=0))
+    if not felt.size:
+        return NaturalModes([], nv, 2 * nv)
+    free = np.setdiff1d(np.arange(nv), felt)
+    across = unit[np.ix_(free, felt)]
+    M_star = unit[np.ix_(felt, felt)] - across.T @ np.linalg.solve(unit[np.ix_(free, free)], across)
+    K = -M_star @ by_s[np.ix_(felt, felt)]
+    squares, vectors = eigh((K + K.T) / 2.0, (M_star + M_star.T) / 2.0)
+    squares, vectors = _polished(by_s[np.ix_(felt, felt)], squares, vectors)
+    found: list[tuple[complex, Any, float]] = []
+    for square, vector in zip(squares.tolist(), vectors.T, strict=True):
+        if abs(square) <= _NO_STIFFNESS * len(felt) * float(np.abs(squares).max()):
+            continue
+        # The coordinates without stiffness follow from -omega^2 s = (d nudot/ds) s.
+        s = by_s[:, felt] @ vector / inertia
+        root = abs(square) ** 0.5
+        for pole in [1j * root] if square > 0.0 else [complex(root), complex(-root)]:
+            shape = np.concatenate((N @ s, pole * s))
+            found.append((pole, shape, math.copysign(math.inf, pole.real) if pole.real else 0.0))
+    counted = sum(2 if pole.imag else 1 for pole, *_ in found)
+    return NaturalModes(found, nv - counted // 2, 2 * nv - counted)
+
+
+def _polished(by_s: Array, squares: Array, vectors: Array) -> tuple[Array, Array]:
+    """Return the pairs of -by_s, after one Newton step from those of its symmetric pencil.
+
+    The Schur complement rounds by the condition of M, while A itself is exact to the last digits.
+    """
+    defect = -np.linalg.solve(vectors, by_s @ vectors) - np.diag(squares)
+    gaps = squares - squares[:, None]
+    # Vectors of equal frequencies are not mixed: any combination of them is a mode.
+    apart = np.abs(defect) < 1e-3 * np.abs(gaps)
+    mixed = np.divide(defect, gaps, out=np.zeros_like(defect), where=apart)
+    return squares + defect.diagonal(), vectors + vectors @ mixed
+
+
+def _scales(A: Array, inertia: Array) -> tuple[Array, float]:
+    """Return weights of the states and a rate, over which the entries of A are of size 1.
+
+    Velocities are weighed by sqrt(M_ii), and positions by the rate as well.
+    """
+    nv = len(inertia)
+    rates = np.abs(np.tile(inertia, 2)[:, None] * A / np.tile(inertia, 2))
+    turning = max(float(rates[nv:, nv:].max()), float(rates[:nv, :nv].max()))
+    fastest = max(float(rates[nv:, :nv].max()) ** 0.5, turning) or 1.0
+    return np.concatenate((fastest * inertia, inertia)), fastest
+
+
+def _general(A: Array, weight: Array, fastest: float) -> NaturalModes:
+    """Return the modes of any model, by the eigenvalues of A."""
+    scaled = weight[:, None] * A / weight / fastest
+    found, nullity = nonzero_eigenpairs(scaled, _NO_STIFFNESS)
+    listed: list[tuple[complex, Any, float]] = []
+    for pole, vector, error in found:
+        if pole.imag < 0.0:
+            continue
+        real = 0.0 if abs(pole.real) <= error and pole.imag else pole.real
+        value = complex(real, pole.imag) * fastest
+        listed.append((value, vector / weight, pole.real / error))
+    return NaturalModes(listed, nullity, len(weight) - len(found))
+
+
+def nonzero_eigenpairs(
+    A: Array, tolerance: float
+) -> tuple[list[tuple[complex, Vector, float]], int]:
+    r"""Return the eigenpairs of A that are not zero, and the dimension of its null space.
+
+    A Jordan block of k zeros turns round-off into eigenvalues of :math:`\epsilon^{1/k}`. So, with
+    :math:`V_0, V_1` a basis of the null space and of its complement, A is replaced by
+    :math:`V_1^T A V_1`, which has the other eigenvalues, until nothing is left to split off.
+
+    Parameters
+    ----------
+    A : ndarray (n, n)
+        Scaled so that its entries are comparable, the largest about 1.
+    tolerance : float
+        Singular values below n times this are taken for zero.
+
+    Returns
+    -------
+    pairs : list of (eigenvalue, eigenvector (n,), error)
+        `error` bounds what rounding does to the eigenvalue: by its condition number.
+    nullity : int
+    """
+    from scipy.linalg import eig
+
+    n, whole = len(A), A
+    size = float(np.linalg.norm(A))
+    nullity = n - int(np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance))
+    steps: list[Array] = []
+    while len(A):
+        complement = _complement(A, n * tolerance)
+        if complement is None:
+            break
+        steps.append(A @ complement)
+        A = complement.T @ steps[-1]
+    if not len(A):
+        return [], nullity
+    values, left, right = eig(A, left=True, right=True)
+    pairs = []
+    for value, y, x in zip(values.tolist(), left.T, right.T, strict=True):
+        error = 1e2 * EPS * size / max(abs(np.vdot(y, x)), EPS)
+        for step in reversed(steps):
+            # As A V_0 = 0, an eigenvector V_0 a + V_1 x is A V_1 x, up to a factor.
+            x = step @ x  # noqa: PLW2901 - the same vector in a larger space
+        # Slow modes lost digits on the way; one inverse iteration restores them.
+        near = whole - (value + EPS * size) * np.eye(n)
+        with suppress(np.linalg.LinAlgError):  # the shift is an eigenvalue exactly
+            x = np.linalg.solve(near, x / np.linalg.norm(x))  # noqa: PLW2901
+        pairs.append((complex(value), x / np.linalg.norm(x), error))
+    return pairs, nullity
+
+
+def _complement(A: Array, tolerance: float) -> Array | None:
+    """Return a basis of what is orthogonal to the null space of A; None where that is empty."""
+    used = A.any(axis=0)
+    if not used.all():
+        # Columns that are exactly zero are dropped as they stand: a rotation would round.
+        return np.eye(len(A))[:, used]
+    _, singular, transposed = np.linalg.svd(A)
+    rank = int(np.count_nonzero(singular > tolerance))
+    return None if rank == len(A) else np.asarray(transposed[:rank].T)

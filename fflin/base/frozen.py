@@ -1,0 +1,27 @@
+"""Results that nobody changes by accident: their arrays are read-only."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from fflin.base.validation import Array
+
+
+class FrozenArrays:
+    """Of a frozen dataclass: its arrays are made read-only, and copied if they could be written."""
+
+    def __post_init__(self) -> None:
+        this: Any = self
+        for item in fields(this):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                object.__setattr__(self, item.name, frozen(value.copy()))
+
+
+def frozen(array: Array) -> Array:
+    """Return the array itself, read-only."""
+    array.setflags(write=False)
+    return array

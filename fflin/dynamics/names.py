@@ -1,0 +1,55 @@
+"""Names and units of the state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m) and of its forces.
+
+The units of the inputs stand in `fflin.robot.inputs`, those of the outputs that are no states in
+`fflin.robot.outputs`, those of a joint in `fflin.robot.joints`; all else is SI.
+"""
+
+from typing import NamedTuple
+
+from fflin.robot.inputs import BaseForce, BaseTorque
+from fflin.robot.robot import Robot
+
+
+class Groups(NamedTuple):
+    """Slices of the six groups of the state."""
+
+    q_b: slice
+    r_b: slice
+    q_m: slice
+    omega_b: slice
+    v_b: slice
+    qdot_m: slice
+
+
+def groups_of(n: int) -> Groups:
+    """Return the groups of the state of a robot with n joints."""
+    return Groups(
+        slice(0, 3),
+        slice(3, 6),
+        slice(6, 6 + n),
+        slice(6 + n, 9 + n),
+        slice(9 + n, 12 + n),
+        slice(12 + n, 12 + 2 * n),
+    )
+
+
+def states_of(robot: Robot) -> dict[str, str]:
+    """Return {name: unit} of the 12 + 2n states."""
+    return {
+        **_of_base(q_b="1", r_b="m"),
+        **{f"q_m.{joint.name}": joint.unit for joint in robot.joints},
+        **_of_base(omega_b="rad/s", v_b="m/s"),
+        **{f"qdot_m.{joint.name}": f"{joint.unit}/s" for joint in robot.joints},
+    }
+
+
+def forces_of(robot: Robot) -> dict[str, str]:
+    """Return {name: unit} of the 6 + n generalised forces."""
+    return {
+        **_of_base(tau_b=BaseTorque.UNIT, F_b=BaseForce.UNIT),
+        **{f"tau_m.{joint.name}": joint.force_unit for joint in robot.joints},
+    }
+
+
+def _of_base(**groups: str) -> dict[str, str]:
+    return {f"{group}.{axis}": unit for group, unit in groups.items() for axis in "xyz"}

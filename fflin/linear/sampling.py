@@ -1,0 +1,22 @@
+"""The exact solution of a linear model over a sample, its input held."""
+
+import numpy as np
+
+from fflin.base.validation import Array
+
+
+def held_exponential(A: Array, driven: Array, h: float) -> tuple[Array, Array]:
+    r"""Return :math:`e^{A h}` (n, n) and :math:`\int_0^h e^{A s}\,ds\,B` (n, k) of B = `driven`.
+
+    Where A^2 = 0 the series ends and the result is exact. What overflows is not finite.
+    """
+    n, k = driven.shape
+    with np.errstate(over="ignore", invalid="ignore"):
+        if not (A @ A).any():
+            return np.eye(n) + A * h, driven * h + A @ driven * (h * h / 2.0)
+        from scipy.linalg import expm
+
+        block = np.zeros((n + k, n + k))
+        block[:n, :n], block[:n, n:] = A, driven
+        exponential = expm(block * h)
+        return exponential[:n, :n], exponential[:n, n:]
