@@ -134,7 +134,7 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     if arguments.free:
         if arguments.limit or arguments.delay:
             raise InputError("--free has no input to limit or delay; leave one out")
-        weighed = arguments.q or arguments.r or arguments.bryson or arguments.dt
+        weighed = any((arguments.weights, arguments.q, arguments.r, arguments.bryson, arguments.dt))
         if weighed or arguments.target_joint or arguments.reduce or arguments.allocate:
             raise InputError(
                 "--free has no regulator to give weights, a target or thrusters; leave one out"

@@ -49,10 +49,10 @@ def lqr(
     the inertia, such as M^-1 R_a M^-1 on accelerations, has lost what the inertia's condition
     takes before any solver sees it: `acceleration_lqr` does without.
 
-    Without weights the regulator is one that the robot can bear: every coordinate comes back alike,
-    at 0.2 rad/s or as much slower as the efforts and speeds of the URDF ask for where the base is
+    Without weights the regulator is one that the robot can bear: its slowest motion comes back at
+    0.2 rad/s, or as much slower as the efforts and speeds of the URDF ask for where the base is
     turned by 30 deg and the joints by 0.3 rad; see `fflin.control.default_weights`. Every input
-    then bears 60 deg of phase and half to any gain.
+    then bears 60 deg of phase, and any gain from a half up.
 
     Parameters
     ----------

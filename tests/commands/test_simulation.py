@@ -200,6 +200,7 @@ def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
         (["-o", "loop.xyz"], "ends in '.xyz'"),
         (["--limit", "tau_x=1"], "tau_x"),
         (["--free", "--reduce"], "--free has no regulator"),
+        (["--free", "--weights", "identity"], "--free has no regulator"),
         (["--free", "--limit", "tau_m=1"], "--free has no input"),
         (["--step", "5"], "too large for a loop"),
         (["--method", "rk4"], "method"),
