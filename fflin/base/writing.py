@@ -60,8 +60,13 @@ def read_file(path: Path, kind: str, limit: int | None = None) -> bytes:
 def read_input(path: Path, kind: str, limit: int | None = None) -> bytes:
     """Do what `read_file` does, and let nothing that is written take the file's place."""
     content = read_file(path, kind, limit)
-    _inputs.add(os.path.abspath(path))
+    remember(path)
     return content
+
+
+def remember(*paths: str | Path) -> None:
+    """Let nothing that is written take the place of files that are read by other means."""
+    _inputs.update(map(os.path.abspath, paths))
 
 
 def write_whole(contents: Mapping[Path, bytes]) -> None:
@@ -140,6 +145,16 @@ def check_place(target: Path, endings: tuple[str, ...] = ()) -> None:
         raise
     except OSError as error:
         raise FileError(f"{target}: cannot be written: {reason(error)}") from None
+
+
+def check_distinct(*targets: Path | None) -> None:
+    """Raise `FileError` where two outputs are one file, links followed; None is no output."""
+    seen: dict[str, Path] = {}
+    for target in targets:
+        if target is not None:
+            first = seen.setdefault(os.path.realpath(target), target)
+            if first is not target:
+                raise FileError(f"{target} and {first} are one file; name another for each output")
 
 
 def reserve(path: Path) -> None:

@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
 
+# The options that name a file to write.
+_OUTPUTS = ("output_file", "plot", "html", "png", "gif")
+
+
 def add_commands(commands: Commands) -> None:
     """Add simulate."""
     simulate = command(
@@ -89,17 +93,19 @@ def add_commands(commands: Commands) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
+    from fflin.base.writing import check_distinct, check_place
     from fflin.simulation.motion import FORMATS, motion_report
 
     robot = load_robot(arguments)
+    check_distinct(*(getattr(arguments, name) for name in _OUTPUTS))
     if arguments.output_file:
-        from fflin.base.writing import check_place
-
         check_place(arguments.output_file, FORMATS)
     if arguments.plot:
         check_figure(arguments.plot)
     check_pictures(robot, arguments)
     motion = simulated(robot, arguments)
+    interrupted = motion.stopped.startswith("interrupted")
+    left = _leave_earlier(arguments) if interrupted else []
 
     # Said when the files are there, which they are then even where nobody reads it to its end.
     lines = [motion_report(motion, controlled=not arguments.free)]
@@ -113,9 +119,17 @@ def _simulate(arguments: argparse.Namespace) -> int:
         lines += show_motion(robot, motion, arguments)
     finally:
         print("\n".join(lines))
-    if motion.stopped.startswith("interrupted"):
-        raise KeyboardInterrupt(motion.stopped)
+    if interrupted:
+        raise KeyboardInterrupt("; ".join([motion.stopped, *left]))
     return FELL_SHORT if motion.stopped else DONE
+
+
+def _leave_earlier(arguments: argparse.Namespace) -> list[str]:
+    """Write no part of a motion where there is an earlier file; return a line for each."""
+    files = {name: path for name in _OUTPUTS if (path := getattr(arguments, name))}
+    earlier = {name: path for name, path in files.items() if path.exists()}
+    vars(arguments).update(dict.fromkeys(earlier))
+    return [f"{path} is left as it was" for path in earlier.values()]
 
 
 def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:

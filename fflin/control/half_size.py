@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dgeqrf, dpotrf, dtrtrs
+from scipy.linalg.lapack import dgeev, dgeqrf, dpotrf, dtrtrs
 
 from fflin.base.validation import Array
-from fflin.control.lyapunov import ModalMatrix, modes_of, scaled
+from fflin.control.lyapunov import ModalMatrix, Spectrum
 
 
 class OptimalLoop(NamedTuple):
@@ -19,7 +19,7 @@ class OptimalLoop(NamedTuple):
 
 
 def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalLoop | None:
-    r"""Return a stable loop, optimal but for odd powers; None for a system of another form.
+    r"""Return a stable loop, optimal but for odd powers; None where the system is another.
 
     A state (x1, x2) of m entries each with
 
@@ -56,12 +56,13 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalL
     if nx != 2 * m or B[:m].any():
         return None
     white = _lower(R_factor, B[m:].T)
-    # The inverse weight on forces is Ls Ls'; forming the product would square its condition.
+    # Of the inverse weight on forces, S = Ls Ls'; squaring it would square its condition.
     Ls: Array = np.triu(dgeqrf(white)[0][:m]).T
     sizes = np.abs(Ls.diagonal())
+    singular = len(white) < m or sizes.min() <= 1e-14 * sizes.max()
     A11, A12 = A[:m, :m], A[:m, m:]
     inverse = _inverse(A12)
-    if len(white) < m or sizes.min() <= 1e-14 * sizes.max() or inverse is None:
+    if singular or inverse is None:
         return None
     # x = T (p, dp/dt)
     T = np.zeros((nx, nx))
@@ -78,19 +79,24 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalL
     G, indefinite = dpotrf(S, lower=1)
     if indefinite:
         return None
-    C = np.zeros((nx, nx))
+    C = np.zeros((nx, nx), order="F")
     C[:m, m:], C[m:, :m], C[m:, m:] = G.T, -G, D
-    squares, W = modes_of(C)
-    if ((squares.imag == 0.0) & (squares.real <= 0.0)).any():
+    if not np.isfinite(C).all():
         return None
-    poles = -np.sqrt(squares)
+    real, imag, _, W, failed = dgeev(C, compute_vl=0, overwrite_a=1)
+    if failed or ((imag == 0.0) & (real <= 0.0)).any():
+        return None
+    spectrum = Spectrum(real, imag)
+    poles = -np.sqrt(spectrum.values)
     # The lower half of w is a = mu p.
-    a = W[m:]
-    motion = np.concatenate((scaled(a, 1.0 / squares), scaled(a, 1.0 / poles)))
+    a = W[m:, spectrum.order]
+    motion = np.concatenate(
+        (spectrum.scale(a, 1.0 / spectrum.values), spectrum.scale(a, 1.0 / poles))
+    )
     if not plain:
         a -= F @ motion[:m] + H @ motion[m:]
     cost = motion.T @ weight @ motion + a.T @ a
-    return OptimalLoop(ModalMatrix(poles, T @ motion, discrete=False), cost)
+    return OptimalLoop(ModalMatrix(T @ motion, spectrum, poles, discrete=False), cost)
 
 
 def _lower(factor: Array, right: Array) -> Array:

@@ -12,7 +12,7 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from fflin.base.validation import Array
 from fflin.control.half_size import second_order_loop
-from fflin.control.lyapunov import ModalMatrix
+from fflin.control.lyapunov import ModalMatrix, eigenvalues
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 
@@ -220,7 +220,7 @@ def _finished(
 ) -> Solution | None:
     K = equation.gain(trial.P)
     F = equation.A - equation.B @ K
-    poles = modes.poles(F) if modes else np.linalg.eigvals(F).astype(complex)
+    poles = modes.poles(F) if modes else eigenvalues(F)
     stable = np.abs(poles).max() < 1.0 if equation.discrete else poles.real.max() < 0.0
     return Solution(trial.P, K, poles, trial.residual, method) if stable else None
 

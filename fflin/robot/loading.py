@@ -12,6 +12,7 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
 from fflin.base.validation import Array, number
+from fflin.base.writing import remember
 from fflin.robot.catalog import find_robot
 from fflin.robot.frames import ROOT
 from fflin.robot.joints import Follower, Joint
@@ -19,6 +20,7 @@ from fflin.robot.massless import idle_coordinates, massless_note
 from fflin.robot.model_checks import check_model
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
+from fflin.robot.urdf.mesh_files import find_mesh
 from fflin.robot.urdf.reader import read_urdf
 
 Lock = Mapping[str, float | None] | Iterable[str]
@@ -77,12 +79,16 @@ def load(
     if idle_coordinates(loaded):
         # No warning: whatever needs the inverse of M refuses with this.
         notes = (*notes, massless_note(loaded))
+    folders = (*_folders(package_dirs), *found.package_dirs)
+    # They are read when the robot is drawn, and no output may take their place before.
+    meshes = (find_mesh(uri, found.path, folders) for uri in description.meshes)
+    remember(*filter(None, meshes))
     loaded = replace(
         loaded,
         urdf=found.path,
         urdf_sha256=description.sha256,
         notes=notes,
-        package_dirs=(*_folders(package_dirs), *found.package_dirs),
+        package_dirs=folders,
         urdf_damping=_independent_damping(loaded, description.damping),
     )
     return loaded.replace(**fields) if fields else loaded

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -10,8 +11,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from fflin.base.validation import Array
-from fflin.view.shapes import Color
+from fflin.base.writing import reason
 
+Color = tuple[float, float, float, float]
 Indices: TypeAlias = "np.ndarray[Any, np.dtype[np.integer[Any]]]"
 
 # Details smaller than this part of a mesh's extent are not drawn; it halves most CAD exports.
@@ -38,7 +40,6 @@ class Mesh:
     color: Color | None
 
 
-@lru_cache(maxsize=256)
 def load_mesh(path: Path) -> tuple[Mesh, ...]:
     """Read a mesh file, in its own unit of length.
 
@@ -54,8 +55,18 @@ def load_mesh(path: Path) -> tuple[Mesh, ...]:
     Raises
     ------
     ValueError
-        If it cannot be read.
+        If it cannot be read, or nothing of it can be seen.
     """
+    try:
+        found = os.stat(path)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {reason(error)}") from None
+    return _loaded(path, found.st_mtime_ns, found.st_size)
+
+
+@lru_cache(maxsize=256)
+def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
+    # Another time or size is another mesh.
     parts = _colored(path) if path.suffix.lower() == ".dae" else []
     parts = parts or [(*_triangles(path), None)]
     corners = np.concatenate([vertices[faces].reshape(-1, 3) for vertices, faces, _ in parts])
@@ -69,8 +80,12 @@ def load_mesh(path: Path) -> tuple[Mesh, ...]:
             for vertices, faces, color in parts
         ]
         if sum(len(mesh.faces) for mesh in welded) <= _LARGEST or resolution > 0.02:
-            return tuple(mesh for mesh in welded if len(mesh.faces))
+            break
         resolution *= 1.5
+    seen = tuple(mesh for mesh in welded if len(mesh.faces))
+    if not seen:
+        raise ValueError(f"{path}: has no triangle large enough to be seen")
+    return seen
 
 
 def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:

@@ -14,7 +14,6 @@ import umsgpack
 
 from fflin.base.validation import Array
 from fflin.robot.robot import ROOT, Robot
-from fflin.robot.urdf.xml import named
 from fflin.view.meshes import Indices, Mesh, load_mesh
 from fflin.view.shapes import PLAIN, Shape, shapes
 
@@ -98,18 +97,11 @@ class Drawing:
         self._visualizer = visualizer
         self._paths = body_paths(robot)
         sent = set() if sent is None else sent
-        found, notes = shapes(robot)
+        found, self.notes = shapes(robot)
         corners: dict[int, list[Array]] = {}
-        unreadable: list[str] = []
         for index, shape in enumerate(found):
             node = visualizer[self._paths[shape.joint - ROOT]]
-            try:
-                pieces = _pieces(shape)
-            except ValueError:
-                assert shape.mesh is not None
-                unreadable.append(shape.mesh.name)
-                continue
-            for part, (geometry, matrix, color, box) in enumerate(pieces):
+            for part, (geometry, matrix, color, box) in enumerate(_pieces(shape)):
                 about = {"finish": shape.finish, "color": color, "look": look}
                 shown = geometry
                 if geometry["type"] == "BufferGeometry":
@@ -119,9 +111,6 @@ class Drawing:
                 placed = shape.placement.homogeneous @ matrix
                 node[f"{index}_{part}"].set_object(_Piece(shown, placed, about))
                 corners.setdefault(shape.joint, []).append(_box_corners(placed, box))
-        if unreadable:
-            notes += (f"{robot.name}: {named('mesh file', unreadable)} cannot be read; not drawn",)
-        self.notes = notes
         self.bodies = list(corners)
         self.corners = [
             _box_corners(np.eye(4), _bounds(np.concatenate(boxes))) for boxes in corners.values()

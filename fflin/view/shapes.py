@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import unquote
 
 import numpy as np
 import pinocchio as pin
@@ -15,11 +13,11 @@ from fflin.base.errors import FflinError
 from fflin.base.writing import shown
 from fflin.robot.robot import ROOT, Robot
 from fflin.robot.urdf.links import read_pose
+from fflin.robot.urdf.mesh_files import find_mesh
 from fflin.robot.urdf.reader import read_document
 from fflin.robot.urdf.xacro import expand, first_xacro
 from fflin.robot.urdf.xml import Element, named, parse
-
-Color = tuple[float, float, float, float]
+from fflin.view.meshes import Color, load_mesh
 
 # Where a URDF names no colour.
 PLAIN: Color = (0.72, 0.74, 0.77, 1.0)
@@ -93,6 +91,7 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
         if "name" in element.attributes and (color := _color(element)) is not None
     }
     missing: list[str] = []
+    unreadable: list[str] = []
     odd: list[int] = []
     for link in root.find_all("link"):
         frame_id = robot.model.getFrameId(link.attributes.get("name", ""), pin.FrameType.BODY)
@@ -115,6 +114,11 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
                 if file is None:
                     missing.append(shown(mesh))
                     continue
+                try:
+                    load_mesh(file)
+                except ValueError:
+                    unreadable.append(file.name)
+                    continue
             yield Shape(frame.parentJoint, kind, size, placement, color, finish, file)
     if missing:
         where = ", ".join(str(folder) for folder in robot.package_dirs) or path.parent
@@ -122,6 +126,8 @@ def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:
             f"{robot.name}: {named('mesh file', missing)} not found below {where}; the rest is "
             "drawn (package_dirs of fflin.load names other folders)"
         )
+    if unreadable:
+        notes.append(f"{robot.name}: {named('mesh file', unreadable)} cannot be read; not drawn")
     if odd:
         lines = ", ".join(map(str, odd[:6])) + ", ..." * (len(odd) > 6)
         notes.append(f"{path.name}: <visual> in line {lines} is malformed and not drawn")
@@ -174,32 +180,6 @@ def _color(material: Element) -> Color | None:
         return None
     r, g, b, a = (min(max(x, 0.0), 1.0) for x in found[0].vector("rgba", "<color>", 4))
     return r, g, b, a
-
-
-def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
-    """Return the file of a mesh, None where it is not there.
-
-    Parameters
-    ----------
-    uri : str
-        package://NAME/PATH, file:///PATH, an absolute path or one relative to the URDF.
-    urdf : Path
-        The robot's file. A package is also looked for in the folders that this one lies in.
-    package_dirs : sequence of Path
-        Folders that hold packages.
-    """
-    scheme, separator, rest = uri.partition("://")
-    if not separator:
-        candidates = [urdf.parent / uri, *(folder / uri for folder in package_dirs)]
-    elif scheme == "file":
-        candidates = [Path(unquote(rest))]
-    else:
-        inside = Path(*Path(rest).parts[1:])
-        candidates = [folder / rest for folder in (*package_dirs, *urdf.resolve().parents)]
-        # A package's own folder may have been given, or be called otherwise.
-        candidates += [folder / inside for folder in (*package_dirs, *urdf.resolve().parents)]
-    # Unlike Path.is_file, this takes a name that is too long for one that does not exist.
-    return next((path for path in candidates if os.path.isfile(path)), None)
 
 
 def _inertia_boxes(robot: Robot) -> Iterator[Shape]:

@@ -11,7 +11,7 @@ from warnings import warn
 
 from fflin.base.errors import FflinWarning, FileError, InputError
 from fflin.base.validation import Array, number, truth
-from fflin.base.writing import as_path, check_place, write_whole
+from fflin.base.writing import as_path, check_distinct, check_place, write_whole
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import find_frame
@@ -191,6 +191,7 @@ def check_outputs(files: dict[str, Any]) -> dict[str, Path]:
             raise FileError(f"'{path}' ends in '{path.suffix}', expected {ending}")
         check_place(path)
         outputs[ending] = path
+    check_distinct(*outputs.values())
     if ".png" in outputs or ".gif" in outputs:
         from fflin.view.capture import find_chromium
 

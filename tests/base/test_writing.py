@@ -133,6 +133,76 @@ def test_other_inputs_are_protected_too(urdf, tmp_path, capsys, monkeypatch):
         fflin.linearize(robot).save("z.json")
 
 
+def linked(tmp_path, read, *command):
+    """Run a command whose output leads to a file that is read; check that it stays."""
+    before = read.read_bytes()
+    (tmp_path / command[-1]).symlink_to(read)
+    done = subprocess.run(
+        [sys.executable, "-m", "fflin", *command],
+        cwd=tmp_path,
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert read.read_bytes() == before and (tmp_path / command[-1]).is_symlink()
+    said = [line for line in done.stderr.splitlines() if "warning" not in line]
+    assert done.returncode == 2 and len(said) == 1
+    assert f"{command[-1]} is the input file {read}; name another" in said[0]
+
+
+@pytest.mark.parametrize("included", ["inc.xacro", "deep.xacro", "mass.yaml"])
+def test_what_a_xacro_reads_is_protected(included, tmp_path):
+    pytest.importorskip("xacrodoc")
+    namespace = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
+    (tmp_path / "mass.yaml").write_text("m: 3\n")
+    (tmp_path / "deep.xacro").write_text(
+        f"""<robot {namespace}>
+        <xacro:property name="of" value="${{xacro.load_yaml('mass.yaml')}}"/></robot>"""
+    )
+    (tmp_path / "inc.xacro").write_text(
+        f"""<robot {namespace}><xacro:include filename="deep.xacro"/>
+        <link name="l"><inertial><mass value="${{of['m']}}"/>
+        <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+    )
+    (tmp_path / "x.urdf.xacro").write_text(
+        f'<robot name="r" {namespace}><xacro:include filename="inc.xacro"/></robot>'
+    )
+    there = tmp_path / "there"
+    there.mkdir()
+    for name in ("x.urdf.xacro", "inc.xacro", "deep.xacro", "mass.yaml"):
+        (tmp_path / name).rename(there / name)
+    linked(tmp_path, there / included, "linearize", "there/x.urdf.xacro", "-o", "o.json")
+
+
+@pytest.mark.parametrize(
+    "command", [("linearize", "-o", "o.json"), ("simulate", "--duration", ".1", "--html", "o.html")]
+)
+@pytest.mark.parametrize("of", ["visual", "collision"])
+def test_meshes_of_a_robot_are_protected(of, command, urdf, tmp_path):
+    mesh = tmp_path / "package" / "m.stl"
+    mesh.parent.mkdir()
+    mesh.write_text("solid m\nendsolid m\n")
+    named = f'<{of}><geometry><mesh filename="package://package/m.stl"/></geometry></{of}></link>'
+    urdf.write_text(urdf.read_text().replace("</link>", named, 1))
+    linked(tmp_path, mesh, command[0], urdf.name, *command[1:])
+
+
+@pytest.mark.parametrize(
+    "second, option", [("m.png", "--png"), ("link.png", "--png"), ("./m.png", "-o")]
+)
+def test_two_outputs_of_one_name_are_refused_before_work(
+    second, option, urdf, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "link.png").symlink_to("m.png")
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.setattr("fflin.commands.simulation.simulated", None)  # the work
+    code, error = fflin_main(capsys, "simulate", urdf, "--plot", "m.png", option, second)
+    assert code == 2 and error.count("\n") == 1
+    assert "m.png are one file" in error or "and link.png are one file" in error
+    assert sorted(tmp_path.iterdir()) == before
+
+
 def test_a_device_is_refused():
     with pytest.raises(fflin.FileError, match="not a regular file; give the name of a file"):
         write_whole({Path("/dev/null"): b"x"})

@@ -154,8 +154,9 @@ def test_a_place_that_cannot_be_written_is_said_before_the_run(tmp_path, option)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_that_is_interrupted_is_kept(tmp_path, monkeypatch, capsys):
-    from fflin.commands import cli, simulation
+@pytest.fixture
+def interrupted(monkeypatch):
+    from fflin.commands import simulation
 
     right = simulation.simulated
     monkeypatch.setattr(
@@ -163,6 +164,29 @@ def test_a_run_that_is_interrupted_is_kept(tmp_path, monkeypatch, capsys):
         "simulated",
         lambda *a: replace(right(*a), stopped="interrupted at t = 0.5 s"),
     )
+
+
+def test_a_run_that_is_interrupted_takes_no_earlier_files_place(tmp_path, interrupted, capsys):
+    from fflin.commands import cli
+
+    path, page, new = tmp_path / "m.npz", tmp_path / "m.html", tmp_path / "m.png"
+    path.write_text("earlier")
+    command = ["simulate", "cubesat", "--duration", "1", "-o", str(path), "--plot", str(new)]
+    with pytest.raises(KeyboardInterrupt) as caught:
+        cli.main(command)
+    assert str(caught.value) == f"interrupted at t = 0.5 s; {path} is left as it was"
+    assert path.read_text() == "earlier"
+    said = capsys.readouterr().out
+    assert f"wrote {new}" in said and str(path) not in said and new.is_file()
+    page.write_text("earlier")
+    with pytest.raises(KeyboardInterrupt, match=r"m\.html is left as it was"):
+        cli.main(["simulate", "cubesat", "--duration", "1", "--html", str(page)])
+    assert page.read_text() == "earlier"
+
+
+def test_a_run_that_is_interrupted_is_kept(tmp_path, interrupted, capsys):
+    from fflin.commands import cli
+
     path = tmp_path / "m.npz"
     with pytest.raises(KeyboardInterrupt, match="interrupted at t"):
         cli.main(["simulate", "cubesat", "--duration", "1", "-o", str(path)])

@@ -1,5 +1,7 @@
 """Mesh files: their triangles against Pinocchio's loader, colours, and what welding leaves."""
 
+import os
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -7,6 +9,7 @@ from scipy.spatial import cKDTree
 import fflin
 from fflin.view.meshes import _colored, _triangles, load_mesh
 from fflin.view.shapes import shapes
+from tests.support.meshes import tetrahedron
 
 
 def area(vertices, faces):
@@ -65,6 +68,29 @@ def test_collada_composes_the_transforms_of_its_nodes(tmp_path):
     assert color == pytest.approx((1.0, 0.5, 0.0, 1.0), abs=1 / 255) and len(faces) == 3
     theirs = 0.01 * _triangles(path)[0]  # Pinocchio's loader pays no heed to the unit either
     assert {tuple(x) for x in np.round(vertices, 6)} == {tuple(x) for x in np.round(theirs, 6)}
+
+
+def test_a_mesh_that_is_mended_is_read_again(tmp_path):
+    path = tmp_path / "m.stl"
+    path.write_text("garbage")
+    with pytest.raises(ValueError, match="cannot be read"):
+        load_mesh(path)
+    for length in (1, 2):
+        tetrahedron(path, length)
+        (mesh,) = load_mesh(path)
+        assert np.ptp(mesh.vertices, axis=0).max() == length
+        os.utime(path, (length, length))  # however coarse the clock of the disk is
+    path.unlink()
+    with pytest.raises(ValueError, match="cannot be read: No such file"):
+        load_mesh(path)
+
+
+def test_dust_is_no_mesh(tmp_path):
+    path = tmp_path / "m.obj"
+    corners = ("0 0 0", "1e-4 0 0", "0 1e-4 0", "1 1 1", "1.0001 1 1", "1 1.0001 1")
+    path.write_text("".join(f"v {each}\n" for each in corners) + "f 1 2 3\nf 4 5 6\n")
+    with pytest.raises(ValueError, match="no triangle large enough"):
+        load_mesh(path)
 
 
 def test_welding_keeps_a_mesh_within_its_grid():

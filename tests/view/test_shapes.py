@@ -8,7 +8,10 @@ from scipy.spatial import cKDTree
 
 import fflin
 from fflin.robot.catalog import find_robot
-from fflin.view.shapes import find_mesh, shapes
+from fflin.robot.urdf.mesh_files import find_mesh
+from fflin.view.shapes import shapes
+from tests.support.meshes import tetrahedron
+from tests.support.motions import settling
 
 URDF = """<robot name="r">
   <material name="red"><color rgba="1 0 0 0.5"/></material>
@@ -25,18 +28,6 @@ URDF = """<robot name="r">
 def write(folder, mesh="missing.stl", more=""):
     path = folder / "r.urdf"
     path.write_text(URDF.format(mesh=mesh, more=more))
-    return path
-
-
-def tetrahedron(path):
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
-    faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
-    lines = ["solid t"]
-    for face in faces:
-        lines += ["facet normal 0 0 0", "outer loop"]
-        lines += ["vertex {} {} {}".format(*corners[i]) for i in face]
-        lines += ["endloop", "endfacet"]
-    path.write_text("\n".join([*lines, "endsolid t", ""]))
     return path
 
 
@@ -126,6 +117,26 @@ def test_a_missing_mesh_and_a_malformed_visual_leave_the_rest(tmp_path):
     assert [shape.kind for shape in found] == ["box"]
     assert len(notes) == 2
     assert "package://nowhere/a.stl" in notes[0] and "line 8, 8" in notes[1]
+
+
+@pytest.mark.parametrize("ending", ["stl", "obj", "dae"])
+def test_where_no_mesh_can_be_read_there_are_boxes(ending, tmp_path):
+    path = tmp_path / "r.urdf"
+    text = URDF.format(mesh=f"m.{ending}", more="")
+    start = text.index("<visual>")
+    path.write_text(text[:start] + text[text.index("</visual>") + 9 :])
+    (tmp_path / f"m.{ending}").write_bytes(b"garbage" * 20)
+    robot = fflin.load(path)
+    found, notes = shapes(robot)
+    assert [shape.finish for shape in found] == ["inertia"]
+    assert f"m.{ending}" in notes[0] and "cannot be read" in notes[0]
+    assert "drawn as boxes" in notes[1]
+    page = tmp_path / "m.html"
+    with pytest.warns(fflin.FflinWarning, match="cannot be read"):
+        fflin.visualize(robot, settling(robot, 1.0), html=page)
+    assert page.stat().st_size > 1000
+    with pytest.warns(fflin.FflinWarning, match="cannot be read"):
+        fflin.visualize(robot, open=False).close()
 
 
 def test_meshes_are_found_where_urdfs_say(tmp_path):

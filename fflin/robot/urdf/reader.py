@@ -44,6 +44,8 @@ class Description:
         {joint: Mimic} of the joints that follow another, resolved to independent leaders.
     damping, friction : dict
         {joint: value} where not zero, [N m s/rad | N s/m] and [N m | N].
+    meshes : tuple of str
+        Mesh files that it names, as it names them; they are not read.
     notes : tuple of str
         Warnings, one line each.
     """
@@ -53,6 +55,7 @@ class Description:
     mimics: dict[str, Mimic]
     damping: dict[str, float]
     friction: dict[str, float]
+    meshes: tuple[str, ...]
     notes: tuple[str, ...]
 
 
@@ -100,6 +103,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     notes += told(root)
     notes += inertia_notes(urdf.links.values(), model, path.name)
 
+    meshes = (e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh")
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
     damping = {joint.name: joint.damping for joint in moving if joint.damping}
     friction = {joint.name: joint.friction for joint in moving if joint.friction}
@@ -115,6 +119,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
         mimics,
         damping,
         friction,
+        tuple(dict.fromkeys(meshes)),
         tuple(notes),
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import faulthandler
+import json
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from fflin.base.errors import MissingPackageError, UrdfError
+from fflin.base.writing import remember
 from fflin.robot.urdf.xml import Element
 
 # How long an expansion may take [s]; xacro's expressions and macros may be without end.
@@ -94,11 +96,16 @@ def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, l
     if done.returncode:
         why = " ".join(said[-1:]) or f"its process ended with {done.returncode}"
         raise UrdfError(f"{failed}: {why[:300]}")
-    return done.stdout, [f"{path.name}: {line}" for line in said if line]
+    files, _, urdf = done.stdout.partition(b"\n")
+    remember(*json.loads(files))
+    return urdf, [f"{path.name}: {line}" for line in said if line]
 
 
 def _expand_here(path: Path, limit: float) -> None:
-    """Expand what comes in on stdin to stdout, in a process of its own."""
+    """Expand what comes in on stdin, in a process of its own.
+
+    To stdout go the files that it read, as a list of JSON in one line, and the expanded document.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever started it ends it
     # It ends with who started it, or else in time, whatever it does.
     if sys.platform == "linux":
@@ -118,7 +125,9 @@ def _expand_here(path: Path, limit: float) -> None:
             ).to_urdf_string()
     except Exception as error:  # xacro evaluates Python expressions, which may raise anything
         sys.exit(" ".join(str(error).split()) or type(error).__name__)
-    sys.stdout.buffer.write(urdf.encode())
+    # Included documents and YAML files; one that is read twice is in the list twice.
+    files = json.dumps(sorted(set(xacro.all_includes)))
+    sys.stdout.buffer.write(f"{files}\n{urdf}".encode())
 
 
 if __name__ == "__main__":
