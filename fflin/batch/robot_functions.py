@@ -42,7 +42,8 @@ def functions_of(
     from fflin.linear.ignorable import ignorable_states
 
     functions = {"_certify": certify, "_inertia": inertia_matrix, "_ignorable": ignorable_states}
-    return {field: partial(function, robot) for field, function in functions.items()}
+    made: dict[str, Any] = {field: partial(made, robot) for field, made in functions.items()}
+    return made | {"_require_unchanged": robot.require_unchanged}
 
 
 def own_reference(root: Array, base: Array) -> Array:

@@ -122,6 +122,7 @@ def make_gain(lin: LinearModel, solution: Solution, Q: Array, R: Array, N: Array
         Q=Q,
         R=R,
         N=np.zeros(lin.B.shape) if N is None else N,
+        verified=lin.verified,
     )
 
 

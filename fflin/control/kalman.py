@@ -214,6 +214,7 @@ def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -
         margin,
         W=W,
         V=V,
+        verified=lin.verified,
         **{key: getattr(lin, key) for key in _FROM_MODEL},
     )
 
@@ -258,6 +259,7 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
         input_names=e.output_names,
         output_names=e.input_names,
         robot=e.robot,
+        verified=gain.verified and e.verified,
     )
 
 

@@ -122,6 +122,8 @@ class LinearModel(FrozenArrays):
     # structure no exponential has blurred.
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
+    # Raises `ModelError` where the robot that it was made of was changed.
+    _require_unchanged: Callable[[], None] | None = None
 
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> LinearModel:
@@ -197,6 +199,11 @@ class LinearModel(FrozenArrays):
                 "with fflin.check"
             )
 
+    def require_unchanged(self) -> None:
+        """Raise `ModelError` where the robot was changed in place after it was made."""
+        if self._require_unchanged is not None:
+            self._require_unchanged()
+
     @property
     def generator(self) -> LinearModel | None:
         """The continuous model that this is sampled from, or itself.
@@ -262,7 +269,10 @@ class LinearModel(FrozenArrays):
         ------
         InputError
             If `dt` is not positive or the model is sampled already.
+        ModelError
+            If the robot's model was changed after it was made.
         """
+        self.require_unchanged()
         dt = number("dt", dt)
         if dt <= 0.0:
             raise InputError(f"dt is {dt:g} s, expected a positive sampling time")
@@ -281,6 +291,7 @@ class LinearModel(FrozenArrays):
         """Return a `scipy.signal.StateSpace` of the deviations; names and f0 are lost."""
         from scipy.signal import StateSpace
 
+        self.require_unchanged()
         matrices = (self.A, self.B, self.C, self.D)
         return StateSpace(*matrices, dt=self.dt) if self.dt else StateSpace(*matrices)
 
@@ -298,6 +309,7 @@ class LinearModel(FrozenArrays):
             raise MissingPackageError(
                 "to_control needs python-control; install it with: pip install 'fflin[control]'"
             ) from None
+        self.require_unchanged()
         # python-control reserves dots in signal names for its own system.signal syntax.
         return control.ss(
             *(self.A, self.B, self.C, self.D, self.dt),
@@ -324,7 +336,7 @@ class LinearModel(FrozenArrays):
         from fflin.base.writing import as_path
         from fflin.linear.files import record_of, write_model
 
-        write_model(as_path(path), record_of(self))
+        write_model(as_path(path), record_of(self), sealed=self.verified)
 
     @staticmethod
     def load(path: str | Path) -> LinearModel:

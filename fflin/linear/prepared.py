@@ -121,6 +121,7 @@ def prepare(
             "_inertia": partial(inertia_matrix, robot),
             "_certify": partial(certify, robot),
             "_ignorable": partial(ignorable_states, robot),
+            "_require_unchanged": robot.require_unchanged,
         },
         rest={
             "A": frozen(at_rest(state)),

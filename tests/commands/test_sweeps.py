@@ -60,6 +60,7 @@ def test_grid_random_and_file_say_the_same(tmp_path, robots):
             r"10,000,000,000 points of 'ets_vii', [\d.]+ TB: add --yes",
         ),
         (("--random", "0"), "0 is too few"),
+        (("--random", "3", "--range", "joint_1=-1e308:1e308"), "wider than all numbers"),
         (("--random", "3", "--grid", "joint_2=0:1:2"), "by one of --grid"),
         (("--random", "3", "--joint", "joint_2=1", "--range", "joint_2=0:1"), "give either"),
         (("--configurations", "none.npz"), "none.npz: cannot be read"),
@@ -87,6 +88,9 @@ def test_what_is_missing_or_damaged_is_one_line(tmp_path, robots):
     np.savez(tmp_path / "q.npz", q=q)
     error = refused("sweep", "ets_vii", "--configurations", "q.npz", "-o", "x.npz", cwd=tmp_path)
     assert error.startswith("fflin: error: configuration 4: q[8] is nan")
+    (tmp_path / "q.npz").write_bytes(b"PK\3\4" + bytes(100))
+    error = refused("sweep", "ets_vii", "--configurations", "q.npz", "-o", "x.npz", cwd=tmp_path)
+    assert "q.npz: not an npz file" in error and "()" not in error
     q[4, 8] = 0.0
     np.savez(tmp_path / "q.npz", q=q)
     error = refused("sweep", "ets_vii", "--configurations", "q.npz", "-o", "q.npz", cwd=tmp_path)
