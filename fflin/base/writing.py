@@ -156,7 +156,8 @@ def reason(error: Exception) -> str:
     said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     if isinstance(error, KeyError) and said.strip("'").isidentifier():
         said = f"it has no entry {said}"
-    return " ".join(said.split()) or type(error).__name__
+    ends = "it ends too early" if isinstance(error, EOFError) else type(error).__name__
+    return " ".join(said.split()) or ends
 
 
 def shown(path: str | Path) -> str:

@@ -88,9 +88,6 @@ def test_what_is_missing_or_damaged_is_one_line(tmp_path, robots):
     np.savez(tmp_path / "q.npz", q=q)
     error = refused("sweep", "ets_vii", "--configurations", "q.npz", "-o", "x.npz", cwd=tmp_path)
     assert error.startswith("fflin: error: configuration 4: q[8] is nan")
-    (tmp_path / "q.npz").write_bytes(b"PK\3\4" + bytes(100))
-    error = refused("sweep", "ets_vii", "--configurations", "q.npz", "-o", "x.npz", cwd=tmp_path)
-    assert "q.npz: not an npz file" in error and "()" not in error
     q[4, 8] = 0.0
     np.savez(tmp_path / "q.npz", q=q)
     error = refused("sweep", "ets_vii", "--configurations", "q.npz", "-o", "q.npz", cwd=tmp_path)

@@ -71,18 +71,18 @@ def test_a_model_of_a_changed_robot_is_refused_by_what_uses_it():
     linearizer = fflin.Linearizer(robot)
     batch = fflin.sweep(robot, [robot.neutral()])
     robot.model.inertias[2].mass *= 2.0
-    for lin in (linearizer(), batch[0]):
-        for use in (
-            lambda: fflin.lqr(lin, 1.0, 1.0),
-            lambda: fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0),
-            lambda: fflin.kalman(lin, 1.0, 1.0),
-            lambda: fflin.momentum_reduction(lin),
-            lambda: lin.discretize(0.1),
-            lin.to_scipy,
-            lin.to_control,
-        ):
+    for use in (
+        lambda lin: fflin.lqr(lin, 1.0, 1.0),
+        lambda lin: fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0),
+        lambda lin: fflin.kalman(lin, 1.0, 1.0),
+        fflin.momentum_reduction,
+        lambda lin: lin.discretize(0.1),
+        fflin.LinearModel.to_scipy,
+        fflin.LinearModel.to_control,
+    ):
+        for lin in (linearizer(), batch[0]):
             with pytest.raises(fflin.ModelError, match="the inertia of joint 'joint_1'"):
-                use()
+                use(lin)
     with pytest.raises(fflin.ModelError, match="the inertia of joint 'joint_1'"):
         fflin.lqr_batch(batch, 1.0, 1.0)
 
