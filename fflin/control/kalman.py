@@ -182,6 +182,8 @@ def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -
         itself, so that a filter would stop correcting it.
     UnknownNameError
         If a name does not exist.
+    ModelError
+        If the robot's model was changed after it was made.
 
     References
     ----------

@@ -68,6 +68,8 @@ def lqr(lin: LinearModel, Q: Weight, R: Weight, N: ArrayLike | None = None) -> G
         not settle by itself.
     UnknownNameError
         If a name does not exist.
+    ModelError
+        If the robot's model was changed after it was made.
 
     Warns
     -----

@@ -86,7 +86,8 @@ class LinearModel(FrozenArrays):
     fflin_version, pinocchio_version : str
         What made the model.
     verified : bool
-        Whether it is as it was made; False of a file that has no digest to tell damage by.
+        Whether it is as it was made; False of a file that has no digest to tell damage by, and of
+        what is made of it.
     """
 
     A: Array
@@ -302,14 +303,16 @@ class LinearModel(FrozenArrays):
         ------
         MissingPackageError
             If python-control is not installed.
+        ModelError
+            If the robot's model was changed after it was made.
         """
+        self.require_unchanged()
         try:
             import control
         except ImportError:
             raise MissingPackageError(
                 "to_control needs python-control; install it with: pip install 'fflin[control]'"
             ) from None
-        self.require_unchanged()
         # python-control reserves dots in signal names for its own system.signal syntax.
         return control.ss(
             *(self.A, self.B, self.C, self.D, self.dt),
