@@ -253,8 +253,10 @@ def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
         raise InputError("expected a fflin.Robot, its fflin.LinearModel and a gain")
     K = as_double("gain", getattr(gain, "K", gain))
-    if K.shape != lin.B.T.shape or not np.isfinite(K).all():
-        raise InputError(f"K has shape {K.shape}, expected {lin.B.T.shape} of finite numbers")
+    if K.shape != lin.B.T.shape:
+        raise InputError(f"K has shape {K.shape}, expected {lin.B.T.shape}")
+    if not np.isfinite(K).all():
+        raise InputError("K has entries that are NaN or infinite, expected finite numbers")
     loop = Loop(robot, lin, K)
     if Actuation(loop.state).names != lin.input_names or not len(loop.watched):
         raise InputError(

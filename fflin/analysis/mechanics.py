@@ -20,6 +20,7 @@ def checked(lin: LinearModel) -> LinearModel:
     """Return a model whose state is positions and their rates, or raise `InputError`."""
     if not isinstance(lin, LinearModel):
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    lin.require_unchanged()
     nx = len(lin.A)
     if lin.M.shape != (nx // 2, nx // 2) or nx % 2:
         raise InputError(

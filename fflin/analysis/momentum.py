@@ -88,6 +88,8 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
     ------
     InputError
         If the point drifts in a direction that is left out, or `lin` is no linear model.
+    ModelError
+        If the robot's model was changed after it was made.
 
     References
     ----------

@@ -4,7 +4,7 @@ Models, gains, schedules, filters and motions are such records, and whoever read
 .json can read them. Each file carries a SHA-256 of its content, so that one that was damaged or
 edited is refused: the entry ``sha256`` of .npz (of the other entries) and .json (of the text
 before it), the header's text of .mat (of all that follows). One without it is read as it is, and
-what is made of it is not ``verified``.
+what is made of it is not ``verified``, nor written with one.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import MISSING, Field, dataclass, field, fields
+from errno import ENOMEM
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -39,10 +40,15 @@ NOT_VERIFIED = f"not verified: read from a file without a {SEAL}, which could te
 _BLOCK = 2**22
 _JSON_SEAL = re.compile(rb',\n"sha256": "([0-9a-f]{64})"\n}\n\Z')
 _MAT_TEXT, _MAT_SEAL = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
+_MAT_NEARLY = re.compile(rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE)  # a header that was sealed
 
 
-def write_record(path: Path, record: Mapping[str, Any]) -> None:
-    """Write a record, in the format that the ending says.
+class NoRoomError(FileError):
+    """What a file holds does not fit into the memory."""
+
+
+def write_record(path: Path, record: Mapping[str, Any], *, sealed: bool) -> None:
+    """Write a record, in the format that the ending says; with its digest where `sealed`.
 
     Raises
     ------
@@ -54,7 +60,7 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
     check_ending(path, FORMATS)
     require_finite(record)
     encode = {".npz": _to_npz, ".mat": _to_mat, ".json": _to_json}[path.suffix]
-    write_whole({path: encode(record)})
+    write_whole({path: encode(record, sealed)})
 
 
 def read_record(path: Path) -> tuple[Record, bool]:
@@ -85,7 +91,11 @@ def reading(path: Path, what: str) -> Iterator[None]:
         raise
     except FileNotFoundError:
         raise FileError(f"{path}: cannot be read: No such file or directory") from None
+    except MemoryError:
+        raise NoRoomError(f"{shown(path)}: does not fit into the memory") from None
     except Exception as error:  # each decoder has its own dozen
+        if isinstance(error, OSError) and error.errno == ENOMEM:
+            raise NoRoomError(f"{shown(path)}: does not fit into the memory") from None
         raise FileError(f"{shown(path)}: not a {what} saved by fflin ({reason(error)})") from None
 
 
@@ -137,13 +147,14 @@ def _sha256(data: Any) -> bytes:
     return hashlib.sha256(data).digest()
 
 
-def _to_npz(record: Mapping[str, Any]) -> bytes:
+def _to_npz(record: Mapping[str, Any], sealed: bool) -> bytes:
     buffer = io.BytesIO()
     plain: dict[str, Any] = {
         key: np.asarray(json.dumps(value) if isinstance(value, dict) else value)
         for key, value in record.items()
     }
-    plain[SEAL] = content_digest(plain)
+    if sealed:
+        plain[SEAL] = content_digest(plain)
     np.savez(buffer, **plain)
     return buffer.getvalue()
 
@@ -162,14 +173,16 @@ def check_seal(record: Record) -> bool:
     return seal is not None
 
 
-def _to_mat(record: Mapping[str, Any]) -> bytes:
+def _to_mat(record: Mapping[str, Any], sealed: bool) -> bytes:
     from scipy.io import savemat
 
     buffer = io.BytesIO()
     cells = {k: np.array(v, dtype=object) for k, v in record.items() if isinstance(v, list)}
     savemat(buffer, {**record, **cells}, oned_as="column")
     body = buffer.getvalue()[_MAT_TEXT:]
-    head = _MAT_SEAL + hashlib.sha256(body).hexdigest().encode()
+    head = b"MATLAB 5.0 MAT-file"
+    if sealed:
+        head = _MAT_SEAL + hashlib.sha256(body).hexdigest().encode()
     return head.ljust(_MAT_TEXT) + body
 
 
@@ -181,10 +194,12 @@ def _from_mat(content: bytes) -> tuple[Record, bool]:
         seal = content[len(_MAT_SEAL) : _MAT_TEXT].rstrip().decode()
         if seal != hashlib.sha256(content[_MAT_TEXT:]).hexdigest():
             raise ValueError(DAMAGED)
+    elif _MAT_NEARLY.search(content[:_MAT_TEXT]):
+        raise ValueError("its header was damaged or edited")
     return read_mat(content), sealed
 
 
-def _to_json(record: Mapping[str, Any]) -> bytes:
+def _to_json(record: Mapping[str, Any], sealed: bool) -> bytes:
     def plain(value: Any) -> Any:
         if isinstance(value, np.ndarray) and value.dtype.kind == "c":
             return {"real": value.real.tolist(), "imag": value.imag.tolist()}
@@ -192,7 +207,8 @@ def _to_json(record: Mapping[str, Any]) -> bytes:
 
     lines = (f"{json.dumps(k)}: {json.dumps(plain(v), allow_nan=False)}" for k, v in record.items())
     body = ("{\n" + ",\n".join(lines)).encode()
-    return body + f',\n"{SEAL}": "{hashlib.sha256(body).hexdigest()}"\n}}\n'.encode()
+    seal = f',\n"{SEAL}": "{hashlib.sha256(body).hexdigest()}"' if sealed else ""
+    return body + f"{seal}\n}}\n".encode()
 
 
 def _from_json(content: bytes) -> tuple[Record, bool]:
@@ -214,7 +230,8 @@ class Design(FrozenArrays):
     Attributes
     ----------
     verified : bool
-        Whether it is as it was made; False of a file that has no digest to tell damage by.
+        Whether it is as it was made; False of a file that has no digest to tell damage by, and of
+        what is designed from it.
     """
 
     # Names of the arrays of one dimension, which Matlab does not know.
@@ -239,7 +256,7 @@ class Design(FrozenArrays):
         for item in _saved(type(self)):
             value = getattr(self, item.name)
             record[item.name] = list(value) if isinstance(value, tuple) else value
-        write_record(as_path(path), record)
+        write_record(as_path(path), record, sealed=self.verified)
 
     @classmethod
     def load(cls: type[Kind], path: str | Path) -> Kind:

@@ -66,6 +66,8 @@ def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
 def number(name: str, value: Any) -> float:
     """Return a finite float, or raise `InputError` that says what was given."""
     refuse_masked(name, value)
+    if isinstance(value, bool | np.bool_):
+        raise InputError(f"{name} is {value}, expected a number")
     try:
         result = float(value)
     except (TypeError, ValueError, OverflowError):

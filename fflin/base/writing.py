@@ -26,6 +26,8 @@ def as_path(path: Any) -> Path:
     """Return a path, or raise `InputError` where it is none."""
     if not isinstance(path, str | os.PathLike) or "\0" in str(path):
         raise InputError(f"{path!r} is not a path")
+    if not str(path):
+        raise InputError("the path is empty; name a file")
     return Path(path)
 
 
@@ -167,7 +169,10 @@ def reserve(path: Path) -> None:
 def reason(error: Exception) -> str:
     """Return why a file could not be opened, in a line."""
     said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    return " ".join(said.split())
+    if isinstance(error, KeyError) and said.strip("'").isidentifier():
+        said = f"it has no entry {said}"
+    ends = "it ends too early" if isinstance(error, EOFError) else type(error).__name__
+    return " ".join(said.split()) or ends
 
 
 def shown(path: str | Path) -> str:

@@ -271,6 +271,10 @@ def _range(robot: Robot, joint: Joint, given: Any) -> tuple[float, float]:
             raise InputError(
                 f"range of '{joint.name}' is {low:g} to {high:g}, expected low to high"
             )
+        if math.isinf(high - low):
+            raise InputError(
+                f"range of '{joint.name}' is {low:g} to {high:g}, wider than all numbers; narrow it"
+            )
         return low, high
     if joint.unbounded:
         return _TURN

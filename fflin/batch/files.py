@@ -77,8 +77,8 @@ def header(batch: Any, count: int) -> str:
     return json.dumps({**texts, "points": count, "columns": batch.columns})
 
 
-def write_batch(path: Path, arrays: Mapping[str, Array], header: str) -> None:
-    """Write the arrays of a batch; see `LinearBatch.save`."""
+def write_batch(path: Path, arrays: Mapping[str, Array], header: str, *, sealed: bool) -> None:
+    """Write the arrays of a batch, with their digests where `sealed`; see `LinearBatch.save`."""
     check_format(path)
     constants = {key: value[0] for key, value in arrays.items() if is_constant(value)}
     varying = {key: value for key, value in arrays.items() if key not in constants}
@@ -86,20 +86,23 @@ def write_batch(path: Path, arrays: Mapping[str, Array], header: str) -> None:
     with replacing(path) as (new,):
         if path.suffix == ".npz":
             plain: dict[str, Any] = {**varying, **constants, **texts}
-            with new.open("wb") as file:
+            if sealed:
                 plain[SEAL] = content_digest(plain)
+            with new.open("wb") as file:
                 np.savez(file, **plain)
             return
-        count = len(arrays["q"])
-        row = sum(value.nbytes // count for value in varying.values())
-        chunk = max(1, _CHUNK_BYTES // row)
-        seals = chunk_seals(varying, count, chunk)
         with hdf5().File(new, "w", libver=CHECKED) as file:
-            for key, value in {**varying, **constants, CHUNK_SEALS: seals}.items():
+            for key, value in {**varying, **constants}.items():
                 file.create_dataset(key, data=value)
-            file.create_dataset(SEAL, data=batch_seal(texts, chunk, seals, constants))
             file.attrs.update(texts)
-            file.attrs["chunk"] = chunk
+            if sealed:
+                count = len(arrays["q"])
+                row = sum(value.nbytes // count for value in varying.values())
+                chunk = max(1, _CHUNK_BYTES // row)
+                seals = chunk_seals(varying, count, chunk)
+                file.create_dataset(CHUNK_SEALS, data=seals)
+                file.create_dataset(SEAL, data=batch_seal(texts, chunk, seals, constants))
+                file.attrs["chunk"] = chunk
 
 
 def chunk_seal(arrays: Mapping[str, Array]) -> bytes:

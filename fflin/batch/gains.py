@@ -168,6 +168,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
         raise InputError(f"batch is a {type(batch).__name__}, expected a LinearBatch of sweep")
     if not len(batch):
         raise InputError("the batch has no points")
+    batch[0].require_unchanged()
     Q = weight("Q", Q, batch.state_names)
     R = weight("R", R, batch.input_names, definite=True)
     nv, nu = batch.B_lower.shape[1:]
@@ -199,6 +200,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
         input_names=batch.input_names,
         frame=batch.frame,
         robot=batch.robot,
+        verified=batch.verified,
     )
 
 

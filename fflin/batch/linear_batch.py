@@ -233,7 +233,8 @@ class LinearBatch:
         """
         if not len(self):
             raise InputError("the batch has no points; there is nothing to save")
-        write_batch(as_path(path), self._arrays(), header(self, len(self)))
+        text = header(self, len(self))
+        write_batch(as_path(path), self._arrays(), text, sealed=self.verified)
 
     @staticmethod
     def load(path: str | Path, robot: Robot | None = None, *, verify: bool = True) -> LinearBatch:

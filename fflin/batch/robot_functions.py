@@ -47,9 +47,10 @@ def functions_of(
         "_certify": certify,
         "_inertia": inertia_matrix,
         "_ignorable": ignorable_states,
+        "_limits": joint_limits,
     }
-    functions["_limits"] = joint_limits
-    return {field: partial(function, robot) for field, function in functions.items()}
+    of_robot = {field: partial(function, robot) for field, function in functions.items()}
+    return of_robot | {"_require_unchanged": robot.require_unchanged}
 
 
 def own_reference(root: Array, base: Array) -> Array:

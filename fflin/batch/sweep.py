@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinWarning, InputError, SweepError, listed
+from fflin.base.errors import FflinWarning, FileError, InputError, SweepError, listed
+from fflin.base.record import NoRoomError
 from fflin.base.validation import whole
 from fflin.batch.chunks import ChunkJob
 from fflin.batch.configurations import Configurations, as_configurations
@@ -266,10 +267,18 @@ def _finish(task: SweepTask, store: FileStore | MemoryStore, path: Path | None) 
             batch.save(path)
         return batch
     store.complete()
-    if store.path.suffix == ".npz":
+    if store.path.suffix != ".npz":
+        return _written(store.path, task)
+    try:
         _written(store.part, task).save(store.path)
-        store.part.unlink()
-    return _written(store.path, task)
+        batch = _written(store.path, task)
+    except (MemoryError, NoRoomError):
+        raise FileError(
+            f"{store.path}: the memory does not suffice for .npz; all is kept in {store.part}, "
+            "which is HDF5: rename it to end in .h5, and write to .h5 another time"
+        ) from None
+    store.part.unlink()
+    return batch
 
 
 def _written(path: Path, task: SweepTask) -> LinearBatch:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 from contextlib import nullcontext
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fflin.base.errors import InputError
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, add_point, command, number
+from fflin.commands.arguments import Commands, add_point, command, file_name, number
 from fflin.commands.points import linear_model
 from fflin.commands.regulator import add_weights, gain_of, regulated_part
 from fflin.commands.visual import check_figure
@@ -56,7 +55,7 @@ def add_commands(commands: Commands) -> None:
         help = f"{what}; {default:g} by default"
         validity.add_argument(f"--{name}", metavar=metavar, type=read, default=default, help=help)
     validity.add_argument(
-        "--plot", metavar="FILE", type=Path, help="draw it into FILE: .png, .pdf or .svg"
+        "--plot", metavar="FILE", type=file_name, help="draw it into FILE: .png, .pdf or .svg"
     )
 
 

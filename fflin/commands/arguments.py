@@ -23,6 +23,13 @@ def number(text: str) -> float:
     return value
 
 
+def file_name(text: str) -> Path:
+    """Read the name of a file."""
+    if not text:
+        raise argparse.ArgumentTypeError("the name of the file is empty")
+    return Path(text)
+
+
 def assignment(text: str) -> tuple[str, float]:
     """Read NAME=VALUE."""
     name, separator, value = text.rpartition("=")
@@ -190,5 +197,5 @@ def add_system(command: argparse.ArgumentParser) -> None:
 def add_output_file(command: argparse.ArgumentParser, what: str) -> None:
     """Add -o FILE; `what` says which endings there are."""
     command.add_argument(
-        "-o", "--output-file", metavar="FILE", dest="output_file", type=Path, help=what
+        "-o", "--output-file", metavar="FILE", dest="output_file", type=file_name, help=what
     )

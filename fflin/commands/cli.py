@@ -32,7 +32,8 @@ class _Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
 
     def error(self, message: str) -> NoReturn:
-        self.exit(BAD_INPUT, f"fflin: error: {message} (see {self.prog} --help)\n")
+        _tell(f"fflin: error: {message} (see {self.prog} --help)")
+        self.exit(BAD_INPUT)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -54,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
         text = " ".join(str(message).split())
         if issubclass(category, FflinWarning):
-            print(f"fflin: warning: {text}", file=sys.stderr)
+            _tell(f"fflin: warning: {text}")
         else:
             held.append(f"fflin: {category.__name__}: {text}")
 
@@ -68,19 +69,27 @@ def main(argv: Sequence[str] | None = None) -> int:
         if sys.stdout is not None:
             sys.stdout.flush()
         for line in held:
-            print(line, file=sys.stderr)
+            _tell(line)
         return code
     except (FflinError, FflinWarning) as error:  # a warning where Python is told to raise them
-        print(f"fflin: error: {' '.join(str(error).split())}", file=sys.stderr)
+        _tell(f"fflin: error: {' '.join(str(error).split())}")
         return BAD_INPUT
     except BrokenPipeError:
         # The reader, such as head, has what it wanted; the interpreter must not complain either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as error:
-        print(f"fflin: error: the output cannot be written: {error.strerror}", file=sys.stderr)
+        _tell(f"fflin: error: the output cannot be written: {error.strerror}")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BAD_INPUT
+
+
+def _tell(line: str) -> None:
+    """Write a line to stderr; the exit code tells enough where that cannot be written."""
+    try:
+        print(line, file=sys.stderr, flush=True)
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinWarning, InputError
@@ -18,6 +17,7 @@ from fflin.commands.arguments import (
     add_system,
     add_values,
     command,
+    file_name,
     number,
 )
 from fflin.commands.points import configuration_of, inputs_at, load_robot, once, placed, velocity_of
@@ -85,7 +85,7 @@ def add_commands(commands: Commands) -> None:
     simulate.add_argument(
         "--plot",
         metavar="FILE",
-        type=Path,
+        type=file_name,
         help="draw linear beside nonlinear into FILE: .png, .pdf or .svg",
     )
     add_output_file(simulate, "save the motion to FILE: .npz, .mat, .json or .csv")

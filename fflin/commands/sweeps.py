@@ -21,6 +21,7 @@ from fflin.commands.arguments import (
     add_system,
     add_values,
     command,
+    file_name,
     number,
 )
 from fflin.commands.points import configuration_of, load_robot, once, velocity_of
@@ -63,7 +64,7 @@ def add_commands(commands: Commands) -> None:
     points.add_argument(
         "--configurations",
         metavar="FILE.npz",
-        type=Path,
+        type=file_name,
         help="q (N, nq) in Pinocchio's order, as numpy.savez writes it, and if it has them v "
         "(N, nv) and u (N, nu)",
     )

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, add_pose, add_robot, command, number
+from fflin.commands.arguments import Commands, add_pose, add_robot, command, file_name, number
 from fflin.commands.points import configuration_of, load_robot
 
 if TYPE_CHECKING:
@@ -41,16 +41,19 @@ def add_commands(commands: Commands) -> None:
 def add_pictures(command: argparse.ArgumentParser) -> None:
     """Add the options of a command that makes a motion: files to show it in, and how."""
     command.add_argument(
-        "--html", metavar="FILE", type=Path, help="write a page that plays it without a network"
+        "--html",
+        metavar="FILE",
+        type=file_name,
+        help="write a page that plays it without a network",
     )
     command.add_argument(
         "--png",
         metavar="FILE",
-        type=Path,
+        type=file_name,
         help="write a picture (takes Chromium): a strip of four, or at the --times that are given",
     )
     command.add_argument(
-        "--gif", metavar="FILE", type=Path, help="write an animated picture (takes Chromium)"
+        "--gif", metavar="FILE", type=file_name, help="write an animated picture (takes Chromium)"
     )
     command.add_argument(
         "--times", metavar="T", type=number, nargs="+", help="when [s] pictures are taken"

@@ -70,6 +70,8 @@ def acceleration_lqr(
     InputError
         If the model is not of double integrators, or a weight is not a diagonal, negative, or zero
         where it must not be: Qp and Ra are positive.
+    ModelError
+        If the robot's model was changed after it was made.
 
     References
     ----------

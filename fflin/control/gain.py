@@ -140,6 +140,7 @@ def make_gain(
         R=R,
         N=np.zeros(lin.B.shape) if N is None else N,
         weights=weights,
+        verified=lin.verified,
     )
 
 

@@ -182,6 +182,8 @@ def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -
         itself, so that a filter would stop correcting it.
     UnknownNameError
         If a name does not exist.
+    ModelError
+        If the robot's model was changed after it was made.
 
     References
     ----------
@@ -214,6 +216,7 @@ def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -
         margin,
         W=W,
         V=V,
+        verified=lin.verified,
         **{key: getattr(lin, key) for key in _FROM_MODEL},
     )
 
@@ -258,6 +261,7 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
         input_names=e.output_names,
         output_names=e.input_names,
         robot=e.robot,
+        verified=gain.verified and e.verified,
     )
 
 

@@ -84,6 +84,8 @@ def lqr(
         not settle by itself.
     UnknownNameError
         If a name does not exist.
+    ModelError
+        If the robot's model was changed after it was made.
 
     Warns
     -----
@@ -106,11 +108,12 @@ def lqr(
 
 
 def require_fixed_point(lin: LinearModel) -> None:
-    """Raise `EquilibriumError` with what of f0 is not zero."""
+    """Raise `EquilibriumError` with what of f0 is not zero; `ModelError` of a changed robot."""
     if not isinstance(lin, LinearModel):
         raise InputError(
             f"lin is a {type(lin).__name__}, expected a LinearModel; fflin.linearize makes one"
         )
+    lin.require_unchanged()
     if lin.is_equilibrium():
         return
     rate = lin.f0 if lin.drift is None else lin.drift

@@ -65,11 +65,13 @@ class StateFeedback:
                 "the model is about a moving reference; follow it with TrajectoryFeedback"
             )
         K, shape = as_double("K", self.K), self.lin.B.shape[::-1]
-        if K.shape != shape or not np.isfinite(K).all():
+        if K.shape != shape:
             raise InputError(
-                f"K has shape {K.shape}, expected {shape} (nu, nx) and finite numbers; take the "
-                "gain that was designed for this model"
+                f"K has shape {K.shape}, expected {shape} (nu, nx); take the gain that was "
+                "designed for this model"
             )
+        if not np.isfinite(K).all():
+            raise InputError("K has entries that are NaN or infinite, expected finite numbers")
         K.setflags(write=False)
         object.__setattr__(self, "K", K)
 

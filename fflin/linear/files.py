@@ -55,15 +55,16 @@ def record_of(lin: Any) -> Record:
     return entries
 
 
-def write_model(path: Path, entries: Record) -> None:
-    """Write what `record_of` returns; see `LinearModel.save`."""
+def write_model(path: Path, entries: Record, *, sealed: bool) -> None:
+    """Write what `record_of` returns, with its digest where `sealed`; see `LinearModel.save`."""
     check_ending(path, FORMATS)
     if path.suffix != ".csv":
-        record.write_record(path, entries)
+        record.write_record(path, entries, sealed=sealed)
         return
     record.require_finite(entries)
     contents = {key: _csv_text(rows) for key, rows in _tables(entries).items()}
-    contents["info"] += f"{record.SEAL},{_seal(contents)}\n".encode()
+    if sealed:
+        contents["info"] += f"{record.SEAL},{_seal(contents)}\n".encode()
     write_whole({_csv_path(path, key): content for key, content in contents.items()})
 
 

@@ -86,7 +86,8 @@ class LinearModel(FrozenArrays):
     fflin_version, pinocchio_version : str
         What made the model.
     verified : bool
-        Whether it is as it was made; False of a file that has no digest to tell damage by.
+        Whether it is as it was made; False of a file that has no digest to tell damage by, and of
+        what is made of it.
     """
 
     A: Array
@@ -123,6 +124,8 @@ class LinearModel(FrozenArrays):
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
     _limits: Callable[[], Mapping[str, float]] | None = None
+    # Raises `ModelError` where the robot that it was made of was changed.
+    _require_unchanged: Callable[[], None] | None = None
 
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> LinearModel:
@@ -198,6 +201,11 @@ class LinearModel(FrozenArrays):
                 "with fflin.check"
             )
 
+    def require_unchanged(self) -> None:
+        """Raise `ModelError` where the robot was changed in place after it was made."""
+        if self._require_unchanged is not None:
+            self._require_unchanged()
+
     @property
     def generator(self) -> LinearModel | None:
         """The continuous model that this is sampled from, or itself.
@@ -272,7 +280,10 @@ class LinearModel(FrozenArrays):
         ------
         InputError
             If `dt` is not positive or the model is sampled already.
+        ModelError
+            If the robot's model was changed after it was made.
         """
+        self.require_unchanged()
         dt = number("dt", dt)
         if dt <= 0.0:
             raise InputError(f"dt is {dt:g} s, expected a positive sampling time")
@@ -291,6 +302,7 @@ class LinearModel(FrozenArrays):
         """Return a `scipy.signal.StateSpace` of the deviations; names and f0 are lost."""
         from scipy.signal import StateSpace
 
+        self.require_unchanged()
         matrices = (self.A, self.B, self.C, self.D)
         return StateSpace(*matrices, dt=self.dt) if self.dt else StateSpace(*matrices)
 
@@ -301,7 +313,10 @@ class LinearModel(FrozenArrays):
         ------
         MissingPackageError
             If python-control is not installed.
+        ModelError
+            If the robot's model was changed after it was made.
         """
+        self.require_unchanged()
         try:
             import control
         except ImportError:
@@ -334,7 +349,7 @@ class LinearModel(FrozenArrays):
         from fflin.base.writing import as_path
         from fflin.linear.files import record_of, write_model
 
-        write_model(as_path(path), record_of(self))
+        write_model(as_path(path), record_of(self), sealed=self.verified)
 
     @staticmethod
     def load(path: str | Path) -> LinearModel:

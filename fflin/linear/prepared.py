@@ -123,6 +123,7 @@ def prepare(
             "_certify": partial(certify, robot),
             "_ignorable": partial(ignorable_states, robot),
             "_limits": partial(joint_limits, robot),
+            "_require_unchanged": robot.require_unchanged,
         },
         rest={
             "A": frozen(at_rest(state)),

@@ -145,6 +145,8 @@ def find_inputs(inputs: str | Path) -> Path:
     """
     if not isinstance(inputs, str | os.PathLike) or "\0" in str(inputs):
         raise InputError(f"{inputs!r} is not the path of a file of inputs")
+    if not str(inputs):
+        raise InputError("the name of the file of inputs is empty")
     bundled = {path.stem: path for path in bundled_directory().glob("*.toml")}
     path = Path(inputs)
     if str(inputs) in bundled:

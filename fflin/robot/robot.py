@@ -99,11 +99,12 @@ class Robot:
     package_dirs: tuple[Path, ...] = ()
     # Where some of its joints are wheels: the same robot without them.
     _wheelless: Robot | None = None
-    # What the model was when the robot was made.
-    _as_made: pin.Model = field(init=False)
+    # The model, and what it was when the first robot of it was made.
+    _as_made: tuple[pin.Model, pin.Model] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_as_made", self.model.copy())
+        if self._as_made is None or self._as_made[0] is not self.model:
+            object.__setattr__(self, "_as_made", (self.model, self.model.copy()))
         if not self.inputs:
             object.__setattr__(self, "inputs", default_inputs(self.joint_names))
 
@@ -330,8 +331,10 @@ class Robot:
 
         Results prepared before the change would be of another robot than those made after it.
         """
+        assert self._as_made is not None
+        made = self._as_made[1]
         # Tells in a microsecond that nothing at all was changed.
-        if self.model != self._as_made and (change := change_in(self.model, self._as_made)):
+        if self.model != made and (change := change_in(self.model, made)):
             raise ModelError(
                 f"the model of '{self.name}' was changed after the robot was made: {change}; make "
                 "a robot of it with fflin.from_model(model)"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from fflin.base.errors import InputError
+from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array, number, whole
 from fflin.control.channel import Channel, Law
 from fflin.control.policies import Allocation, bound
@@ -26,6 +27,7 @@ LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
 LARGEST_TURN = 1.0  # within one step [rad], beyond which no integrator follows
 _STEP = 0.01  # [s]
 _MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
+_MANY_STEPS = 100_000  # some seconds
 _LONGEST = 1e100  # [s]; the square of its inverse is still a number
 
 
@@ -52,14 +54,23 @@ class Times(NamedTuple):
     def require_room(self, width: int, *, chosen: bool) -> None:
         """Raise `InputError` where rows of so many numbers, or the steps, are too many.
 
-        `chosen` says that the step was chosen here and not given.
+        `chosen` says that the step was chosen here and not given; where the loop's fastest pole
+        asks for many steps, an `FflinWarning` says so.
         """
+        forced = chosen and self.fastest * _STEP > 1.0
         if self.rows * width > _MOST_ENTRIES or self.steps > _MOST_STEPS:
             asked = f", which the loop's fastest pole at {self.fastest:.3g} 1/s asks for,"
             raise InputError(
                 f"{self.steps * self.dt:g} s in steps of {self.dt:g} s"
-                f"{asked if chosen and self.dt < _STEP and self.fastest else ''} are "
+                f"{asked if forced else ''} are "
                 f"{self.steps:.3g} steps and {self.rows:.3g} rows; take a larger dt or `every`"
+            )
+        if forced and self.steps > _MANY_STEPS:
+            warnings.warn(
+                f"the loop's fastest pole at {self.fastest:.3g} 1/s asks for steps of "
+                f"{self.dt:.3g} s, {self.steps:,} in all; give dt=, or take a slower gain",
+                FflinWarning,
+                stacklevel=3,
             )
 
 

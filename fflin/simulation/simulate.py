@@ -130,6 +130,11 @@ def simulate(
     UnknownNameError
         If there is no such method or input.
 
+    Warns
+    -----
+    FflinWarning
+        If the loop's fastest pole asks for more than 100,000 steps.
+
     References
     ----------
     E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.

@@ -59,7 +59,8 @@ def content(thing):
     if isinstance(thing, fflin.LinearModel):
         held |= {"M": thing.M.tobytes(), "certificate": thing.certificate}
         held["ignorable"] = thing.ignorable
-    held.pop("_ignorable", None)
+    for name in ("_ignorable", "_require_unchanged"):
+        held.pop(name, None)
     return held
 
 
@@ -146,9 +147,10 @@ def test_a_file_without_a_digest_is_read_and_said_to_be_unverified(kind, ending,
     assert str(read).endswith(NOT_VERIFIED)
     if kind == "batch":
         assert not read[0].verified
-    # Saved anew it has one of its own.
+    # Saved anew it has none either.
     read.save(path)
-    assert type(thing).load(path).verified
+    anew = type(thing).load(path)
+    assert not anew.verified and content(anew) == content(thing)
 
 
 @pytest.mark.parametrize("ending", [".mat", ".npz", ".json"])
@@ -264,8 +266,36 @@ def test_verified_is_kept_where_a_thing_is_changed(tmp_path):
     made("model").save(path)
     unsealed(path)
     read = fflin.LinearModel.load(path)
-    assert not read.discretize(0.1).verified and not replace(read, u0=read.u0 + 1.0).verified
+    gain, estimator = fflin.lqr(read, 1.0, 1.0), fflin.kalman(read, 1.0, 1.0)
+    sound = fflin.lqr(made("model"), 1.0, 1.0)
+    made_of_it = (
+        *(read.discretize(0.1), replace(read, u0=read.u0 + 1.0), fflin.momentum_reduction(read)),
+        *(gain, fflin.acceleration_lqr(read, 1.0, 1.0, 1.0), estimator),
+        *(fflin.lqg(gain, made("estimator")), fflin.lqg(sound, estimator)),
+        fflin.lqr_batch(replace(made("batch"), verified=False), 1.0, 1.0),
+    )
+    assert not any(each.verified for each in made_of_it)
+    assert fflin.lqg(sound, made("estimator")).verified
     assert all(made(kind).verified for kind in FORMATS)
+
+
+@pytest.mark.parametrize("kind", ["model", "gain"])
+def test_a_header_of_mat_that_is_nearly_sealed_is_refused(kind, tmp_path):
+    path = tmp_path / "x.mat"
+    made(kind).save(path)
+    data = path.read_bytes()
+    for bit in range(8 * 116):
+        damaged = bytearray(data)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        with pytest.raises(fflin.FileError):
+            type(made(kind)).load(path)
+
+
+def test_a_record_of_others_says_what_it_has_not(tmp_path):
+    np.savez(tmp_path / "x.npz", a=1.0)
+    with pytest.raises(fflin.FileError, match="it has no entry 'state_names'"):
+        fflin.LinearModel.load(tmp_path / "x.npz")
 
 
 def test_a_batch_that_is_not_held_against_its_digest_says_so(tmp_path):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.base.writing import check_place, replacing, write_whole
+from fflin.base.writing import check_place, reason, replacing, write_whole
 from fflin.robot.catalog import bundled_directory
 
 # What each command writes, with the option that names it.
@@ -287,3 +287,9 @@ def test_the_room_of_a_sweep_is_its_own_from_the_start(tmp_path):
     points = fflin.random_configurations(robot, 20_000)
     fflin.sweep(robot, points, out=tmp_path / "x.h5", chunk=1000, progress=look, threads=1)
     assert held[0] >= 1.0
+
+
+def test_a_reason_is_never_empty():
+    assert reason(EOFError()) == "it ends too early"
+    assert reason(NotImplementedError()) == "NotImplementedError"
+    assert reason(KeyError("q")) == "it has no entry 'q'"

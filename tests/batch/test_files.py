@@ -1,5 +1,6 @@
 """Batches on disk: exact, whole or not at all, and resumed after a crash."""
 
+import errno
 import signal
 import subprocess
 import sys
@@ -231,3 +232,23 @@ def test_a_failed_chunk_leaves_the_others_in_the_file(tmp_path):
         ):
             fflin.sweep(robot, configurations, chunk=10, out=tmp_path / "b.h5")
     assert [entry.name for entry in tmp_path.iterdir()] == ["b.h5.part"]
+
+
+@pytest.mark.parametrize("step", ["read", "write"])
+def test_an_npz_that_does_not_fit_into_the_memory_leaves_its_hdf5(step, tmp_path, monkeypatch):
+    robot, path = fflin.load("cubesat"), tmp_path / "x.npz"
+    points = fflin.random_configurations(robot, 20)
+    full = OSError(errno.ENOMEM, "Cannot allocate memory") if step == "read" else MemoryError()
+
+    def fails(*_, **__):
+        raise full
+
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "memmap" if step == "read" else "savez", fails)
+        with pytest.raises(fflin.FileError, match=r"memory does not suffice .*\.part.*\.h5"):
+            fflin.sweep(robot, points, out=path)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["x.npz.part"]
+    whole = path.with_name("x.npz.part").rename(tmp_path / "x.h5")
+    batch = fflin.LinearBatch.load(whole, robot)
+    assert batch.verified
+    np.testing.assert_array_equal(batch.B_lower, fflin.sweep(robot, points).B_lower)

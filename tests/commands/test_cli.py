@@ -277,6 +277,21 @@ def test_unwritable_stdout_is_one_line():
     assert done.stderr == "fflin: error: the output cannot be written: No space left on device\n"
 
 
+@pytest.mark.parametrize("arguments", [("check", "nosuch"), ("check",)])
+def test_unwritable_stderr_does_not_change_the_exit_code(arguments):
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "fflin", *arguments]
+        assert subprocess.run(command, stderr=full, check=False).returncode == 2
+
+
+def test_an_empty_name_is_said_to_be_empty():
+    assert "is empty" in refused("linearize", "cubesat", "-o", "")
+    assert "is empty" in refused("linearize", "cubesat", "--inputs", "")
+    assert "is empty" in refused("simulate", "cubesat", "--duration", "1", "--plot", "")
+    with pytest.raises(fflin.InputError, match="path is empty"):
+        fflin.linearize(fflin.load("cubesat")).save("")
+
+
 def test_negative_numbers_are_no_options():
     code, out, _ = run("check", "cubesat", "--rpy", "-30", "-1e-3", "0", "--position", "-.5", 0, 0)
     assert code == 0 and "OK" in out

@@ -60,6 +60,7 @@ def test_grid_random_and_file_say_the_same(tmp_path, robots):
             r"10,000,000,000 points of 'ets_vii', [\d.]+ TB: add --yes",
         ),
         (("--random", "0"), "0 is too few"),
+        (("--random", "3", "--range", "joint_1=-1e308:1e308"), "wider than all numbers"),
         (("--random", "3", "--grid", "joint_2=0:1:2"), "by one of --grid"),
         (("--random", "3", "--joint", "joint_2=1", "--range", "joint_2=0:1"), "give either"),
         (("--configurations", "none.npz"), "none.npz: cannot be read"),

@@ -53,6 +53,8 @@ def test_bad_sampling_times(rest):
     for dt in (np.nan, "fast"):
         with pytest.raises(fflin.InputError, match="expected a"):
             rest.discretize(dt)
+    with pytest.raises(fflin.InputError, match="dt is True, expected a number"):
+        rest.discretize(True)
     with pytest.raises(fflin.InputError, match="sampled already"):
         rest.discretize(0.1).discretize(0.1)
 

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -63,6 +64,46 @@ def test_a_changed_model_is_refused_wherever_results_are_made(change, said, tmp_
         with pytest.raises(fflin.ModelError, match=f"changed after .*: {said}; .*from_model"):
             result()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_model_of_a_changed_robot_is_refused_by_what_uses_it():
+    robot = fflin.load("ets_vii")
+    linearizer = fflin.Linearizer(robot)
+    batch = fflin.sweep(robot, [robot.neutral()])
+    robot.model.inertias[2].mass *= 2.0
+    for use in (
+        lambda lin: fflin.lqr(lin, 1.0, 1.0),
+        lambda lin: fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0),
+        lambda lin: fflin.kalman(lin, 1.0, 1.0),
+        fflin.momentum_reduction,
+        lambda lin: lin.discretize(0.1),
+        fflin.LinearModel.to_scipy,
+        fflin.LinearModel.to_control,
+    ):
+        for lin in (linearizer(), batch[0]):
+            with pytest.raises(fflin.ModelError, match="the inertia of joint 'joint_1'"):
+                use(lin)
+    with pytest.raises(fflin.ModelError, match="the inertia of joint 'joint_1'"):
+        fflin.lqr_batch(batch, 1.0, 1.0)
+
+
+def test_what_is_made_of_a_model_remembers_the_robot():
+    robot = fflin.load("ets_vii", lock=["joint_6"])
+    lin = fflin.linearize(robot)
+    made = [lin.discretize(0.1), fflin.momentum_reduction(lin), replace(lin, u0=lin.u0 + 1.0)]
+    heavier(robot.model)
+    for each in made:
+        with pytest.raises(fflin.ModelError, match="the inertia of joint 'joint_1'"):
+            each.to_scipy()
+
+
+def test_a_replaced_robot_remembers_what_was_made():
+    robot = fflin.load("ets_vii")
+    heavier(robot.model)
+    with pytest.raises(fflin.ModelError, match="the inertia of joint 'joint_1'"):
+        fflin.linearize(replace(robot, name="x"))
+    fresh = replace(robot, model=robot.model.copy())
+    assert fflin.linearize(fresh).certificate.route_B < 1e-9
 
 
 def test_a_robot_made_of_the_changed_model_works_and_differs():

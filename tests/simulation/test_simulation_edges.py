@@ -324,3 +324,32 @@ def test_a_motion_that_is_not_finite_is_not_saved(tmp_path):
         with pytest.raises(fflin.InputError, match="not finite; it is not saved"):
             bad.save(tmp_path / name)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_step_that_a_fast_gain_makes_short_is_told_once():
+    robot = free_body((20.0, 30.0, 40.0))
+    lin = fflin.linearize(robot)
+    K = fflin.lqr(lin, 1.0, 1.0).K
+
+    def at_once(t, q, v):
+        return -1.0
+
+    with pytest.warns(fflin.FflinWarning) as told:
+        fflin.simulate(robot, fflin.StateFeedback(lin, 1e6 * K), duration=2.0, events=[at_once])
+    (said,) = [str(each.message) for each in told]
+    poles = np.abs(np.linalg.eigvals(lin.A - lin.B @ (1e6 * K)))
+    assert f"fastest pole at {poles.max():.3g} 1/s" in said and "give dt=" in said
+    steps = int(said.split(" in all")[0].split()[-1].replace(",", ""))
+    assert 1e5 < steps <= 2.0 * 2.0 * poles.max() + 1.0
+    # Neither where the step is given, nor where it is not the pole that asks for so many.
+    for gain, times in ((1e6, {"dt": 1e-5}), (1.0, {"duration": 2000.0})):
+        policy = fflin.StateFeedback(lin, gain * K)
+        fflin.simulate(robot, policy, **{"duration": 2.0} | times, events=[at_once])
+
+
+def test_a_gain_that_is_not_finite_is_said_to_hold_nan():
+    lin = fflin.linearize(free_body((20.0, 30.0, 40.0)))
+    with pytest.raises(fflin.InputError, match="K has entries that are NaN"):
+        fflin.StateFeedback(lin, np.full((6, 12), np.nan))
+    with pytest.raises(fflin.InputError, match=r"shape \(6, 6\), expected \(6, 12\)"):
+        fflin.StateFeedback(lin, np.eye(6))
