@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import count, pairwise
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ from fflin.robot.robot import Robot
 # A run has settled where its error is this share of the first, in the norm of its Lyapunov
 # function, and has diverged where it is this many times as large.
 SETTLED, DIVERGED = 1e-3, 1e3
+
+_LSODA_TURN = Lock()
 
 # A run has left the chart where 1 - |q_b|^2 is less: within 4 degrees of a turn of 180.
 _EDGE = 1e-3
@@ -186,16 +189,18 @@ class Loop:
             return float(self._outcome(x, first) == "slow") - 0.5
 
         ended.terminal = True  # type: ignore[attr-defined]
-        # A loop with fast poles is stiff; LSODA finds that out and changes its method.
-        found = solve_ivp(
-            lambda _, x: dynamics(x, self._input(x)),
-            (times[0], times[-1]),
-            x,
-            method="LSODA",
-            t_eval=times,
-            events=ended,
-            **_tolerances(x, precision),
-        )
+        # A loop with fast poles is stiff; LSODA finds that out and changes its method. That of
+        # ODEPACK keeps its state for the whole process.
+        with _LSODA_TURN:
+            found = solve_ivp(
+                lambda _, x: dynamics(x, self._input(x)),
+                (times[0], times[-1]),
+                x,
+                method="LSODA",
+                t_eval=times,
+                events=ended,
+                **_tolerances(x, precision),
+            )
         motion += list(found.y.T[1:, self.watched] - self.lin.x0)
         if found.t_events[0].size:
             return self._outcome(found.y_events[0][-1], first, slack=1e-3)

@@ -73,7 +73,9 @@ class OwnWorkers(Executor):
             self._closed = True
             for process in self._processes:
                 process.terminate()
-        self._threads.shutdown(wait=wait, cancel_futures=True)
+        # The threads end with their processes. To join them could take for ever: Ctrl-C in the
+        # middle of waiting for a future leaves its lock taken, which they need to say the end.
+        self._threads.shutdown(wait=False, cancel_futures=True)
         for process in list(self._processes):
             self._end(process)
 
@@ -116,7 +118,10 @@ class OwnWorkers(Executor):
         return process
 
     def _end(self, process: Any) -> None:
-        self._processes.pop(process).close()
+        pipe = self._processes.pop(process, None)
+        if pipe is None:  # its thread or the one that shuts down is at it
+            return
+        pipe.close()
         process.join(_PATIENCE)
         if process.is_alive():
             process.kill()
