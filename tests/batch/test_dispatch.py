@@ -390,3 +390,30 @@ def test_dask(robot):
     assert killed
     assert np.array_equal(batch.q, expected.q)
     assert np.abs(batch.B_lower - expected.B_lower).max() < 1e-13
+
+
+LEFT_TAKEN = """
+import os, time
+from fflin.batch.workers import OwnWorkers
+
+if __name__ == "__main__":
+    workers = OwnWorkers(1)
+    workers.submit(pow, 2, 3).result()
+    future = workers.submit(time.sleep, 9999)
+    while not future.running():
+        time.sleep(0.01)
+    future._condition.acquire()
+    workers.shutdown()
+    print("ended", flush=True)
+    os._exit(0)
+"""
+
+
+def test_shutdown_does_not_wait_for_a_future_whose_lock_is_left_taken(tmp_path):
+    """As Ctrl-C leaves it that comes between taking the lock and waiting."""
+    script = tmp_path / "script.py"
+    script.write_text(LEFT_TAKEN)
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
+    assert done.stdout == "ended\n"
