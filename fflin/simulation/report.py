@@ -10,6 +10,7 @@ from fflin.base.names import group_of
 from fflin.base.tables import grid, width
 from fflin.base.validation import Array
 from fflin.simulation.motion import Motion
+from fflin.simulation.passed import lines
 
 # A motion has settled once its error stays below this share of the largest.
 _SETTLED = 0.02
@@ -48,6 +49,7 @@ def motion_report(motion: Motion, *, controlled: bool = True) -> str:
         # Name, value and unit stay on one line.
         line = textwrap.fill(line, width(), subsequent_indent="  ", break_on_hyphens=False)
         parts.append(line.replace("\u00a0", " "))
+    parts += lines(motion)
     energy = motion.energy
     parts.append(
         f"energy {energy[0]:.6g} J at first, {energy[-1]:.6g} J at last; "
