@@ -95,10 +95,8 @@ class Channel:
         self._limited = bool(np.isfinite((limits.low, limits.high)).any())
         self._wheels, self._speeds = limits.wheels, speeds
         self._pulses = limits.pulses() if limits.pulses else None
-        initial = self._within(initial)
-        late = range(0, delay, sample) if sample else ()
-        self._pending: deque[tuple[int, Array]] = deque((step, initial) for step in late)
-        self._held = initial
+        self._pending: deque[tuple[int, Array]] = deque()
+        self._held = self._initial = self._within(initial)
 
     @property
     def continuous(self) -> bool:
@@ -111,6 +109,8 @@ class Channel:
             return self.ask(*point)
         if step % self._sample == 0:
             self._pending.append((step + self._delay, self._within(self._law(*point))))
+            if self._pulses and step < self._delay:
+                self._pulses.begin(step, self._initial)
         while self._pending and self._pending[0][0] <= step:
             self._held = self._pending.popleft()[1]
             if self._pulses:
