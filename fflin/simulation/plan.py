@@ -86,7 +86,6 @@ class Plan:
     law: Law | None  # nothing but `initial` acts where there is none
     initial: Array  # (nu,), what acts until the first command arrives
     limits: Saturation  # what acts of a command
-    rotors: list[int]  # velocities of the wheels that have a largest speed
     known: dict[str, Range]  # limits of states and inputs, whether they cut or not
     method: type[Integrator]
     project: bool  # whether momentum and centre of mass are kept
@@ -104,12 +103,7 @@ class Plan:
         """Return the way of the law's commands to the inputs, with nothing on it yet."""
         if self.law is None:
             return None
-        times, rotors = self.times, self.rotors
-
-        def speeds(t: float, q: Array, v: Array) -> Array:
-            return v[rotors]
-
-        return Channel(self.law, self.initial, self.limits, times.sample, times.delay, speeds)
+        return Channel(self.law, self.initial, self.limits, self.times.sample, self.times.delay)
 
 
 def start_of(state: StateMap, x0: Any, q0: Any, v0: Any) -> tuple[Array, Array]:

@@ -170,10 +170,7 @@ def simulate(
         law=law,
         initial=lin.u0 if lin is not None and same else np.zeros(len(within.low)),
         limits=within,
-        rotors=[robot.joint(name).idx_v for name in within.wheels.names] if within.wheels else [],
-        known={
-            name: known[name] for name in (*state.names, *plant.actuation.names) if name in known
-        },
+        known=known,
         method=method_of(method, times),
         project=truth("project", project),
         turning=turning(robot),
