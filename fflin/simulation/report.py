@@ -24,8 +24,8 @@ def motion_report(motion: Motion, *, controlled: bool = True) -> str:
     parts = [f"{motion.robot}: {end:g} s, {len(motion.t)} rows, frame {motion.frame}"]
     if motion.stopped:
         parts.append(textwrap.fill(f"stopped: {motion.stopped}", width(), subsequent_indent="  "))
-    error = np.abs(motion.error)
-    if controlled:
+    if controlled and motion.error is not None and motion.attitude_error is not None:
+        error = np.abs(motion.error)
         rows = [["error", "unit", "first", "largest", "last", "settled after [s]"]]
         rows.append(["attitude", "deg", *_course(motion.attitude_error, motion.t)])
         groups = {"r_b": "position", "q_m": "joints", "omega_b": "omega_b", "v_b": "v_b"}
