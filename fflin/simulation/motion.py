@@ -59,6 +59,8 @@ class Motion(Design):
         Why it ended before its time; empty where it did not.
     wheels : tuple of str
         The joints that are reaction wheels, whose angle is no error.
+    steered : tuple of str
+        The states that the policy is known to feed back; empty where that is not known.
     notes : tuple of str
         What is to be known of the run.
     """
@@ -86,6 +88,7 @@ class Motion(Design):
     stopped: str
     com_drift: Array = field(default_factory=lambda: np.zeros(0))
     wheels: tuple[str, ...] = field(default_factory=tuple)
+    steered: tuple[str, ...] = field(default_factory=tuple)
     notes: tuple[str, ...] = field(default_factory=tuple)
 
     def __post_init__(self) -> None:

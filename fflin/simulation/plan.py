@@ -93,6 +93,7 @@ class Plan:
     progress: bool | None  # whether a bar is shown; None shows it where the run takes long
     near: Array | None  # the state (nx,) from which continuous joints count turns
     target: Array | None  # the state (nx,) that is steered to, where one is known
+    steered: tuple[str, ...]  # the states that are known to be fed back
     linear: LinearModel | None  # predicts the motion under u = u0 - K (x - x0)
     K: Array | None  # (nu, nx)
 
@@ -209,6 +210,17 @@ def law_of(policy: Any, plant: Plant, limits: tuple[Array, Array], times: Times)
     if policy is None:
         return None
     return Law(bound(policy, plant.robot), plant.actuation.names, limits, times.slow)
+
+
+def fed_back(policy: Any) -> tuple[str, ...]:
+    """Return the names of the states that a policy about a model's point feeds back."""
+    lin = getattr(policy, "lin", None)
+    if not isinstance(lin, LinearModel):
+        return ()
+    decides = policy.policy if isinstance(policy, Allocation) else policy
+    K = getattr(decides, "K", None)
+    used = np.ones(len(lin.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
+    return tuple(name for name, size in zip(lin.state_names, used, strict=True) if size)
 
 
 def _fastest_pole(policy: Any) -> float:

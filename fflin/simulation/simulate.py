@@ -19,6 +19,7 @@ from fflin.simulation.motion import Motion
 from fflin.simulation.plan import (
     Plan,
     events_of,
+    fed_back,
     law_of,
     method_of,
     start_of,
@@ -178,6 +179,7 @@ def simulate(
         progress=progress,
         near=goal if x0 is None else np.asarray(x0, dtype=float),
         target=goal,
+        steered=fed_back(policy),
         linear=predictor,
         K=K,
     )
@@ -219,6 +221,7 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         urdf_sha256=robot.urdf_sha256,
         stopped=run.stopped,
         wheels=tuple(robot.wheels),
+        steered=plan.steered,
     )
 
 
