@@ -18,6 +18,7 @@ from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import readout
 from fflin.linear.model import LinearModel
+from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -153,7 +154,7 @@ class TrajectoryFeedback:
 
 @dataclass(frozen=True, eq=False)
 class Allocation:
-    """Thrusts, none of them negative, that come nearest to what a policy asks for.
+    """Thrusts, none negative or beyond its limit, that come nearest to what a policy asks for.
 
     The policy decides on the inputs of the robot `design`, such as torque and force on the base;
     the thrusters and motors of the simulated robot give the generalised force that it means, in
@@ -199,8 +200,8 @@ class Allocation:
         free = np.full(len(asking.names), np.inf)
         inner = Law(bound(self.policy, self.design), asking.names, (-free, free), np.inf)
         data = robot.create_data()
-        least = np.full(len(giving.names), -np.inf)
-        least[giving.groups.get("thrust", [])] = 0.0
+        limits, open_ = limits_of(robot), (-np.inf, np.inf)
+        least, most = np.array([limits.get(name, open_) for name in giving.names]).T
 
         def policy(t: float, q: Array, v: Array) -> Array:
             u = inner(t, q, v)
@@ -221,11 +222,11 @@ class Allocation:
             found = lsq_linear(
                 np.vstack((A / unit, 1e-7 * np.eye(len(least)))),
                 np.concatenate((b / size, np.zeros(len(least)))),
-                (least, np.full_like(least, np.inf)),
+                (least * (unit / size), most * (unit / size)),
                 method="bvls",
                 tol=1e-14,
             )
-            thrusts: Array = np.maximum(found.x, least) * (size / unit)
+            thrusts: Array = np.clip(found.x * (size / unit), least, most)
             return thrusts
 
         return policy

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple
@@ -10,8 +11,10 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.errors import FflinWarning, listed
 from fflin.base.validation import Array
 from fflin.control.pulses import Pulses
+from fflin.linear.model import LinearModel
 from fflin.robot.fields import Range
 from fflin.robot.inputs import Thruster, named_inputs
 from fflin.robot.robot import Robot
@@ -82,3 +85,21 @@ def saturation(
         )
     pulses = partial(Pulses, pulsed, high, sample, dt) if pulsed else None
     return Saturation(low, high, wheels, pulses)
+
+
+def warn_beyond(lin: LinearModel, where: str, asked: Array, low: Array, high: Array) -> None:
+    """Warn of inputs that are asked (nu,) for more than their limits."""
+    limits = np.where(asked > 0.0, high, low)
+    beyond = [
+        f"{name} is asked for {u:.3g} {unit}, limit {limit:g}"
+        for name, unit, u, limit in zip(
+            lin.input_names, lin.input_units, asked, limits, strict=True
+        )
+        if abs(u) > (1.0 + 1e-6) * abs(limit)
+    ]
+    if beyond:
+        warnings.warn(
+            f"the limits do not hold '{lin.robot}' {where}: {listed(beyond)}",
+            FflinWarning,
+            stacklevel=3,
+        )

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, truth
-from fflin.control.saturation import saturation
+from fflin.control.saturation import saturation, warn_beyond
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import state_history
 from fflin.linear.model import LinearModel
@@ -144,7 +144,8 @@ def simulate(
     Warns
     -----
     FflinWarning
-        If the loop's fastest pole asks for more than 100,000 steps.
+        If the loop's fastest pole asks for more than 100,000 steps, or springs and gravity at the
+        target for more than the limits.
 
     References
     ----------
@@ -168,6 +169,8 @@ def simulate(
     law = law_of(policy, plant, within, times)
     # The model's inputs are others where they are allocated to the robot's.
     same = lin is not None and lin.input_names == plant.actuation.names
+    if lin is not None and same:
+        warn_beyond(lin, "at its target", lin.u0, within.low, within.high)
     goal = target_of(state, lin if target is None else target)
     plan = Plan(
         q=q,
