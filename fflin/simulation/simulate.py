@@ -231,6 +231,7 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         urdf_sha256=robot.urdf_sha256,
         stopped=run.stopped,
         wheels=tuple(robot.wheels),
+        wheel_inertias=np.array(list(robot.wheels.values())),
         steered=plan.steered,
         limit_names=tuple(plan.known),
         limits=np.array(list(plan.known.values())).reshape(-1, 2),

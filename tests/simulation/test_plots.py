@@ -42,7 +42,7 @@ def test_motion_shows_linear_beside_nonlinear_and_their_difference(loop):
     apart = differences[0].get_lines()[2].get_ydata()
     np.testing.assert_array_equal(apart, motion.x[:, 2] - motion.linear[:, 2])
     assert axes["velocity v_b"].get_ylabel() == "[m/s]"
-    torque = lines(axes["inputs"])["tau_b.z"]
+    torque = lines(axes["torques"])["tau_b.z"]
     np.testing.assert_array_equal(torque.get_ydata(), motion.u[:, 2])
     assert set(lines(axes["joint inputs tau_m"])) == {
         name for name in motion.input_names if name.startswith("tau_m")
@@ -69,7 +69,7 @@ def test_many_inputs_and_joints_are_named_beside_the_panels_each_in_its_colour()
     named = {legend.get_title().get_text(): legend for legend in figure.legends}
     shown = [text.get_text() for text in named["joints"].get_texts()]
     assert shown == list(robot.joint_names)
-    assert len(named["inputs"].get_texts()) == 12
+    assert len(named["forces"].get_texts()) == 12
     for legend in named.values():
         colors = {line.get_color() for line in legend.get_lines()}
         assert len(colors) == len(legend.get_lines())
@@ -86,6 +86,100 @@ def test_many_inputs_and_joints_are_named_beside_the_panels_each_in_its_colour()
         assert not any(one.overlaps(other) for other in boxes[:i])
         assert one.x0 >= 0.0
         assert one.x1 <= figure.bbox.x1 + 1.0
+
+
+@pytest.fixture(scope="module")
+def limited():
+    """An arm with prismatic joint, thrusters and wheels, all with limits, some of which bind."""
+    robot = fflin.load("servicer_7dof", limits={"qdot_m": 0.05})
+    inputs = [
+        fflin.BaseTorque(max=8.0),
+        fflin.BaseForce(max=2e3),
+        *robot.inputs[2:],
+        fflin.Thruster("base", (0, 0, 0), (1, 0, 0), "main", max=22.0),
+        fflin.ReactionWheel((0, 0, 1), inertia=0.05, name="spin", max=2.0, max_speed=300.0),
+        fflin.ReactionWheel((1, 0, 0), inertia=0.05, name="idle", max=2.0, max_speed=300.0),
+    ]
+    robot = robot.replace(inputs=inputs)
+    u = np.zeros(18)
+    u[0], u[4], u[6], u[15], u[16] = 5.0, 400.0, 120.0, 30.0, 1.0
+
+    def policy(t, q, v):
+        return u * np.cos(0.2 * t) + u * (np.arange(18) == 16)
+
+    v0 = fflin.velocity(robot, {"spin": 290.0, "joint_1": 0.04})
+    return fflin.simulate(robot, policy, v0=v0, duration=0.02, dt=1e-3, limits="urdf")
+
+
+def panels(figure):
+    return {each.get_title(): each for each in figure.axes if each.get_title()}
+
+
+def test_each_axis_has_one_unit_and_wheels_have_panels_of_their_own(limited):
+    found = panels(limited.plot())
+    units = {title: axes.get_ylabel() for title, axes in found.items()}
+    assert units["torques"] == "[N m]"
+    assert units["forces"] == "[N]"
+    assert units["joint inputs tau_m"] == "[N m]"
+    assert units["wheel speeds"] == "[rad/s]"
+    assert units["wheel torques"] == "[N m]"
+    assert units["wheel momenta"] == "[N m s]"
+    assert {"tau_b.x", "tau_b.y", "tau_b.z"} == set(lines(found["torques"])) - {"limit"}
+    assert {"F_b.x", "F_b.y", "F_b.z", "main"} == set(lines(found["forces"])) - {"limit"}
+    for title in ("wheel speeds", "wheel torques", "wheel momenta"):
+        assert set(lines(found[title])) == {"spin", "idle", "limit"}
+    for title in ("joints q_m", "joint rates"):
+        assert not {"spin", "idle"} & set(lines(found[title]))
+    speed = limited.x[:, limited.state_names.index("qdot_m.spin")]
+    np.testing.assert_array_equal(lines(found["wheel speeds"])["spin"].get_ydata(), speed)
+    momentum = lines(found["wheel momenta"])["spin"].get_ydata()
+    np.testing.assert_allclose(momentum, 0.05 * speed)
+
+
+def levels(axes):
+    """The heights of the lines of limits, and how many of them the legend would name."""
+    dashed = [line for line in axes.get_lines() if line.get_linestyle() == "--"]
+    named = [line for line in dashed if line.get_label() == "limit"]
+    return sorted(float(line.get_ydata()[0]) for line in dashed), len(named)
+
+
+def test_limits_are_drawn_where_a_curve_comes_to_a_third_of_them(limited):
+    found = panels(limited.plot())
+    assert levels(found["torques"]) == ([8.0], 1)
+    assert levels(found["forces"]) == ([22.0], 1)
+    assert levels(found["joint inputs tau_m"]) == ([300.0], 1)
+    assert levels(found["wheel speeds"]) == ([300.0], 1)
+    assert levels(found["wheel momenta"]) == ([15.0], 1)
+    assert levels(found["joint rates"])[0] in ([0.05], [-0.05, 0.05])
+    assert levels(found["joints q_m"]) == ([], 0)
+    figure = limited.plot()
+    (named,) = [x for x in figure.legends if x.get_title().get_text() == "joints"]
+    assert [text.get_text() for text in named.get_texts()].count("limit") == 1
+
+
+def test_a_motion_without_limits_has_no_lines_of_them(loop):
+    _, _, motion = loop
+    assert not motion.limit_names
+    for axes in motion.plot().axes:
+        assert "limit" not in lines(axes)
+
+
+def test_panels_of_wheels_and_limits_do_not_lie_on_each_other(limited):
+    figure = limited.plot()
+    figure.draw_without_rendering()
+    boxes = [each.get_tightbbox() for each in (*figure.axes, *figure.legends)]
+    for i, one in enumerate(boxes):
+        assert not any(one.overlaps(other) for other in boxes[:i])
+        assert one.x0 >= 0.0
+        assert one.x1 <= figure.bbox.x1 + 1.0
+
+
+def test_the_inertias_of_wheels_are_saved_and_loaded(limited, tmp_path):
+    for ending in (".npz", ".mat", ".json"):
+        limited.save(tmp_path / f"m{ending}")
+        found = fflin.Motion.load(tmp_path / f"m{ending}")
+        np.testing.assert_array_equal(found.wheel_inertias, [0.05, 0.05])
+        assert found.wheels == ("spin", "idle") or found.wheels == ("idle", "spin")
 
 
 def test_attitude_through_180_degrees_has_a_gap():
