@@ -310,3 +310,26 @@ def test_displacements_that_ask_for_more_than_the_limits_are_warned_of(loops):
     for name, value, limit in asked:
         assert float(limit) == pytest.approx(lin.limits[name], rel=1e-3)
         assert float(value) > float(limit) > abs(lin.u0[lin.input_names.index(name)])
+
+
+@pytest.mark.parametrize(
+    ("name", "fields"),
+    [
+        ("cubesat", {}),
+        ("servicer_7dof", {"stiffness": {"panel_left": 100.0, "panel_right": 100.0}}),
+    ],
+)
+def test_bundled_inputs_fly_within_what_they_say_they_give(name, fields):
+    robot = fflin.load(name, inputs=fflin.load_inputs(name), **fields)
+    lin = fflin.linearize(robot)
+    for item in robot.inputs:
+        assert isinstance(item, fflin.JointTorque) or item.max
+    assert set(lin.input_names) <= set(lin.limits)
+    gain = fflin.lqr(lin)
+    motors = [f"joint_{k}" for k in range(1, 8)] if name == "servicer_7dof" else []
+    turn = pin.exp3(np.radians(ANGLE) * np.array([2.0, -1.0, 2.0]) / 3.0)
+    q0 = fflin.configuration(robot, dict.fromkeys(motors, 0.3), pin.SE3(turn, np.zeros(3)))
+    policy = fflin.StateFeedback(lin, gain.K)
+    motion = fflin.simulate(robot, policy, q0=q0, duration=60.0, limits="urdf", every=10)
+    assert not motion.stopped and not motion.passed and not motion.saturated
+    assert motion.attitude_error[-1] < 0.1 * ANGLE

@@ -56,9 +56,9 @@ def sound(folder):
         "acceleration_lqr": {"lin": lin, "Qp": 1.0, "Qv": 1.0, "Ra": 1.0, "dt": None},
         "Accelerometer": {"frame": "base"},
         "Allocation": {"policy": fflin.StateFeedback(lin, gain.K), "design": robot},
-        "BaseForce": {},
+        "BaseForce": {"max": 1.0, "min": (-1.0, -1.0, 0.0)},
         "BasePose": {},
-        "BaseTorque": {},
+        "BaseTorque": {"max": (1.0, 1.0, 1.0), "min": None},
         "bryson": {"lin": lin, "largest": {"q_b": 1.0}},
         "CenterOfMass": {},
         "check": {"robot": robot, "lin": lin},
@@ -76,7 +76,7 @@ def sound(folder):
         "grid": {"robot": robot, "axes": {joint: [0.0, 1.0]}, "base": None},
         "Gyroscope": {"frame": "base"},
         "JointPositions": {"joints": (joint,)},
-        "JointTorque": {"joint": joint},
+        "JointTorque": {"joint": joint, "max": 1.0, "min": -0.5},
         "JointVelocities": {"joints": (joint,)},
         "kalman": {"lin": lin, "W": 1.0, "V": 1.0, "G": lin.B},
         "linearize": found | place,
@@ -86,6 +86,7 @@ def sound(folder):
         "load": {
             **{"robot": "planar_detumble", "lock": [joint], "package_dirs": (), "inputs": None},
             **{"outputs": None, "stiffness": 1.0, "damping": "urdf", "rest": {}, "gravity": vector},
+            "limits": {"tau_b": 1.0},
         },
         "load_inputs": {"path": "nosuch.toml"},
         "lqg": {"gain": gain, "estimator": filtered},
@@ -114,6 +115,8 @@ def sound(folder):
             "inertia": 0.1,
             "name": "w",
             "momentum": 0,
+            "max": 1.0,
+            "max_speed": 10.0,
         },
         "sampled_cost": {"lin": lin, "dt": 0.1} | weights,
         "ScheduledFeedback": {"lin": lin, "gains": fflin.lqr_batch(batch, **weights)},
@@ -129,7 +132,10 @@ def sound(folder):
         | {"q": [q]}
         | place
         | dict.fromkeys(("executor", "threads", "chunk", "progress", "out")),
-        "Thruster": {"frame": "base", "position": vector, "direction": vector, "name": "t"},
+        "Thruster": {
+            **{"frame": "base", "position": vector, "direction": vector, "name": "t"},
+            **{"max": 1.0, "min": None, "on_off": True, "least_impulse": 0.1},
+        },
         "TrajectoryFeedback": {"trajectory": along, "schedule": schedule},
         "tvlqr": {"traj": along, "Qf": 1.0} | weights,
         "validity": {
