@@ -94,6 +94,7 @@ class Plan:
     near: Array | None  # the state (nx,) from which continuous joints count turns
     target: Array | None  # the state (nx,) that is steered to, where one is known
     steered: tuple[str, ...]  # the states that are known to be fed back
+    notes: tuple[str, ...]  # what is to be said of the run
     linear: LinearModel | None  # predicts the motion under u = u0 - K (x - x0)
     K: Array | None  # (nu, nx)
 

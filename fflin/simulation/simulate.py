@@ -11,6 +11,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, truth
 from fflin.control.channel import limits_of
+from fflin.control.plants import notes_of
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import state_history
 from fflin.linear.model import LinearModel
@@ -180,6 +181,7 @@ def simulate(
         near=goal if x0 is None else np.asarray(x0, dtype=float),
         target=goal,
         steered=fed_back(policy),
+        notes=notes_of(policy, robot),
         linear=predictor,
         K=K,
     )
@@ -222,6 +224,7 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         stopped=run.stopped,
         wheels=tuple(robot.wheels),
         steered=plan.steered,
+        notes=plan.notes,
     )
 
 
