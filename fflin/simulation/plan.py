@@ -21,6 +21,8 @@ from fflin.simulation.integrators import Integrator, integrator
 from fflin.simulation.plant import Plant
 
 Event: TypeAlias = Callable[[float, Array, Array], float]
+# Returns the command (nu,) at a deviation (nx,) from a linear model's point.
+LinearLaw: TypeAlias = Callable[[Array], Array]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 
 LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
@@ -74,6 +76,13 @@ class Times(NamedTuple):
             )
 
 
+class Predictor(NamedTuple):
+    """A linear model, and what makes the law that it is under, which remembers nothing yet."""
+
+    lin: LinearModel
+    law: Callable[[], LinearLaw]
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """A simulation to be done, which nothing changes while it runs: arrays and whole numbers."""
@@ -95,8 +104,7 @@ class Plan:
     target: Array | None  # the state (nx,) that is steered to, where one is known
     steered: tuple[str, ...]  # the states that are known to be fed back
     notes: tuple[str, ...]  # what is to be said of the run
-    linear: LinearModel | None  # predicts the motion under u = u0 - K (x - x0)
-    K: Array | None  # (nu, nx)
+    predictor: Predictor | None  # of the linear motion under the same law
 
     def channel(self) -> Channel | None:
         """Return the way of the law's commands to the inputs, with nothing on it yet."""

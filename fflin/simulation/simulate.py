@@ -29,7 +29,7 @@ from fflin.simulation.plan import (
     turning,
 )
 from fflin.simulation.plant import Plant
-from fflin.simulation.prediction import predict
+from fflin.simulation.prediction import predict, predictor
 from fflin.simulation.run import go
 
 if TYPE_CHECKING:
@@ -110,8 +110,9 @@ def simulate(
     callback : callable, optional
         callback(t, q, v, u), called at every recorded row.
     linear : LinearModel or bool, optional
-        Predicts the motion under the same law; by default the policy's own model, False for none.
-        Sampled, it does so where every row is at a sample.
+        Predicts the motion under the same law, of a StateFeedback, an OutputFeedback without its
+        noise, or none; by default the policy's own model, False for none. Sampled, it does so
+        where every row is at a sample.
     target : LinearModel or array_like (nx,), optional
         State, or model whose point it is, that errors are counted from; by default the point of
         the policy's own model, and none under a policy without one.
@@ -147,7 +148,6 @@ def simulate(
     E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
     """
     own: Any = getattr(policy, "lin", None)
-    K: Any = getattr(policy, "K", None)
     lin = own if isinstance(own, LinearModel) else None
     if lin is not None:
         if frame is not None or reference is not None:
@@ -155,7 +155,7 @@ def simulate(
         frame, reference = lin.frame, lin.reference
     state = StateMap(robot, reference=reference, frame="hybrid" if frame is None else frame)
     plant = Plant(state, disturbance)
-    predictor = _predictor(plant, K, lin, linear)
+    foresees = predictor(plant, policy, linear)
     q, v = start_of(state, x0, q0, v0)
     times = times_of(policy, duration, dt, every, sample, delay)
     times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=dt is None)
@@ -182,8 +182,7 @@ def simulate(
         target=goal,
         steered=fed_back(policy),
         notes=notes_of(policy, robot),
-        linear=predictor,
-        K=K,
+        predictor=foresees,
     )
     try:
         return _motion(plan, plant)
@@ -226,26 +225,3 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         steered=plan.steered,
         notes=plan.notes,
     )
-
-
-def _predictor(
-    plant: Plant, K: Array | None, own: LinearModel | None, linear: Any
-) -> LinearModel | None:
-    """Return the model that predicts the run: the policy's own one, or the one that is given."""
-    if linear is None or isinstance(linear, bool | np.bool_):
-        fits = own is not None and own.state_names == plant.state.names
-        wanted = linear is None or bool(linear)
-        return own if wanted and fits and K is not None else None
-    if not isinstance(linear, LinearModel):
-        raise InputError(
-            f"linear is a {type(linear).__name__}, expected a fflin.LinearModel, True or False"
-        )
-    names = (plant.state.names, plant.actuation.names, plant.state.frame)
-    if (linear.state_names, linear.input_names, linear.frame) != names or linear.moving:
-        raise InputError(
-            f"linear is a model of '{linear.robot}' that has not the states, inputs and frame of "
-            f"the run of '{plant.robot.name}'; linearise that robot in the policy's frame"
-        )
-    if K is None:
-        raise InputError("linear predicts under a StateFeedback alone; leave it out")
-    return linear

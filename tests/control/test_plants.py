@@ -159,7 +159,7 @@ def test_joints_of_another_kind_are_refused():
     pin.seed(0)
     lin = fflin.linearize(arm(pin.JointModelRZ()))
     policy = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
-    with pytest.raises(fflin.InputError, match="whose input tau_m.arm is in N, not N m"):
+    with pytest.raises(fflin.InputError, match=r"whose input tau_m\.arm is in N, not N m"):
         fflin.simulate(arm(pin.JointModelPZ()), policy, duration=0.1)
     with pytest.raises(fflin.InputError, match="entries, not 8: other joints are continuous"):
         fflin.simulate(arm(pin.JointModelRUBZ()), policy, duration=0.1)
@@ -171,7 +171,9 @@ def test_a_trajectory_of_other_inputs_is_refused():
     along = fflin.linearize_trajectory(robot, t, q, v, u)
     policy = fflin.TrajectoryFeedback(along, fflin.tvlqr(along, 1.0, 1.0, 1.0))
     fewer = robot.replace(inputs=robot.inputs[1:])
-    with pytest.raises(fflin.InputError, match="'planar_detumble' as .*, without the inputs tau_b"):
+    with pytest.raises(
+        fflin.InputError, match=r"'planar_detumble' as .*, without the inputs tau_b"
+    ):
         fflin.simulate(fewer, policy, duration=0.1)
 
 
@@ -181,5 +183,5 @@ def test_measurements_of_other_names_are_refused(nominal):
     weights = unit_weights(sampled)
     law = fflin.lqg(fflin.lqr(sampled, *weights), fflin.kalman(sampled, 1.0, 1.0))
     other = robot.replace(outputs=[fflin.JointPositions(robot.joint_names)])
-    with pytest.raises(fflin.InputError, match="without the outputs q_b.x, q_b.y"):
+    with pytest.raises(fflin.InputError, match=r"without the outputs q_b\.x, q_b\.y"):
         fflin.simulate(other, fflin.OutputFeedback(sampled, law), duration=0.1)

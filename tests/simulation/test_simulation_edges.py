@@ -183,7 +183,7 @@ def test_a_model_that_cannot_predict_is_refused():
     ):
         with pytest.raises(fflin.InputError, match="linearise that robot"):
             fflin.simulate(robot, policy, duration=1.0, linear=other)
-    with pytest.raises(fflin.InputError, match="under a StateFeedback alone"):
+    with pytest.raises(fflin.InputError, match="a function is not known to be linear"):
         fflin.simulate(robot, lambda t, q, v: np.zeros(len(lin.u0)), duration=1.0, linear=lin)
 
 
