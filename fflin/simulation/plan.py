@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from fflin.base.errors import FflinWarning, InputError
-from fflin.base.validation import Array, number, vector, whole
+from fflin.base.errors import InputError
+from fflin.base.validation import Array, vector
 from fflin.control.channel import Channel, Law
 from fflin.control.policies import Allocation, bound
 from fflin.dynamics.state import StateMap
@@ -19,6 +18,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.integrators import Integrator, integrator
 from fflin.simulation.plant import Plant
+from fflin.simulation.times import Times
 
 Event: TypeAlias = Callable[[float, Array, Array], float]
 # Returns the command (nu,) at a deviation (nx,) from a linear model's point.
@@ -26,54 +26,6 @@ LinearLaw: TypeAlias = Callable[[Array], Array]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 
 LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
-LARGEST_TURN = 1.0  # within one step [rad], beyond which no integrator follows
-_STEP = 0.01  # [s]
-_MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
-_MANY_STEPS = 100_000  # some seconds
-_LONGEST = 1e100  # [s]; the square of its inverse is still a number
-
-
-class Times(NamedTuple):
-    """The step `dt` [s], and how many steps there are in all and between what happens."""
-
-    dt: float
-    steps: int
-    every: int  # from one recorded row to the next
-    sample: int  # between samples of the law; 0 where it is asked at every stage of every step
-    delay: int  # from a sample to its effect
-    fastest: float  # magnitude of the loop's poles [1/s]; 0 where it is not known
-
-    @property
-    def rows(self) -> int:
-        """Most rows that are recorded."""
-        return self.steps // self.every + 2
-
-    @property
-    def slow(self) -> float:
-        """Square of the velocity up to which no turn within a step is too large."""
-        return float((LARGEST_TURN / self.dt) ** 2)
-
-    def require_room(self, width: int, *, chosen: bool) -> None:
-        """Raise `InputError` where rows of so many numbers, or the steps, are too many.
-
-        `chosen` says that the step was chosen here and not given; where the loop's fastest pole
-        asks for many steps, an `FflinWarning` says so.
-        """
-        forced = chosen and self.fastest * _STEP > 1.0
-        if self.rows * width > _MOST_ENTRIES or self.steps > _MOST_STEPS:
-            asked = f", which the loop's fastest pole at {self.fastest:.3g} 1/s asks for,"
-            raise InputError(
-                f"{self.steps * self.dt:g} s in steps of {self.dt:g} s"
-                f"{asked if forced else ''} are "
-                f"{self.steps:.3g} steps and {self.rows:.3g} rows; take a larger dt or `every`"
-            )
-        if forced and self.steps > _MANY_STEPS:
-            warnings.warn(
-                f"the loop's fastest pole at {self.fastest:.3g} 1/s asks for steps of "
-                f"{self.dt:.3g} s, {self.steps:,} in all; give dt=, or take a slower gain",
-                FflinWarning,
-                stacklevel=3,
-            )
 
 
 class Predictor(NamedTuple):
@@ -150,46 +102,6 @@ def target_of(state: StateMap, target: Any) -> Array | None:
     return goal
 
 
-def times_of(
-    policy: Any,
-    duration: float,
-    dt: float | None,
-    every: int,
-    sample: float | None,
-    delay: float,
-) -> Times:
-    """Return the times of a simulation, whose arguments are those of `simulate`."""
-    if sample is not None:
-        sample = _positive("sample", sample)
-    else:
-        sample = getattr(getattr(policy, "lin", None), "dt", None) or None
-    fastest = 0.0 if sample else _fastest_pole(policy)
-    duration, delay = _positive("duration", duration), number("delay", delay)
-    if not 0.0 <= delay <= _LONGEST:
-        raise InputError(f"delay is {delay:g} s, expected 0 to {_LONGEST:g} s")
-    every = whole("every", every, 1)
-    if dt is None:
-        dt = _STEP
-        if fastest * dt > 1.0:
-            dt = float(0.5 ** np.ceil(np.log2(fastest)))
-        if sample or delay:
-            dt = _part_of(sample or delay, dt, duration, delay)
-    dt = _positive("the step dt", dt)
-    steps = max(1, round(duration / dt))
-    if abs(steps * dt - duration) > 1e-6 * duration:
-        if sample or delay:
-            raise InputError(
-                f"duration is {duration:g} s, expected a multiple of the step dt = {dt:g} s where "
-                "the input is sampled or late; choose the step so"
-            )
-        steps = int(np.ceil(duration / dt))
-        dt = duration / steps
-    if sample is None:
-        sample = dt if delay else 0.0
-    samples, late = _whole(dt, sample=sample, delay=delay)
-    return Times(dt, steps, every, samples, late, fastest)
-
-
 def method_of(name: str, times: Times) -> type[Integrator]:
     """Return the integrator of that name, stable at the fastest pole of the loop."""
     method = integrator(name)
@@ -232,15 +144,6 @@ def fed_back(policy: Any) -> tuple[str, ...]:
     return tuple(name for name, size in zip(lin.state_names, used, strict=True) if size)
 
 
-def _fastest_pole(policy: Any) -> float:
-    """Return the largest magnitude [1/s] of the poles of a continuous loop, where it has any."""
-    decides = policy.policy if isinstance(policy, Allocation) else policy
-    lin, K = getattr(policy, "lin", None), getattr(decides, "K", None)
-    if not isinstance(lin, LinearModel) or K is None or lin.dt:
-        return 0.0
-    return float(np.abs(np.linalg.eigvals(lin.A - lin.B @ K)).max())
-
-
 def turning(robot: Robot) -> Array:
     """Return where angular velocities stand, less those of rotors.
 
@@ -249,31 +152,3 @@ def turning(robot: Robot) -> Array:
     rotors = rotor_names(robot)
     joints = [joint for joint in robot.joints if not joint.prismatic and joint.name not in rotors]
     return np.array([3, 4, 5, *(joint.idx_v for joint in joints)])
-
-
-def _whole(dt: float, **times: float) -> list[int]:
-    """Return named times [s] in steps."""
-    for name, time in times.items():
-        if abs(round(time / dt) * dt - time) > 1e-6 * dt:
-            raise InputError(
-                f"{name} is {time:g} s, expected a multiple of the step dt = {dt:g} s; "
-                "choose the step so"
-            )
-    return [round(time / dt) for time in times.values()]
-
-
-def _part_of(sample: float, largest: float, *times: float) -> float:
-    """Return a step of which the sample and, where there is one, the other times are multiples."""
-    least = int(np.ceil(sample / largest))
-    for parts in range(least, least + 1000):
-        dt = sample / parts
-        if all(abs(round(time / dt) * dt - time) <= 1e-6 * dt for time in times):
-            return dt
-    return sample / least
-
-
-def _positive(name: str, value: Any) -> float:
-    time = number(name, value)
-    if not 1.0 / _LONGEST < time <= _LONGEST:
-        raise InputError(f"{name} is {time:g} s, expected more than 0 and at most {_LONGEST:g} s")
-    return time

@@ -126,7 +126,7 @@ def predict(plan: Plan, x: Array, steps: int) -> Array:
 
 
 def _states(predictor: Predictor, plan: Plan, x: Array, steps: int) -> Array:
-    dt, _, every, sample, delay, _ = plan.times
+    dt, _, every, sample, delay, *_ = plan.times
     lin = predictor.lin
     x0, u0 = lin.x0, lin.u0
     channel = Channel(predictor.law(), plan.initial, *plan.limits, sample, delay)

@@ -25,12 +25,12 @@ from fflin.simulation.plan import (
     method_of,
     start_of,
     target_of,
-    times_of,
     turning,
 )
 from fflin.simulation.plant import Plant
 from fflin.simulation.prediction import predict, predictor
 from fflin.simulation.run import go
+from fflin.simulation.times import times_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -63,7 +63,7 @@ def simulate(
     target: LinearModel | ArrayLike | None = None,
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
-    every: int = 1,
+    every: int | None = None,
     progress: bool | None = None,
 ) -> Motion:
     r"""Simulate a robot under a policy.
@@ -119,8 +119,9 @@ def simulate(
     frame : {"hybrid", "local", "world"}, optional
     reference : pin.SE3, optional
         Chart of x and axes of u; the policy's model's by default, else hybrid and the identity.
-    every : int
-        Steps from one recorded row to the next.
+    every : int, optional
+        Steps from one recorded row to the next; by default 1, or where that would be more than
+        100,000 rows, as many as leave 10,000, which the motion's `notes` say.
     progress : bool, optional
         Whether a bar is shown on stderr; by default on a terminal, for runs that take long.
 
@@ -141,7 +142,7 @@ def simulate(
     Warns
     -----
     FflinWarning
-        If the loop's fastest pole asks for more than 100,000 steps.
+        If the loop's fastest pole, which is named, asks for more than 50,000 steps.
 
     References
     ----------
@@ -181,7 +182,7 @@ def simulate(
         near=goal if x0 is None else np.asarray(x0, dtype=float),
         target=goal,
         steered=fed_back(policy),
-        notes=notes_of(policy, robot),
+        notes=(*notes_of(policy, robot), *times.notes),
         predictor=foresees,
     )
     try:

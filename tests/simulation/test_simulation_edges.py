@@ -154,7 +154,7 @@ def test_the_default_step_divides_samples_delay_and_duration():
         ({"sample": 0.0}, "sample is 0 s, expected more than 0"),
         ({"sample": "often"}, "sample is 'often', expected a number"),
         ({"duration": 1e-200}, "expected more than 0"),
-        ({"dt": 1e-30}, "1e+30 rows"),
+        ({"dt": 1e-30}, "1e+30 steps"),
         ({"events": None}, "expected a list of functions"),
         ({"events": abs}, "expected a list of functions"),
         ({"events": [lambda t, q, v: None]}, "an event gave None at t = 0.01 s"),
