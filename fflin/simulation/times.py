@@ -41,8 +41,8 @@ class Times(NamedTuple):
     @property
     def notes(self) -> tuple[str, ...]:
         """What is to be said of the rows."""
-        said = f"one in {self.every} of {self.steps:,} steps is recorded; every=1 (--every 1) records all"
-        return (said,) if self.thinned else ()
+        said = f"one in {self.every} of {self.steps:,} steps is recorded; every=1 (--every 1) "
+        return (f"{said}records all",) if self.thinned else ()
 
     @property
     def slow(self) -> float:
