@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, vector
 from fflin.control.kalman import Compensator
-from fflin.control.plants import require_fit, require_same
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.outputs import Measuring, Sensing
 from fflin.dynamics.state import StateMap
+from fflin.linear.fit import require_fit, require_same
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
 

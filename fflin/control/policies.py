@@ -14,10 +14,10 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import conjugate, quaternion_product, rotation_matrix
 from fflin.base.validation import Array, as_double
 from fflin.control.channel import Law
-from fflin.control.plants import require_fit, require_same, require_turns
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import readout
+from fflin.linear.fit import require_fit, require_same, require_turns
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 

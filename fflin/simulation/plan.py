@@ -13,6 +13,7 @@ from fflin.base.validation import Array, vector
 from fflin.control.channel import Channel, Law
 from fflin.control.policies import Allocation, bound
 from fflin.dynamics.state import StateMap
+from fflin.linear.fit import require_turns
 from fflin.linear.ignorable import rotor_names
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -91,12 +92,12 @@ def target_of(state: StateMap, target: Any) -> Array | None:
         goal: Array = vector("target", target, state.nx, "a state (12 + 2n)").copy()
         state.to_pinocchio(goal)  # refuses what is no attitude
         return goal
-    missing = [name for name in target.state_names if name not in state.names]
-    if missing or len(target.q) != state.robot.nq or target.moving:
+    if target.moving or not set(target.state_names) <= set(state.names):
         raise InputError(
             f"target is a model of '{target.robot}', of which '{state.robot.name}' has no such "
             "state; give one of this robot"
         )
+    require_turns("target", len(target.q), state.robot)
     goal = state.read(target.q, target.v)
     goal[[state.names.index(name) for name in target.state_names]] = target.x0
     return goal

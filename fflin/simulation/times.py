@@ -15,7 +15,7 @@ from fflin.linear.model import LinearModel
 LARGEST_TURN = 1.0  # within one step [rad], beyond which no integrator follows
 _STEP = 0.01  # [s]
 _MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
-_MANY_STEPS = 50_000  # half a minute
+_MANY_STEPS, _ENDLESS = 50_000, 10_000_000  # half a minute, and some hours that nobody asked for
 _MANY_ROWS, _FEW_ROWS = 100_000, 10_000  # that nobody reads, and that a page or a plot shows
 _ALIKE = 1e-3  # parts in a mode, relative, of which the first is named
 _LONGEST = 1e100  # [s]; the square of its inverse is still a number
@@ -56,22 +56,27 @@ class Times(NamedTuple):
         asks for many steps, an `FflinWarning` says so.
         """
         forced = chosen and self.fastest * _STEP > 1.0
-        if self.rows * width > _MOST_ENTRIES or self.steps > _MOST_STEPS:
-            asked = f", which the loop's fastest pole at {self.fastest:.3g} 1/s, "
-            asked += f"of {self.mode}, asks for,"
+        most = _ENDLESS if self.thinned else _MOST_STEPS
+        if self.rows * width > _MOST_ENTRIES or self.steps > most:
+            asked = f", which the loop's fastest pole at {self.fastest:.3g} 1/s asks for,"
             raise InputError(
                 f"{self.steps * self.dt:g} s in steps of {self.dt:g} s"
                 f"{asked if forced else ''} are "
                 f"{self.steps:.3g} steps and {self.rows:.3g} rows; take a larger dt or `every`"
+                f"{self._moving if forced else ''}"
             )
         if forced and self.steps > _MANY_STEPS:
             warnings.warn(
-                f"the loop's fastest pole at {self.fastest:.3g} 1/s, of {self.mode}, asks for "
-                f"steps of {self.dt:.3g} s, {self.steps:,} in all; give dt= or sample=, or weigh "
-                "that state less",
+                f"the loop's fastest pole at {self.fastest:.3g} 1/s asks for steps of "
+                f"{self.dt:.3g} s, {self.steps:,} in all; give dt= or sample=, or a slower gain"
+                f"{self._moving}",
                 FflinWarning,
                 stacklevel=3,
             )
+
+    @property
+    def _moving(self) -> str:
+        return f": {self.mode} moves most there"
 
 
 def times_of(

@@ -132,7 +132,8 @@ def test_what_has_other_names_is_refused_with_the_names(nominal):
     start = "the model is one of 'ets_vii', not of "
     other = Renamed(robot, names={3: "elbow"})
     assert said(other) == (
-        f"{start}'other' as it is given, without the input tau_m.joint_2; linearise this robot"
+        f"{start}'other' as it is given, without the input tau_m.joint_2; linearise this robot, "
+        "or give it the same (Robot.replace)"
     )
     fewer = robot.replace(inputs=robot.inputs[:-1])
     assert "without the input tau_m.joint_6;" in said(fewer)

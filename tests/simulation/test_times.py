@@ -66,14 +66,23 @@ def test_the_pole_that_makes_a_run_slow_is_named():
         motion = fflin.simulate(robot, policy, duration=120.0, events=[at_once])
     fastest = np.abs(np.linalg.eigvals(lin.A - lin.B @ K)).max()
     (line,) = [str(each.message) for each in said]
-    assert line.startswith(f"the loop's fastest pole at {fastest:.3g} 1/s, of qdot_m.joint_5, asks")
-    assert "122,880 in all; give dt= or sample=, or weigh that state less" in line
+    assert line == (
+        f"the loop's fastest pole at {fastest:.3g} 1/s asks for steps of 0.000977 s, 122,880 "
+        "in all; give dt= or sample=, or a slower gain: qdot_m.joint_5 moves most there"
+    )
     assert motion.notes == (
         "one in 13 of 122,880 steps is recorded; every=1 (--every 1) records all",
     )
     # A loop without such a pole is not analysed further.
     calm = times.times_of(fflin.StateFeedback(lin, fflin.lqr(lin).K), 1.0, None, None, None, 0.0)
     assert calm.mode == "" and calm.fastest > 0.0
+
+
+def test_hours_that_nobody_asked_for_are_refused():
+    robot = fflin.load("planar_detumble")
+    with pytest.raises(fflin.InputError, match=r"2e\+07 steps .* take a larger dt or `every`"):
+        fflin.simulate(robot, duration=2e5)
+    times.times_of(None, 2e5, 0.01, 1000, None, 0.0).require_room(55, chosen=True)
 
 
 def test_every_of_the_command(tmp_path):
