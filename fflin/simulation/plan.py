@@ -9,11 +9,11 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError
+from fflin.base.names import group_of
 from fflin.base.validation import Array, vector
 from fflin.control.channel import Channel, Law
 from fflin.control.policies import Allocation, bound
 from fflin.dynamics.state import StateMap
-from fflin.linear.fit import require_turns
 from fflin.linear.ignorable import rotor_names
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -92,14 +92,18 @@ def target_of(state: StateMap, target: Any) -> Array | None:
         goal: Array = vector("target", target, state.nx, "a state (12 + 2n)").copy()
         state.to_pinocchio(goal)  # refuses what is no attitude
         return goal
-    if target.moving or not set(target.state_names) <= set(state.names):
+    theirs = set(target.state_names) <= set(state.names) and len(target.q) == state.robot.nq
+    if target.moving or not theirs:
         raise InputError(
-            f"target is a model of '{target.robot}', of which '{state.robot.name}' has no such "
-            "state; give one of this robot"
+            f"target is a model of '{target.robot}', expected a state of '{state.robot.name}' or a "
+            "model of it about a point that stays"
         )
-    require_turns("target", len(target.q), state.robot)
     goal = state.read(target.q, target.v)
-    goal[[state.names.index(name) for name in target.state_names]] = target.x0
+    # Where the model has another reference or frame, its state of the base is another.
+    same = target.frame == state.frame and target.reference.isApprox(state.reference, 1e-12)
+    for name, value in zip(target.state_names, target.x0, strict=True):
+        if same or group_of(name) == "q_m":
+            goal[state.names.index(name)] = value
     return goal
 
 

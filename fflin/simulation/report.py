@@ -19,7 +19,7 @@ _SETTLED = 0.02
 # shown as none. Rounding moves a robot that stands still by less than either.
 _THERE, _NOTHING = 1e-9, 1e-14
 
-# Share of the rows with an input at its limit from which on it is there all along.
+# Share of the run with an input at its limit from which on it is there all along.
 _ALL_ALONG = 0.9
 
 _TITLES = {"r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
@@ -128,23 +128,10 @@ def verdict(motion: Motion, kinds: list[Course]) -> str:
     aside = [k.last for k in places if not k.steered and k.size[-1] > _THERE]
     if aside:
         said += f"; not steered: {_and(aside)}"
-    if full := saturated(motion):
+    held = getattr(motion, "saturated", ())
+    if full := [each.name for each in held if each.share > _ALL_ALONG]:
         said += f"; at the limit all along: {', '.join(full)}"
     return said
-
-
-def saturated(motion: Motion) -> list[str]:
-    """Return the names of the inputs that are at their limits all along."""
-    names, values = getattr(motion, "limit_names", ()), getattr(motion, "limits", ())
-    limits = dict(zip(names, values, strict=True))
-    found = []
-    for name, u in zip(motion.input_names, motion.u.T, strict=True):
-        least, largest = limits.get(name, (-np.inf, np.inf))
-        # A thruster that rests is not at its limit, nor is what cannot act at all.
-        full = ((u >= largest) & (largest > 0.0)) | ((u <= least) & (least < 0.0))
-        if full.mean() > _ALL_ALONG:
-            found.append(name)
-    return found
 
 
 def _and(words: list[str]) -> str:
