@@ -243,6 +243,13 @@ def bound(policy: Any, robot: Robot) -> Policy:
     return result
 
 
+def feedback_of(policy: Any) -> tuple[LinearModel | None, Array | None]:
+    """Return the model that a policy was made for, and its K, where it has them."""
+    lin = getattr(policy, "lin", None)
+    decides = policy.policy if isinstance(policy, Allocation) else policy
+    return (lin if isinstance(lin, LinearModel) else None), getattr(decides, "K", None)
+
+
 def _error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Array) -> Array:
     """Return the error (nx,) from a moving reference, in its axes."""
     g = state.groups

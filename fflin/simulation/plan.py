@@ -12,7 +12,7 @@ from fflin.base.errors import InputError
 from fflin.base.names import group_of
 from fflin.base.validation import Array, vector
 from fflin.control.channel import Channel, Law
-from fflin.control.policies import Allocation, bound
+from fflin.control.policies import bound, feedback_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.ignorable import rotor_names
 from fflin.linear.model import LinearModel
@@ -140,11 +140,9 @@ def law_of(policy: Any, plant: Plant, limits: tuple[Array, Array], times: Times)
 
 def fed_back(policy: Any) -> tuple[str, ...]:
     """Return the names of the states that a policy about a model's point feeds back."""
-    lin = getattr(policy, "lin", None)
-    if not isinstance(lin, LinearModel):
+    lin, K = feedback_of(policy)
+    if lin is None:
         return ()
-    decides = policy.policy if isinstance(policy, Allocation) else policy
-    K = getattr(decides, "K", None)
     used = np.ones(len(lin.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
     return tuple(name for name, size in zip(lin.state_names, used, strict=True) if size)
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import number, whole
-from fflin.control.policies import Allocation
-from fflin.linear.model import LinearModel
+from fflin.control.policies import feedback_of
 
 LARGEST_TURN = 1.0  # within one step [rad], beyond which no integrator follows
 _STEP = 0.01  # [s]
@@ -137,9 +136,8 @@ def _fastest_pole(policy: Any) -> tuple[float, str]:
     The state is named that takes the largest part in the mode, by the products of its left and
     right vectors, which have no unit; only where the pole asks for a step below the usual one.
     """
-    decides = policy.policy if isinstance(policy, Allocation) else policy
-    lin, K = getattr(policy, "lin", None), getattr(decides, "K", None)
-    if not isinstance(lin, LinearModel) or K is None or lin.dt:
+    lin, K = feedback_of(policy)
+    if lin is None or K is None or lin.dt:
         return 0.0, ""
     loop = lin.A - lin.B @ K
     fastest = float(np.abs(np.linalg.eigvals(loop)).max())
