@@ -127,15 +127,28 @@ def predict(plan: Plan, x: Array, steps: int) -> Array:
 
 def _states(predictor: Predictor, plan: Plan, x: Array, steps: int) -> Array:
     dt, _, every, sample, delay, *_ = plan.times
-    lin = predictor.lin
+    lin, limits = predictor.lin, plan.limits
     x0, u0 = lin.x0, lin.u0
-    channel = Channel(predictor.law(), plan.initial, *plan.limits, sample, delay)
+    if limits.wheels or limits.pulses:
+        # Both change within a sample.
+        lin = lin.generator or lin
+    rotors = (
+        [lin.state_names.index(f"qdot_m.{name}") for name in limits.wheels.names]
+        if limits.wheels
+        else []
+    )
+
+    def speeds(e: Array) -> Array:
+        return x0[rotors] + e[rotors]
+
+    channel = Channel(predictor.law(), plan.initial, limits, sample, delay, speeds)
     rows = []
     e = x - x0
     if lin.dt:
         # Between the samples of a sampled model there is nothing to say.
         whole = round(lin.dt / dt)
-        if sample != whole or any(count % whole for count in (delay, every, steps)):
+        within = limits.wheels or limits.pulses
+        if within or sample != whole or any(count % whole for count in (delay, every, steps)):
             return np.zeros((0, len(x)))
         for step in range(0, steps, whole):
             u = channel.begin(step, e)

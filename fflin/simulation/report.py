@@ -11,6 +11,7 @@ from fflin.base.names import group_of, input_keys
 from fflin.base.tables import folded, grid, width
 from fflin.base.validation import Array
 from fflin.simulation.motion import Motion
+from fflin.simulation.passed import lines
 
 # An error has settled once it stays below this share of its largest.
 _SETTLED = 0.02
@@ -67,6 +68,7 @@ def motion_report(motion: Motion) -> str:
         parts.append(f"\n{grid([*rows, *(kind.row(motion.t) for kind in kinds)], 'll')}\n")
     if kinds or motion.u.any():
         parts.append(_largest_inputs(motion))
+    parts += lines(motion)
     energy = motion.energy
     parts.append(
         f"energy {energy[0]:.6g} J at first, {energy[-1]:.6g} J at last; "
@@ -128,8 +130,7 @@ def verdict(motion: Motion, kinds: list[Course]) -> str:
     aside = [k.last for k in places if not k.steered and k.size[-1] > _THERE]
     if aside:
         said += f"; not steered: {_and(aside)}"
-    held = getattr(motion, "saturated", ())
-    if full := [each.name for each in held if each.share > _ALL_ALONG]:
+    if full := [each.name for each in motion.saturated if each.share > _ALL_ALONG]:
         said += f"; at the limit all along: {', '.join(full)}"
     return said
 

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -128,10 +127,12 @@ def test_the_states_that_a_feedback_feeds_back_are_on_record():
     assert set(lin.state_names) - set(motion.steered) == {"r_b.x", "r_b.y", "r_b.z"}
 
 
-def test_inputs_at_their_limits_all_along_are_named(monkeypatch):
-    held = [SimpleNamespace(name="tau_b.x", share=0.97), SimpleNamespace(name="F_b.x", share=0.5)]
-    monkeypatch.setattr(fflin.Motion, "saturated", held, raising=False)
-    said = first(course(lambda t: np.exp(-t / 10.0), joint=0.0))
+def test_inputs_at_their_limits_all_along_are_named():
+    motion = course(lambda t: np.exp(-t / 10.0), joint=0.0)
+    u = np.zeros_like(motion.u)
+    u[:, 0], u[:1000, 1] = -3.0, 2.0  # all of the run, and half of it
+    names, limits = ("tau_b.x", "tau_b.y"), np.array([[-3.0, 3.0], [-2.0, 2.0]])
+    said = first(replace(motion, u=u, limit_names=names, limits=limits))
     assert said == "not settled: attitude 2.7 deg at the end; at the limit all along: tau_b.x"
 
 
