@@ -32,7 +32,8 @@ def notes_of(policy: Any, robot: Robot) -> tuple[str, ...]:
     sampled = here.discretize(lin.dt) if lin.dt else here
     own, other = (size[rows, None] * B for B in (lin.B, sampled.B[rows]))
     apart = np.linalg.norm(own - other, axis=0) / np.linalg.norm(own, axis=0).clip(1e-300)
+    most = 100.0 * float(apart.max(initial=0.0))
     return (
         f"the controller is one of '{lin.robot}', the robot another: the accelerations that its "
-        f"inputs cause differ by up to {100.0 * float(apart.max(initial=0.0)):.2g} %",
+        f"inputs cause differ by up to {most:.{0 if most >= 10.0 else 1}f} %",
     )

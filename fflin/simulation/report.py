@@ -64,7 +64,8 @@ def motion_report(motion: Motion) -> str:
     parts.extend(motion.notes)
     parts = [folded(parts)]
     if kinds:
-        rows = [["error", "unit", "first", "largest", "last", "settled after [s]"]]
+        settled = f"within {100.0 * _SETTLED:g} % after [s]"
+        rows = [["error", "unit", "first", "largest", "last", settled]]
         parts.append(f"\n{grid([*rows, *(kind.row(motion.t) for kind in kinds)], 'll')}\n")
     if kinds or motion.u.any():
         parts.append(_largest_inputs(motion))

@@ -54,8 +54,9 @@ def test_what_the_note_says_is_the_relative_change_of_what_inputs_cause(nominal)
     } | {"base": {"mass": 2.0 * robot.model.inertias[1].mass}}
     heavy = robot.with_mass_properties(bodies)
     K = np.zeros(lin.B.T.shape)
-    run = fflin.simulate(heavy, fflin.StateFeedback(lin, K), duration=0.02)
-    assert told(run) == 50.0
+    for plant, model, percent in ((heavy, lin, 50.0), (robot, fflin.linearize(heavy), 100.0)):
+        run = fflin.simulate(plant, fflin.StateFeedback(model, K), duration=0.02)
+        assert told(run) == percent
 
 
 def test_a_lock_at_another_value_is_another_robot():
