@@ -17,6 +17,7 @@ from fflin.commands.arguments import (
     add_system,
     add_values,
     command,
+    count_of,
     file_name,
     number,
 )
@@ -68,6 +69,12 @@ def add_commands(commands: Commands) -> None:
     )
     simulate.add_argument(
         "--step", metavar="H", type=number, help="step of the integration [s]; chosen by default"
+    )
+    simulate.add_argument(
+        "--every",
+        metavar="N",
+        type=count_of,
+        help="steps from one recorded row to the next; chosen where there are many",
     )
     simulate.add_argument(
         "--method", default="cf4", help="cf4 (default), rkmk4 or semi_implicit_euler"
@@ -152,6 +159,7 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
         "v0": velocity_of(robot, arguments),
         "duration": arguments.duration,
         "dt": arguments.step,
+        "every": arguments.every,
         "method": arguments.method,
         "limits": [arguments.limits, given] if arguments.limits == "urdf" else given or None,
         "delay": arguments.delay,

@@ -205,7 +205,7 @@ def test_bad_input(arm):
         ((arm, lin, gain.K[:, 1:]), "K has shape"),
         ((arm, lin, "K"), "gain holds <U1 values, expected real numbers"),
         ((arm, None, gain), "expected a fflin.Robot"),
-        ((arm.replace(inputs=[fflin.BaseTorque()]), lin, gain), "inputs are not those"),
+        ((arm.replace(inputs=[fflin.BaseTorque()]), lin, gain), "without the inputs F_b"),
     ):
         with pytest.raises(fflin.InputError, match=words):
             fflin.validity(*arguments)

@@ -152,6 +152,8 @@ def sound(folder):
         "LinearModel.load": {"path": "nosuch.npz"},
         "LinearModel.save": {"self": lin, "path": folder / "a.npz"},
         "Motion.save": {"self": motion, "path": folder / "b.npz"},
+        "Robot.perturbed": {"self": robot, "mass": 0.1, "com": 0.1, "inertia": 0.1, "seed": 0},
+        "Robot.with_mass_properties": {"self": robot, "bodies": {"base": {"mass": 1.0}}},
         "Robot.replace": {
             **{"self": robot, "inputs": robot.inputs, "outputs": robot.outputs, "gravity": vector},
             **{"stiffness": 1.0, "damping": {}, "rest": {}},
