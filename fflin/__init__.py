@@ -91,10 +91,13 @@ _PUBLIC = {
     "modes": "analysis.modes",
     "momentum_reduction": "analysis.momentum",
     "observability": "analysis.observability",
+    "plot_check": "analysis.plots",
+    "plot_loops": "control.plots",
     "plot_matrices": "analysis.plots",
+    "plot_modes": "analysis.plots",
     "plot_motion": "simulation.motion",
-    "plot_poles": "analysis.plots",
-    "plot_validity": "analysis.plots",
+    "plot_poles": "control.plots",
+    "plot_validity": "analysis.validity_plot",
     "random_configurations": "batch.configurations",
     "sampled_cost": "control.sampled_cost",
     "simulate": "simulation.simulate",
@@ -118,8 +121,9 @@ if TYPE_CHECKING:
         momentum_reduction,
     )
     from fflin.analysis.observability import Observability, observability
-    from fflin.analysis.plots import plot_matrices, plot_poles, plot_validity
+    from fflin.analysis.plots import plot_check, plot_matrices, plot_modes
     from fflin.analysis.validity import Validity, validity
+    from fflin.analysis.validity_plot import plot_validity
     from fflin.base.errors import (
         ChartError,
         DetectabilityError,
@@ -145,6 +149,7 @@ if TYPE_CHECKING:
     from fflin.control.kalman import Compensator, Estimator, kalman, lqg
     from fflin.control.lqr import lqr
     from fflin.control.output_feedback import OutputFeedback
+    from fflin.control.plots import plot_loops, plot_poles
     from fflin.control.policies import Allocation, StateFeedback, TrajectoryFeedback
     from fflin.control.sampled_cost import sampled_cost
     from fflin.control.tvlqr import GainSchedule, tvlqr

@@ -83,7 +83,7 @@ class Modes:
     equilibrium : bool
         Whether the point is a fixed point or a relative equilibrium; elsewhere the eigenvalues
         are those of a frozen model and say nothing about stability.
-    state_names : tuple of str
+    state_names, state_units : tuple of str
         Of the shapes.
     robot : str
     """
@@ -94,6 +94,7 @@ class Modes:
     residual: float
     equilibrium: bool
     state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
     robot: str
 
     @property
@@ -189,6 +190,7 @@ def modes(lin: LinearModel) -> Modes:
         found.residual,
         lin.is_equilibrium(),
         lin.state_names,
+        lin.state_units,
         lin.robot,
     )
 

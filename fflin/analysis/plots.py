@@ -1,4 +1,4 @@
-"""Figures of linear models: poles, the pattern of A and B, and how far they are valid."""
+"""Figures of linear models: the pattern of A and B, natural modes, and what a check found."""
 
 from __future__ import annotations
 
@@ -8,72 +8,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fflin.analysis.modes import Mode, Modes
 from fflin.base.errors import InputError
-from fflin.base.figures import COLORS, saved, styled, target_of
-from fflin.base.validation import Array, number
+from fflin.base.figures import COLORS, letters_of, saved, styled, target_of
+from fflin.base.tables import counted
+from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from fflin.analysis.validity import Validity
+# With more states than this, names of the groups alone can be read.
+_MANY = 110
 
-
-def plot_poles(
-    poles: Any, path: str | Path | None = None, *, dt: float = 0.0, title: str = "poles"
-) -> Figure:
-    """Draw a pole map.
-
-    Parameters
-    ----------
-    poles : array_like or Gain or LinearModel
-        Poles [1/s], or what has them; several of these as {label: poles}.
-    path : str or Path, optional
-        .png, .pdf or .svg to save to.
-    dt : float
-        Sampling time of poles that are given as numbers; then the unit circle is drawn.
-    title : str
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    MissingPackageError, FileError
-        As in `plot_motion`.
-    """
-    target, dt = target_of(path), number("dt", dt)
-    sets = poles if isinstance(poles, dict) else {"": poles}
-    with styled() as figure_class:
-        figure = figure_class(figsize=(5.5, 5.0), layout="constrained")
-        axes = figure.add_subplot()
-        for place, (label, given) in enumerate(sets.items()):
-            values, own_dt = _poles_of(given)
-            dt = own_dt or dt
-            axes.plot(
-                values.real,
-                values.imag,
-                "x" if place == 0 else "+",
-                color=COLORS[place % len(COLORS)],
-                label=label or None,
-            )
-        if dt:
-            angle = np.linspace(0.0, 2.0 * np.pi, 201)
-            axes.plot(np.cos(angle), np.sin(angle), color="#888888", lw=0.8)
-            axes.set_aspect("equal")
-        else:
-            axes.axvline(0.0, color="#888888", lw=0.8)
-        unit = "" if dt else " [1/s]"
-        axes.set(xlabel=f"real part{unit}", ylabel=f"imaginary part{unit}", title=title)
-        if any(sets):
-            axes.legend()
-        return saved(figure, target)
+# Of the two routes to a block, one is drawn above its line and one below.
+_SHIFTS = (-0.15, 0.15, 0.0, 0.0, 0.0, 0.0)
 
 
 def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
-    """Draw which entries of A and B are not zero, and how large they are.
+    """Draw which entries of A and B are not zero, and how large they are, by groups.
 
     Parameters
     ----------
@@ -94,34 +48,95 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
     target = target_of(path)
     with styled() as figure_class:
+        from matplotlib.colors import LogNorm
+
         nx, nu = lin.B.shape
-        size = min(1.0, 24.0 / nx)
-        letters = min(8.0, 16.0 * size)
-        figure = figure_class(figsize=(2.8 + 0.26 * size * (nx + nu), 2.0 + 0.26 * size * nx))
-        figure.set_layout_engine("constrained")
-        axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})
+        cell = max(0.24 * min(1.0, 24.0 / nx), min(0.12, 12.0 / nx))  # inches
+        figure = figure_class(
+            figsize=(4.2 + cell * (nx + nu), 2.6 + cell * nx), layout="compressed"
+        )
+        axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)}, sharey=True)
         entries = np.abs(np.hstack((lin.A, lin.B)))
-        top = float(np.log10(entries.max() or 1.0))
+        top = float(entries.max()) or 1.0
         # Entries below the rounding of the largest would use up the range of colours.
-        least = max(top - 12.0, float(np.log10(entries[entries > 0.0].min(initial=10.0**top))))
-        for ax, values, name, columns in zip(
-            axes, (lin.A, lin.B), "AB", (lin.state_names, lin.input_names), strict=True
-        ):
-            image = _spy(ax, values, columns, letters, (least, top))
+        least = max(1e-12 * top, float(entries[entries > 0.0].min(initial=top)))
+        norm = LogNorm(least, max(top, 1.01 * least))
+        columns = (
+            (lin.A, lin.state_names, lin.state_units),
+            (lin.B, lin.input_names, lin.input_units),
+        )
+        letters = letters_of(1, 72.0 * cell)
+        for ax, name, (values, names, units) in zip(axes, "AB", columns, strict=True):
+            sizes = np.ma.masked_equal(np.abs(values), 0.0).clip(least, None)
+            image = ax.imshow(sizes, cmap="viridis_r", aspect="equal", norm=norm)
             ax.set_title(f"{name} ({values.shape[0]} x {values.shape[1]})")
-        axes[0].set_yticks(range(nx), lin.state_names, fontsize=letters)
-        axes[1].set_yticks([])
-        figure.colorbar(image, ax=axes, shrink=0.7).set_label("log10 of the magnitude")
-        figure.suptitle(f"{lin.robot}, frame {lin.frame}")
+            ax.grid(visible=False)
+            ax.spines[:].set_visible(True)
+            _grouped(ax, "x", names, units, letters)
+        _grouped(axes[1], "y", lin.state_names, lin.state_units, letters)
+        axes[1].tick_params(axis="y", which="both", labelleft=False, length=0)
+        for start in _groups(lin.state_names, lin.state_units)[1:]:
+            axes[0].axhline(start[0] - 0.5, color="#888888", lw=0.6)
+        axes[0].set_yticks(*_ticks(lin.state_names), fontsize=letters)
+        figure.colorbar(image, ax=axes, shrink=0.8).set_label(
+            "size, each entry in SI units of its row's rate per unit of its column"
+            if not lin.dt
+            else "size, each entry in SI units of its row per unit of its column"
+        )
+        time = f", sampled every {lin.dt:g} s" if lin.dt else ""
+        figure.suptitle(f"{lin.robot}, frame {lin.frame}{time}")
         return saved(figure, target)
 
 
-def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
-    """Draw how far a linear model foresees the nonlinear loop, and which random runs settled.
+def _groups(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str]]:
+    """Return (first, last, label) of the runs of names of one group, or of one unit without."""
+    found: list[tuple[int, int, str, list[str]]] = []
+    for i, (name, unit) in enumerate(zip(names, units, strict=True)):
+        group = name.rpartition(".")[0]
+        if found and found[-1][2] == group and (group or unit in found[-1][3]):
+            first, _, _, others = found.pop()
+            found.append((first, i, group, [*others, unit]))
+        else:
+            found.append((i, i, group, [unit]))
+    return [
+        (first, last, f"{group} [{'|'.join(dict.fromkeys(of))}]".strip())
+        for first, last, group, of in found
+    ]
+
+
+def _ticks(names: Sequence[str]) -> tuple[list[int], list[str]]:
+    if len(names) > _MANY:
+        return [], []
+    return list(range(len(names))), [name.rpartition(".")[2] for name in names]
+
+
+def _grouped(
+    axes: Axes, axis: str, names: Sequence[str], units: Sequence[str], letters: float
+) -> None:
+    """Name the columns below and their groups above; the groups of rows at the right."""
+    groups = _groups(names, units)
+    middles = [(first + last) / 2.0 for first, last, _ in groups]
+    labels = [label for _, _, label in groups]
+    if axis == "x":
+        axes.set_xticks(*_ticks(names), rotation=90, fontsize=letters)
+        other = axes.secondary_xaxis("top")
+        # Three axes of the base are the narrowest group that stands beside others.
+        size = max(4.0, min(7.0, 0.9 * letters))
+        other.set_xticks(middles, [label.replace(" ", "\n", 1) for label in labels], fontsize=size)
+    else:
+        other = axes.secondary_yaxis("right")
+        other.set_yticks(middles, labels, fontsize=7)
+    other.tick_params(length=0)
+    for first, _, _ in groups[1:]:
+        (axes.axvline if axis == "x" else axes.axhline)(first - 0.5, color="#888888", lw=0.6)
+
+
+def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
+    """Draw the frequency and damping of each mode, and how far each position moves in it.
 
     Parameters
     ----------
-    validity : Validity
+    modes : Modes
     path : str or Path, optional
         .png, .pdf or .svg to save to.
 
@@ -134,84 +149,128 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     MissingPackageError, FileError
         As in `plot_motion`.
     """
-    from fflin.analysis.displacement import shown
-    from fflin.analysis.validity import TRUSTED, Validity
-
-    if not isinstance(validity, Validity):
-        raise InputError(
-            f"validity is a {type(validity).__name__}, expected what fflin.validity returns"
-        )
+    if not isinstance(modes, Modes):
+        raise InputError(f"modes is a {type(modes).__name__}, expected what fflin.modes returns")
     target = target_of(path)
-    percent = 100.0
+    count, names = len(modes.modes), modes.state_names[: len(modes.state_names) // 2]
+    title = (
+        f"{modes.robot}: {counted(len(modes.vibrations), 'vibration')}, "
+        f"{counted(count - len(modes.vibrations), 'real pole')}, "
+        f"{counted(modes.rigid_body, 'rigid-body mode')}"
+    )
     with styled() as figure_class:
-        figure = figure_class(figsize=(9.0, 4.0), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        measured = np.isfinite(validity.prediction_error)
-        levels, errors = (each[measured] for each in (validity.levels, validity.prediction_error))
-        left.loglog(percent * levels, percent * errors, "o-", color=COLORS[0], ms=3)
-        left.axhline(percent * TRUSTED, color="#888888", lw=0.8)
-        left.annotate(
-            f"trusted up to {percent * TRUSTED:g} %",
-            (0.01, percent * TRUSTED),
-            xytext=(0, 3),
-            xycoords=left.get_yaxis_transform(),
-            textcoords="offset points",
-            fontsize=8,
-        )
-        left.set_xticks(percent * validity.levels, [f"{percent * x:.3g}" for x in validity.levels])
-        left.minorticks_off()
-        left.set(
-            title="prediction error of the linear loop",
-            xlabel="displacement [% of the largest]",
-            ylabel="error [% of the displacement]",
-        )
-        if np.isfinite(validity.slope):
-            order = f"error ~ displacement^{validity.slope:.2f}"
-            left.text(0.97, 0.05, order, transform=left.transAxes, ha="right")
+        if not count:
+            figure = figure_class(figsize=(6.5, 1.0))
+            figure.suptitle(f"{title}\nnothing opposes a motion; a joint with a stiffness vibrates", y=0.7)
+            return saved(figure, target)
+        from matplotlib.patches import Patch
+        from matplotlib.ticker import NullFormatter
 
-        settled = np.array([outcome == "settled" for outcome in validity.outcomes])
-        edges = np.linspace(0.0, 1.0, 11)
-        counts = [np.histogram(validity.sampled[at], edges)[0] for at in (settled, ~settled)]
-        middles, wide = percent * (edges[1:] + edges[:-1]) / 2.0, percent * 0.09
-        right.bar(middles, counts[0], wide, color=COLORS[2], label="settled")
-        right.bar(middles, counts[1], wide, bottom=counts[0], color=COLORS[1], label="not settled")
-        low, high = validity.rate
-        right.set(
-            title=f"{validity.settled} of {len(settled)} runs settled",
-            xlabel="displacement [% of the largest]",
-            ylabel="runs",
+        figure = figure_class(
+            figsize=(6.5 + 0.2 * len(names), 3.0 + 0.36 * count), layout="constrained"
         )
-        right.yaxis.get_major_locator().set_params(integer=True)
-        right.set_ylim(0.0, 1.25 * float(np.add(*counts).max()))
-        right.legend(loc="upper left", ncols=2)
-        figure.suptitle(
-            f"{validity.robot}, up to {shown(validity.largest)}; {percent * low:.1f} to "
-            f"{percent * high:.1f} % settle ({percent * validity.confidence:g} % confidence)",
-            fontsize=10,
+        shapes, rates, damping = figure.subplots(
+            1, 3, sharey=True, gridspec_kw={"width_ratios": (0.2 * len(names) + 1.0, 1.6, 1.6)}
         )
+        units = modes.state_units[: len(names)]
+        colors = dict(zip(dict.fromkeys(units), COLORS, strict=False))
+        for place, mode in enumerate(modes.modes):
+            _bars(shapes, place, mode.shape[: len(names)], [colors[unit] for unit in units])
+        grows = [COLORS[1] if mode.unstable else "#000000" for mode in modes.modes]
+        rates.scatter([mode.frequency for mode in modes.modes], range(count), c=grows, s=16)
+        shapes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
+        shapes.set_yticks(range(count), [_said(mode) for mode in modes.modes], fontsize=8)
+        shapes.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, len(names) - 0.4), title="shape")
+        turn = 2.0 * np.pi
+        top = rates.secondary_xaxis("top", functions=(lambda w: w / turn, lambda f: turn * f))
+        top.set_xlabel("[Hz]")
+        rates.set(xscale="log", xlabel="[rad/s]", title="frequency")
+        ends = np.log10([mode.frequency for mode in modes.modes])
+        rates.set_xlim(10.0 ** np.floor(ends.min() - 0.1), 10.0 ** np.ceil(ends.max() + 0.1))
+        for axis in (rates.xaxis, top.xaxis):
+            axis.set_minor_formatter(NullFormatter())
+        ratios = [mode.damping_ratio for mode in modes.modes]
+        damping.scatter(ratios, range(count), c=grows, s=16)
+        damping.set(title="damping ratio", xlabel="[1]; orange: grows")
+        damping.set_xlim(1.1 * min(-0.01, *ratios), 1.1 * max(0.01, *ratios))
+        figure.legend(
+            handles=[Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()],
+            title="what moves most is 1; outline: modulus of what is out of phase",
+            loc="outside lower center",
+            ncols=len(colors),
+        )
+        figure.suptitle(title)
         return saved(figure, target)
 
 
-def _spy(
-    axes: Axes, values: Array, columns: Sequence[str], size: float, limits: tuple[float, float]
-) -> Any:
-    filled = np.abs(values) > 0.0
-    axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=size)
-    axes.grid(visible=False)
-    shown = np.full(values.shape, np.nan)
-    shown[filled] = np.maximum(np.log10(np.abs(values[filled])), limits[0])
-    return axes.imshow(shown, cmap="viridis", aspect="equal", vmin=limits[0], vmax=limits[1])
+def _bars(axes: Axes, place: int, shape: Any, colors: Sequence[str]) -> None:
+    """Draw a shape as bars about its line: filled what is in phase, outlined the modulus."""
+    x, half = np.arange(len(shape)), 0.45
+    axes.axhline(place, color="#888888", lw=0.5)
+    axes.bar(x, -half * shape.real, 0.7, place, color=colors)  # the axis points down
+    late = np.flatnonzero(np.abs(shape.imag) > 0.02 * np.abs(shape))
+    whole = np.where(shape.real < 0.0, half, -half) * np.abs(shape)
+    outline = [colors[i] for i in late]
+    axes.bar(x[late], whole[late], 0.7, place, fill=False, edgecolor=outline, lw=0.6)
 
 
-def _poles_of(given: Any) -> tuple[Any, float]:
-    if isinstance(given, LinearModel):
-        return np.linalg.eigvals(given.A), given.dt
-    if hasattr(given, "poles"):
-        return np.asarray(given.poles), float(getattr(given, "dt", 0.0))
-    try:
-        poles = np.asarray(given)
-    except ValueError:
-        poles = np.asarray(None)  # its rows differ in length
-    if poles.dtype.kind not in "fiuc" or not np.isfinite(poles).all():
-        raise InputError(f"poles is a {type(given).__name__}, expected finite numbers or a Gain")
-    return poles.ravel(), 0.0
+def _said(mode: Mode) -> str:
+    if not mode.oscillates:
+        return f"real, {'grows' if mode.unstable else 'decays'} in {mode.time_constant:.3g} s"
+    return (
+        f"{mode.frequency:.3g} rad/s, {mode.frequency / (2.0 * np.pi):.3g} Hz, "
+        f"damping {mode.damping_ratio:.2g}"
+    )
+
+
+def plot_check(check: Check, path: str | Path | None = None) -> Figure:
+    """Draw each error that a check found beside what it must not exceed.
+
+    Parameters
+    ----------
+    check : Check
+    path : str or Path, optional
+        .png, .pdf or .svg to save to.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    MissingPackageError, FileError
+        As in `plot_motion`.
+    """
+    if not isinstance(check, Check):
+        raise InputError(f"check is a {type(check).__name__}, expected what fflin.check returns")
+    target = target_of(path)
+    rows = [row for row in check.rows if row.error != 0.0]
+    tests = list(dict.fromkeys(row.test for row in rows))
+    names = list(dict.fromkeys(_place(row) for row in rows))
+    with styled() as figure_class:
+        figure = figure_class(figsize=(7.5, 2.2 + 0.2 * len(names)), layout="constrained")
+        axes = figure.add_subplot()
+        for shift, test, color in zip(_SHIFTS, tests, COLORS, strict=False):
+            shown = [row for row in rows if row.test == test]
+            places = [names.index(_place(row)) + shift for row in shown]
+            axes.plot([row.error for row in shown], places, "o", color=color, ms=4, label=test)
+            axes.plot([row.tolerance for row in shown], places, "|", color=color, ms=7)
+        bad = [row for row in rows if not row.ok]
+        axes.plot([row.error for row in bad], [names.index(_place(row)) for row in bad], "rx")
+        axes.set_yticks(range(len(names)), names, fontsize=8)
+        axes.set(xscale="log", ylim=(max(len(names), 1) - 0.5, -0.5))
+        axes.set_xlabel("relative error (dot) and what it must not exceed (bar)")
+        held = f"FAILED: {len(bad)} of {len(check.rows)} figures" if bad else (
+            f"OK: {len(check.rows)} figures hold"
+        )
+        exact = len(check.rows) - len(rows)
+        axes.set_title(
+            f"{check.title}\n{held}; {exact} agree to the last bit and are not drawn", loc="left"
+        )
+        figure.legend(loc="outside lower center", ncols=len(tests) or 1)
+        return saved(figure, target)
+
+
+def _place(row: Any) -> str:
+    both = ("ABA derivatives", "differences")
+    return row.block if row.test in both else f"{row.test}: {row.block}"

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import io
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from fflin.base.errors import MissingPackageError
 from fflin.base.writing import as_path, check_ending, write_whole
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from fflin.base.validation import Array
 
 FORMATS = (".png", ".pdf", ".svg")
 
@@ -42,6 +46,26 @@ def cycle(count: int) -> list[str]:
     from matplotlib.colors import to_hex
 
     return [to_hex(colormaps["turbo"](i / (count - 1))) for i in range(count)]
+
+
+def letters_of(count: int, room: float) -> float:
+    """Size of letters [pt] with which so many lines stand in a room [pt] without touching."""
+    return min(8.0, 0.75 * room / max(1, count))
+
+
+def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float) -> None:
+    """Scale an axis so that values which differ by more than a factor of 10 are told apart.
+
+    What is below the rounding of `unit` stands at zero.
+    """
+    sizes = [abs(value) for value in values.tolist() if abs(value) > 1e-9 * unit]
+    if not sizes or max(sizes) < 10.0 * min(sizes):
+        return
+    least = 10.0 ** math.floor(math.log10(min(sizes)))
+    getattr(axes, f"set_{axis}scale")("symlog", linthresh=least, linscale=0.5)
+    getattr(axes, f"{axis}axis").get_major_locator().set_params(numticks=9)
+    low, high = (2.0 * float(end) for end in (values.min(), values.max()))
+    getattr(axes, f"set_{axis}lim")(min(low, -0.5 * least), max(high, 0.5 * least))
 
 
 class styled:
