@@ -10,6 +10,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from fflin.base.errors import InputError, listed, unknown
+from fflin.base.names import input_keys
 from fflin.base.validation import Array
 from fflin.control.riccati import half_size, solve
 from fflin.control.sampled_cost import sampled_cost
@@ -80,7 +81,7 @@ def rule_weights(
     q, r = q or {}, r or {}
     if q or r:
         Q = reweighed("state", Q, q, lin.state_names)
-        R = reweighed("input", R, r, lin.input_names)
+        R = reweighed("input", R, r, input_keys(lin))
         rule = f"{', '.join((*q, *r))} as given, the others {rule}"
     if source.dt == lin.dt:
         return Q, R, None, rule
