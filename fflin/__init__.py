@@ -1,4 +1,28 @@
-"""Linear models of free-floating robots: URDF in, checked A and B out."""
+"""Linear models of free-floating robots: URDF in, checked A and B out.
+
+Robots: `load`, `from_model`, `list_robots`, `Robot`, `configuration`, `velocity`, `effort`.
+Inputs: `BaseTorque`, `BaseForce`, `JointTorque`, `Thruster`, `ReactionWheel`, `load_inputs`.
+Outputs: `FullState`, `JointPositions`, `JointVelocities`, `BasePose`, `FramePose`, `FrameVelocity`,
+`RelativePose`, `Gyroscope`, `Accelerometer`, `CenterOfMass`, `Momentum`.
+Linear models: `linearize`, `Linearizer`, `LinearModel`, `Certificate`, `StateMap`, `equilibrium`,
+`Equilibrium`, `linearize_trajectory`, `LinearTrajectory`, `check`, `Check`.
+Analysis: `controllability`, `Controllability`, `observability`, `Observability`, `gramians`,
+`Gramians`, `modes`, `Modes`, `Mode`, `momentum_reduction`, `ReducedModel`, `generalized_inertia`,
+`generalized_jacobian`, `validity`, `Validity`.
+Control: `lqr`, `bryson`, `Gain`, `acceleration_lqr`, `sampled_cost`, `tvlqr`, `GainSchedule`,
+`kalman`, `Estimator`, `lqg`, `Compensator`.
+Policies: `StateFeedback`, `TrajectoryFeedback`, `OutputFeedback`, `Allocation`,
+`ScheduledFeedback`.
+Simulation: `simulate`, `Motion`, `visualize`.
+Sweeps: `sweep`, `LinearBatch`, `lqr_batch`, `GainBatch`, `grid`, `Grid`, `random_configurations`,
+`RandomConfigurations`.
+Figures: `plot_matrices`, `plot_check`, `plot_modes`, `plot_poles`, `plot_loops`, `plot_validity`,
+`plot_motion`.
+Errors: `FflinError`, of which all others are: `InputError`, `UnknownNameError`, `FileError`,
+`MissingPackageError`, `ModelError`, `UrdfError`, `ChartError`, `EquilibriumError`,
+`SingularInertiaError`, `StabilizabilityError`, `DetectabilityError`, `SweepError`; the warnings are
+`FflinWarning`.
+"""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

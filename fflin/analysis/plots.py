@@ -161,7 +161,9 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     with styled() as figure_class:
         if not count:
             figure = figure_class(figsize=(6.5, 1.0))
-            figure.suptitle(f"{title}\nnothing opposes a motion; a joint with a stiffness vibrates", y=0.7)
+            figure.suptitle(
+                f"{title}\nnothing opposes a motion; a joint with a stiffness vibrates", y=0.7
+            )
             return saved(figure, target)
         from matplotlib.patches import Patch
         from matplotlib.ticker import NullFormatter
@@ -260,8 +262,10 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
         axes.set_yticks(range(len(names)), names, fontsize=8)
         axes.set(xscale="log", ylim=(max(len(names), 1) - 0.5, -0.5))
         axes.set_xlabel("relative error (dot) and what it must not exceed (bar)")
-        held = f"FAILED: {len(bad)} of {len(check.rows)} figures" if bad else (
-            f"OK: {len(check.rows)} figures hold"
+        held = (
+            f"FAILED: {len(bad)} of {len(check.rows)} figures"
+            if bad
+            else (f"OK: {len(check.rows)} figures hold")
         )
         exact = len(check.rows) - len(rows)
         axes.set_title(

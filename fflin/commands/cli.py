@@ -25,6 +25,16 @@ from fflin.commands import (
 )
 
 
+# The commands by task, as the help lists them.
+TASKS = {
+    "look at robots": ("robots", "info", "view"),
+    "make and check a linear model": ("linearize", "check"),
+    "judge it": ("analyze", "modes", "validity"),
+    "close the loop": ("lqr", "simulate"),
+    "go through many points": ("sweep",),
+}
+
+
 class _Parser(argparse.ArgumentParser):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -92,18 +102,35 @@ def _tell(line: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
+class _TopParser(_Parser):
+    commands: argparse._SubParsersAction[_Parser]
+
+    def format_help(self) -> str:
+        """Return the help, in which the commands stand by task."""
+        formatter = self._get_formatter()
+        formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
+        formatter.add_text(self.description)
+        shown = {action.dest: action for action in self.commands._get_subactions()}
+        left = tuple(name for name in shown if name not in sum(TASKS.values(), ()))
+        for task, names in (TASKS | {"other": left}).items():
+            formatter.start_section(task)
+            formatter.add_arguments(shown[name] for name in names)
+            formatter.end_section()
+        formatter.start_section("options")
+        formatter.add_arguments(each for each in self._actions if each is not self.commands)
+        formatter.end_section()
+        formatter.add_text(self.epilog)
+        return formatter.format_help()
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+    parser = _TopParser(
         prog="fflin",
         description="Linear models of free-floating robots from URDF.",
-        epilog="example: fflin linearize ets_vii -o ets_vii.mat",
+        epilog="fflin COMMAND --help has an example of each; first of all: fflin linearize ets_vii",
     )
     parser.add_argument("--version", action="version", version=f"fflin {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    models.add_commands(commands)
-    analysis.add_commands(commands)
-    regulator.add_commands(commands)
-    simulation.add_commands(commands)
-    visual.add_commands(commands)
-    sweeps.add_commands(commands)
+    parser.commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
+    for module in (models, analysis, regulator, simulation, visual, sweeps):
+        module.add_commands(parser.commands)
     return parser

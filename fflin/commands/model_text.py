@@ -6,11 +6,12 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from fflin.base.tables import matrix, signals, width
+from fflin.base.tables import grid, matrix, signals, width
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array
     from fflin.linear.model import LinearModel
+    from fflin.robot.robot import Robot
 
 
 # Below this rate [SI] nothing moves to speak of.
@@ -62,6 +63,19 @@ def model_report(lin: LinearModel) -> str:
         f"{c.inertia_residual:.1e};\ncond(M): {c.condition:.1e}; |f0|: {c.f0:.1e}"
     )
     return "\n\n".join(parts)
+
+
+def inputs_report(robot: Robot) -> str:
+    """Show the inputs of a robot, with what the URDF says of their limits."""
+    from fflin.dynamics.actuation import Actuation
+    from fflin.dynamics.state import StateMap
+    from fflin.robot.limits import joint_limits
+
+    acting, limits = Actuation(StateMap(robot)), joint_limits(robot)
+    rows = [["input", "unit", "limit"]]
+    for name, unit in zip(acting.names, acting.units, strict=True):
+        rows.append([name, unit, f"{limits[name]:.5g}" if name in limits else "."])
+    return grid(rows, "ll")
 
 
 def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:

@@ -31,6 +31,9 @@ def add_commands(commands: Commands) -> None:
         commands, "info", _info, "show tree, joints, masses and limits", "fflin info servicer_7dof"
     )
     add_robot(info)
+    info.add_argument(
+        "--inputs", metavar="FILE.toml", help="show these as well: a file, or a bundled one's name"
+    )
     linearize = command(
         commands,
         "linearize",
@@ -80,7 +83,12 @@ def _robots(_: argparse.Namespace) -> int:
 def _info(arguments: argparse.Namespace) -> int:
     from fflin.robot.summary import robot_info
 
-    print(robot_info(load_robot(arguments)))
+    robot = load_robot(arguments)
+    print(robot_info(robot))
+    if arguments.inputs is not None:
+        from fflin.commands.model_text import inputs_report
+
+        print(f"\n{inputs_report(robot)}")
     return DONE
 
 

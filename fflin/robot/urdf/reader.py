@@ -18,7 +18,7 @@ from fflin.robot.urdf.mimics import counted_leaders, resolve_mimics
 from fflin.robot.urdf.tree import Urdf, read_description
 from fflin.robot.urdf.writer import write_urdf
 from fflin.robot.urdf.xacro import expand, first_xacro
-from fflin.robot.urdf.xml import Element, named, parse, told
+from fflin.robot.urdf.xml import Element, enumerated, parse, told
 
 _SIZE_LIMIT = 64 * 2**20
 
@@ -101,7 +101,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     mimics = resolve_mimics(urdf.joints)
     model = _build(urdf, path, root, counted_leaders(urdf.joints, mimics))
     notes += told(root)
-    notes += inertia_notes(urdf.links.values(), model, path.name)
+    notes += inertia_notes(urdf.links.values(), model, path.stem)
 
     meshes = (e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh")
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
@@ -109,10 +109,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     friction = {joint.name: joint.friction for joint in moving if joint.friction}
     for what, values in (("damping", damping), ("Coulomb friction", friction)):
         if values:
-            notes.append(
-                f"{path.name}: the {what} of {named('joint', list(values))} is not in the linear "
-                "model unless it is asked for"
-            )
+            notes.append(f"{path.stem}: {what} unused: {enumerated(list(values))}")
     return Description(
         model,
         hashlib.sha256(document).hexdigest(),
