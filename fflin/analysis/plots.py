@@ -10,7 +10,8 @@ import numpy as np
 
 from fflin.analysis.modes import Mode, Modes
 from fflin.base.errors import InputError
-from fflin.base.figures import COLORS, letters_of, saved, styled, target_of
+from fflin.base.figures import COLORS, drawing, letters_of
+from fflin.base.names import input_keys, runs
 from fflin.base.tables import counted
 from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
@@ -33,102 +34,70 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     ----------
     lin : LinearModel
     path : str or Path, optional
-        .png, .pdf or .svg to save to.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    MissingPackageError, FileError
-        As in `plot_motion`.
+        .png, .pdf or .svg to save to; errors as in `plot_motion`.
     """
     if not isinstance(lin, LinearModel):
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
-    target = target_of(path)
-    with styled() as figure_class:
+    nx, nu = lin.B.shape
+    cell = max(0.24 * min(1.0, 24.0 / nx), min(0.12, 12.0 / nx))  # inches
+    size = (4.2 + cell * (nx + nu), 2.6 + cell * nx)
+    with drawing(path, *size, layout="compressed") as figure:
         from matplotlib.colors import LogNorm
 
-        nx, nu = lin.B.shape
-        cell = max(0.24 * min(1.0, 24.0 / nx), min(0.12, 12.0 / nx))  # inches
-        figure = figure_class(
-            figsize=(4.2 + cell * (nx + nu), 2.6 + cell * nx), layout="compressed"
-        )
-        axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)}, sharey=True)
+        axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})
         entries = np.abs(np.hstack((lin.A, lin.B)))
         top = float(entries.max()) or 1.0
         # Entries below the rounding of the largest would use up the range of colours.
         least = max(1e-12 * top, float(entries[entries > 0.0].min(initial=top)))
         norm = LogNorm(least, max(top, 1.01 * least))
-        columns = (
-            (lin.A, lin.state_names, lin.state_units),
-            (lin.B, lin.input_names, lin.input_units),
-        )
+        rows = lin.state_names, lin.state_names, lin.state_units
+        inputs = lin.input_names, input_keys(lin), lin.input_units
         letters = letters_of(1, 72.0 * cell)
-        for ax, name, (values, names, units) in zip(axes, "AB", columns, strict=True):
+        for ax, values, columns in zip(axes, (lin.A, lin.B), (rows, inputs), strict=True):
             sizes = np.ma.masked_equal(np.abs(values), 0.0).clip(least, None)
-            image = ax.imshow(sizes, cmap="viridis_r", aspect="equal", norm=norm)
-            ax.set_title(f"{name} ({values.shape[0]} x {values.shape[1]})")
+            image = ax.imshow(sizes, cmap="viridis_r", norm=norm)
             ax.grid(visible=False)
             ax.spines[:].set_visible(True)
-            _grouped(ax, "x", names, units, letters)
-        _grouped(axes[1], "y", lin.state_names, lin.state_units, letters)
-        axes[1].tick_params(axis="y", which="both", labelleft=False, length=0)
-        for start in _groups(lin.state_names, lin.state_units)[1:]:
-            axes[0].axhline(start[0] - 0.5, color="#888888", lw=0.6)
-        axes[0].set_yticks(*_ticks(lin.state_names), fontsize=letters)
+            _name(ax.xaxis, ax.secondary_xaxis("top").xaxis, *columns, letters)
+            _name(ax.yaxis, ax.secondary_yaxis("right").yaxis, *rows, letters)
+            ax.tick_params("x", rotation=90)
+        axes[0].child_axes[1].set_yticks([])
+        axes[1].set_yticks([])
+        axes[0].set_title(f"A ({nx} x {nx})")
+        axes[1].set_title(f"B ({nx} x {nu})")
+        of = "row" if lin.dt else "row's rate"
         figure.colorbar(image, ax=axes, shrink=0.8).set_label(
-            "size, each entry in SI units of its row's rate per unit of its column"
-            if not lin.dt
-            else "size, each entry in SI units of its row per unit of its column"
+            f"size, each entry in SI units of its {of} per unit of its column"
         )
         time = f", sampled every {lin.dt:g} s" if lin.dt else ""
         figure.suptitle(f"{lin.robot}, frame {lin.frame}{time}")
-        return saved(figure, target)
+    return figure
 
 
-def _groups(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str]]:
-    """Return (first, last, label) of the runs of names of one group, or of one unit without."""
-    found: list[tuple[int, int, str, list[str]]] = []
-    for i, (name, unit) in enumerate(zip(names, units, strict=True)):
-        group = name.rpartition(".")[0]
-        if found and found[-1][2] == group and (group or unit in found[-1][3]):
-            first, _, _, others = found.pop()
-            found.append((first, i, group, [*others, unit]))
-        else:
-            found.append((i, i, group, [unit]))
-    return [
-        (first, last, f"{group} [{'|'.join(dict.fromkeys(of))}]".strip())
-        for first, last, group, of in found
-    ]
-
-
-def _ticks(names: Sequence[str]) -> tuple[list[int], list[str]]:
-    if len(names) > _MANY:
-        return [], []
-    return list(range(len(names))), [name.rpartition(".")[2] for name in names]
-
-
-def _grouped(
-    axes: Axes, axis: str, names: Sequence[str], units: Sequence[str], letters: float
+def _name(
+    axis: Any,
+    opposite: Any,
+    names: Sequence[str],
+    keys: Sequence[str],
+    units: Sequence[str],
+    letters: float,
 ) -> None:
-    """Name the columns below and their groups above; the groups of rows at the right."""
-    groups = _groups(names, units)
-    middles = [(first + last) / 2.0 for first, last, _ in groups]
-    labels = [label for _, _, label in groups]
-    if axis == "x":
-        axes.set_xticks(*_ticks(names), rotation=90, fontsize=letters)
-        other = axes.secondary_xaxis("top")
-        # Three axes of the base are the narrowest group that stands beside others.
-        size = max(4.0, min(7.0, 0.9 * letters))
-        other.set_xticks(middles, [label.replace(" ", "\n", 1) for label in labels], fontsize=size)
+    """Name rows or columns on one side and their groups on the other, with lines between these."""
+    if len(names) <= _MANY:
+        axis.set_ticks(range(len(names)), [n.rpartition(".")[2] for n in names], fontsize=letters)
     else:
-        other = axes.secondary_yaxis("right")
-        other.set_yticks(middles, labels, fontsize=7)
-    other.tick_params(length=0)
-    for first, _, _ in groups[1:]:
-        (axes.axvline if axis == "x" else axes.axhline)(first - 0.5, color="#888888", lw=0.6)
+        axis.set_ticks([])
+    found, side = runs(keys, units), "x" if axis.axis_name == "x" else "y"
+    opposite.set_ticks(
+        [(first + last) / 2.0 for first, last, _, _ in found],
+        [f"{group}{chr(10) if side == 'x' else ' '}[{of}]" for _, _, group, of in found],
+        # Three axes of the base are the narrowest group that stands beside others.
+        fontsize=max(4.0, min(7.0, 0.9 * letters)) if side == "x" else 7.0,
+    )
+    opposite.set_tick_params(length=0)
+    for first, *_ in found[1:]:
+        line = axis.axes.axvline if side == "x" else axis.axes.axhline
+        line(first - 0.5, color="#888888", lw=0.6)
 
 
 def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
@@ -138,63 +107,31 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     ----------
     modes : Modes
     path : str or Path, optional
-        .png, .pdf or .svg to save to.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    MissingPackageError, FileError
-        As in `plot_motion`.
+        .png, .pdf or .svg to save to; errors as in `plot_motion`.
     """
     if not isinstance(modes, Modes):
         raise InputError(f"modes is a {type(modes).__name__}, expected what fflin.modes returns")
-    target = target_of(path)
-    count, names = len(modes.modes), modes.state_names[: len(modes.state_names) // 2]
+    count, half = len(modes.modes), len(modes.state_names) // 2
+    names, units = modes.state_names[:half], modes.state_units[:half]
     title = (
         f"{modes.robot}: {counted(len(modes.vibrations), 'vibration')}, "
         f"{counted(count - len(modes.vibrations), 'real pole')}, "
         f"{counted(modes.rigid_body, 'rigid-body mode')}"
     )
-    with styled() as figure_class:
-        if not count:
-            figure = figure_class(figsize=(6.5, 1.0))
-            figure.suptitle(
-                f"{title}\nnothing opposes a motion; a joint with a stiffness vibrates", y=0.7
-            )
-            return saved(figure, target)
+    if not count:
+        with drawing(path, 6.5, 1.0) as figure:
+            figure.suptitle(f"{title}\nnothing opposes a motion; a joint with a stiffness vibrates")
+        return figure
+    with drawing(path, 5.0 + 0.2 * half, 2.6 + 0.36 * count) as figure:
         from matplotlib.patches import Patch
-        from matplotlib.ticker import NullFormatter
 
-        figure = figure_class(
-            figsize=(6.5 + 0.2 * len(names), 3.0 + 0.36 * count), layout="constrained"
-        )
-        shapes, rates, damping = figure.subplots(
-            1, 3, sharey=True, gridspec_kw={"width_ratios": (0.2 * len(names) + 1.0, 1.6, 1.6)}
-        )
-        units = modes.state_units[: len(names)]
+        axes = figure.add_subplot()
         colors = dict(zip(dict.fromkeys(units), COLORS, strict=False))
         for place, mode in enumerate(modes.modes):
-            _bars(shapes, place, mode.shape[: len(names)], [colors[unit] for unit in units])
-        grows = [COLORS[1] if mode.unstable else "#000000" for mode in modes.modes]
-        rates.scatter([mode.frequency for mode in modes.modes], range(count), c=grows, s=16)
-        shapes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
-        shapes.set_yticks(range(count), [_said(mode) for mode in modes.modes], fontsize=8)
-        shapes.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, len(names) - 0.4), title="shape")
-        turn = 2.0 * np.pi
-        top = rates.secondary_xaxis("top", functions=(lambda w: w / turn, lambda f: turn * f))
-        top.set_xlabel("[Hz]")
-        rates.set(xscale="log", xlabel="[rad/s]", title="frequency")
-        ends = np.log10([mode.frequency for mode in modes.modes])
-        rates.set_xlim(10.0 ** np.floor(ends.min() - 0.1), 10.0 ** np.ceil(ends.max() + 0.1))
-        for axis in (rates.xaxis, top.xaxis):
-            axis.set_minor_formatter(NullFormatter())
-        ratios = [mode.damping_ratio for mode in modes.modes]
-        damping.scatter(ratios, range(count), c=grows, s=16)
-        damping.set(title="damping ratio", xlabel="[1]; orange: grows")
-        damping.set_xlim(1.1 * min(-0.01, *ratios), 1.1 * max(0.01, *ratios))
+            _bars(axes, place, mode.shape[:half], [colors[unit] for unit in units])
+        axes.set_xticks(range(half), names, rotation=90, fontsize=8)
+        axes.set_yticks(range(count), [_said(mode) for mode in modes.modes], fontsize=8)
+        axes.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, half - 0.4))
         figure.legend(
             handles=[Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()],
             title="what moves most is 1; outline: modulus of what is out of phase",
@@ -202,17 +139,17 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
             ncols=len(colors),
         )
         figure.suptitle(title)
-        return saved(figure, target)
+    return figure
 
 
 def _bars(axes: Axes, place: int, shape: Any, colors: Sequence[str]) -> None:
     """Draw a shape as bars about its line: filled what is in phase, outlined the modulus."""
-    x, half = np.arange(len(shape)), 0.45
+    x, tall = np.arange(len(shape)), -0.45  # for the axis points down
     axes.axhline(place, color="#888888", lw=0.5)
-    axes.bar(x, -half * shape.real, 0.7, place, color=colors)  # the axis points down
+    axes.bar(x, tall * shape.real, 0.7, place, color=colors)
     late = np.flatnonzero(np.abs(shape.imag) > 0.02 * np.abs(shape))
-    whole = np.where(shape.real < 0.0, half, -half) * np.abs(shape)
-    outline = [colors[i] for i in late]
+    whole = tall * np.where(shape.real < 0.0, -1.0, 1.0) * np.abs(shape)
+    outline = [colors[i] for i in late.tolist()]
     axes.bar(x[late], whole[late], 0.7, place, fill=False, edgecolor=outline, lw=0.6)
 
 
@@ -232,25 +169,14 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
     ----------
     check : Check
     path : str or Path, optional
-        .png, .pdf or .svg to save to.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    MissingPackageError, FileError
-        As in `plot_motion`.
+        .png, .pdf or .svg to save to; errors as in `plot_motion`.
     """
     if not isinstance(check, Check):
         raise InputError(f"check is a {type(check).__name__}, expected what fflin.check returns")
-    target = target_of(path)
     rows = [row for row in check.rows if row.error != 0.0]
     tests = list(dict.fromkeys(row.test for row in rows))
     names = list(dict.fromkeys(_place(row) for row in rows))
-    with styled() as figure_class:
-        figure = figure_class(figsize=(7.5, 2.2 + 0.2 * len(names)), layout="constrained")
+    with drawing(path, 7.5, 2.2 + 0.2 * len(names)) as figure:
         axes = figure.add_subplot()
         for shift, test, color in zip(_SHIFTS, tests, COLORS, strict=False):
             shown = [row for row in rows if row.test == test]
@@ -272,7 +198,7 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
             f"{check.title}\n{held}; {exact} agree to the last bit and are not drawn", loc="left"
         )
         figure.legend(loc="outside lower center", ncols=len(tests) or 1)
-        return saved(figure, target)
+    return figure
 
 
 def _place(row: Any) -> str:

@@ -94,11 +94,10 @@ class Validity:
         """Number of runs that settled."""
         return self.outcomes.count("settled")
 
-    def shown(self, displacement: dict[str, float]) -> str:
-        """Say a displacement such as `holds` in words."""
-        return shown(displacement, self.joint_unit)
-
     def __str__(self) -> str:
+        trusted, holds, largest = (
+            shown(each, self.joint_unit) for each in (self.trusted, self.holds, self.largest)
+        )
         count, sure = len(self.outcomes), f"{100.0 * self.confidence:g} %"
         low, high = self.rate
         ends = Counter(self.outcomes)
@@ -107,15 +106,15 @@ class Validity:
         if np.isfinite(self.slope):
             order = f"the error grows with the displacement to the power {self.slope:.3f}"
         beyond = " and beyond" if self.trusted == self.largest else ""
-        first = {key: value * self.sampled[0] for key, value in self.largest.items()}
+        first = shown(scaled(self.largest, float(self.sampled[0])), self.joint_unit)
         lines = [
             f"{self.robot}: the linear loop foresees the nonlinear one within "
-            f"{100.0 * TRUSTED:g} % up to {self.shown(self.trusted)}{beyond}; {order}",
-            f"every loop settled up to {self.shown(self.holds)}: {self.inside} of {self.inside} runs, "
+            f"{100.0 * TRUSTED:g} % up to {trusted}{beyond}; {order}",
+            f"every loop settled up to {holds}: {self.inside} of {self.inside} runs, "
             f"so that at least {100.0 * self.inside_rate:.1f} % do ({sure} confidence)"
             if self.inside
-            else f"even from the smallest displacement tried, {self.shown(first)}, it did not settle",
-            f"of displacements up to {self.shown(self.largest)} {self.settled} of {count} runs settled: "
+            else f"even from the smallest displacement tried, {first}, it did not settle",
+            f"of displacements up to {largest} {self.settled} of {count} runs settled: "
             f"between {100.0 * low:.1f} and {100.0 * high:.1f} % do ({sure} confidence)"
             + (f"; {failures}" if failures else ""),
         ]

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fflin.analysis.displacement import shown
 from fflin.analysis.validity import TRUSTED, Validity
 from fflin.base.errors import InputError
-from fflin.base.figures import COLORS, saved, styled, target_of
+from fflin.base.figures import COLORS, drawing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,25 +23,14 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     ----------
     validity : Validity
     path : str or Path, optional
-        .png, .pdf or .svg to save to.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    MissingPackageError, FileError
-        As in `plot_motion`.
+        .png, .pdf or .svg to save to; errors as in `plot_motion`.
     """
     if not isinstance(validity, Validity):
         raise InputError(
             f"validity is a {type(validity).__name__}, expected what fflin.validity returns"
         )
-    target = target_of(path)
     percent = 100.0
-    with styled() as figure_class:
-        figure = figure_class(figsize=(9.0, 4.3), layout="constrained")
+    with drawing(path, 9.0, 4.3) as figure:
         left, right = figure.subplots(1, 2)
         measured = np.isfinite(validity.prediction_error)
         levels, errors = (each[measured] for each in (validity.levels, validity.prediction_error))
@@ -75,8 +65,9 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
         right.set_ylim(0.0, 1.05 * float(np.add(*counts).max()))
         figure.legend(loc="outside lower center", ncols=4)
         figure.suptitle(
-            f"{validity.robot}, up to {validity.shown(validity.largest)}; {percent * low:.1f} to "
-            f"{percent * high:.1f} % settle ({percent * validity.confidence:g} % confidence)",
+            f"{validity.robot}, up to {shown(validity.largest, validity.joint_unit)}; "
+            f"{percent * low:.1f} to {percent * high:.1f} % settle "
+            f"({percent * validity.confidence:g} % confidence)",
             fontsize=10,
         )
-        return saved(figure, target)
+    return figure

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -48,7 +50,7 @@ def cycle(count: int) -> list[str]:
     return [to_hex(colormaps["turbo"](i / (count - 1))) for i in range(count)]
 
 
-def letters_of(count: int, room: float) -> float:
+def letters_of(count: float, room: float) -> float:
     """Size of letters [pt] with which so many lines stand in a room [pt] without touching."""
     return min(8.0, 0.75 * room / max(1, count))
 
@@ -82,6 +84,16 @@ class styled:
 
     def __exit__(self, *problem: object) -> None:
         self._context.__exit__(None, None, None)
+
+
+@contextmanager
+def drawing(path: str | Path | None, width: float, height: float, **options: Any) -> Iterator[Any]:
+    """Give a figure of a size [in] in the style, without a window; saved where there is a path."""
+    target = target_of(path)
+    with styled() as figure_class:
+        figure = figure_class(**{"figsize": (width, height), "layout": "constrained"} | options)
+        yield figure
+        saved(figure, target)
 
 
 def require_matplotlib() -> None:

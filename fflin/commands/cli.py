@@ -24,7 +24,6 @@ from fflin.commands import (
     visual,
 )
 
-
 # The commands by task, as the help lists them.
 TASKS = {
     "look at robots": ("robots", "info", "view"),
@@ -102,35 +101,23 @@ def _tell(line: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
-class _TopParser(_Parser):
-    commands: argparse._SubParsersAction[_Parser]
-
-    def format_help(self) -> str:
-        """Return the help, in which the commands stand by task."""
-        formatter = self._get_formatter()
-        formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
-        formatter.add_text(self.description)
-        shown = {action.dest: action for action in self.commands._get_subactions()}
-        left = tuple(name for name in shown if name not in sum(TASKS.values(), ()))
-        for task, names in (TASKS | {"other": left}).items():
-            formatter.start_section(task)
-            formatter.add_arguments(shown[name] for name in names)
-            formatter.end_section()
-        formatter.start_section("options")
-        formatter.add_arguments(each for each in self._actions if each is not self.commands)
-        formatter.end_section()
-        formatter.add_text(self.epilog)
-        return formatter.format_help()
-
-
 def _parser() -> argparse.ArgumentParser:
-    parser = _TopParser(
+    parser = _Parser(
         prog="fflin",
+        usage="fflin [-h] [--version] COMMAND ...",
         description="Linear models of free-floating robots from URDF.",
-        epilog="fflin COMMAND --help has an example of each; first of all: fflin linearize ets_vii",
+        epilog="example: fflin linearize ets_vii -o ets_vii.mat",
     )
     parser.add_argument("--version", action="version", version=f"fflin {__version__}")
-    parser.commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=_Parser)
+    commands = parser.add_subparsers(
+        prog="fflin", metavar="COMMAND", required=True, help=argparse.SUPPRESS
+    )
     for module in (models, analysis, regulator, simulation, visual, sweeps):
-        module.add_commands(parser.commands)
+        module.add_commands(commands)
+    # argparse lists all in one group.
+    left = {command.dest: command for command in commands._choices_actions}
+    commands._choices_actions = []
+    for task, names in TASKS.items():
+        parser.add_argument_group(task)._group_actions += [left.pop(name) for name in names]
+    parser.add_argument_group("other")._group_actions += left.values()
     return parser

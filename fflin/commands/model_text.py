@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from fflin.base.names import runs
 from fflin.base.tables import grid, matrix, signals, width
 
 if TYPE_CHECKING:
@@ -97,20 +98,9 @@ def _units(lin: LinearModel) -> str:
 
 
 def _grouped(names: Sequence[str], units: Sequence[str]) -> str:
-    # Names without a group, such as a thruster's, stand together as long as their unit is one.
-    groups: list[tuple[str, list[str], list[str]]] = []
-    for name, unit in zip(names, units, strict=True):
-        group = name.partition(".")[0] if name.count(".") == 1 else name.rpartition(".")[0]
-        last = groups[-1] if groups else None
-        if last and last[0] == group and (group or unit in last[2]):
-            last[1].append(name)
-            last[2].append(unit)
-        else:
-            groups.append((group, [name], [unit]))
     return ", ".join(
-        f"{group or ' ... '.join(dict.fromkeys((members[0], members[-1])))} "
-        f"[{'|'.join(dict.fromkeys(of))}]"
-        for group, members, of in groups
+        f"{group or ' ... '.join(dict.fromkeys((names[first], names[last])))} [{of}]"
+        for first, last, group, of in runs(names, units)
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,28 +13,21 @@ from fflin.control.gain import Gain
 
 _POINTS = 400
 
-# A factor on the gain below this is none: at low frequencies a loop with an integrator is infinite.
+# A factor on the gain below this is none: a loop with an integrator is infinite at rest.
 _NOTHING = 1e-6
 
 
 class Loop(NamedTuple):
-    """What the loop of one input bears, the others closed.
+    """Frequencies [rad/s] with the phase [deg] where the gain is 1, the gain where that is -180."""
 
-    Attributes
-    ----------
-    crossings : tuple of (float, float)
-        Where its gain is one: frequency [rad/s] and phase [deg], in (-360, 0].
-    turns : tuple of (float, float)
-        Where its phase is -180 deg: frequency [rad/s] and gain.
-    """
-
-    crossings: tuple[tuple[float, float], ...]
-    turns: tuple[tuple[float, float], ...]
+    crossings: list[tuple[float, float]]
+    turns: list[tuple[float, float]]
 
     @property
     def phase(self) -> float:
         """Lag or lead [deg] that it bears; infinite where its gain is never one."""
-        return min((abs(180.0 + angle) for _, angle in self.crossings), default=math.inf)
+        each = (abs(math.remainder(angle - 180.0, 360.0)) for _, angle in self.crossings)
+        return min(each, default=math.inf)
 
     @property
     def gain(self) -> tuple[float, float]:
@@ -44,7 +37,7 @@ class Loop(NamedTuple):
         return low, min((each for each in factors if each > 1.0), default=math.inf)
 
 
-def input_loops(gain: Gain) -> tuple[Array, Array, tuple[Loop, ...]]:
+def input_loops(gain: Gain) -> tuple[Array, Any, list[Loop]]:
     r"""Return frequencies (k,) [rad/s], the loops' responses (k, nu) there, and what each bears.
 
     With :math:`T = K (s E - A + B K)^{-1} B` the loop of input i is
@@ -52,52 +45,33 @@ def input_loops(gain: Gain) -> tuple[Array, Array, tuple[Loop, ...]]:
     """
     F, B, K, dt = gain.closed_loop, gain.B, gain.K, gain.dt
 
-    def response(w: float) -> Array:
+    def response(w: float) -> Any:
         s = np.exp(1j * w * dt) if dt else 1j * w
         T = np.einsum("ij,ji->i", K, np.linalg.solve(s * np.eye(len(F)) - F, B))
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(T / (1.0 - T))
+            return T / (1.0 - T)
 
     rates = np.abs(np.log(gain.poles[gain.poles != 0.0]) / dt if dt else gain.poles)
     end = math.pi / dt if dt else 100.0 * float(rates.max())
-    own = np.abs(np.linalg.eigvals(gain.A).imag)
-    start = min(float(rates.min()), end) / 100.0
-    grid = np.geomspace(start, end, _POINTS)
-    if not dt:
-        grid = np.union1d(grid, own[(own > start) & (own < end)])
+    grid = np.geomspace(min(float(rates.min()), end) / 100.0, end, _POINTS)
     values = np.array([response(w) for w in grid])
-    # At the ends of the axis a loop is real, and its phase may be -180 deg there.
-    ends = [(0.0, response(0.0)), *([(end, values[-1])] if dt else [])]
-    return grid, values, tuple(_loop(i, response, grid, values, ends) for i in range(len(K)))
 
-
-def _loop(
-    i: int,
-    response: Callable[[float], Array],
-    grid: Array,
-    values: Array,
-    ends: list[tuple[float, Array]],
-) -> Loop:
-    def where(value: Callable[[Array], Array], among: Array) -> list[float]:
-        """Return the frequencies at which a function of the response changes its sign."""
+    def changes(value: Callable[[Any], Any], i: int, among: Any) -> list[tuple[float, complex]]:
+        """Return where a function of response i changes its sign, and the response there."""
         from scipy.optimize import brentq
 
         signs = np.signbit(value(values[:, i]))
         at = np.flatnonzero((signs[1:] != signs[:-1]) & among[1:] & among[:-1])
-        return [
-            float(brentq(lambda w: float(value(response(w)[i])), grid[k], grid[k + 1])) for k in at
-        ]
+        found = (brentq(lambda w: value(response(w)[i]), *grid[k : k + 2], xtol=1e-12) for k in at)
+        return [(w, complex(response(w)[i])) for w in found]
 
-    # A gain that stands at one, as that of no loop does, crosses it nowhere.
-    crossed = where(lambda L: np.log(np.abs(L)), np.abs(values[:, i]) > 0.0)
-    turned = where(lambda L: np.imag(L), values[:, i].real < 0.0)
-    turns = [(w, response(w)[i]) for w in turned] + [(w, value[i]) for w, value in ends]
-    return Loop(
-        tuple((w, _degrees(response(w)[i])) for w in crossed),
-        tuple((w, abs(value)) for w, value in turns if value.real < 0.0),
-    )
-
-
-def _degrees(value: complex) -> float:
-    angle = math.degrees(math.atan2(value.imag, value.real))
-    return angle if angle <= 0.0 else angle - 360.0
+    loops = []
+    # At the ends of the axis a loop is real, and its phase may be -180 deg there.
+    ends = [(0.0, response(0.0))] + [(end, values[-1])] * bool(dt)
+    for i in range(len(K)):
+        crossed = changes(lambda L: np.log(np.abs(L)), i, values[:, i] != 0.0)
+        turned = changes(np.imag, i, values[:, i].real < 0.0)
+        turned += [(w, complex(value[i])) for w, value in ends if value[i].real < 0.0]
+        angles = [(w, math.degrees(np.angle(value))) for w, value in crossed]
+        loops.append(Loop(angles, [(w, abs(value)) for w, value in turned]))
+    return grid, values, loops
