@@ -66,9 +66,8 @@ _NAMES = {
         "batch.configurations grid Grid random_configurations RandomConfigurations",
     ),
     "Figures": (
-        "analysis.plots plot_matrices plot_check plot_modes",
+        "analysis.plots plot_matrices plot_check plot_modes plot_validity",
         "control.plots plot_poles plot_loops",
-        "analysis.validity_plot plot_validity",
         "simulation.motion plot_motion",
     ),
     "Errors": (
@@ -103,9 +102,8 @@ if TYPE_CHECKING:
         momentum_reduction,
     )
     from fflin.analysis.observability import Observability, observability
-    from fflin.analysis.plots import plot_check, plot_matrices, plot_modes
+    from fflin.analysis.plots import plot_check, plot_matrices, plot_modes, plot_validity
     from fflin.analysis.validity import Validity, validity
-    from fflin.analysis.validity_plot import plot_validity
     from fflin.base.errors import (
         ChartError,
         DetectabilityError,
