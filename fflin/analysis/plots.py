@@ -14,7 +14,7 @@ from fflin.analysis.validity import TRUSTED, Validity
 from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, drawing, letters_of
 from fflin.base.names import input_keys, runs
-from fflin.base.tables import counted
+from fflin.base.tables import counted, rounding
 from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
 
@@ -27,7 +27,7 @@ _SHIFTS = (-0.15, 0.15, 0.0, 0.0, 0.0, 0.0)
 
 
 def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
-    """Draw which entries of A and B are not zero, and how large they are, by groups.
+    """Draw which entries of A and B are more than rounding, and how large they are, by groups.
 
     Parameters
     ----------
@@ -44,16 +44,17 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
         from matplotlib.colors import LogNorm
 
         axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})
-        entries = np.abs(np.hstack((lin.A, lin.B)))
-        top = float(entries.max()) or 1.0
-        # Entries below the rounding of the largest would use up the range of colours.
-        least = max(1e-12 * top, float(entries[entries > 0.0].min(initial=top)))
-        norm = LogNorm(least, max(top, 1.01 * least))
+        drawn = [
+            np.ma.masked_where((m == 0.0) | (np.abs(m) < rounding(m)), np.abs(m))
+            for m in (lin.A, lin.B)
+        ]
+        entries = np.concatenate([m.compressed() for m in drawn])
+        top = float(entries.max(initial=0.0)) or 1.0
+        norm = LogNorm(float(entries.min(initial=top)), 1.01 * top)
         rows = lin.state_names, lin.state_names, lin.state_units
         inputs = lin.input_names, input_keys(lin), lin.input_units
         letters = letters_of(1, 72.0 * cell)
-        for ax, values, columns in zip(axes, (lin.A, lin.B), (rows, inputs), strict=True):
-            sizes = np.ma.masked_equal(np.abs(values), 0.0).clip(least, None)
+        for ax, sizes, columns in zip(axes, drawn, (rows, inputs), strict=True):
             image = ax.imshow(sizes, cmap="viridis_r", norm=norm)
             ax.grid(visible=False)
             ax.spines[:].set_visible(True)
