@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -67,15 +68,16 @@ def model_report(lin: LinearModel) -> str:
 
 
 def inputs_report(robot: Robot) -> str:
-    """Show the inputs of a robot, with what the URDF says of their limits."""
+    """Show the inputs of a robot and their limits."""
     from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.state import StateMap
-    from fflin.robot.limits import joint_limits
+    from fflin.robot.limits import limits_of
 
-    acting, limits = Actuation(StateMap(robot)), joint_limits(robot)
-    rows = [["input", "unit", "limit"]]
+    acting, limits = Actuation(StateMap(robot)), limits_of(robot)
+    rows = [["input", "unit", "min", "max"]]
     for name, unit in zip(acting.names, acting.units, strict=True):
-        rows.append([name, unit, f"{limits[name]:.5g}" if name in limits else "."])
+        ends = limits.get(name, (-math.inf, math.inf))
+        rows.append([name, unit, *(f"{end:.5g}" if math.isfinite(end) else "." for end in ends)])
     return grid(rows, "ll")
 
 

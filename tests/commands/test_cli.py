@@ -390,13 +390,13 @@ def test_what_other_packages_warn_of_stands_before_no_error(monkeypatch, capsys)
 def test_info_shows_the_inputs_of_a_file_with_the_limits_of_the_urdf():
     code, out, err = run("info", "servicer_7dof", "--inputs", "servicer_7dof")
     assert code == 0 and not err and "9 joints, 30 states, 17 inputs" in out
-    rows = [line.rsplit(maxsplit=1) for line in out.split("\ninput ")[1].splitlines()]
-    limits = {row[0].split()[0]: row[1] for row in rows[1:]}
+    rows = [line.split() for line in out.split("\ninput ")[1].splitlines()[1:]]
+    limits = {row[0]: (row[-2], row[-1]) for row in rows}
     model = fflin.load("servicer_7dof").model
     effort = dict(zip(model.names.tolist()[2:], model.effortLimit[6:].tolist(), strict=True))
     for name in ("joint_1", "joint_7"):
-        assert float(limits[f"tau_m.{name}"]) == effort[name]
-    assert limits["back_left_top"] == limits["F_b.x"] == "."
+        assert tuple(map(float, limits[f"tau_m.{name}"])) == (-effort[name], effort[name])
+    assert limits["F_b.x"] == (".", ".") and limits["back_left_top"] == ("0", ".")
     assert len(limits) == 17
     assert "\ninput " not in run("info", "servicer_7dof")[1]
     assert "no file at" in refused("info", "cubesat", "--inputs", "./nosuch.toml")

@@ -18,7 +18,7 @@ from fflin.robot.urdf.mimics import counted_leaders, resolve_mimics
 from fflin.robot.urdf.tree import Urdf, read_description
 from fflin.robot.urdf.writer import write_urdf
 from fflin.robot.urdf.xacro import expand, first_xacro
-from fflin.robot.urdf.xml import Element, enumerated, parse, told
+from fflin.robot.urdf.xml import Element, enumerated, named, parse, told
 
 _SIZE_LIMIT = 64 * 2**20
 
@@ -110,6 +110,16 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     for what, values in (("damping", damping), ("Coulomb friction", friction)):
         if values:
             notes.append(f"{path.stem}: {what} unused: {enumerated(list(values))}")
+    unlimited = {
+        what: [joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0]
+        for what in ("effort", "velocity")
+    }
+    zeros = [f"{what} 0 of {named('joint', names)}" for what, names in unlimited.items() if names]
+    if zeros:
+        notes.append(
+            f"{path.name}: {', '.join(zeros)}: taken as no limit; if a joint has no motor, name it "
+            "in passive"
+        )
     return Description(
         model,
         hashlib.sha256(document).hexdigest(),
