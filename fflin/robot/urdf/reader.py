@@ -110,16 +110,14 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     for what, values in (("damping", damping), ("Coulomb friction", friction)):
         if values:
             notes.append(f"{path.stem}: {what} unused: {enumerated(list(values))}")
-    unlimited = {
-        what: [joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0]
-        for what in ("effort", "velocity")
-    }
-    zeros = [f"{what} 0 of {named('joint', names)}" for what, names in unlimited.items() if names]
-    if zeros:
-        notes.append(
-            f"{path.name}: {', '.join(zeros)}: taken as no limit; if a joint has no motor, name it "
-            "in passive"
-        )
+    unlimited: dict[tuple[str, ...], list[str]] = {}
+    for what in ("effort", "velocity"):
+        zero = tuple(joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0)
+        unlimited.setdefault(zero, []).append(what)
+    for zero, of in unlimited.items():
+        if zero:
+            joints = named("joint", list(zero)) if len(zero) < 3 else f"{len(zero)} joints"
+            notes.append(f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)")
     return Description(
         model,
         hashlib.sha256(document).hexdigest(),
