@@ -253,9 +253,14 @@ def check_report(check: Check) -> str:
     states = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
     blocks = [row.block for row in check.rows]
     inputs = dict.fromkeys(b[:-1].split(", ")[1] for b in blocks if b.startswith("B["))
-    parts = [f"check of {check.title}"]
+    parts = [f"check of {check.title}\na dot is an error of exactly zero"]
     for test in ("ABA derivatives", "differences"):
         rows = {row.block: row for row in check.rows if row.test == test}
+        tolerance = next(iter(rows.values())).tolerance
+        title = f"A and B against {test}: "
+        if not any(row.error for row in rows.values()):
+            parts.append(f"{title}no difference in any of {len(rows)} blocks")
+            continue
         body = [
             [
                 state,
@@ -264,10 +269,7 @@ def check_report(check: Check) -> str:
             ]
             for state in states
         ]
-        tolerance = next(iter(rows.values())).tolerance
-        parts.append(
-            f"A and B against {test}: relative error of each block, at most {tolerance:.1e}"
-        )
+        parts.append(f"{title}relative error of each block, at most {tolerance:.1e}")
         parts.append(grid([["", *states, *inputs], *body]))
     single = [r for r in check.rows if r.test not in ("ABA derivatives", "differences")]
     rest = [[f"{r.test}: {r.block}", _error(r), f"at most {r.tolerance:.1e}"] for r in single]

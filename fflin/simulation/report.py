@@ -135,7 +135,10 @@ def verdict(motion: Motion, kinds: list[Course]) -> str:
         said = "settled: at the target from first to last"
     if aside := [kind.last for kind in places if kind.late and not kind.steered]:
         said += f"; not steered: {_and(aside)}"
-    if full := [each.name for each in motion.saturated if each.share > _ALL_ALONG]:
+    shares: dict[str, float] = {}  # at either limit
+    for each in motion.saturated:
+        shares[each.name] = shares.get(each.name, 0.0) + each.share
+    if full := [name for name, share in shares.items() if share > _ALL_ALONG]:
         said += f"; at the limit all along: {', '.join(full)}"
     return said
 
