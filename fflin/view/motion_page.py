@@ -29,6 +29,7 @@ SUN = (0.62, -0.78, 0.62)
 
 TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
 FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
+_GAS = "#5a8cff"
 
 # Length of the arrow of the largest force, and the way on which the camera goes along with the
 # base unless it is told otherwise, both in sizes of the robot.
@@ -43,7 +44,7 @@ def motion_page(
     fps: float,
     speed: float,
     follow: bool | None,
-    target: Array,
+    target: Array | None,
     tool: str | None,
 ) -> tuple[str, tuple[str, ...]]:
     """Return the page of a motion, and what could not be drawn; see `visualize`."""
@@ -57,7 +58,9 @@ def motion_page(
     drawing = Drawing(robot, scenery["robot"], sent=sent)
     moving = [(drawing, film.poses)]
     data = robot.model.createData()
-    Drawing(robot, scenery["target"], "ghost", sent).place(body_poses(robot, data, target))
+    goal = None if target is None else body_poses(robot, data, target)
+    if goal is not None:
+        Drawing(robot, scenery["target"], "ghost", sent).place(goal)
     if motion.linear is not None:
         predicted = [state.to_pinocchio(x)[0] for x in motion.linear[shown]]
         poses = np.array([body_poses(robot, data, each) for each in predicted])
@@ -68,29 +71,26 @@ def motion_page(
         clips += each.tracks(t - t[0], poses)
     window.send(Animation(clips))
 
-    # Without a policy that steers somewhere, errors are counted from the start.
-    ghost = "start" if np.array_equal(target, motion.q[0]) else "target"
     about = f"{subtitle(robot)}, {t[-1] - t[0]:.4g} s"
     info = stage_info(robot, drawing, film.poses[0], scene=scene, subtitle=about)
-    goal = corner_points(drawing, body_poses(robot, data, target))
-    shown_points = np.concatenate((frame_points(drawing, film, info["size"]), goal))
+    shown_points = frame_points(drawing, film, info["size"])
+    if goal is not None:
+        shown_points = np.concatenate((shown_points, corner_points(drawing, goal)))
     info["floor"][2] = float(shown_points[:, 2].min())
     if follow is None:
         # All of a long way at once, and nothing is to be seen of the robot.
         follow = bool(np.ptp(shown_points, axis=0).max() > _FAR * info["size"])
     if follow:
         shown_points = frame_points(drawing, film, info["size"], follow=True)
-    info |= marks(robot, film, tool, info["size"])
-    # A file may not tell how far the centre of mass drifts.
-    of_com = motion.com_drift[shown] if len(motion.com_drift) else None
-    info |= panel(robot, state, q, u, target, motion.momentum_drift[shown], of_com)
+    info |= panel(robot, motion, shown, target)
+    info |= marks(robot, film, tool, info["size"], info["plots"])
     info |= {
         "mode": "motion",
         "t": packed(t),
         "speed": speed,
         "follow": follow,
         "points": rounded(shown_points, info["size"]),
-        "legend": legend(info, ghost=ghost, linear=motion.linear is not None),
+        "legend": legend(info, target=goal is not None, linear=motion.linear is not None),
     }
     return build_page(info, window.commands()), drawing.notes
 
@@ -188,8 +188,13 @@ def triads(robot: Robot, tool: str | None, size: float) -> list[dict[str, Any]]:
     ]
 
 
-def marks(robot: Robot, film: Playback, tool: str | None, size: float) -> dict[str, Any]:
-    """Return trails, arrows of the base's wrench and plumes."""
+def marks(
+    robot: Robot, film: Playback, tool: str | None, size: float, plots: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """Return trails, arrows of the base's wrench, and plumes in the colours of their plot."""
+    colors = dict(
+        key for plot in plots if plot["title"] == "thrusters" for key in plot.get("keys", ())
+    )
     trails = [("centre of mass", COM_COLOR, film.com)]
     if tool:
         trails.insert(0, ("tool", TOOL_COLOR, film.tool))
@@ -219,16 +224,21 @@ def marks(robot: Robot, film: Playback, tool: str | None, size: float) -> dict[s
                 "direction": direction.tolist(),
                 "values": packed(film.thrust[:, k]),
                 "most": most,
+                "name": name,
+                "colour": colors.get(name, _GAS),
             }
-            for k, (joint, position, direction) in enumerate(thrusters(robot))
-            if most
+            for k, (name, joint, position, direction) in enumerate(thrusters(robot))
+            if film.thrust[:, k].any()
         ],
         "triads": triads(robot, tool, size),
     }
 
 
-def legend(shown: dict[str, Any], *, ghost: str, linear: bool) -> list[dict[str, Any]]:
-    """Return the entries of the legend, each of which can be switched off."""
+def legend(shown: dict[str, Any], *, target: bool, linear: bool) -> list[dict[str, Any]]:
+    """Return the entries of the legend, each of which can be switched off.
+
+    Thrusters are named in their plot; where there is none, in a strip of pictures, here.
+    """
     entries = [
         {"label": f"path of the {each['name']}", "colour": each["colour"],
          "paths": [["meshcat", "trails", each["name"]]]}
@@ -239,9 +249,15 @@ def legend(shown: dict[str, Any], *, ghost: str, linear: bool) -> list[dict[str,
          "paths": [["meshcat", "wrench", each["kind"]]]}
         for each in shown["arrows"]
     ]  # fmt: skip
-    entries.append({"label": ghost, "colour": "#8fb4ff", "paths": [["meshcat", "target"]]})
+    if target:
+        entries.append({"label": "target", "colour": "#8fb4ff", "paths": [["meshcat", "target"]]})
     if linear:
         entries.append(
             {"label": "linear model", "colour": "#ff7fc8", "paths": [["meshcat", "linear"]]}
         )
+    named = [each for each in shown["plumes"] if each["colour"] != _GAS]
+    entries += [
+        {"label": each["name"], "colour": each["colour"], "paths": [], "strip": True}
+        for each in named
+    ]
     return entries

@@ -1,27 +1,62 @@
-"""The figures beside a motion: errors, drift of the momentum and inputs over time."""
+"""The figures beside a motion: where it is, what drives it and its limits, over time."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.names import input_keys
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
 from fflin.view.page import packed
 
-# Titles of inputs of a group and a unit; of another group its own name.
-_TITLES = {
-    ("tau_b", "N m"): "base torque",
-    ("F_b", "N"): "base force",
-    ("tau_m", "N m"): "joint torques",
-    ("tau_m", "N"): "joint forces",
-    ("thrust", "N"): "thrusters",
-    ("wheel", "N m"): "wheel torques",
-}
+if TYPE_CHECKING:
+    from fflin.simulation.motion import Motion
+
+_COLORS = (
+    *("#ff7a70", "#7ad97f", "#6aa5ff", "#f6c35b", "#c58bff", "#5fd6d0"),
+    *("#ff9ed0", "#b6c46a", "#9aa7ff", "#d79a6a", "#4fb08c", "#e05fa8"),
+)
+# Of more lines than there are colours those that change most are named, so many.
+_NAMED, _UNNAMED = 8, "#8a93a5"
+
+# A limit is drawn where a curve comes to this share of it.
+_NEAR = 1.0 / 3.0
+
+# What is below this, in SI units, is rounding.
+_NOTHING = 1e-14
+
+# What has one colour for a name, and one legend: charts of a group and a unit, in their order.
+_CHARTS = (
+    {("tau_b", "N m"): "base torque"},
+    {("F_b", "N"): "base force"},
+    {
+        ("q_m", "rad"): "joints",
+        ("q_m", "m"): "slides",
+        ("qdot_m", "rad/s"): "joint rates",
+        ("qdot_m", "m/s"): "slide rates",
+        ("tau_m", "N m"): "joint torques",
+        ("tau_m", "N"): "joint forces",
+    },
+    {("thrust", "N"): "thrusters"},
+    {
+        ("speed", "rad/s"): "wheel speed",
+        ("wheel", "N m"): "wheel torque",
+        ("momentum", "N m s"): "wheel momentum",
+    },
+)
+
+
+class _Line(NamedTuple):
+    """What a chart shows of one name: its values (N,), and limits (2,), infinite where open."""
+
+    name: str
+    values: Array
+    limits: Array
 
 
 def errors(robot: Robot, q: Array, target: Array) -> dict[str, Array]:
@@ -51,55 +86,49 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, Array]:
     }
 
 
-def panel(
-    robot: Robot,
-    state: StateMap,
-    q: Array,
-    u: Array,
-    target: Array,
-    drift: Array,
-    of_com: Array | None = None,
-) -> dict[str, Any]:
+def panel(robot: Robot, motion: Motion, shown: Array, target: Array | None) -> dict[str, Any]:
     """Return the readouts and plots of a motion's page.
 
     Parameters
     ----------
     robot : Robot
-    state : StateMap
-    q : ndarray (N, nq)
-    u : ndarray (N, nu)
-    target : ndarray (nq,)
-    drift : ndarray (N,)
-        Of the momentum, relative.
-    of_com : ndarray (N,), optional
-        Distance of the centre of mass from its line [m].
+    motion : Motion
+    shown : ndarray (N,) of int
+        Its rows on the page.
+    target : ndarray (nq,) or None
+        What the errors are counted from; without one there are none, and the way from the start
+        is shown.
     """
-    found = errors(robot, q, target)
-    slide = any(joint.prismatic for joint in robot.joints)
-    turn = robot.n > len(robot.wheels) + sum(joint.prismatic for joint in robot.joints)
+    found = errors(robot, motion.q[shown], motion.q[0] if target is None else target)
+    of = "{} from the start" if target is None else "{} error"
+    prismatic = [joint.prismatic for joint in robot.joints if joint.name not in robot.wheels]
+    kinds = {"attitude": "°", "position": "m"}
+    kinds |= {"turns": "°"} if not all(prismatic) else {}
+    kinds |= {"slides": "m"} if any(prismatic) else {}
+    titles = {"turns": "largest joint", "slides": "largest slide"}
     readouts = [
-        ("attitude error", "°", found["attitude"]),
-        ("position error", "m", found["position"]),
-        *([("largest joint error", "°", found["turns"])] if turn else []),
-        *([("largest slide error", "m", found["slides"])] if slide else []),
-        ("momentum drift", "", drift),
-        *([] if of_com is None else [("centre of mass drift", "m", of_com)]),
+        (of.format(titles.get(kind, kind)), unit, np.where(found[kind] < _NOTHING, 0.0, found[kind]))
+        for kind, unit in kinds.items()
     ]
-    plots: list[dict[str, Any]] = [
-        _plot("attitude error", "°", [("", found["attitude"])]),
-        _plot("position error", "m", [("", found["position"])]),
+    none = np.full(2, np.inf)
+    plots = [
+        _plot(title, unit, [_Line("", values, none)], {})
+        for title, unit, values in readouts[:2]
+        if values.any()
     ]
-    actuation = Actuation(state)
-    for kind, indices in actuation.groups.items():
-        labels = "xyz" if kind in ("tau_b", "F_b") else [""] * len(indices)
-        for unit in dict.fromkeys(actuation.units[index] for index in indices):
-            lines = [
-                (label, u[:, index])
-                for label, index in zip(labels, indices, strict=True)
-                if actuation.units[index] == unit
-            ]
-            if any(values.any() for _, values in lines):
-                plots.append(_plot(_TITLES.get((kind, unit), kind), unit, lines))
+    readouts.append(("momentum drift", "", motion.momentum_drift[shown]))
+    if len(motion.com_drift):  # a file may not tell
+        readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
+    lines = _lines(robot, motion, shown)
+    for charts in _CHARTS:
+        family = {key: lines[key] for key in charts if key in lines}
+        colors = _colors(family.values())
+        drawn = [_plot(charts[key], key[1], each, colors) for key, each in family.items()]
+        # Of rates their limits alone are of interest.
+        drawn = [plot for plot in drawn if plot["limits"] or not plot["title"].endswith("rates")]
+        if drawn:
+            drawn[0]["keys"] = list(colors.items())
+        plots += drawn
     return {
         "readouts": [
             {"label": label, "unit": unit, "values": packed(values)}
@@ -109,9 +138,63 @@ def panel(
     }
 
 
-def _plot(title: str, unit: str, lines: list[tuple[str, Array]]) -> dict[str, Any]:
+def _lines(robot: Robot, motion: Motion, shown: Array) -> dict[tuple[str, str], list[_Line]]:
+    """Return the lines of states and inputs that are not zero all along, by group and unit."""
+    limits = dict(
+        zip(getattr(motion, "limit_names", ()), getattr(motion, "limits", ()), strict=True)
+    )
+    found: dict[tuple[str, str], list[_Line]] = {}
+    for name, key, unit, column in (
+        *zip(motion.state_names, motion.state_names, motion.state_units, motion.x.T, strict=True),
+        *zip(motion.input_names, input_keys(motion), motion.input_units, motion.u.T, strict=True),
+    ):
+        group, _, entry = key.partition(".")
+        line = _Line(entry, column[shown], limits.get(name, np.full(2, np.inf)))
+        if np.abs(line.values).max() < _NOTHING:
+            continue
+        if group in ("q_m", "qdot_m") and entry in robot.wheels:
+            if group == "q_m":
+                continue
+            group, inertia = "speed", robot.wheels[entry]
+            momentum = _Line(entry, inertia * line.values, inertia * line.limits)
+            found.setdefault(("momentum", "N m s"), []).append(momentum)
+        found.setdefault((group, unit), []).append(line)
+    return found
+
+
+def _colors(charts: Iterable[list[_Line]]) -> dict[str, str]:
+    """Return {name: colour}: of all, or of those that change most."""
+    change: dict[str, float] = {}
+    for lines in charts:
+        most = max(float(np.ptp(line.values)) for line in lines) or 1.0
+        for line in lines:
+            share = float(np.ptp(line.values)) / most
+            change[line.name] = max(share, change.get(line.name, 0.0))
+    if set(change) <= set("xyz"):
+        return {axis: _COLORS["xyz".index(axis)] for axis in change}
+    names = list(change)
+    if len(names) > len(_COLORS):
+        names = sorted(sorted(names, key=lambda name: -change[name])[:_NAMED], key=names.index)
+    return dict(zip(names, _COLORS, strict=False))
+
+
+def _plot(title: str, unit: str, lines: list[_Line], colors: dict[str, str]) -> dict[str, Any]:
+    drawn: dict[float, set[str]] = {}
+    for line in lines:
+        for level in line.limits[np.isfinite(line.limits) & (line.limits != 0.0)].tolist():
+            if (line.values / level).max() >= _NEAR:
+                drawn.setdefault(level, set()).add(colors.get(line.name, _UNNAMED))
     return {
         "title": title,
         "unit": unit,
-        "lines": [{"label": label, "values": packed(values)} for label, values in lines],
+        "lines": [
+            {
+                "label": line.name,
+                "colour": colors.get(line.name, _UNNAMED if line.name else _COLORS[0]),
+                "values": packed(line.values),
+            }
+            for line in lines
+        ],
+        # One that several lines share is of no line's colour.
+        "limits": [[level, *of] if len(of) == 1 else [level, ""] for level, of in drawn.items()],
     }

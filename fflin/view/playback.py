@@ -128,12 +128,15 @@ def play_back(
     return Playback(t, poses, com, tools, force, torque, thrust)
 
 
-def thrusters(robot: Robot) -> list[tuple[int, Array, Array]]:
-    """Return joint, position and direction of push, in the joint's frame, of each thruster."""
+def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
+    """Return name, joint, position and direction of push, in its frame, of each thruster."""
     found = []
+    actuation = Actuation(StateMap(robot))
+    names = [actuation.names[index] for index in actuation.groups.get("thrust", ())]
     for item in robot.inputs:
         if isinstance(item, Thruster):
             joint, placement = find_frame(robot.model, item.frame)
             position = placement.act(np.array(item.position))
-            found.append((joint, position, placement.rotation @ np.array(item.direction)))
+            direction = placement.rotation @ np.array(item.direction)
+            found.append((names[len(found)], joint, position, direction))
     return found

@@ -15,8 +15,9 @@ function problem(message) {
 
 function makeLegend(viewer, entries) {
   const legend = document.getElementById("legend");
-  for (const { label, colour, paths, off } of entries) {
+  for (const { label, colour, paths, off, strip } of entries) {
     const row = document.createElement("label"), check = document.createElement("input");
+    row.className = strip ? "strip" : "";
     const swatch = document.createElement("i");
     check.type = "checkbox";
     check.checked = !off;
@@ -72,6 +73,7 @@ function main() {
   const panel = document.getElementById("panel");
   const showMarks = makeMarks(viewer, info);
   const showFigures = makeReadouts(panel, info.readouts);
+  const stamp = document.getElementById("stamp");
   const base = viewer.scene_tree.find(info.base).object;
   const centre = yUp(info.centre), last = new THREE.Vector3().copy(base.position);
   const camera = viewer.camera, controls = viewer.controls;
@@ -81,6 +83,7 @@ function main() {
   const player = makePlayer(viewer, info, (i, time) => {
     showMarks(i);
     showFigures(i);
+    stamp.textContent = `t = ${figure(time, 3)} s`;
     for (const show of plots) show(i, time);
     const moved = base.position.clone().sub(last);
     last.copy(base.position);
@@ -91,6 +94,9 @@ function main() {
   });
   plots = info.plots.map((plot) => makePlot(panel, info.t, plot, (time) => { player.pause(); player.seek(time); }));
   if (plots.length) makeSpan(panel, info.t);
+  const fit = () => fitPlots(panel);
+  fit();
+  window.addEventListener("resize", fit);
   makeLegend(viewer, info.legend);
   const button = document.createElement("button");
   const press = () => button.setAttribute("aria-pressed", follow);
@@ -102,8 +108,9 @@ function main() {
   player.seek(player.first);
   keepFramed(() => [info.points.map(([x, y, z]) => [x + gone.x, y - gone.z, z + gone.y]), info.direction]);
   window.addEventListener("resize", () => requestAnimationFrame(() => player.seek(player.state.time)));
-  const plain = (on) => {
+  const plain = (on, keyed) => {
     document.body.classList.toggle("plain", on);
+    document.body.classList.toggle("keyed", Boolean(keyed));
     window.dispatchEvent(new Event("resize"));
   };
   window.fflin = { ...player, plain, ready: true };

@@ -2,7 +2,7 @@
 
 const GUTTER = 44; // for the figures of the axis, right of the lines [CSS pixels]
 
-const LINES = ["#ff7a70", "#7ad97f", "#6aa5ff", "#f6c35b", "#c58bff", "#5fd6d0", "#ff9ed0", "#b6c46a", "#9aa7ff", "#d79a6a"];
+const TALL = 62, LOW = 30; // heights of a plot where there is room, and at least
 
 function figure(value, digits) {
   if (value === 0) return "0";
@@ -37,27 +37,46 @@ function makeSpan(parent, t) {
   parent.append(row);
 }
 
+// Which colour is whose, for this plot and those below it with the same names.
+function makeKeys(plot) {
+  if (!(plot.keys || []).length) return null;
+  const keys = document.createElement("div");
+  keys.className = "keys";
+  const grey = new Set(plot.lines.map((line) => line.label));
+  for (const [label, colour] of plot.keys) {
+    const key = document.createElement("span");
+    key.textContent = label;
+    key.style.setProperty("--swatch", colour);
+    keys.append(key);
+    grey.delete(label);
+  }
+  if (grey.size) keys.append(`and ${grey.size} in grey`);
+  return keys;
+}
+
+// Give the plots of a panel the height that is there for them.
+function fitPlots(panel) {
+  const set = (height) => panel.style.setProperty("--tall", `${height}px`);
+  set(TALL);
+  const over = panel.scrollHeight - panel.clientHeight, count = panel.querySelectorAll(".plot").length;
+  if (over > 0 && count) set(Math.max(LOW, Math.floor(TALL - over / count)));
+}
+
 function makePlot(parent, t, plot, seek) {
   const box = document.createElement("div");
   box.className = "plot";
-  const name = document.createElement("div");
+  const name = document.createElement("div"), at = document.createElement("span");
   name.className = "name";
-  name.append(plot.unit ? `${plot.title} [${plot.unit}]` : plot.title);
-  const keys = document.createElement("span");
-  keys.className = "keys";
-  plot.lines.forEach((line, k) => {
-    if (!line.label) return;
-    const key = document.createElement("i");
-    key.textContent = line.label;
-    key.style.color = LINES[k % LINES.length];
-    keys.append(key);
-  });
-  if (plot.lines.length <= 4) name.append(keys);
+  name.append(plot.unit ? `${plot.title} [${plot.unit}]` : plot.title, at);
+  at.className = "at";
   const canvas = document.createElement("canvas");
-  box.append(name, canvas);
+  const keys = makeKeys(plot);
+  // x, y, z have room beside the title.
+  if (keys && keys.textContent.length < 6) name.append(keys);
+  box.append(name, ...(keys && !keys.parentNode ? [keys] : []), canvas);
   parent.append(box);
 
-  const values = plot.lines.flatMap((line) => Array.from(line.values)).filter(Number.isFinite);
+  const values = [...plot.lines.flatMap((line) => Array.from(line.values)).filter(Number.isFinite), ...plot.limits.map(([level]) => level)];
   let low = Math.min(0, ...[values.reduce((a, b) => Math.min(a, b), Infinity)]);
   let high = Math.max(0, ...[values.reduce((a, b) => Math.max(a, b), -Infinity)]);
   const least = low, most = high;
@@ -85,15 +104,23 @@ function makePlot(parent, t, plot, seek) {
     for (const level of [low, 0, high]) { context.moveTo(0, y(level)); context.lineTo(width - GUTTER * ratio, y(level)); }
     context.stroke();
     context.lineJoin = "round";
-    plot.lines.forEach((line, k) => {
-      context.strokeStyle = LINES[k % LINES.length];
+    context.setLineDash([5 * ratio, 4 * ratio]);
+    for (const [level, colour] of plot.limits) {
+      context.strokeStyle = colour || style.getPropertyValue("--ink");
+      context.beginPath();
+      context.moveTo(0, y(level)); context.lineTo(width - GUTTER * ratio, y(level));
+      context.stroke();
+    }
+    context.setLineDash([]);
+    plot.lines.forEach((line) => {
+      context.strokeStyle = line.colour;
       context.lineWidth = 1.4 * ratio;
       context.beginPath();
       line.values.forEach((value, i) => context.lineTo(x(t[i]), y(value)));
       context.stroke();
     });
     context.fillStyle = style.getPropertyValue("--faint");
-    context.font = `${10 * ratio}px system-ui, sans-serif`;
+    context.font = `${11 * ratio}px system-ui, sans-serif`;
     context.textBaseline = "middle";
     context.textAlign = "right";
     const half = 6 * ratio, taken = [];
@@ -117,19 +144,30 @@ function makePlot(parent, t, plot, seek) {
     context.moveTo(x(time), 0); context.lineTo(x(time), height);
     context.stroke();
     context.globalAlpha = 1;
-    plot.lines.forEach((line, k) => {
-      context.fillStyle = LINES[k % LINES.length];
+    plot.lines.forEach((line) => {
+      context.fillStyle = line.colour;
       context.beginPath();
       context.arc(x(time), y(line.values[i]), 2.3 * ratio, 0, 7);
       context.fill();
     });
   };
-  const pick = (event) => {
+  const under = (event) => {
     const bounds = canvas.getBoundingClientRect();
-    seek(first + duration * Math.min(1, Math.max(0, (event.clientX - bounds.left) / (bounds.width - GUTTER))));
+    return first + duration * Math.min(1, Math.max(0, (event.clientX - bounds.left) / (bounds.width - GUTTER)));
+  };
+  const pick = (event) => seek(under(event));
+  // The line nearest to the pointer, by its name, and its value there.
+  const tell = (event) => {
+    const time = under(event), row = (event.clientY - canvas.getBoundingClientRect().top) * ratio;
+    const after = t.findIndex((each) => each >= time), i = after < 0 ? t.length - 1 : after;
+    const away = (line) => Math.abs(y(line.values[i]) - row);
+    const { label, values, colour } = plot.lines.reduce((a, b) => (away(b) < away(a) ? b : a));
+    at.textContent = `${label} ${figure(values[i], 3)}`.trim();
+    at.style.color = colour;
   };
   canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); pick(event); });
-  canvas.addEventListener("pointermove", (event) => { if (event.buttons) pick(event); });
+  canvas.addEventListener("pointermove", (event) => { tell(event); if (event.buttons) pick(event); });
+  canvas.addEventListener("pointerleave", () => { at.textContent = ""; });
   window.addEventListener("resize", () => { drawn = null; });
   return show;
 }
