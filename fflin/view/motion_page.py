@@ -47,7 +47,10 @@ def motion_page(
     target: Array | None,
     tool: str | None,
 ) -> tuple[str, tuple[str, ...]]:
-    """Return the page of a motion, and what could not be drawn; see `visualize`."""
+    """Return the page of a motion, and what could not be drawn; see `visualize`.
+
+    Without a target (nq,) it is the motion's own, if it has one.
+    """
     shown = frame_indices(motion.t, fps, speed)
     t, q, u = motion.t[shown], motion.q[shown], motion.u[shown]
     state = chart_of(robot, motion)
@@ -58,9 +61,13 @@ def motion_page(
     drawing = Drawing(robot, scenery["robot"], sent=sent)
     moving = [(drawing, film.poses)]
     data = robot.model.createData()
-    goal = None if target is None else body_poses(robot, data, target)
-    if goal is not None:
-        Drawing(robot, scenery["target"], "ghost", sent).place(goal)
+    goal = _target(motion, state, shown) if target is None else target[None]
+    # One pose where it stands still, or one a frame.
+    goals = np.array([body_poses(robot, data, each) for each in goal])
+    if len(goal):
+        ghost = Drawing(robot, scenery["target"], "ghost", sent)
+        ghost.place(goals[0])
+        moving += [(ghost, goals)] if len(goal) > 1 else []
     if motion.linear is not None:
         predicted = [state.to_pinocchio(x)[0] for x in motion.linear[shown]]
         poses = np.array([body_poses(robot, data, each) for each in predicted])
@@ -74,15 +81,15 @@ def motion_page(
     about = f"{subtitle(robot)}, {t[-1] - t[0]:.4g} s"
     info = stage_info(robot, drawing, film.poses[0], scene=scene, subtitle=about)
     shown_points = frame_points(drawing, film, info["size"])
-    if goal is not None:
-        shown_points = np.concatenate((shown_points, corner_points(drawing, goal)))
+    for poses in goals[:: max(1, len(goals) // 24)]:
+        shown_points = np.concatenate((shown_points, corner_points(drawing, poses)))
     info["floor"][2] = float(shown_points[:, 2].min())
     if follow is None:
         # All of a long way at once, and nothing is to be seen of the robot.
         follow = bool(np.ptp(shown_points, axis=0).max() > _FAR * info["size"])
     if follow:
         shown_points = frame_points(drawing, film, info["size"], follow=True)
-    info |= panel(robot, motion, shown, target)
+    info |= panel(robot, motion, shown, goal)
     info |= marks(robot, film, tool, info["size"], info["plots"])
     info |= {
         "mode": "motion",
@@ -90,7 +97,7 @@ def motion_page(
         "speed": speed,
         "follow": follow,
         "points": rounded(shown_points, info["size"]),
-        "legend": legend(info, target=goal is not None, linear=motion.linear is not None),
+        "legend": legend(info, target=len(goal) > 0, linear=motion.linear is not None),
     }
     return build_page(info, window.commands()), drawing.notes
 
@@ -98,6 +105,15 @@ def motion_page(
 def chart_of(robot: Robot, motion: Motion) -> StateMap:
     """Return the map between a motion's states and configurations."""
     return StateMap(robot, reference=motion.reference, frame=cast("Frame", motion.frame))
+
+
+def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
+    """Return where a motion is steered to (k, nq): nowhere, one place, or one a frame."""
+    states = (
+        motion.target[shown] if motion.target.ndim == 2 else motion.target.reshape(-1, state.nx)
+    )
+    found = np.array([state.to_pinocchio(x)[0] for x in states])
+    return found.reshape(len(states), state.robot.nq)
 
 
 def subtitle(robot: Robot) -> str:

@@ -60,7 +60,7 @@ class _Line(NamedTuple):
 
 
 def errors(robot: Robot, q: Array, target: Array) -> dict[str, Array]:
-    """Return the distance of configurations (N, nq) from a target (nq,).
+    """Return the distance of configurations (N, nq) from a target (1, nq) or targets (N, nq).
 
     Returns
     -------
@@ -69,9 +69,11 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, Array]:
         joints that turn and that slide, which reaction wheels do not count as; each (N,).
     """
     state = StateMap(robot)
-    goal = pin.XYZQUATToSE3(target[:7])
-    relative = [goal.actInv(pin.XYZQUATToSE3(each[:7])) for each in q]
-    joints = np.array([state.joint_positions(each) for each in q]) - state.joint_positions(target)
+    goals = map(pin.XYZQUATToSE3, np.broadcast_to(target, q.shape)[:, :7])
+    relative = [
+        goal.actInv(pin.XYZQUATToSE3(each[:7])) for goal, each in zip(goals, q, strict=True)
+    ]
+    joints = state.joint_positions(q) - state.joint_positions(target)
     for index, joint in enumerate(robot.joints):
         if joint.unbounded:
             joints[:, index] = np.angle(np.exp(1j * joints[:, index]))
@@ -86,7 +88,7 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, Array]:
     }
 
 
-def panel(robot: Robot, motion: Motion, shown: Array, target: Array | None) -> dict[str, Any]:
+def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, Any]:
     """Return the readouts and plots of a motion's page.
 
     Parameters
@@ -95,19 +97,23 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array | None) -> d
     motion : Motion
     shown : ndarray (N,) of int
         Its rows on the page.
-    target : ndarray (nq,) or None
-        What the errors are counted from; without one there are none, and the way from the start
-        is shown.
+    target : ndarray (k, nq)
+        What the errors are counted from, one for all rows or one each; of none there are no
+        errors, and the way from the start is shown.
     """
-    found = errors(robot, motion.q[shown], motion.q[0] if target is None else target)
-    of = "{} from the start" if target is None else "{} error"
+    found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
+    of = "{} error" if len(target) else "{} from the start"
     prismatic = [joint.prismatic for joint in robot.joints if joint.name not in robot.wheels]
     kinds = {"attitude": "°", "position": "m"}
     kinds |= {"turns": "°"} if not all(prismatic) else {}
     kinds |= {"slides": "m"} if any(prismatic) else {}
     titles = {"turns": "largest joint", "slides": "largest slide"}
     readouts = [
-        (of.format(titles.get(kind, kind)), unit, np.where(found[kind] < _NOTHING, 0.0, found[kind]))
+        (
+            of.format(titles.get(kind, kind)),
+            unit,
+            np.where(found[kind] < _NOTHING, 0.0, found[kind]),
+        )
         for kind, unit in kinds.items()
     ]
     none = np.full(2, np.inf)

@@ -145,13 +145,9 @@ def visualize(
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif})
     _check_motion(robot, motion)
     fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
-    from fflin.view.motion_page import chart_of, motion_page
+    from fflin.view.motion_page import motion_page
 
-    goal = None
-    if target is not None:
-        goal = _configuration(robot, "target", target)
-    elif motion.target.size:
-        goal = chart_of(robot, motion).to_pinocchio(motion.target)[0]
+    goal = None if target is None else _configuration(robot, "target", target)
 
     page, notes = motion_page(
         robot, motion, scene=scene, fps=fps, speed=speed, follow=follow, target=goal, tool=tool
