@@ -86,6 +86,8 @@ class Modes:
     state_names : tuple of str
         Of the shapes.
     robot : str
+    lin : LinearModel
+        What they are modes of.
     """
 
     modes: tuple[Mode, ...]
@@ -95,6 +97,7 @@ class Modes:
     equilibrium: bool
     state_names: tuple[str, ...]
     robot: str
+    lin: LinearModel
 
     @property
     def vibrations(self) -> tuple[Mode, ...]:
@@ -190,6 +193,7 @@ def modes(lin: LinearModel) -> Modes:
         lin.is_equilibrium(),
         lin.state_names,
         lin.robot,
+        lin,
     )
 
 

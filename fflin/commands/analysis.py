@@ -35,6 +35,9 @@ def add_commands(commands: Commands) -> None:
         "fflin modes servicer_7dof --stiffness panel_left=100 --stiffness panel_right=100",
     )
     add_point(modes)
+    modes.add_argument(
+        "--html", metavar="FILE", type=file_name, help="write a page that plays the mode shapes"
+    )
     validity = command(
         commands,
         "validity",
@@ -78,8 +81,16 @@ def _analyze(arguments: argparse.Namespace) -> int:
 def _modes(arguments: argparse.Namespace) -> int:
     from fflin.analysis.modes import modes
 
-    _, lin = linear_model(arguments)
-    print(modes(lin))
+    robot, lin = linear_model(arguments)
+    if arguments.html:
+        from fflin.view.visualize import check_outputs, visualize
+
+        check_outputs({".html": arguments.html})
+    found = modes(lin)
+    print(found, flush=True)
+    if arguments.html:
+        visualize(robot, found, html=arguments.html)
+        print(f"wrote {arguments.html}: {arguments.html.stat().st_size / 1e6:.2f} MB")
     return DONE
 
 

@@ -130,7 +130,7 @@ def play_back(
 
 def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
     """Return name, joint, position and direction of push, in its frame, of each thruster."""
-    found = []
+    found: list[tuple[str, int, Array, Array]] = []
     actuation = Actuation(StateMap(robot))
     names = [actuation.names[index] for index in actuation.groups.get("thrust", ())]
     for item in robot.inputs:

@@ -95,7 +95,7 @@ def test_a_free_flyer_alone_has_no_joint_error():
 
 
 def test_plots_have_the_units_of_the_model():
-    """Sliding joints are pushed, turning ones turned, and thrust is no torque: never on one axis."""
+    """Sliding joints are pushed, turning ones turned, and thrust is no torque."""
     robot = fflin.load("panda")
     assert {joint.prismatic for joint in robot.joints} == {True, False}
     more = [

@@ -65,6 +65,12 @@ function main() {
     window.fflin = makeLive(stage, info);
     return;
   }
+  if (info.mode === "modes") {
+    makeLegend(viewer, info.legend);
+    window.fflin = makeModes(stage, info);
+    if (!/[#&]pause\b/.test(location.hash)) window.fflin.play();
+    return;
+  }
 
   info.t = floats(info.t);
   for (const each of info.trails) each.points = floats(each.points);
