@@ -69,13 +69,11 @@ def mode_page(
         "bodies": [["meshcat", "robot", path] for path in body_paths(robot)],
         "triads": triads(robot, tool, info["size"]),
         "points": rounded(np.concatenate(points), info["size"]),
-        "legend": [{"label": "at rest", "colour": "#8fb4ff", "paths": [["meshcat", "rest"]]}],
         "modes": [
             {
                 "frequency": mode.frequency,
                 "damping": mode.damping_ratio,
                 "unstable": bool(mode.unstable),
-                "name": _name(mode, lin),
                 "shape": _shape(mode, lin),
                 "poses": packed(poses),
             }
@@ -111,27 +109,12 @@ def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size
     return poses(min(most, default=0.0))
 
 
-def _name(mode: Mode, lin: LinearModel) -> str:
-    """Name a mode by the two positions that move most, and whether they move alike."""
-    half = len(lin.x0) // 2
-    first, second = np.argsort(-np.abs(mode.shape[:half]).round(9), kind="stable")[:2].tolist()
-    names = [lin.state_names[i].removeprefix("q_m.") for i in (first, second)]
-    if abs(mode.shape[second]) < 0.5:
-        return names[0]
-    return f"{names[0]} {'+' if mode.shape[second].real > 0.0 else '−'} {names[1]}"
-
-
-def _shape(mode: Mode, lin: LinearModel) -> list[tuple[str, str]]:
-    """Return names and amounts of the positions that move most, the largest of which is 1."""
-    half = len(lin.x0) // 2
-    found = []
-    for i in np.argsort(-np.abs(mode.shape[:half]).round(9), kind="stable")[:_MOST_NAMES].tolist():
-        value = complex(mode.shape[i])
-        if abs(value) < 0.01:
-            break
-        unit = lin.state_units[i].replace("1", "")
-        amount = f"{value.real:.2g} {unit}".rstrip()
-        if abs(value.imag) > 0.02 * abs(value):
-            amount = f"{abs(value):.2g} {unit}".rstrip() + f" at {np.angle(value, deg=True):.0f}°"
-        found.append((lin.state_names[i], amount))
-    return found
+def _shape(mode: Mode, lin: LinearModel) -> list[tuple[str, str, float, float]]:
+    """Return name, unit, size and phase [deg] of the positions that move most; one has size 1."""
+    sizes, phases = np.abs(mode.shape), np.angle(mode.shape, deg=True)
+    order = np.argsort(-sizes[: len(sizes) // 2].round(9), kind="stable")[:_MOST_NAMES].tolist()
+    return [
+        (lin.state_names[i], lin.state_units[i], float(sizes[i]), float(phases[i]))
+        for i in order
+        if sizes[i] > 0.01
+    ]

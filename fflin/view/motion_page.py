@@ -29,7 +29,6 @@ SUN = (0.62, -0.78, 0.62)
 
 TOOL_COLOR, COM_COLOR = "#ff9d4d", "#7fe3c4"
 FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
-_GAS = "#5a8cff"
 
 # Length of the arrow of the largest force, and the way on which the camera goes along with the
 # base unless it is told otherwise, both in sizes of the robot.
@@ -47,10 +46,7 @@ def motion_page(
     target: Array | None,
     tool: str | None,
 ) -> tuple[str, tuple[str, ...]]:
-    """Return the page of a motion, and what could not be drawn; see `visualize`.
-
-    Without a target (nq,) it is the motion's own, if it has one.
-    """
+    """Return the page of a motion, and what could not be drawn; see `visualize`."""
     shown = frame_indices(motion.t, fps, speed)
     t, q, u = motion.t[shown], motion.q[shown], motion.u[shown]
     state = chart_of(robot, motion)
@@ -90,14 +86,15 @@ def motion_page(
     if follow:
         shown_points = frame_points(drawing, film, info["size"], follow=True)
     info |= panel(robot, motion, shown, goal)
-    info |= marks(robot, film, tool, info["size"], info["plots"])
+    info |= marks(robot, film, tool, info["size"])
     info |= {
         "mode": "motion",
         "t": packed(t),
         "speed": speed,
         "follow": follow,
         "points": rounded(shown_points, info["size"]),
-        "legend": legend(info, target=len(goal) > 0, linear=motion.linear is not None),
+        "target": len(goal) > 0,
+        "linear": motion.linear is not None,
     }
     return build_page(info, window.commands()), drawing.notes
 
@@ -109,11 +106,9 @@ def chart_of(robot: Robot, motion: Motion) -> StateMap:
 
 def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
     """Return where a motion is steered to (k, nq): nowhere, one place, or one a frame."""
-    states = (
-        motion.target[shown] if motion.target.ndim == 2 else motion.target.reshape(-1, state.nx)
-    )
-    found = np.array([state.to_pinocchio(x)[0] for x in states])
-    return found.reshape(len(states), state.robot.nq)
+    states = motion.target.reshape(-1, state.nx)
+    states = states[shown] if len(states) > 1 else states
+    return np.array([state.to_pinocchio(x)[0] for x in states]).reshape(-1, state.robot.nq)
 
 
 def subtitle(robot: Robot) -> str:
@@ -204,13 +199,8 @@ def triads(robot: Robot, tool: str | None, size: float) -> list[dict[str, Any]]:
     ]
 
 
-def marks(
-    robot: Robot, film: Playback, tool: str | None, size: float, plots: list[dict[str, Any]]
-) -> dict[str, Any]:
-    """Return trails, arrows of the base's wrench, and plumes in the colours of their plot."""
-    colors = dict(
-        key for plot in plots if plot["title"] == "thrusters" for key in plot.get("keys", ())
-    )
+def marks(robot: Robot, film: Playback, tool: str | None, size: float) -> dict[str, Any]:
+    """Return trails, arrows of the base's wrench and plumes."""
     trails = [("centre of mass", COM_COLOR, film.com)]
     if tool:
         trails.insert(0, ("tool", TOOL_COLOR, film.tool))
@@ -241,39 +231,9 @@ def marks(
                 "values": packed(film.thrust[:, k]),
                 "most": most,
                 "name": name,
-                "colour": colors.get(name, _GAS),
             }
             for k, (name, joint, position, direction) in enumerate(thrusters(robot))
-            if film.thrust[:, k].any()
+            if most
         ],
         "triads": triads(robot, tool, size),
     }
-
-
-def legend(shown: dict[str, Any], *, target: bool, linear: bool) -> list[dict[str, Any]]:
-    """Return the entries of the legend, each of which can be switched off.
-
-    Thrusters are named in their plot; where there is none, in a strip of pictures, here.
-    """
-    entries = [
-        {"label": f"path of the {each['name']}", "colour": each["colour"],
-         "paths": [["meshcat", "trails", each["name"]]]}
-        for each in shown["trails"]
-    ]  # fmt: skip
-    entries += [
-        {"label": f"{each['kind']} on the base", "colour": each["colour"],
-         "paths": [["meshcat", "wrench", each["kind"]]]}
-        for each in shown["arrows"]
-    ]  # fmt: skip
-    if target:
-        entries.append({"label": "target", "colour": "#8fb4ff", "paths": [["meshcat", "target"]]})
-    if linear:
-        entries.append(
-            {"label": "linear model", "colour": "#ff7fc8", "paths": [["meshcat", "linear"]]}
-        )
-    named = [each for each in shown["plumes"] if each["colour"] != _GAS]
-    entries += [
-        {"label": each["name"], "colour": each["colour"], "paths": [], "strip": True}
-        for each in named
-    ]
-    return entries

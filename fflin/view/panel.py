@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -17,21 +16,16 @@ from fflin.view.page import packed
 if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
-_COLORS = (
-    *("#ff7a70", "#7ad97f", "#6aa5ff", "#f6c35b", "#c58bff", "#5fd6d0"),
-    *("#ff9ed0", "#b6c46a", "#9aa7ff", "#d79a6a", "#4fb08c", "#e05fa8"),
-)
-# Of more lines than there are colours those that change most are named, so many.
-_NAMED, _UNNAMED = 8, "#8a93a5"
-
 # A limit is drawn where a curve comes to this share of it.
 _NEAR = 1.0 / 3.0
 
 # What is below this, in SI units, is rounding.
 _NOTHING = 1e-14
 
-# What has one colour for a name, and one legend: charts of a group and a unit, in their order.
-_CHARTS = (
+_OPEN = np.full(2, np.inf)
+
+# Titles of states and inputs of a group and a unit; in a family a name has one colour.
+_CHARTS: tuple[dict[tuple[str, str], str], ...] = (
     {("tau_b", "N m"): "base torque"},
     {("F_b", "N"): "base force"},
     {
@@ -59,14 +53,14 @@ class _Line(NamedTuple):
     limits: Array
 
 
-def errors(robot: Robot, q: Array, target: Array) -> dict[str, Array]:
+def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]]:
     """Return the distance of configurations (N, nq) from a target (1, nq) or targets (N, nq).
 
     Returns
     -------
     dict
-        attitude [deg], position [m] of the base, turns [deg] and slides [m]: the largest errors of
-        joints that turn and that slide, which reaction wheels do not count as; each (N,).
+        {what: (unit, values (N,))}: attitude and position of the base, and of joints that turn and
+        that slide, if there are any, the largest error; reaction wheels are none of them.
     """
     state = StateMap(robot)
     goals = map(pin.XYZQUATToSE3, np.broadcast_to(target, q.shape)[:, :7])
@@ -80,12 +74,15 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, Array]:
     wheels = robot.wheels
     turns = [not j.prismatic and j.name not in wheels for j in robot.joints]
     slides = [j.prismatic for j in robot.joints]
-    return {
-        "attitude": np.degrees([np.linalg.norm(pin.log3(each.rotation)) for each in relative]),
-        "position": np.array([np.linalg.norm(each.translation) for each in relative]),
-        "turns": np.degrees(np.abs(joints[:, turns]).max(axis=1, initial=0.0)),
-        "slides": np.abs(joints[:, slides]).max(axis=1, initial=0.0),
+    found = {
+        "attitude": ("°", np.degrees([np.linalg.norm(pin.log3(x.rotation)) for x in relative])),
+        "position": ("m", np.array([np.linalg.norm(x.translation) for x in relative])),
     }
+    if any(turns):
+        found["largest joint"] = ("°", np.degrees(np.abs(joints[:, turns]).max(axis=1)))
+    if any(slides):
+        found["largest slide"] = ("m", np.abs(joints[:, slides]).max(axis=1))
+    return {k: (unit, np.where(x < _NOTHING, 0.0, x)) for k, (unit, x) in found.items()}
 
 
 def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, Any]:
@@ -103,22 +100,9 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
     """
     found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
     of = "{} error" if len(target) else "{} from the start"
-    prismatic = [joint.prismatic for joint in robot.joints if joint.name not in robot.wheels]
-    kinds = {"attitude": "°", "position": "m"}
-    kinds |= {"turns": "°"} if not all(prismatic) else {}
-    kinds |= {"slides": "m"} if any(prismatic) else {}
-    titles = {"turns": "largest joint", "slides": "largest slide"}
-    readouts = [
-        (
-            of.format(titles.get(kind, kind)),
-            unit,
-            np.where(found[kind] < _NOTHING, 0.0, found[kind]),
-        )
-        for kind, unit in kinds.items()
-    ]
-    none = np.full(2, np.inf)
+    readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]
     plots = [
-        _plot(title, unit, [_Line("", values, none)], {})
+        _plot(title, unit, [_Line("", values, _OPEN)])
         for title, unit, values in readouts[:2]
         if values.any()
     ]
@@ -126,15 +110,12 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
     if len(motion.com_drift):  # a file may not tell
         readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
     lines = _lines(robot, motion, shown)
-    for charts in _CHARTS:
-        family = {key: lines[key] for key in charts if key in lines}
-        colors = _colors(family.values())
-        drawn = [_plot(charts[key], key[1], each, colors) for key, each in family.items()]
-        # Of rates their limits alone are of interest.
-        drawn = [plot for plot in drawn if plot["limits"] or not plot["title"].endswith("rates")]
-        if drawn:
-            drawn[0]["keys"] = list(colors.items())
-        plots += drawn
+    for family, charts in enumerate(_CHARTS):
+        for key, title in charts.items():
+            plot = _plot(title, key[1], lines.get(key, []), family)
+            # Of rates their limits alone are of interest.
+            if any(each["limits"] or not title.endswith("rates") for each in plot["lines"]):
+                plots.append(plot)
     return {
         "readouts": [
             {"label": label, "unit": unit, "values": packed(values)}
@@ -146,16 +127,15 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
 
 def _lines(robot: Robot, motion: Motion, shown: Array) -> dict[tuple[str, str], list[_Line]]:
     """Return the lines of states and inputs that are not zero all along, by group and unit."""
-    limits = dict(
-        zip(getattr(motion, "limit_names", ()), getattr(motion, "limits", ()), strict=True)
-    )
+    names, values = getattr(motion, "limit_names", ()), getattr(motion, "limits", ())
+    limits = dict(zip(names, values, strict=True))
     found: dict[tuple[str, str], list[_Line]] = {}
     for name, key, unit, column in (
         *zip(motion.state_names, motion.state_names, motion.state_units, motion.x.T, strict=True),
         *zip(motion.input_names, input_keys(motion), motion.input_units, motion.u.T, strict=True),
     ):
         group, _, entry = key.partition(".")
-        line = _Line(entry, column[shown], limits.get(name, np.full(2, np.inf)))
+        line = _Line(entry, column[shown], limits.get(name, _OPEN))
         if np.abs(line.values).max() < _NOTHING:
             continue
         if group in ("q_m", "qdot_m") and entry in robot.wheels:
@@ -168,39 +148,22 @@ def _lines(robot: Robot, motion: Motion, shown: Array) -> dict[tuple[str, str], 
     return found
 
 
-def _colors(charts: Iterable[list[_Line]]) -> dict[str, str]:
-    """Return {name: colour}: of all, or of those that change most."""
-    change: dict[str, float] = {}
-    for lines in charts:
-        most = max(float(np.ptp(line.values)) for line in lines) or 1.0
-        for line in lines:
-            share = float(np.ptp(line.values)) / most
-            change[line.name] = max(share, change.get(line.name, 0.0))
-    if set(change) <= set("xyz"):
-        return {axis: _COLORS["xyz".index(axis)] for axis in change}
-    names = list(change)
-    if len(names) > len(_COLORS):
-        names = sorted(sorted(names, key=lambda name: -change[name])[:_NAMED], key=names.index)
-    return dict(zip(names, _COLORS, strict=False))
-
-
-def _plot(title: str, unit: str, lines: list[_Line], colors: dict[str, str]) -> dict[str, Any]:
-    drawn: dict[float, set[str]] = {}
-    for line in lines:
-        for level in line.limits[np.isfinite(line.limits) & (line.limits != 0.0)].tolist():
-            if (line.values / level).max() >= _NEAR:
-                drawn.setdefault(level, set()).add(colors.get(line.name, _UNNAMED))
+def _plot(title: str, unit: str, lines: list[_Line], family: int = -1) -> dict[str, Any]:
+    """Return a plot, with those limits of each line that it comes near."""
     return {
         "title": title,
         "unit": unit,
+        "family": family,
         "lines": [
             {
                 "label": line.name,
-                "colour": colors.get(line.name, _UNNAMED if line.name else _COLORS[0]),
                 "values": packed(line.values),
+                "limits": [
+                    level
+                    for level in line.limits[np.isfinite(line.limits)].tolist()
+                    if level and (line.values / level).max() >= _NEAR
+                ],
             }
             for line in lines
         ],
-        # One that several lines share is of no line's colour.
-        "limits": [[level, *of] if len(of) == 1 else [level, ""] for level, of in drawn.items()],
     }

@@ -1,5 +1,16 @@
 // Natural modes: the robot swings in one of them at a time, about where it stands.
 
+// Whether a phase [deg] is neither 0 nor 180, and the sign of what moves with it if it is one.
+const aside = (phase) => Math.abs(Math.sin((phase * Math.PI) / 180)) > 0.02;
+const sign = (phase) => (!aside(phase) && Math.abs(phase) > 90 ? "−" : "");
+
+// A mode by the two positions that move most, and whether they move alike.
+function nameOf({ shape }) {
+  const [first, second] = shape.map(([name]) => name.replace(/^q_m\./, ""));
+  if (!second || shape[1][2] < 0.5) return first;
+  return `${first} ${Math.abs(shape[1][3]) > 90 ? "−" : "+"} ${second}`;
+}
+
 function makeModes({ viewer, aim, keepFramed }, info) {
   const panel = document.getElementById("panel"), bar = document.getElementById("bar");
   const nodes = info.bodies.map((path) => viewer.scene_tree.find(path).object), n = nodes.length;
@@ -15,7 +26,7 @@ function makeModes({ viewer, aim, keepFramed }, info) {
   shape.className = "readouts shape";
   const rows = info.modes.map((mode, k) => {
     const row = document.createElement("button"), name = document.createElement("b"), figures = document.createElement("div");
-    name.textContent = mode.name + (mode.unstable ? " (unstable)" : "");
+    name.textContent = nameOf(mode) + (mode.unstable ? " (unstable)" : "");
     figures.className = "figures";
     cells(figures, [figure(mode.frequency, 4), figure(mode.frequency / (2 * Math.PI), 4), figure(mode.damping, 3)]);
     row.append(name, figures);
@@ -52,10 +63,10 @@ function makeModes({ viewer, aim, keepFramed }, info) {
     const mode = info.modes[state.mode], ratio = (mode.frequency / (2 * Math.PI)) * info.period;
     pace.textContent = `shown at ${figure(1 / info.period, 2)} Hz, ${figure(Math.max(ratio, 1 / ratio), 2)}× ${ratio > 1 ? "slower" : "faster"}`;
     shape.textContent = "";
-    for (const [name, amount] of mode.shape) {
+    for (const [name, unit, size, phase] of mode.shape) {
       const left = document.createElement("span"), right = document.createElement("b");
       left.textContent = name;
-      right.textContent = amount;
+      right.textContent = `${sign(phase)}${figure(size, 2)} ${unit === "1" ? "" : unit}${aside(phase) ? ` at ${phase.toFixed(0)}°` : ""}`.trim();
       shape.append(left, right);
     }
     seek(state.phase);

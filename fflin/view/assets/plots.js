@@ -2,6 +2,9 @@
 
 const GUTTER = 44; // for the figures of the axis, right of the lines [CSS pixels]
 
+const COLOURS = ["#ff7a70", "#7ad97f", "#6aa5ff", "#f6c35b", "#c58bff", "#5fd6d0", "#ff9ed0", "#b6c46a", "#9aa7ff", "#d79a6a", "#4fb08c", "#e05fa8"];
+const NAMED = 8, UNNAMED = "#8a93a5"; // of more lines than colours those that change most are named
+
 const TALL = 62, LOW = 30; // heights of a plot where there is room, and at least
 
 function figure(value, digits) {
@@ -35,6 +38,27 @@ function makeSpan(parent, t) {
     row.append(end);
   }
   parent.append(row);
+}
+
+// Give the lines their colours: a name has one in all plots of a family, the first of which has keys.
+function paint(plots) {
+  const change = (line) => line.values.reduce((a, b) => Math.max(a, b), -Infinity) - line.values.reduce((a, b) => Math.min(a, b), Infinity);
+  for (const family of new Set(plots.map((plot) => plot.family))) {
+    const kin = plots.filter((plot) => plot.family === family), most = new Map();
+    for (const { lines } of kin) {
+      const changes = lines.map(change), largest = Math.max(...changes) || 1;
+      lines.forEach(({ label }, k) => most.set(label, Math.max(changes[k] / largest, most.get(label) || 0)));
+    }
+    let names = [...most.keys()];
+    if (names.length > COLOURS.length) {
+      const named = new Set([...names].sort((a, b) => most.get(b) - most.get(a)).slice(0, NAMED));
+      names = names.filter((name) => named.has(name));
+    }
+    const axes = names.every((name) => "xyz".includes(name));
+    const colours = new Map(names.map((name, k) => [name, COLOURS[axes ? "xyz".indexOf(name) : k]]));
+    for (const { lines } of kin) for (const line of lines) line.colour = colours.get(line.label) || UNNAMED;
+    if (names.some((name) => name)) kin[0].keys = [...colours];
+  }
 }
 
 // Which colour is whose, for this plot and those below it with the same names.
@@ -76,7 +100,7 @@ function makePlot(parent, t, plot, seek) {
   box.append(name, ...(keys && !keys.parentNode ? [keys] : []), canvas);
   parent.append(box);
 
-  const values = [...plot.lines.flatMap((line) => Array.from(line.values)).filter(Number.isFinite), ...plot.limits.map(([level]) => level)];
+  const values = [...plot.lines.flatMap((line) => Array.from(line.values)).filter(Number.isFinite), ...plot.lines.flatMap((line) => line.limits)];
   let low = Math.min(0, ...[values.reduce((a, b) => Math.min(a, b), Infinity)]);
   let high = Math.max(0, ...[values.reduce((a, b) => Math.max(a, b), -Infinity)]);
   const least = low, most = high;
@@ -105,8 +129,8 @@ function makePlot(parent, t, plot, seek) {
     context.stroke();
     context.lineJoin = "round";
     context.setLineDash([5 * ratio, 4 * ratio]);
-    for (const [level, colour] of plot.limits) {
-      context.strokeStyle = colour || style.getPropertyValue("--ink");
+    for (const { colour, limits } of plot.lines) for (const level of limits) {
+      context.strokeStyle = colour;
       context.beginPath();
       context.moveTo(0, y(level)); context.lineTo(width - GUTTER * ratio, y(level));
       context.stroke();
