@@ -122,6 +122,7 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
             for label, unit, values in readouts
         ],
         "plots": plots,
+        "passed": [[str(each), each.time] for each in getattr(motion, "passed", ())],
     }
 
 

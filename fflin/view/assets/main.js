@@ -115,7 +115,9 @@ function main() {
     centre.add(shift);
     aim(centre);
   });
-  plots = info.plots.map((plot) => makePlot(panel, info.t, plot, (time) => { player.pause(); player.seek(time); }));
+  const goTo = (time) => { player.pause(); player.seek(time); };
+  makePassed(panel, info.passed, goTo);
+  plots = info.plots.map((plot) => makePlot(panel, info.t, plot, goTo));
   if (plots.length) makeSpan(panel, info.t);
   const fit = () => fitPlots(panel);
   fit();

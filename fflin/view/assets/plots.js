@@ -28,6 +28,17 @@ function makeReadouts(parent, readouts) {
   return (i) => shows.forEach((show) => show(i));
 }
 
+// What went beyond its limit: the worst of it, which leads to its time; all of it on hovering.
+function makePassed(parent, passed, seek) {
+  if (!passed.length) return;
+  const line = document.createElement("button");
+  line.className = "passed";
+  line.textContent = `beyond its limit: ${passed[0][0]}${passed.length > 1 ? `; and ${passed.length - 1} more` : ""}`;
+  line.title = passed.map(([text]) => text).join("\n");
+  line.addEventListener("click", () => seek(passed[0][1]));
+  parent.append(line);
+}
+
 // Where the time of the plots begins and ends.
 function makeSpan(parent, t) {
   const row = document.createElement("div");
