@@ -122,14 +122,13 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
             for label, unit, values in readouts
         ],
         "plots": plots,
-        "passed": [[str(each), each.time] for each in getattr(motion, "passed", ())],
+        "passed": [[str(each), each.time] for each in motion.passed],
     }
 
 
 def _lines(robot: Robot, motion: Motion, shown: Array) -> dict[tuple[str, str], list[_Line]]:
     """Return the lines of states and inputs that are not zero all along, by group and unit."""
-    names, values = getattr(motion, "limit_names", ()), getattr(motion, "limits", ())
-    limits = dict(zip(names, values, strict=True))
+    limits = dict(zip(motion.limit_names, motion.limits, strict=True))
     found: dict[tuple[str, str], list[_Line]] = {}
     for name, key, unit, column in (
         *zip(motion.state_names, motion.state_names, motion.state_units, motion.x.T, strict=True),

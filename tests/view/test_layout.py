@@ -80,7 +80,8 @@ def test_nothing_overlaps_is_clipped_or_wraps(watched, size):
         assert not overlap(one, other)
     for left, top, right, bottom in np.concatenate(parts):
         assert left >= 0 and top >= 0 and right <= size[0] and bottom <= size[1]
-    for selector in (".readouts > *", ".plot > *", ".plot .keys > *", "#legend label"):
+    inner = ".plot .name > *, .plot canvas"
+    for selector in (".readouts > *", ".plot > *", ".plot .keys > *", "#legend label", inner):
         for one, other in itertools.combinations(boxes(watched, selector), 2):
             assert not overlap(one, other), selector
     # Nothing is wider than its place: no scrollbar below, no dots for what is left out.
@@ -143,7 +144,8 @@ def test_every_curve_can_be_told(watched):
     at = next(k for k, plot in enumerate(plots) if len(plot["lines"]) > 2)
     canvas = watched.page.locator(".plot canvas").nth(at)
     canvas.scroll_into_view_if_needed()
-    canvas.hover(position={"x": canvas.bounding_box()["width"] - 30, "y": 1})
+    box = canvas.bounding_box()
+    watched.page.mouse.move(box["x"] + box["width"] - 30, box["y"] + 1)
     highest = max(plots[at]["lines"], key=lambda line: line[2][-1])
     told = watched.page.locator(".plot .at").nth(at).text_content()
     assert told.split()[0] == highest[0]
@@ -217,9 +219,8 @@ def test_curves_and_limits_are_drawn_where_the_data_have_them(browser, tmp_path)
     at = motion.input_names.index(name)
     u = np.zeros_like(motion.u)
     u[:, at] = 6.0 * np.sin(motion.t / 3.0)
-    motion = replace(motion, u=u)
-    object.__setattr__(motion, "limit_names", (name, "tau_m.joint_2"))
-    object.__setattr__(motion, "limits", np.array([[-10.0, 12.0], [-1.0, 1.0]]))
+    limits = np.array([[-10.0, 12.0], [-1.0, 1.0]])
+    motion = replace(motion, u=u, limit_names=(name, "tau_m.joint_2"), limits=limits)
     path = tmp_path / "m.html"
     fflin.visualize(robot, motion, html=path)
     watched = Watched(browser, path.as_uri() + "#pause", size=(1400, 900))
