@@ -96,10 +96,10 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
         Its rows on the page.
     target : ndarray (k, nq)
         What the errors are counted from, one for all rows or one each; of none there are no
-        errors, and the way from the start is shown.
+        errors, and the change from the start is shown.
     """
     found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
-    of = "{} error" if len(target) else "{} from the start"
+    of = "{} error" if len(target) else "{} change"
     readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]
     plots = [
         _plot(title, unit, [_Line("", values, _OPEN)])

@@ -86,7 +86,7 @@ def visualize(
         would be a dot on its way.
     target : array_like (nq,), optional
         Configuration that errors are counted from; by default the one that the motion was steered
-        to. Where there is none the way from the start is shown instead, and no ghost.
+        to. Where there is none the change from the start is shown instead, and no ghost.
     tool : str, optional
         Frame whose trail is drawn; "tool" or the last link of the longest chain by default.
     q : array_like (nq,), optional

@@ -198,6 +198,30 @@ def test_frames_of_a_strip_have_their_time_and_the_first_a_legend(watched, size)
     assert not watched.page.locator("#legend label.strip:visible").count()
 
 
+def test_what_was_passed_leads_to_its_time(browser, tmp_path):
+    robot = fflin.load("ets_vii")
+    motion = settling(robot, 20.0)
+    names = ("tau_m.joint_1", "tau_m.joint_2")
+    u = np.zeros_like(motion.u)
+    at = [motion.input_names.index(name) for name in names]
+    u[motion.t > 12.5, at[0]], u[motion.t > 3.0, at[1]] = 5.0, -9.0
+    limits = np.array([[-4.0, 4.0], [-4.0, 4.0]])
+    path = tmp_path / "m.html"
+    fflin.visualize(robot, replace(motion, u=u, limit_names=names, limits=limits), html=path)
+    watched = Watched(browser, path.as_uri() + "#pause", size=(800, 600))
+    line = watched.page.locator(".passed")
+    expected = "beyond its limit, the farthest of 2:\ntau_m.joint_2 -9 N m at 3.01 s, limit -4"
+    assert line.text_content() == expected
+    assert "tau_m.joint_1 5 N m at 12.5 s, limit 4" in line.get_attribute("title")
+    line.click()
+    assert watched.do("fflin.state.time") == pytest.approx(3.01)
+    assert watched.do(
+        "(({ scrollWidth, clientWidth }) => scrollWidth <= clientWidth)"
+        "(document.querySelector('.passed'))"
+    )
+    watched.page.close()
+
+
 def rows_of(watched, at, colour, low, high):
     """Return {value: columns} where a plot has a colour, of values from its axis."""
     pixels, width, height = watched.do(f"""(() => {{

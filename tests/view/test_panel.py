@@ -193,7 +193,7 @@ def test_without_a_target_nothing_is_called_an_error(robots):
     shown = panel(robot, motion, every(motion), np.zeros((0, robot.nq)))
     labels = [each["label"] for each in shown["readouts"]]
     titles = [each["title"] for each in shown["plots"]]
-    assert labels[0] == titles[0] == "attitude from the start"
+    assert labels[0] == titles[0] == "attitude change"
     assert not any("error" in text for text in labels + titles)
     expected = errors(robot, motion.q[every(motion)], motion.q[:1])["attitude"][1]
     assert expected[0] < 1e-6 < 1.0 < expected[-1]

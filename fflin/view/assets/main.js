@@ -119,9 +119,8 @@ function main() {
   makePassed(panel, info.passed, goTo);
   plots = info.plots.map((plot) => makePlot(panel, info.t, plot, goTo));
   if (plots.length) makeSpan(panel, info.t);
-  const fit = () => fitPlots(panel);
-  fit();
-  window.addEventListener("resize", fit);
+  fitPlots(panel);
+  window.addEventListener("resize", () => { if (fitPlots(panel)) window.dispatchEvent(new Event("resize")); });
   makeLegend(viewer, legendOf(info));
   const button = document.createElement("button");
   const press = () => button.setAttribute("aria-pressed", follow);

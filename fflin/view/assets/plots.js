@@ -33,7 +33,7 @@ function makePassed(parent, passed, seek) {
   if (!passed.length) return;
   const line = document.createElement("button");
   line.className = "passed";
-  line.textContent = `beyond its limit: ${passed[0][0]}${passed.length > 1 ? `; and ${passed.length - 1} more` : ""}`;
+  line.textContent = `beyond its limit${passed.length > 1 ? `, the farthest of ${passed.length}` : ""}:\n${passed[0][0]}`;
   line.title = passed.map(([text]) => text).join("\n");
   line.addEventListener("click", () => seek(passed[0][1]));
   parent.append(line);
@@ -89,12 +89,20 @@ function makeKeys(plot) {
   return keys;
 }
 
-// Give the plots of a panel the height that is there for them.
+// Give the plots of a panel the height that is there for them, in a wide window in two columns
+// where one is too short. Returns whether the panel has another width by that.
 function fitPlots(panel) {
-  const set = (height) => panel.style.setProperty("--tall", `${height}px`);
-  set(TALL);
-  const over = panel.scrollHeight - panel.clientHeight, count = panel.querySelectorAll(".plot").length;
-  if (over > 0 && count) set(Math.max(LOW, Math.floor(TALL - over / count)));
+  const count = panel.querySelectorAll(".plot").length, width = panel.clientWidth;
+  const over = () => Math.max(panel.scrollHeight - panel.clientHeight, panel.scrollWidth - panel.clientWidth);
+  const fit = (wide) => {
+    panel.classList.toggle("wide", wide);
+    for (let tall = TALL; ; tall = Math.max(LOW, tall - Math.max(2, Math.floor(over() / count)))) {
+      panel.style.setProperty("--tall", `${tall}px`);
+      if (over() <= 0 || tall === LOW || !count) return over() <= 0;
+    }
+  };
+  if (!fit(false) && window.innerWidth >= 1100) fit(true);
+  return panel.clientWidth !== width;
 }
 
 function makePlot(parent, t, plot, seek) {
