@@ -83,14 +83,19 @@ def _modes(arguments: argparse.Namespace) -> int:
 
     robot, lin = linear_model(arguments)
     if arguments.html:
-        from fflin.view.visualize import check_outputs, visualize
+        from fflin.base.writing import check_place
 
-        check_outputs({".html": arguments.html})
+        check_place(arguments.html, (".html",))
     found = modes(lin)
-    print(found, flush=True)
-    if arguments.html:
-        visualize(robot, found, html=arguments.html)
-        print(f"wrote {arguments.html}: {arguments.html.stat().st_size / 1e6:.2f} MB")
+    lines = [str(found)]
+    try:
+        if arguments.html:
+            from fflin.view.visualize import visualize
+
+            visualize(robot, found, html=arguments.html)
+            lines.append(f"wrote {arguments.html}: {arguments.html.stat().st_size / 1e6:.2f} MB")
+    finally:
+        print("\n".join(lines))
     return DONE
 
 

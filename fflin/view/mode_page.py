@@ -27,19 +27,11 @@ if TYPE_CHECKING:
 _PHASES, _PERIOD = 48, 2.0
 _ANGLE, _SHARE = 0.5, 0.14
 
-_MOST_NAMES = 8
-
 
 def mode_page(
     robot: Robot, found: Modes, *, scene: str, tool: str | None
 ) -> tuple[str, tuple[str, ...]]:
-    """Return the page of a robot's vibrations, and what could not be drawn.
-
-    Raises
-    ------
-    InputError
-        If the modes are of another robot or of a reduced model, or none of them oscillates.
-    """
+    """Return the page of a robot's vibrations, and what could not be drawn; see `visualize`."""
     lin = found.lin
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.urdf_sha256 != robot.urdf_sha256 or lin.state_names != state.names:
@@ -58,8 +50,7 @@ def mode_page(
     at_rest = body_poses(robot, robot.model.createData(), lin.q)
     drawing.place(at_rest)
     Drawing(robot, scenery["rest"], "ghost", sent).place(at_rest)
-    vibrations = counted(len(found.vibrations), "vibration")
-    about = f"{subtitle(robot)}, {vibrations}"
+    about = f"{subtitle(robot)}, {counted(len(found.vibrations), 'vibration')}"
     info = stage_info(robot, drawing, at_rest, scene=scene, subtitle=about)
     swings = [_swing(state, drawing, mode, lin, info["size"]) for mode in found.vibrations]
     points = [corner_points(drawing, poses) for swing in swings for poses in swing[:: _PHASES // 4]]
@@ -112,7 +103,7 @@ def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size
 def _shape(mode: Mode, lin: LinearModel) -> list[tuple[str, str, float, float]]:
     """Return name, unit, size and phase [deg] of the positions that move most; one has size 1."""
     sizes, phases = np.abs(mode.shape), np.angle(mode.shape, deg=True)
-    order = np.argsort(-sizes[: len(sizes) // 2].round(9), kind="stable")[:_MOST_NAMES].tolist()
+    order = np.argsort(-sizes[: len(sizes) // 2].round(9), kind="stable")[:8].tolist()
     return [
         (lin.state_names[i], lin.state_units[i], float(sizes[i]), float(phases[i]))
         for i in order

@@ -152,18 +152,7 @@ def corner_points(drawing: Drawing, poses: Array) -> Array:
 def stage_info(
     robot: Robot, drawing: Drawing, poses: Array, *, scene: str, subtitle: str
 ) -> dict[str, Any]:
-    """Return what the page's stage needs: sizes, light, floor and where the base is.
-
-    Parameters
-    ----------
-    robot : Robot
-    drawing : Drawing
-    poses : ndarray (njoints - 1, 7)
-        Of the first frame.
-    scene : str
-        "space" or "lab".
-    subtitle : str
-    """
+    """Return what the page's stage needs, of the first frame's poses (njoints - 1, 7)."""
     points = corner_points(drawing, poses)
     low, high = points.min(axis=0), points.max(axis=0)
     centre = (low + high) / 2.0

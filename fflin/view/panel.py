@@ -86,17 +86,10 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]
 
 
 def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, Any]:
-    """Return the readouts and plots of a motion's page.
+    """Return the readouts and plots of a motion's page, of the rows (N,) that it shows.
 
-    Parameters
-    ----------
-    robot : Robot
-    motion : Motion
-    shown : ndarray (N,) of int
-        Its rows on the page.
-    target : ndarray (k, nq)
-        What the errors are counted from, one for all rows or one each; of none there are no
-        errors, and the change from the start is shown.
+    Errors are counted from a target for all rows or one each, (k, nq); where there is none there
+    are no errors, and the change from the start is shown.
     """
     found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
     of = "{} error" if len(target) else "{} change"

@@ -102,8 +102,8 @@ def visualize(
     Raises
     ------
     InputError
-        If the motion is another robot's, or a value is none; if no mode oscillates, or pictures
-        of modes are asked for; if the port is taken.
+        If the motion or modes are another robot's or of a reduced model, or a value is none; if
+        no mode oscillates, or pictures of modes are asked for; if the port is taken.
     FileError
         If a file cannot be written. No file is left half written.
     UnknownNameError
