@@ -86,6 +86,8 @@ class Modes:
     state_names, state_units : tuple of str
         Of the shapes.
     robot : str
+    lin : LinearModel
+        What they are modes of.
     """
 
     modes: tuple[Mode, ...]
@@ -96,6 +98,7 @@ class Modes:
     state_names: tuple[str, ...]
     state_units: tuple[str, ...]
     robot: str
+    lin: LinearModel
 
     @property
     def vibrations(self) -> tuple[Mode, ...]:
@@ -192,6 +195,7 @@ def modes(lin: LinearModel) -> Modes:
         lin.state_names,
         lin.state_units,
         lin.robot,
+        lin,
     )
 
 

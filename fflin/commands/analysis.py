@@ -37,6 +37,9 @@ def add_commands(commands: Commands) -> None:
     )
     add_point(modes)
     add_figure(modes, "draw frequencies, damping and shapes")
+    modes.add_argument(
+        "--html", metavar="FILE", type=file_name, help="write a page that plays the mode shapes"
+    )
     validity = command(
         commands,
         "validity",
@@ -82,10 +85,19 @@ def _modes(arguments: argparse.Namespace) -> int:
     from fflin.analysis.modes import modes
 
     check_figure(arguments.plot)
-    _, lin = linear_model(arguments)
+    if arguments.html:
+        from fflin.base.writing import check_place
+
+        check_place(arguments.html, (".html",))
+    robot, lin = linear_model(arguments)
     found = modes(lin)
     print(found)
     draw(arguments.plot, "plot_modes", found)
+    if arguments.html:
+        from fflin.view.visualize import visualize
+
+        visualize(robot, found, html=arguments.html)
+        print(f"wrote {arguments.html}: {arguments.html.stat().st_size / 1e6:.2f} MB")
     return DONE
 
 
