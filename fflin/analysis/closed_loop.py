@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from fflin.analysis.names import rate_of
+from fflin.analysis.regulated import regulated_part
 from fflin.base.errors import ChartError, InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, as_double
@@ -88,8 +90,11 @@ class Loop:
         """P of the Lyapunov function of the linear loop that decays as its energy does."""
         from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
-        size = np.sqrt(self.lin.M.diagonal())
-        Q = np.diag(np.concatenate((self.decay * size, size)) ** 2)
+        names = self.lin.state_names
+        of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
+        # A coordinate as its rate; a rate may stand without one.
+        size = [self.decay * of[rate_of(name)] for name in names if name not in of]
+        Q = np.diag(np.array([*size, *of.values()]) ** 2)
         solve = solve_discrete_lyapunov if self.lin.dt else solve_continuous_lyapunov
         P: Array = solve(self.rate.T, Q if self.lin.dt else -Q)
         return (P + P.T) / 2.0
@@ -262,6 +267,13 @@ def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
         raise InputError(f"K has shape {K.shape}, expected {lin.B.T.shape}")
     if not np.isfinite(K).all():
         raise InputError("K has entries that are NaN or infinite, expected finite numbers")
+    kept = getattr(gain, "regulated", ())
+    for wheel_speeds in (None, True, False):
+        # The others, which are left to themselves, do not settle.
+        part = regulated_part(lin, wheel_speeds) if kept else lin
+        if part.state_names == kept:
+            K, lin = K[:, [lin.state_names.index(name) for name in kept]], part
+            break
     loop = Loop(robot, lin, K)
     if Actuation(loop.state).names != lin.input_names or not len(loop.watched):
         raise InputError(

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -12,10 +11,11 @@ import pinocchio as pin
 from fflin.analysis.mechanics import checked, conserved
 from fflin.analysis.names import undecided
 from fflin.analysis.ranks import Margin
+from fflin.analysis.wheels import certified, leaving, part_of, without
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
-from fflin.linear.model import Certificate, LinearModel
+from fflin.linear.model import LinearModel
 from fflin.robot.frames import frame_index
 from fflin.robot.robot import Robot
 
@@ -54,7 +54,7 @@ class ReducedModel(LinearModel):
     notes: tuple[str, ...]
 
 
-def momentum_reduction(lin: LinearModel) -> ReducedModel:
+def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) -> ReducedModel:
     r"""Reduce a model to the part without its conserved momenta, exactly.
 
     A momentum :math:`W M \nu` that no input, spring or damper changes is zero for all time
@@ -95,7 +95,9 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
     ----------
     Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
     """
-    lin = checked(lin)
+    whole = checked(lin)
+    wheels = leaving(whole, wheel_speeds)
+    lin = without(whole, wheels) if len(wheels) else whole
     held = conserved(lin)
     z, T = held.selected, held.T
     judged = [name not in lin.ignorable for name in lin.state_names]
@@ -105,36 +107,23 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
             f"the point is no fixed point: |f0| is {np.abs(lin.f0).max():.3g} and changes what "
             "the reduction leaves out; linearise at rest"
         )
-    S = np.zeros((len(z), len(T)))
-    S[np.arange(len(z)), z] = 1.0
-    M = held.rates.T @ lin.M @ held.rates
-    M.setflags(write=False)
     values = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
-    values |= {
-        "A": lin.A[z] @ T,
-        "B": lin.B[z],
-        "C": lin.C @ T,
-        "f0": lin.f0[z],
-        "x0": lin.x0[z],
-        "state_names": tuple(lin.state_names[i] for i in z),
-        "state_units": tuple(lin.state_units[i] for i in z),
-        "_ignorable": partial(_given, tuple(lin.state_names[i] for i in z if not judged[i])),
-        "_drift": None if lin.drift is None else lin.drift[z],
-        "_inertia": partial(_given, M),
-    }
+    values |= part_of(lin, z, T, held.rates) | {"C": lin.C @ T}
+    # Of the whole, in which the wheels stand that have left.
+    stays = [whole.state_names.index(name) for name in lin.state_names]
+    in_whole = np.eye(len(whole.A))[stays]
     reduced = ReducedModel(
         **values,
-        T=T,
-        S=S,
-        momenta=held.momenta,
-        coordinates=held.coordinates,
+        T=in_whole.T @ T,
+        S=in_whole[z],
+        momenta=held.momenta @ in_whole,
+        coordinates=held.coordinates @ in_whole,
         margin=held.margin,
         notes=undecided(lin, held.margin, "kept by the reduction", len(z)),
     )
-    fingerprint, source = reduced.fingerprint, lin.generator
-    certify = partial(_same_certificate, lin, fingerprint)
-    of = (fingerprint, momentum_reduction(source)) if lin.dt and source is not None else None
-    return replace(reduced, _certify=certify, _source=of)
+    again = partial(momentum_reduction, wheel_speeds=wheel_speeds)
+    made: ReducedModel = certified(reduced, whole, again)
+    return made
 
 
 def generalized_inertia(lin: LinearModel) -> Array:
@@ -216,11 +205,3 @@ def _following(M: Array) -> Array:
     G: Array = -np.linalg.solve(M[:6, :6], M[:6, 6:])
     return G
 
-
-def _given(value: Any, _: LinearModel) -> Any:
-    return value
-
-
-def _same_certificate(whole: LinearModel, fingerprint: str, lin: LinearModel) -> Certificate:
-    lin.require(fingerprint)
-    return whole.certificate

@@ -15,6 +15,7 @@ from fflin.analysis.observability import observability
 from fflin.analysis.ranks import Margin, judged
 from fflin.base.errors import (
     DetectabilityError,
+    FflinError,
     FflinWarning,
     InputError,
     StabilizabilityError,
@@ -29,9 +30,20 @@ if TYPE_CHECKING:
 # zero: repeated eigenvalues are computed with such errors.
 _RANK = 1e-7
 
+_UNSEEN = "which do not settle by themselves; add outputs"
+
+
+def _has_rates_alone(lin: LinearModel) -> bool:
+    """Whether there are rates without their coordinates, as of wheels: no second-order model."""
+    return len(lin.A) < 2 * len(lin.M)
+
 
 def require_stabilizable(lin: LinearModel) -> None:
     """Raise `StabilizabilityError` that names what no input can hold."""
+    if _has_rates_alone(lin):
+        missed, error_of = "the inputs cannot hold {}; add inputs", StabilizabilityError
+        doubts = _checked_reach(lin, lin.A, lin.B, "held by the inputs", missed, error_of)
+        return _warn_of_doubts(doubts)
     found = controllability(lin)
     if not found.stabilizable:
         weights = conserved(lin).weights
@@ -45,11 +57,17 @@ def require_stabilizable(lin: LinearModel) -> None:
 
 def require_detectable(lin: LinearModel) -> None:
     """Raise `DetectabilityError` that names what no output shows and what does not settle."""
+    if _has_rates_alone(lin):
+        missed = f"the outputs do not show {{}}, {_UNSEEN}"
+        doubts = _checked_reach(
+            lin, lin.A.T, lin.C.T, "shown by the outputs", missed, DetectabilityError
+        )
+        return _warn_of_doubts(doubts)
     found = observability(lin)
     if not found.detectable:
         error = DetectabilityError(
-            f"the outputs do not show {with_rates(found.unobservable)}, which do not settle by "
-            f"themselves; add outputs{_doubts(found.notes)}"
+            f"the outputs do not show {with_rates(found.unobservable)}, {_UNSEEN}"
+            f"{_doubts(found.notes)}"
         )
         error.margin = found.margin
         raise error
@@ -95,16 +113,25 @@ def _root(W: Array) -> Array:
 
 
 def _checked_reach(
-    lin: LinearModel, A: Array, B: Array, what: str, complaint: str
+    lin: LinearModel,
+    A: Array,
+    B: Array,
+    what: str,
+    complaint: str,
+    error: type[FflinError] = InputError,
 ) -> tuple[str, ...]:
-    """Return what is undecided; raise `InputError` where B misses a mode on the boundary."""
+    """Return what is undecided; raise an error where B misses a mode on the boundary.
+
+    Of a weight or a disturbance, for `InputError`, a mode beyond the boundary is none to miss.
+    """
     discrete = bool(lin.dt)
     poles = np.linalg.eigvals(A)
     size = max(float(np.abs(poles - discrete).max()), 1e-300)
     beyond = np.abs(poles) - 1.0 if discrete else poles.real
     # Rounding moves a Jordan block of four by its fourth root.
     candidates = [complex(discrete)]
-    for pole in poles[(np.abs(beyond) <= 1e-3 * size) & (poles.imag >= 0.0)]:
+    growing = (beyond > 0.0) & (error is not InputError)
+    for pole in poles[((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)]:
         if all(abs(pole - other) > 1e-3 * size for other in candidates):
             candidates.append(complex(pole))
     missed, margin = [], Margin()
@@ -121,7 +148,7 @@ def _checked_reach(
     )
     if missed:
         words = _dominant(np.array(missed), lin.state_names)
-        raise InputError(f"{complaint.format(words)}{_doubts(doubts)}")
+        raise error(f"{complaint.format(words)}{_doubts(doubts)}")
     return doubts
 
 

@@ -9,8 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.linalg import eigh
 
+from fflin.analysis.ranks import Noisy, null_space
+from fflin.analysis.regulated import regulated_part
+from fflin.analysis.wheels import ignorable_wheels, rigid_forces, without
 from fflin.base.errors import InputError, listed, unknown
 from fflin.base.validation import Array
+from fflin.control.gain import spread_square, states_of
 from fflin.control.riccati import half_size, solve
 from fflin.control.sampled_cost import sampled_cost
 from fflin.control.weights import reweighed
@@ -30,12 +34,17 @@ TURN, WAY, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 _TRIALS = 8
 
 
+# The speeds of wheels come back at this share of the bandwidth.
+_SPEEDS = 0.1
+
+
 class Weights(NamedTuple):
-    """Weights of a continuous cost (nx, nx) and (nu, nu), and the rule that made them."""
+    """Weights of a continuous cost (nx, nx) and (nu, nu), the rule that made them, and w."""
 
     Q: Array
     R: Array
     rule: str
+    bandwidth: float
 
 
 class _Limit(NamedTuple):
@@ -50,6 +59,8 @@ def rule_weights(
     name: str | None,
     q: Mapping[str, float] | None = None,
     r: Mapping[str, float] | None = None,
+    *,
+    wheel_speeds: bool | None = None,
 ) -> tuple[Array, Array, Array | None, str]:
     """Return Q, R and N of a model by a rule, and the rule in words.
 
@@ -63,6 +74,8 @@ def rule_weights(
         "urdf" is `default_weights`, and the default; "identity" is 1 on every state and input.
     q, r : mapping
         {name of a state, an input or a group: weight} of those that have their own.
+    wheel_speeds : bool, optional
+        As `lqr` takes it; what it does not regulate has no weight.
 
     Raises
     ------
@@ -71,7 +84,7 @@ def rule_weights(
     """
     source = lin.generator or lin
     if name is None or name == "urdf":
-        Q, R, rule = default_weights(source, lin.dt)
+        Q, R, rule = _of_regulated(source, lin.dt, wheel_speeds)
     elif name == "identity":
         nx, nu = lin.B.shape
         Q, R, rule = np.eye(nx), np.eye(nu), "identity: 1 on every state and every input"
@@ -85,6 +98,33 @@ def rule_weights(
     if source.dt == lin.dt:
         return Q, R, None, rule
     return (*sampled_cost(source, lin.dt, Q, R), rule)
+
+
+def _of_regulated(
+    lin: LinearModel, hold: float, wheel_speeds: bool | None
+) -> tuple[Array, Array, str]:
+    r"""Return Q (nx, nx), R and the rule of what is regulated of a model that may have wheels.
+
+    The inputs :math:`u = R^{-1/2} Z \nu` that turn no body change the speeds of wheels at
+    :math:`\dot\sigma = X \nu`: with the weight :math:`(X X^T)^{-1} w^2/100` they come back at w/10.
+    """
+    part = regulated_part(lin, wheel_speeds)
+    if part is lin:
+        return default_weights(lin, hold)[:3]
+    wheels, _ = ignorable_wheels(lin)
+    body = regulated_part(without(lin, wheels))
+    Q, R, rule, bandwidth = default_weights(body, hold)
+    whole = spread_square(Q, states_of(body, lin), len(lin.A))
+    speeds = [name for name in part.state_names if name not in body.state_names]
+    if speeds:
+        at = [lin.state_names.index(name) for name in speeds]
+        root = np.sqrt(R.diagonal())
+        still = null_space(Noisy.exact(rigid_forces(lin, wheels).values / root))[0]
+        X = lin.B[at] / root @ still / (lin.dt or 1.0)
+        slow = _SPEEDS * bandwidth
+        whole[np.ix_(at, at)] = slow**2 * np.linalg.pinv(X @ X.T, 1e-9, hermitian=True)
+        rule = f"{rule}; wheel speeds at {slow:.3g} rad/s"
+    return whole, R, rule
 
 
 def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:
@@ -174,7 +214,8 @@ def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:
     limit = min(limits)
     if A[m:].any() or A[:m, :m].any():
         limit = _slowed(lin, Q, cost, size, limit)
-    return Weights(h * Q, np.diag(h * cost / limit.bandwidth**4), _rule(lin, size, limit))
+    R = np.diag(h * cost / limit.bandwidth**4)
+    return Weights(h * Q, R, _rule(lin, size, limit), limit.bandwidth)
 
 
 def _displacements(lin: LinearModel) -> Array:

@@ -35,8 +35,9 @@ class Gain(Design):
     K : ndarray (nu, nx)
     P : ndarray (nx, nx)
         The cost from x on is ``(x - x0)' P (x - x0)``.
-    poles : ndarray (nx,) of complex
-        Eigenvalues of ``A - B K`` [1/s]; of a sampled model those of the step.
+    poles : ndarray (nz,) of complex
+        Eigenvalues of ``A - B K`` [1/s], over the states that are regulated; of a sampled model
+        those of the step.
     residual : float
         Of the Riccati equation: its norm relative to the sum of the norms of its terms.
     margin : float
@@ -55,6 +56,9 @@ class Gain(Design):
         Of the model.
     weights : str
         The rule that made the weights, in words.
+    regulated : tuple of str (nz,)
+        The states that are fed back; the others have columns of zeros in K, P, Q and N. An empty
+        one, of an early file, stands for all.
     """
 
     VECTORS: ClassVar = ("poles", "x0", "u0")
@@ -80,6 +84,7 @@ class Gain(Design):
     frame: str
     robot: str
     weights: str = field(default_factory=str)
+    regulated: tuple[str, ...] = field(default_factory=tuple)
 
     def __repr__(self) -> str:
         nu, nx = self.K.shape
@@ -103,6 +108,8 @@ class Gain(Design):
             )
         figures = textwrap.fill(_figures(self), width())
         parts = [head, body, _poles(self), figures]
+        if unregulated := _unregulated(self):
+            parts.append(textwrap.fill(f"not regulated: {unregulated}", width()))
         if self.weights:
             parts.append(textwrap.fill(f"weights: {self.weights}", width()))
         if fragile := fragility(self):
@@ -118,7 +125,9 @@ class Gain(Design):
     @cached_property
     def margins(self) -> Margins:
         """Gain and phase margins at the inputs, computed when first asked for."""
-        return input_margins(self.A, self.B, self.K, self.R, self.dt)
+        at = [self.state_names.index(name) for name in self.regulated or self.state_names]
+        A, B, K = self.A[np.ix_(at, at)], self.B[at], self.K[:, at]
+        return input_margins(A, B, K, self.R, self.dt)
 
 
 def make_gain(
@@ -128,20 +137,47 @@ def make_gain(
     R: Array,
     N: Array | None,
     weights: str = "as given",
+    part: LinearModel | None = None,
 ) -> Gain:
-    """Return a gain of a solution (P, K, poles, residual, method)."""
+    """Return a gain of a solution (P, K, poles, residual, method) and the weights of a part."""
     poles, margin = solution.ordered(lin.dt)
+    part = lin if part is None else part
+    at, nx = states_of(part, lin), len(lin.A)
     return Gain(
-        **{key: getattr(solution, key) for key in ("K", "P", "residual", "method")},
+        **{key: getattr(solution, key) for key in ("residual", "method")},
         **{key: getattr(lin, key) for key in _FROM_MODEL},
+        K=spread(solution.K.T, at, nx).T,
+        P=spread_square(solution.P, at, nx),
         poles=poles,
         margin=margin,
-        Q=Q,
+        Q=spread_square(Q, at, nx),
         R=R,
-        N=np.zeros(lin.B.shape) if N is None else N,
+        N=np.zeros(lin.B.shape) if N is None else spread(N, at, nx),
         weights=weights,
+        regulated=part.state_names,
         verified=lin.verified,
     )
+
+
+def states_of(part: LinearModel, lin: LinearModel) -> Array:
+    """Return the states (nz,) of int of a part of a model."""
+    if part is lin:
+        return np.arange(len(lin.A))
+    return np.array([lin.state_names.index(name) for name in part.state_names])
+
+
+def spread(rows: Array, at: Array, count: int) -> Array:
+    """Return rows (nz, k) where they stand among the whole (nx, k), with zeros between."""
+    if len(at) == count:
+        return rows
+    whole = np.zeros((count, rows.shape[1]))
+    whole[at] = rows
+    return whole
+
+
+def spread_square(matrix: Array, at: Array, count: int) -> Array:
+    """Return a matrix (nz, nz) where it stands in the whole (nx, nx), with zeros around it."""
+    return spread(spread(matrix, at, count).T, at, count).T
 
 
 _FROM_MODEL = (
@@ -168,6 +204,26 @@ def fragility(gain: Gain) -> str:
         f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or error of the model makes it "
         f"unstable; {remedy}, as the default weights do"
     )
+
+
+def _unregulated(gain: Gain) -> str:
+    """Say which states are not fed back, and why."""
+    left = [name for name in gain.state_names if gain.regulated and name not in gain.regulated]
+    parts = []
+    if base := [name for name in left if name[:4] in ("r_b.", "v_b.")]:
+        whole = len(base) == 6
+        parts.append(f"{'r_b, v_b' if whole else ', '.join(base)} (no input pushes it)")
+    if any(name.startswith("q_m.") for name in left):
+        parts.append("wheel angles (ignorable)")
+    if speeds := [name for name in left if name.startswith("qdot_m.")]:
+        at = [i for i, name in enumerate(gain.state_names) if name in gain.regulated]
+        also = [*at, *(gain.state_names.index(name) for name in speeds)]
+        B = gain.B / np.linalg.norm(gain.B, axis=1, keepdims=True).clip(1e-300)
+        tied = np.linalg.matrix_rank(B[also]) == np.linalg.matrix_rank(B[at])
+        why = "tied to the body's rate by the conserved momentum"
+        why = why if tied else "wheel_speeds=True regulates those that can be"
+        parts.append(f"wheel speeds ({why})")
+    return ", ".join(parts)
 
 
 def _blocks(gain: Gain) -> str:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.base.errors import DetectabilityError, InputError, MissingPackageError
+from fflin.analysis.regulated import regulated_part
+from fflin.analysis.wheels import seen_by
+from fflin.base.errors import DetectabilityError, InputError, MissingPackageError, listed
 from fflin.base.record import Design
 from fflin.base.validation import Array
-from fflin.control.gain import Gain
+from fflin.control.gain import Gain, spread, spread_square, states_of
 from fflin.control.lqr import require_fixed_point
 from fflin.control.weights import Weight, columns, weight
 from fflin.linear.model import LinearModel
@@ -34,8 +36,9 @@ class Estimator(Design):
         ``L = A L_update`` of a sampled model; L itself for continuous time.
     P : ndarray (nx, nx)
         Covariance of the error of xh.
-    poles : ndarray (nx,) of complex
-        Eigenvalues of ``A - L C`` [1/s]; of a sampled model those of the step.
+    poles : ndarray (nz,) of complex
+        Eigenvalues of ``A - L C`` [1/s], over the states that are estimated; of a sampled model
+        those of the step.
     residual : float
         Of the Riccati equation, relative to the sum of the norms of its terms.
     margin : float
@@ -44,6 +47,9 @@ class Estimator(Design):
         The model.
     W, V : ndarray
         Covariances of the disturbance of the state and of the noise of the outputs.
+    estimated : tuple of str (nz,)
+        The states that are estimated; the others have rows of zeros in L, P and W. An empty one,
+        of an early file, stands for all.
     x0, u0, y0 : ndarray
     dt : float
         Sampling time [s]; 0 for continuous time.
@@ -73,6 +79,7 @@ class Estimator(Design):
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
     robot: str
+    estimated: tuple[str, ...] = field(default_factory=tuple)
 
     def __repr__(self) -> str:
         nx, ny = self.L.shape
@@ -91,10 +98,10 @@ class Compensator(Design):
 
     Attributes
     ----------
-    A : ndarray (nx, nx)
-    B : ndarray (nx, ny)
-    C : ndarray (nu, nx)
-    poles : ndarray (2 nx,) of complex
+    A : ndarray (nz, nz)
+    B : ndarray (nz, ny)
+    C : ndarray (nu, nz)
+    poles : ndarray (.., ) of complex
         Of the loop that it closes around the model: those of the gain and of the estimator.
     y0, u0 : ndarray
     dt : float
@@ -145,7 +152,14 @@ class Compensator(Design):
         )
 
 
-def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -> Estimator:
+def kalman(
+    lin: LinearModel,
+    W: Weight,
+    V: Weight,
+    G: ArrayLike | None = None,
+    *,
+    wheel_speeds: bool | None = None,
+) -> Estimator:
     r"""Return the steady Kalman filter of a model about a fixed point.
 
     The model is disturbed by white noises, ``dx/dt = ... + w`` and ``y = ... + n`` of intensities
@@ -154,6 +168,9 @@ def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -
     .. math:: A P + P A^T - P C^T V^{-1} C P + W = 0,\qquad L = P C^T V^{-1}
 
     or its sampled counterpart, by SciPy's solver and Newton's method, see `lqr`.
+
+    Of a model with reaction wheels those states are estimated that `lqr` regulates; outputs that
+    see others have columns of zeros in L.
 
     Parameters
     ----------
@@ -166,6 +183,8 @@ def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -
     G : array_like (nx, nw), optional
         The disturbance acts through G and W is (nw, nw): ``G=lin.B`` for noisy inputs, whose
         names W then takes.
+    wheel_speeds : bool, optional
+        Whether the speeds of wheels are estimated, as in `lqr`.
 
     Returns
     -------
@@ -194,28 +213,34 @@ def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -
 
     require_fixed_point(lin)
     W, V = _disturbance(lin, W, G), weight("V", V, lin.output_names, definite=True)
-    require_detectable(lin)
-    require_disturbed(lin, W)
-    C = np.ascontiguousarray(lin.C)
+    part, nx, ny = regulated_part(lin, wheel_speeds), len(lin.A), len(V)
+    at, seen = states_of(part, lin), np.arange(ny)
+    if part is not lin:
+        seen, W = np.flatnonzero(seen_by(lin, at)), W[np.ix_(at, at)]
+    require_detectable(part)
+    require_disturbed(part, W)
+    C, noise = np.ascontiguousarray(part.C), V[np.ix_(seen, seen)]
     try:
-        solution = solve(lin.A.T.copy(), C.T.copy(), W, V, None, lin.dt)
+        solution = solve(part.A.T.copy(), C.T.copy(), W, noise, None, lin.dt)
     except np.linalg.LinAlgError as error:
         raise DetectabilityError(
             f"no stable filter was found ({error}); scale W and V, or add outputs"
         ) from None
     L = L_update = solution.K.T
     if lin.dt:
-        L_update = np.linalg.solve(C @ solution.P @ C.T + V, C @ solution.P).T
+        L_update = np.linalg.solve(C @ solution.P @ C.T + noise, C @ solution.P).T
     poles, margin = solution.ordered(lin.dt)
+    L, L_update = (spread(spread(each, at, nx).T, seen, ny).T for each in (L, L_update))
     return Estimator(
         L,
         L_update,
-        solution.P,
+        spread_square(solution.P, at, nx),
         poles,
         solution.residual,
         margin,
-        W=W,
+        W=spread_square(W, at, nx),
         V=V,
+        estimated=part.state_names,
         verified=lin.verified,
         **{key: getattr(lin, key) for key in _FROM_MODEL},
     )
@@ -242,22 +267,31 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     Raises
     ------
     InputError
-        If the two are of different models.
+        If the two are of different models, or the gain feeds back what is not estimated.
     """
     if not isinstance(gain, Gain) or not isinstance(estimator, Estimator):
         raise InputError("lqg takes a Gain, as lqr returns it, and an Estimator, as kalman does")
     e = estimator
     if gain.dt != e.dt or not (np.array_equal(gain.A, e.A) and np.array_equal(gain.B, e.B)):
         raise InputError("the gain and the estimator are of different models; use one for both")
+    names = e.estimated or e.state_names
+    unknown = [name for name in gain.regulated if name not in names]
+    if unknown:
+        raise InputError(
+            f"the gain feeds back {listed(unknown)}, which the estimator does not estimate; give "
+            "the same wheel_speeds to both"
+        )
+    at = [e.state_names.index(name) for name in names]
+    A = e.A - e.B @ gain.K - e.L @ (e.C - e.D @ gain.K)
     return Compensator(
-        A=e.A - e.B @ gain.K - e.L @ (e.C - e.D @ gain.K),
-        B=e.L,
-        C=-gain.K,
+        A=A[np.ix_(at, at)],
+        B=e.L[at],
+        C=-gain.K[:, at],
         poles=np.concatenate((gain.poles, e.poles)),
         y0=e.y0,
         u0=e.u0,
         dt=e.dt,
-        state_names=e.state_names,
+        state_names=names,
         input_names=e.output_names,
         output_names=e.input_names,
         robot=e.robot,

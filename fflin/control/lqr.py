@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fflin.analysis.regulated import regulated_part
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.base.validation import Array
 from fflin.control.default_weights import rule_weights
-from fflin.control.gain import Gain, make_gain
+from fflin.control.gain import Gain, make_gain, states_of
 from fflin.control.weights import Weight, cost_weights
 from fflin.linear.model import LinearModel
 
@@ -34,6 +35,7 @@ def lqr(
     N: ArrayLike | None = None,
     *,
     weights: str | None = None,
+    wheel_speeds: bool | None = None,
 ) -> Gain:
     r"""Return the linear quadratic regulator of a model about a fixed point.
 
@@ -54,6 +56,11 @@ def lqr(
     turned by 30 deg and the joints by 0.3 rad; see `fflin.control.default_weights`. Every input
     then bears 60 deg of phase, and any gain from a half up.
 
+    Of a model with reaction wheels the part is regulated that can be: the angles of wheels are
+    ignorable, their speeds follow the body's rate where only they turn it, and where the base is no
+    input may push it. These states have columns of zeros in K, and weights on them are not used;
+    ``gain.regulated`` has the others, (9.4) and (9.5) of docs/derivation.md.
+
     Parameters
     ----------
     lin : LinearModel
@@ -68,6 +75,10 @@ def lqr(
     weights : {"urdf", "identity"}, optional
         Instead of Q and R: those above (default), or 1 on every state and input. Of a sampled
         model they are those of the continuous cost under the hold.
+    wheel_speeds : bool, optional
+        Whether the speeds of wheels come back to the point's: by default where inputs other than
+        wheels can make them; True also of more than three wheels those that turn nothing else,
+        and False none. The default weights bring them back at a tenth of the slowest other.
 
     Returns
     -------
@@ -99,12 +110,15 @@ def lqr(
     require_fixed_point(lin)
     rule = "as given"
     if Q is None and R is None and N is None:
-        Q, R, N, rule = rule_weights(lin, weights)
+        Q, R, N, rule = rule_weights(lin, weights, wheel_speeds=wheel_speeds)
     elif weights is not None or Q is None or R is None:
         raise InputError("give Q and R, both, or weights='urdf' or 'identity' without them")
     Q, R, cross = cost_weights(lin, Q, R, N)
-    solution = _solve(lin, Q, R, cross)
-    return make_gain(lin, solution, Q, R, cross, rule)
+    part = regulated_part(lin, wheel_speeds)
+    if part is not lin:
+        at = states_of(part, lin)
+        Q, cross = Q[np.ix_(at, at)], None if cross is None else cross[at]
+    return make_gain(lin, _solve(part, Q, R, cross), Q, R, cross, rule, part)
 
 
 def require_fixed_point(lin: LinearModel) -> None:

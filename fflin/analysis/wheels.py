@@ -1,0 +1,162 @@
+"""Reaction wheels in a linear model: whose angle and speed nothing else depends on."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from functools import partial
+from itertools import compress
+from typing import Any
+
+import numpy as np
+
+from fflin.analysis.mechanics import second_order
+from fflin.analysis.ranks import Noisy, echelon, image, null_space
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.linear.model import Certificate, LinearModel
+
+# What is smaller, relative to the rest, is rounding.
+_ROUNDING = 1e-9
+
+
+def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
+    """Return the inputs that are wheels: torques that have names of their own."""
+    pairs = zip(lin.input_names, lin.input_units, strict=True)
+    own = (name for name, unit in pairs if unit == "N m")
+    return tuple(name for name in own if not name.startswith(("tau_b.", "tau_m.")))
+
+
+def wheel_joints(lin: LinearModel) -> Array:
+    """Return the coordinates (k,) of int of the wheels that are joints."""
+    wanted = {f"q_m.{name}" for name in wheel_inputs(lin)}
+    names = lin.state_names[: len(lin.M)]
+    return np.array([i for i, name in enumerate(names) if name in wanted], dtype=np.intp)
+
+
+def ignorable_wheels(lin: LinearModel) -> tuple[Array, Array]:
+    """Return the wheels on whose angle nothing depends, and those of them whose speed is so too.
+
+    A speed matters where the carrier turns at the point, and where the wheel has friction.
+    """
+    at = wheel_joints(lin)
+    if not len(at):
+        return at, at
+    system = second_order(lin.generator or lin)
+    angle = ~system.K.values[:, at].any(axis=0)
+    speed = angle & ~system.D.values[:, at].any(axis=0)
+    return at[angle], at[speed]
+
+
+def leaving(lin: LinearModel, wheel_speeds: bool | None) -> Array:
+    r"""Return the wheels (k,) that leave a design, (9.5) of docs/derivation.md.
+
+    Inputs that turn no body at rest, :math:`\Phi^T S u = 0` with the rigid motions
+    :math:`\Phi` of what is left without wheels, still spin some of them up and down: by as many
+    wheels as they do so independently they can be held. By default these stay where the momentum
+    that the wheels have in all can be changed.
+    """
+    if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
+        raise InputError(f"wheel_speeds is {wheel_speeds!r}, expected True, False or None")
+    _, free = ignorable_wheels(lin)
+    if not len(free) or wheel_speeds is not None and not wheel_speeds:
+        return free
+    forces = rigid_forces(lin, free)
+    sizes = np.linalg.norm(forces.values, axis=0)
+    scale = np.diag(1.0 / np.where(sizes > 0.0, sizes, 1.0))
+    idle = null_space(forces @ scale)[0]
+    names = lin.input_names
+    motors = [names.index(lin.state_names[i].removeprefix("q_m.")) for i in free]
+    spun = image(idle[motors], _ROUNDING)[0]
+    outside = np.abs((forces.values @ scale)[:, motors] @ spun).max(initial=0.0) > _ROUNDING
+    if not outside and not wheel_speeds:
+        return free
+    _, held = echelon(spun, np.ones(len(free)))
+    return np.delete(free, held)
+
+
+def rigid_forces(lin: LinearModel, wheels: Array) -> Noisy:
+    """Return what the inputs do to the rigid motions of a robot without its wheels (r, nu)."""
+    body = second_order(lin.generator or lin).restricted(following(lin.M, wheels))
+    motions = null_space(body.K.T @ np.diag(1.0 / body.size))[0] / body.size[:, None]
+    return body.S.after(motions.T)
+
+
+def following(M: Array, left: Array) -> Array:
+    """Return all rates (nv, r) over the others, of coordinates (k,) that no force holds."""
+    kept = np.setdiff1d(np.arange(len(M)), left)
+    R = np.zeros((len(M), len(kept)))
+    R[kept, np.arange(len(kept))] = 1.0
+    R[left] = -np.linalg.solve(M[np.ix_(left, left)], M[np.ix_(left, kept)])
+    return R
+
+
+def without(lin: LinearModel, left: Array) -> LinearModel:
+    r"""Return a model without coordinates (k,) and rates that no other depends on, (9.4).
+
+    It is a quotient, exact whatever those do: z = S x picks the others, and S A = A_z S. Outputs
+    that see what is left out are left out.
+    """
+    nv = len(lin.M)
+    kept = np.setdiff1d(np.arange(nv), left)
+    z = np.concatenate((kept, kept + nv))
+    T = np.eye(2 * nv)[:, z]
+    part: LinearModel = replace(
+        LinearModel(**{item.name: getattr(lin, item.name) for item in fields(LinearModel)}),
+        **part_of(lin, z, T, following(lin.M, left)),
+        **outputs_of(lin, z),
+    )
+    return certified(part, lin, partial(without, left=left))
+
+
+def seen_by(lin: LinearModel, z: Array) -> Array:
+    """Return which outputs (ny,) of bool see none but the states z (nz,)."""
+    C = np.abs(lin.C)
+    others: Array = np.delete(C, z, axis=1).max(axis=1, initial=0.0)
+    return others <= 1e-12 * C.max(axis=1, initial=0.0)
+
+
+def outputs_of(lin: LinearModel, z: Array) -> dict[str, Any]:
+    """Return the fields of a model of the states z (nz,) about the outputs that see these alone."""
+    seen = seen_by(lin, z)
+    return {
+        "C": lin.C[np.ix_(seen, z)],
+        "D": lin.D[seen],
+        "y0": lin.y0[seen],
+        "output_names": tuple(compress(lin.output_names, seen)),
+        "output_units": tuple(compress(lin.output_units, seen)),
+    }
+
+
+def part_of(lin: LinearModel, z: Array, T: Array, R: Array) -> dict[str, Any]:
+    """Return the fields of a model of the states z (nz,), the others T z, with rates R of all."""
+    M = R.T @ lin.M @ R
+    M.setflags(write=False)
+    ignorable = tuple(lin.state_names[i] for i in z if lin.state_names[i] in lin.ignorable)
+    return {
+        "A": lin.A[z] @ T,
+        "B": lin.B[z],
+        "f0": lin.f0[z],
+        "x0": lin.x0[z],
+        "state_names": tuple(lin.state_names[i] for i in z),
+        "state_units": tuple(lin.state_units[i] for i in z),
+        "_ignorable": partial(_given, ignorable),
+        "_drift": None if lin.drift is None else lin.drift[z],
+        "_inertia": partial(_given, M),
+    }
+
+
+def certified(part: Any, lin: LinearModel, make: Any) -> Any:
+    """Return a part with the certificate of the whole, and with what made it of its source."""
+    fingerprint, source = part.fingerprint, lin.generator
+    certify = partial(_same_certificate, lin, fingerprint)
+    of = (fingerprint, make(source)) if lin.dt and source is not None else None
+    return replace(part, _certify=certify, _source=of)
+
+
+def _given(value: Any, _: LinearModel) -> Any:
+    return value
+
+
+def _same_certificate(whole: LinearModel, fingerprint: str, lin: LinearModel) -> Certificate:
+    lin.require(fingerprint)
+    return whole.certificate
