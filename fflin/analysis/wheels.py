@@ -12,6 +12,7 @@ import numpy as np
 from fflin.analysis.mechanics import second_order
 from fflin.analysis.ranks import Noisy, echelon, image, null_space
 from fflin.base.errors import InputError
+from fflin.base.names import input_keys
 from fflin.base.validation import Array
 from fflin.linear.model import Certificate, LinearModel
 
@@ -20,10 +21,9 @@ _ROUNDING = 1e-9
 
 
 def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
-    """Return the inputs that are wheels: torques that have names of their own."""
-    pairs = zip(lin.input_names, lin.input_units, strict=True)
-    own = (name for name, unit in pairs if unit == "N m")
-    return tuple(name for name in own if not name.startswith(("tau_b.", "tau_m.")))
+    """Return the names of the inputs that are wheels."""
+    keys = (key.partition(".") for key in input_keys(lin))
+    return tuple(name for group, _, name in keys if group == "wheel")
 
 
 def wheel_joints(lin: LinearModel) -> Array:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from fflin.base.errors import FflinError, InputError
+from fflin.base.names import input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array, vector
 from fflin.batch.files import is_constant
@@ -170,7 +171,7 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
         raise InputError("the batch has no points")
     batch[0].require_unchanged()
     Q = weight("Q", Q, batch.state_names)
-    R = weight("R", R, batch.input_names, definite=True)
+    R = weight("R", R, input_keys(batch), definite=True)
     nv, nu = batch.B_lower.shape[1:]
     K: Array = np.empty((len(batch), nu, 2 * nv))
     residual, margin = np.full((2, len(batch)), np.inf)

@@ -12,7 +12,6 @@ from fflin.base.errors import (
     FflinWarning,
     InputError,
     StabilizabilityError,
-    unknown,
 )
 from fflin.commands import DONE
 from fflin.commands.arguments import (
@@ -56,13 +55,13 @@ def add_weights(command: argparse.ArgumentParser) -> None:
     add_values(
         command,
         "--q",
-        "weight on a state or a group of them, such as q_b or q_m.joint_1",
+        "weight on states: a name, a group or a pattern, such as q_m.joint_1, q_b, q_m.hinge_*",
         metavar="NAME=W",
     )
     add_values(
         command,
         "--r",
-        "weight on an input or a group of them, such as tau_b",
+        "weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*",
         metavar="NAME=W",
     )
     add_values(
@@ -128,21 +127,15 @@ def _weighed(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     """Return the regulator with weights that are named, and a rule's for what is not."""
     from fflin.control.default_weights import rule_weights
     from fflin.control.lqr import lqr
-    from fflin.control.weights import inverse_square
+    from fflin.control.weights import inverse_square, is_input
 
     values = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
     squares = {}
     for name, value in values["bryson"].items():
         squares[name] = inverse_square(f"largest value of '{name}' (--bryson)", value)
-    known, states = (
-        dict.fromkeys((*(name.partition(".")[0] for name in names), *names))
-        for names in (lin.input_names, lin.state_names)
-    )
-    for name in squares:
-        if name not in known and name not in states:
-            raise unknown("state or input", name, (*states, *known))
-    of_inputs = {name: value for name, value in squares.items() if name in known}
-    of_states = {name: value for name, value in squares.items() if name not in known}
+    sides = {name: is_input("state or input", name, lin) for name in squares}
+    of_inputs = {name: value for name, value in squares.items() if sides[name]}
+    of_states = {name: value for name, value in squares.items() if not sides[name]}
     both = [*(set(values["q"]) & set(of_states)), *(set(values["r"]) & set(of_inputs))]
     if both:
         raise InputError(f"'{both[0]}' has a weight and a largest value; give either")

@@ -101,7 +101,8 @@ def add_commands(commands: Commands) -> None:
 
 def _simulate(arguments: argparse.Namespace) -> int:
     from fflin.base.writing import check_distinct, check_place
-    from fflin.simulation.motion import FORMATS, motion_report
+    from fflin.simulation.motion import FORMATS
+    from fflin.simulation.report import motion_report
 
     robot = load_robot(arguments)
     check_distinct(*(getattr(arguments, name) for name in _OUTPUTS))

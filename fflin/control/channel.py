@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError
+from fflin.base.names import by_name, input_keys
 from fflin.base.validation import DOUBLE, Array, as_double, dimension, number
 from fflin.dynamics.actuation import Actuation
 
@@ -21,8 +22,8 @@ def limits_of(actuation: Actuation, limits: Any) -> tuple[Array, Array]:
     ----------
     actuation : Actuation
     limits : None, float or mapping
-        Largest magnitude of all inputs, or {name of an input or a group: largest magnitude, or
-        (least, largest)}. A thruster never pulls.
+        Largest magnitude of all inputs, or {name of an input, a group or a pattern: largest
+        magnitude, or (least, largest)}. A thruster never pulls.
 
     Raises
     ------
@@ -39,26 +40,25 @@ def limits_of(actuation: Actuation, limits: Any) -> tuple[Array, Array]:
         given = limits
     else:
         given = dict.fromkeys(groups, limits)
-    # A limit for a single name overrides that of its group, whatever the order.
-    for name in sorted(given, key=lambda name: name in names):
-        if name not in names and name not in groups:
-            raise unknown("input", str(name), (*groups, *names))
-        entries = [names.index(name)] if name in names else groups[name]
-        value = given[name]
-        if dimension(f"limit of '{name}'", value) == 1 and len(value) == 2:
-            least, largest = (number(f"limit of '{name}'", x) for x in value)
-        else:
-            largest = number(f"limit of '{name}'", value)
-            least = -largest
-        if least > largest:
-            raise InputError(
-                f"limit of '{name}' is {value}, expected a magnitude of 0 or more, or "
-                "(least, largest)"
-            )
-        low[entries], high[entries] = least, largest
+    ranges = {name: _range(name, value) for name, value in given.items()}
+    for index, (least, largest) in by_name("input", ranges, input_keys(actuation)).items():
+        low[index], high[index] = least, largest
     thrusters = groups.get("thrust", np.zeros(0, dtype=int))
     low[thrusters] = np.maximum(low[thrusters], 0.0)
     return low, high
+
+
+def _range(name: str, value: Any) -> tuple[float, float]:
+    if dimension(f"limit of '{name}'", value) == 1 and len(value) == 2:
+        least, largest = (number(f"limit of '{name}'", x) for x in value)
+    else:
+        largest = number(f"limit of '{name}'", value)
+        least = -largest
+    if least > largest:
+        raise InputError(
+            f"limit of '{name}' is {value}, expected a magnitude of 0 or more, or (least, largest)"
+        )
+    return least, largest
 
 
 class Law:

@@ -13,6 +13,7 @@ from fflin.analysis.ranks import Noisy, null_space
 from fflin.analysis.regulated import regulated_part
 from fflin.analysis.wheels import ignorable_wheels, rigid_forces, without
 from fflin.base.errors import InputError, listed, unknown
+from fflin.base.names import input_keys
 from fflin.base.validation import Array
 from fflin.control.gain import spread_square, states_of
 from fflin.control.riccati import half_size, solve
@@ -93,7 +94,7 @@ def rule_weights(
     q, r = q or {}, r or {}
     if q or r:
         Q = reweighed("state", Q, q, lin.state_names)
-        R = reweighed("input", R, r, lin.input_names)
+        R = reweighed("input", R, r, input_keys(lin))
         rule = f"{', '.join((*q, *r))} as given, the others {rule}"
     if source.dt == lin.dt:
         return Q, R, None, rule
@@ -291,7 +292,7 @@ def _of_speeds(lin: LinearModel, speeds: Array) -> list[_Limit]:
 def _of_efforts(lin: LinearModel, use: Array, bandwidth: float = 1.0) -> list[_Limit]:
     """Return what the limits of the inputs leave of a bandwidth at which they come to `use`."""
     found = []
-    for name, used, at in zip(lin.input_names, use, lin.u0, strict=True):
+    for name, used, at in zip(input_keys(lin), use, lin.u0, strict=True):
         room = lin.limits.get(name, math.inf) - abs(at)
         if 0.0 < room < math.inf and used > 0.0:
             what = f"the effort of {name.partition('.')[2]}"
@@ -333,7 +334,7 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit) -> str:
     slow = f", set by {limit.what}" if limit.what else ""
     beyond = [
         name
-        for name, at in zip(lin.input_names, lin.u0, strict=True)
+        for name, at in zip(input_keys(lin), lin.u0, strict=True)
         if abs(at) >= lin.limits.get(name, math.inf)
     ]
     if beyond:

@@ -10,6 +10,7 @@ import numpy as np
 from fflin.analysis.regulated import regulated_part
 from fflin.analysis.wheels import seen_by
 from fflin.base.errors import DetectabilityError, InputError, MissingPackageError, listed
+from fflin.base.names import input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array
 from fflin.control.gain import Gain, spread, spread_square, states_of
@@ -311,7 +312,7 @@ def _disturbance(lin: LinearModel, W: Weight, G: ArrayLike | None) -> Array:
     through = columns("G", G, len(lin.A))
     count = through.shape[1]
     same = np.array_equal(through, lin.B)
-    names = lin.input_names if same else [f"w_{i + 1}" for i in range(count)]
+    names = input_keys(lin) if same else [f"w_{i + 1}" for i in range(count)]
     spread = through @ weight("W", W, names) @ through.T
     half: Array = 0.5 * (spread + spread.T)
     return half

@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from fflin.base.errors import InputError
+from fflin.base.names import input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array, number
 from fflin.control.differential_riccati import NODES, Coefficients, step_back
 from fflin.control.weights import Weight, weight
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
@@ -152,7 +155,7 @@ def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSched
         )
     names = traj.state_names
     Q, Qf = weight("Q", Q, names), weight("Qf", Qf, names)
-    R = weight("R", R, traj.input_names, definite=True)
+    R = weight("R", R, input_keys(Actuation(StateMap(traj.robot))), definite=True)
     try:
         # A P that overflows is refused below, so that NumPy need not warn of it.
         with np.errstate(over="ignore", invalid="ignore"):

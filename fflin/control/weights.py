@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError
+from fflin.base.names import by_name, input_keys, matching
 from fflin.base.validation import Array, dimension, number, vector
 
 if TYPE_CHECKING:
@@ -32,8 +33,9 @@ def bryson(lin: LinearModel, largest: Mapping[str, float]) -> Array:
     largest : mapping
         {name: largest acceptable value}, of states or of inputs. A name is one of
         ``lin.state_names`` or ``lin.input_names``, or that of a group such as ``q_b``, ``r_b``,
-        ``q_m``, ``omega_b``, ``v_b``, ``qdot_m``, ``tau_b``, ``F_b``, ``tau_m``; a single name
-        goes before its group's. States that are not named cost nothing; inputs must all be named.
+        ``q_m``, ``omega_b``, ``v_b``, ``qdot_m``, ``tau_b``, ``F_b``, ``tau_m``, or a pattern
+        such as ``q_m.hinge_*``; a single name goes before both. States that are not named cost
+        nothing; inputs must all be named.
 
     Returns
     -------
@@ -60,24 +62,28 @@ def bryson(lin: LinearModel, largest: Mapping[str, float]) -> Array:
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
     if not isinstance(largest, Mapping) or not largest:
         raise InputError(f"largest is {largest!r}, expected {{name: largest acceptable value}}")
-    known = {*lin.input_names, *map(_group, lin.input_names)}
-    of_inputs = [name for name in largest if name in known]
-    if of_inputs and len(of_inputs) < len(largest):
-        other = next(name for name in largest if name not in known)
-        if other in {*lin.state_names, *map(_group, lin.state_names)}:
-            raise InputError(
-                f"'{of_inputs[0]}' is an input and '{other}' a state; ask for one weight of each"
-            )
-    names = lin.input_names if of_inputs else lin.state_names
+    sides = {name: is_input("state or input", name, lin) for name in largest}
+    if len(set(sides.values())) > 1:
+        one = {side: name for name, side in sides.items()}
+        raise InputError(
+            f"'{one[True]}' is an input and '{one[False]}' a state; ask for one weight of each"
+        )
+    of_inputs = all(sides.values())
+    names = input_keys(lin) if of_inputs else lin.state_names
     values = {}
     for name, value in largest.items():
         size = number(f"largest value of '{name}'", value)
         values[name] = inverse_square(f"largest value of '{name}'", size)
-    if not of_inputs:
-        for name in values:
-            if name not in {*names, *map(_group, names)}:
-                raise unknown("state or input", name, (*names, *lin.input_names))
-    return _diagonal("largest", values, names, complete=bool(of_inputs))
+    return _diagonal("largest", values, names, complete=of_inputs)
+
+
+def is_input(kind: str, key: str, lin: LinearModel) -> bool:
+    """Whether a name, group or pattern is of inputs and not of states."""
+    found = matching(kind, key, (*lin.state_names, *input_keys(lin)))
+    sides = {index >= len(lin.state_names) for index in found}
+    if len(sides) > 1:
+        raise InputError(f"{kind} '{key}' is of states and of inputs; name one group of them")
+    return sides.pop()
 
 
 def inverse_square(what: str, size: float) -> float:
@@ -98,7 +104,7 @@ def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = F
         What to call it in an error.
     value : array_like (k, k) or (k,), float, or mapping
         The matrix, its diagonal, a number for the whole diagonal, or {name: number} with the
-        names of entries or of their groups.
+        names of entries, their groups, or patterns such as ``q_m.hinge_*``.
     names : sequence of str (k,)
     definite : bool
         Whether every direction must cost something; else none may be negative.
@@ -160,7 +166,7 @@ def cost_weights(
     """Return the weights as matrices, checked."""
     nx, nu = lin.B.shape
     Q = weight("Q", Q, lin.state_names)
-    R = weight("R", R, lin.input_names, definite=True)
+    R = weight("R", R, input_keys(lin), definite=True)
     if N is None:
         return Q, R, None
     cross = cross_weight("N", N, nx, nu)
@@ -191,18 +197,9 @@ def _checked_matrix(what: str, value: Any, names: Sequence[str], definite: bool)
 
 
 def named_weights(what: str, values: Mapping[str, float], names: Sequence[str]) -> dict[int, float]:
-    """Return {index: value} of {name of an entry or of a group: value}."""
-    groups: dict[str, list[int]] = {}
-    for index, name in enumerate(names):
-        groups.setdefault(_group(name), []).append(index)
-    found: dict[int, float] = {}
-    # A single name goes before its group's, whichever stands first.
-    for name, value in sorted(values.items(), key=lambda item: item[0] in names):
-        if name not in names and name not in groups:
-            raise unknown(what, name, (*groups, *names))
-        entries = [names.index(name)] if name in names else groups[name]
-        found |= dict.fromkeys(entries, number(f"weight of '{name}'", value))
-    return found
+    """Return {index: value} of {name, group or pattern: value}."""
+    checked = {name: number(f"weight of '{name}'", value) for name, value in values.items()}
+    return by_name(what, checked, names)
 
 
 def reweighed(what: str, matrix: Array, values: Mapping[str, float], names: Sequence[str]) -> Array:
@@ -222,10 +219,6 @@ def _diagonal(
         missing = next(name for index, name in enumerate(names) if index not in found)
         raise InputError(f"{what} has no value for {missing}; each needs one")
     return np.array([found.get(index, 0.0) for index in range(len(names))])
-
-
-def _group(name: str) -> str:
-    return name.partition(".")[0]
 
 
 def _negative(what: str, value: float, where: str, definite: bool) -> InputError:

@@ -106,6 +106,16 @@ class Actuation:
         self._of_carried = [at for items in carried.values() for at, _ in items]
 
     @property
+    def input_names(self) -> tuple[str, ...]:
+        """As a model calls them."""
+        return self.names
+
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """As a model calls them."""
+        return self.units
+
+    @property
     def fixed(self) -> Array:
         """Generalised force (6 + n, nu) of the inputs that the configuration does not change."""
         return self._fixed

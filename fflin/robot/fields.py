@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from fflin.base.errors import InputError, ModelError, unknown
+from fflin.base.names import joints_by_name
 from fflin.base.validation import number
 from fflin.robot.inputs import (
     KINDS,
@@ -104,10 +105,8 @@ def _by_joint(
         if what == "rest":
             raise InputError(f"rest is {value!r}, expected a mapping {{joint: position}}")
         value = dict.fromkeys(joints, value)
-    result = {}
-    for name, entry in value.items():
-        find(name)
-        result[name] = number(f"{what} of joint '{name}'", entry)
-        if what != "rest" and result[name] < 0.0:
-            raise InputError(f"{what} of joint '{name}' is {result[name]:g}, expected 0 or more")
-    return result
+    checked = {name: number(f"{what} of joint '{name}'", entry) for name, entry in value.items()}
+    for name, entry in checked.items():
+        if what != "rest" and entry < 0.0:
+            raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")
+    return joints_by_name("joint", checked, joints, lambda name: find(name).name)

@@ -11,6 +11,7 @@ from typing import Any
 import pinocchio as pin
 
 from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
+from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
 from fflin.base.writing import remember
 from fflin.robot.catalog import find_robot
@@ -40,8 +41,8 @@ def load(
     robot : str or Path
         Bundled name, example-robot-data name, or path to a URDF. No mesh is loaded.
     lock : mapping or iterable of str, optional
-        {joint: value [rad|m]} welded at that value (None: at neutral), or names. What mimics a
-        locked joint is welded with it.
+        {joint: value [rad|m]} welded at that value (None: at neutral), or names; a name
+        may be a pattern, ``hinge_*``. What mimics a locked joint is welded with it.
     package_dirs : sequence of path
         Folders in which ``package://`` paths of meshes are looked up when the robot is drawn,
         before those that the URDF lies in.
@@ -200,13 +201,17 @@ def _locked(
 
     Returns the smaller model, the mimics that are left, and "joint=value" of what was welded.
     """
-    names = [lock] if isinstance(lock, str) else _listed(lock)
-    given = lock if isinstance(lock, Mapping) else {}
+    keys = [lock] if isinstance(lock, str) else _listed(lock)
     movable = list(model.names)[ROOT + 1 :]
-    q = pin.neutral(model)
-    for name in names:
+
+    def movable_one(name: str) -> str:
         if name not in movable:
             raise unknown("joint to lock", name, movable)
+        return name
+
+    asked = {key: lock[key] if isinstance(lock, Mapping) else None for key in keys}
+    given = joints_by_name("joint to lock", asked, movable, movable_one)
+    names, q = list(given), pin.neutral(model)
     values = {
         name: None if given.get(name) is None else number(f"lock '{name}'", given[name])
         for name in names

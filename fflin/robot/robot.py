@@ -119,7 +119,8 @@ class Robot:
         outputs : sequence of Output
             What is watched of it, in the order of y.
         stiffness : mapping or float
-            {joint: K [N m/rad | N/m]}, or one for all joints but wheels.
+            {joint: K [N m/rad | N/m]}, or one for all joints but wheels. A name may be a
+            pattern, ``hinge_*``, here and below.
         damping : mapping, float or "urdf"
             {joint: D [N m s/rad | N s/m]}, one for all joints but wheels, or what the URDF
             says.

@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.simulation.motion import motion_report
+from fflin.simulation.report import motion_report
 from tests.simulation.test_simulate import displaced, free_body, regulated, tumbling
 from tests.support.robots import random_tree
 

@@ -1,0 +1,115 @@
+"""What a name stands for: an entry GROUP.ENTRY, a group of them, or a pattern."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from fflin.base.errors import InputError, unknown
+
+T = TypeVar("T")
+
+_GROUPS = ("tau_b", "F_b", "tau_m")
+_OF_UNIT = {"N": "thrust", "N m": "wheel"}
+
+
+def group_of(name: str) -> str:
+    """Return GROUP of GROUP.ENTRY; nothing where a name has no group."""
+    return name.partition(".")[0] if "." in name else ""
+
+
+def input_keys(of: Any) -> tuple[str, ...]:
+    """Return GROUP.ENTRY of each input of a model, or of what else has their names and units.
+
+    Thrusters and wheels have names of their own; that one pushes and the other turns tells them.
+    """
+    return tuple(
+        name if group_of(name) in _GROUPS else f"{_OF_UNIT.get(unit, 'input')}.{name}"
+        for name, unit in zip(of.input_names, of.input_units, strict=True)
+    )
+
+
+def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
+    """Return where the names are that a key stands for.
+
+    Parameters
+    ----------
+    kind : str
+        What to call them in an error.
+    key : str
+        A name such as ``tau_m.hinge_1``, a group such as ``tau_m``, or either the name or the
+        entry alone with ``*``, ``?`` for any letters, any one: ``tau_m.hinge_*``, ``hinge_*``,
+        ``*.x``. An entry may stand for itself too, ``hinge_1``.
+    names : sequence of str
+        In their order.
+
+    Raises
+    ------
+    UnknownNameError
+        If it stands for nothing.
+    InputError
+        If an entry's name or pattern is found in several groups.
+    """
+    if key in names:
+        return [names.index(key)]
+    pattern = _pattern(str(key))
+    of_group = [i for i, name in enumerate(names) if group_of(name) == key]
+    found = of_group or [i for i, name in enumerate(names) if pattern.fullmatch(name)]
+    if not found:
+        found = [i for i, n in enumerate(names) if pattern.fullmatch(n.partition(".")[2])]
+        groups = list(dict.fromkeys(group_of(names[i]) for i in found))
+        if len(groups) > 1:
+            written = " or ".join(f"{group}.{key}" for group in groups)
+            raise InputError(f"{kind} '{key}' may be of {', '.join(groups)}; write {written}")
+    if not found:
+        known = dict.fromkeys((*filter(None, map(group_of, names)), *names))
+        raise unknown(kind, key, known)
+    return found
+
+
+def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[int, T]:
+    """Return {index: value} of {key: value}, with keys as `matching` reads them.
+
+    A pattern goes before a group, and a name before both, whichever stands first.
+    """
+    found: dict[int, T] = {}
+    for key in sorted(values, key=lambda key: _rank(key, names)):
+        found |= dict.fromkeys(matching(kind, key, names), values[key])
+    return found
+
+
+def chosen(kind: str, keys: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Return where the names are that any of the keys stands for, in the order of the names."""
+    return sorted({index for key in keys for index in matching(kind, key, names)})
+
+
+def joints_by_name(
+    kind: str, values: Mapping[str, T], joints: Sequence[str], find: Callable[[str], str]
+) -> dict[str, T]:
+    """Return {joint: value} of {joint or pattern: value}; the group ``q_m`` is all joints.
+
+    `find` returns the joint of a single name, which need not be among `joints`, or raises.
+    """
+    many = {key: value for key, value in values.items() if key == "q_m" or _is_pattern(key)}
+    states = [f"q_m.{name}" for name in joints]
+    found = {joints[i]: value for i, value in by_name(kind, many, states).items()}
+    for key, value in values.items():
+        if key not in many:
+            found[find(key.removeprefix("q_m."))] = value
+    return found
+
+
+def _is_pattern(key: Any) -> bool:
+    return "*" in str(key) or "?" in str(key)
+
+
+def _rank(key: str, names: Sequence[str]) -> int:
+    """Return 0 for groups, 1 for patterns, 2 for names: what comes later goes before."""
+    return 2 if key in names else int(_is_pattern(key))
+
+
+def _pattern(key: str) -> re.Pattern[str]:
+    """Read * and ? alone as wild: brackets stand in names of joints."""
+    wild = re.escape(key).replace(r"\*", ".*").replace(r"\?", ".")
+    return re.compile(wild, re.DOTALL)
