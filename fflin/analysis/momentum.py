@@ -204,4 +204,3 @@ def _following(M: Array) -> Array:
     """Return G (6, n), what the free base does when the joints move."""
     G: Array = -np.linalg.solve(M[:6, :6], M[:6, 6:])
     return G
-

@@ -120,9 +120,7 @@ def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
     return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
 
 
-def velocity_of(
-    robot: Robot, arguments: argparse.Namespace, *options: str
-) -> Array | None:
+def velocity_of(robot: Robot, arguments: argparse.Namespace, *options: str) -> Array | None:
     """Return the velocity (nv,) that --velocity says, or these options, the later before others."""
     from fflin.dynamics.points import velocity
 

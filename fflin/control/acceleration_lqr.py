@@ -51,8 +51,9 @@ def acceleration_lqr(
 
     the poles those of :math:`\lambda^2 + k_d \lambda + s k_p`. Under an exact hold the channels
     stay apart, and each has a closed form too. The speed of a reaction wheel whose angle is not
-    regulated, see `lqr`, is a single integrator, of which k_p is zero. The weight on u is :math:`L^T R_a L`, of which no
-    number is formed for the gain, so that an ill-conditioned inertia costs no digits.
+    regulated, see `lqr`, is a single integrator with k_p = 0. The weight on u is
+    :math:`L^T R_a L`, of which no number is formed for the gain, so that an ill-conditioned inertia
+    costs no digits.
 
     Parameters
     ----------
@@ -112,8 +113,8 @@ def acceleration_lqr(
     pick = np.eye(len(s))[double]
     kd, p22 = np.empty(len(s)), np.empty(len(s))
     with np.errstate(all="ignore"):
-        solve, dt = (_sampled, (lin.dt,)) if lin.dt else (_continuous, ())
-        channel = solve(s[double], qp, qv[double], ra[double], *dt)
+        those = s[double], qp, qv[double], ra[double]
+        channel = _sampled(*those, lin.dt) if lin.dt else _continuous(*those)
         kd[double], p22[double] = channel.kd, channel.p22
         kd[single], p22[single], alone = _single(qv[single], ra[single], lin.dt)
     poles = np.concatenate((channel.poles, alone))

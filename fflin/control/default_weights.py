@@ -119,8 +119,8 @@ def _of_regulated(
     speeds = [name for name in part.state_names if name not in body.state_names]
     if speeds:
         at = [lin.state_names.index(name) for name in speeds]
-        root = np.sqrt(R.diagonal())
-        still = null_space(Noisy.exact(rigid_forces(lin, wheels).values / root))[0]
+        root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
+        still = null_space(Noisy.exact(forces / root))[0]
         X = lin.B[at] / root @ still / (lin.dt or 1.0)
         slow = _SPEEDS * bandwidth
         whole[np.ix_(at, at)] = slow**2 * np.linalg.pinv(X @ X.T, 1e-9, hermitian=True)

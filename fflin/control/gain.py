@@ -159,14 +159,14 @@ def make_gain(
     )
 
 
-def states_of(part: LinearModel, lin: LinearModel) -> Array:
+def states_of(part: LinearModel, lin: LinearModel) -> Any:
     """Return the states (nz,) of int of a part of a model."""
     if part is lin:
         return np.arange(len(lin.A))
     return np.array([lin.state_names.index(name) for name in part.state_names])
 
 
-def spread(rows: Array, at: Array, count: int) -> Array:
+def spread(rows: Array, at: Any, count: int) -> Array:
     """Return rows (nz, k) where they stand among the whole (nx, k), with zeros between."""
     if len(at) == count:
         return rows
@@ -175,7 +175,7 @@ def spread(rows: Array, at: Array, count: int) -> Array:
     return whole
 
 
-def spread_square(matrix: Array, at: Array, count: int) -> Array:
+def spread_square(matrix: Array, at: Any, count: int) -> Array:
     """Return a matrix (nz, nz) where it stands in the whole (nx, nx), with zeros around it."""
     return spread(spread(matrix, at, count).T, at, count).T
 

@@ -213,25 +213,27 @@ def kalman(
     from fflin.control.riccati import solve
 
     require_fixed_point(lin)
-    W, V = _disturbance(lin, W, G), weight("V", V, lin.output_names, definite=True)
-    part, nx, ny = regulated_part(lin, wheel_speeds), len(lin.A), len(V)
-    at, seen = states_of(part, lin), np.arange(ny)
+    spectrum, noise = _disturbance(lin, W, G), weight("V", V, lin.output_names, definite=True)
+    part, nx, ny = regulated_part(lin, wheel_speeds), len(lin.A), len(noise)
+    at, seen = states_of(part, lin), np.ones(ny, dtype=bool)
     if part is not lin:
-        seen, W = np.flatnonzero(seen_by(lin, at)), W[np.ix_(at, at)]
+        seen, spectrum = seen_by(lin, at), spectrum[np.ix_(at, at)]
     require_detectable(part)
-    require_disturbed(part, W)
-    C, noise = np.ascontiguousarray(part.C), V[np.ix_(seen, seen)]
+    require_disturbed(part, spectrum)
+    C, seen_noise = np.ascontiguousarray(part.C), noise[np.ix_(seen, seen)]
     try:
-        solution = solve(part.A.T.copy(), C.T.copy(), W, noise, None, lin.dt)
+        solution = solve(part.A.T.copy(), C.T.copy(), spectrum, seen_noise, None, lin.dt)
     except np.linalg.LinAlgError as error:
         raise DetectabilityError(
             f"no stable filter was found ({error}); scale W and V, or add outputs"
         ) from None
     L = L_update = solution.K.T
     if lin.dt:
-        L_update = np.linalg.solve(C @ solution.P @ C.T + noise, C @ solution.P).T
+        L_update = np.linalg.solve(C @ solution.P @ C.T + seen_noise, C @ solution.P).T
     poles, margin = solution.ordered(lin.dt)
-    L, L_update = (spread(spread(each, at, nx).T, seen, ny).T for each in (L, L_update))
+    L, L_update = (
+        spread(spread(each, at, nx).T, np.flatnonzero(seen), ny).T for each in (L, L_update)
+    )
     return Estimator(
         L,
         L_update,
@@ -239,8 +241,8 @@ def kalman(
         poles,
         solution.residual,
         margin,
-        W=spread_square(W, at, nx),
-        V=V,
+        W=spread_square(spectrum, at, nx),
+        V=noise,
         estimated=part.state_names,
         verified=lin.verified,
         **{key: getattr(lin, key) for key in _FROM_MODEL},

@@ -113,12 +113,13 @@ def lqr(
         Q, R, N, rule = rule_weights(lin, weights, wheel_speeds=wheel_speeds)
     elif weights is not None or Q is None or R is None:
         raise InputError("give Q and R, both, or weights='urdf' or 'identity' without them")
-    Q, R, cross = cost_weights(lin, Q, R, N)
+    state, inputs, cross = cost_weights(lin, Q, R, N)
     part = regulated_part(lin, wheel_speeds)
     if part is not lin:
         at = states_of(part, lin)
-        Q, cross = Q[np.ix_(at, at)], None if cross is None else cross[at]
-    return make_gain(lin, _solve(part, Q, R, cross), Q, R, cross, rule, part)
+        state, cross = state[np.ix_(at, at)], None if cross is None else cross[at]
+    solution = _solve(part, state, inputs, cross)
+    return make_gain(lin, solution, state, inputs, cross, rule, part)
 
 
 def require_fixed_point(lin: LinearModel) -> None:

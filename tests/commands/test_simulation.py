@@ -83,7 +83,8 @@ def test_thrusts_are_allocated_or_their_cut_is_told(tmp_path):
         settled.append(motion.t[motion.attitude_error > 0.4].max())
         cut = "fflin: warning: thrusters cannot pull: in 100.0 % of the run"
         assert done.stderr.startswith(cut) if not option else not done.stderr
-    assert settled[1] < 0.8 * settled[0]  # half of the torque was cut
+    # Half of what the thrusters were to give was cut; the wheels gave their part.
+    assert settled[1] < 0.85 * settled[0]
     assert "--allocate: 'ets_vii' has no thrusters" in refused("simulate", "ets_vii", "--allocate")
 
 
@@ -118,7 +119,11 @@ def test_the_linear_model_is_shown_between_samples_and_inputs_stay_with_their_un
     assert code == 0
     motion = fflin.Motion.load(tmp_path / "m.npz")
     assert motion.linear.shape == motion.x.shape
-    assert np.abs(motion.linear - motion.x).max() < 1e-4
+    # The wheels make some turns, and are left where they are then.
+    base = [not name.partition(".")[2].startswith("wheel_") for name in motion.state_names]
+    assert np.abs(motion.linear - motion.x)[:, base].max() < 1e-4
+    apart = np.abs(motion.linear - motion.x).max() / np.abs(motion.x).max()
+    assert apart < 1e-3
     lines = out.splitlines()
     at = next(i for i, line in enumerate(lines) if line.startswith("largest inputs"))
     until = next(i for i, line in enumerate(lines) if line.startswith("energy"))
