@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from fflin.analysis.momentum import regulated_part
 from fflin.analysis.names import rate_of
-from fflin.analysis.regulated import regulated_part
+from fflin.analysis.wheels import picked, wheel_inputs
 from fflin.base.errors import ChartError, InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, as_double
@@ -268,12 +269,9 @@ def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     if not np.isfinite(K).all():
         raise InputError("K has entries that are NaN or infinite, expected finite numbers")
     kept = getattr(gain, "regulated", ())
-    for wheel_speeds in (None, True, False):
-        # The others, which are left to themselves, do not settle.
-        part = regulated_part(lin, wheel_speeds) if kept else lin
-        if part.state_names == kept:
-            K, lin = K[:, [lin.state_names.index(name) for name in kept]], part
-            break
+    part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))
+    if part.state_names == kept:  # the others, which are left to themselves, do not settle
+        K, lin = K @ picked(kept, lin.state_names).T, part
     loop = Loop(robot, lin, K)
     if Actuation(loop.state).names != lin.input_names or not len(loop.watched):
         raise InputError(

@@ -11,7 +11,16 @@ import pinocchio as pin
 from fflin.analysis.mechanics import checked, conserved
 from fflin.analysis.names import undecided
 from fflin.analysis.ranks import Margin
-from fflin.analysis.wheels import certified, leaving, part_of, without
+from fflin.analysis.wheels import (
+    certified,
+    ignorable_wheels,
+    leaving,
+    part_of,
+    picked,
+    selected,
+    wheel_inputs,
+    without,
+)
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
@@ -71,18 +80,25 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     Without springs the result is minimal; a vibration that no input drives stays in it. From
     inputs to joint states it has the transfer function of the whole model.
 
+    Reaction wheels leave too, whatever their momentum (9.4), and the attitude that they turn
+    stays. Wheels whose speeds are to be held, (9.5), stay with their angles, as do those whose
+    speeds matter: of a carrier that turns at the point, or with friction.
+
     Parameters
     ----------
     lin : LinearModel
         About rest, continuous or sampled.
+    wheel_speeds : bool, optional
+        Whether wheels stay whose speeds the inputs can hold; by default where inputs other than
+        wheels turn the base.
 
     Returns
     -------
     ReducedModel
         A `LinearModel` of 2 r states, r being nv less the number of conserved momenta, with
         the maps ``T`` and ``S``. Its ``M`` is that of the kept coordinates with the others
-        free to follow, and its outputs are those of `lin`. All states are kept where nothing is
-        conserved.
+        free to follow, and its outputs are those of `lin` but what sees wheels that have left,
+        of which ``T`` has zeros. All states are kept where nothing is conserved.
 
     Raises
     ------
@@ -108,22 +124,40 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
             "the reduction leaves out; linearise at rest"
         )
     values = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
-    values |= part_of(lin, z, T, held.rates) | {"C": lin.C @ T}
-    # Of the whole, in which the wheels stand that have left.
-    stays = [whole.state_names.index(name) for name in lin.state_names]
-    in_whole = np.eye(len(whole.A))[stays]
+    M = held.rates.T @ lin.M @ held.rates
+    values |= part_of(lin, np.eye(len(T))[z], T, M) | {"C": lin.C @ T}
+    stays = picked(lin.state_names, whole.state_names)
     reduced = ReducedModel(
         **values,
-        T=in_whole.T @ T,
-        S=in_whole[z],
-        momenta=held.momenta @ in_whole,
-        coordinates=held.coordinates @ in_whole,
+        T=stays.T @ T,
+        S=stays[z],
+        momenta=held.momenta @ stays,
+        coordinates=held.coordinates @ stays,
         margin=held.margin,
         notes=undecided(lin, held.margin, "kept by the reduction", len(z)),
     )
-    again = partial(momentum_reduction, wheel_speeds=wheel_speeds)
-    made: ReducedModel = certified(reduced, whole, again)
-    return made
+    return certified(reduced, whole, partial(momentum_reduction, wheel_speeds=wheel_speeds))
+
+
+def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
+    """Return the model of the states that are regulated; `lin` itself where it has no wheels.
+
+    Wheels leave it as `momentum_reduction` says, the angles of the others too where nothing
+    depends on them, so that there are fewer positions than rates; and the position of the base in
+    the directions in which no input can push it.
+    """
+    if not wheel_inputs(lin):
+        return lin
+    part: LinearModel = momentum_reduction(lin, wheel_speeds=wheel_speeds)
+    still, _ = ignorable_wheels(lin)
+    wheels = {lin.state_names[i] for i in still}
+    left = set(lin.state_names[: len(lin.M)]) - set(part.state_names) - wheels
+    if any(not name.startswith("r_b.") for name in left):
+        # Something else is not held either, which whoever designs is to be told.
+        gone = [i for i in still if lin.state_names[i] not in part.state_names]
+        part = without(lin, np.array(gone, dtype=np.intp))
+    names = [name for name in part.state_names if name not in wheels]
+    return selected(lin, names, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
 
 
 def generalized_inertia(lin: LinearModel) -> Array:

@@ -33,17 +33,12 @@ _RANK = 1e-7
 _UNSEEN = "which do not settle by themselves; add outputs"
 
 
-def _has_rates_alone(lin: LinearModel) -> bool:
-    """Whether there are rates without their coordinates, as of wheels: no second-order model."""
-    return len(lin.A) < 2 * len(lin.M)
-
-
 def require_stabilizable(lin: LinearModel) -> None:
     """Raise `StabilizabilityError` that names what no input can hold."""
-    if _has_rates_alone(lin):
-        missed, error_of = "the inputs cannot hold {}; add inputs", StabilizabilityError
-        doubts = _checked_reach(lin, lin.A, lin.B, "held by the inputs", missed, error_of)
-        return _warn_of_doubts(doubts)
+    if len(lin.A) < 2 * len(lin.M):  # with speeds of wheels without their angles
+        missed = "the inputs cannot hold {}; add inputs"
+        reached = lin.A, lin.B, "held by the inputs", missed, StabilizabilityError
+        return _warn_of_doubts(_checked_reach(lin, *reached))
     found = controllability(lin)
     if not found.stabilizable:
         weights = conserved(lin).weights
@@ -57,12 +52,10 @@ def require_stabilizable(lin: LinearModel) -> None:
 
 def require_detectable(lin: LinearModel) -> None:
     """Raise `DetectabilityError` that names what no output shows and what does not settle."""
-    if _has_rates_alone(lin):
+    if len(lin.A) < 2 * len(lin.M):
         missed = f"the outputs do not show {{}}, {_UNSEEN}"
-        doubts = _checked_reach(
-            lin, lin.A.T, lin.C.T, "shown by the outputs", missed, DetectabilityError
-        )
-        return _warn_of_doubts(doubts)
+        shown = lin.A.T, lin.C.T, "shown by the outputs", missed, DetectabilityError
+        return _warn_of_doubts(_checked_reach(lin, *shown))
     found = observability(lin)
     if not found.detectable:
         error = DetectabilityError(
@@ -122,7 +115,7 @@ def _checked_reach(
 ) -> tuple[str, ...]:
     """Return what is undecided; raise an error where B misses a mode on the boundary.
 
-    Of a weight or a disturbance, for `InputError`, a mode beyond the boundary is none to miss.
+    A growing mode may be missed by a weight or a disturbance, whose error is an `InputError`.
     """
     discrete = bool(lin.dt)
     poles = np.linalg.eigvals(A)

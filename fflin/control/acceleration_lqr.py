@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.analysis.regulated import regulated_part
+from fflin.analysis.momentum import regulated_part
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.validation import Array, dimension
-from fflin.control.gain import Gain, make_gain
+from fflin.control.gain import Gain, for_whole, make_gain
 from fflin.control.lqr import require_fixed_point
 from fflin.control.riccati import Riccati, Solution
 from fflin.control.weights import Weight, weight
@@ -51,9 +51,8 @@ def acceleration_lqr(
 
     the poles those of :math:`\lambda^2 + k_d \lambda + s k_p`. Under an exact hold the channels
     stay apart, and each has a closed form too. The speed of a reaction wheel whose angle is not
-    regulated, see `lqr`, is a single integrator with k_p = 0. The weight on u is
-    :math:`L^T R_a L`, of which no number is formed for the gain, so that an ill-conditioned inertia
-    costs no digits.
+    regulated is a single integrator with k_p = 0. The weight on u is :math:`L^T R_a L`, of which no
+    number is formed for the gain, so that an ill-conditioned inertia costs no digits.
 
     Parameters
     ----------
@@ -66,7 +65,7 @@ def acceleration_lqr(
     dt : float, optional
         Samples a continuous model first.
     wheel_speeds : bool, optional
-        Whether the speeds of wheels are regulated, as in `lqr`.
+        As in `lqr`.
 
     Returns
     -------
@@ -81,7 +80,7 @@ def acceleration_lqr(
         If a coordinate is not actuated.
     InputError
         If the model is not of double integrators, or a weight is not a diagonal, negative, or zero
-        where it must not be: Qp and Ra are positive, and Qv of wheels.
+        where it must not be: Qp and Ra are positive, and Qv of wheels' speeds.
     ModelError
         If the robot's model was changed after it was made.
 
@@ -93,68 +92,61 @@ def acceleration_lqr(
     require_fixed_point(lin)
     if dt is not None:
         lin = lin.discretize(dt)
-    part = regulated_part(lin, wheel_speeds)
-    s, L = _integrators(part)
-    m = len(lin.A) // 2
-    positions, velocities = part.state_names[: -len(s)], part.state_names[-len(s) :]
+    whole, lin = lin, regulated_part(lin, wheel_speeds)
+    rates, L = _integrators(lin)
+    m, half = len(rates), len(whole.A) // 2
+    positions, velocities = lin.state_names[:-m], lin.state_names[-m:]
     qp, qv, ra = (
         _diagonal(name, value, names, kept, definite=name != "Qv")
         for name, value, names, kept in (
-            ("Qp", Qp, lin.state_names[:m], positions),
-            ("Qv", Qv, lin.state_names[m:], velocities),
-            ("Ra", Ra, lin.state_names[m:], velocities),
+            ("Qp", Qp, whole.state_names[:half], positions),
+            ("Qv", Qv, whole.state_names[half:], velocities),
+            ("Ra", Ra, whole.state_names[half:], velocities),
         )
     )
-    double, single = s != 0.0, s == 0.0
-    if (low := qv[single] == 0.0).any():
-        name = np.array(velocities)[single][low][0]
-        raise InputError(f"Qv is 0 for {name}, expected a positive weight of a wheel's speed")
-    # The double integrators among all.
-    pick = np.eye(len(s))[double]
-    kd, p22 = np.empty(len(s)), np.empty(len(s))
+    if (rates + qv == 0.0).any():
+        name = velocities[int((rates + qv).argmin())]
+        raise InputError(f"Qv is 0 for {name}, expected a positive weight on a wheel's speed")
     with np.errstate(all="ignore"):
-        those = s[double], qp, qv[double], ra[double]
-        channel = _sampled(*those, lin.dt) if lin.dt else _continuous(*those)
-        kd[double], p22[double] = channel.kd, channel.p22
-        kd[single], p22[single], alone = _single(qv[single], ra[single], lin.dt)
-    poles = np.concatenate((channel.poles, alone))
-    stable = np.abs(poles) < 1.0 if lin.dt else poles.real < 0.0
-    if not stable.all() or not all(np.isfinite(x).all() for x in (kd, p22, poles, *channel)):
+        channel = _channels(rates, qp, qv, ra, lin.dt)
+    stable = np.abs(channel.poles) < 1.0 if lin.dt else channel.poles.real < 0.0
+    if not stable.all() or not all(np.isfinite(part).all() for part in channel):
         raise InputError(_BEYOND)
     inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
-    K = inverse @ np.hstack((pick.T * channel.kp, np.diag(kd)))
+    pick = np.eye(m)[rates != 0.0]
+    K = inverse @ np.hstack((pick.T * channel.kp, np.diag(channel.kd)))
     p12 = channel.p12[:, None] * pick
-    P = np.block([[np.diag(channel.p11), p12], [p12.T, np.diag(p22)]])
+    P = np.block([[np.diag(channel.p11), p12], [p12.T, np.diag(channel.p22)]])
     Q = np.diag(np.concatenate((qp, qv)))
     # The residual is that of the same equation with accelerations as inputs.
-    hold = np.vstack((0.5 * lin.dt**2 * s[double, None] * pick, lin.dt * np.eye(len(s))))
-    by_acceleration = hold if lin.dt else np.vstack((np.zeros_like(pick), np.eye(len(s))))
-    equation = Riccati(part.A, by_acceleration, Q, np.diag(ra), None, lin.dt)
+    hold = np.vstack((0.5 * lin.dt**2 * rates * pick, lin.dt * np.eye(m)))
+    by_acceleration = hold if lin.dt else np.vstack((np.zeros_like(pick), np.eye(m)))
+    equation = Riccati(lin.A, by_acceleration, Q, np.diag(ra), None, lin.dt)
     R = L.T @ (ra[:, None] * L)
     try:
         with np.errstate(all="ignore"):
             residual = equation.trial(P).residual
     except np.linalg.LinAlgError:
         raise InputError(_BEYOND) from None
-    solution = Solution(P, K, poles, residual, "closed form")
-    return make_gain(lin, solution, Q, 0.5 * (R + R.T), None, part=part)
+    solution = Solution(P, K, channel.poles, residual, "closed form")
+    gain = make_gain(lin, solution, Q, 0.5 * (R + R.T), None)
+    return for_whole(gain, whole)
 
 
 def _integrators(lin: LinearModel) -> tuple[Array, Array]:
-    """Return s (m,), 0 of rates without a coordinate, and L (m, nu) of a model of integrators."""
-    nx = len(lin.A)
+    """Return s (m,), 0 of a rate without its coordinate, and L (m, nu) of integrators."""
+    nx, h = len(lin.A), lin.dt or 1.0
     p = sum(name.startswith(("q_", "r_")) for name in lin.state_names)
-    h = lin.dt or 1.0
     slope = (lin.A - np.eye(nx)) / h if lin.dt else lin.A
     s: Array = slope[:p, p:].sum(axis=0)
-    L = lin.B[p:] / h
-    expected, pick = np.zeros((nx, nx)), np.diag(s)[s != 0.0]
-    expected[: len(pick), nx - len(s) :] = pick
+    L, double = lin.B[p:] / h, np.diag(s)[s != 0.0]
+    expected = np.zeros((nx, nx))
+    expected[: len(double), p:] = double
     # A tolerance, since the division by the sampling time rounds.
     if (
-        len(pick) != p
+        len(double) != p
         or not np.allclose(slope, expected, rtol=1e-12, atol=0.0)
-        or not np.allclose(lin.B[:p], 0.5 * h * lin.dt * pick @ L, rtol=1e-12, atol=0.0)
+        or not np.allclose(lin.B[:p], 0.5 * h * lin.dt * double @ L, rtol=1e-12, atol=0.0)
     ):
         raise InputError(
             "the model is not of double integrators alone, as one at rest without gravity, "
@@ -175,18 +167,23 @@ def _diagonal(
     """Return the diagonal of a weight on the states that are kept of those that it may name."""
     if not isinstance(value, Mapping) and dimension(what, value) == 2:
         raise InputError(f"{what} is a matrix; the closed form needs its diagonal alone, use lqr")
-    whole = weight(what, value, names, definite=definite and len(kept) == len(names)).diagonal()
-    part = whole[[names.index(name) for name in kept]]
-    return weight(what, part, kept, definite=definite).diagonal()
+    whole = weight(what, value, names, definite=definite and len(kept) == len(names))
+    diagonal = whole.diagonal()[[names.index(name) for name in kept]]
+    return weight(what, diagonal, kept, definite=definite).diagonal()
 
 
-def _single(qv: Array, ra: Array, h: float) -> tuple[Array, Array, Array]:
-    """Return gains, P and poles of single integrators, sampled with a hold of length h or not."""
-    if not h:
-        kd = np.sqrt(qv / ra)
-        return kd, ra * kd, -kd
-    step = _decaying((-(h**2) * qv / ra).astype(complex)).real
-    return step / h, ra * step / (h**2 * (1.0 - step)), 1.0 - step
+def _channels(s: Array, qp: Array, qv: Array, ra: Array, h: float) -> _Channel:
+    """Solve all channels: double integrators where s is not zero, single ones elsewhere."""
+    double, single = s != 0.0, s == 0.0
+    those = s[double], qp, qv[double], ra[double]
+    found = _sampled(*those, h) if h else _continuous(*those)
+    kd, p22 = np.sqrt(qv / ra), np.sqrt(qv * ra)
+    if h:
+        step = _decaying((-(h**2) * qv / ra).astype(complex)).real
+        kd, p22 = step / h, ra * step / (h**2 * (1.0 - step))
+    poles = np.concatenate((found.poles, (1.0 - h * kd if h else -kd)[single]))
+    kd[double], p22[double] = found.kd, found.p22
+    return found._replace(kd=kd, p22=p22, poles=poles)
 
 
 def _continuous(s: Array, qp: Array, qv: Array, ra: Array) -> _Channel:

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.linalg import eigh
 
+from fflin.analysis.momentum import regulated_part
 from fflin.analysis.ranks import Noisy, null_space
-from fflin.analysis.regulated import regulated_part
-from fflin.analysis.wheels import ignorable_wheels, rigid_forces, without
+from fflin.analysis.wheels import ignorable_wheels, picked, rigid_forces, without
 from fflin.base.errors import InputError, listed, unknown
 from fflin.base.names import input_keys
 from fflin.base.validation import Array
-from fflin.control.gain import spread_square, states_of
 from fflin.control.riccati import half_size, solve
 from fflin.control.sampled_cost import sampled_cost
 from fflin.control.weights import reweighed
@@ -76,7 +75,7 @@ def rule_weights(
     q, r : mapping
         {name of a state, an input or a group: weight} of those that have their own.
     wheel_speeds : bool, optional
-        As `lqr` takes it; what it does not regulate has no weight.
+        As in `lqr`.
 
     Raises
     ------
@@ -104,28 +103,23 @@ def rule_weights(
 def _of_regulated(
     lin: LinearModel, hold: float, wheel_speeds: bool | None
 ) -> tuple[Array, Array, str]:
-    r"""Return Q (nx, nx), R and the rule of what is regulated of a model that may have wheels.
-
-    The inputs :math:`u = R^{-1/2} Z \nu` that turn no body change the speeds of wheels at
-    :math:`\dot\sigma = X \nu`: with the weight :math:`(X X^T)^{-1} w^2/100` they come back at w/10.
-    """
+    """Return Q (nx, nx), R and the rule of what is regulated of a model that may have wheels."""
     part = regulated_part(lin, wheel_speeds)
     if part is lin:
         return default_weights(lin, hold)[:3]
     wheels, _ = ignorable_wheels(lin)
     body = regulated_part(without(lin, wheels))
     Q, R, rule, bandwidth = default_weights(body, hold)
-    whole = spread_square(Q, states_of(body, lin), len(lin.A))
-    speeds = [name for name in part.state_names if name not in body.state_names]
-    if speeds:
-        at = [lin.state_names.index(name) for name in speeds]
+    S = picked(body.state_names, lin.state_names)
+    Q = S.T @ Q @ S
+    if speeds := [name for name in part.state_names if name not in body.state_names]:
+        S, slow = picked(speeds, lin.state_names), _SPEEDS * bandwidth
+        # Inputs R^-1/2 Z n that turn no body change the speeds at X n.
         root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
-        still = null_space(Noisy.exact(forces / root))[0]
-        X = lin.B[at] / root @ still / (lin.dt or 1.0)
-        slow = _SPEEDS * bandwidth
-        whole[np.ix_(at, at)] = slow**2 * np.linalg.pinv(X @ X.T, 1e-9, hermitian=True)
+        X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
+        Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
         rule = f"{rule}; wheel speeds at {slow:.3g} rad/s"
-    return whole, R, rule
+    return Q, R, rule
 
 
 def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from fflin.analysis.wheels import picked
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import grid, matrix, width
 from fflin.base.validation import Array
@@ -36,8 +37,7 @@ class Gain(Design):
     P : ndarray (nx, nx)
         The cost from x on is ``(x - x0)' P (x - x0)``.
     poles : ndarray (nz,) of complex
-        Eigenvalues of ``A - B K`` [1/s], over the states that are regulated; of a sampled model
-        those of the step.
+        Eigenvalues of ``A - B K`` [1/s] over what is regulated; of a sampled model of the step.
     residual : float
         Of the Riccati equation: its norm relative to the sum of the norms of its terms.
     margin : float
@@ -57,8 +57,7 @@ class Gain(Design):
     weights : str
         The rule that made the weights, in words.
     regulated : tuple of str (nz,)
-        The states that are fed back; the others have columns of zeros in K, P, Q and N. An empty
-        one, of an early file, stands for all.
+        The states that are fed back, all where it is empty; K, P, Q and N are zero elsewhere.
     """
 
     VECTORS: ClassVar = ("poles", "x0", "u0")
@@ -108,8 +107,8 @@ class Gain(Design):
             )
         figures = textwrap.fill(_figures(self), width())
         parts = [head, body, _poles(self), figures]
-        if unregulated := _unregulated(self):
-            parts.append(textwrap.fill(f"not regulated: {unregulated}", width()))
+        if left := _unregulated(self):
+            parts.append(textwrap.fill(f"not regulated: {left}", width()))
         if self.weights:
             parts.append(textwrap.fill(f"weights: {self.weights}", width()))
         if fragile := fragility(self):
@@ -125,9 +124,8 @@ class Gain(Design):
     @cached_property
     def margins(self) -> Margins:
         """Gain and phase margins at the inputs, computed when first asked for."""
-        at = [self.state_names.index(name) for name in self.regulated or self.state_names]
-        A, B, K = self.A[np.ix_(at, at)], self.B[at], self.K[:, at]
-        return input_margins(A, B, K, self.R, self.dt)
+        S = picked(self.regulated or self.state_names, self.state_names)
+        return input_margins(S @ self.A @ S.T, S @ self.B, self.K @ S.T, self.R, self.dt)
 
 
 def make_gain(
@@ -137,47 +135,31 @@ def make_gain(
     R: Array,
     N: Array | None,
     weights: str = "as given",
-    part: LinearModel | None = None,
 ) -> Gain:
-    """Return a gain of a solution (P, K, poles, residual, method) and the weights of a part."""
+    """Return a gain of a solution (P, K, poles, residual, method)."""
     poles, margin = solution.ordered(lin.dt)
-    part = lin if part is None else part
-    at, nx = states_of(part, lin), len(lin.A)
     return Gain(
-        **{key: getattr(solution, key) for key in ("residual", "method")},
+        **{key: getattr(solution, key) for key in ("K", "P", "residual", "method")},
         **{key: getattr(lin, key) for key in _FROM_MODEL},
-        K=spread(solution.K.T, at, nx).T,
-        P=spread_square(solution.P, at, nx),
         poles=poles,
         margin=margin,
-        Q=spread_square(Q, at, nx),
+        Q=Q,
         R=R,
-        N=np.zeros(lin.B.shape) if N is None else spread(N, at, nx),
+        N=np.zeros(lin.B.shape) if N is None else N,
         weights=weights,
-        regulated=part.state_names,
+        regulated=lin.state_names,
         verified=lin.verified,
     )
 
 
-def states_of(part: LinearModel, lin: LinearModel) -> Any:
-    """Return the states (nz,) of int of a part of a model."""
-    if part is lin:
-        return np.arange(len(lin.A))
-    return np.array([lin.state_names.index(name) for name in part.state_names])
-
-
-def spread(rows: Array, at: Any, count: int) -> Array:
-    """Return rows (nz, k) where they stand among the whole (nx, k), with zeros between."""
-    if len(at) == count:
-        return rows
-    whole = np.zeros((count, rows.shape[1]))
-    whole[at] = rows
-    return whole
-
-
-def spread_square(matrix: Array, at: Any, count: int) -> Array:
-    """Return a matrix (nz, nz) where it stands in the whole (nx, nx), with zeros around it."""
-    return spread(spread(matrix, at, count).T, at, count).T
+def for_whole(gain: Gain, lin: LinearModel) -> Gain:
+    """Return a gain of a part of a model as one of the model, with the rest not fed back."""
+    if gain.state_names == lin.state_names:
+        return gain
+    S = picked(gain.regulated, lin.state_names)
+    values = {key: getattr(lin, key) for key in _FROM_MODEL}
+    values |= {"K": gain.K @ S, "P": S.T @ gain.P @ S, "Q": S.T @ gain.Q @ S, "N": S.T @ gain.N}
+    return replace(gain, **values)
 
 
 _FROM_MODEL = (
@@ -209,19 +191,19 @@ def fragility(gain: Gain) -> str:
 def _unregulated(gain: Gain) -> str:
     """Say which states are not fed back, and why."""
     left = [name for name in gain.state_names if gain.regulated and name not in gain.regulated]
-    parts = []
-    if base := [name for name in left if name[:4] in ("r_b.", "v_b.")]:
-        whole = len(base) == 6
-        parts.append(f"{'r_b, v_b' if whole else ', '.join(base)} (no input pushes it)")
+    base = [name for name in left if name.startswith(("r_b.", "v_b."))]
+    shown = "r_b, v_b" if len(base) == 6 else ", ".join(base)
+    parts = [f"{shown} (no input pushes it)"] if base else []
     if any(name.startswith("q_m.") for name in left):
         parts.append("wheel angles (ignorable)")
     if speeds := [name for name in left if name.startswith("qdot_m.")]:
-        at = [i for i, name in enumerate(gain.state_names) if name in gain.regulated]
-        also = [*at, *(gain.state_names.index(name) for name in speeds)]
         B = gain.B / np.linalg.norm(gain.B, axis=1, keepdims=True).clip(1e-300)
-        tied = np.linalg.matrix_rank(B[also]) == np.linalg.matrix_rank(B[at])
-        why = "tied to the body's rate by the conserved momentum"
-        why = why if tied else "wheel_speeds=True regulates those that can be"
+        held, both = (
+            np.linalg.matrix_rank(picked(names, gain.state_names) @ B)
+            for names in (gain.regulated, (*gain.regulated, *speeds))
+        )
+        tied = "tied to the body's rate by the conserved momentum"
+        why = tied if held == both else "wheel_speeds=True regulates those that can be"
         parts.append(f"wheel speeds ({why})")
     return ", ".join(parts)
 

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.analysis.regulated import regulated_part
-from fflin.analysis.wheels import seen_by
+from fflin.analysis.momentum import regulated_part
+from fflin.analysis.wheels import picked, seen_through
 from fflin.base.errors import DetectabilityError, InputError, MissingPackageError, listed
 from fflin.base.names import input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array
-from fflin.control.gain import Gain, spread, spread_square, states_of
+from fflin.control.gain import Gain
 from fflin.control.lqr import require_fixed_point
 from fflin.control.weights import Weight, columns, weight
 from fflin.linear.model import LinearModel
@@ -38,8 +38,7 @@ class Estimator(Design):
     P : ndarray (nx, nx)
         Covariance of the error of xh.
     poles : ndarray (nz,) of complex
-        Eigenvalues of ``A - L C`` [1/s], over the states that are estimated; of a sampled model
-        those of the step.
+        Eigenvalues of ``A - L C`` [1/s] over what is estimated; of a sampled model of the step.
     residual : float
         Of the Riccati equation, relative to the sum of the norms of its terms.
     margin : float
@@ -48,14 +47,13 @@ class Estimator(Design):
         The model.
     W, V : ndarray
         Covariances of the disturbance of the state and of the noise of the outputs.
-    estimated : tuple of str (nz,)
-        The states that are estimated; the others have rows of zeros in L, P and W. An empty one,
-        of an early file, stands for all.
     x0, u0, y0 : ndarray
     dt : float
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
     robot : str
+    estimated : tuple of str (nz,)
+        The states that are, all where it is empty; L, P and W are zero elsewhere.
     """
 
     VECTORS: ClassVar = ("poles", "x0", "u0", "y0")
@@ -102,7 +100,7 @@ class Compensator(Design):
     A : ndarray (nz, nz)
     B : ndarray (nz, ny)
     C : ndarray (nu, nz)
-    poles : ndarray (.., ) of complex
+    poles : ndarray (2 nz,) of complex
         Of the loop that it closes around the model: those of the gain and of the estimator.
     y0, u0 : ndarray
     dt : float
@@ -168,10 +166,8 @@ def kalman(
 
     .. math:: A P + P A^T - P C^T V^{-1} C P + W = 0,\qquad L = P C^T V^{-1}
 
-    or its sampled counterpart, by SciPy's solver and Newton's method, see `lqr`.
-
-    Of a model with reaction wheels those states are estimated that `lqr` regulates; outputs that
-    see others have columns of zeros in L.
+    or its sampled counterpart, by SciPy's solver and Newton's method, see `lqr`. Of a model with
+    reaction wheels what `lqr` regulates is estimated, by the outputs that see nothing else.
 
     Parameters
     ----------
@@ -185,7 +181,7 @@ def kalman(
         The disturbance acts through G and W is (nw, nw): ``G=lin.B`` for noisy inputs, whose
         names W then takes.
     wheel_speeds : bool, optional
-        Whether the speeds of wheels are estimated, as in `lqr`.
+        As in `lqr`.
 
     Returns
     -------
@@ -213,39 +209,36 @@ def kalman(
     from fflin.control.riccati import solve
 
     require_fixed_point(lin)
-    spectrum, noise = _disturbance(lin, W, G), weight("V", V, lin.output_names, definite=True)
-    part, nx, ny = regulated_part(lin, wheel_speeds), len(lin.A), len(noise)
-    at, seen = states_of(part, lin), np.ones(ny, dtype=bool)
-    if part is not lin:
-        seen, spectrum = seen_by(lin, at), spectrum[np.ix_(at, at)]
-    require_detectable(part)
-    require_disturbed(part, spectrum)
-    C, seen_noise = np.ascontiguousarray(part.C), noise[np.ix_(seen, seen)]
+    W, V = _disturbance(lin, W, G), weight("V", V, lin.output_names, definite=True)
+    whole, noises, lin = lin, V, regulated_part(lin, wheel_speeds)
+    S = picked(lin.state_names, whole.state_names)
+    seen = seen_through(whole, S)
+    W, V = S @ W @ S.T, seen @ V @ seen.T
+    require_detectable(lin)
+    require_disturbed(lin, W)
+    C = np.ascontiguousarray(lin.C)
     try:
-        solution = solve(part.A.T.copy(), C.T.copy(), spectrum, seen_noise, None, lin.dt)
+        solution = solve(lin.A.T.copy(), C.T.copy(), W, V, None, lin.dt)
     except np.linalg.LinAlgError as error:
         raise DetectabilityError(
             f"no stable filter was found ({error}); scale W and V, or add outputs"
         ) from None
     L = L_update = solution.K.T
     if lin.dt:
-        L_update = np.linalg.solve(C @ solution.P @ C.T + seen_noise, C @ solution.P).T
+        L_update = np.linalg.solve(C @ solution.P @ C.T + V, C @ solution.P).T
     poles, margin = solution.ordered(lin.dt)
-    L, L_update = (
-        spread(spread(each, at, nx).T, np.flatnonzero(seen), ny).T for each in (L, L_update)
-    )
     return Estimator(
-        L,
-        L_update,
-        spread_square(solution.P, at, nx),
+        S.T @ L @ seen,
+        S.T @ L_update @ seen,
+        S.T @ solution.P @ S,
         poles,
         solution.residual,
         margin,
-        W=spread_square(spectrum, at, nx),
-        V=noise,
-        estimated=part.state_names,
+        W=S.T @ W @ S,
+        V=noises,
+        estimated=lin.state_names,
         verified=lin.verified,
-        **{key: getattr(lin, key) for key in _FROM_MODEL},
+        **{key: getattr(whole, key) for key in _FROM_MODEL},
     )
 
 
@@ -278,18 +271,16 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     if gain.dt != e.dt or not (np.array_equal(gain.A, e.A) and np.array_equal(gain.B, e.B)):
         raise InputError("the gain and the estimator are of different models; use one for both")
     names = e.estimated or e.state_names
-    unknown = [name for name in gain.regulated if name not in names]
-    if unknown:
+    if unseen := [name for name in gain.regulated if name not in names]:
         raise InputError(
-            f"the gain feeds back {listed(unknown)}, which the estimator does not estimate; give "
+            f"the gain feeds back {listed(unseen)}, which the estimator does not estimate; give "
             "the same wheel_speeds to both"
         )
-    at = [e.state_names.index(name) for name in names]
-    A = e.A - e.B @ gain.K - e.L @ (e.C - e.D @ gain.K)
+    S = picked(names, e.state_names)
     return Compensator(
-        A=A[np.ix_(at, at)],
-        B=e.L[at],
-        C=-gain.K[:, at],
+        A=S @ (e.A - e.B @ gain.K - e.L @ (e.C - e.D @ gain.K)) @ S.T,
+        B=S @ e.L,
+        C=-gain.K @ S.T,
         poles=np.concatenate((gain.poles, e.poles)),
         y0=e.y0,
         u0=e.u0,

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.analysis.regulated import regulated_part
+from fflin.analysis.momentum import regulated_part
+from fflin.analysis.wheels import picked
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.base.validation import Array
 from fflin.control.default_weights import rule_weights
-from fflin.control.gain import Gain, make_gain, states_of
+from fflin.control.gain import Gain, for_whole, make_gain
 from fflin.control.weights import Weight, cost_weights
 from fflin.linear.model import LinearModel
 
@@ -56,10 +57,9 @@ def lqr(
     turned by 30 deg and the joints by 0.3 rad; see `fflin.control.default_weights`. Every input
     then bears 60 deg of phase, and any gain from a half up.
 
-    Of a model with reaction wheels the part is regulated that can be: the angles of wheels are
-    ignorable, their speeds follow the body's rate where only they turn it, and where the base is no
-    input may push it. These states have columns of zeros in K, and weights on them are not used;
-    ``gain.regulated`` has the others, (9.4) and (9.5) of docs/derivation.md.
+    Of a model with reaction wheels what can be is regulated, and named in ``gain.regulated``:
+    wheels' angles are ignorable, their speeds follow the body's rate where only they turn it, and
+    no input may push the base, (9.4) of docs/derivation.md. Weights on these have no effect.
 
     Parameters
     ----------
@@ -76,9 +76,9 @@ def lqr(
         Instead of Q and R: those above (default), or 1 on every state and input. Of a sampled
         model they are those of the continuous cost under the hold.
     wheel_speeds : bool, optional
-        Whether the speeds of wheels come back to the point's: by default where inputs other than
-        wheels can make them; True also of more than three wheels those that turn nothing else,
-        and False none. The default weights bring them back at a tenth of the slowest other.
+        Whether wheels come back to the speeds of the point: by default where other inputs can
+        bring them; True also where wheels turn against each other, False none. The default
+        weights bring them back at a tenth of w.
 
     Returns
     -------
@@ -113,13 +113,13 @@ def lqr(
         Q, R, N, rule = rule_weights(lin, weights, wheel_speeds=wheel_speeds)
     elif weights is not None or Q is None or R is None:
         raise InputError("give Q and R, both, or weights='urdf' or 'identity' without them")
-    state, inputs, cross = cost_weights(lin, Q, R, N)
+    Q, R, cross = cost_weights(lin, Q, R, N)
     part = regulated_part(lin, wheel_speeds)
     if part is not lin:
-        at = states_of(part, lin)
-        state, cross = state[np.ix_(at, at)], None if cross is None else cross[at]
-    solution = _solve(part, state, inputs, cross)
-    return make_gain(lin, solution, state, inputs, cross, rule, part)
+        S = picked(part.state_names, lin.state_names)
+        Q, cross = S @ Q @ S.T, None if cross is None else S @ cross
+    solution = _solve(part, Q, R, cross)
+    return for_whole(make_gain(part, solution, Q, R, cross, rule), lin)
 
 
 def require_fixed_point(lin: LinearModel) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 import fflin
 from fflin import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
-from fflin.analysis.regulated import regulated_part
+from fflin.analysis.momentum import regulated_part
 from fflin.analysis.wheels import without
 from tests.support.robots import FRAMES, random_pose, random_tree
 from tests.support.wheels import AXES, carrier_alone, unit, wheels
