@@ -1,5 +1,7 @@
 """Models without their wheels: the quotient, which wheels stay, and closed forms beside it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -7,6 +9,7 @@ import pytest
 import fflin
 from fflin import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
 from fflin.analysis.momentum import regulated_part
+from fflin.analysis.stabilizability import require_detectable, require_stabilizable
 from fflin.analysis.wheels import without
 from tests.support.robots import FRAMES, random_pose, random_tree
 from tests.support.wheels import AXES, carrier_alone, unit, wheels
@@ -101,6 +104,9 @@ def test_what_is_left_is_the_carrier_without_its_wheels_under_minus_a_u(count, s
     torques = beside.B[at][:, n : n + 3] @ -np.array([unit(axis) for axis in AXES[:count]]).T
     assert part.B[:, n:] == pytest.approx(torques, abs=1e-11 * np.abs(torques).max())
     assert part.B[:, :n] == pytest.approx(beside.B[at][:, :n], abs=1e-11)
+    rates = [beside.state_names.index(name) - 6 - n for name in part.state_names[3 + n :]]
+    expected = np.linalg.inv(np.linalg.inv(beside.M)[np.ix_(rates, rates)])
+    assert part.M == pytest.approx(expected, abs=1e-11 * np.abs(expected).max())
 
 
 def test_which_speeds_stay_is_what_the_inputs_can_hold():
@@ -143,6 +149,22 @@ def test_the_speed_of_a_wheel_matters_on_a_carrier_that_turns_and_with_friction(
     assert held(part) == {"wheel_1"} and "q_m.wheel_1" not in part.state_names
     sprung = ship.replace(stiffness={"wheel_1": 1e-4})
     assert "q_m.wheel_1" in regulated_part(fflin.linearize(sprung), False).state_names
+
+
+def test_what_grows_without_an_input_is_named_beside_speeds_alone():
+    """Of the first-order models that speeds without angles make."""
+    ship = fflin.load("cubesat").replace(inputs=[BaseTorque(), *wheels(AXES[:3], 1e-5)])
+    part = regulated_part(fflin.linearize(ship))
+    assert len(part.A) == 9 and len(part.M) == 6
+    require_stabilizable(part)
+    require_detectable(part)
+    A = part.A.copy()
+    A[1], A[1, 1] = 0.0, 0.5
+    with pytest.raises(fflin.StabilizabilityError, match=r"inputs cannot hold q_b\.y; add inputs"):
+        require_stabilizable(replace(part, A=A))
+    A[:, 1], A[1, 1] = 0.0, 0.5
+    with pytest.raises(fflin.DetectabilityError, match=r"do not show q_b\.y, which do not settle"):
+        require_detectable(replace(part, A=A, C=np.delete(part.C, 1, axis=0)))
 
 
 def test_from_inputs_to_what_stays_the_transfer_function_is_kept():

@@ -171,6 +171,16 @@ def test_the_default_bears_much_and_settles(dt):
         assert np.abs(motion.v[-1, 6:]).max() < 1e-2
 
 
+def test_the_torque_of_a_wheel_limits_the_loop():
+    lin = fflin.linearize(wheeled(ORTHOGONAL))
+    limit = 0.01
+    weak = replace(lin, _limits=lambda: {"wheel.wheel_2": limit})
+    gain = fflin.lqr(weak)
+    assert gain.weights.endswith("rad/s or faster, set by the effort of wheel_2")
+    used = np.sin(np.radians(15.0)) * np.linalg.norm(gain.K[1, :3])
+    assert used == pytest.approx(limit, rel=1e-6)
+
+
 def test_spinning_wheels_are_held_about_their_speed():
     """A bias: the momentum stays where it is, the attitude returns, and with it the speeds."""
     robot = wheeled(AXES[:3])
