@@ -47,7 +47,7 @@ def load(
         Folders in which ``package://`` paths of meshes are looked up when the robot is drawn,
         before those that the URDF lies in.
     **fields
-        inputs, stiffness, damping, rest, gravity: see `Robot.replace`.
+        inputs, outputs, stiffness, damping, rest, gravity, limits: see `Robot.replace`.
 
     Returns
     -------

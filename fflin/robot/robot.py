@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, vector
-from fflin.robot.fields import validated_fields, validated_inputs
+from fflin.robot.fields import Range, given_limits, validated_fields, validated_inputs
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.inputs import Input, default_inputs, named_wheels
 from fflin.robot.joints import Follower, Joint, check_followers_rates, followed
@@ -79,6 +79,8 @@ class Robot:
         Uniform acceleration [m/s^2] in Pinocchio's world axes. `model` itself has none.
     package_dirs : tuple of Path
         Folders in which ``package://`` paths of meshes are looked up when it is drawn.
+    limits : mapping
+        {name of an input or state: (least, largest)} in place of what the URDF and the inputs say.
     """
 
     model: pin.Model
@@ -97,6 +99,7 @@ class Robot:
     rest: Mapping[str, float] = field(default_factory=dict)
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     package_dirs: tuple[Path, ...] = ()
+    limits: Mapping[str, Range] = field(default_factory=dict)
     # Where some of its joints are wheels: the same robot without them.
     _wheelless: Robot | None = None
     # The model, and what it was when the first robot of it was made.
@@ -128,6 +131,9 @@ class Robot:
             {joint: position [rad|m]} where its spring is relaxed.
         gravity : sequence of float (3,)
             Uniform acceleration [m/s^2] in Pinocchio's world axes.
+        limits : mapping
+            {name, group or pattern of inputs or states: largest magnitude, or (least, largest)},
+            in place of what the URDF and the inputs say of them.
 
         Returns
         -------
@@ -139,7 +145,7 @@ class Robot:
             If a value is negative or not a number, a field is not one of these, or a wheel has
             more inertia than what carries it.
         UnknownNameError
-            If there is no such joint, or no such frame for an input or output.
+            If there is no such joint, no such frame for an input or output, or nothing to limit.
         ModelError
             If dry friction is asked for, which is not differentiable at rest, or the robot's
             model was changed after it was made.
@@ -148,6 +154,9 @@ class Robot:
         robot = self
         if "inputs" in fields:
             robot = self._with_inputs(fields.pop("inputs"))
+        if "limits" in fields:
+            limits = given_limits(robot.inputs, robot.joint_names, fields.pop("limits"))
+            robot = replace(robot, limits=limits)
         own = (robot._wheelless or robot).joint_names
         robot = replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
         for name in robot.used_frames:
