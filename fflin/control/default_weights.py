@@ -109,7 +109,11 @@ def _of_regulated(
         return default_weights(lin, hold)[:3]
     wheels, _ = ignorable_wheels(lin)
     body = regulated_part(without(lin, wheels))
-    Q, R, rule, bandwidth = default_weights(body, hold)
+    at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
+    names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
+    room = [lin.limits[name] for name in names] - spin
+    momenta = dict(zip(names, lin.M.diagonal()[at] * room.clip(0.0), strict=True))
+    Q, R, rule, bandwidth = default_weights(body, hold, momenta)
     S = picked(body.state_names, lin.state_names)
     Q = S.T @ Q @ S
     if speeds := [name for name in part.state_names if name not in body.state_names]:
@@ -122,7 +126,9 @@ def _of_regulated(
     return Q, R, rule
 
 
-def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:
+def default_weights(
+    lin: LinearModel, hold: float = 0.0, momenta: Mapping[str, float] | None = None
+) -> Weights:
     r"""Return weights with which a displaced robot comes back within the URDF's limits.
 
     With the forces S u of the inputs, a model at rest is :math:`M \dot\nu = S u`,
@@ -154,6 +160,8 @@ def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:
         Whole or reduced; of a sampled one, weights for the sum over its samples.
     hold : float
         Time [s] that the inputs will be held for.
+    momenta : mapping, optional
+        {qdot_m.WHEEL: most momentum [N m s] that it can take up} of wheels that are not states.
 
     Raises
     ------
@@ -198,9 +206,14 @@ def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:
     stiffness = back.T @ (ratios[:, None] ** 0.75 * to_modes)
     gain = (S / cost).T @ np.linalg.solve(reach, stiffness)
     rates = ratios**0.375
+    # The speeds of the coordinates, and the momenta of wheels, as the inputs add them up.
+    room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]} | (momenta or {})
+    added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
+    motors = [lin.input_names.index(name.removeprefix("qdot_m.")) for name in momenta or ()]
+    taken = np.vstack((T, added[motors]))
     limits = [
         _Limit(BANDWIDTH, ""),
-        *_of_speeds(lin, _fastest(T, rates, to_modes, size, lin)),
+        *_of_speeds(room, _fastest(taken, rates, to_modes, size, lin)),
         *_of_efforts(lin, _largest(gain, size, lin.state_names)),
     ]
     if hold or lin.dt:
@@ -262,9 +275,9 @@ def _reach(S: Array, cost: Array, D: Array) -> Array:
 
 
 def _fastest(T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel) -> Array:
-    """Return the largest speed (m,) at w = 1 on the way back from any displacement."""
-    speeds = np.zeros(len(size))
-    if any(name in lin.limits for name in lin.state_names[len(size) :]):
+    """Return the largest of speeds (k,), T over the modes', on the way back at w = 1."""
+    speeds = np.zeros(len(T))
+    if any(name.startswith("qdot_m.") for name in lin.limits):
         for time in np.geomspace(0.1 / rates[-1], 3.0, 60):
             x = rates * time / math.sqrt(2.0)
             moving = math.sqrt(2.0) * rates * np.exp(-x) * np.sin(x)
@@ -273,23 +286,22 @@ def _fastest(T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearMo
     return speeds
 
 
-def _of_speeds(lin: LinearModel, speeds: Array) -> list[_Limit]:
+def _of_speeds(room: Mapping[str, float], speeds: Array) -> list[_Limit]:
     """Return what the limits of speeds leave of a bandwidth at which they are these times it."""
-    names = lin.state_names[len(speeds) :]
     return [
-        _Limit(lin.limits[name] / speed, f"the speed of {name.partition('.')[2]}")
-        for name, speed in zip(names, speeds, strict=True)
-        if name in lin.limits and speed > 0.0
+        _Limit(limit / speed, f"the speed of {name.partition('.')[2]}")
+        for (name, limit), speed in zip(room.items(), speeds, strict=True)
+        if 0.0 < limit < math.inf and speed > 0.0
     ]
 
 
 def _of_efforts(lin: LinearModel, use: Array, bandwidth: float = 1.0) -> list[_Limit]:
     """Return what the limits of the inputs leave of a bandwidth at which they come to `use`."""
     found = []
-    for name, used, at in zip(input_keys(lin), use, lin.u0, strict=True):
+    for name, used, at in zip(lin.input_names, use, lin.u0, strict=True):
         room = lin.limits.get(name, math.inf) - abs(at)
         if 0.0 < room < math.inf and used > 0.0:
-            what = f"the effort of {name.partition('.')[2]}"
+            what = f"the effort of {name.rpartition('.')[2]}"
             found.append(_Limit(bandwidth * math.sqrt(room / used), what))
     return found
 
@@ -328,7 +340,7 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit) -> str:
     slow = f", set by {limit.what}" if limit.what else ""
     beyond = [
         name
-        for name, at in zip(input_keys(lin), lin.u0, strict=True)
+        for name, at in zip(lin.input_names, lin.u0, strict=True)
         if abs(at) >= lin.limits.get(name, math.inf)
     ]
     if beyond:

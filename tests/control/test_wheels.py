@@ -172,13 +172,39 @@ def test_the_default_bears_much_and_settles(dt):
 
 
 def test_the_torque_of_a_wheel_limits_the_loop():
-    lin = fflin.linearize(wheeled(ORTHOGONAL))
-    limit = 0.01
-    weak = replace(lin, _limits=lambda: {"wheel.wheel_2": limit})
-    gain = fflin.lqr(weak)
+    limits = (None, 0.01, None)
+    added = [
+        ReactionWheel(axis, inertia=J, max=most)
+        for axis, most in zip(ORTHOGONAL, limits, strict=True)
+    ]
+    gain = fflin.lqr(fflin.linearize(body().replace(inputs=added)))
     assert gain.weights.endswith("rad/s or faster, set by the effort of wheel_2")
     used = np.sin(np.radians(15.0)) * np.linalg.norm(gain.K[1, :3])
-    assert used == pytest.approx(limit, rel=1e-6)
+    assert used == pytest.approx(0.01, rel=1e-6)
+
+
+@pytest.mark.parametrize("spin", [0.0, -2.0])
+def test_the_speed_of_a_wheel_limits_the_loop(spin):
+    """Its momentum is that which the body has on the way back, beside what it has already."""
+    added = [
+        ReactionWheel(axis, inertia=J, max_speed=most)
+        for axis, most in zip(PYRAMID[:3], (1e3, 6.0, 1e3), strict=True)
+    ]
+    robot = body().replace(inputs=added)
+    v = fflin.velocity(robot, {"wheel_2": spin})
+    lin = fflin.linearize(robot, v=v)
+    gain = fflin.lqr(lin)
+    assert "or faster, set by the speed of wheel_2" in gain.weights
+    largest = 0.0
+    for axis in np.random.default_rng(3).normal(size=(40, 3)):
+        turn = pin.SE3(pin.exp3(np.radians(30.0) * unit(axis)), np.zeros(3))
+        q0 = fflin.configuration(robot, base=turn)
+        policy = fflin.StateFeedback(lin, gain.K)
+        motion = fflin.simulate(
+            robot, policy, q0=q0, v0=v, duration=2.0 / gain.margin, dt=0.2, linear=False
+        )
+        largest = max(largest, np.abs(motion.v[:, 7]).max())
+    assert 0.85 * 6.0 < largest < 1.03 * 6.0
 
 
 def test_spinning_wheels_are_held_about_their_speed():
