@@ -207,7 +207,8 @@ def default_weights(
     gain = (S / cost).T @ np.linalg.solve(reach, stiffness)
     rates = ratios**0.375
     # The speeds of the coordinates, and the momenta of wheels, as the inputs add them up.
-    room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]} | (momenta or {})
+    room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]}
+    room |= momenta or {}
     added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
     motors = [lin.input_names.index(name.removeprefix("qdot_m.")) for name in momenta or ()]
     taken = np.vstack((T, added[motors]))
