@@ -13,6 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from fflin.analysis.momentum import regulated_part
+from fflin.analysis.names import rate_of
+from fflin.analysis.wheels import picked, wheel_inputs
 from fflin.base.errors import ChartError, InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, as_double
@@ -86,8 +89,11 @@ class Loop:
         """P of the Lyapunov function of the linear loop that decays as its energy does."""
         from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
-        size = np.sqrt(self.lin.M.diagonal())
-        Q = np.diag(np.concatenate((self.decay * size, size)) ** 2)
+        names = self.lin.state_names
+        of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
+        # A coordinate as its rate; a rate may stand without one.
+        size = [self.decay * of[rate_of(name)] for name in names if name not in of]
+        Q = np.diag(np.array([*size, *of.values()]) ** 2)
         solve = solve_discrete_lyapunov if self.lin.dt else solve_continuous_lyapunov
         P: Array = solve(self.rate.T, Q if self.lin.dt else -Q)
         return (P + P.T) / 2.0
@@ -260,6 +266,10 @@ def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
         raise InputError(f"K has shape {K.shape}, expected {lin.B.T.shape}")
     if not np.isfinite(K).all():
         raise InputError("K has entries that are NaN or infinite, expected finite numbers")
+    kept = getattr(gain, "regulated", ())
+    part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))
+    if part.state_names == kept:  # the others, which are left to themselves, do not settle
+        K, lin = K @ picked(kept, lin.state_names).T, part
     loop = Loop(robot, lin, K)
     require_fit(lin, robot, loop.state)
     if not len(lin.x0):

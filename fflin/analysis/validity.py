@@ -159,7 +159,8 @@ def validity(
         K, which makes the linear loop stable.
     attitude, position, joint : float
         Largest displacement of the base [deg], [m], and of the joint displaced most [rad|m]. What
-        is not among the states of a reduced model is not displaced, and given as 0.
+        is not among the states of a reduced model, or not regulated, is not displaced, and given
+        as 0.
     samples : int
         Number of random runs.
     seed : int
@@ -189,7 +190,7 @@ def validity(
     case of the binomial, Biometrika 26(4), 1934.
     """
     loop = checked_loop(robot, lin, gain)
-    largest = checked_displacement(lin, attitude, position, joint)
+    largest = checked_displacement(loop.lin, attitude, position, joint)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = number("confidence", confidence)
     if not 0.0 < confidence < 1.0:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from fflin.base.errors import InputError
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, add_point, command, number
+from fflin.commands.arguments import Commands, add_point, command, file_name, number
 from fflin.commands.points import linear_model
 from fflin.commands.regulator import add_weights, gain_of, regulated_part
 from fflin.commands.visual import add_figure, check_figure, draw
@@ -111,11 +111,12 @@ def _momentum(lin: LinearModel) -> str:
         text = f"no reduction: {error}"
     else:
         count, left = len(reduced.momenta), len(reduced.A)
+        wheels = ", the wheels" * (len(lin.A) > left + 2 * count)
         text = "none is conserved: the inputs, springs and dampers act on all of them"
         if count:
             text = (
-                f"{count} momenta are conserved whatever the inputs do; without them and what "
-                f"they drive {left} states are left"
+                f"{count} momenta are conserved whatever the inputs do; without them{wheels} and "
+                f"what they drive {left} states are left"
             )
         elif not lin.is_equilibrium():
             text = "none can be split off: the model is one of a point that moves on"

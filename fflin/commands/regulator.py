@@ -46,7 +46,7 @@ def add_commands(commands: Commands) -> None:
 
 
 def add_weights(command: argparse.ArgumentParser) -> None:
-    """Add what is regulated and at which cost: --q, --r, --bryson, --dt and --reduce."""
+    """Add what is regulated and at which cost: --q, --r, --bryson, --dt, --reduce and so on."""
     command.add_argument(
         "--weights",
         choices=("urdf", "identity"),
@@ -82,6 +82,12 @@ def add_weights(command: argparse.ArgumentParser) -> None:
         action="store_true",
         help="regulate the part that the inputs can hold where momentum is conserved",
     )
+    command.add_argument(
+        "--wheel-speeds",
+        action=argparse.BooleanOptionalAction,
+        help="bring the speeds of reaction wheels back to the point's: by default where thrusters "
+        "or a torque on the base can make them; also those that turn nothing else, or none",
+    )
 
 
 def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearModel:
@@ -90,7 +96,7 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
         return lin
     from fflin.analysis.momentum import momentum_reduction
 
-    return momentum_reduction(lin)
+    return momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
 
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
@@ -110,7 +116,7 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
         if arguments.q or arguments.r or arguments.bryson:
             gain = _weighed(lin, arguments)
         else:
-            gain = lqr(lin, weights=arguments.weights)
+            gain = lqr(lin, weights=arguments.weights, wheel_speeds=arguments.wheel_speeds)
     except StabilizabilityError as error:
         hint = " (--reduce)" if "momentum_reduction" in str(error) else ""
         raise StabilizabilityError(f"{error}{hint}") from None
@@ -136,8 +142,9 @@ def _weighed(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     if both:
         raise InputError(f"'{both[0]}' has a weight and a largest value; give either")
     q, r = values["q"] | of_states, values["r"] | of_inputs
-    *weights, rule = rule_weights(lin, arguments.weights, q, r)
-    return replace(lqr(lin, *weights), weights=rule)
+    speeds = arguments.wheel_speeds
+    *weights, rule = rule_weights(lin, arguments.weights, q, r, wheel_speeds=speeds)
+    return replace(lqr(lin, *weights, wheel_speeds=speeds), weights=rule)
 
 
 def _lqr(arguments: argparse.Namespace) -> int:
