@@ -99,20 +99,8 @@ def validated_inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, .
 def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> dict[str, Range]:
     """Return {name of an input or state: (least, largest)} of what a caller gives.
 
-    Parameters
-    ----------
-    inputs : sequence of Input
-    joints : sequence of str
-    given : float or mapping
-        Largest magnitude of all inputs, or {name, group or pattern: largest magnitude, or (least,
-        largest)}. States may be named too. A thruster never pulls.
-
-    Raises
-    ------
-    InputError
-        If a limit is negative or not a number, or a range is empty.
-    UnknownNameError
-        If there is no such input, state or group.
+    Which is the largest magnitude of all inputs, or {name, group or pattern of inputs or states:
+    largest magnitude, or (least, largest)}. A thruster never pulls.
     """
     names: list[str] = []
     keys: list[str] = []
@@ -130,7 +118,12 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> 
     except UnknownNameError:
         states = states_of(joints)
         names, floors = names + states, floors + [-math.inf] * len(states)
-        found = by_name("input or state", ranges, (*keys, *states))
+        # The group of all joints leaves wheels out, whose speeds are of another size.
+        joints_alone = {key: ranges.pop(key) for key in ("q_m", "qdot_m") if key in ranges}
+        wheels = {f"{key}.{name}" for key in joints_alone for name, _ in named_wheels(inputs)}
+        found = by_name("input or state", joints_alone, (*keys, *states))
+        found = {i: limits for i, limits in found.items() if names[i] not in wheels}
+        found |= by_name("input or state", ranges, (*keys, *states))
     return {
         names[i]: (max(low, floors[i]), max(high, floors[i])) for i, (low, high) in found.items()
     }

@@ -77,6 +77,16 @@ def test_a_pattern_goes_before_a_group_and_a_name_before_both():
     assert found["tau_m.panel_left"] == (-3.0, 3.0)
 
 
+def test_the_group_of_all_joints_leaves_wheels_out():
+    wheel = fflin.ReactionWheel((0, 0, 1), inertia=0.03, max_speed=600.0, name="spin")
+    robot = fflin.load("servicer_7dof", inputs=[wheel])
+    found = limits_of(robot.replace(limits={"qdot_m": 0.5, "qdot_m.joint_*": 0.2}))
+    assert found["qdot_m.panel_left"] == (-0.5, 0.5)
+    assert found["qdot_m.joint_1"] == (-0.2, 0.2)
+    assert found["qdot_m.spin"] == (-600.0, 600.0)
+    assert limits_of(robot.replace(limits={"qdot_m.spin": 50}))["qdot_m.spin"] == (-50.0, 50.0)
+
+
 def test_limits_are_kept_in_files_of_models(tmp_path):
     inputs = [fflin.BaseTorque(max=4.0), *fflin.load("cubesat").inputs[1:]]
     lin = fflin.linearize(fflin.load("cubesat", inputs=inputs))
