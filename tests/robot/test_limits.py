@@ -43,7 +43,7 @@ def test_limits_of_inputs_go_before_the_urdf_and_given_ones_before_both():
             fflin.ReactionWheel((0, 0, 1), inertia=0.03, max=0.2, max_speed=600.0, name="spin"),
             fflin.ReactionWheel((0, 1, 0), momentum=1.0, max=0.1),
         ],
-        limits={"q_m.joint_*": 1.0, "tau_m.joint_2": (-5.0, 6.0), "omega_b": 0.1, "main": 4.0},
+        limits={"q_m.joint_*": 1.0, "joint_2": (-5.0, 6.0), "omega_b": 0.1, "main": 4.0},
     )
     found = limits_of(robot)
     assert found["tau_b.y"] == (-40.0, 40.0)
