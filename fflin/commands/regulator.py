@@ -23,6 +23,7 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import linear_model, once
+from fflin.commands.visual import add_figure, check_figure, draw
 
 if TYPE_CHECKING:
     from fflin.control.gain import Gain
@@ -41,10 +42,11 @@ def add_commands(commands: Commands) -> None:
     add_point(lqr)
     add_weights(lqr)
     add_output_file(lqr, "save the gain to FILE: .npz, .mat or .json")
+    add_figure(lqr, "draw the loop of each input with its margins, and the poles,")
 
 
 def add_weights(command: argparse.ArgumentParser) -> None:
-    """Add what is regulated and at which cost: --q, --r, --bryson, --dt and --reduce."""
+    """Add what is regulated and at which cost: --q, --r, --bryson, --dt, --reduce and so on."""
     command.add_argument(
         "--weights",
         choices=("urdf", "identity"),
@@ -80,6 +82,12 @@ def add_weights(command: argparse.ArgumentParser) -> None:
         action="store_true",
         help="regulate the part that the inputs can hold where momentum is conserved",
     )
+    command.add_argument(
+        "--wheel-speeds",
+        action=argparse.BooleanOptionalAction,
+        help="bring the speeds of reaction wheels back to the point's: by default where thrusters "
+        "or a torque on the base can make them; also those that turn nothing else, or none",
+    )
 
 
 def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearModel:
@@ -88,7 +96,7 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
         return lin
     from fflin.analysis.momentum import momentum_reduction
 
-    return momentum_reduction(lin)
+    return momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
 
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
@@ -108,7 +116,7 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
         if arguments.q or arguments.r or arguments.bryson:
             gain = _weighed(lin, arguments)
         else:
-            gain = lqr(lin, weights=arguments.weights)
+            gain = lqr(lin, weights=arguments.weights, wheel_speeds=arguments.wheel_speeds)
     except StabilizabilityError as error:
         hint = " (--reduce)" if "momentum_reduction" in str(error) else ""
         raise StabilizabilityError(f"{error}{hint}") from None
@@ -134,11 +142,13 @@ def _weighed(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     if both:
         raise InputError(f"'{both[0]}' has a weight and a largest value; give either")
     q, r = values["q"] | of_states, values["r"] | of_inputs
-    *weights, rule = rule_weights(lin, arguments.weights, q, r)
-    return replace(lqr(lin, *weights), weights=rule)
+    speeds = arguments.wheel_speeds
+    *weights, rule = rule_weights(lin, arguments.weights, q, r, wheel_speeds=speeds)
+    return replace(lqr(lin, *weights, wheel_speeds=speeds), weights=rule)
 
 
 def _lqr(arguments: argparse.Namespace) -> int:
+    check_figure(arguments.plot)
     _, lin = linear_model(arguments)
     if arguments.output_file:
         from fflin.base.record import FORMATS
@@ -151,4 +161,5 @@ def _lqr(arguments: argparse.Namespace) -> int:
     print(gain)
     if arguments.output_file:
         print(f"\nwrote {arguments.output_file}")
+    draw(arguments.plot, "plot_loops", gain)
     return DONE

@@ -186,7 +186,11 @@ def test_without_limits_the_loop_does_not_depend_on_units_of_mass_and_length(loo
 def test_thrusters_springs_gravity_and_reduced_models_have_weights_too():
     cubesat = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     gain = fflin.lqr(fflin.linearize(cubesat))
-    assert np.abs(gain.poles).min() == pytest.approx(BANDWIDTH, rel=1e-6)
+    base, wheels = np.split(np.sort(np.abs(gain.poles))[::-1], [12])
+    # What brings the wheels back at a tenth hardly moves the poles of the base.
+    assert base.min() == pytest.approx(BANDWIDTH, rel=0.01)
+    assert wheels == pytest.approx(np.full(3, 0.1 * BANDWIDTH), rel=1e-4)
+    assert gain.weights.endswith("or faster; wheel speeds at 0.02 rad/s")
     assert gain.margins.disk > 0.6
     panels = dict.fromkeys(("panel_left", "panel_right"), 100.0)
     servicer = fflin.load(

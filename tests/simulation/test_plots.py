@@ -190,40 +190,6 @@ def test_attitude_through_180_degrees_has_a_gap():
     assert np.nanmax(np.abs(np.diff(z))) < 0.1
 
 
-def test_pole_map_and_pattern(loop):
-    lin, gain, _ = loop
-    figure = fflin.plot_poles({"open": lin, "closed": gain})
-    shown = lines(figure.axes[0])["closed"]
-    np.testing.assert_array_equal(np.sort(shown.get_xdata()), np.sort(gain.poles.real))
-    sampled = fflin.plot_poles(lin.discretize(0.1))
-    assert sampled.axes[0].get_xlabel() == "real part"
-    assert len(sampled.axes[0].get_lines()) == 2  # with the unit circle
-
-    pattern = fflin.plot_matrices(lin)
-    left, right = pattern.axes[:2]
-    for axes, values, names in ((left, lin.A, lin.state_names), (right, lin.B, lin.input_names)):
-        image = axes.get_images()[0].get_array()
-        np.testing.assert_array_equal(np.ma.getmaskarray(np.ma.masked_invalid(image)), values == 0)
-        assert [label.get_text() for label in axes.get_xticklabels()] == list(names)
-
-
-def test_validity_shows_the_runs_and_the_order(tmp_path):
-    robot = fflin.load("cubesat")
-    lin = fflin.linearize(robot)
-    gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
-    found = fflin.validity(robot, lin, gain, attitude=170.0, samples=12)
-    figure = fflin.plot_validity(found, tmp_path / "validity.png")
-    left, right = figure.axes
-    curve = left.get_lines()[0]
-    known = np.isfinite(found.prediction_error)
-    np.testing.assert_allclose(curve.get_ydata(), 100.0 * found.prediction_error[known])
-    heights = [sum(bar.get_height() for bar in bars) for bars in right.containers]
-    assert heights == [found.settled, 12 - found.settled]
-    assert (tmp_path / "validity.png").exists()
-    with pytest.raises(fflin.InputError, match=r"expected what fflin\.validity returns"):
-        fflin.plot_validity(3)
-
-
 @pytest.mark.parametrize("suffix", [".png", ".pdf", ".svg"])
 def test_figures_are_saved_whole(loop, tmp_path, suffix):
     _, _, motion = loop
@@ -240,8 +206,6 @@ def test_bad_figures_are_refused(loop, tmp_path, monkeypatch):
         motion.plot(tmp_path / "loop.bmp")
     with pytest.raises(fflin.InputError, match="expected a Motion"):
         fflin.plot_motion(3)
-    with pytest.raises(fflin.InputError, match="expected finite numbers or a Gain"):
-        fflin.plot_poles("stable")
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(fflin.MissingPackageError, match=r"pip install 'fflin\[plot\]'"):
         motion.plot()

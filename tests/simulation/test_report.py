@@ -141,6 +141,16 @@ def test_inputs_at_their_limits_all_along_are_named():
     assert "F_b" not in said
 
 
+def test_an_input_that_goes_from_limit_to_limit_is_at_its_limit_all_along():
+    motion = course(lambda t: np.exp(-t / 10.0), joint=0.0)
+    u = np.zeros_like(motion.u)
+    u[:, 0], u[:1000, 1] = -3.0, 2.0  # all of the run, and half of it
+    u[:1000, 0] = 3.0  # at the one limit or at the other
+    names, limits = ("tau_b.x", "tau_b.y"), np.array([[-3.0, 3.0], [-2.0, 2.0]])
+    said = first(replace(motion, u=u, limit_names=names, limits=limits))
+    assert said == "not settled: attitude 2.7 deg at the end; at the limit all along: tau_b.x"
+
+
 @pytest.mark.parametrize(
     ("options", "code", "begins"),
     [
