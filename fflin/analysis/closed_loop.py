@@ -18,8 +18,8 @@ from fflin.analysis.wheels import picked, regulated_part, wheel_inputs
 from fflin.base.errors import ChartError, InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, as_double
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
+from fflin.linear.fit import require_fit
 from fflin.linear.model import LinearModel
 from fflin.linear.nonlinear import Nonlinear
 from fflin.robot.robot import Robot
@@ -67,8 +67,6 @@ class Loop:
     def watched(self) -> Array:
         """Which of its entries are the model's states."""
         names = self.state.names
-        if not set(self.lin.state_names) <= set(names):
-            raise InputError(f"the model of '{self.lin.robot}' is not one of '{self.robot.name}'")
         return np.array([names.index(name) for name in self.lin.state_names], dtype=np.intp)
 
     @cached_property
@@ -272,10 +270,9 @@ def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     if part.state_names == kept:  # the others, which are left to themselves, do not settle
         K, lin = K @ picked(kept, lin.state_names).T, part
     loop = Loop(robot, lin, K)
-    if Actuation(loop.state).names != lin.input_names or not len(loop.watched):
-        raise InputError(
-            f"the model's inputs are not those of '{robot.name}'; give the robot with its inputs"
-        )
+    require_fit(lin, robot, loop.state)
+    if not len(lin.x0):
+        raise InputError(f"the model of '{lin.robot}' has no states; nothing is to settle")
     if lin.moving or not lin.is_equilibrium() or lin.v.any():
         raise InputError("the point is no fixed point at rest; its loop cannot settle there")
     if not loop.decay > 0.0:

@@ -80,7 +80,7 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
     shown = [i for i in order if abs(weights[i]) * sizes[i] > 1e-6 * largest]
     terms = [_term(float(weights[i]), names[i], first=i == shown[0]) for i in shown[:most]]
     if len(shown) > most:
-        terms.append("+ ...")
+        terms.append(f"+ {len(shown) - most} more")
     return " ".join(terms)
 
 

@@ -98,8 +98,7 @@ def placed(
         value, unit = joints[joint.name], "m" if joint.prismatic else "rad"
         if not low <= value <= high:
             warnings.warn(
-                f"joint '{joint.name}' is put at {value:g} {unit}, outside its limits from "
-                f"{low:g} to {high:g} {unit}",
+                f"joint '{joint.name}' at {value:g} {unit} is outside {low:g} to {high:g} {unit}",
                 FflinWarning,
                 stacklevel=2,
             )

@@ -23,6 +23,7 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import linear_model, once
+from fflin.commands.visual import add_figure, check_figure, draw
 
 if TYPE_CHECKING:
     from fflin.control.gain import Gain
@@ -41,6 +42,7 @@ def add_commands(commands: Commands) -> None:
     add_point(lqr)
     add_weights(lqr)
     add_output_file(lqr, "save the gain to FILE: .npz, .mat or .json")
+    add_figure(lqr, "draw the loop of each input with its margins, and the poles,")
 
 
 def add_weights(command: argparse.ArgumentParser) -> None:
@@ -146,6 +148,7 @@ def _weighed(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
 
 
 def _lqr(arguments: argparse.Namespace) -> int:
+    check_figure(arguments.plot)
     _, lin = linear_model(arguments)
     if arguments.output_file:
         from fflin.base.record import FORMATS
@@ -158,4 +161,5 @@ def _lqr(arguments: argparse.Namespace) -> int:
     print(gain)
     if arguments.output_file:
         print(f"\nwrote {arguments.output_file}")
+    draw(arguments.plot, "plot_loops", gain)
     return DONE

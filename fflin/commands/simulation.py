@@ -17,6 +17,7 @@ from fflin.commands.arguments import (
     add_system,
     add_values,
     command,
+    count_of,
     file_name,
     number,
 )
@@ -77,10 +78,25 @@ def add_commands(commands: Commands) -> None:
         "--step", metavar="H", type=number, help="step of the integration [s]; chosen by default"
     )
     simulate.add_argument(
+        "--every",
+        metavar="N",
+        type=count_of,
+        help="steps from one recorded row to the next; chosen where there are many",
+    )
+    simulate.add_argument(
         "--method", default="cf4", help="cf4 (default), rkmk4 or semi_implicit_euler"
     )
+    simulate.add_argument(
+        "--limits",
+        choices=("urdf", "none"),
+        default="urdf",
+        help="what cuts the inputs: efforts of the URDF, max and min of the inputs and speeds of "
+        "wheels (urdf, default), or only what --limit says (none)",
+    )
     add_values(
-        simulate, "--limit", "largest magnitude of an input or of a group of them, such as tau_m"
+        simulate,
+        "--limit",
+        "largest magnitude of an input, a group of them such as tau_m, or a pattern; goes first",
     )
     simulate.add_argument(
         "--delay",
@@ -144,13 +160,15 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     """Return the motion that the arguments ask for."""
     from fflin.simulation.simulate import simulate
 
+    given = once("--limit", arguments.limit)
     options: dict[str, Any] = {
         "q0": configuration_of(robot, arguments),
         "v0": velocity_of(robot, arguments, "target_velocity", "velocity"),
         "duration": arguments.duration,
         "dt": arguments.step,
+        "every": arguments.every,
         "method": arguments.method,
-        "limits": once("--limit", arguments.limit) or None,
+        "limits": [arguments.limits, given] if arguments.limits == "urdf" else given or None,
         "delay": arguments.delay,
     }
     if arguments.free:

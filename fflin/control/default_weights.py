@@ -16,6 +16,7 @@ from fflin.base.names import input_keys
 from fflin.base.validation import Array
 from fflin.control.riccati import half_size, solve
 from fflin.control.sampled_cost import sampled_cost
+from fflin.control.saturation import warn_beyond
 from fflin.control.weights import reweighed
 
 if TYPE_CHECKING:
@@ -301,7 +302,7 @@ def _of_efforts(lin: LinearModel, use: Array, bandwidth: float = 1.0) -> list[_L
     for name, used, at in zip(lin.input_names, use, lin.u0, strict=True):
         room = lin.limits.get(name, math.inf) - abs(at)
         if 0.0 < room < math.inf and used > 0.0:
-            what = f"the effort of {name.rpartition('.')[2]}"
+            what = f"the effort of {name.partition('.')[2] or name}"
             found.append(_Limit(bandwidth * math.sqrt(room / used), what))
     return found
 
@@ -320,6 +321,11 @@ def _slowed(lin: LinearModel, Q: Array, cost: Array, size: Array, limit: _Limit)
             return limit
         # What springs and gravity ask for stays however slow the loop.
         limit = least._replace(bandwidth=max(least.bandwidth, 0.3 * limit.bandwidth))
+        asked = np.abs(lin.u0) + use
+    else:
+        high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
+        where = "at the displacements of the default weights"
+        warn_beyond(lin, where, asked, -high, high)
     return limit._replace(what=f"{limit.what}, which is not enough for all displacements")
 
 

@@ -240,6 +240,32 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, arguments, said):
     assert not list(tmp_path.iterdir())
 
 
+def test_inputs_are_cut_to_the_limits_of_the_robot_unless_told_otherwise(tmp_path):
+    (tmp_path / "weak.toml").write_text(
+        "[[input]]\ntype = 'base_torque'\nmax = 1e-3\n[[input]]\ntype = 'base_force'\n"
+    )
+    command = ("simulate", "cubesat", "--inputs", "weak.toml", "--weights", "identity")
+    command = (*command, "--rpy", 20, 0, 0, "--duration", 5, "--step", 0.01, "-o", "m.npz")
+
+    def largest(*options):
+        code, out, _ = run(*command, *options, cwd=tmp_path)
+        assert code == 0
+        assert max(map(len, out.splitlines())) <= 80
+        return np.abs(fflin.Motion.load(tmp_path / "m.npz").u[:, 0]).max(), out
+
+    size, out = largest()
+    assert size == 1e-3
+    assert "\ntau_b.x at its limit of 0.001 N m for " in out and "beyond" not in out
+    size, _ = largest("--limit", "tau_b=2e-3")
+    assert size == 2e-3
+    size, out = largest("--limits", "none")
+    assert size > 0.1
+    assert "\nbeyond its limit: tau_b.x -0.1" in out
+    size, _ = largest("--limits", "none", "--limit", "tau_b.x=3e-3")
+    assert size == 3e-3
+    assert "--limits: invalid choice" in refused("simulate", "cubesat", "--limits", "all")
+
+
 def wheels_file(tmp_path, count=3):
     path = tmp_path / "wheels.toml"
     axes = zip("xyz", ([1, 0, 0], [0, 1, 0], [0, 0, 1]), strict=True)
