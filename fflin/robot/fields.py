@@ -1,6 +1,7 @@
 """What of a robot its user may set: inputs, passive joints, gravity; checked once."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from fflin.base.errors import InputError, ModelError, unknown
@@ -19,7 +20,10 @@ from fflin.robot.inputs import (
 from fflin.robot.joints import Joint
 from fflin.robot.outputs import Output
 
-FIELDS = ("inputs", "outputs", "stiffness", "damping", "rest", "gravity")
+FIELDS = (
+    *("inputs", "outputs", "stiffness", "damping", "rest", "gravity"),
+    *("passive", "weights", "start"),
+)
 
 
 def validated_fields(
@@ -67,7 +71,9 @@ def validated_fields(
     return checked
 
 
-def validated_inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, ...]:
+def validated_inputs(
+    value: Any, find: Callable[[str], Joint], joints: Sequence[str], passive: Sequence[str]
+) -> tuple[Input, ...]:
     """Return the inputs as a robot holds them; `find` returns the joint of a name or raises."""
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise InputError(f"inputs is a {type(value).__name__}, expected a sequence of inputs")
@@ -78,8 +84,7 @@ def validated_inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, .
             raise InputError(
                 f"{item!r} is not an input; expected {', '.join(kind.__name__ for kind in KINDS)}"
             )
-        if isinstance(item, JointTorque):
-            find(item.joint)
+    value = [one for item in value for one in _spread(item, find, joints, passive)]
     names = [item.name for item in value if isinstance(item, Thruster) and item.name]
     names += [name for name, _ in named_wheels(value)]
     plain = [item for item in value if isinstance(item, BaseTorque | BaseForce | JointTorque)]
@@ -87,6 +92,18 @@ def validated_inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, .
     if twice:
         raise InputError(f"input {twice[0]} stands there twice")
     return tuple(value)
+
+
+def _spread(
+    item: Input, find: Callable[[str], Joint], joints: Sequence[str], passive: Sequence[str]
+) -> list[Input]:
+    """Return a joint torque for each joint with a motor that its name, or pattern, stands for."""
+    if not isinstance(item, JointTorque):
+        return [item]
+    found = joints_by_name("joint", {item.joint: None}, joints, lambda name: find(name).name)
+    if item.joint in found and item.joint in passive:
+        raise InputError(f"joint '{item.joint}' is passive and has a joint torque; leave one out")
+    return [replace(item, joint=name) for name in found if name not in passive]
 
 
 def _outputs(value: Any) -> tuple[Output, ...]:

@@ -20,6 +20,7 @@ from fflin.robot.inputs import Input, default_inputs, named_wheels
 from fflin.robot.joints import Follower, Joint, check_followers_rates, followed
 from fflin.robot.model_checks import change_in
 from fflin.robot.outputs import FullState, Output
+from fflin.robot.start import checked_passive, checked_start, checked_weights, kept_start
 from fflin.robot.wheels import stored_momentum, with_wheels
 
 _CONFIGURATION = "a configuration in Pinocchio's order"
@@ -32,8 +33,8 @@ _DATA_BYTES_PER_NV3 = 32
 _DATA_LIMIT = 2**30
 
 
-class Passive(NamedTuple):
-    """What passive joints do: -stiffness (q_m - rest) - damping qdot_m, each (n,)."""
+class Springs(NamedTuple):
+    """What springs and dampers do: -stiffness (q_m - rest) - damping qdot_m, each (n,)."""
 
     stiffness: Array
     damping: Array
@@ -72,13 +73,19 @@ class Robot:
     outputs : tuple of Output
         What is watched of it; the full state by default.
     stiffness, damping : mapping
-        {joint: value [N m/rad | N/m], [N m s/rad | N s/m]} of passive joints.
+        {joint: value [N m/rad | N/m], [N m s/rad | N s/m]} of springs and dampers.
     rest : mapping
         {joint: position [rad|m]} where a spring is relaxed; 0 where not named.
     gravity : tuple of float (3,)
         Uniform acceleration [m/s^2] in Pinocchio's world axes. `model` itself has none.
     package_dirs : tuple of Path
         Folders in which ``package://`` paths of meshes are looked up when it is drawn.
+    passive : tuple of str
+        Joints without a motor.
+    weights : mapping
+        What `lqr` weighs by default, where it is not the rule's: see `replace`.
+    start : mapping
+        Where `simulate` and `visualize` begin by default: see `replace`.
     """
 
     model: pin.Model
@@ -97,6 +104,9 @@ class Robot:
     rest: Mapping[str, float] = field(default_factory=dict)
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     package_dirs: tuple[Path, ...] = ()
+    passive: tuple[str, ...] = ()
+    weights: Mapping[str, Any] = field(default_factory=dict)
+    start: Mapping[str, Any] = field(default_factory=dict)
     # Where some of its joints are wheels: the same robot without them.
     _wheelless: Robot | None = None
     # The model, and what it was when the first robot of it was made.
@@ -115,7 +125,8 @@ class Robot:
         ----------
         inputs : sequence of Input
             What acts on it, in the order of u. Wheels with an inertia among them become joints
-            of the robot; those that it had before and that are not among them go.
+            of the robot; those that it had before and that are not among them go. The joint of
+            a `JointTorque` may be a pattern, ``*``, for all that it fits and that have a motor.
         outputs : sequence of Output
             What is watched of it, in the order of y.
         stiffness : mapping or float
@@ -128,6 +139,15 @@ class Robot:
             {joint: position [rad|m]} where its spring is relaxed.
         gravity : sequence of float (3,)
             Uniform acceleration [m/s^2] in Pinocchio's world axes.
+        passive : sequence of str
+            Joints without a motor: their torques leave the inputs.
+        weights : mapping
+            What `lqr` weighs where it is given nothing: ``rule`` ("urdf", "identity"), ``q``,
+            ``r``, ``bryson``: {state, input, group or pattern: weight or largest value}.
+        start : mapping
+            Where `simulate` begins where it is not told: ``joints`` {joint: position [rad|m]},
+            ``rpy`` (3,) [deg] about fixed axes, ``position`` (3,) [m] of the base, ``velocity``
+            {joint or state: rate}, as `fflin.velocity` takes it.
 
         Returns
         -------
@@ -146,8 +166,13 @@ class Robot:
         """
         self.require_unchanged()
         robot = self
+        if "passive" in fields:
+            robot = robot._without_motors(fields.pop("passive"))
         if "inputs" in fields:
             robot = self._with_inputs(fields.pop("inputs"))
+        for name, checked in (("weights", checked_weights), ("start", checked_start)):
+            if name in fields:
+                robot = replace(robot, **{name: checked(robot, fields.pop(name))})
         own = (robot._wheelless or robot).joint_names
         robot = replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
         for name in robot.used_frames:
@@ -172,9 +197,9 @@ class Robot:
         return stored_momentum(self.model, self.inputs)
 
     @cached_property
-    def passive(self) -> Passive:
+    def springs(self) -> Springs:
         """Stiffness, damping and rest positions (n,) in state order."""
-        return Passive(
+        return Springs(
             *(
                 np.array([values.get(name, 0.0) for name in self.joint_names])
                 for values in (self.stiffness, self.damping, self.rest)
@@ -304,10 +329,18 @@ class Robot:
         check_followers_rates(self.followers, v)
         return v
 
+    def _without_motors(self, passive: Any) -> Robot:
+        """Return the robot without the torques of joints that have no motor."""
+        joints = checked_passive(self._wheelless or self, passive)
+        inputs = tuple(item for item in self.inputs if getattr(item, "joint", None) not in joints)
+        if not inputs:
+            raise InputError("passive leaves no input; a model needs at least one")
+        return replace(self, passive=joints, inputs=inputs)
+
     def _with_inputs(self, inputs: Any) -> Robot:
         """Return the robot with other inputs, and with the wheels among them as joints."""
         bare = self._wheelless or self
-        checked = validated_inputs(inputs, bare.joint)
+        checked = validated_inputs(inputs, bare.joint, bare.joint_names, self.passive)
         wheels = [(name, wheel) for name, wheel in named_wheels(checked) if wheel.inertia]
         model, joints, followers = with_wheels(bare.model, bare.joints, bare.followers, wheels)
         names = {joint.name for joint in joints}
@@ -315,7 +348,7 @@ class Robot:
             {name: x for name, x in values.items() if name in names}
             for values in (self.stiffness, self.damping, self.rest)
         )
-        return replace(
+        robot = replace(
             self,
             model=model,
             joints=joints,
@@ -326,6 +359,7 @@ class Robot:
             rest=rest,
             _wheelless=bare if wheels else None,
         )
+        return replace(robot, start=kept_start(robot, self.start)) if self.start else robot
 
     def require_unchanged(self) -> None:
         """Raise `ModelError` where the model was changed in place after the robot was made.
