@@ -136,9 +136,9 @@ def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
             raise document.unknown(problem, "input", index, key)
         right, expected = isinstance(value, str) and value != "", "a name in quotes"
         if key in _VECTORS:
-            right, expected = _is_vector(value), "three finite numbers, [x, y, z]"
+            right, expected = is_vector(value), "three finite numbers, [x, y, z]"
         elif key in _NUMBERS:
-            right, expected = _is_number(value), "a finite number"
+            right, expected = is_number(value), "a finite number"
         if not right:
             raise _error(
                 document, index, key, f"{key} is {reprlib.repr(value)}, expected {expected}"
@@ -154,10 +154,12 @@ def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
         raise _error(document, index, wrong, message) from None
 
 
-def _is_vector(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))
+def is_vector(value: Any) -> bool:
+    """Whether a value of a TOML file is three numbers."""
+    return isinstance(value, list) and len(value) == 3 and all(map(is_number, value))
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whether a value of a TOML file is a finite number."""
     # The limit keeps lengths finite, and integers that are no floats out.
     return type(value) in (int, float) and abs(value) < 1e100

@@ -14,7 +14,7 @@ from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
 from fflin.base.writing import remember
-from fflin.robot.catalog import find_robot
+from fflin.robot.catalog import RobotFile, find_robot
 from fflin.robot.frames import ROOT
 from fflin.robot.joints import Follower, Joint
 from fflin.robot.massless import idle_coordinates, massless_note
@@ -39,7 +39,8 @@ def load(
     Parameters
     ----------
     robot : str or Path
-        Bundled name, example-robot-data name, or path to a URDF. No mesh is loaded.
+        Bundled name, example-robot-data name, or path to a URDF or to a robot file, a TOML that
+        names a URDF and what else is known of the robot; see the guide. No mesh is loaded.
     lock : mapping or iterable of str, optional
         {joint: value [rad|m]} welded at that value (None: at neutral), or names; a name
         may be a pattern, ``hinge_*``. What mimics a locked joint is welded with it.
@@ -47,7 +48,9 @@ def load(
         Folders in which ``package://`` paths of meshes are looked up when the robot is drawn,
         before those that the URDF lies in.
     **fields
-        inputs, stiffness, damping, rest, gravity: see `Robot.replace`.
+        inputs, outputs, stiffness, damping, rest, gravity, passive, weights, start: see
+        `Robot.replace`. What is given here goes before what a robot file says; of locks, springs
+        and dampers joint by joint.
 
     Returns
     -------
@@ -72,19 +75,44 @@ def load(
         Of what the file holds and the model does not, and of what cannot be quite right in it.
     """
     found = find_robot(robot)
+    if found.path.suffix.lower() != ".toml":
+        return _with_fields(_load(found, [lock], _folders(package_dirs)), fields)
+    from fflin.robot.robot_files import RobotToml
+
+    file = RobotToml(found.path, found.name)
+    folders = (*_folders(package_dirs), *file.package_dirs)
+    with file.placed("lock"):
+        loaded = _load(file.found, [file.lock or None, lock], folders)
+    return _with_fields(file.applied(loaded), fields)
+
+
+def _with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
+    """Return a robot with fields, those of joints over what it has."""
+    if not fields:
+        return robot
+    changed = robot.replace(**fields)
+    over = {
+        name: {**getattr(robot, name), **getattr(changed, name)}
+        for name in ("stiffness", "damping", "rest")
+        if name in fields and getattr(robot, name)
+    }
+    return changed.replace(**over) if over else changed
+
+
+def _load(found: RobotFile, locks: Sequence[Lock | None], package_dirs: tuple[Path, ...]) -> Robot:
     description = read_urdf(found.path, found.prune)
-    loaded = _robot(description.model, found.name, lock, description.mimics)
+    loaded = _robot(description.model, found.name, locks, description.mimics)
     notes = description.notes
     for note in notes:
-        warnings.warn(note, FflinWarning, stacklevel=2)
+        warnings.warn(note, FflinWarning, stacklevel=3)
     if idle_coordinates(loaded):
         # No warning: whatever needs the inverse of M refuses with this.
         notes = (*notes, massless_note(loaded))
-    folders = (*_folders(package_dirs), *found.package_dirs)
+    folders = (*package_dirs, *found.package_dirs)
     # They are read when the robot is drawn, and no output may take their place before.
     meshes = (find_mesh(uri, found.path, folders) for uri in description.meshes)
     remember(*filter(None, meshes))
-    loaded = replace(
+    return replace(
         loaded,
         urdf=found.path,
         urdf_sha256=description.sha256,
@@ -92,7 +120,6 @@ def load(
         package_dirs=folders,
         urdf_damping=_independent_damping(loaded, description.damping),
     )
-    return loaded.replace(**fields) if fields else loaded
 
 
 def from_model(
@@ -130,7 +157,7 @@ def from_model(
     copy.gravity.setZero()
     name = name or model.name or "model"
     check_model(copy, name)
-    robot = _robot(copy, name, lock, {})
+    robot = _robot(copy, name, [lock], {})
     own = {joint.name: float(robot.model.damping[joint.idx_v]) for joint in robot.joints}
     robot = replace(robot, urdf_damping=own)
     return robot.replace(**fields) if fields else robot
@@ -144,11 +171,13 @@ def _folders(package_dirs: Any) -> tuple[Path, ...]:
     return tuple(as_path(folder) for folder in package_dirs)
 
 
-def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, Mimic]) -> Robot:
+def _robot(
+    model: pin.Model, name: str, locks: Sequence[Lock | None], mimics: Mapping[str, Mimic]
+) -> Robot:
     _check_root(model, name)
     locked: tuple[str, ...] = ()
-    if lock is not None:
-        model, mimics, locked = _locked(model, lock, mimics)
+    if any(lock is not None for lock in locks):
+        model, mimics, locked = _locked(model, locks, mimics)
     all_joints = [_joint(model, index) for index in range(ROOT + 1, model.njoints)]
     by_name = {joint.name: joint for joint in all_joints}
     robot = Robot(
@@ -195,13 +224,12 @@ def _check_root(model: pin.Model, name: str) -> None:
 
 
 def _locked(
-    model: pin.Model, lock: Lock, mimics: Mapping[str, Mimic]
+    model: pin.Model, locks: Sequence[Lock | None], mimics: Mapping[str, Mimic]
 ) -> tuple[pin.Model, dict[str, Mimic], tuple[str, ...]]:
-    """Weld joints, and what mimics them.
+    """Weld joints, and what mimics them; of several locks the last goes first.
 
     Returns the smaller model, the mimics that are left, and "joint=value" of what was welded.
     """
-    keys = [lock] if isinstance(lock, str) else _listed(lock)
     movable = list(model.names)[ROOT + 1 :]
 
     def movable_one(name: str) -> str:
@@ -209,8 +237,11 @@ def _locked(
             raise unknown("joint to lock", name, movable)
         return name
 
-    asked = {key: lock[key] if isinstance(lock, Mapping) else None for key in keys}
-    given = joints_by_name("joint to lock", asked, movable, movable_one)
+    given: dict[str, float | None] = {}
+    for lock in (lock for lock in locks if lock is not None):
+        keys = [lock] if isinstance(lock, str) else _listed(lock)
+        asked = {key: lock[key] if isinstance(lock, Mapping) else None for key in keys}
+        given |= joints_by_name("joint to lock", asked, movable, movable_one)
     names, q = list(given), pin.neutral(model)
     values = {
         name: None if given.get(name) is None else number(f"lock '{name}'", given[name])

@@ -169,10 +169,11 @@ class Robot:
         if "passive" in fields:
             robot = robot._without_motors(fields.pop("passive"))
         if "inputs" in fields:
-            robot = self._with_inputs(fields.pop("inputs"))
-        for name, checked in (("weights", checked_weights), ("start", checked_start)):
-            if name in fields:
-                robot = replace(robot, **{name: checked(robot, fields.pop(name))})
+            robot = robot._with_inputs(fields.pop("inputs"))
+        if "weights" in fields:
+            robot = replace(robot, weights=checked_weights(robot, fields.pop("weights")))
+        if "start" in fields:
+            robot = replace(robot, start=checked_start(robot, fields.pop("start")))
         own = (robot._wheelless or robot).joint_names
         robot = replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
         for name in robot.used_frames:
