@@ -12,6 +12,7 @@ from fflin.base.validation import Array, by_name, number, placement
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT
+from fflin.robot.inputs import named_wheels
 from fflin.robot.robot import Robot
 from fflin.robot.signals import rates_by_name
 
@@ -86,7 +87,10 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
         name: number(f"velocity '{name}'", value)
         for name, value in by_name("values", values, "velocity").items()
     }
-    state, rates = StateMap(robot), rates_by_name(robot, checked)
+    for name, _ in named_wheels(robot.inputs):
+        if name in checked and name not in robot.joint_names:
+            robot.joint(name)  # says why it has no speed
+    state, rates = StateMap(robot), rates_by_name(robot.joint_names, checked)
     return state.spread(np.array([rates.get(name, 0.0) for name in state.names[6 + robot.n :]]))
 
 

@@ -171,9 +171,13 @@ class Robot:
         if "inputs" in fields:
             robot = robot._with_inputs(fields.pop("inputs"))
         if "weights" in fields:
-            robot = replace(robot, weights=checked_weights(robot, fields.pop("weights")))
+            robot = replace(
+                robot,
+                weights=checked_weights(fields.pop("weights"), robot.joint_names, robot.inputs),
+            )
         if "start" in fields:
-            robot = replace(robot, start=checked_start(robot, fields.pop("start")))
+            start = checked_start(fields.pop("start"), robot.joint, robot.joint_names)
+            robot = replace(robot, start=start)
         own = (robot._wheelless or robot).joint_names
         robot = replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
         for name in robot.used_frames:
@@ -332,7 +336,8 @@ class Robot:
 
     def _without_motors(self, passive: Any) -> Robot:
         """Return the robot without the torques of joints that have no motor."""
-        joints = checked_passive(self._wheelless or self, passive)
+        bare = self._wheelless or self
+        joints = checked_passive(passive, bare.joint, bare.joint_names, self.locked)
         inputs = tuple(item for item in self.inputs if getattr(item, "joint", None) not in joints)
         if not inputs:
             raise InputError("passive leaves no input; a model needs at least one")
@@ -360,7 +365,9 @@ class Robot:
             rest=rest,
             _wheelless=bare if wheels else None,
         )
-        return replace(robot, start=kept_start(robot, self.start)) if self.start else robot
+        return (
+            replace(robot, start=kept_start(self.start, robot.joint_names)) if self.start else robot
+        )
 
     def require_unchanged(self) -> None:
         """Raise `ModelError` where the model was changed in place after the robot was made.

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 from fflin.base.names import by_name
-from fflin.robot.inputs import BaseForce, BaseTorque, JointTorque, named_wheels
-
-if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
+from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 
 
-def state_keys(robot: Robot) -> tuple[str, ...]:
+def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the 12 + 2n states: of the configuration, then of their rates."""
-    joints = robot.joint_names
     return (
         *(f"{group}.{axis}" for group in ("q_b", "r_b") for axis in "xyz"),
         *(f"q_m.{name}" for name in joints),
@@ -23,11 +18,11 @@ def state_keys(robot: Robot) -> tuple[str, ...]:
     )
 
 
-def input_keys_of(robot: Robot) -> tuple[str, ...]:
+def input_keys_of(inputs: Sequence[Input]) -> tuple[str, ...]:
     """Return the names of the inputs, as `fflin.base.names.input_keys` has those of a model."""
-    wheels = iter([name for name, _ in named_wheels(robot.inputs)])
+    wheels = iter([name for name, _ in named_wheels(inputs)])
     keys: list[str] = []
-    for item in robot.inputs:
+    for item in inputs:
         if isinstance(item, BaseTorque | BaseForce):
             keys += [f"{item.GROUP}.{axis}" for axis in "xyz"]
         elif isinstance(item, JointTorque):
@@ -39,19 +34,14 @@ def input_keys_of(robot: Robot) -> tuple[str, ...]:
     return tuple(keys)
 
 
-def rates_by_name(robot: Robot, values: Mapping[str, float]) -> dict[str, float]:
+def rates_by_name(joints: Sequence[str], values: Mapping[str, float]) -> dict[str, float]:
     """Return {state: rate} of {joint, state, group or pattern: rate}.
 
     Raises
     ------
     UnknownNameError
         If there is no such joint or component.
-    InputError
-        If it is that of a wheel which is no joint.
     """
-    names = state_keys(robot)[6 + robot.n :]
-    bare = {name for name, _ in named_wheels(robot.inputs)} - set(robot.joint_names)
-    for name in bare & set(values):
-        robot.joint(name)  # says why it has no speed
-    full = {f"qdot_m.{key}" if key in robot.joint_names else key: x for key, x in values.items()}
+    names = state_keys(joints)[6 + len(joints) :]
+    full = {f"qdot_m.{key}" if key in joints else key: value for key, value in values.items()}
     return {names[index]: value for index, value in by_name("velocity", full, names).items()}

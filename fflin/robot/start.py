@@ -2,41 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.names import joints_by_name, matching
 from fflin.base.validation import number
-from fflin.robot.inputs import three_numbers
+from fflin.robot.inputs import Input, three_numbers
+from fflin.robot.joints import Joint
 from fflin.robot.signals import input_keys_of, rates_by_name, state_keys
-
-if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
 
 RULES = ("urdf", "identity")
 _START = ("joints", "rpy", "position", "velocity")
 _WEIGHTS = ("rule", "q", "r", "bryson")
 
 
-def checked_start(robot: Robot, value: Any) -> dict[str, Any]:
-    """Return where a robot starts: joints and rates by their full names, the base's numbers."""
+def checked_start(
+    value: Any, find: Callable[[str], Joint], joints: Sequence[str]
+) -> dict[str, Any]:
+    """Return where a robot starts, with joints and rates by their full names."""
     start = _parts("start", value, _START)
     if "joints" in start:
-        joints = _numbers("start of joint", "start joints", start["joints"])
-        start["joints"] = _of_joints(robot, joints)
+        values = _numbers("start of joint", "start joints", start["joints"])
+        start["joints"] = joints_by_name("joint", values, joints, lambda name: find(name).name)
     for name in ("rpy", "position"):
         if name in start:
             start[name] = three_numbers(f"start {name}", start[name])
     if "velocity" in start:
         rates = _numbers("start velocity", "start velocity", start["velocity"])
-        start["velocity"] = rates_by_name(robot, rates)
+        start["velocity"] = rates_by_name(joints, rates)
     return start
 
 
-def kept_start(robot: Robot, start: Mapping[str, Any]) -> dict[str, Any]:
-    """Return of a start what is of this robot, where some wheels are no joints of it."""
-    names = {*robot.joint_names, *state_keys(robot)}
+def kept_start(start: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any]:
+    """Return of a start what is of these joints, of which some wheels are none."""
+    names = {*joints, *state_keys(joints)}
     return {
         part: {key: x for key, x in value.items() if key in names}
         if isinstance(value, Mapping)
@@ -45,16 +45,16 @@ def kept_start(robot: Robot, start: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def checked_weights(robot: Robot, value: Any) -> dict[str, Any]:
+def checked_weights(value: Any, joints: Sequence[str], inputs: Sequence[Input]) -> dict[str, Any]:
     """Return the weights of a robot's regulator, whose names are those of states and inputs."""
     weights = _parts("weights", value, _WEIGHTS)
     if weights.get("rule", RULES[0]) not in RULES:
         raise unknown("rule of weights", weights["rule"], RULES)
-    states, inputs = state_keys(robot), input_keys_of(robot)
+    states, keys = state_keys(joints), input_keys_of(inputs)
     parts = {
         "q": ("state", states),
-        "r": ("input", inputs),
-        "bryson": ("state or input", (*states, *inputs)),
+        "r": ("input", keys),
+        "bryson": ("state or input", (*states, *keys)),
     }
     for part, (kind, names) in parts.items():
         weights[part] = _numbers(f"{part} of", part, weights.get(part, {}))
@@ -69,21 +69,19 @@ def checked_weights(robot: Robot, value: Any) -> dict[str, Any]:
     return {part: value for part, value in weights.items() if value}
 
 
-def checked_passive(robot: Robot, value: Any) -> tuple[str, ...]:
+def checked_passive(
+    value: Any, find: Callable[[str], Joint], joints: Sequence[str], locked: Sequence[str]
+) -> tuple[str, ...]:
     """Return the joints without a motor, in the order of the state."""
     keys = [value] if isinstance(value, str) else value
     if not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
         raise InputError(f"passive is {value!r}, expected names of joints")
     for key in keys:
-        if any(locked.rpartition("=")[0] == key for locked in robot.locked):
+        if any(each.rpartition("=")[0] == key for each in locked):
             raise InputError(f"joint '{key}' is locked and passive; leave one out")
-    found = _of_joints(robot, dict.fromkeys(keys))
-    return tuple(name for name in robot.joint_names if name in found)
-
-
-def _of_joints(robot: Robot, values: Mapping[str, Any]) -> dict[str, Any]:
-    names = robot.joint_names
-    return joints_by_name("joint", values, names, lambda name: robot.joint(name).name)
+    asked = dict.fromkeys(keys)
+    found = joints_by_name("joint", asked, joints, lambda name: find(name).name)
+    return tuple(name for name in joints if name in found)
 
 
 def _parts(what: str, value: Any, known: Sequence[str]) -> dict[str, Any]:
