@@ -109,7 +109,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     left = _leave_earlier(arguments) if interrupted else []
 
     # Said when the files are there, which they are then even where nobody reads it to its end.
-    lines = [motion_report(motion, controlled=not arguments.free)]
+    lines = [motion_report(motion)]
     try:
         if arguments.output_file:
             motion.save(arguments.output_file)

@@ -56,7 +56,7 @@ class Robot:
     urdf : Path or None
         The file it was read from.
     urdf_sha256 : str
-        Hash of that file; empty where there is none.
+        Hash of that file, and of the masses where they are others; empty where there is none.
     joints : tuple of Joint
         The n independent joints in state order, which is Pinocchio's.
     followers : tuple of Follower
@@ -183,6 +183,70 @@ class Robot:
         for name in robot.used_frames:
             find_frame(robot.model, name)
         return robot
+
+    def with_mass_properties(self, bodies: Mapping[str, Any]) -> Robot:
+        """Return the same robot with other masses.
+
+        Parameters
+        ----------
+        bodies : mapping
+            {body: {"mass": m [kg], "com": (3,) [m], "inertia": (3, 3) [kg m^2] about the centre of
+            mass} or pin.Inertia}, in the axes of the body's joint. A body is named by the joint
+            that moves it, ``base``, a pattern, or by its link where no other is fixed to it: links
+            that are fixed to each other are one body, whose properties are those of all together,
+            wheels included. What is left out stays; a mass without an inertia scales the inertia
+            with it, as another density does.
+
+        Returns
+        -------
+        Robot
+            With the pictures, names and inputs of this one, and another ``urdf_sha256``.
+
+        Raises
+        ------
+        InputError
+            If a mass is not positive, an inertia is that of no rigid body, or less than that of
+            the wheels in it.
+        UnknownNameError
+            If there is no such body or property.
+        """
+        from fflin.robot.mass_properties import with_bodies
+
+        return self._of_model(with_bodies((self._wheelless or self).model, bodies))
+
+    def perturbed(
+        self, *, mass: float = 0.1, com: float = 0.1, inertia: float = 0.1, seed: int = 0
+    ) -> Robot:
+        r"""Return the same robot with masses drawn at random, each body still a rigid body.
+
+        Each mass is multiplied by 1 + mass d with d uniform in [-1, 1]; each body is stretched
+        along the axes of its frame so that its second moments per mass are multiplied by
+        1 + inertia d, and its moments of inertia per mass by something in between; its centre of
+        mass is shifted along each axis by com d times the body's radius of gyration there. The
+        pseudo-inertia goes through a congruence, which keeps it positive.
+
+        Parameters
+        ----------
+        mass, com, inertia : float
+            Relative spreads, from 0 to less than 1.
+        seed : int
+            The same seed gives the same robot.
+
+        Returns
+        -------
+        Robot
+            As of `with_mass_properties`.
+
+        References
+        ----------
+        P. M. Wensing, S. Kim and J.-J. E. Slotine, Linear matrix inequalities for physically-
+        consistent inertial parameter identification, IEEE Robotics and Automation Letters 3(1),
+        2018.
+        """
+        from fflin.robot.mass_properties import perturbed
+
+        model = (self._wheelless or self).model
+        return self._of_model(perturbed(model, seed, mass=mass, com=com, inertia=inertia))
 
     @property
     def used_frames(self) -> tuple[str, ...]:
@@ -368,6 +432,18 @@ class Robot:
         return (
             replace(robot, start=kept_start(self.start, robot.joint_names)) if self.start else robot
         )
+
+    def _of_model(self, model: pin.Model) -> Robot:
+        """Return the robot with a model that has other masses and no wheels."""
+        from fflin.robot.mass_properties import identity
+
+        self.require_unchanged()
+        bare = self._wheelless or self
+        told = identity(self.urdf_sha256, model, bare.model)
+        other = replace(bare, model=model, urdf_sha256=told)
+        if self._wheelless is None:
+            return other
+        return replace(self, urdf_sha256=told, _wheelless=other)._with_inputs(self.inputs)
 
     def require_unchanged(self) -> None:
         """Raise `ModelError` where the model was changed in place after the robot was made.

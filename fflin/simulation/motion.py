@@ -39,7 +39,7 @@ class Motion(Design):
     u : ndarray (N, nu)
         What acted from t on, in the frame's axes; the last row repeats what acted to the end.
     target : ndarray (nx,)
-        The state that a feedback steers to; the initial one where there is none.
+        The state that is steered to, or one a row, (N, nx); empty where none is known.
     prediction : ndarray (N, nx)
         The state as the linear model has it under the same law; no rows where there is none.
     energy : ndarray (N,)
@@ -57,9 +57,15 @@ class Motion(Design):
     robot, urdf_sha256 : str
     stopped : str
         Why it ended before its time; empty where it did not.
+    wheels : tuple of str
+        The joints that are reaction wheels, whose angle is no error.
+    steered : tuple of str
+        The states that the policy is known to feed back; empty where that is not known.
+    notes : tuple of str
+        What is to be known of the run.
     """
 
-    VECTORS: ClassVar = ("t", "target", "energy", "momentum_drift", "com_drift", "placement")
+    VECTORS: ClassVar = ("t", "energy", "momentum_drift", "com_drift", "placement")
 
     t: Array
     q: Array
@@ -81,6 +87,9 @@ class Motion(Design):
     urdf_sha256: str
     stopped: str
     com_drift: Array = field(default_factory=lambda: np.zeros(0))
+    wheels: tuple[str, ...] = field(default_factory=tuple)
+    steered: tuple[str, ...] = field(default_factory=tuple)
+    notes: tuple[str, ...] = field(default_factory=tuple)
 
     def __post_init__(self) -> None:
         rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)
@@ -89,6 +98,8 @@ class Motion(Design):
             len(each) not in (0, len(self.t)) for each in may_lack
         ):
             raise InputError("the rows of the motion are not as many as its times")
+        if self.target.size in (0, self.x.shape[1]):  # of .mat, which knows no vectors
+            object.__setattr__(self, "target", self.target.ravel())
         if not len(self.prediction):  # of json, which knows no empty matrices
             object.__setattr__(self, "prediction", np.zeros((0, self.x.shape[1])))
         super().__post_init__()
@@ -112,21 +123,24 @@ class Motion(Design):
         return self.prediction if len(self.prediction) else None
 
     @property
-    def error(self) -> Array:
-        """The states less the target (N, nx)."""
-        difference: Array = self.x - self.target
-        return difference
+    def error(self) -> Array | None:
+        """The states less the target (N, nx); None where there is no target."""
+        return self.x - self.target if self.target.size else None
 
     @property
-    def attitude_error(self) -> Array:
-        """Angle (N,) [deg] between the base's attitude and the target's."""
-        at, to = self.x[:, :3], self.target[:3]
-        scalar = np.sqrt(np.maximum(0.0, 1.0 - (at * at).sum(axis=1)))
-        target_scalar = np.sqrt(max(0.0, 1.0 - float(to @ to)))
+    def attitude_error(self) -> Array | None:
+        """Angle (N,) [deg] between the base's attitude and the target's; None without target."""
+        if not self.target.size:
+            return None
+        at, to = self.x[:, :3], self.target[..., :3]
+        scalar, target_scalar = (
+            np.sqrt(np.maximum(0.0, 1.0 - (each * each).sum(axis=-1, keepdims=True)))
+            for each in (at, to)
+        )
         # The vector part of target^-1 at, whose length is that of half the angle's sine.
-        vector = target_scalar * at - scalar[:, None] * to - np.cross(to, at)
+        vector = target_scalar * at - scalar * to - np.cross(to, at)
         sines: Array = np.minimum(1.0, np.linalg.norm(vector, axis=1))
-        cosines = np.abs(target_scalar * scalar + at @ to)
+        cosines = np.abs(target_scalar * scalar + (at * to).sum(axis=1, keepdims=True))[:, 0]
         return np.degrees(2.0 * np.arctan2(sines, cosines))
 
     def save(self, path: str | Path) -> None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from fflin.base.errors import FflinWarning, InputError
-from fflin.base.validation import Array, number, whole
+from fflin.base.validation import Array, number, vector, whole
 from fflin.control.channel import Channel, Law
 from fflin.control.policies import Allocation, bound
 from fflin.dynamics.state import StateMap
@@ -92,7 +92,8 @@ class Plan:
     callback: Callback | None
     progress: bool | None  # whether a bar is shown; None shows it where the run takes long
     near: Array | None  # the state (nx,) from which continuous joints count turns
-    target: Array | None  # the state (nx,) that is steered to; the initial one where there is none
+    target: Array | None  # the state (nx,) that is steered to, where one is known
+    steered: tuple[str, ...]  # the states that are known to be fed back
     linear: LinearModel | None  # predicts the motion under u = u0 - K (x - x0)
     K: Array | None  # (nu, nx)
 
@@ -119,6 +120,25 @@ def start_of(state: StateMap, x0: Any, q0: Any, v0: Any) -> tuple[Array, Array]:
             f"{LARGEST_SPEED:g} [rad/s|m/s]"
         )
     return q, v
+
+
+def target_of(state: StateMap, target: Any) -> Array | None:
+    """Return the state (nx,) that is given, or that a model's point is; None where none is."""
+    if target is None:
+        return None
+    if not isinstance(target, LinearModel):
+        goal: Array = vector("target", target, state.nx, "a state (12 + 2n)").copy()
+        state.to_pinocchio(goal)  # refuses what is no attitude
+        return goal
+    missing = [name for name in target.state_names if name not in state.names]
+    if missing or len(target.q) != state.robot.nq or target.moving:
+        raise InputError(
+            f"target is a model of '{target.robot}', of which '{state.robot.name}' has no such "
+            "state; give one of this robot"
+        )
+    goal = state.read(target.q, target.v)
+    goal[[state.names.index(name) for name in target.state_names]] = target.x0
+    return goal
 
 
 def times_of(
@@ -190,6 +210,17 @@ def law_of(policy: Any, plant: Plant, limits: tuple[Array, Array], times: Times)
     if policy is None:
         return None
     return Law(bound(policy, plant.robot), plant.actuation.names, limits, times.slow)
+
+
+def fed_back(policy: Any) -> tuple[str, ...]:
+    """Return the names of the states that a policy about a model's point feeds back."""
+    lin = getattr(policy, "lin", None)
+    if not isinstance(lin, LinearModel):
+        return ()
+    decides = policy.policy if isinstance(policy, Allocation) else policy
+    K = getattr(decides, "K", None)
+    used = np.ones(len(lin.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
+    return tuple(name for name, size in zip(lin.state_names, used, strict=True) if size)
 
 
 def _fastest_pole(policy: Any) -> float:

@@ -19,9 +19,11 @@ from fflin.simulation.motion import Motion
 from fflin.simulation.plan import (
     Plan,
     events_of,
+    fed_back,
     law_of,
     method_of,
     start_of,
+    target_of,
     times_of,
     turning,
 )
@@ -57,6 +59,7 @@ def simulate(
     events: Sequence[Event] = (),
     callback: Callable[[float, Array, Array, Array], None] | None = None,
     linear: LinearModel | bool | None = None,
+    target: LinearModel | ArrayLike | None = None,
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
     every: int = 1,
@@ -108,6 +111,9 @@ def simulate(
     linear : LinearModel or bool, optional
         Predicts the motion under the same law; by default the policy's own model, False for none.
         Sampled, it does so where every row is at a sample.
+    target : LinearModel or array_like (nx,), optional
+        State, or model whose point it is, that errors are counted from; by default the point of
+        the policy's own model, and none under a policy without one.
     frame : {"hybrid", "local", "world"}, optional
     reference : pin.SE3, optional
         Chart of x and axes of u; the policy's model's by default, else hybrid and the identity.
@@ -156,7 +162,7 @@ def simulate(
     law = law_of(policy, plant, within, times)
     # The model's inputs are others where they are allocated to the robot's.
     same = lin is not None and lin.input_names == plant.actuation.names
-    target = None if lin is None else _target(state, lin)
+    goal = target_of(state, lin if target is None else target)
     plan = Plan(
         q=q,
         v=v,
@@ -171,8 +177,9 @@ def simulate(
         events=events_of(events, callback),
         callback=callback,
         progress=progress,
-        near=target if x0 is None else np.asarray(x0, dtype=float),
-        target=target,
+        near=goal if x0 is None else np.asarray(x0, dtype=float),
+        target=goal,
+        steered=fed_back(policy),
         linear=predictor,
         K=K,
     )
@@ -198,7 +205,7 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         v=run.v,
         x=x,
         u=run.u,
-        target=x[0] if plan.target is None else plan.target,
+        target=np.zeros(0) if plan.target is None else plan.target,
         prediction=predict(plan, x, run.steps),
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
@@ -213,6 +220,8 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         robot=robot.name,
         urdf_sha256=robot.urdf_sha256,
         stopped=run.stopped,
+        wheels=tuple(robot.wheels),
+        steered=plan.steered,
     )
 
 
@@ -237,10 +246,3 @@ def _predictor(
     if K is None:
         raise InputError("linear predicts under a StateFeedback alone; leave it out")
     return linear
-
-
-def _target(state: StateMap, lin: LinearModel) -> Array:
-    """Return the state (nx,) that a feedback about a model's point steers to."""
-    target = state.read(lin.q, lin.v)
-    target[[state.names.index(name) for name in lin.state_names]] = lin.x0
-    return target

@@ -19,6 +19,7 @@ SUMMARY = {
     "canadarm2": (7, 2 * 243.66 + 4 * 105.98 + 314.88 + 279.2, ["tool"]),
     "astrobee_arm": (2, 9.58 + 0.25 + 0.2 + 0.13, ["tool"]),
     "servicer_7dof": (9, 800 + 2 * 24 + 12 + 10 + 9.5 + 8.5 + 6.5 + 5 + 6, ["tool"]),
+    "inspector": (10, 424 + 4 * 6 + 6 + 9 + 7 + 3 + 3 + 4, ["tool"]),
     "dual_arm": (8, 240 + 2 * (4 + 5 + 3.8 + 2.4), ["tool_left", "tool_right"]),
 }
 NAMES = sorted(SUMMARY)

@@ -27,7 +27,7 @@ def free_flyer(*joints):
 def test_bundled_names_come_first():
     assert set(BUNDLED) == {
         *("astrobee_arm", "canadarm2", "cubesat", "dual_arm"),
-        *("ets_vii", "planar_detumble", "servicer_7dof"),
+        *("ets_vii", "inspector", "planar_detumble", "servicer_7dof"),
     }
     assert fflin.list_robots()[: len(BUNDLED)] == BUNDLED
     assert "talos" in fflin.list_robots()
