@@ -138,8 +138,8 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     from fflin.simulation.simulate import simulate
 
     options: dict[str, Any] = {
-        "q0": configuration_of(robot, arguments),
-        "v0": velocity_of(robot, arguments),
+        "q0": configuration_of(robot, arguments, robot.start),
+        "v0": velocity_of(robot, arguments, robot.start),
         "duration": arguments.duration,
         "dt": arguments.step,
         "method": arguments.method,

@@ -61,6 +61,15 @@ def configuration(
     return robot.checked_configuration(q)
 
 
+def start_of(robot: Robot) -> tuple[Array, Array]:
+    """Return the configuration (nq,) and velocity (nv,) at which a robot starts."""
+    start = robot.start
+    rotation = pin.rpy.rpyToMatrix(*np.radians(start.get("rpy", np.zeros(3))))
+    base = pin.SE3(rotation, np.array(start.get("position", np.zeros(3))))
+    q = configuration(robot, start.get("joints"), base)
+    return q, velocity(robot, start.get("velocity", {}))
+
+
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     """Build a Pinocchio velocity.
 

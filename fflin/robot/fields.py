@@ -85,6 +85,8 @@ def validated_inputs(
                 f"{item!r} is not an input; expected {', '.join(kind.__name__ for kind in KINDS)}"
             )
     value = [one for item in value for one in _spread(item, find, joints, passive)]
+    if not value:
+        raise InputError("inputs are torques of joints that all are passive; name another input")
     names = [item.name for item in value if isinstance(item, Thruster) and item.name]
     names += [name for name, _ in named_wheels(value)]
     plain = [item for item in value if isinstance(item, BaseTorque | BaseForce | JointTorque)]

@@ -76,20 +76,22 @@ def load(
     """
     found = find_robot(robot)
     if found.path.suffix.lower() != ".toml":
-        return _with_fields(_load(found, [lock], _folders(package_dirs)), fields)
+        return with_fields(_load(found, [lock], _folders(package_dirs)), fields)
     from fflin.robot.robot_files import RobotToml
 
     file = RobotToml(found.path, found.name)
     folders = (*_folders(package_dirs), *file.package_dirs)
     with file.placed("lock"):
         loaded = _load(file.found, [file.lock or None, lock], folders)
-    return _with_fields(file.applied(loaded), fields)
+    return with_fields(file.applied(loaded), fields)
 
 
-def _with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
-    """Return a robot with fields, those of joints over what it has."""
+def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
+    """Return a robot with fields, those of joints beside what it has of others."""
     if not fields:
         return robot
+    if robot.passive and isinstance(given := fields.get("passive"), list | tuple):
+        fields = {**fields, "passive": [*robot.passive, *given]}
     changed = robot.replace(**fields)
     over = {
         name: {**getattr(robot, name), **getattr(changed, name)}

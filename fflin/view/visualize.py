@@ -88,7 +88,7 @@ def visualize(
     tool : str, optional
         Frame whose trail is drawn; "tool" or the last link of the longest chain by default.
     q : array_like (nq,), optional
-        Where a live robot stands first; neutral by default.
+        Where a live robot stands first; by default at its `start`, or neutral.
     port : int
         Of the live page; a free one by default.
 
@@ -130,7 +130,7 @@ def visualize(
         if any(file is not None for file in (html, png, gif)):
             raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
         _check_port(port)
-        start = robot.neutral() if q is None else _configuration(robot, "q", q)
+        start = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
 
         pace = _speed(speed, 1.0)
