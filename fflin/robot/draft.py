@@ -72,5 +72,12 @@ def draft(robot: Robot, urdf: str) -> str:
         joint=_quoted(first),
     )
     start = [f"# joints = {{ {_quoted(first)} = 0.1 }}  # [rad|m]"] * bool(robot.n)
-    parts = [head, *_passive(robot), _INPUTS, *_candidates(robot), *_springs(robot), *_limits(robot)]
+    parts = [
+        head,
+        *_passive(robot),
+        _INPUTS,
+        *_candidates(robot),
+        *_springs(robot),
+        *_limits(robot),
+    ]
     return "\n\n".join(parts) + "\n\n" + "\n".join((_WEIGHTS, *start)) + "\n"

@@ -1,12 +1,13 @@
 """What of a robot its user may set: inputs, passive joints, gravity; checked once."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeAlias
 
-from fflin.base.errors import InputError, ModelError, unknown
-from fflin.base.names import joints_by_name
-from fflin.base.validation import number
+from fflin.base.errors import InputError, ModelError, UnknownNameError, unknown
+from fflin.base.names import by_name, joints_by_name
+from fflin.base.validation import dimension, number
 from fflin.robot.inputs import (
     KINDS,
     BaseForce,
@@ -14,14 +15,19 @@ from fflin.robot.inputs import (
     Input,
     JointTorque,
     Thruster,
+    named_inputs,
     named_wheels,
     three_numbers,
 )
 from fflin.robot.joints import Joint
 from fflin.robot.outputs import Output
+from fflin.robot.signals import input_keys_of, state_keys
+
+# The least and the largest value; infinite where there is no limit.
+Range: TypeAlias = tuple[float, float]
 
 FIELDS = (
-    *("inputs", "outputs", "stiffness", "damping", "rest", "gravity"),
+    *("inputs", "outputs", "stiffness", "damping", "rest", "gravity", "limits"),
     *("passive", "weights", "start"),
 )
 
@@ -37,7 +43,7 @@ def validated_fields(
     Parameters
     ----------
     fields : mapping
-        As `Robot.replace` takes them, but for inputs.
+        As `Robot.replace` takes them, but for inputs and limits.
     find : callable
         Returns the joint of a name or raises.
     joints : sequence of str
@@ -89,7 +95,8 @@ def validated_inputs(
         raise InputError("inputs are torques of joints that all are passive; name another input")
     names = [item.name for item in value if isinstance(item, Thruster) and item.name]
     names += [name for name, _ in named_wheels(value)]
-    plain = [item for item in value if isinstance(item, BaseTorque | BaseForce | JointTorque)]
+    kinds = BaseTorque | BaseForce | JointTorque
+    plain = [replace(x, min=None, max=None) for x in value if isinstance(x, kinds)]
     twice = [str(x) for x in (*names, *plain) if (*names, *plain).count(x) > 1]
     if twice:
         raise InputError(f"input {twice[0]} stands there twice")
@@ -106,6 +113,44 @@ def _spread(
     if item.joint in found and item.joint in passive:
         raise InputError(f"joint '{item.joint}' is passive and has a joint torque; leave one out")
     return [replace(item, joint=name) for name in found if name not in passive]
+
+
+def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> dict[str, Range]:
+    """Return {name of an input or state: (least, largest)} of what a caller gives.
+
+    Parameters
+    ----------
+    inputs : sequence of Input
+    joints : sequence of str
+    given : float or mapping
+        Largest magnitude of all inputs, or {name, group or pattern: largest magnitude, or (least,
+        largest)}. States may be named too. A thruster never pulls.
+
+    Raises
+    ------
+    InputError
+        If a limit is negative or not a number, or a range is empty.
+    UnknownNameError
+        If there is no such input, state or group.
+    """
+    keys = input_keys_of(inputs)
+    names: list[str] = []
+    floors: list[float] = []
+    for item, own in named_inputs(inputs):
+        names += own
+        floors += [-math.inf if item.PULLS else 0.0] * len(own)
+    if not isinstance(given, Mapping):
+        given = dict.fromkeys(dict.fromkeys(item.GROUP for item in inputs), given)
+    ranges = {str(key): _range(key, value) for key, value in given.items()}
+    try:
+        found = by_name("input", ranges, keys)
+    except UnknownNameError:
+        states = state_keys(joints)
+        names, floors = [*names, *states], floors + [-math.inf] * len(states)
+        found = by_name("input or state", ranges, (*keys, *states))
+    return {
+        names[i]: (max(low, floors[i]), max(high, floors[i])) for i, (low, high) in found.items()
+    }
 
 
 def _outputs(value: Any) -> tuple[Output, ...]:
@@ -129,3 +174,16 @@ def _by_joint(
         if what != "rest" and entry < 0.0:
             raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")
     return joints_by_name("joint", checked, joints, lambda name: find(name).name)
+
+
+def _range(name: str, value: Any) -> Range:
+    if dimension(f"limit of '{name}'", value) == 1 and len(value) == 2:
+        least, largest = (number(f"limit of '{name}'", x) for x in value)
+    else:
+        largest = number(f"limit of '{name}'", value)
+        least = -largest
+    if least > largest:
+        raise InputError(
+            f"limit of '{name}' is {value}, expected a magnitude of 0 or more, or (least, largest)"
+        )
+    return least, largest

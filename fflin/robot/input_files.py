@@ -1,7 +1,7 @@
 """Inputs from a TOML file."""
 
 import reprlib
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,8 @@ from fflin.robot.catalog import find_inputs
 from fflin.robot.inputs import KINDS, Input
 
 _TYPES = {kind.KEY: kind for kind in KINDS}
-_VECTORS, _NUMBERS = ("position", "direction", "axis"), ("inertia", "momentum")
+_VECTORS = ("position", "direction", "axis")
+_NUMBERS = ("inertia", "momentum", "max", "min", "max_speed", "least_impulse")
 
 # The keys of a robot file; one that has no `urdf` holds inputs alone.
 ROBOT_KEYS = (
@@ -32,10 +33,15 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     ``base_torque``     none: `BaseTorque`
     ``base_force``      none: `BaseForce`
     ``joint_torque``    ``joint``: `JointTorque`
-    ``thruster``        ``frame``, ``position`` [m], ``direction`` and, if it is
-                        to have one, ``name``: `Thruster`
+    ``thruster``        ``frame``, ``position`` [m], ``direction`` and, as
+                        wanted, ``name``, ``on_off`` (true: pulses of ``max``),
+                        ``least_impulse`` [N s]: `Thruster`
     ``reaction_wheel``  ``axis`` and, as wanted, ``frame``, ``inertia`` [kg m^2]
-                        or ``momentum`` [N m s], ``name``: `ReactionWheel`
+                        with ``max_speed`` [rad/s], or ``momentum`` [N m s],
+                        ``name``: `ReactionWheel`
+    all                 as wanted, ``max`` and ``min`` [N m | N]: the largest
+                        and the least value; ``min`` is -max by default, 0 of a
+                        thruster. For the base one number or three
     ==================  =========================================================
 
     Parameters
@@ -101,7 +107,11 @@ def read_inputs(document: TomlFile) -> tuple[Input, ...]:
     seen: dict[Input | str | None, int] = {}
     for index, table in enumerate(tables):
         item = _input(document, index, table)
-        what = getattr(item, "name", item)
+        what = (
+            getattr(item, "name", "")
+            if hasattr(item, "name")
+            else replace(item, min=None, max=None)
+        )
         if what is not None and what in seen:
             shown = f"the name '{what}'" if isinstance(what, str) else what
             first = document.line("input", seen[what])
@@ -128,7 +138,8 @@ def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
     if not isinstance(kind, str) or kind not in _TYPES:
         shown = kind if isinstance(kind, str) else reprlib.repr(kind)
         raise document.unknown(unknown("type of input", shown, _TYPES), "input", index, "type")
-    known = {field.name: field for field in fields(_TYPES[kind])}
+    by_keyword_last = sorted(fields(_TYPES[kind]), key=lambda field: field.kw_only is True)
+    known = {field.name: field for field in by_keyword_last}
     values = {key: value for key, value in table.items() if key != "type"}
     for key, value in values.items():
         if key not in known:
@@ -139,6 +150,10 @@ def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
             right, expected = is_vector(value), "three finite numbers, [x, y, z]"
         elif key in _NUMBERS:
             right, expected = is_number(value), "a finite number"
+            if key in ("max", "min") and len(_TYPES[kind].ENTRIES) > 1:
+                right, expected = right or is_vector(value), "a finite number or three of them"
+        elif key == "on_off":
+            right, expected = isinstance(value, bool), "true or false"
         if not right:
             raise _error(
                 document, index, key, f"{key} is {reprlib.repr(value)}, expected {expected}"

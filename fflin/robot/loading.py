@@ -48,9 +48,9 @@ def load(
         Folders in which ``package://`` paths of meshes are looked up when the robot is drawn,
         before those that the URDF lies in.
     **fields
-        inputs, outputs, stiffness, damping, rest, gravity, passive, weights, start: see
-        `Robot.replace`. What is given here goes before what a robot file says; of locks, springs
-        and dampers joint by joint.
+        inputs, outputs, stiffness, damping, rest, gravity, limits, passive, weights, start: see
+        `Robot.replace`. What is given here goes before what a robot file says; of locks, limits,
+        springs and dampers name by name.
 
     Returns
     -------
@@ -95,7 +95,7 @@ def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
     changed = robot.replace(**fields)
     over = {
         name: {**getattr(robot, name), **getattr(changed, name)}
-        for name in ("stiffness", "damping", "rest")
+        for name in ("stiffness", "damping", "rest", "limits")
         if name in fields and getattr(robot, name)
     }
     return changed.replace(**over) if over else changed

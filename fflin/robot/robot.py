@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, vector
-from fflin.robot.fields import validated_fields, validated_inputs
+from fflin.robot.fields import Range, given_limits, validated_fields, validated_inputs
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.inputs import Input, default_inputs, named_wheels
 from fflin.robot.joints import Follower, Joint, check_followers_rates, followed
@@ -86,6 +86,8 @@ class Robot:
         What `lqr` weighs by default, where it is not the rule's: see `replace`.
     start : mapping
         Where `simulate` and `visualize` begin by default: see `replace`.
+    limits : mapping
+        {name of an input or state: (least, largest)} in place of what the URDF and the inputs say.
     """
 
     model: pin.Model
@@ -107,6 +109,7 @@ class Robot:
     passive: tuple[str, ...] = ()
     weights: Mapping[str, Any] = field(default_factory=dict)
     start: Mapping[str, Any] = field(default_factory=dict)
+    limits: Mapping[str, Range] = field(default_factory=dict)
     # Where some of its joints are wheels: the same robot without them.
     _wheelless: Robot | None = None
     # The model, and what it was when the first robot of it was made.
@@ -148,6 +151,9 @@ class Robot:
             Where `simulate` begins where it is not told: ``joints`` {joint: position [rad|m]},
             ``rpy`` (3,) [deg] about fixed axes, ``position`` (3,) [m] of the base, ``velocity``
             {joint or state: rate}, as `fflin.velocity` takes it.
+        limits : mapping
+            {name, group or pattern of inputs or states: largest magnitude, or (least, largest)},
+            in place of what the URDF and the inputs say of them.
 
         Returns
         -------
@@ -159,7 +165,7 @@ class Robot:
             If a value is negative or not a number, a field is not one of these, or a wheel has
             more inertia than what carries it.
         UnknownNameError
-            If there is no such joint, or no such frame for an input or output.
+            If there is no such joint, no such frame for an input or output, or nothing to limit.
         ModelError
             If dry friction is asked for, which is not differentiable at rest, or the robot's
             model was changed after it was made.
@@ -170,13 +176,15 @@ class Robot:
             robot = robot._without_motors(fields.pop("passive"))
         if "inputs" in fields:
             robot = robot._with_inputs(fields.pop("inputs"))
+        joints = robot.joint_names
+        if "limits" in fields:
+            limits = given_limits(robot.inputs, joints, fields.pop("limits"))
+            robot = replace(robot, limits=limits)
         if "weights" in fields:
-            robot = replace(
-                robot,
-                weights=checked_weights(fields.pop("weights"), robot.joint_names, robot.inputs),
-            )
+            weights = checked_weights(fields.pop("weights"), joints, robot.inputs)
+            robot = replace(robot, weights=weights)
         if "start" in fields:
-            start = checked_start(fields.pop("start"), robot.joint, robot.joint_names)
+            start = checked_start(fields.pop("start"), robot.joint, joints)
             robot = replace(robot, start=start)
         own = (robot._wheelless or robot).joint_names
         robot = replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from fflin.base.names import by_name
-from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
+from fflin.robot.inputs import Input, named_inputs
 
 
 def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
@@ -20,18 +20,11 @@ def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
 
 def input_keys_of(inputs: Sequence[Input]) -> tuple[str, ...]:
     """Return the names of the inputs, as `fflin.base.names.input_keys` has those of a model."""
-    wheels = iter([name for name, _ in named_wheels(inputs)])
-    keys: list[str] = []
-    for item in inputs:
-        if isinstance(item, BaseTorque | BaseForce):
-            keys += [f"{item.GROUP}.{axis}" for axis in "xyz"]
-        elif isinstance(item, JointTorque):
-            keys.append(f"{item.GROUP}.{item.joint}")
-        else:
-            count = sum(key.startswith(f"{item.GROUP}.") for key in keys)
-            own = getattr(item, "name", None) or f"{item.KEY}_{1 + count}"
-            keys.append(f"{item.GROUP}.{next(wheels) if item.GROUP == 'wheel' else own}")
-    return tuple(keys)
+    return tuple(
+        name if name.startswith(f"{item.GROUP}.") else f"{item.GROUP}.{name}"
+        for item, names in named_inputs(inputs)
+        for name in names
+    )
 
 
 def rates_by_name(joints: Sequence[str], values: Mapping[str, float]) -> dict[str, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -16,6 +17,7 @@ from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, check_ending, write_whole
+from fflin.simulation.passed import Limited, Passed, Saturated, passed, saturated
 
 FORMATS = (*record.FORMATS, ".csv")
 
@@ -63,8 +65,14 @@ class Motion(Design):
         The states that the policy is known to feed back; empty where that is not known.
     notes : tuple of str
         What is to be known of the run.
+    limit_names : tuple of str
+        The states and inputs that have limits.
+    limits : ndarray (k, 2)
+        Their least and largest values, infinite where there is none, whether or not the run was
+        kept within.
     """
 
+    OPEN: ClassVar = ("limits",)
     VECTORS: ClassVar = ("t", "energy", "momentum_drift", "com_drift", "placement")
 
     t: Array
@@ -90,6 +98,8 @@ class Motion(Design):
     wheels: tuple[str, ...] = field(default_factory=tuple)
     steered: tuple[str, ...] = field(default_factory=tuple)
     notes: tuple[str, ...] = field(default_factory=tuple)
+    limit_names: tuple[str, ...] = field(default_factory=tuple)
+    limits: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
         rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)
@@ -102,6 +112,7 @@ class Motion(Design):
             object.__setattr__(self, "target", self.target.ravel())
         if not len(self.prediction):  # of json, which knows no empty matrices
             object.__setattr__(self, "prediction", np.zeros((0, self.x.shape[1])))
+        object.__setattr__(self, "limits", self.limits.reshape(len(self.limit_names), 2))
         super().__post_init__()
 
     def __repr__(self) -> str:
@@ -142,6 +153,23 @@ class Motion(Design):
         sines: Array = np.minimum(1.0, np.linalg.norm(vector, axis=1))
         cosines = np.abs(target_scalar * scalar + (at * to).sum(axis=1, keepdims=True))[:, 0]
         return np.degrees(2.0 * np.arctan2(sines, cosines))
+
+    @property
+    def passed(self) -> tuple[Passed, ...]:
+        """What went beyond its limit, the farthest first, with value, time and limit."""
+        return passed(self.t, self._limited())
+
+    @property
+    def saturated(self) -> tuple[Saturated, ...]:
+        """Inputs that were at their limit, with the share of the run, the longest first."""
+        of_inputs = (each for each in self._limited() if each[0] in self.input_names)
+        return saturated(self.t, of_inputs)
+
+    def _limited(self) -> Iterator[Limited]:
+        names = (*self.state_names, *self.input_names)
+        units, values = (*self.state_units, *self.input_units), np.hstack((self.x, self.u)).T
+        for name, limits in zip(self.limit_names, self.limits, strict=True):
+            yield name, values[names.index(name)], units[names.index(name)], limits
 
     def save(self, path: str | Path) -> None:
         """Write it to a .npz, .mat, .json or .csv file, whole or not at all.

@@ -13,10 +13,12 @@ from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array, number, vector, whole
 from fflin.control.channel import Channel, Law
 from fflin.control.policies import Allocation, bound
+from fflin.control.saturation import Saturation
 from fflin.dynamics import points
 from fflin.dynamics.state import StateMap
 from fflin.linear.ignorable import rotor_names
 from fflin.linear.model import LinearModel
+from fflin.robot.fields import Range
 from fflin.robot.robot import Robot
 from fflin.simulation.integrators import Integrator, integrator
 from fflin.simulation.plant import Plant
@@ -84,7 +86,9 @@ class Plan:
     times: Times
     law: Law | None  # nothing but `initial` acts where there is none
     initial: Array  # (nu,), what acts until the first command arrives
-    limits: tuple[Array, Array]  # least and largest value (nu,) of each input
+    limits: Saturation  # what acts of a command
+    rotors: list[int]  # velocities of the wheels that have a largest speed
+    known: dict[str, Range]  # limits of states and inputs, whether they cut or not
     method: type[Integrator]
     project: bool  # whether momentum and centre of mass are kept
     turning: Array  # the velocities whose turn within a step has a bound
@@ -102,7 +106,12 @@ class Plan:
         """Return the way of the law's commands to the inputs, with nothing on it yet."""
         if self.law is None:
             return None
-        return Channel(self.law, self.initial, *self.limits, self.times.sample, self.times.delay)
+        times, rotors = self.times, self.rotors
+
+        def speeds(t: float, q: Array, v: Array) -> Array:
+            return v[rotors]
+
+        return Channel(self.law, self.initial, self.limits, times.sample, times.delay, speeds)
 
 
 def start_of(state: StateMap, x0: Any, q0: Any, v0: Any) -> tuple[Array, Array]:
@@ -208,11 +217,12 @@ def events_of(events: Any, callback: Any) -> tuple[Event, ...]:
     return tuple(events)
 
 
-def law_of(policy: Any, plant: Plant, limits: tuple[Array, Array], times: Times) -> Law | None:
+def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law | None:
     """Return the policy bound to the robot, of which nothing but inputs is taken."""
     if policy is None:
         return None
-    return Law(bound(policy, plant.robot), plant.actuation.names, limits, times.slow)
+    within = (limits.low, limits.high)
+    return Law(bound(policy, plant.robot), plant.actuation.names, within, times.slow)
 
 
 def fed_back(policy: Any) -> tuple[str, ...]:

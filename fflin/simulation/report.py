@@ -11,6 +11,7 @@ from fflin.base.names import group_of, input_keys
 from fflin.base.tables import folded, grid, width
 from fflin.base.validation import Array
 from fflin.simulation.motion import Motion
+from fflin.simulation.passed import lines
 
 # An error has settled once it stays below this share of its largest.
 _SETTLED = 0.02
@@ -67,6 +68,7 @@ def motion_report(motion: Motion) -> str:
         parts.append(f"\n{grid([*rows, *(kind.row(motion.t) for kind in kinds)], 'll')}\n")
     if kinds or motion.u.any():
         parts.append(_largest_inputs(motion))
+    parts += lines(motion)
     energy = motion.energy
     parts.append(
         f"energy {energy[0]:.6g} J at first, {energy[-1]:.6g} J at last; "

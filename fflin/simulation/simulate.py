@@ -10,10 +10,11 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, truth
-from fflin.control.channel import limits_of
+from fflin.control.saturation import saturation
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import state_history
 from fflin.linear.model import LinearModel
+from fflin.robot.limits import chosen_limits
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import (
@@ -54,7 +55,7 @@ def simulate(
     project: bool = True,
     sample: float | None = None,
     delay: float = 0.0,
-    limits: float | Mapping[str, Any] | None = None,
+    limits: float | str | Mapping[str, Any] | Sequence[Any] | None = None,
     disturbance: Disturbance | None = None,
     events: Sequence[Event] = (),
     callback: Callable[[float, Array, Array, Array], None] | None = None,
@@ -100,8 +101,12 @@ def simulate(
     delay : float
         Time [s] from a sample to its effect, a multiple of dt; until then u0 of the policy's
         model acts, or nothing. Where there is a delay and no `sample`, samples are dt apart.
-    limits : float or mapping, optional
-        Largest magnitude of all inputs, or {input or group: magnitude, or (least, largest)}.
+    limits : "urdf", float, mapping or list of them, optional
+        What cuts the inputs: "urdf" for all limits of the robot (efforts of the URDF, `min` and
+        `max` of the inputs, the largest speeds of wheels, `Robot.limits`), the largest magnitude
+        of all inputs, or {input, group or pattern: magnitude, or (least, largest)}; in a list such
+        as ``["urdf", {"tau_m": 5.0}]`` what is given goes first. Nothing is cut by default. On-off
+        thrusters fire in pulses in any case, and `Motion.passed` tells which limits were passed.
     disturbance : callable, optional
         disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order.
     events : sequence of callable
@@ -158,7 +163,8 @@ def simulate(
     q, v = start_of(state, x0, q0, v0)
     times = times_of(policy, duration, dt, every, sample, delay)
     times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=dt is None)
-    within = limits_of(plant.actuation, limits)
+    acting, known = chosen_limits(robot, limits)
+    within = saturation(robot, acting, q, times.dt, times.sample)
     law = law_of(policy, plant, within, times)
     # The model's inputs are others where they are allocated to the robot's.
     same = lin is not None and lin.input_names == plant.actuation.names
@@ -168,8 +174,12 @@ def simulate(
         v=v,
         times=times,
         law=law,
-        initial=lin.u0 if lin is not None and same else np.zeros(len(within[0])),
+        initial=lin.u0 if lin is not None and same else np.zeros(len(within.low)),
         limits=within,
+        rotors=[robot.joint(name).idx_v for name in within.wheels.names] if within.wheels else [],
+        known={
+            name: known[name] for name in (*state.names, *plant.actuation.names) if name in known
+        },
         method=method_of(method, times),
         project=truth("project", project),
         turning=turning(robot),
@@ -222,6 +232,8 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         stopped=run.stopped,
         wheels=tuple(robot.wheels),
         steered=plan.steered,
+        limit_names=tuple(plan.known),
+        limits=np.array(list(plan.known.values())).reshape(-1, 2),
     )
 
 

@@ -13,6 +13,7 @@ from fflin.base.errors import FflinWarning, FileError, InputError
 from fflin.base.validation import Array, number, truth
 from fflin.base.writing import as_path, check_distinct, check_place, write_whole
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.points import start_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import find_frame
 from fflin.robot.robot import Robot
