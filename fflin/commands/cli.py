@@ -17,6 +17,7 @@ from fflin.commands import (
     BAD_INPUT,
     DONE,
     analysis,
+    init,
     models,
     regulator,
     simulation,
@@ -101,6 +102,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"fflin {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     models.add_commands(commands)
+    init.add_commands(commands)
     analysis.add_commands(commands)
     regulator.add_commands(commands)
     simulation.add_commands(commands)

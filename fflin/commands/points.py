@@ -23,9 +23,11 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
     """Load the robot with the passive joints, inputs, outputs and gravity that are given."""
     from fflin.robot.loading import load, with_fields
 
-    robot = load(arguments.robot, lock=once("--lock", arguments.lock))
-    if getattr(arguments, "passive", []):
-        robot = with_fields(robot, {"passive": arguments.passive})
+    lock, passive = once("--lock", arguments.lock), getattr(arguments, "passive", [])
+    first: dict[str, Any] = {"passive": passive} if passive else {}
+    if getattr(arguments, "damping", None) == [(None, "urdf")]:
+        first["damping"] = "urdf"
+    robot = load(arguments.robot, lock=lock, **first)
     fields: dict[str, Any] = {}
     for name in ("stiffness", "damping"):
         values = getattr(arguments, name, [])

@@ -22,7 +22,7 @@ from fflin.robot.model_checks import check_model
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
 from fflin.robot.urdf.mesh_files import find_mesh
-from fflin.robot.urdf.reader import read_urdf
+from fflin.robot.urdf.reader import Advice, read_urdf
 
 Lock = Mapping[str, float | None] | Iterable[str]
 
@@ -76,14 +76,29 @@ def load(
     """
     found = find_robot(robot)
     if found.path.suffix.lower() != ".toml":
-        return with_fields(_load(found, [lock], _folders(package_dirs)), fields)
-    from fflin.robot.robot_files import RobotToml
+        loaded, advice = _load(found, [lock], _folders(package_dirs))
+    else:
+        from fflin.robot.robot_files import RobotToml
 
-    file = RobotToml(found.path, found.name)
-    folders = (*_folders(package_dirs), *file.package_dirs)
-    with file.placed("lock"):
-        loaded = _load(file.found, [file.lock or None, lock], folders)
-    return with_fields(file.applied(loaded), fields)
+        file = RobotToml(found.path, found.name)
+        folders = (*_folders(package_dirs), *file.package_dirs)
+        with file.placed("lock"):
+            loaded, advice = _load(file.found, [file.lock or None, lock], folders)
+        loaded = file.applied(loaded)
+    loaded = with_fields(loaded, fields)
+    gone = {name.rpartition("=")[0] for name in loaded.locked}
+    notes = [*loaded.notes]
+    for field, names, text in advice:
+        said = {*getattr(loaded, field, ()), *gone}
+        said |= {x.joint.name for x in loaded.followers if x.leader.name in said}
+        if not {*names} <= said:
+            notes.append(text)
+    for note in notes:
+        warnings.warn(note, FflinWarning, stacklevel=2)
+    if idle_coordinates(loaded):
+        # No warning: whatever needs the inverse of M refuses with this.
+        notes.append(massless_note(loaded))
+    return replace(loaded, notes=tuple(notes))
 
 
 def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
@@ -93,35 +108,33 @@ def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
     if robot.passive and isinstance(given := fields.get("passive"), list | tuple):
         fields = {**fields, "passive": [*robot.passive, *given]}
     changed = robot.replace(**fields)
-    over = {
+    over: dict[str, Any] = {
         name: {**getattr(robot, name), **getattr(changed, name)}
         for name in ("stiffness", "damping", "rest", "limits")
         if name in fields and getattr(robot, name)
     }
-    return changed.replace(**over) if over else changed
+    return replace(changed, **over)
 
 
-def _load(found: RobotFile, locks: Sequence[Lock | None], package_dirs: tuple[Path, ...]) -> Robot:
+def _load(
+    found: RobotFile, locks: Sequence[Lock | None], package_dirs: tuple[Path, ...]
+) -> tuple[Robot, tuple[Advice, ...]]:
+    """Return the robot of a URDF, and what is to be told of it where its fields say no more."""
     description = read_urdf(found.path, found.prune)
     loaded = _robot(description.model, found.name, locks, description.mimics)
-    notes = description.notes
-    for note in notes:
-        warnings.warn(note, FflinWarning, stacklevel=3)
-    if idle_coordinates(loaded):
-        # No warning: whatever needs the inverse of M refuses with this.
-        notes = (*notes, massless_note(loaded))
     folders = (*package_dirs, *found.package_dirs)
     # They are read when the robot is drawn, and no output may take their place before.
     meshes = (find_mesh(uri, found.path, folders) for uri in description.meshes)
     remember(*filter(None, meshes))
-    return replace(
+    loaded = replace(
         loaded,
         urdf=found.path,
         urdf_sha256=description.sha256,
-        notes=notes,
+        notes=description.notes,
         package_dirs=folders,
         urdf_damping=_independent_damping(loaded, description.damping),
     )
+    return loaded, description.advice
 
 
 def from_model(

@@ -6,7 +6,9 @@ import hashlib
 import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import pinocchio as pin
 
@@ -30,6 +32,14 @@ _SHALLOW = 100
 _STACK = 16 * 2**20
 
 
+class Advice(NamedTuple):
+    """A warning that falls away where a field of the robot names all of the joints."""
+
+    field: str
+    joints: tuple[str, ...]
+    note: str
+
+
 @dataclass(frozen=True, eq=False)
 class Description:
     """A robot as its file describes it.
@@ -48,6 +58,8 @@ class Description:
         Mesh files that it names, as it names them; they are not read.
     notes : tuple of str
         Warnings, one line each.
+    advice : tuple of Advice
+        Warnings of those joints that the robot's fields leave as they are.
     """
 
     model: pin.Model
@@ -57,6 +69,7 @@ class Description:
     friction: dict[str, float]
     meshes: tuple[str, ...]
     notes: tuple[str, ...]
+    advice: tuple[Advice, ...] = ()
 
 
 def read_urdf(path: Path, prune: Sequence[str] = ()) -> Description:
@@ -107,22 +120,28 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
     damping = {joint.name: joint.damping for joint in moving if joint.damping}
     friction = {joint.name: joint.friction for joint in moving if joint.friction}
-    for what, values in (("damping", damping), ("Coulomb friction", friction)):
+    advice = []
+    for what, key, values in (
+        ("damping", "damping", damping),
+        ("Coulomb friction", "friction", friction),
+    ):
         if values:
-            notes.append(
+            text = (
                 f"{path.name}: the {what} of {named('joint', list(values))} is not in the linear "
                 "model unless it is asked for"
             )
+            advice.append(Advice(key, tuple(values), text))
     unlimited = {
         what: [joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0]
         for what in ("effort", "velocity")
     }
     zeros = [f"{what} 0 of {named('joint', names)}" for what, names in unlimited.items() if names]
     if zeros:
-        notes.append(
+        text = (
             f"{path.name}: {', '.join(zeros)}: taken as no limit; if a joint has no motor, name it "
             "in passive"
         )
+        advice.append(Advice("passive", tuple(chain(*unlimited.values())), text))
     return Description(
         model,
         hashlib.sha256(document).hexdigest(),
@@ -131,6 +150,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
         friction,
         tuple(dict.fromkeys(meshes)),
         tuple(notes),
+        tuple(advice),
     )
 
 
