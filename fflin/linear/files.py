@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-from collections.abc import Mapping
+import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,16 +26,14 @@ _MATRICES = {
 }
 _VECTORS = {"x0": "state", "f0": "state", "u0": "input", "y0": "output"}
 _SIGNALS = ("state", "input", "output")
-_POINT = ("q", "v", "reference", "drift", "limits", "weights")
+_POINT = ("q", "v", "reference", "drift", "limits")
 _LISTS = (
     *(f"{signal}_{what}" for what in ("names", "units") for signal in _SIGNALS),
-    *("locked", "ignorable", "limit_names", "weight_names"),
+    *("locked", "ignorable", "limit_names"),
 )
 # Which older files have not.
-_LATER: Record = dict.fromkeys(
-    ("ignorable", "drift", "limit_names", "limits", "weight_names", "weights"), ()
-)
-_TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version")
+_LATER: Record = {"ignorable": (), "drift": (), "limit_names": (), "limits": (), "weights": "{}"}
+_TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version", "weights")
 _CERTIFICATE = ("condition", "inertia_residual", "route_A", "route_B", "f0")
 
 # Of csv, the last of which has the digest of all.
@@ -49,12 +47,11 @@ def record_of(lin: Any) -> Record:
     entries: Record = {key: getattr(lin, key) for key in (*_MATRICES, *_VECTORS, "q", "v")}
     entries["reference"] = lin.placement
     entries["drift"] = np.zeros(0) if lin.drift is None else lin.drift
-    weights = _flat(lin.weights)
-    entries |= {key: list(getattr(lin, key)) for key in _LISTS[:-2]}
-    for key, values in (("limit", lin.limits), ("weight", weights)):
-        entries[f"{key}s"] = np.array(list(values.values()))
-        entries[f"{key}_names"] = list(values)
-    entries |= {key: getattr(lin, key) for key in _TEXTS}
+    entries["limits"] = np.array(list(lin.limits.values()))
+    entries |= {key: list(getattr(lin, key)) for key in _LISTS[:-1]}
+    entries["limit_names"] = list(lin.limits)
+    entries |= {key: getattr(lin, key) for key in _TEXTS[:-1]}
+    entries["weights"] = json.dumps(dict(lin.weights))
     entries["dt"], entries["moving"] = float(lin.dt), float(lin.moving)
     entries["certificate"] = {key: getattr(lin.certificate, key) for key in _CERTIFICATE}
     return entries
@@ -105,45 +102,28 @@ def _fields(entries: Record) -> dict[str, Any]:
     for key, signal in _VECTORS.items():
         _check_size(key, fields[key].size, sizes[signal])
     reference, drift, M = (fields.pop(key) for key in ("reference", "drift", "M"))
-    limits, weights = (_named(fields, key) for key in ("limit", "weight"))
+    names, limits = fields.pop("limit_names"), fields.pop("limits")
+    _check_size("limits", limits.size, len(names))
     _check_size("reference", reference.size, 7)
     _check_size("drift", drift.size, sizes["state"] if drift.size else 0)
     M.setflags(write=False)
     return fields | {
         "dt": figure(entries["dt"]),
         "moving": bool(figure(entries["moving"])),
+        "weights": _weights(fields.pop("weights")),
         "_reference": reference,
         "_drift": drift if drift.size else None,
         "_inertia": partial(given, M),
         "_ignorable": partial(given, fields.pop("ignorable")),
-        "_limits": partial(dict, limits),
-        "weights": _parts(weights),
+        "_limits": partial(dict, dict(zip(names, limits.tolist(), strict=True))),
     }
 
 
-def _named(fields: dict[str, Any], what: str) -> dict[str, float]:
-    """Take {name: value} out of the fields."""
-    names, values = fields.pop(f"{what}_names"), fields.pop(f"{what}s")
-    _check_size(f"{what}s", values.size, len(names))
-    return dict(zip(names, values.tolist(), strict=True))
-
-
-def _flat(weights: Mapping[str, Any]) -> dict[str, float]:
-    """Return {PART.NAME: weight} of a model's weights; the rule's name has a 1."""
-    parts = {key: {part: 1.0} if key == "rule" else part for key, part in weights.items()}
-    return {f"{key}.{name}": x for key, part in parts.items() for name, x in part.items()}
-
-
-def _parts(flat: Mapping[str, float]) -> dict[str, Any]:
-    """Return the weights that are written so."""
-    weights: dict[str, Any] = {}
-    for written, value in flat.items():
-        part, _, name = written.partition(".")
-        if part == "rule":
-            weights[part] = name
-        else:
-            weights.setdefault(part, {})[name] = value
-    return weights
+def _weights(written: str) -> dict[str, Any]:
+    found = json.loads(written)
+    if not isinstance(found, dict) or not all(isinstance(x, dict | str) for x in found.values()):
+        raise ValueError("weights are no table")
+    return found
 
 
 def _numbers(key: str, raw: Any) -> Any:
@@ -182,7 +162,7 @@ def _tables(entries: Record) -> dict[str, list[list[Any]]]:
     point = [[f"{key}[{i}]", x] for key in _POINT for i, x in enumerate(entries[key].tolist())]
     tables["point"] = [["name", "value"], *point]
     info = {key: entries[key] for key in (*_TEXTS, "dt", "moving")}
-    info |= {key: ";".join(entries[key]) for key in _LISTS[-4:]}
+    info |= {key: ";".join(entries[key]) for key in _LISTS[-3:]}
     info |= {f"certificate.{key}": value for key, value in entries["certificate"].items()}
     tables["info"] = [["name", "value"], *map(list, info.items())]
     return tables
@@ -230,9 +210,12 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
     entries["certificate"] = {
         key.removeprefix(prefix): float(x) for key, x in info.items() if key.startswith(prefix)
     }
-    for key in _LISTS[-4:]:
+    for key in _LISTS[-3:]:
         entries[key] = [entry for entry in info.get(key, "").split(";") if entry]
-    return {**entries, **{key: info[key] for key in (*_TEXTS, "dt", "moving")}}, bool(mark)
+    return {
+        **entries,
+        **{key: info[key] for key in (*_TEXTS, "dt", "moving") if key in info},
+    }, bool(mark)
 
 
 def _csv_path(path: Path, key: str) -> Path:

@@ -62,7 +62,7 @@ def test_all_that_init_suggests_can_be_taken(tmp_path):
     code, _, _ = run("init", "own.urdf", cwd=tmp_path)
     assert code == 0
     text = (tmp_path / "own.toml").read_text()
-    assert '"hinge 1",  # effort 0 in the URDF' in text
+    assert 'effort is 0 in the URDF.\npassive = ["hinge 1"]\n' in text
     assert '# Link "rw_x" at [0, 0, 0.5], axis [0, 1, 0] in the robot\'s axes:' in text
     assert '# Link "RCS_1" at [-1, 0, 0], direction [1, 0, 0] in the robot\'s axes:' in text
     taken = re.sub(r"(?m)^# (?=\[|[a-z_]+ = |\"[\w. ]+\" = )", "", text)
@@ -93,7 +93,7 @@ def test_joints_that_all_have_no_effort_keep_their_motors(tmp_path):
     (tmp_path / "zero.urdf").write_text(re.sub(r'effort="[^"]*"', 'effort="0"', text))
     code, _, _ = run("init", "zero.urdf", "-o", "sub.toml", cwd=tmp_path)
     text = (tmp_path / "sub.toml").read_text()
-    assert code == 0 and "every joint an effort of 0, as some exporters do" in text
+    assert code == 0 and "Of every joint the effort is 0, as some exporters" in text
     with pytest.warns(fflin.FflinWarning, match="effort 0 of joints"):
         robot = fflin.load(tmp_path / "sub.toml")
     assert robot.passive == () and len(fflin.linearize(robot).u0) == 13
