@@ -88,6 +88,13 @@ def add_commands(commands: Commands) -> None:
         type=file_name,
         help="draw linear beside nonlinear into FILE: .png, .pdf or .svg",
     )
+    add_values(
+        simulate,
+        "--show",
+        "what --plot draws: a state or input, a group or a pattern, such as q_m, '*.hinge_*'",
+        metavar="NAME",
+        read=str,
+    )
     add_output_file(simulate, "save the motion to FILE: .npz, .mat, .json or .csv")
     add_pictures(simulate)
 
@@ -115,7 +122,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
             motion.save(arguments.output_file)
             lines.append(f"wrote {arguments.output_file}")
         if arguments.plot:
-            motion.plot(arguments.plot)
+            motion.plot(arguments.plot, show=arguments.show or None)
             lines.append(f"wrote {arguments.plot}")
         lines += show_motion(robot, motion, arguments)
     finally:

@@ -36,6 +36,11 @@ class Signals(NamedTuple):
     names: Sequence[str]
     units: Sequence[str]
 
+    def only(self, indices: Sequence[int]) -> Signals:
+        """Return some of the columns."""
+        names, units = ([of[i] for i in indices] for of in (self.names, self.units))
+        return Signals(self.values[:, indices], names, units)
+
     def groups(self) -> dict[str, list[int]]:
         """Return the columns of each group."""
         groups: dict[str, list[int]] = {}
@@ -95,7 +100,7 @@ def draw(
 def _histories(
     axes: Axes, t: Array, states: Signals, linear: Array | None, group: str, indices: list[int]
 ) -> None:
-    times, shown = _broken(t, states.values) if group == "q_b" else (t, states.values)
+    times, shown = _broken(t, states.values, indices) if group == "q_b" else (t, states.values)
     for color, i in zip(cycle(len(indices)), indices, strict=True):
         axes.plot(times, shown[:, i], color=color, label=_short(states.names[i]))
         if linear is not None:
@@ -106,9 +111,9 @@ def _histories(
     axes.margins(x=0.0)
 
 
-def _broken(t: Array, x: Array) -> tuple[Array, Array]:
+def _broken(t: Array, x: Array, indices: list[int]) -> tuple[Array, Array]:
     """Return times and states with a gap where the attitude goes through a turn of 180 degrees."""
-    q_b = x[:, :3]
+    q_b = x[:, indices]
     # The vector part of a unit quaternion whose sign has changed.
     jumps = 1 + np.flatnonzero((q_b[1:] * q_b[:-1]).sum(axis=1) < -0.5)
     return np.insert(t, jumps, t[jumps]), np.insert(x, jumps, np.nan, axis=0)
@@ -132,7 +137,7 @@ def _inputs(
     groups = inputs.groups()
     joints = {"tau_m": groups.pop("tau_m")} if "tau_m" in groups else {}
     panels = [panel for panel in (groups, joints) if panel]
-    places = (0, 1) if len(panels) == 2 else (slice(0, 2),)
+    places = (0, 1) if len(panels) == 2 else (slice(0, 2),) * len(panels)
     for place, panel in zip(places, panels, strict=True):
         axes = figure.add_subplot(grid[row, place])
         shown = [i for indices in panel.values() for i in indices]
@@ -141,7 +146,7 @@ def _inputs(
                 name = inputs.names[i]
                 axes.step(
                     *(t, inputs.values[:, i], style),
-                    color=colors[_short(name)] if panel is joints else color,
+                    color=colors.get(_short(name), color) if panel is joints else color,
                     where="post",
                     label=name,
                 )

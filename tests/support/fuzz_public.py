@@ -97,7 +97,7 @@ def sound(folder):
         "observability": {"lin": lin},
         "OutputFeedback": {"lin": lin, "compensator": fflin.lqg(gain, filtered), "noise": None},
         "plot_matrices": {"lin": lin, "path": None},
-        "plot_motion": {"motion": motion, "path": None},
+        "plot_motion": {"motion": motion, "path": None, "show": None},
         "plot_poles": {"poles": gain, "path": None, "dt": 0.0, "title": "x"},
         "plot_validity": {"validity": None, "path": None},
         "random_configurations": {
@@ -148,7 +148,8 @@ def sound(folder):
         "Motion.save": {"self": motion, "path": folder / "b.npz"},
         "Robot.replace": {
             **{"self": robot, "inputs": robot.inputs, "outputs": robot.outputs, "gravity": vector},
-            **{"stiffness": 1.0, "damping": {}, "rest": {}},
+            **{"stiffness": 1.0, "damping": {}, "rest": {}, "passive": [], "weights": {}},
+            "start": {},
         },
         "StateMap.to_pinocchio": {"self": fflin.StateMap(robot), "x": lin.x0},
         "StateMap.to_state": {"self": fflin.StateMap(robot), "q": q, "v": v},
