@@ -184,7 +184,8 @@ def add_system(command: argparse.ArgumentParser) -> None:
     add_values(
         command,
         "--output",
-        "what is watched: state (default), base, joints, rates, com, momentum, frame:NAME (pose "
+        "what is watched: state (default), base, joints, rates, joints:NAME, rates:NAME (a joint "
+        "or a pattern), com, momentum, frame:NAME (pose "
         "and velocity), pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME; "
         "relative:NAME:TO, as another frame sees it",
         metavar="SPEC",
