@@ -147,11 +147,11 @@ def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
             raise document.unknown(problem, "input", index, key)
         right, expected = isinstance(value, str) and value != "", "a name in quotes"
         if key in _VECTORS:
-            right, expected = is_vector(value), "three finite numbers, [x, y, z]"
+            right, expected = _is_vector(value), "three finite numbers, [x, y, z]"
         elif key in _NUMBERS:
             right, expected = is_number(value), "a finite number"
             if key in ("max", "min") and len(_TYPES[kind].ENTRIES) > 1:
-                right, expected = right or is_vector(value), "a finite number or three of them"
+                right, expected = right or _is_vector(value), "a finite number or three of them"
         elif key == "on_off":
             right, expected = isinstance(value, bool), "true or false"
         if not right:
@@ -169,8 +169,7 @@ def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
         raise _error(document, index, wrong, message) from None
 
 
-def is_vector(value: Any) -> bool:
-    """Whether a value of a TOML file is three numbers."""
+def _is_vector(value: Any) -> bool:
     return isinstance(value, list) and len(value) == 3 and all(map(is_number, value))
 
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import FflinError, InputError, unknown
+from fflin.base.errors import FflinError, InputError
 from fflin.base.names import stands_for_any
 from fflin.base.toml_file import TomlFile, flat
 from fflin.robot.catalog import find_robot
-from fflin.robot.input_files import check_keys, is_number, is_vector, read_inputs
+from fflin.robot.input_files import check_keys, is_number, read_inputs
 from fflin.robot.outputs import parse_output
 
 if TYPE_CHECKING:
@@ -21,56 +22,9 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
 
-def is_text(value: Any) -> bool:
-    """Whether a value is a name."""
-    return isinstance(value, str) and value != ""
-
-
-def _texts(value: Any) -> bool:
-    return isinstance(value, list) and all(map(is_text, value))
-
-
-def _numbers(value: Any) -> bool:
-    return isinstance(value, dict) and all(map(is_number, value.values()))
-
-
-def _ranges(value: Any) -> bool:
-    return isinstance(value, dict) and all(
-        is_number(x) or (isinstance(x, list) and len(x) == 2 and all(map(is_number, x)))
-        for x in value.values()
-    )
-
-
-_Kind: TypeAlias = "tuple[str, Callable[[Any], bool]]"
-
-_TEXT: _Kind = ("a text in quotes", is_text)
-_LIST: _Kind = ('a list of names, ["a", "b"]', _texts)
-_VECTOR: _Kind = ("three finite numbers, [x, y, z]", is_vector)
-_TABLE: _Kind = ("a table of lines name = number", _numbers)
-_PER_JOINT: _Kind = (
-    "a table of lines joint = number, or a number for all joints",
-    lambda value: is_number(value) or _numbers(value),
-)
-
-_KINDS: dict[str, _Kind] = {
-    "urdf": _TEXT,
-    "package_dirs": _LIST,
-    "gravity": _VECTOR,
-    "lock": (
-        'a list of names, ["a", "b"], or a table {joint = number}',
-        lambda value: _texts(value) or _numbers(value),
-    ),
-    "passive": _LIST,
-    "outputs": _LIST,
-    "stiffness": _PER_JOINT,
-    "damping": (f'{_PER_JOINT[0]}, or "urdf"', lambda x: x == "urdf" or _PER_JOINT[1](x)),
-    "rest": _TABLE,
-    "limits": ("a table of lines name = number, or name = [least, largest]", _ranges),
-}
-_PARTS: dict[str, dict[str, _Kind]] = {
-    "weights": {"rule": _TEXT, "q": _TABLE, "r": _TABLE, "bryson": _TABLE},
-    "start": {"joints": _TABLE, "rpy": _VECTOR, "position": _VECTOR, "velocity": _TABLE},
-}
+# What holds names; all else holds numbers, but for what may be a word.
+_OF_NAMES = ("urdf", "package_dirs", "lock", "passive", "outputs")
+_WORDS = (["damping"], ["weights", "rule"])
 
 # In the order in which they are given to the robot: names of inputs are known after the inputs.
 _FIELDS = (
@@ -139,7 +93,11 @@ class RobotToml:
         except FflinError as error:
             document, message = self._document, str(error)
             places = _places(self._written.get(key))
-            quoted = [place for name, *place in places if f"'{name}'" in message]
+            quoted = [
+                place
+                for name, *place in places
+                if re.search(f"'{re.escape(name)}'| {re.escape(name)} is ", message)
+            ]
             if key == "lock" and not quoted:
                 raise
             table = "input" if key == "inputs" else key
@@ -154,30 +112,34 @@ class RobotToml:
                 raise InputError(f"joint '{name}' is locked in line {line}; leave one out")
 
     def _checked(self, key: str) -> Any:
-        """Return the value of a key, which is of the kind that is expected."""
-        value, parts = self._document.record[key], _PARTS.get(key)
-        if parts is None:
-            return self._of_kind(_KINDS[key], value, key)
-        if not isinstance(value, dict):
-            shown = reprlib.repr(value)
-            raise self._document.error(f"{key} is {shown}, expected a table [{key}]", key)
-        for part in value:
-            if part not in parts:
-                raise self._document.unknown(unknown(f"key of [{key}]", part, parts), key, part)
-        return {part: self._of_kind(parts[part], x, key, part) for part, x in value.items()}
-
-    def _of_kind(self, kind: _Kind, value: Any, *place: str) -> Any:
-        expected, right = kind
+        """Return the value of a key, in which names stand for names and numbers for numbers."""
+        value = self._document.record[key]
         if isinstance(value, dict):
-            value = flat(value)
-            wrong = [name for name, x in value.items() if not right({name: x})]
-            place, value = ((*place, wrong[0]), value[wrong[0]]) if wrong else (place, value)
-            if not wrong and right(value):
-                return value
-        elif right(value):
-            return value
-        shown = reprlib.repr(value)
-        raise self._document.error(f"{'.'.join(place)} is {shown}, expected {expected}", *place)
+            # The parts of these are tables of names, which may have dots.
+            parts = value if key in ("weights", "start") else {"": value}
+            parts = {part: flat(x) if isinstance(x, dict) else x for part, x in parts.items()}
+            value = parts.get("", parts)
+        named = key in _OF_NAMES and not isinstance(value, dict)
+        for *place, leaf in _leaves(value, key):
+            right, expected = is_number(leaf), "a finite number"
+            if named:
+                right, expected = isinstance(leaf, str) and leaf != "", "a name in quotes"
+            if not right and not (isinstance(leaf, str) and place in _WORDS):
+                shown = f"{'.'.join(place)} is {reprlib.repr(leaf)}, expected {expected}"
+                raise self._document.error(shown, *place)
+        return [value] if key in _OF_NAMES[1:] and isinstance(value, str) else value
+
+
+def _leaves(value: Any, *place: str) -> Iterator[tuple[Any, ...]]:
+    """Yield (*place, value) of all that is no table or list."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _leaves(inner, *place, key)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from _leaves(inner, *place)
+    else:
+        yield (*place, value)
 
 
 def is_toml(path: Path) -> bool:

@@ -121,6 +121,8 @@ def test_urdf_lies_beside_the_file_wherever_that_is_named_from(written, tmp_path
     assert [str(folder) for folder in robot.package_dirs[:2]] == [str(tmp_path / "deep"), "/x"]
     monkeypatch.chdir(tmp_path / "deep")
     assert fflin.load("../sat.toml").n == 6
+    one = 'urdf = "ets_vii"\npassive = "joint_1"\nlock = "joint_2"\noutputs = "com"\n'
+    assert fflin.load(written(one)).locked == ("joint_2=0.0",)
     assert fflin.load(written('urdf = "talos"\nlock = ["arm_*"]')).name == "sat"
 
 
@@ -186,15 +188,15 @@ CASES = {
     URDF + "orbit = 1\n": ":2: no key of a robot file named 'orbit'",
     URDF + "[[inputs]]\ntype = 'base_force'": ":2: no key of a robot file named 'inputs'; did you",
     URDF + INPUT + "'base_forces'": ":3: no type of input named 'base_forces'; did you mean base_f",
-    "urdf = 3": ":1: urdf is 3, expected a text in quotes",
+    "urdf = 3": ":1: urdf is 3, expected a name in quotes",
     "#\nurdf = 'nosuch'": ":2: no robot named 'nosuch'",
     "#\nurdf = 'no/such.urdf'": "no/such.urdf'; give a URDF's path or a name",
     "urdf = 'sat.toml'": "expected a URDF or a robot's name",
-    URDF + "lock = 'joint_1'": ":2: lock is 'joint_1', expected a list of names",
+    URDF + "lock = 3": ":2: lock is 3, expected a name in quotes",
     URDF + "\nlock = ['joint_9']": ":3: no joint to lock named 'joint_9'; did you mean",
     URDF + "[lock]\njoint_1 = 0\njoint_9 = 1": ":4: no joint to lock named 'joint_9'",
-    URDF + "[lock]\njoint_1 = 'a'": ":3: lock.joint_1 is 'a', expected a list of names",
-    URDF + "passive = 'panel_left'": ":2: passive is 'panel_left', expected a list of names",
+    URDF + "[lock]\njoint_1 = 'a'": ":3: lock.joint_1 is 'a', expected a finite number",
+    URDF + "passive = ['panel_left', 3]": ":2: passive is 3, expected a name in quotes",
     URDF + "passive = ['panel_*', 'hinge']": ":2: no joint named 'hinge'",
     URDF + "passive = ['panel_left']\nlock = ['panel_left']": (
         ":2: joint 'panel_left' is locked in line 3; leave one out"
@@ -204,26 +206,26 @@ CASES = {
     ),
     URDF + "outputs = ['com', 'frame:nosuch']": ":2: no frame named 'nosuch'",
     URDF + "outputs = ['comm']": ":2: no output named 'comm'; did you mean com",
-    URDF + "outputs = 'com'": ":2: outputs is 'com', expected a list of names",
-    URDF + "gravity = [0, 0]": ":2: gravity is [0, 0], expected three finite numbers",
-    URDF + "stiffness = true": ":2: stiffness is True, expected a table of lines joint = number,",
+    URDF + "gravity = [0, 0]": ":2: gravity is [0, 0], expected three numbers",
+    URDF + "gravity = '123'": ":2: gravity is '123', expected a finite number",
+    URDF + "stiffness = true": ":2: stiffness is True, expected a finite number",
     URDF + "[stiffness]\n#\npanel_left = -1": ":4: stiffness of joint 'panel_left' is -1, expected",
-    URDF + "[stiffness]\npanel_left = '1'": ":3: stiffness.panel_left is '1', expected a table of",
+    URDF + "[stiffness]\npanel_left = '1'": ":3: stiffness.panel_left is '1', expected a finite",
     URDF + "[stiffness]\n#\npanel = 1": ":4: no joint named 'panel'; did you mean panel_",
     URDF + "[stiffness]\n'hinge_*' = 1": ":3: no joint named 'hinge_*'",
-    URDF + "[damping]\njoint_1 = inf": ":3: damping.joint_1 is inf, expected a table of lines",
-    URDF + "damping = 'all'": ":2: damping is 'all', expected a table of lines joint = number, or",
-    URDF + "rest = 1": ":2: rest is 1, expected a table of lines name = number",
+    URDF + "[damping]\njoint_1 = inf": ":3: damping.joint_1 is inf, expected a finite number",
+    URDF + "damping = 'all'": ":2: damping is 'all', expected 'urdf', a number or a mapping",
+    URDF + "rest = 1": ":2: rest is 1, expected a mapping {joint: position}",
     URDF + "lock = ['joint_1']\n[rest]\njoint_1 = 1": ":4: joint 'joint_1' is locked in line 2; l",
-    URDF + "weights = 3": ":2: weights is 3, expected a table [weights]",
+    URDF + "weights = 3": ":2: weights is 3, expected a mapping of rule, q, r, bryson",
     URDF
-    + "[weights]\nQ.q_b = 3": ":3: no key of [weights] named 'Q'; there are: rule, q, r, bryson",
+    + "[weights]\nQ.q_b = 3": ":3: no part of weights named 'Q'; there are: rule, q, r, bryson",
     URDF + "[weights]\nrule = 'none'": ":3: no rule of weights named 'none'; there are: urdf, id",
     URDF + "[weights.q]\nq_b = 3\ntau_b = 3": ":4: no state named 'tau_b'; did you mean",
     URDF + "[weights.r]\n'tau_m.*' = 0": ":3: r of 'tau_m.*' is 0, expected more than 0",
     URDF + "[weights.q]\nq_b = 3\n[weights.bryson]\nq_b = 3": "'q_b' has a weight and a largest",
-    URDF + "[start]\nrpy = [0, 0]": ":3: start.rpy is [0, 0], expected three finite numbers",
-    URDF + "[start]\nrpz = [0, 0, 1]": ":3: no key of [start] named 'rpz'; did you mean rpy?",
+    URDF + "[start]\nrpy = [0, 0]": ":3: start rpy is [0, 0], expected three numbers",
+    URDF + "[start]\nrpz = [0, 0, 1]": ":3: no part of start named 'rpz'; did you mean rpy?",
     URDF + "[start.joints]\njoint_1 = 1\njoint_9 = 0": ":4: no joint named 'joint_9'",
     URDF + "[start.velocity]\nomega_b.w = 1": ":3: no velocity named 'omega_b.w'; did you mean",
     URDF + "[stiffness]\na.b.c.d = 'x'": ":3: stiffness.a.b.c.d is 'x', expected",
