@@ -193,7 +193,9 @@ def state_indices(state: StateMap, output: Output) -> list[int]:
     return [
         group.start + names.index(name)
         for key in asked
-        for name in joints_by_name("joint", {key: 0}, names, lambda name: robot.joint(name).name)
+        for name in joints_by_name(
+            "joint", {str(key): 0}, names, lambda name: robot.joint(name).name
+        )
     ]
 
 

@@ -109,7 +109,7 @@ def _spread(
     """Return a joint torque for each joint with a motor that its name, or pattern, stands for."""
     if not isinstance(item, JointTorque):
         return [item]
-    found = joints_by_name("joint", {item.joint: None}, joints, lambda name: find(name).name)
+    found = joints_by_name("joint", {str(item.joint): None}, joints, lambda name: find(name).name)
     if item.joint in found and item.joint in passive:
         raise InputError(f"joint '{item.joint}' is passive and has a joint torque; leave one out")
     return [replace(item, joint=name) for name in found if name not in passive]

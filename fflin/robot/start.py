@@ -48,7 +48,7 @@ def kept_start(start: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any
 def checked_weights(value: Any, joints: Sequence[str], inputs: Sequence[Input]) -> dict[str, Any]:
     """Return the weights of a robot's regulator, whose names are those of states and inputs."""
     weights = _parts("weights", value, _WEIGHTS)
-    if weights.get("rule", RULES[0]) not in RULES:
+    if str(weights.get("rule", RULES[0])) not in RULES:
         raise unknown("rule of weights", weights["rule"], RULES)
     states, keys = state_keys(joints), input_keys_of(inputs)
     parts = {
