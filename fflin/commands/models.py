@@ -18,6 +18,7 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import linear_model, load_robot
+from fflin.commands.visual import add_figure, check_figure, draw
 
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
@@ -30,6 +31,9 @@ def add_commands(commands: Commands) -> None:
         commands, "info", _info, "show tree, joints, masses and limits", "fflin info servicer_7dof"
     )
     add_robot(info)
+    info.add_argument(
+        "--inputs", metavar="FILE.toml", help="show these as well: a file, or a bundled one's name"
+    )
     linearize = command(
         commands,
         "linearize",
@@ -44,6 +48,7 @@ def add_commands(commands: Commands) -> None:
     add_output_file(
         linearize, "save to FILE: .npz, .mat, .json, or .csv (one file a matrix: NAME.A.csv, ...)"
     )
+    add_figure(linearize, "draw the pattern of A and B")
     check = command(
         commands,
         "check",
@@ -52,6 +57,7 @@ def add_commands(commands: Commands) -> None:
         "fflin check canadarm2 --rpy 20 0 0 --reference world --frame world",
     )
     add_point(check)
+    add_figure(check, "draw the errors beside what they must not exceed")
 
 
 def _robots(_: argparse.Namespace) -> int:
@@ -77,7 +83,12 @@ def _robots(_: argparse.Namespace) -> int:
 def _info(arguments: argparse.Namespace) -> int:
     from fflin.robot.summary import robot_info
 
-    print(robot_info(load_robot(arguments)))
+    robot = load_robot(arguments)
+    print(robot_info(robot))
+    if arguments.inputs is not None:
+        from fflin.commands.model_text import inputs_report
+
+        print(f"\n{inputs_report(robot)}")
     return DONE
 
 
@@ -87,6 +98,7 @@ def _linearize(arguments: argparse.Namespace) -> int:
         from fflin.linear.files import FORMATS
 
         check_place(arguments.output_file, FORMATS)
+    check_figure(arguments.plot)
     _, lin = linear_model(arguments)
     if arguments.dt is not None:
         lin = lin.discretize(arguments.dt)
@@ -97,13 +109,16 @@ def _linearize(arguments: argparse.Namespace) -> int:
         from fflin.commands.model_text import model_report
 
         print(model_report(lin))
+    draw(arguments.plot, "plot_matrices", lin)
     return DONE
 
 
 def _check(arguments: argparse.Namespace) -> int:
     from fflin.linear.check import check
 
+    check_figure(arguments.plot)
     robot, lin = linear_model(arguments)
     found = check(robot, lin)
     print(found)
+    draw(arguments.plot, "plot_check", found)
     return DONE if found.ok else FELL_SHORT

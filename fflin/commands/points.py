@@ -117,8 +117,7 @@ def placed(
         value, unit = joints[joint.name], "m" if joint.prismatic else "rad"
         if not low <= value <= high:
             warnings.warn(
-                f"joint '{joint.name}' is put at {value:g} {unit}, outside its limits from "
-                f"{low:g} to {high:g} {unit}",
+                f"joint '{joint.name}' at {value:g} {unit} is outside {low:g} to {high:g} {unit}",
                 FflinWarning,
                 stacklevel=2,
             )
@@ -140,16 +139,26 @@ def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
 
 
 def velocity_of(
-    robot: Robot, arguments: argparse.Namespace, start: Mapping[str, Any] | None = None
+    robot: Robot,
+    arguments: argparse.Namespace,
+    *options: str,
+    start: Mapping[str, Any] | None = None,
 ) -> Array | None:
-    """Return the velocity (nv,) that --velocity says, before a start."""
+    """Return the velocity (nv,) that --velocity says, or these options, the later before others.
+
+    A start goes before all but --velocity.
+    """
     from fflin.dynamics.points import velocity
     from fflin.robot.signals import rates_by_name
 
-    given, known = once("--velocity", arguments.velocity), (start or {}).get("velocity", {})
-    if not known:
-        return velocity(robot, given) if given else None
-    return velocity(robot, {**known, **rates_by_name(robot.joint_names, given)})
+    values: dict[str, float] = {}
+    for option in options or ("velocity",):
+        if option == "velocity":
+            values |= (start or {}).get("velocity", {})
+        given = once(f"--{option.replace('_', '-')}", getattr(arguments, option))
+        velocity(robot, given)  # says what is wrong with it
+        values |= rates_by_name(robot.joint_names, given)
+    return velocity(robot, values) if values else None
 
 
 def inputs_at(

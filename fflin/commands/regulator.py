@@ -22,6 +22,7 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import linear_model, once
+from fflin.commands.visual import add_figure, check_figure, draw
 
 if TYPE_CHECKING:
     from fflin.control.gain import Gain
@@ -40,10 +41,11 @@ def add_commands(commands: Commands) -> None:
     add_point(lqr)
     add_weights(lqr)
     add_output_file(lqr, "save the gain to FILE: .npz, .mat or .json")
+    add_figure(lqr, "draw the loop of each input with its margins, and the poles,")
 
 
 def add_weights(command: argparse.ArgumentParser) -> None:
-    """Add what is regulated and at which cost: --q, --r, --bryson, --dt and --reduce."""
+    """Add what is regulated and at which cost: --q, --r, --bryson, --dt, --reduce and so on."""
     command.add_argument(
         "--weights",
         choices=("urdf", "identity"),
@@ -79,6 +81,12 @@ def add_weights(command: argparse.ArgumentParser) -> None:
         action="store_true",
         help="regulate the part that the inputs can hold where momentum is conserved",
     )
+    command.add_argument(
+        "--wheel-speeds",
+        action=argparse.BooleanOptionalAction,
+        help="bring the speeds of reaction wheels back to the point's: by default where thrusters "
+        "or a torque on the base can make them; also those that turn nothing else, or none",
+    )
 
 
 def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearModel:
@@ -87,7 +95,7 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
         return lin
     from fflin.analysis.momentum import momentum_reduction
 
-    return momentum_reduction(lin)
+    return momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
 
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
@@ -106,8 +114,12 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
         lin = lin.discretize(arguments.dt)
     try:
         given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
-        *weights, rule = rule_weights(lin, arguments.weights, given)
-        gain = replace(lqr(lin, *weights), weights=rule)
+        speeds = arguments.wheel_speeds
+        if any(given.values()):
+            *weights, rule = rule_weights(lin, arguments.weights, given, wheel_speeds=speeds)
+            gain = replace(lqr(lin, *weights, wheel_speeds=speeds), weights=rule)
+        else:
+            gain = lqr(lin, weights=arguments.weights, wheel_speeds=speeds)
     except StabilizabilityError as error:
         hint = " (--reduce)" if "momentum_reduction" in str(error) else ""
         raise StabilizabilityError(f"{error}{hint}") from None
@@ -117,6 +129,7 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
 
 
 def _lqr(arguments: argparse.Namespace) -> int:
+    check_figure(arguments.plot)
     _, lin = linear_model(arguments)
     if arguments.output_file:
         from fflin.base.record import FORMATS
@@ -129,4 +142,5 @@ def _lqr(arguments: argparse.Namespace) -> int:
     print(gain)
     if arguments.output_file:
         print(f"\nwrote {arguments.output_file}")
+    draw(arguments.plot, "plot_loops", gain)
     return DONE
