@@ -275,7 +275,7 @@ def test_models_of_a_file_are_told_from_those_of_its_urdf(written, tmp_path):
     lin = fflin.linearize(robot)
     gain = fflin.lqr(lin)
     with pytest.raises(
-        fflin.InputError, match="the model is one of 'sat', not of .* without the input rw"
+        fflin.InputError, match=r"the model is one of 'sat', not of .* without the input rw"
     ):
         fflin.simulate(plain, fflin.StateFeedback(lin, gain.K), duration=0.1)
     batch = fflin.sweep(robot, [robot.neutral()], out=tmp_path / "a.npz")
