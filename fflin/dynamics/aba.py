@@ -54,7 +54,7 @@ class Aba:
         holds d(B u)/dq too. B comes from the accelerations of unit inputs at rest.
         """
         state = self.state
-        stiffness, damping, _ = state.robot.passive
+        stiffness, damping, _ = state.robot.springs
         tau = state.lift(self.actuation.torques(u) + self._passive_force(q, v))
         external = self._wrenches(q, v, u)
         if state.S is None:
@@ -118,7 +118,7 @@ class Aba:
         return jacobian, turning
 
     def _passive_force(self, q: Array, v: Array) -> Array:
-        stiffness, damping, rest = self.state.robot.passive
+        stiffness, damping, rest = self.state.robot.springs
         force = np.zeros(6 + self.state.robot.n)
         force[6:] -= stiffness * (self.state.joint_positions(q) - rest)
         force[6:] -= damping * self.state.velocities(v)[6:]
