@@ -22,8 +22,9 @@ def width() -> int:
 
 
 def folded(lines: Iterable[str]) -> str:
-    """Fold each line to the width; what does not fit goes on below, indented."""
-    return "\n".join(textwrap.fill(line, width(), subsequent_indent="  ") for line in lines)
+    """Fold each line to the width, not at a no-break space; the rest goes below, indented."""
+    wrap = textwrap.TextWrapper(width(), subsequent_indent="  ", break_on_hyphens=False)
+    return "\n".join(map(wrap.fill, lines)).replace("\u00a0", " ")
 
 
 def dim(text: str) -> str:

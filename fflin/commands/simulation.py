@@ -64,15 +64,19 @@ def add_commands(commands: Commands) -> None:
     add_weights(simulate)
     simulate.add_argument(
         "--allocate",
-        action="store_true",
-        help="design with torque and force on the base, and let the thrusters, none of which "
-        "pulls, give what comes nearest; else a thrust below zero is cut",
+        action=argparse.BooleanOptionalAction,
+        help="whether to design with torque and force on the base, and let the thrusters, none of "
+        "which pulls, give what comes nearest; by default where they push every way; else a "
+        "thrust below zero is cut",
     )
     simulate.add_argument(
         "--free", action="store_true", help="let it move without a regulator or any input"
     )
     simulate.add_argument(
-        "--duration", metavar="T", type=number, default=60.0, help="time [s]; 60 by default"
+        "--duration",
+        metavar="T",
+        type=number,
+        help="time [s]; by default what the linear loop takes to settle, from 60 to 600",
     )
     simulate.add_argument(
         "--step", metavar="H", type=number, help="step of the integration [s]; chosen by default"
@@ -165,13 +169,14 @@ def _leave_earlier(arguments: argparse.Namespace) -> list[str]:
 
 def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     """Return the motion that the arguments ask for."""
+    from fflin.control.bounded import thrusters_push_every_way
+    from fflin.simulation.settling import SHORTEST, time_to_settle
     from fflin.simulation.simulate import simulate
 
     given = once("--limit", arguments.limit)
     options: dict[str, Any] = {
         "q0": configuration_of(robot, arguments, robot.start),
         "v0": velocity_of(robot, arguments, "target_velocity", "velocity", start=robot.start),
-        "duration": arguments.duration,
         "dt": arguments.step,
         "every": arguments.every,
         "method": arguments.method,
@@ -187,19 +192,24 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
             raise InputError(
                 "--free has no regulator to give weights, a target or thrusters; leave one out"
             )
-        return simulate(robot, frame=arguments.frame, **options)
+        duration = SHORTEST if arguments.duration is None else arguments.duration
+        return simulate(robot, frame=arguments.frame, duration=duration, **options)
     from fflin.control.policies import Allocation, StateFeedback
 
-    design = _without_thrusters(robot) if arguments.allocate else robot
+    allocate = thrusters_push_every_way(robot) if arguments.allocate is None else arguments.allocate
+    design = _without_thrusters(robot) if allocate else robot
     lin = _about_target(design, arguments)
     gain = gain_of(lin, arguments)
-    if not (arguments.reduce or arguments.allocate):
+    if not (arguments.reduce or allocate):
         options["linear"] = lin  # at every row, where the sampled model has the samples alone
     if gain.dt:
         lin = lin.discretize(gain.dt)
     policy = StateFeedback(lin, gain.K)
     _require_held(robot, policy, options["q0"])
-    if arguments.allocate:
+    options["duration"] = arguments.duration
+    if arguments.duration is None:
+        options["duration"] = time_to_settle(robot, policy, options["q0"], options["v0"])
+    if allocate:
         return simulate(robot, Allocation(policy, design), **options)
     motion = simulate(robot, policy, **options)
     _warn_of_cut_thrust(robot, motion, policy)

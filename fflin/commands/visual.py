@@ -115,9 +115,12 @@ def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
     if not check_outputs({f".{name}": getattr(arguments, name) for name in _FILES}):
         return
     check_tool(robot, arguments.tool)
-    check_rates(arguments.fps, arguments.speed, arguments.duration)
+    from fflin.simulation.settling import LONGEST
+
+    duration = arguments.duration or LONGEST
+    check_rates(arguments.fps, arguments.speed, duration)
     if arguments.times:
-        check_times(arguments.times, 0.0, arguments.duration)
+        check_times(arguments.times, 0.0, duration)
 
 
 def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> list[str]:

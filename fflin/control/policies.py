@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError
 from fflin.base.rotation import conjugate, quaternion_product, rotation_matrix
 from fflin.base.validation import Array, as_double
+from fflin.control.bounded import nearest
 from fflin.control.channel import Law
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
@@ -183,8 +184,6 @@ class Allocation:
         InputError
             If the two robots have not the same joints.
         """
-        from scipy.optimize import lsq_linear
-
         if not isinstance(self.design, Robot):
             raise InputError(f"design is a {type(self.design).__name__}, expected a fflin.Robot")
         if self.design.joint_names != robot.joint_names:
@@ -214,21 +213,7 @@ class Allocation:
             M = asked.project(pin.crba(self.design.model, own, q).T)
             factor = np.linalg.cholesky(M)
             A, b = np.linalg.solve(factor, columns), np.linalg.solve(factor, force)
-            size = float(np.linalg.norm(b))
-            if size == 0.0:
-                return np.zeros(len(least))
-            # Scaled to 1, as the solver stops at absolute figures. The added rows choose the
-            # least of the thrusts that do the same; their effect is below rounding.
-            unit = float(np.linalg.norm(A))
-            found = lsq_linear(
-                np.vstack((A / unit, 1e-7 * np.eye(len(least)))),
-                np.concatenate((b / size, np.zeros(len(least)))),
-                (least * (unit / size), most * (unit / size)),
-                method="bvls",
-                tol=1e-14,
-            )
-            thrusts: Array = np.clip(found.x * (size / unit), least, most)
-            return thrusts
+            return nearest(A, b, least, most)
 
         return policy
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import textwrap
 from typing import NamedTuple
 
 import numpy as np
 
 from fflin.base.names import group_of, input_keys
-from fflin.base.tables import folded, grid, width
+from fflin.base.tables import folded, grid
 from fflin.base.validation import Array
 from fflin.simulation.motion import Motion
 from fflin.simulation.passed import lines
@@ -49,7 +48,7 @@ class Course(NamedTuple):
     @property
     def last(self) -> str:
         """Its last value, for a sentence."""
-        return f"{self.title} {self.size[-1]:.2g} {self.unit}"
+        return f"{self.title}\u00a0{self.size[-1]:.2g}\u00a0{self.unit}"
 
     def row(self, t: Array) -> list[str]:
         """Return its row of the table."""
@@ -130,7 +129,7 @@ def verdict(motion: Motion, kinds: list[Course]) -> str:
         said = f"not settled: {_and(failed)} at the end"
     elif moved:
         when = motion.t[max(kind.settled for kind in moved)]
-        said = f"settled: {_and([kind.last for kind in moved])} after {when:.3g} s"
+        said = f"settled: {_and([kind.last for kind in moved])} after {when:.3g}\u00a0s"
     else:
         said = "settled: at the target from first to last"
     if aside := [kind.last for kind in places if kind.late and not kind.steered]:
@@ -155,7 +154,5 @@ def _largest_inputs(motion: Motion) -> str:
             key = (group_of(name), unit.replace(" ", "\u00a0"))
             kinds[key] = max(kinds.get(key, 0.0), float(value))
     shown = [f"{name}\u00a0{value:.4g}\u00a0{unit}" for (name, unit), value in kinds.items()]
-    line = f"largest inputs: {', '.join(shown) or 'none'}"
     # Name, value and unit stay on one line.
-    line = textwrap.fill(line, width(), subsequent_indent="  ", break_on_hyphens=False)
-    return line.replace("\u00a0", " ")
+    return folded([f"largest inputs: {', '.join(shown) or 'none'}"])

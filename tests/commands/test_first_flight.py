@@ -1,0 +1,37 @@
+"""A satellite with panels, an arm, thrusters and wheels, in one URDF and one TOML, flies."""
+
+from pathlib import Path
+
+import numpy as np
+
+import fflin
+from tests.support.commands import run
+
+TOML = Path(__file__).parents[2] / "robots" / "inspector.toml"
+
+
+def test_the_inspector_flies_within_its_limits_at_the_first_try(tmp_path):
+    code, out, err = run("simulate", TOML, "--html", "a.html", "-o", "a.npz", cwd=tmp_path)
+    assert (code, err) == (0, "")
+    assert out.startswith("settled: attitude ")
+    assert (tmp_path / "a.html").stat().st_size < 6e6
+    motion = fflin.Motion.load(tmp_path / "a.npz")
+    robot = fflin.load(TOML)
+    assert motion.attitude_error[0] > 19.9 and motion.attitude_error[-1] < 0.05
+    assert motion.wheels == ("wheel_x", "wheel_y", "wheel_z")
+    assert not motion.passed and not motion.saturated
+    # By their own figures, not by what the motion says of itself.
+    u = dict(zip(motion.input_names, np.abs(motion.u).max(axis=0), strict=True))
+    x = dict(zip(motion.state_names, np.abs(motion.x).max(axis=0), strict=True))
+    assert all(u[name] <= 1.0 and x[f"qdot_m.{name}"] <= 500.0 for name in motion.wheels)
+    thrusts = [item.name for item in robot.inputs if isinstance(item, fflin.Thruster)]
+    assert len(thrusts) == 8
+    for name in thrusts:
+        values = motion.u[:, motion.input_names.index(name)]
+        assert values.min() >= 0.0 and values.max() <= 10.0
+    efforts = {"arm_1": 60, "arm_2": 60, "arm_3": 40, "arm_4": 15, "arm_5": 15, "arm_6": 10}
+    speeds = {"arm_1": 0.2, "arm_2": 0.2, "arm_3": 0.2, "arm_4": 0.4, "arm_5": 0.4, "arm_6": 0.4}
+    for name, effort in efforts.items():
+        assert u[f"tau_m.{name}"] <= effort and x[f"qdot_m.{name}"] <= speeds[name]
+    assert not any(name.startswith("tau_m.hinge") for name in motion.input_names)
+    assert motion.momentum_drift.max() < 1e-12

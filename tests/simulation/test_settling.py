@@ -1,0 +1,68 @@
+"""A run is as long as its loop takes to settle."""
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.control.bounded import thrusters_push_every_way
+from fflin.simulation.settling import time_to_settle
+
+
+def course(robot, policy, q):
+    """Return the largest linear error of attitude, position and joints (3, N) each half second."""
+    lin = policy.lin
+    state = fflin.StateMap(robot, reference=lin.reference, frame=lin.frame)
+    e = state.to_state(q, np.zeros(robot.nv)) - lin.x0
+    values, vectors = np.linalg.eig(lin.A - lin.B @ policy.K)
+    parts = np.linalg.solve(vectors, e)
+    times = np.arange(0.0, 601.0, 0.5)
+    x = np.abs((vectors @ (parts[:, None] * np.exp(np.outer(values, times)))).real)
+    groups = (x[:3], x[3:6], x[6 : 6 + robot.n])
+    return times, np.array([group.max(axis=0, initial=0.0) for group in groups])
+
+
+@pytest.mark.parametrize("name", ["cubesat", "canadarm2", "servicer_7dof", "dual_arm"])
+def test_it_is_the_time_after_which_the_linear_loop_stays_within_a_hundredth(name):
+    springs = {"stiffness": 100.0, "damping": 1.0} if name == "servicer_7dof" else {}
+    robot = fflin.load(name, **springs)
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    q = fflin.configuration(robot, dict.fromkeys(robot.joint_names[:1], 0.1))
+    q[3:7] = [np.sin(0.2), 0.0, 0.0, np.cos(0.2)]
+    times, errors = course(robot, policy, q)
+    late = (errors > 0.01 * errors.max(axis=1, keepdims=True) + 1e-15).any(axis=0)
+    expected = max(60.0, 10.0 * np.ceil(times[late].max() / 10.0))
+    assert time_to_settle(robot, policy, q, None) == expected
+
+
+def test_sampled_loops_settle_when_their_continuous_ones_do():
+    robot = fflin.load("canadarm2")
+    lin = fflin.linearize(robot)
+    sampled = lin.discretize(0.25)
+    q = fflin.configuration(robot, {"joint_2": 0.3})
+    one, two = (
+        time_to_settle(robot, fflin.StateFeedback(each, fflin.lqr(each).K), q, None)
+        for each in (lin, sampled)
+    )
+    assert abs(one - two) <= 20.0
+
+
+def test_a_loop_that_takes_for_ever_is_looked_at_for_a_minute():
+    robot = fflin.load("cubesat")
+    lin = fflin.linearize(robot)
+    K = np.hstack((1e-6 * np.eye(6), 1e-3 * np.eye(6))) * np.abs(lin.M.diagonal())[:, None]
+    q = fflin.configuration(robot)
+    q[:3] = 1.0
+    assert time_to_settle(robot, fflin.StateFeedback(lin, K), q, None) == 60.0
+
+
+def test_which_thrusters_push_every_way():
+    inspector, cubesat = (
+        fflin.load(name, inputs=fflin.load_inputs(name)) for name in ("inspector", "cubesat")
+    )
+    assert thrusters_push_every_way(inspector) and thrusters_push_every_way(cubesat)
+    assert not thrusters_push_every_way(fflin.load("cubesat"))
+    fewer = [each for each in inspector.inputs if getattr(each, "name", "") != "top_left_front"]
+    assert not thrusters_push_every_way(inspector.replace(inputs=fewer))
+    helped = [*fewer, fflin.BaseTorque(), fflin.BaseForce()]
+    assert thrusters_push_every_way(inspector.replace(inputs=helped))
