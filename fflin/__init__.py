@@ -41,7 +41,7 @@ _PUBLIC = {
     "JointVelocities": "robot.outputs",
     "LinearBatch": "batch.linear_batch",
     "LinearModel": "linear.model",
-    "LinearTrajectory": "linear.trajectory",
+    "LinearTrajectory": "linear.linear_trajectory",
     "Linearizer": "linear.linearization",
     "MissingPackageError": "base.errors",
     "Mode": "analysis.modes",
@@ -63,6 +63,7 @@ _PUBLIC = {
     "StateMap": "dynamics.state",
     "SweepError": "base.errors",
     "Thruster": "robot.inputs",
+    "Trajectory": "linear.trajectory",
     "TrajectoryFeedback": "control.policies",
     "UnknownNameError": "base.errors",
     "UrdfError": "base.errors",
@@ -81,7 +82,7 @@ _PUBLIC = {
     "grid": "batch.configurations",
     "kalman": "control.kalman",
     "linearize": "linear.linearization",
-    "linearize_trajectory": "linear.trajectory",
+    "linearize_trajectory": "linear.linear_trajectory",
     "list_robots": "robot.catalog",
     "load": "robot.loading",
     "load_inputs": "robot.input_files",
@@ -153,9 +154,10 @@ if TYPE_CHECKING:
     from fflin.dynamics.state import StateMap
     from fflin.linear.check import Check, check
     from fflin.linear.equilibrium import Equilibrium, equilibrium
+    from fflin.linear.linear_trajectory import LinearTrajectory, linearize_trajectory
     from fflin.linear.linearization import Linearizer, linearize
     from fflin.linear.model import Certificate, LinearModel
-    from fflin.linear.trajectory import LinearTrajectory, linearize_trajectory
+    from fflin.linear.trajectory import Trajectory
     from fflin.robot.catalog import list_robots
     from fflin.robot.input_files import load_inputs
     from fflin.robot.inputs import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster

@@ -22,7 +22,7 @@ from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from fflin.control.tvlqr import GainSchedule
-    from fflin.linear.trajectory import LinearTrajectory
+    from fflin.linear.linear_trajectory import LinearTrajectory
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 

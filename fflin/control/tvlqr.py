@@ -21,7 +21,7 @@ from fflin.dynamics.state import StateMap
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
 
-    from fflin.linear.trajectory import LinearTrajectory
+    from fflin.linear.linear_trajectory import LinearTrajectory
 
 # Between two knots P is a cubic; knots are added until it is this accurate, relative to P.
 _ACCURACY = 1e-7
@@ -146,7 +146,7 @@ def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSched
     E. Celledoni, A. Marthinsen and B. Owren, Commutator-free Lie group methods, Future Generation
     Computer Systems 19(3), 2003.
     """
-    from fflin.linear.trajectory import LinearTrajectory
+    from fflin.linear.linear_trajectory import LinearTrajectory
 
     if not isinstance(traj, LinearTrajectory):
         raise InputError(

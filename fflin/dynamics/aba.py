@@ -47,6 +47,16 @@ class Aba:
             forces += self.state.forces(tau)
         return self._accelerate(self._model, q, v, forces, self._wrenches(q, v, u))
 
+    def terms(self, q: Array, v: Array, u: Array) -> Array:
+        """Return the size (6 + n,) of the terms that add up to the accelerations; `u` as above."""
+        state, data = self.state, self._data
+        M = state.project(pin.crba(self._model, data, q).T)
+        columns = self.actuation.columns(data, q)
+        bias = state.forces(pin.nonLinearEffects(self._model, data, q, v))
+        forces = np.abs(columns) @ np.abs(u) + np.abs(bias) + np.abs(self._passive_force(q, v))
+        size: Array = np.abs(np.linalg.inv(M)) @ forces
+        return size
+
     def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return d(nudot)/d(tangent of q, nu, u) in state order, (6 + n, ...); `u` in base axes.
 

@@ -22,6 +22,9 @@ FORMATS = (*record.FORMATS, ".csv")
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from fflin.linear.trajectory import Trajectory
+    from fflin.robot.robot import Robot
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Motion(Design):
@@ -81,6 +84,7 @@ class Motion(Design):
     urdf_sha256: str
     stopped: str
     com_drift: Array = field(default_factory=lambda: np.zeros(0))
+    _robot: Any = field(default=None, kw_only=True)  # that was simulated; no file has it
 
     def __post_init__(self) -> None:
         rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)
@@ -128,6 +132,25 @@ class Motion(Design):
         sines: Array = np.minimum(1.0, np.linalg.norm(vector, axis=1))
         cosines = np.abs(target_scalar * scalar + at @ to)
         return np.degrees(2.0 * np.arctan2(sines, cosines))
+
+    def trajectory(self, robot: Robot | None = None) -> Trajectory:
+        """Return the motion by knots, with inputs that are held or linear: what it holds to better.
+
+        Of inputs that change all the time the last, which no row has, is extrapolated.
+
+        Parameters
+        ----------
+        robot : Robot, optional
+            That moves; needed where the motion is read from a file.
+
+        Raises
+        ------
+        InputError
+            If there is no robot, or it is another one.
+        """
+        from fflin.linear.trajectory_files import of_motion
+
+        return of_motion(self, robot or self._robot)
 
     def save(self, path: str | Path) -> None:
         """Write it to a .npz, .mat, .json or .csv file, whole or not at all.

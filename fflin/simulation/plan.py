@@ -13,11 +13,11 @@ from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array, number, whole
 from fflin.control.channel import Channel, Law
 from fflin.control.policies import Allocation, bound
+from fflin.dynamics.integrators import Integrator, integrator
 from fflin.dynamics.state import StateMap
 from fflin.linear.ignorable import rotor_names
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
-from fflin.simulation.integrators import Integrator, integrator
 from fflin.simulation.plant import Plant
 
 Event: TypeAlias = Callable[[float, Array, Array], float]

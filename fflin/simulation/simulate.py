@@ -213,6 +213,7 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         robot=robot.name,
         urdf_sha256=robot.urdf_sha256,
         stopped=run.stopped,
+        _robot=robot,
     )
 
 
