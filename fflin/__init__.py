@@ -31,7 +31,7 @@ _PUBLIC = {
     "FullState": "robot.outputs",
     "Gain": "control.gain",
     "GainBatch": "batch.gains",
-    "GainSchedule": "control.tvlqr",
+    "GainSchedule": "control.gain_schedule",
     "Gramians": "analysis.gramians",
     "Grid": "batch.configurations",
     "Gyroscope": "robot.outputs",
@@ -143,12 +143,13 @@ if TYPE_CHECKING:
     from fflin.batch.sweep import sweep
     from fflin.control.acceleration_lqr import acceleration_lqr
     from fflin.control.gain import Gain
+    from fflin.control.gain_schedule import GainSchedule
     from fflin.control.kalman import Compensator, Estimator, kalman, lqg
     from fflin.control.lqr import lqr
     from fflin.control.output_feedback import OutputFeedback
     from fflin.control.policies import Allocation, StateFeedback, TrajectoryFeedback
     from fflin.control.sampled_cost import sampled_cost
-    from fflin.control.tvlqr import GainSchedule, tvlqr
+    from fflin.control.tvlqr import tvlqr
     from fflin.control.weights import bryson
     from fflin.dynamics.points import configuration, effort, velocity
     from fflin.dynamics.state import StateMap

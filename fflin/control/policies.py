@@ -21,7 +21,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from fflin.control.tvlqr import GainSchedule
+    from fflin.control.gain_schedule import GainSchedule
     from fflin.linear.linear_trajectory import LinearTrajectory
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]

@@ -16,6 +16,7 @@ from fflin.linear.flow import placed
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
+from fflin.linear.trajectory_sampling import transitions
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -108,8 +109,8 @@ class LinearTrajectory(Trajectory):
         InputError
             If dt is no such time, or it is sampled already.
         """
-        from fflin.linear.trajectory_sampling import transitions
-
+        if self.dt:
+            raise InputError(f"the model is sampled already, at dt = {self.dt:g} s")
         found = np.array([transition for _, transition in transitions(self, dt)])
         nx, models = len(self.state_names), along(self.resampled(dt))
         return replace(models, A=found[:, :nx, :nx], B=found[:, :nx, nx:], dt=float(dt))
@@ -172,13 +173,7 @@ def along(motion: Trajectory) -> LinearTrajectory:
     """Return the linear models along a motion."""
     linearizer = Linearizer(motion.robot, moving=True)
     models = [linearizer(*each) for each in zip(motion.q, motion.v, motion.u_base, strict=True)]
-    of_knots = (np.array([getattr(lin, name) for lin in models]) for name in ("A", "B", "C", "D"))
-    return LinearTrajectory(
-        **motion._given,
-        **dict(zip("ABCD", of_knots, strict=True)),
-        y=np.array([lin.y0 for lin in models]),
-        **{name: getattr(models[0], name) for name in _NAMES},
-    )
-
-
-_NAMES = ("state_names", "input_names", "output_names")
+    values = motion._given | {name: np.array([getattr(x, name) for x in models]) for name in "ABCD"}
+    names = ("state_names", "input_names", "output_names")
+    values |= {name: getattr(models[0], name) for name in names}
+    return LinearTrajectory(**values, y=np.array([lin.y0 for lin in models]))

@@ -222,7 +222,12 @@ class Trajectory(Design):
         """
         from fflin.linear.trajectory_files import read
 
-        return read(path, robot, hold, frame)
+        source = as_path(path)
+        values = read(source, robot, hold, frame)
+        try:
+            return Trajectory(robot, **values)
+        except InputError as error:
+            raise InputError(f"{source}: {error}") from None
 
     def _within(self, t: float) -> float:
         t = number("t", t)

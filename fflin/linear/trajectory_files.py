@@ -14,16 +14,15 @@ from fflin.base import record
 from fflin.base.errors import FflinError, FileError, InputError, unknown
 from fflin.base.record import Record, read_record, reading, text
 from fflin.base.validation import Array, as_double
-from fflin.base.writing import as_path, check_ending, read_input, write_whole
+from fflin.base.writing import check_ending, read_input, write_whole
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
 FORMATS = (*record.FORMATS, ".csv")
 
 
-def write_csv(path: Path, traj: Trajectory) -> None:
+def write_csv(path: Path, traj: Any) -> None:
     """Write named columns, as `Trajectory.load` reads them."""
     columns = [f"{name}[{i}]" for name in "qv" for i in range(getattr(traj, name).shape[1])]
     table = io.StringIO()
@@ -34,9 +33,8 @@ def write_csv(path: Path, traj: Trajectory) -> None:
     write_whole({path: table.getvalue().encode()})
 
 
-def read(path: str | Path, robot: Robot, hold: str | None, frame: str | None) -> Trajectory:
-    """Do what `Trajectory.load` says."""
-    source = as_path(path)
+def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dict[str, Any]:
+    """Return what `Trajectory` takes of a file, see `Trajectory.load`."""
     check_ending(source, FORMATS)
     state = StateMap(robot)
     with reading(source, "trajectory"):
@@ -48,37 +46,15 @@ def read(path: str | Path, robot: Robot, hold: str | None, frame: str | None) ->
         entries = _entries(entries, state) if table else entries
         hold = hold or (text(entries["hold"]) if "hold" in entries else None)
         frame = frame or (text(entries["frame"]) if "frame" in entries else "local")
-        return _trajectory(entries, robot, hold, frame, verified)
+        return arguments(entries, robot, hold, frame, verified)
     except FflinError as error:
         raise type(error)(f"{source}: {error}") from None
 
 
-def of_motion(motion: Any, robot: Robot | None) -> Trajectory:
-    """Do what `Motion.trajectory` says."""
-    if robot is None:
-        raise InputError("the motion is from a file, which has no robot; give the one that moves")
-    state = StateMap(robot, frame=motion.frame)
-    if (motion.state_names, motion.input_names) != (state.names, Actuation(state).names):
-        raise InputError(
-            f"the motion is one of '{motion.robot}' and not of '{robot.name}' as given"
-        )
-    entries = {name: getattr(motion, name) for name in ("t", "q", "v", "u", "placement")}
-    held = _trajectory(entries, robot, "previous", motion.frame, motion.verified)
-    if not (motion.u - motion.u[0]).any():
-        return held
-    before, u = motion.t[-4:-1], motion.u.copy()
-    u[-1] = 0.0
-    for i, t in enumerate(before):
-        others = np.delete(before, i)
-        u[-1] += motion.u[i - len(before) - 1] * np.prod((motion.t[-1] - others) / (t - others))
-    smooth = _trajectory(entries | {"u": u}, robot, "linear", motion.frame, motion.verified)
-    return min(held, smooth, key=lambda each: float(each.residual.max()))
-
-
-def _trajectory(
+def arguments(
     entries: Record, robot: Robot, hold: str | None, frame: Any, verified: bool
-) -> Trajectory:
-    """Return the trajectory in named entries, t, u and q, v or x."""
+) -> dict[str, Any]:
+    """Return what `Trajectory` takes of named entries, t, u and q, v or x."""
     states = "q" in entries and "v" in entries
     if not {"t", "u"} <= {*entries} or not (states or "x" in entries):
         found = ", ".join(sorted(entries))
@@ -90,14 +66,15 @@ def _trajectory(
     for vector in Actuation(state).held:
         # In the axes of the world, which those of the reference may not be.
         u[:, vector.columns] = u[:, vector.columns] @ reference.rotation.T
-    q, v = (entries[name] if states else None for name in "qv")
-    if not states:
-        x = as_double("x", entries["x"])
-        if x.ndim != 2 or x.shape[1] != state.nx:
-            raise InputError(f"x has shape {x.shape}, expected (N, {state.nx}), the states")
-        q, v = map(np.array, zip(*map(state.to_pinocchio, x), strict=True))
-    t = as_double("t", entries["t"]).ravel()
-    return Trajectory(robot, t, q, v, u, hold=hold, frame=frame, verified=verified)
+    found_as: dict[str, Any] = {"t": as_double("t", entries["t"]).ravel(), "u": u}
+    found_as |= {"hold": hold, "frame": frame, "verified": verified}
+    if states:
+        return found_as | {name: entries[name] for name in "qv"}
+    x = as_double("x", entries["x"])
+    if x.ndim != 2 or x.shape[1] != state.nx:
+        raise InputError(f"x has shape {x.shape}, expected (N, {state.nx}), the states")
+    q, v = map(np.array, zip(*map(state.to_pinocchio, x), strict=True))
+    return found_as | {"q": q, "v": v}
 
 
 def _columns(path: Path) -> Record:

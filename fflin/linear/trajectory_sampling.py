@@ -9,26 +9,25 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
-from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.linearization import Linearizer
 from fflin.linear.sampling import GAUSS, HEAVY, LIGHT, held_exponential
+from fflin.linear.trajectory import Trajectory
 
 # Steps are halved until the transition of a sample is this accurate.
 _ACCURACY, _MOST_PARTS = 1e-8, 64
 
-# F = [[A, B], [0, 0]] (nx + nu, nx + nu), and for how long [s].
-Steps = list[tuple[Array, float]]
+# F = [[A, B], [0, 0]] (nx + nu, nx + nu), for how long [s], and what it does (nx, nx + nu).
+Steps = list[tuple[Array, float, Array]]
 
 
-def transitions(along: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Array]]:
+def transitions(along: Trajectory, dt: float) -> Iterator[tuple[Steps, Array]]:
     """Yield the steps of each sample, and what they do to the error and du (nx, nx + nu)."""
-    if along.dt:
-        raise InputError(f"the model is sampled already, at dt = {along.dt:g} s")
     times = along.samples(dt)
     if times[-1] != along.t[-1]:
         duration = along.t[-1] - along.t[0]
         raise InputError(f"dt is {dt:g} s, expected a part of the {duration:g} s of the trajectory")
-    linearizer, (nx, nu) = Linearizer(along.robot, moving=True), along.B.shape[1:]
+    linearizer, nu = Linearizer(along.robot, moving=True), along.u.shape[1]
+    nx = 12 + 2 * along.robot.n
 
     def at(t: float) -> Array:
         lin, F = linearizer(*along.flow.at(t)), np.zeros((nx + nu, nx + nu))
@@ -42,9 +41,9 @@ def transitions(along: LinearTrajectory, dt: float) -> Iterator[tuple[Steps, Arr
                 early, late = (at(a + c * (b - a)) for c in GAUSS)
                 for first, second in ((early, late), (late, early)):
                     F, h = HEAVY * first + LIGHT * second, 0.5 * (b - a)
-                    steps.append((F, h))
-                    step = held_exponential(F[:nx, :nx], F[:nx, nx:], h)
-                    whole[:nx] = np.column_stack(step) @ whole
+                    step = np.column_stack(held_exponential(F[:nx, :nx], F[:nx, nx:], h))
+                    steps.append((F, h, step))
+                    whole[:nx] = step @ whole
         return steps, whole[:nx]
 
     parts = 1

@@ -148,9 +148,27 @@ class Motion(Design):
         InputError
             If there is no robot, or it is another one.
         """
-        from fflin.linear.trajectory_files import of_motion
+        from fflin.linear.trajectory import Trajectory
+        from fflin.linear.trajectory_files import arguments
 
-        return of_motion(self, robot or self._robot)
+        robot = robot or self._robot
+        if robot is None:
+            raise InputError(
+                "the motion is from a file, without its robot; give the one that moves"
+            )
+        entries = {name: getattr(self, name) for name in ("t", "q", "v", "u", "placement")}
+        values = arguments(entries, robot, "previous", self.frame, self.verified)
+        held = Trajectory(robot, **values)
+        if not (self.u - self.u[0]).any():
+            return held
+        before, u = self.t[-4:-1], values["u"]
+        u[-1] = 0.0
+        for i, t in enumerate(before):
+            others = np.delete(before, i)
+            share = np.prod((self.t[-1] - others) / (t - others))
+            u[-1] += share * u[i - len(before) - 1]
+        smooth = Trajectory(robot, **values | {"hold": "linear", "u": u})
+        return min(held, smooth, key=lambda each: float(each.residual.max()))
 
     def save(self, path: str | Path) -> None:
         """Write it to a .npz, .mat, .json or .csv file, whole or not at all.
