@@ -11,12 +11,11 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
-from fflin.base.rotation import conjugate, quaternion_product, rotation_matrix
 from fflin.base.validation import Array, as_double
 from fflin.control.channel import Law
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.dynamics.state_rows import readout
+from fflin.dynamics.state_rows import moving_error, readout
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -145,7 +144,7 @@ class TrajectoryFeedback:
         def policy(t: float, q: Array, v: Array) -> Array:
             t = min(max(t, float(along.t[0])), end)
             q_star, v_star, u_star = along.point(t)
-            u: Array = u_star - self.schedule.gain(t).dot(_error(state, q_star, v_star, q, v))
+            u: Array = u_star - self.schedule.gain(t).dot(moving_error(state, q_star, v_star, q, v))
             return u
 
         return policy
@@ -254,16 +253,3 @@ def require_same_robot(lin: LinearModel, robot: Robot, state: StateMap) -> None:
             f"the model is one of '{lin.robot}' with {len(lin.input_names)} inputs, not of "
             f"'{robot.name}' as it is given with {len(names)}; linearise this robot"
         )
-
-
-def _error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Array) -> Array:
-    """Return the error (nx,) from a moving reference, in its axes."""
-    g = state.groups
-    e = np.empty(state.nx)
-    turned = quaternion_product(conjugate(q_star[3:7]), q[3:7])
-    e[g.q_b] = turned[:3] if turned[3] >= 0.0 else -turned[:3]
-    e[g.r_b] = rotation_matrix(q_star[3:7]).T @ (q[:3] - q_star[:3])
-    apart = pin.difference(state.robot.model, q_star, q)
-    e[g.q_m] = state.velocities(apart)[6:]
-    e[-6 - state.robot.n :] = state.velocities(v - v_star)
-    return e

@@ -90,7 +90,7 @@ class LinearTrajectory(Trajectory):
         """Check every knot as `fflin.check` does: the worst of each figure."""
         from fflin.linear.check import check_all
 
-        return check_all(self.robot, list(self), f"{self.robot.name}, {len(self)} knots")
+        return check_all(self.robot, self, f"{self.robot.name}, {len(self)} knots")
 
     def discretize(self, dt: float) -> LinearTrajectory:
         r"""Sample it along the motion, du held from sample to sample.

@@ -6,10 +6,11 @@ from functools import partial
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.rotation import rotation_matrix
+from fflin.base.rotation import rotation_matrix, skew
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.state import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR, StateMap
+from fflin.dynamics.state_rows import moving_error
 from fflin.linear.certificate import mobilities
 from fflin.linear.model import LinearModel
 from fflin.robot.frames import ROOT
@@ -43,7 +44,7 @@ class Nonlinear:
         seen, observer = v.copy(), rotation_matrix(q[3:7]).T @ self._observer
         seen[PIN_LINEAR] -= observer
         a = self.aba.acceleration(q, seen, u).copy()
-        a[PIN_LINEAR] -= np.cross(v[PIN_ANGULAR], observer)
+        a[PIN_LINEAR] -= skew(v[PIN_ANGULAR]).dot(observer)
         return q, v, a
 
     def passing(self, x: Array, motion: tuple[Array, Array, Array], t: float) -> Array:
@@ -60,10 +61,10 @@ class Nonlinear:
         linear, angular = v[PIN_LINEAR], v[PIN_ANGULAR]
         rate = state.velocities(a)
         if state.axes[1]:
-            rate[LINEAR] += np.cross(angular, linear)  # of the velocity's reference-axis components
+            rate[LINEAR] += skew(angular).dot(linear)  # of the velocity's reference-axis components
         return np.concatenate(
             (
-                0.5 * (chart.q0 * angular + np.cross(chart.q_b, angular)),
+                0.5 * (chart.q0 * angular + skew(chart.q_b).dot(angular)),
                 chart.R @ linear,
                 state.velocities(v)[6:],
                 state.to_frame(chart, rate[:, None])[:, 0],
@@ -86,14 +87,10 @@ class ErrorDynamics(Nonlinear):
 
     def passing(self, x: Array, motion: tuple[Array, Array, Array], t: float) -> Array:
         """Return the error when reference and robot, at x, have both moved on for a time t."""
-        error = super().passing(x, motion, t)
-        robot = self.state.robot
-        q, v, _ = motion
-        q_star = pin.integrate(robot.model, self._q, t * self._v)
-        reference = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(q_star[:7])
-        moved = StateMap(robot, reference=reference, frame="local")
-        error[:6] = moved.to_state(pin.integrate(robot.model, q, t * v), v)[:6]
-        error[6:] -= t * np.concatenate((self.state.velocities(self._v)[6:], self._a))
+        model, (q, v, a) = self.state.robot.model, motion
+        ahead = pin.integrate(model, self._q, t * self._v), self._v
+        error = moving_error(self.state, *ahead, pin.integrate(model, q, t * v), v + t * a)
+        error[-len(self._a) :] -= t * self._a
         return error
 
     def __call__(self, x: Array, u: Array) -> Array:
@@ -102,19 +99,26 @@ class ErrorDynamics(Nonlinear):
         q, v, a = self.acceleration(x, u)
         chart = state.chart(q)
         (linear, angular), (at_linear, at_angular) = (w[:6].reshape(2, 3) for w in (v, self._v))
-        turning = chart.q0 * (angular - at_angular) + np.cross(chart.q_b, angular + at_angular)
-        flying = chart.R @ linear - at_linear - np.cross(at_angular, x[g.r_b])
+        turning = chart.q0 * (angular - at_angular) + skew(chart.q_b).dot(angular + at_angular)
+        flying = chart.R @ linear - at_linear - skew(at_angular).dot(x[g.r_b])
         rates = state.velocities(v)[6:] - state.velocities(self._v)[6:]
         return np.concatenate((0.5 * turning, flying, rates, state.velocities(a) - self._a))
 
 
-def jacobian(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:
-    """Return the slopes of f at a point by sixth-order central differences of the given steps."""
+def jacobian(
+    f: Callable[[Array], Array], point: Array, steps: Array, curved: Array | None = None
+) -> Array:
+    """Return the slopes of f at a point by sixth-order central differences of the given steps.
 
-    def slope(along: Array) -> Array:
-        return _derivative(lambda t: f(point + t * along), 1.0)
-
-    return np.column_stack([slope(along) for along in np.diag(steps)]) / steps
+    Where an entry is not `curved`, f is at most quadratic in it and one difference is exact.
+    """
+    slopes = [
+        _derivative(lambda t, along=along: f(point + t * along), 1.0)
+        if curved is None or curved[i]
+        else 0.5 * (f(point + along) - f(point - along))
+        for i, along in enumerate(np.diag(steps))
+    ]
+    return np.column_stack(slopes) / steps
 
 
 def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array, Array]:
