@@ -35,6 +35,7 @@ class Aba:
         self._model = robot.model.copy()
         self._model.gravity.linear = np.array(robot.gravity)
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
+        self._resists = any(values.any() for values in robot.passive)
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 
     def acceleration(self, q: Array, v: Array, u: Array, tau: Array | None = None) -> Array:
@@ -42,7 +43,9 @@ class Aba:
 
         `tau` (nv,), in Pinocchio's order, is a force besides.
         """
-        forces = self.actuation.torques(u) + self._passive_force(q, v)
+        forces = self.actuation.torques(u)
+        if self._resists:
+            forces += self._passive_force(q, v)
         if tau is not None:
             forces += self.state.forces(tau)
         return self._accelerate(self._model, q, v, forces, self._wrenches(q, v, u))

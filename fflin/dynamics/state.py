@@ -265,8 +265,11 @@ class StateMap:
         return v.take(self._order, axis=-1)
 
     def spread(self, nu: Array) -> Array:
-        """Return Pinocchio's v (nv,) of (omega_b, v_b, qdot_m) in base axes: v = S nu."""
-        v = nu.take(self._place)
+        """Return Pinocchio's v (nv,) of (omega_b, v_b, qdot_m) in base axes: v = S nu.
+
+        Without mimic joints of many rows too.
+        """
+        v = nu.take(self._place, axis=-1)
         for joint, leader, multiplier, _ in self.robot.followers:
             v[joint.idx_v] = multiplier * v[leader.idx_v]
         return v

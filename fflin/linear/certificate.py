@@ -163,10 +163,11 @@ def compare(state: StateMap, lin: LinearModel, M: Array, A: Array, B: Array) -> 
     blocks = []
     for row, rows in groups.items():
         for column, columns in groups.items():
-            scales = mobility, input_mobility, *of_point
-            cancelling = _cancelling_terms(state, lin, scales, row, column)
-            scale = max(_largest(scaled_A[rows, columns]), cancelling) or 1.0
-            error = _largest(difference_A[rows, columns]) / scale
+            error = _largest(difference_A[rows, columns])
+            if error:
+                scales = mobility, input_mobility, *of_point
+                cancelling = _cancelling_terms(state, lin, scales, row, column)
+                error /= max(_largest(scaled_A[rows, columns]), cancelling) or 1.0
             blocks.append(Block("A", row, column, error))
         for column, columns in inputs.items():
             blocks.append(Block("B", row, column, _largest(difference_B[rows, columns])))
@@ -192,7 +193,7 @@ def _cancelling_terms(
     mobility, input_mobility, (speed, rate, momentum), steepest = scales
     steepness = steepest if column == "q_b" else 1.0
     # What the momentum of wheels does to a turning link, in the units of the rows.
-    spin = momentum * _largest(mobility[np.r_[ANGULAR, 6 : len(mobility)]])
+    spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
     still = speed.copy()
     still[LINEAR] *= _ROUNDING_SHARE
     moving = {"omega_b", "v_b", "qdot_m"}

@@ -24,7 +24,14 @@ from fflin.linear.certificate import (
     speeds,
 )
 from fflin.linear.model import LinearModel
-from fflin.linear.nonlinear import ErrorDynamics, Nonlinear, difference_steps, flow_error, jacobian
+from fflin.linear.nonlinear import (
+    ErrorDynamics,
+    Nonlinear,
+    difference_steps,
+    flow_error,
+    jacobian,
+    slopes,
+)
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
@@ -162,7 +169,7 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     ]
     rows += [
         Row("differences", f"{b.matrix}[{b.row}, {b.column}]", b.error, difference)
-        for b in compare(state, lin, M, *_differences(model, lin, M))
+        for b in compare(state, lin, M, *slopes(model, lin, M))
     ]
     rows += _output_rows(model, lin, M, difference)
     rows.append(Row("flow", "f", flow_error(robot, lin), difference))
@@ -209,17 +216,6 @@ def _point_errors(
         floor = float(natural[rows].max(initial=0.0)) or float(np.abs(rate[rows]).max(initial=1.0))
         errors.append((f"f0[{name}]", _relative(lin.f0[rows], rate[rows], floor=floor or 1.0)))
     return errors
-
-
-def _differences(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
-    """Return A and B by central differences of the nonlinear model."""
-    step, push = difference_steps(model.state, lin, M)
-    # f is quadratic in velocities, and linear in inputs and in where the base is.
-    curved = np.arange(len(step)) < len(step) - len(M)
-    curved[model.state.groups.r_b] = False
-    A = jacobian(lambda x: model(x, lin.u0), lin.x0, step, curved)
-    B = jacobian(lambda u: model(lin.x0, u), lin.u0, push, np.zeros(len(push), dtype=bool))
-    return A, B
 
 
 def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float) -> list[Row]:

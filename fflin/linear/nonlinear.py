@@ -1,19 +1,19 @@
 """The nonlinear model in the chart, its slopes by differences, and the flow that it must follow."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.rotation import rotation_matrix, skew
+from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
+from fflin.dynamics.chart import Chart, times
 from fflin.dynamics.state import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR, StateMap
-from fflin.dynamics.state_rows import moving_error
+from fflin.dynamics.state_rows import moving_error, points_of
 from fflin.linear.certificate import mobilities
 from fflin.linear.model import LinearModel
-from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
 # Where the base flies faster than this [m/s], the rounding of its speed would hide the rest.
@@ -39,15 +39,22 @@ class Nonlinear:
 
     def acceleration(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return (q, v, a) in Pinocchio's order."""
-        q, v = self.state.to_pinocchio(x)
-        u = self.aba.actuation.in_base_axes(self.state.chart(q), u)
-        seen, observer = v.copy(), rotation_matrix(q[3:7]).T @ self._observer
-        seen[PIN_LINEAR] -= observer
-        a = self.aba.acceleration(q, seen, u).copy()
-        a[PIN_LINEAR] -= skew(v[PIN_ANGULAR]).dot(observer)
-        return q, v, a
+        _, q, v, a = self._accelerations(x[None], u[None])
+        return q[0], v[0], a[0]
 
-    def passing(self, x: Array, motion: tuple[Array, Array, Array], t: float) -> Array:
+    def _accelerations(self, x: Array, u: Array) -> tuple[Chart, Array, Array, Array]:
+        """Return the chart, q, v and a of rows."""
+        chart, q, v = points_of(self.state, x)
+        u = self.aba.actuation.in_base_axes(chart, u)
+        observer = self._observer @ rotation_matrices(q[:, 3:7])
+        seen = v.copy()
+        seen[:, PIN_LINEAR] -= observer
+        rows = zip(q, seen, u, strict=True)
+        a = np.array([self.aba.acceleration(*each).copy() for each in rows])
+        a[:, PIN_LINEAR] -= times(skew(v[:, PIN_ANGULAR]), observer)
+        return chart, q, v, a
+
+    def passing(self, x: Array, motion: Sequence[Array], t: float) -> Array:
         """Return the state a time t after x on a motion that has (q, v, a) there."""
         q, v, a = motion
         after = pin.integrate(self.state.robot.model, q, t * v)
@@ -55,21 +62,21 @@ class Nonlinear:
 
     def __call__(self, x: Array, u: Array) -> Array:
         """Return dx/dt (nx,)."""
+        return self.rates(x[None], u[None])[0]
+
+    def rates(self, x: Array, u: Array) -> Array:
+        """Return dx/dt (N, nx) of rows x (N, nx) and u (N, nu)."""
         state = self.state
-        q, v, a = self.acceleration(x, u)
-        chart = state.chart(q)
-        linear, angular = v[PIN_LINEAR], v[PIN_ANGULAR]
+        chart, _, v, a = self._accelerations(x, u)
+        linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
         rate = state.velocities(a)
         if state.axes[1]:
-            rate[LINEAR] += skew(angular).dot(linear)  # of the velocity's reference-axis components
-        return np.concatenate(
-            (
-                0.5 * (chart.q0 * angular + skew(chart.q_b).dot(angular)),
-                chart.R @ linear,
-                state.velocities(v)[6:],
-                state.to_frame(chart, rate[:, None])[:, 0],
-            )
-        )
+            # Of the velocity's reference-axis components.
+            rate[:, LINEAR] += times(skew(angular), linear)
+        turning = chart.q0 * angular + times(skew(chart.q_b), angular)
+        flying, rates = times(chart.R, linear), state.velocities(v)[:, 6:]
+        rate = state.to_frame(chart, rate[..., None])[..., 0]
+        return np.concatenate((0.5 * turning, flying, rates, rate), axis=1)
 
 
 class ErrorDynamics(Nonlinear):
@@ -85,7 +92,7 @@ class ErrorDynamics(Nonlinear):
         self._q[:3] = 0.0
         self._a = state.velocities(self.acceleration(lin.x0, lin.u0)[2])
 
-    def passing(self, x: Array, motion: tuple[Array, Array, Array], t: float) -> Array:
+    def passing(self, x: Array, motion: Sequence[Array], t: float) -> Array:
         """Return the error when reference and robot, at x, have both moved on for a time t."""
         model, (q, v, a) = self.state.robot.model, motion
         ahead = pin.integrate(model, self._q, t * self._v), self._v
@@ -93,32 +100,50 @@ class ErrorDynamics(Nonlinear):
         error[-len(self._a) :] -= t * self._a
         return error
 
-    def __call__(self, x: Array, u: Array) -> Array:
-        """Return the rate of the error (nx,)."""
-        state, g = self.state, self.state.groups
-        q, v, a = self.acceleration(x, u)
-        chart = state.chart(q)
-        (linear, angular), (at_linear, at_angular) = (w[:6].reshape(2, 3) for w in (v, self._v))
-        turning = chart.q0 * (angular - at_angular) + skew(chart.q_b).dot(angular + at_angular)
-        flying = chart.R @ linear - at_linear - skew(at_angular).dot(x[g.r_b])
-        rates = state.velocities(v)[6:] - state.velocities(self._v)[6:]
-        return np.concatenate((0.5 * turning, flying, rates, state.velocities(a) - self._a))
+    def rates(self, x: Array, u: Array) -> Array:
+        """Return the rates of the error (N, nx) of rows."""
+        state = self.state
+        chart, _, v, a = self._accelerations(x, u)
+        linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
+        at_linear, at_angular = self._v[PIN_LINEAR], self._v[PIN_ANGULAR]
+        turning = chart.q0 * (angular - at_angular)
+        turning += times(skew(chart.q_b), angular + at_angular)
+        flying = times(chart.R, linear) - at_linear - x[:, state.groups.r_b] @ skew(at_angular).T
+        rates = state.velocities(v - self._v)[:, 6:]
+        return np.concatenate((0.5 * turning, flying, rates, state.velocities(a) - self._a), axis=1)
 
 
-def jacobian(
-    f: Callable[[Array], Array], point: Array, steps: Array, curved: Array | None = None
-) -> Array:
-    """Return the slopes of f at a point by sixth-order central differences of the given steps.
+def slopes(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
+    """Return A and B of a model's point by central differences, of sixth order where they bend.
 
-    Where an entry is not `curved`, f is at most quadratic in it and one difference is exact.
+    f is quadratic in the velocities, and linear in the inputs and in where the base is.
     """
-    slopes = [
-        _derivative(lambda t, along=along: f(point + t * along), 1.0)
-        if curved is None or curved[i]
-        else 0.5 * (f(point + along) - f(point - along))
-        for i, along in enumerate(np.diag(steps))
-    ]
-    return np.column_stack(slopes) / steps
+    groups, nx, x0, u0 = model.state.groups, len(lin.x0), lin.x0, lin.u0
+    step, push = difference_steps(model.state, lin, M)
+    bends = np.arange(nx) < nx - len(M)
+    bends[groups.r_b] = False
+    curved, straight = np.diag(step)[bends], np.diag(step)[~bends]
+    ways = np.concatenate((*(k * curved for k in (1, 2, 3)), straight))
+    pushes = np.diag(push)
+    x = np.concatenate((x0 + ways, x0 - ways, np.tile(x0, (2 * len(push), 1))))
+    u = np.concatenate((np.tile(u0, (2 * len(ways), 1)), u0 + pushes, u0 - pushes))
+    of_x, of_u = np.split(model.rates(x, u), [2 * len(ways)])
+    first, last = np.split(of_x, 2)
+    parts = np.split(first - last, [len(curved) * k for k in (1, 2, 3)])
+    A: Array = np.empty((nx, nx))
+    A[:, bends] = np.tensordot(_WEIGHTS, parts[:3], axes=1).T
+    A[:, ~bends] = 0.5 * parts[3].T
+    first, last = np.split(of_u, 2)
+    return A / step, 0.5 * (first - last).T / push
+
+
+def jacobian(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:
+    """Return the slopes of f at a point by sixth-order central differences of the given steps."""
+
+    def slope(along: Array) -> Array:
+        return _derivative(lambda t: f(point + t * along), 1.0)
+
+    return np.column_stack([slope(along) for along in np.diag(steps)]) / steps
 
 
 def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array, Array]:
@@ -152,17 +177,17 @@ def flow_error(robot: Robot, lin: LinearModel) -> float:
     turned = pin.SE3(lin.reference.rotation, np.zeros(3))
     state = StateMap(robot, reference=turned, frame=lin.frame)
     model = (ErrorDynamics if lin.moving else Nonlinear)(state, lin)
+    x = np.tile(lin.x0, (7, 1))
+    x[:, state.groups.r_b] = 0.0
+    x[1:, 6 + robot.n : 12 + robot.n] += np.eye(6)
+    u = np.tile(lin.u0, (7, 1))
+    chart, *motions = model._accelerations(x, u)
     worst = 0.0
-    for unit in (None, *range(6)):
-        x = lin.x0.copy()
-        x[state.groups.r_b] = 0.0
-        if unit is not None:
-            x[6 + robot.n + unit] += 1.0
-        motion = _, v, _ = model.acceleration(x, lin.u0)
-        h = 1e-2 * float(state.chart(motion[0]).q0) / (1.0 + float(np.abs(v[3:]).max()))
-        rate = _derivative(partial(model.passing, x, motion), h)
+    for at, q0, expected, *motion in zip(x, chart.q0, model.rates(x, u), *motions, strict=True):
+        v = motion[1]
+        h = 1e-2 * float(q0[0]) / (1.0 + float(np.abs(v[3:]).max()))
+        rate = _derivative(partial(model.passing, at, motion), h)
         floor = 1.0 + float(np.abs(v).max())
-        expected = model(x, lin.u0)
         scale = max(floor, float(np.abs(expected).max()))
         worst = max(worst, float(np.abs(expected - rate).max()) / scale)
     return worst

@@ -1,12 +1,17 @@
 """The linear model along a motion."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.integrate import solve_ivp
 
 import fflin
+from fflin.linear import trajectory_sampling
 from tests.support.motions import motion
+from tests.support.robots import random_point
 
 
 def test_knots_are_the_moving_models_and_errors_are_carried_along():
@@ -136,3 +141,140 @@ def test_holding_still_in_gravity_is_a_motion():
     t = np.linspace(0.0, 1.0, 5)
     still = (np.tile(x, (len(t), 1)) for x in (q, np.zeros(robot.nv), u))
     assert fflin.linearize_trajectory(robot, t, *still).residual.max() < 1e-9
+
+
+def held_motion(robot, **options):
+    """A motion under inputs that are held for 0.1 s each."""
+    u = 0.3 * np.random.default_rng(4).normal(size=(4, 6 + robot.n))
+    u[:, 6:] *= 0.1
+    q0, v0, _ = random_point(robot, np.random.default_rng(1))
+    run = fflin.simulate(
+        *(robot, lambda t, q, v: u[min(int(10.0 * t + 1e-9), 3)]),
+        **{"q0": q0, "v0": 0.3 * v0, "duration": 0.4, "dt": 0.002, "sample": 0.1, "every": 10},
+        **options,
+    )
+    return run.trajectory()
+
+
+def transition(along, start, end):
+    """What the variational equation makes of the error and of a held du, by DOP853."""
+    linearizer = fflin.Linearizer(along.robot, moving=True)
+    nx, nu = along.B.shape[1:]
+    y = np.eye(nx, nx + nu).ravel()
+    inner = along.t[(along.t > start + 1e-9) & (along.t < end - 1e-9)]
+    for first, last in pairwise([start, *inner, end]):
+
+        def rate(t, y, last=last):
+            lin = linearizer(*along.point(min(t, last - 1e-12)))
+            held = np.eye(nx + nu)[nx:] + 0.0
+            return (lin.A @ y.reshape(nx, -1) + lin.B @ held).ravel()
+
+        y = solve_ivp(rate, (first, last), y, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
+    return y.reshape(nx, -1)
+
+
+def test_samples_are_those_of_the_variational_equation():
+    robot = fflin.load("astrobee_arm", gravity=(0.0, 0.1, -0.2), damping=0.05)
+    for motion_ in (held_motion(robot, frame="hybrid"), fflin.Trajectory(robot, *motion(robot))):
+        along = fflin.linearize_trajectory(robot, motion_, strict=True)
+        for dt in (0.2, 0.05, 0.01):
+            sampled = along.discretize(dt)
+            count = round(0.4 / dt)
+            assert (sampled.dt, len(sampled), len(sampled.t)) == (dt, count, count + 1)
+            for k in (0, count // 2, count - 1):
+                expected = transition(along, sampled.t[k], sampled.t[k + 1])
+                found = np.column_stack((sampled.A[k], sampled.B[k]))
+                size = np.abs(expected).max(axis=0)
+                assert (np.abs(found - expected) / size).max() < 1e-8
+                assert (sampled[k].A == sampled.A[k]).all()
+                assert sampled[k].dt == dt
+                assert (sampled.matrices(float(sampled.t[k]) + 0.3 * dt)[1] == sampled.B[k]).all()
+    with pytest.raises(fflin.InputError, match=r"dt is 0\.3 s, expected a part of the 0\.4 s"):
+        along.discretize(0.3)
+    with pytest.raises(fflin.InputError, match=r"sampled already, at dt = 0\.01 s"):
+        sampled.discretize(0.1)
+    with pytest.raises(fflin.InputError, match="give the continuous one, and sample="):
+        fflin.tvlqr(sampled, 1.0, 1.0, 1.0)
+
+
+def test_a_step_of_the_transition_is_of_order_four(monkeypatch):
+    robot = fflin.load("ets_vii")
+    t, q, v, u = motion(robot, knots=3)
+    along = fflin.linearize_trajectory(robot, fflin.Trajectory(robot, t, q, v, u))
+    exact = transition(along, 0.0, 0.2)
+    errors = []
+    for parts in (1, 2, 4):
+        monkeypatch.setattr(trajectory_sampling, "_MOST_PARTS", parts)
+        found = next(trajectory_sampling.transitions(along, 0.2))[1]
+        errors.append(np.abs(found - exact).max())
+    assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx([4.0, 4.0], abs=0.5)
+
+
+def test_at_rest_samples_are_those_of_one_model():
+    robot = fflin.load("ets_vii")
+    t = np.linspace(0.0, 1.0, 3)
+    q = np.tile(robot.neutral(), (3, 1))
+    along = fflin.linearize_trajectory(robot, t, q, np.zeros((3, 12)), np.zeros((3, 12)))
+    sampled, lin = along.discretize(0.25), fflin.linearize(robot, moving=True).discretize(0.25)
+    for k in range(4):
+        assert sampled.A[k] == pytest.approx(lin.A, abs=1e-15)
+        assert sampled.B[k] == pytest.approx(lin.B, abs=1e-15)
+
+
+@pytest.fixture(scope="module")
+def watched():
+    robot = fflin.load("planar_detumble", outputs=[fflin.Gyroscope("base"), fflin.JointPositions()])
+    return robot, fflin.linearize_trajectory(robot, held_motion(robot))
+
+
+def test_its_items_are_the_models_at_the_knots(watched):
+    robot, along = watched
+    assert (len(along), along.output_names) == (21, along[0].output_names)
+    lin = fflin.linearize(robot, along.q[3], along.v[3], along.u_base[3], moving=True)
+    for name in "ABCD":
+        assert (getattr(along, name)[3] == getattr(lin, name)).all()
+    assert (along.y[3] == lin.y0).all()
+    assert [model.fingerprint for model in along][3] == lin.fingerprint == along[3].fingerprint
+    assert along[-1].fingerprint == along[20].fingerprint
+    with pytest.raises(IndexError):
+        along[21]
+    assert fflin.check(robot, along[7]).ok
+
+
+def test_a_check_goes_along_it(watched):
+    robot, along = watched
+    short = fflin.linearize_trajectory(
+        robot, along.t[:4], along.q[:4], along.v[:4], along.u[:3], frame="hybrid"
+    )
+    found = short.check()
+    assert found.ok
+    assert "planar_detumble, 4 knots" in str(found)
+    each = [fflin.check(robot, lin) for lin in short]
+    assert found.max_error == max(check.max_error for check in each)
+    wrong = short.A.copy()
+    wrong[2, 12, 10] *= 1.0 + 1e-6
+    found = replace(short, A=wrong).check()
+    assert {(row.test, row.block) for row in found.failures} == {
+        ("ABA derivatives", "A[v_b, omega_b]"),
+        ("differences", "A[v_b, omega_b]"),
+    }
+
+
+@pytest.mark.parametrize("ending", ["npz", "mat", "json"])
+def test_it_is_saved_and_loaded(watched, tmp_path, ending):
+    robot, along = watched
+    for thing in (along, along.discretize(0.05)):
+        thing.save(tmp_path / f"ltv.{ending}")
+        again = fflin.LinearTrajectory.load(tmp_path / f"ltv.{ending}", robot)
+        for name in ("t", "q", "v", "u", "A", "B", "C", "D", "y", "residual"):
+            assert (getattr(again, name) == getattr(thing, name)).all()
+        assert (again.hold, again.frame, again.dt) == ("previous", "hybrid", thing.dt)
+        assert again.verified
+        assert again[2].fingerprint == thing[2].fingerprint
+    with pytest.raises(fflin.FflinError):
+        fflin.LinearTrajectory.load(tmp_path / f"ltv.{ending}", fflin.load("ets_vii"))
+    fflin.linearize(robot).save(tmp_path / f"lin.{ending}")
+    with pytest.raises(fflin.FileError, match="not a LinearTrajectory saved by fflin"):
+        fflin.LinearTrajectory.load(tmp_path / f"lin.{ending}", robot)
+    with pytest.raises(fflin.FileError, match=r"ends in '\.csv', expected one of"):
+        along.save(tmp_path / "ltv.csv")
