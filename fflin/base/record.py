@@ -38,6 +38,7 @@ DAMAGED = f"its content is not what its {SEAL} says: it was damaged or edited"
 NOT_VERIFIED = f"not verified: read from a file without a {SEAL}, which could tell damage"
 
 _BLOCK = 2**22
+_LARGEST = 1e300
 _JSON_SEAL = re.compile(rb',\n"sha256": "([0-9a-f]{64})"\n}\n\Z')
 _MAT_TEXT, _MAT_SEAL = 116, b"MATLAB 5.0 MAT-file, by fflin, sha256 "
 _MAT_NEARLY = re.compile(rb"[0-9a-f]{64}|, by fflin", re.IGNORECASE)  # a header that was sealed
@@ -236,6 +237,8 @@ class Design(FrozenArrays):
 
     # Names of the arrays of one dimension, which Matlab does not know.
     VECTORS: ClassVar[tuple[str, ...]] = ()
+    # Those that may be infinite, which JSON does not know: written as the largest double.
+    OPEN: ClassVar[tuple[str, ...]] = ()
 
     verified: bool = field(default=True, kw_only=True)
 
@@ -255,6 +258,8 @@ class Design(FrozenArrays):
         record: Record = {"kind": type(self).__name__}
         for item in _saved(type(self)):
             value = getattr(self, item.name)
+            if item.name in self.OPEN:
+                value = np.nan_to_num(value, nan=np.nan)
             record[item.name] = list(value) if isinstance(value, tuple) else value
         write_record(as_path(path), record, sealed=self.verified)
 
@@ -311,4 +316,6 @@ def _value(cls: type[Design], item: Field[Any], raw: Any) -> Any:
     if array.dtype.kind not in "fiuc" or not np.isfinite(array).all():
         raise ValueError(f"{item.name} is not an array of finite numbers")
     array = array.astype(complex if array.dtype.kind == "c" else float)
+    if item.name in cls.OPEN:
+        array[np.abs(array) > _LARGEST] = np.copysign(np.inf, array[np.abs(array) > _LARGEST])
     return array.ravel() if item.name in cls.VECTORS else array

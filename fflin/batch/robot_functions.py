@@ -41,13 +41,13 @@ def functions_of(
         }
     from fflin.linear.certificate import certify, inertia_matrix
     from fflin.linear.ignorable import ignorable_states
-    from fflin.robot.limits import joint_limits
+    from fflin.robot.limits import magnitudes_of
 
     functions: dict[str, Any] = {
         "_certify": certify,
         "_inertia": inertia_matrix,
         "_ignorable": ignorable_states,
-        "_limits": joint_limits,
+        "_limits": magnitudes_of,
     }
     of_robot = {field: partial(function, robot) for field, function in functions.items()}
     return of_robot | {"_require_unchanged": robot.require_unchanged}

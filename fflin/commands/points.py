@@ -22,7 +22,10 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
     """Load the robot with the passive joints, inputs, outputs and gravity that are given."""
     from fflin.robot.loading import load
 
-    robot = load(arguments.robot, lock=once("--lock", arguments.lock))
+    with warnings.catch_warnings():
+        if getattr(arguments, "damping", []):  # it is asked for
+            warnings.filterwarnings("ignore", ".*: the damping of", FflinWarning)
+        robot = load(arguments.robot, lock=once("--lock", arguments.lock))
     fields: dict[str, Any] = {}
     for name in ("stiffness", "damping"):
         values = getattr(arguments, name, [])

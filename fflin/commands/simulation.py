@@ -109,7 +109,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     left = _leave_earlier(arguments) if interrupted else []
 
     # Said when the files are there, which they are then even where nobody reads it to its end.
-    lines = [motion_report(motion, controlled=not arguments.free)]
+    lines = [motion_report(motion)]
     try:
         if arguments.output_file:
             motion.save(arguments.output_file)
@@ -199,7 +199,10 @@ def _without_thrusters(robot: Robot) -> Robot:
     others = tuple(each for each in robot.inputs if not isinstance(each, Thruster))
     if len(others) == len(robot.inputs):
         raise InputError(f"--allocate: '{robot.name}' has no thrusters; give --inputs with some")
-    base = tuple(each() for each in (BaseTorque, BaseForce) if each() not in others)
+    missing = [
+        kind for kind in (BaseTorque, BaseForce) if not any(isinstance(x, kind) for x in others)
+    ]
+    base = tuple(kind() for kind in missing)
     return robot.replace(inputs=(*base, *others))
 
 

@@ -4,61 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.names import by_name, input_keys
-from fflin.base.validation import DOUBLE, Array, as_double, dimension, number
-from fflin.dynamics.actuation import Actuation
-
-
-def limits_of(actuation: Actuation, limits: Any) -> tuple[Array, Array]:
-    """Return the least and the largest value (nu,) of each input.
-
-    Parameters
-    ----------
-    actuation : Actuation
-    limits : None, float or mapping
-        Largest magnitude of all inputs, or {name of an input, a group or a pattern: largest
-        magnitude, or (least, largest)}. A thruster never pulls.
-
-    Raises
-    ------
-    InputError
-        If a limit is negative or not a number, or a range is empty.
-    UnknownNameError
-        If there is no such input or group.
-    """
-    names, groups = actuation.names, actuation.groups
-    low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
-    if limits is None:
-        given: Mapping[str, Any] = {}
-    elif isinstance(limits, Mapping):
-        given = limits
-    else:
-        given = dict.fromkeys(groups, limits)
-    ranges = {name: _range(name, value) for name, value in given.items()}
-    for index, (least, largest) in by_name("input", ranges, input_keys(actuation)).items():
-        low[index], high[index] = least, largest
-    thrusters = groups.get("thrust", np.zeros(0, dtype=int))
-    low[thrusters] = np.maximum(low[thrusters], 0.0)
-    return low, high
-
-
-def _range(name: str, value: Any) -> tuple[float, float]:
-    if dimension(f"limit of '{name}'", value) == 1 and len(value) == 2:
-        least, largest = (number(f"limit of '{name}'", x) for x in value)
-    else:
-        largest = number(f"limit of '{name}'", value)
-        least = -largest
-    if least > largest:
-        raise InputError(
-            f"limit of '{name}' is {value}, expected a magnitude of 0 or more, or (least, largest)"
-        )
-    return least, largest
+from fflin.base.validation import DOUBLE, Array, as_double
+from fflin.control.saturation import Saturation
 
 
 class Law:
@@ -119,27 +72,33 @@ class Channel:
         Returns the command (nu,) of whatever it is given.
     initial : ndarray (nu,)
         What acts until the first command arrives.
-    low, high : ndarray (nu,)
+    limits : Saturation
     sample : int
         Steps between samples; 0 for a law that is asked at every stage of every step.
     delay : int
         Steps between a sample and its effect.
+    speeds : callable
+        Returns the speeds of the wheels that have a largest one, of whatever the law is given.
     """
 
     def __init__(
         self,
         law: Callable[..., Array],
         initial: Array,
-        low: Array,
-        high: Array,
+        limits: Saturation,
         sample: int,
         delay: int,
+        speeds: Callable[..., Array],
     ) -> None:
-        self._law, self._low, self._high = law, low, high
+        self._law, self._low, self._high = law, limits.low, limits.high
         self._sample, self._delay = sample, delay
-        self._limited = bool(np.isfinite(low).any() or np.isfinite(high).any())
-        self._pending: deque[tuple[int, Array]] = deque()
-        self._held = self._within(initial)
+        self._limited = bool(np.isfinite((limits.low, limits.high)).any())
+        self._wheels, self._speeds = limits.wheels, speeds
+        self._pulses = limits.pulses() if limits.pulses else None
+        initial = self._within(initial)
+        late = range(0, delay, sample) if sample else ()
+        self._pending: deque[tuple[int, Array]] = deque((step, initial) for step in late)
+        self._held = initial
 
     @property
     def continuous(self) -> bool:
@@ -151,14 +110,18 @@ class Channel:
         if not self._sample:
             return self.ask(*point)
         if step % self._sample == 0:
-            self._pending.append((step + self._delay, self.ask(*point)))
+            self._pending.append((step + self._delay, self._within(self._law(*point))))
         while self._pending and self._pending[0][0] <= step:
             self._held = self._pending.popleft()[1]
-        return self._held
+            if self._pulses:
+                self._pulses.begin(step, self._held)
+        u = self._pulses.at(step) if self._pulses else self._held
+        return u if self._wheels is None else self._wheels.cut(u, self._speeds(*point))
 
     def ask(self, *point: Any) -> Array:
-        """Return the law's command within its limits."""
-        return self._within(self._law(*point))
+        """Return what acts of the law's command at once."""
+        u = self._within(self._law(*point))
+        return u if self._wheels is None else self._wheels.cut(u, self._speeds(*point))
 
     def _within(self, u: Array) -> Array:
         return np.minimum(np.maximum(u, self._low), self._high) if self._limited else u

@@ -18,7 +18,7 @@ from fflin.robot.inputs import (
     JointTorque,
     ReactionWheel,
     WrenchInput,
-    named_wheels,
+    named_inputs,
 )
 from fflin.robot.robot import Robot
 
@@ -56,34 +56,28 @@ class Actuation:
         kinds: list[str] = []
         columns: list[Array] = []
         held: list[Held] = []
-        wheel_names = iter([name for name, _ in named_wheels(robot.inputs)])
         # Thrusters and wheels that are no joints, by the Pinocchio joint that carries them:
         # (input, wrench in its frame).
         carried: dict[int, list[tuple[int, Array]]] = {}
         identity = np.eye(nv)
-        for item in robot.inputs:
+        for item, own in named_inputs(robot.inputs):
             at = len(names)
+            names += own
             kind, unit = item.GROUP, item.UNIT
             if isinstance(item, BaseTorque | BaseForce):
                 torque = isinstance(item, BaseTorque)
                 rows = ANGULAR if torque else LINEAR
-                names += [f"{kind}.{axis}" for axis in "xyz"]
                 columns += list(identity[rows])
                 if state.axes[0 if torque else 1]:
                     held.append(Held(slice(at, at + 3), rows))
             elif isinstance(item, JointTorque):
                 index = robot.joints.index(robot.joint(item.joint))
                 unit = robot.joints[index].force_unit
-                names.append(f"{kind}.{item.joint}")
                 columns.append(identity[6 + index])
             elif isinstance(item, ReactionWheel) and item.inertia:
-                names.append(next(wheel_names))
-                columns.append(identity[6 + robot.joint_names.index(names[-1])])
+                columns.append(identity[6 + robot.joint_names.index(own[0])])
             else:
                 assert isinstance(item, WrenchInput)
-                wheel = isinstance(item, ReactionWheel)
-                own = getattr(item, "name", None) or f"{item.KEY}_{1 + kinds.count(kind)}"
-                names.append(next(wheel_names) if wheel else own)
                 joint, wrench = _carried(robot, item)
                 carried.setdefault(joint, []).append((at, wrench))
                 columns.append(np.zeros(nv))

@@ -180,7 +180,7 @@ def check(robot: Robot, lin: LinearModel) -> Check:
         inverse = lin.B[-len(M) :]  # all of it stands in B
     rows.append(Row("inertia", "M M^-1 = E", inertia_residual(M, inverse), route))
     rows += [Row("inertia", name, error, 1e-12) for name, error in _positive_definite(inverse)]
-    return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, cond(M) {condition:.1e}")
+    return Check(tuple(rows), f"{robot.name}, frame {lin.frame}, scaled cond(M) {condition:.1e}")
 
 
 def check_all(robot: Robot, models: Iterable[LinearModel], title: str) -> Check:

@@ -183,7 +183,9 @@ def flow_error(robot: Robot, lin: LinearModel) -> float:
     u = np.tile(lin.u0, (7, 1))
     chart, *motions = model._accelerations(x, u)
     worst = 0.0
-    for at, q0, expected, *motion in zip(x, chart.q0, model.rates(x, u), *motions, strict=True):
+    for at, q0, expected, *motion in zip(
+        x, np.asarray(chart.q0), model.rates(x, u), *motions, strict=True
+    ):
         v = motion[1]
         h = 1e-2 * float(q0[0]) / (1.0 + float(np.abs(v[3:]).max()))
         rate = _derivative(partial(model.passing, at, motion), h)

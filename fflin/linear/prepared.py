@@ -19,7 +19,7 @@ from fflin.dynamics.state import Frame, StateMap, unknown_frame
 from fflin.linear.certificate import certify, inertia_matrix
 from fflin.linear.ignorable import ignorable_states
 from fflin.linear.state_equations import at_rest
-from fflin.robot.limits import joint_limits
+from fflin.robot.limits import magnitudes_of
 from fflin.robot.massless import require_inertia
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
@@ -122,7 +122,7 @@ def prepare(
             "_inertia": partial(inertia_matrix, robot),
             "_certify": partial(certify, robot),
             "_ignorable": partial(ignorable_states, robot),
-            "_limits": partial(joint_limits, robot),
+            "_limits": partial(magnitudes_of, robot),
             "_require_unchanged": robot.require_unchanged,
         },
         rest={

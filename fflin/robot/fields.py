@@ -1,11 +1,13 @@
 """What of a robot its user may set: inputs, passive joints, gravity; checked once."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeAlias
 
-from fflin.base.errors import InputError, ModelError, unknown
-from fflin.base.names import joints_by_name
-from fflin.base.validation import number
+from fflin.base.errors import InputError, ModelError, UnknownNameError, unknown
+from fflin.base.names import by_name, joints_by_name
+from fflin.base.validation import dimension, number
 from fflin.robot.inputs import (
     KINDS,
     BaseForce,
@@ -13,13 +15,17 @@ from fflin.robot.inputs import (
     Input,
     JointTorque,
     Thruster,
+    named_inputs,
     named_wheels,
     three_numbers,
 )
 from fflin.robot.joints import Joint
 from fflin.robot.outputs import Output
 
-FIELDS = ("inputs", "outputs", "stiffness", "damping", "rest", "gravity")
+# The least and the largest value; infinite where there is no limit.
+Range: TypeAlias = tuple[float, float]
+
+FIELDS = ("inputs", "outputs", "stiffness", "damping", "rest", "gravity", "limits")
 
 
 def validated_fields(
@@ -33,7 +39,7 @@ def validated_fields(
     Parameters
     ----------
     fields : mapping
-        As `Robot.replace` takes them, but for inputs.
+        As `Robot.replace` takes them, but for inputs and limits.
     find : callable
         Returns the joint of a name or raises.
     joints : sequence of str
@@ -82,11 +88,58 @@ def validated_inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, .
             find(item.joint)
     names = [item.name for item in value if isinstance(item, Thruster) and item.name]
     names += [name for name, _ in named_wheels(value)]
-    plain = [item for item in value if isinstance(item, BaseTorque | BaseForce | JointTorque)]
+    kinds = BaseTorque | BaseForce | JointTorque
+    plain = [replace(x, min=None, max=None) for x in value if isinstance(x, kinds)]
     twice = [str(x) for x in (*names, *plain) if (*names, *plain).count(x) > 1]
     if twice:
         raise InputError(f"input {twice[0]} stands there twice")
     return tuple(value)
+
+
+def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> dict[str, Range]:
+    """Return {name of an input or state: (least, largest)} of what a caller gives.
+
+    Parameters
+    ----------
+    inputs : sequence of Input
+    joints : sequence of str
+    given : float or mapping
+        Largest magnitude of all inputs, or {name, group or pattern: largest magnitude, or (least,
+        largest)}. States may be named too. A thruster never pulls.
+
+    Raises
+    ------
+    InputError
+        If a limit is negative or not a number, or a range is empty.
+    UnknownNameError
+        If there is no such input, state or group.
+    """
+    names: list[str] = []
+    keys: list[str] = []
+    floors: list[float] = []
+    for item, own in named_inputs(inputs):
+        names += own
+        group = f"{item.GROUP}."
+        keys += [name if name.startswith(group) else group + name for name in own]
+        floors += [-math.inf if item.PULLS else 0.0] * len(own)
+    if not isinstance(given, Mapping):
+        given = dict.fromkeys(dict.fromkeys(item.GROUP for item in inputs), given)
+    ranges = {str(key): _range(key, value) for key, value in given.items()}
+    try:
+        found = by_name("input", ranges, keys)
+    except UnknownNameError:
+        states = states_of(joints)
+        names, floors = names + states, floors + [-math.inf] * len(states)
+        found = by_name("input or state", ranges, (*keys, *states))
+    return {
+        names[i]: (max(low, floors[i]), max(high, floors[i])) for i, (low, high) in found.items()
+    }
+
+
+def states_of(joints: Sequence[str]) -> list[str]:
+    """Return the names of the states of a robot with such joints."""
+    base = [f"{group}.{axis}" for group in ("q_b", "r_b", "omega_b", "v_b") for axis in "xyz"]
+    return base + [f"{group}.{name}" for group in ("q_m", "qdot_m") for name in joints]
 
 
 def _outputs(value: Any) -> tuple[Output, ...]:
@@ -110,3 +163,16 @@ def _by_joint(
         if what != "rest" and entry < 0.0:
             raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")
     return joints_by_name("joint", checked, joints, lambda name: find(name).name)
+
+
+def _range(name: str, value: Any) -> Range:
+    if dimension(f"limit of '{name}'", value) == 1 and len(value) == 2:
+        least, largest = (number(f"limit of '{name}'", x) for x in value)
+    else:
+        largest = number(f"limit of '{name}'", value)
+        least = -largest
+    if least > largest:
+        raise InputError(
+            f"limit of '{name}' is {value}, expected a magnitude of 0 or more, or (least, largest)"
+        )
+    return least, largest

@@ -3,7 +3,7 @@
 import re
 import reprlib
 import sys
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ else:
     import tomli as tomllib
 
 _TYPES = {kind.KEY: kind for kind in KINDS}
-_VECTORS, _NUMBERS = ("position", "direction", "axis"), ("inertia", "momentum")
+_VECTORS = ("position", "direction", "axis")
+_NUMBERS = ("inertia", "momentum", "max", "min", "max_speed", "least_impulse")
 
 # Some 1,000 inputs.
 _SIZE_LIMIT = 2**17
@@ -50,10 +51,15 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     ``base_torque``     none: `BaseTorque`
     ``base_force``      none: `BaseForce`
     ``joint_torque``    ``joint``: `JointTorque`
-    ``thruster``        ``frame``, ``position`` [m], ``direction`` and, if it is
-                        to have one, ``name``: `Thruster`
+    ``thruster``        ``frame``, ``position`` [m], ``direction`` and, as
+                        wanted, ``name``, ``on_off`` (true: pulses of ``max``),
+                        ``least_impulse`` [N s]: `Thruster`
     ``reaction_wheel``  ``axis`` and, as wanted, ``frame``, ``inertia`` [kg m^2]
-                        or ``momentum`` [N m s], ``name``: `ReactionWheel`
+                        with ``max_speed`` [rad/s], or ``momentum`` [N m s],
+                        ``name``: `ReactionWheel`
+    all                 as wanted, ``max`` and ``min`` [N m | N]: the largest
+                        and the least value; ``min`` is -max by default, 0 of a
+                        thruster. For the base one number or three
     ==================  =========================================================
 
     Parameters
@@ -97,7 +103,11 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
     seen: dict[Input | str | None, int] = {}
     for index, table in enumerate(document.tables):
         item = _input(document, index, table)
-        what = getattr(item, "name", item)
+        what = (
+            getattr(item, "name", "")
+            if hasattr(item, "name")
+            else replace(item, min=None, max=None)
+        )
         if what is not None and what in seen:
             shown = f"the name '{what}'" if isinstance(what, str) else what
             message = f"{shown} stands in line {document.line(seen[what])} already; take one out"
@@ -180,7 +190,8 @@ def _input(document: _Document, index: int, table: dict[str, Any]) -> Input:
     if not isinstance(kind, str) or kind not in _TYPES:
         shown = kind if isinstance(kind, str) else reprlib.repr(kind)
         raise document.unknown(index, "type", unknown("type of input", shown, _TYPES))
-    known = {field.name: field for field in fields(_TYPES[kind])}
+    by_keyword_last = sorted(fields(_TYPES[kind]), key=lambda field: field.kw_only is True)
+    known = {field.name: field for field in by_keyword_last}
     values = {key: value for key, value in table.items() if key != "type"}
     for key, value in values.items():
         if key not in known:
@@ -190,6 +201,10 @@ def _input(document: _Document, index: int, table: dict[str, Any]) -> Input:
             right, expected = _is_vector(value), "three finite numbers, [x, y, z]"
         elif key in _NUMBERS:
             right, expected = _is_number(value), "a finite number"
+            if key in ("max", "min") and len(_TYPES[kind].ENTRIES) > 1:
+                right, expected = right or _is_vector(value), "a finite number or three of them"
+        elif key == "on_off":
+            right, expected = isinstance(value, bool), "true or false"
         if not right:
             raise document.error(index, key, f"{key} is {reprlib.repr(value)}, expected {expected}")
     for key, field in known.items():

@@ -2,14 +2,15 @@
 
 import math
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias
 
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, number, refuse_masked
+from fflin.base.validation import Array, dimension, number, refuse_masked, truth
 
 Vector3: TypeAlias = Sequence[float]
 
@@ -21,20 +22,54 @@ class Input:
     Attributes
     ----------
     KEY : str
-        Its type in a TOML file; what has no name of its own is KEY_1, KEY_2, ...
+        Its type in a TOML file.
     GROUP : str
         What its inputs are called together, in weights and limits.
     UNIT : str
+    max : float, optional
+        What it does not exceed, in its unit; one number, or three for torque and force on the base.
+    min : float, optional
+        The least that it gives; by default -max, of a thruster 0.
     """
 
     KEY: ClassVar[str]
     GROUP: ClassVar[str]
     UNIT: ClassVar[str] = "N m"
+    ENTRIES: ClassVar[str] = " "
+    PULLS: ClassVar[bool] = True
+
+    max: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
+    min: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in ("max", "min"):
+            value, what = getattr(self, name), f"{self.KEY} {name}"
+            if value is not None:
+                several = len(self.ENTRIES) > 1 and dimension(what, value)
+                limit = three_numbers(what, value) if several else number(what, value)
+                object.__setattr__(self, name, limit)
+        for least, largest in self.ranges:
+            if largest <= 0.0:
+                raise InputError(f"{self.KEY} max is {largest:g}, expected more than 0, or none")
+            if least > largest:
+                raise InputError(f"{self.KEY} min is {least:g}, more than its max of {largest:g}")
+
+    @property
+    def ranges(self) -> tuple[tuple[float, float], ...]:
+        """(least, largest) of each of its entries; infinite where there is no limit."""
+        largest = np.broadcast_to(math.inf if self.max is None else self.max, len(self.ENTRIES))
+        usual = -largest if self.PULLS else 0.0
+        least = np.broadcast_to(usual if self.min is None else self.min, len(largest))
+        return tuple(zip(least.tolist(), largest.tolist(), strict=True))
 
     @property
     def frames(self) -> tuple[str, ...]:
         """The frames of the model that it is fixed in."""
         return ()
+
+    def names(self, count: int) -> tuple[str, ...]:
+        """Return the names of its entries in u, where it is the count-th of its kind."""
+        return tuple(f"{self.GROUP}.{entry}" for entry in self.ENTRIES)
 
 
 class WrenchInput(Input, ABC):
@@ -47,11 +82,16 @@ class WrenchInput(Input, ABC):
     """
 
     frame: str | None
+    name: str | None
 
     @property
     def frames(self) -> tuple[str, ...]:
         """The frames of the model that it is fixed in."""
         return () if self.frame is None else (self.frame,)
+
+    def names(self, count: int) -> tuple[str, ...]:
+        """Return its name in u; thruster_1, wheel_1 and so on where it has none of its own."""
+        return (self.name or f"{self.KEY.rpartition('_')[2]}_{count}",)
 
     @property
     @abstractmethod
@@ -61,16 +101,28 @@ class WrenchInput(Input, ABC):
 
 @dataclass(frozen=True)
 class BaseTorque(Input):
-    """Torque tau_b (3) [N m] on the base, in the axes that the velocity frame says."""
+    """Torque tau_b (3) [N m] on the base, in the axes that the velocity frame says.
 
-    KEY, GROUP = "base_torque", "tau_b"
+    Parameters
+    ----------
+    max, min : float or sequence of float (3,), optional
+        Limits [N m] of each of its entries, as for every input; by keyword.
+    """
+
+    KEY, GROUP, ENTRIES = "base_torque", "tau_b", "xyz"
 
 
 @dataclass(frozen=True)
 class BaseForce(Input):
-    """Force F_b (3) [N] at the base origin, in the axes that the velocity frame says."""
+    """Force F_b (3) [N] at the base origin, in the axes that the velocity frame says.
 
-    KEY, GROUP, UNIT = "base_force", "F_b", "N"
+    Parameters
+    ----------
+    max, min : float or sequence of float (3,), optional
+        Limits [N] of each of its entries; by keyword.
+    """
+
+    KEY, GROUP, UNIT, ENTRIES = "base_force", "F_b", "N", "xyz"
 
 
 @dataclass(frozen=True)
@@ -81,10 +133,16 @@ class JointTorque(Input):
     ----------
     joint : str
         An independent joint. What mimics it is driven with it.
+    max, min : float, optional
+        Limits [N m | N] in place of the URDF's effort; by keyword.
     """
 
     KEY, GROUP = "joint_torque", "tau_m"
     joint: str
+
+    def names(self, count: int) -> tuple[str, ...]:
+        """Return its name in u."""
+        return (f"{self.GROUP}.{self.joint}",)
 
 
 @dataclass(frozen=True)
@@ -101,15 +159,33 @@ class Thruster(WrenchInput):
         Along which the link is pushed, in that frame; of any length but zero.
     name : str, optional
         Name of the input; thruster_1, thruster_2, ... by default.
+    max, min : float, optional
+        Limits [N]; a thruster never pulls. By keyword, as what follows.
+    on_off : bool
+        Whether it knows `max` and nothing else: in `simulate` the command of a sample becomes a
+        pulse of `max` for its share of the sample, in whole steps; what is left over is carried
+        to the next sample, so that the impulse is right in the mean.
+    least_impulse : float, optional
+        [N s] of a sample, below which it does not fire; that is carried over too.
     """
 
-    KEY, GROUP, UNIT = "thruster", "thrust", "N"
+    KEY, GROUP, UNIT, PULLS = "thruster", "thrust", "N", False
     frame: str
     position: Vector3
     direction: Vector3
     name: str | None = None
+    on_off: bool = field(default=False, kw_only=True, repr=False)
+    least_impulse: float | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.ranges[0][0] < 0.0:
+            raise InputError(f"thruster min is {self.min}, expected 0 or more: it never pulls")
+        if truth("thruster on_off", self.on_off) and (self.max is None or self.min):
+            raise InputError("thruster on_off is set: it needs a max, which it pushes with, no min")
+        if self.least_impulse is not None:
+            impulse = _positive("thruster least_impulse", self.least_impulse, "N s")
+            object.__setattr__(self, "least_impulse", impulse)
         position = three_numbers("thruster position", self.position)
         object.__setattr__(self, "position", position)
         direction = _unit("thruster direction", self.direction, "where it pushes")
@@ -149,6 +225,11 @@ class ReactionWheel(WrenchInput):
         Name of the input, and of the joint if there is one; wheel_1, wheel_2, ... by default.
     momentum : float
         h [N m s] along the axis, relative to the carrier; of a wheel without inertia.
+    max, min : float, optional
+        Limits [N m] of the motor's torque; by keyword, as what follows.
+    max_speed : float, optional
+        Largest speed [rad/s] relative to the carrier, either way, of a wheel with an inertia J:
+        it stores up to J max_speed [N m s].
     """
 
     KEY, GROUP = "reaction_wheel", "wheel"
@@ -157,18 +238,24 @@ class ReactionWheel(WrenchInput):
     inertia: float | None = None
     name: str | None = None
     momentum: float = 0.0
+    max_speed: float | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         object.__setattr__(self, "axis", _unit("wheel axis", self.axis, "what it turns about"))
         object.__setattr__(self, "momentum", number("wheel momentum", self.momentum))
+        if self.max_speed is not None:
+            speed = _positive("wheel max_speed", self.max_speed, "rad/s")
+            object.__setattr__(self, "max_speed", speed)
+            if self.inertia is None:
+                raise InputError(
+                    f"wheel max_speed is {speed:g} rad/s, but its speed is no state; give it an "
+                    "inertia too"
+                )
         if self.inertia is None:
             return
-        inertia = number("wheel inertia", self.inertia)
-        if inertia <= 0.0:
-            raise InputError(
-                f"wheel inertia is {inertia:g} kg m^2, expected more than 0; leave it out for a "
-                "wheel of which only the momentum counts"
-            )
+        hint = "; leave it out for a wheel of which only the momentum counts"
+        inertia = _positive("wheel inertia", self.inertia, "kg m^2", hint)
         if self.momentum:
             raise InputError(
                 "wheel momentum is given beside an inertia, with which its speed is a state; leave "
@@ -197,6 +284,13 @@ def three_numbers(what: str, value: Vector3) -> tuple[float, float, float]:
     return x, y, z
 
 
+def _positive(what: str, value: float, unit: str, hint: str = "") -> float:
+    size = number(what, value)
+    if size <= 0.0:
+        raise InputError(f"{what} is {size:g} {unit}, expected more than 0{hint}")
+    return size
+
+
 def _unit(what: str, value: Vector3, hint: str) -> tuple[float, float, float]:
     """Return three numbers scaled to length 1, or raise `InputError` where they are zero."""
     x, y, z = three_numbers(what, value)
@@ -209,10 +303,20 @@ def _unit(what: str, value: Vector3, hint: str) -> tuple[float, float, float]:
     return x / length, y / length, z / length
 
 
+def named_inputs(inputs: Sequence[Input]) -> list[tuple[Input, tuple[str, ...]]]:
+    """Return inputs, each with the names of its entries in u."""
+    seen: Counter[str] = Counter()
+    found = []
+    for item in inputs:
+        seen[item.GROUP] += 1
+        found.append((item, item.names(seen[item.GROUP])))
+    return found
+
+
 def named_wheels(inputs: Sequence[Input]) -> list[tuple[str, ReactionWheel]]:
     """Return the wheels among inputs, each with its name: wheel_1, wheel_2, ... by default."""
-    wheels = [item for item in inputs if isinstance(item, ReactionWheel)]
-    return [(wheel.name or f"wheel_{k}", wheel) for k, wheel in enumerate(wheels, start=1)]
+    found = named_inputs(inputs)
+    return [(names[0], item) for item, names in found if isinstance(item, ReactionWheel)]
 
 
 def default_inputs(joint_names: Sequence[str]) -> tuple[Input, ...]:

@@ -1,28 +1,93 @@
-"""What the URDF says that a robot's joints can do."""
+"""What a robot can do: limits of its inputs, and of the speeds and travels of its joints."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, Any
+
+from fflin.base.errors import InputError
+from fflin.robot.fields import Range, given_limits, states_of
+from fflin.robot.inputs import JointTorque, ReactionWheel, named_inputs
 
 if TYPE_CHECKING:
+    from fflin.robot.joints import Joint
     from fflin.robot.robot import Robot
 
-# Pinocchio marks what the URDF does not limit by the largest double or by infinity.
-_NONE = 1e300
+_OPEN: Range = (-math.inf, math.inf)
 
 
-def joint_limits(robot: Robot) -> dict[str, float]:
-    """Return {name of an input or state: limit}, of those that the URDF limits.
+def limits_of(robot: Robot) -> dict[str, Range]:
+    """Return {name of an input or state: (least, largest)} of those that have a limit.
 
-    Of ``tau_m`` the largest effort [N m | N], of ``qdot_m`` the largest speed [rad/s | m/s], of
-    ``q_m`` the whole travel [rad | m]. A limit of zero, which exporters write for none, is none.
+    Of the URDF ``tau_m`` within the effort [N m | N], ``qdot_m`` within the velocity
+    [rad/s | m/s] and ``q_m`` within the travel [rad | m], where a limit of zero, which exporters
+    write for none, is none. Before it go `min` and `max` of the inputs and the speed of wheels,
+    and before those `Robot.limits`.
     """
-    model = robot.model
-    found = {}
+    found: dict[str, Range] = {}
     for joint in robot.joints:
-        found[f"tau_m.{joint.name}"] = float(model.effortLimit[joint.idx_v])
-        found[f"qdot_m.{joint.name}"] = float(model.velocityLimit[joint.idx_v])
-        if not joint.unbounded:
-            low, high = model.lowerPositionLimit, model.upperPositionLimit
-            found[f"q_m.{joint.name}"] = float(high[joint.idx_q]) - float(low[joint.idx_q])
-    return {name: value for name, value in found.items() if 0.0 < value < _NONE}
+        found[f"q_m.{joint.name}"] = _travel(robot, joint)
+        found[f"qdot_m.{joint.name}"] = _either(float(robot.model.velocityLimit[joint.idx_v]))
+    for item, names in named_inputs(robot.inputs):
+        found |= dict(zip(names, item.ranges, strict=True))
+        if isinstance(item, JointTorque) and item.max is None and item.min is None:
+            effort = robot.model.effortLimit[robot.joint(item.joint).idx_v]
+            found[names[0]] = _either(float(effort))
+        if isinstance(item, ReactionWheel) and item.max_speed is not None:
+            found[f"qdot_m.{names[0]}"] = _either(item.max_speed)
+    known = {*found, *states_of(robot.joint_names)}
+    found |= {name: limits for name, limits in robot.limits.items() if name in known}
+    return {name: limits for name, limits in found.items() if limits != _OPEN}
+
+
+def magnitudes_of(robot: Robot) -> dict[str, float]:
+    """Return {name of an input or state: limit}: of what is limited both ways, the lesser one.
+
+    Of ``q_m`` the whole travel, of a thruster its largest thrust. What is limited to zero, or not
+    at all, is left out.
+    """
+    sizes = {
+        name: largest - least if name.startswith("q_m.") or least >= 0.0 else min(-least, largest)
+        for name, (least, largest) in limits_of(robot).items()
+    }
+    return {name: size for name, size in sizes.items() if 0.0 < size < math.inf}
+
+
+def chosen_limits(robot: Robot, limits: Any) -> tuple[dict[str, Range], dict[str, Range]]:
+    """Return {name: (least, largest)} of what cuts the inputs of a run, and of all that is known.
+
+    `limits` is that of `simulate`: nothing, "urdf" for all that `limits_of` knows, what
+    `given_limits` takes, or a list of the two, where what is given goes first.
+    """
+    own = limits_of(robot)
+    parts = limits if isinstance(limits, list | tuple) else [limits]
+    words = [part for part in parts if isinstance(part, str)]
+    for word in words:
+        if word != "urdf":
+            raise InputError(
+                f"limits is '{word}', expected 'urdf', a largest magnitude, {{input: magnitude}}, "
+                "or ['urdf', {input: magnitude}]"
+            )
+    given: dict[str, Range] = {}
+    for part in parts if words else [limits]:
+        if part is not None and not isinstance(part, str):
+            given |= given_limits(robot.inputs, robot.joint_names, part)
+    return (own if words else {}) | given, own | given
+
+
+def _travel(robot: Robot, joint: Joint) -> Range:
+    if joint.unbounded:
+        return _OPEN
+    low = _known(float(robot.model.lowerPositionLimit[joint.idx_q]))
+    high = _known(float(robot.model.upperPositionLimit[joint.idx_q]))
+    return (low, high) if low < high else _OPEN
+
+
+def _either(size: float) -> Range:
+    """Return the range of a largest magnitude."""
+    return (-_known(size), _known(size)) if size > 0.0 else _OPEN
+
+
+def _known(limit: float) -> float:
+    # Pinocchio marks what the URDF does not limit by the largest double or by infinity.
+    return limit if abs(limit) < 1e300 else math.copysign(math.inf, limit)

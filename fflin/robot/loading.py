@@ -47,7 +47,7 @@ def load(
         Folders in which ``package://`` paths of meshes are looked up when the robot is drawn,
         before those that the URDF lies in.
     **fields
-        inputs, stiffness, damping, rest, gravity: see `Robot.replace`.
+        inputs, outputs, stiffness, damping, rest, gravity, limits: see `Robot.replace`.
 
     Returns
     -------
@@ -74,12 +74,13 @@ def load(
     found = find_robot(robot)
     description = read_urdf(found.path, found.prune)
     loaded = _robot(description.model, found.name, lock, description.mimics)
-    notes = description.notes
+    # Where it is asked for, the damping is in the model.
+    notes = [n for n in description.notes if "damping" not in fields or ": the damping of" not in n]
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
     if idle_coordinates(loaded):
         # No warning: whatever needs the inverse of M refuses with this.
-        notes = (*notes, massless_note(loaded))
+        notes.append(massless_note(loaded))
     folders = (*_folders(package_dirs), *found.package_dirs)
     # They are read when the robot is drawn, and no output may take their place before.
     meshes = (find_mesh(uri, found.path, folders) for uri in description.meshes)
@@ -88,7 +89,7 @@ def load(
         loaded,
         urdf=found.path,
         urdf_sha256=description.sha256,
-        notes=notes,
+        notes=tuple(notes),
         package_dirs=folders,
         urdf_damping=_independent_damping(loaded, description.damping),
     )

@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, vector
-from fflin.robot.fields import validated_fields, validated_inputs
+from fflin.robot.fields import Range, given_limits, validated_fields, validated_inputs
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.inputs import Input, default_inputs, named_wheels
 from fflin.robot.joints import Follower, Joint, check_followers_rates, followed
@@ -55,7 +55,7 @@ class Robot:
     urdf : Path or None
         The file it was read from.
     urdf_sha256 : str
-        Hash of that file; empty where there is none.
+        Hash of that file, and of the masses where they are others; empty where there is none.
     joints : tuple of Joint
         The n independent joints in state order, which is Pinocchio's.
     followers : tuple of Follower
@@ -79,6 +79,8 @@ class Robot:
         Uniform acceleration [m/s^2] in Pinocchio's world axes. `model` itself has none.
     package_dirs : tuple of Path
         Folders in which ``package://`` paths of meshes are looked up when it is drawn.
+    limits : mapping
+        {name of an input or state: (least, largest)} in place of what the URDF and the inputs say.
     """
 
     model: pin.Model
@@ -97,6 +99,7 @@ class Robot:
     rest: Mapping[str, float] = field(default_factory=dict)
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     package_dirs: tuple[Path, ...] = ()
+    limits: Mapping[str, Range] = field(default_factory=dict)
     # Where some of its joints are wheels: the same robot without them.
     _wheelless: Robot | None = None
     # The model, and what it was when the first robot of it was made.
@@ -128,6 +131,9 @@ class Robot:
             {joint: position [rad|m]} where its spring is relaxed.
         gravity : sequence of float (3,)
             Uniform acceleration [m/s^2] in Pinocchio's world axes.
+        limits : mapping
+            {name, group or pattern of inputs or states: largest magnitude, or (least, largest)},
+            in place of what the URDF and the inputs say of them.
 
         Returns
         -------
@@ -139,7 +145,7 @@ class Robot:
             If a value is negative or not a number, a field is not one of these, or a wheel has
             more inertia than what carries it.
         UnknownNameError
-            If there is no such joint, or no such frame for an input or output.
+            If there is no such joint, no such frame for an input or output, or nothing to limit.
         ModelError
             If dry friction is asked for, which is not differentiable at rest, or the robot's
             model was changed after it was made.
@@ -148,11 +154,78 @@ class Robot:
         robot = self
         if "inputs" in fields:
             robot = self._with_inputs(fields.pop("inputs"))
+        if "limits" in fields:
+            limits = given_limits(robot.inputs, robot.joint_names, fields.pop("limits"))
+            robot = replace(robot, limits=limits)
         own = (robot._wheelless or robot).joint_names
         robot = replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
         for name in robot.used_frames:
             find_frame(robot.model, name)
         return robot
+
+    def with_mass_properties(self, bodies: Mapping[str, Any]) -> Robot:
+        """Return the same robot with other masses.
+
+        Parameters
+        ----------
+        bodies : mapping
+            {body: {"mass": m [kg], "com": (3,) [m], "inertia": (3, 3) [kg m^2] about the centre of
+            mass} or pin.Inertia}, in the axes of the body's joint. A body is named by the joint
+            that moves it, ``base``, a pattern, or by its link where no other is fixed to it: links
+            that are fixed to each other are one body, whose properties are those of all together,
+            wheels included. What is left out stays; a mass without an inertia scales the inertia
+            with it, as another density does.
+
+        Returns
+        -------
+        Robot
+            With the pictures, names and inputs of this one, and another ``urdf_sha256``.
+
+        Raises
+        ------
+        InputError
+            If a mass is not positive, an inertia is that of no rigid body, or less than that of
+            the wheels in it.
+        UnknownNameError
+            If there is no such body or property.
+        """
+        from fflin.robot.mass_properties import with_bodies
+
+        return self._of_model(with_bodies((self._wheelless or self).model, bodies))
+
+    def perturbed(
+        self, *, mass: float = 0.1, com: float = 0.1, inertia: float = 0.1, seed: int = 0
+    ) -> Robot:
+        r"""Return the same robot with masses drawn at random, each body still a rigid body.
+
+        Each mass is multiplied by 1 + mass d with d uniform in [-1, 1]; each body is stretched
+        along the axes of its frame so that its second moments per mass are multiplied by
+        1 + inertia d, and its moments of inertia per mass by something in between; its centre of
+        mass is shifted along each axis by com d times the body's radius of gyration there. The
+        pseudo-inertia goes through a congruence, which keeps it positive.
+
+        Parameters
+        ----------
+        mass, com, inertia : float
+            Relative spreads, from 0 to less than 1.
+        seed : int
+            The same seed gives the same robot.
+
+        Returns
+        -------
+        Robot
+            As of `with_mass_properties`.
+
+        References
+        ----------
+        P. M. Wensing, S. Kim and J.-J. E. Slotine, Linear matrix inequalities for physically-
+        consistent inertial parameter identification, IEEE Robotics and Automation Letters 3(1),
+        2018.
+        """
+        from fflin.robot.mass_properties import perturbed
+
+        model = (self._wheelless or self).model
+        return self._of_model(perturbed(model, seed, mass=mass, com=com, inertia=inertia))
 
     @property
     def used_frames(self) -> tuple[str, ...]:
@@ -326,6 +399,18 @@ class Robot:
             rest=rest,
             _wheelless=bare if wheels else None,
         )
+
+    def _of_model(self, model: pin.Model) -> Robot:
+        """Return the robot with a model that has other masses and no wheels."""
+        from fflin.robot.mass_properties import identity
+
+        self.require_unchanged()
+        bare = self._wheelless or self
+        told = identity(self.urdf_sha256, model, bare.model)
+        other = replace(bare, model=model, urdf_sha256=told)
+        if self._wheelless is None:
+            return other
+        return replace(self, urdf_sha256=told, _wheelless=other)._with_inputs(self.inputs)
 
     def require_unchanged(self) -> None:
         """Raise `ModelError` where the model was changed in place after the robot was made.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -16,6 +17,7 @@ from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, check_ending, write_whole
+from fflin.simulation.passed import Limited, Passed, Saturated, passed, saturated
 
 FORMATS = (*record.FORMATS, ".csv")
 
@@ -42,7 +44,7 @@ class Motion(Design):
     u : ndarray (N, nu)
         What acted from t on, in the frame's axes; the last row repeats what acted to the end.
     target : ndarray (nx,)
-        The state that a feedback steers to; the initial one where there is none.
+        The state that is steered to, or one a row, (N, nx); empty where none is known.
     prediction : ndarray (N, nx)
         The state as the linear model has it under the same law; no rows where there is none.
     energy : ndarray (N,)
@@ -60,9 +62,21 @@ class Motion(Design):
     robot, urdf_sha256 : str
     stopped : str
         Why it ended before its time; empty where it did not.
+    wheels : tuple of str
+        The joints that are reaction wheels, whose angle is no error.
+    steered : tuple of str
+        The states that the policy is known to feed back; empty where that is not known.
+    notes : tuple of str
+        What is to be known of the run.
+    limit_names : tuple of str
+        The states and inputs that have limits.
+    limits : ndarray (k, 2)
+        Their least and largest values, infinite where there is none, whether or not the run was
+        kept within.
     """
 
-    VECTORS: ClassVar = ("t", "target", "energy", "momentum_drift", "com_drift", "placement")
+    OPEN: ClassVar = ("limits",)
+    VECTORS: ClassVar = ("t", "energy", "momentum_drift", "com_drift", "placement")
 
     t: Array
     q: Array
@@ -85,6 +99,11 @@ class Motion(Design):
     stopped: str
     com_drift: Array = field(default_factory=lambda: np.zeros(0))
     _robot: Any = field(default=None, kw_only=True)  # that was simulated; no file has it
+    wheels: tuple[str, ...] = field(default_factory=tuple)
+    steered: tuple[str, ...] = field(default_factory=tuple)
+    notes: tuple[str, ...] = field(default_factory=tuple)
+    limit_names: tuple[str, ...] = field(default_factory=tuple)
+    limits: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
         rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)
@@ -93,8 +112,11 @@ class Motion(Design):
             len(each) not in (0, len(self.t)) for each in may_lack
         ):
             raise InputError("the rows of the motion are not as many as its times")
+        if self.target.size in (0, self.x.shape[1]):  # of .mat, which knows no vectors
+            object.__setattr__(self, "target", self.target.ravel())
         if not len(self.prediction):  # of json, which knows no empty matrices
             object.__setattr__(self, "prediction", np.zeros((0, self.x.shape[1])))
+        object.__setattr__(self, "limits", self.limits.reshape(len(self.limit_names), 2))
         super().__post_init__()
 
     def __repr__(self) -> str:
@@ -116,21 +138,24 @@ class Motion(Design):
         return self.prediction if len(self.prediction) else None
 
     @property
-    def error(self) -> Array:
-        """The states less the target (N, nx)."""
-        difference: Array = self.x - self.target
-        return difference
+    def error(self) -> Array | None:
+        """The states less the target (N, nx); None where there is no target."""
+        return self.x - self.target if self.target.size else None
 
     @property
-    def attitude_error(self) -> Array:
-        """Angle (N,) [deg] between the base's attitude and the target's."""
-        at, to = self.x[:, :3], self.target[:3]
-        scalar = np.sqrt(np.maximum(0.0, 1.0 - (at * at).sum(axis=1)))
-        target_scalar = np.sqrt(max(0.0, 1.0 - float(to @ to)))
+    def attitude_error(self) -> Array | None:
+        """Angle (N,) [deg] between the base's attitude and the target's; None without target."""
+        if not self.target.size:
+            return None
+        at, to = self.x[:, :3], self.target[..., :3]
+        scalar, target_scalar = (
+            np.sqrt(np.maximum(0.0, 1.0 - (each * each).sum(axis=-1, keepdims=True)))
+            for each in (at, to)
+        )
         # The vector part of target^-1 at, whose length is that of half the angle's sine.
-        vector = target_scalar * at - scalar[:, None] * to - np.cross(to, at)
+        vector = target_scalar * at - scalar * to - np.cross(to, at)
         sines: Array = np.minimum(1.0, np.linalg.norm(vector, axis=1))
-        cosines = np.abs(target_scalar * scalar + at @ to)
+        cosines = np.abs(target_scalar * scalar + (at * to).sum(axis=1, keepdims=True))[:, 0]
         return np.degrees(2.0 * np.arctan2(sines, cosines))
 
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
@@ -169,6 +194,23 @@ class Motion(Design):
             u[-1] += share * u[i - len(before) - 1]
         smooth = Trajectory(robot, **values | {"hold": "linear", "u": u})
         return min(held, smooth, key=lambda each: float(each.residual.max()))
+
+    @property
+    def passed(self) -> tuple[Passed, ...]:
+        """What went beyond its limit, the farthest first, with value, time and limit."""
+        return passed(self.t, self._limited())
+
+    @property
+    def saturated(self) -> tuple[Saturated, ...]:
+        """Inputs that were at their limit, with the share of the run, the longest first."""
+        of_inputs = (each for each in self._limited() if each[0] in self.input_names)
+        return saturated(self.t, of_inputs)
+
+    def _limited(self) -> Iterator[Limited]:
+        names = (*self.state_names, *self.input_names)
+        units, values = (*self.state_units, *self.input_units), np.hstack((self.x, self.u)).T
+        for name, limits in zip(self.limit_names, self.limits, strict=True):
+            yield name, values[names.index(name)], units[names.index(name)], limits
 
     def save(self, path: str | Path) -> None:
         """Write it to a .npz, .mat, .json or .csv file, whole or not at all.

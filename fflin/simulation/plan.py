@@ -10,13 +10,15 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from fflin.base.errors import FflinWarning, InputError
-from fflin.base.validation import Array, number, whole
+from fflin.base.validation import Array, number, vector, whole
 from fflin.control.channel import Channel, Law
 from fflin.control.policies import Allocation, bound
+from fflin.control.saturation import Saturation
 from fflin.dynamics.integrators import Integrator, integrator
 from fflin.dynamics.state import StateMap
 from fflin.linear.ignorable import rotor_names
 from fflin.linear.model import LinearModel
+from fflin.robot.fields import Range
 from fflin.robot.robot import Robot
 from fflin.simulation.plant import Plant
 
@@ -83,7 +85,9 @@ class Plan:
     times: Times
     law: Law | None  # nothing but `initial` acts where there is none
     initial: Array  # (nu,), what acts until the first command arrives
-    limits: tuple[Array, Array]  # least and largest value (nu,) of each input
+    limits: Saturation  # what acts of a command
+    rotors: list[int]  # velocities of the wheels that have a largest speed
+    known: dict[str, Range]  # limits of states and inputs, whether they cut or not
     method: type[Integrator]
     project: bool  # whether momentum and centre of mass are kept
     turning: Array  # the velocities whose turn within a step has a bound
@@ -92,7 +96,8 @@ class Plan:
     callback: Callback | None
     progress: bool | None  # whether a bar is shown; None shows it where the run takes long
     near: Array | None  # the state (nx,) from which continuous joints count turns
-    target: Array | None  # the state (nx,) that is steered to; the initial one where there is none
+    target: Array | None  # the state (nx,) that is steered to, where one is known
+    steered: tuple[str, ...]  # the states that are known to be fed back
     linear: LinearModel | None  # predicts the motion under u = u0 - K (x - x0)
     K: Array | None  # (nu, nx)
 
@@ -100,7 +105,12 @@ class Plan:
         """Return the way of the law's commands to the inputs, with nothing on it yet."""
         if self.law is None:
             return None
-        return Channel(self.law, self.initial, *self.limits, self.times.sample, self.times.delay)
+        times, rotors = self.times, self.rotors
+
+        def speeds(t: float, q: Array, v: Array) -> Array:
+            return v[rotors]
+
+        return Channel(self.law, self.initial, self.limits, times.sample, times.delay, speeds)
 
 
 def start_of(state: StateMap, x0: Any, q0: Any, v0: Any) -> tuple[Array, Array]:
@@ -119,6 +129,25 @@ def start_of(state: StateMap, x0: Any, q0: Any, v0: Any) -> tuple[Array, Array]:
             f"{LARGEST_SPEED:g} [rad/s|m/s]"
         )
     return q, v
+
+
+def target_of(state: StateMap, target: Any) -> Array | None:
+    """Return the state (nx,) that is given, or that a model's point is; None where none is."""
+    if target is None:
+        return None
+    if not isinstance(target, LinearModel):
+        goal: Array = vector("target", target, state.nx, "a state (12 + 2n)").copy()
+        state.to_pinocchio(goal)  # refuses what is no attitude
+        return goal
+    missing = [name for name in target.state_names if name not in state.names]
+    if missing or len(target.q) != state.robot.nq or target.moving:
+        raise InputError(
+            f"target is a model of '{target.robot}', of which '{state.robot.name}' has no such "
+            "state; give one of this robot"
+        )
+    goal = state.read(target.q, target.v)
+    goal[[state.names.index(name) for name in target.state_names]] = target.x0
+    return goal
 
 
 def times_of(
@@ -185,11 +214,23 @@ def events_of(events: Any, callback: Any) -> tuple[Event, ...]:
     return tuple(events)
 
 
-def law_of(policy: Any, plant: Plant, limits: tuple[Array, Array], times: Times) -> Law | None:
+def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law | None:
     """Return the policy bound to the robot, of which nothing but inputs is taken."""
     if policy is None:
         return None
-    return Law(bound(policy, plant.robot), plant.actuation.names, limits, times.slow)
+    within = (limits.low, limits.high)
+    return Law(bound(policy, plant.robot), plant.actuation.names, within, times.slow)
+
+
+def fed_back(policy: Any) -> tuple[str, ...]:
+    """Return the names of the states that a policy about a model's point feeds back."""
+    lin = getattr(policy, "lin", None)
+    if not isinstance(lin, LinearModel):
+        return ()
+    decides = policy.policy if isinstance(policy, Allocation) else policy
+    K = getattr(decides, "K", None)
+    used = np.ones(len(lin.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
+    return tuple(name for name, size in zip(lin.state_names, used, strict=True) if size)
 
 
 def _fastest_pole(policy: Any) -> float:

@@ -32,19 +32,31 @@ def predict(plan: Plan, x: Array, steps: int) -> Array:
 
 def _states(lin: LinearModel, K: Array, plan: Plan, x: Array, steps: int) -> Array:
     dt, _, every, sample, delay, _ = plan.times
-    x0, u0 = lin.x0, lin.u0
+    x0, u0, limits = lin.x0, lin.u0, plan.limits
+    if limits.wheels or limits.pulses:
+        # Both change within a sample.
+        lin = lin.generator or lin
+    rotors = (
+        [lin.state_names.index(f"qdot_m.{name}") for name in limits.wheels.names]
+        if limits.wheels
+        else []
+    )
 
     def law(e: Array) -> Array:
         u: Array = u0 - K @ e
         return u
 
-    channel = Channel(law, u0, *plan.limits, sample, delay)
+    def speeds(e: Array) -> Array:
+        return x0[rotors] + e[rotors]
+
+    channel = Channel(law, u0, limits, sample, delay, speeds)
     rows = []
     e = x - x0
     if lin.dt:
         # Between the samples of a sampled model there is nothing to say.
         whole = round(lin.dt / dt)
-        if sample != whole or any(count % whole for count in (delay, every, steps)):
+        within = limits.wheels or limits.pulses
+        if within or sample != whole or any(count % whole for count in (delay, every, steps)):
             return np.zeros((0, len(x)))
         for step in range(0, steps, whole):
             u = channel.begin(step, e)

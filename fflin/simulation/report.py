@@ -1,53 +1,74 @@
-"""What is said of a motion: where it began and ended, what it took, what proves it."""
+"""What is said of a motion: whether it arrived, what it took, what proves it."""
 
 from __future__ import annotations
 
 import textwrap
+from typing import NamedTuple
 
 import numpy as np
 
-from fflin.base.names import group_of
-from fflin.base.tables import grid, width
+from fflin.base.names import group_of, input_keys
+from fflin.base.tables import folded, grid, width
 from fflin.base.validation import Array
 from fflin.simulation.motion import Motion
+from fflin.simulation.passed import lines
 
-# A motion has settled once its error stays below this share of the largest.
+# An error has settled once it stays below this share of its largest.
 _SETTLED = 0.02
 
-# An error below this, in SI units, is rounding.
-_NOTHING = 1e-14
+# An error, in SI units, that is never above this was there all the time; below the other it is
+# shown as none. Rounding moves a robot that stands still by less than either.
+_THERE, _NOTHING = 1e-9, 1e-14
+
+# Share of the rows with an input at its limit from which on it is there all along.
+_ALL_ALONG = 0.9
+
+_TITLES = {"r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
+_PLACES = ("attitude", "position", "joints")
 
 
-def motion_report(motion: Motion, *, controlled: bool = True) -> str:
-    """Show where a motion began and ended, what it took, and the figures that prove it."""
-    end = motion.t[-1]
-    parts = [f"{motion.robot}: {end:g} s, {len(motion.t)} rows, frame {motion.frame}"]
-    if motion.stopped:
-        parts.append(textwrap.fill(f"stopped: {motion.stopped}", width(), subsequent_indent="  "))
-    error = np.abs(motion.error)
-    if controlled:
+class Course(NamedTuple):
+    """How large (N,) an error of one kind was, and whether the policy feeds it back."""
+
+    title: str
+    unit: str
+    size: Array
+    steered: bool
+
+    @property
+    def settled(self) -> int:
+        """The row from which on it has settled; N where it has not."""
+        outside = np.flatnonzero(self.size > max(_SETTLED * float(self.size.max()), _THERE))
+        return int(outside[-1]) + 1 if len(outside) else 0
+
+    @property
+    def last(self) -> str:
+        """Its last value, for a sentence."""
+        return f"{self.title} {self.size[-1]:.2g} {self.unit}"
+
+    def row(self, t: Array) -> list[str]:
+        """Return its row of the table."""
+        values = (self.size[0], self.size.max(), self.size[-1])
+        cells = ["." if value < _NOTHING else f"{value:.3g}" for value in values]
+        when = f"{t[self.settled]:.3g}" if self.settled < len(t) else "not yet"
+        if self.size.max() <= _THERE:
+            when = "."
+        return [self.title, self.unit, *cells, when]
+
+
+def motion_report(motion: Motion) -> str:
+    """Show whether a motion arrived, what it took, and the figures that prove it."""
+    kinds = courses(motion)
+    parts = [verdict(motion, kinds)] if kinds or motion.stopped else []
+    parts.append(f"{motion.robot}: {motion.t[-1]:g} s, {len(motion.t)} rows, frame {motion.frame}")
+    parts.extend(motion.notes)
+    parts = [folded(parts)]
+    if kinds:
         rows = [["error", "unit", "first", "largest", "last", "settled after [s]"]]
-        rows.append(["attitude", "deg", *_course(motion.attitude_error, motion.t)])
-        groups = {"r_b": "position", "q_m": "joints", "omega_b": "omega_b", "v_b": "v_b"}
-        groups["qdot_m"] = "joint rates"
-        for group, title in groups.items():
-            at = [i for i, n in enumerate(motion.state_names) if group_of(n) == group]
-            if at:
-                units = "|".join(dict.fromkeys(motion.state_units[i] for i in at))
-                rows.append([title, units, *_course(error[:, at].max(axis=1), motion.t)])
-        parts.append(f"\n{grid(rows, 'll')}\n")
-        largest = np.abs(motion.u).max(axis=0)
-        kinds: dict[tuple[str, str], float] = {}
-        for name, unit, value in zip(motion.input_names, motion.input_units, largest, strict=True):
-            if value < _NOTHING:
-                continue
-            key = (group_of(name), unit.replace(" ", "\u00a0"))
-            kinds[key] = max(kinds.get(key, 0.0), float(value))
-        shown = [f"{name}\u00a0{value:.4g}\u00a0{unit}" for (name, unit), value in kinds.items()]
-        line = f"largest inputs: {', '.join(shown) or 'none'}"
-        # Name, value and unit stay on one line.
-        line = textwrap.fill(line, width(), subsequent_indent="  ", break_on_hyphens=False)
-        parts.append(line.replace("\u00a0", " "))
+        parts.append(f"\n{grid([*rows, *(kind.row(motion.t) for kind in kinds)], 'll')}\n")
+    if kinds or motion.u.any():
+        parts.append(_largest_inputs(motion))
+    parts += lines(motion)
     energy = motion.energy
     parts.append(
         f"energy {energy[0]:.6g} J at first, {energy[-1]:.6g} J at last; "
@@ -67,13 +88,80 @@ def motion_report(motion: Motion, *, controlled: bool = True) -> str:
     return "\n".join(parts)
 
 
-def _course(error: Array, t: Array) -> list[str]:
-    largest = float(error.max())
-    outside = np.flatnonzero(error > _SETTLED * largest)
-    if largest < _NOTHING:
-        return [".", ".", ".", "."]
-    if len(outside) and outside[-1] == len(error) - 1:
-        settled = "not yet"
+def courses(motion: Motion) -> list[Course]:
+    """Return the errors of each kind, none where there is no target; wheels are no joints."""
+    if motion.error is None or motion.attitude_error is None:
+        return []
+    steered = set(motion.steered or motion.state_names)
+    sizes = np.abs(motion.error)
+    columns: dict[tuple[str, str], list[int]] = {}
+    for i, (name, unit) in enumerate(zip(motion.state_names, motion.state_units, strict=True)):
+        group, _, entry = name.partition(".")
+        title = _TITLES.get(group, group)
+        if group == "qdot_m" and entry in motion.wheels:
+            title = "wheel speeds"
+        if group != "q_b" and not (group == "q_m" and entry in motion.wheels):
+            columns.setdefault((title, unit), []).append(i)
+    attitude = any(name.startswith("q_b.") for name in steered)
+    return [
+        Course("attitude", "deg", motion.attitude_error, attitude),
+        *(
+            Course(*of, sizes[:, at].max(axis=1), any(motion.state_names[i] in steered for i in at))
+            for of, at in columns.items()
+        ),
+    ]
+
+
+def verdict(motion: Motion, kinds: list[Course]) -> str:
+    """Say in a line whether a motion arrived at its target and what hindered it."""
+    if motion.stopped:
+        return f"stopped: {motion.stopped}"
+    places = [kind for kind in kinds if kind.title in _PLACES]
+    judged = [kind for kind in places if kind.steered] or [k for k in kinds if k.steered]
+    moved = [kind for kind in judged if kind.size.max() > _THERE]
+    late = [kind.last for kind in moved if kind.settled == len(motion.t)]
+    if late:
+        said = f"not settled: {_and(late)} at the end"
+    elif moved:
+        when = motion.t[max(kind.settled for kind in moved)]
+        said = f"settled: {_and([kind.last for kind in moved])} after {when:.3g} s"
     else:
-        settled = f"{t[outside[-1] + 1]:.3g}"
-    return [*(f"{value:.3g}" for value in (error[0], largest, error[-1])), settled]
+        said = "settled: at the target from first to last"
+    aside = [k.last for k in places if not k.steered and k.size[-1] > _THERE]
+    if aside:
+        said += f"; not steered: {_and(aside)}"
+    if full := saturated(motion):
+        said += f"; at the limit all along: {', '.join(full)}"
+    return said
+
+
+def saturated(motion: Motion) -> list[str]:
+    """Return the names of the inputs that are at their limits all along."""
+    names, values = getattr(motion, "limit_names", ()), getattr(motion, "limits", ())
+    limits = dict(zip(names, values, strict=True))
+    found = []
+    for name, u in zip(motion.input_names, motion.u.T, strict=True):
+        least, largest = limits.get(name, (-np.inf, np.inf))
+        # A thruster that rests is not at its limit, nor is what cannot act at all.
+        full = ((u >= largest) & (largest > 0.0)) | ((u <= least) & (least < 0.0))
+        if full.mean() > _ALL_ALONG:
+            found.append(name)
+    return found
+
+
+def _and(words: list[str]) -> str:
+    return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
+
+
+def _largest_inputs(motion: Motion) -> str:
+    largest = np.abs(motion.u).max(axis=0)
+    kinds: dict[tuple[str, str], float] = {}
+    for name, unit, value in zip(input_keys(motion), motion.input_units, largest, strict=True):
+        if value >= _NOTHING:
+            key = (group_of(name), unit.replace(" ", "\u00a0"))
+            kinds[key] = max(kinds.get(key, 0.0), float(value))
+    shown = [f"{name}\u00a0{value:.4g}\u00a0{unit}" for (name, unit), value in kinds.items()]
+    line = f"largest inputs: {', '.join(shown) or 'none'}"
+    # Name, value and unit stay on one line.
+    line = textwrap.fill(line, width(), subsequent_indent="  ", break_on_hyphens=False)
+    return line.replace("\u00a0", " ")

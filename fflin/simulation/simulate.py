@@ -10,18 +10,21 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, truth
-from fflin.control.channel import limits_of
+from fflin.control.saturation import saturation
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import state_history
 from fflin.linear.model import LinearModel
+from fflin.robot.limits import chosen_limits
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import (
     Plan,
     events_of,
+    fed_back,
     law_of,
     method_of,
     start_of,
+    target_of,
     times_of,
     turning,
 )
@@ -52,11 +55,12 @@ def simulate(
     project: bool = True,
     sample: float | None = None,
     delay: float = 0.0,
-    limits: float | Mapping[str, Any] | None = None,
+    limits: float | str | Mapping[str, Any] | Sequence[Any] | None = None,
     disturbance: Disturbance | None = None,
     events: Sequence[Event] = (),
     callback: Callable[[float, Array, Array, Array], None] | None = None,
     linear: LinearModel | bool | None = None,
+    target: LinearModel | ArrayLike | None = None,
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
     every: int = 1,
@@ -97,8 +101,12 @@ def simulate(
     delay : float
         Time [s] from a sample to its effect, a multiple of dt; until then u0 of the policy's
         model acts, or nothing. Where there is a delay and no `sample`, samples are dt apart.
-    limits : float or mapping, optional
-        Largest magnitude of all inputs, or {input or group: magnitude, or (least, largest)}.
+    limits : "urdf", float, mapping or list of them, optional
+        What cuts the inputs: "urdf" for all limits of the robot (efforts of the URDF, `min` and
+        `max` of the inputs, the largest speeds of wheels, `Robot.limits`), the largest magnitude
+        of all inputs, or {input, group or pattern: magnitude, or (least, largest)}; in a list such
+        as ``["urdf", {"tau_m": 5.0}]`` what is given goes first. Nothing is cut by default. On-off
+        thrusters fire in pulses in any case, and `Motion.passed` tells which limits were passed.
     disturbance : callable, optional
         disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order.
     events : sequence of callable
@@ -108,6 +116,9 @@ def simulate(
     linear : LinearModel or bool, optional
         Predicts the motion under the same law; by default the policy's own model, False for none.
         Sampled, it does so where every row is at a sample.
+    target : LinearModel or array_like (nx,), optional
+        State, or model whose point it is, that errors are counted from; by default the point of
+        the policy's own model, and none under a policy without one.
     frame : {"hybrid", "local", "world"}, optional
     reference : pin.SE3, optional
         Chart of x and axes of u; the policy's model's by default, else hybrid and the identity.
@@ -152,18 +163,23 @@ def simulate(
     q, v = start_of(state, x0, q0, v0)
     times = times_of(policy, duration, dt, every, sample, delay)
     times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=dt is None)
-    within = limits_of(plant.actuation, limits)
+    acting, known = chosen_limits(robot, limits)
+    within = saturation(robot, acting, q, times.dt, times.sample)
     law = law_of(policy, plant, within, times)
     # The model's inputs are others where they are allocated to the robot's.
     same = lin is not None and lin.input_names == plant.actuation.names
-    target = None if lin is None else _target(state, lin)
+    goal = target_of(state, lin if target is None else target)
     plan = Plan(
         q=q,
         v=v,
         times=times,
         law=law,
-        initial=lin.u0 if lin is not None and same else np.zeros(len(within[0])),
+        initial=lin.u0 if lin is not None and same else np.zeros(len(within.low)),
         limits=within,
+        rotors=[robot.joint(name).idx_v for name in within.wheels.names] if within.wheels else [],
+        known={
+            name: known[name] for name in (*state.names, *plant.actuation.names) if name in known
+        },
         method=method_of(method, times),
         project=truth("project", project),
         turning=turning(robot),
@@ -171,8 +187,9 @@ def simulate(
         events=events_of(events, callback),
         callback=callback,
         progress=progress,
-        near=target if x0 is None else np.asarray(x0, dtype=float),
-        target=target,
+        near=goal if x0 is None else np.asarray(x0, dtype=float),
+        target=goal,
+        steered=fed_back(policy),
         linear=predictor,
         K=K,
     )
@@ -198,7 +215,7 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         v=run.v,
         x=x,
         u=run.u,
-        target=x[0] if plan.target is None else plan.target,
+        target=np.zeros(0) if plan.target is None else plan.target,
         prediction=predict(plan, x, run.steps),
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
@@ -214,6 +231,10 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         urdf_sha256=robot.urdf_sha256,
         stopped=run.stopped,
         _robot=robot,
+        wheels=tuple(robot.wheels),
+        steered=plan.steered,
+        limit_names=tuple(plan.known),
+        limits=np.array(list(plan.known.values())).reshape(-1, 2),
     )
 
 
@@ -238,10 +259,3 @@ def _predictor(
     if K is None:
         raise InputError("linear predicts under a StateFeedback alone; leave it out")
     return linear
-
-
-def _target(state: StateMap, lin: LinearModel) -> Array:
-    """Return the state (nx,) that a feedback about a model's point steers to."""
-    target = state.read(lin.q, lin.v)
-    target[[state.names.index(name) for name in lin.state_names]] = lin.x0
-    return target

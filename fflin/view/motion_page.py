@@ -43,7 +43,7 @@ def motion_page(
     fps: float,
     speed: float,
     follow: bool | None,
-    target: Array,
+    target: Array | None,
     tool: str | None,
 ) -> tuple[str, tuple[str, ...]]:
     """Return the page of a motion, and what could not be drawn; see `visualize`."""
@@ -57,7 +57,8 @@ def motion_page(
     drawing = Drawing(robot, scenery["robot"], sent=sent)
     moving = [(drawing, film.poses)]
     data = robot.model.createData()
-    Drawing(robot, scenery["target"], "ghost", sent).place(body_poses(robot, data, target))
+    if target is not None:
+        Drawing(robot, scenery["target"], "ghost", sent).place(body_poses(robot, data, target))
     if motion.linear is not None:
         predicted = [state.to_pinocchio(x)[0] for x in motion.linear[shown]]
         poses = np.array([body_poses(robot, data, each) for each in predicted])
@@ -68,12 +69,12 @@ def motion_page(
         clips += each.tracks(t - t[0], poses)
     window.send(Animation(clips))
 
-    # Without a policy that steers somewhere, errors are counted from the start.
-    ghost = "start" if np.array_equal(target, motion.q[0]) else "target"
     about = f"{subtitle(robot)}, {t[-1] - t[0]:.4g} s"
     info = stage_info(robot, drawing, film.poses[0], scene=scene, subtitle=about)
-    goal = corner_points(drawing, body_poses(robot, data, target))
-    shown_points = np.concatenate((frame_points(drawing, film, info["size"]), goal))
+    shown_points = frame_points(drawing, film, info["size"])
+    if target is not None:
+        goal = corner_points(drawing, body_poses(robot, data, target))
+        shown_points = np.concatenate((shown_points, goal))
     info["floor"][2] = float(shown_points[:, 2].min())
     if follow is None:
         # All of a long way at once, and nothing is to be seen of the robot.
@@ -90,7 +91,7 @@ def motion_page(
         "speed": speed,
         "follow": follow,
         "points": rounded(shown_points, info["size"]),
-        "legend": legend(info, ghost=ghost, linear=motion.linear is not None),
+        "legend": legend(info, ghost=target is not None, linear=motion.linear is not None),
     }
     return build_page(info, window.commands()), drawing.notes
 
@@ -227,7 +228,7 @@ def marks(robot: Robot, film: Playback, tool: str | None, size: float) -> dict[s
     }
 
 
-def legend(shown: dict[str, Any], *, ghost: str, linear: bool) -> list[dict[str, Any]]:
+def legend(shown: dict[str, Any], *, ghost: bool, linear: bool) -> list[dict[str, Any]]:
     """Return the entries of the legend, each of which can be switched off."""
     entries = [
         {"label": f"path of the {each['name']}", "colour": each["colour"],
@@ -239,7 +240,8 @@ def legend(shown: dict[str, Any], *, ghost: str, linear: bool) -> list[dict[str,
          "paths": [["meshcat", "wrench", each["kind"]]]}
         for each in shown["arrows"]
     ]  # fmt: skip
-    entries.append({"label": ghost, "colour": "#8fb4ff", "paths": [["meshcat", "target"]]})
+    if ghost:
+        entries.append({"label": "target", "colour": "#8fb4ff", "paths": [["meshcat", "target"]]})
     if linear:
         entries.append(
             {"label": "linear model", "colour": "#ff7fc8", "paths": [["meshcat", "linear"]]}

@@ -56,7 +56,7 @@ def panel(
     state: StateMap,
     q: Array,
     u: Array,
-    target: Array,
+    target: Array | None,
     drift: Array,
     of_com: Array | None = None,
 ) -> dict[str, Any]:
@@ -68,27 +68,24 @@ def panel(
     state : StateMap
     q : ndarray (N, nq)
     u : ndarray (N, nu)
-    target : ndarray (nq,)
+    target : ndarray (nq,) or None
+        Without one there are no errors.
     drift : ndarray (N,)
         Of the momentum, relative.
     of_com : ndarray (N,), optional
         Distance of the centre of mass from its line [m].
     """
-    found = errors(robot, q, target)
+    found = {} if target is None else errors(robot, q, target)
     slide = any(joint.prismatic for joint in robot.joints)
     turn = robot.n > len(robot.wheels) + sum(joint.prismatic for joint in robot.joints)
-    readouts = [
-        ("attitude error", "°", found["attitude"]),
-        ("position error", "m", found["position"]),
-        *([("largest joint error", "°", found["turns"])] if turn else []),
-        *([("largest slide error", "m", found["slides"])] if slide else []),
-        ("momentum drift", "", drift),
-        *([] if of_com is None else [("centre of mass drift", "m", of_com)]),
-    ]
-    plots: list[dict[str, Any]] = [
-        _plot("attitude error", "°", [("", found["attitude"])]),
-        _plot("position error", "m", [("", found["position"])]),
-    ]
+    shown = {"attitude error": ("°", "attitude"), "position error": ("m", "position")}
+    shown |= {"largest joint error": ("°", "turns")} if turn else {}
+    shown |= {"largest slide error": ("m", "slides")} if slide else {}
+    readouts = [(label, unit, found[key]) for label, (unit, key) in shown.items() if found]
+    plots = [_plot(label, unit, [("", values)]) for label, unit, values in readouts[:2]]
+    readouts.append(("momentum drift", "", drift))
+    if of_com is not None:
+        readouts.append(("centre of mass drift", "m", of_com))
     actuation = Actuation(state)
     for kind, indices in actuation.groups.items():
         labels = "xyz" if kind in ("tau_b", "F_b") else [""] * len(indices)

@@ -84,7 +84,7 @@ def visualize(
         would be a dot on its way.
     target : array_like (nq,), optional
         Configuration that errors are counted from; by default the one that the motion was steered
-        to, or where it begins.
+        to. Without one no errors are shown.
     tool : str, optional
         Frame whose trail is drawn; "tool" or the last link of the longest chain by default.
     q : array_like (nq,), optional
@@ -147,9 +147,9 @@ def visualize(
     fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
     from fflin.view.motion_page import chart_of, motion_page
 
-    if target is None:
+    if target is None and motion.target.size:
         target = chart_of(robot, motion).to_pinocchio(motion.target)[0]
-    goal = _configuration(robot, "target", target)
+    goal = None if target is None else _configuration(robot, "target", target)
 
     page, notes = motion_page(
         robot, motion, scene=scene, fps=fps, speed=speed, follow=follow, target=goal, tool=tool

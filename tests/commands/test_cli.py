@@ -50,6 +50,13 @@ def test_check_exits_0_on_every_bundled_robot(name):
     assert max(map(len, out.splitlines())) <= 80
 
 
+def test_damping_that_is_asked_for_is_not_warned_of():
+    for option, said in (([], True), (["--damping", "urdf"], False)):
+        done = run("modes", "planar_detumble", *option)
+        assert done.returncode == 0
+        assert ("damping" in done.stderr) == said
+
+
 def test_warnings_are_one_line_each_on_stderr_and_in_info():
     done = subprocess.run(
         [sys.executable, "-m", "fflin", "info", "planar_detumble"],

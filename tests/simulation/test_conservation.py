@@ -194,7 +194,7 @@ def test_the_drift_is_saved_loaded_and_shown(tmp_path, suffix):
 
 
 def motion_text(motion):
-    return motion_report(motion, controlled=False)
+    return motion_report(motion)
 
 
 def test_a_file_that_does_not_tell_the_drift_is_loaded_and_shown_without_it(tmp_path):

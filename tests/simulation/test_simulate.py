@@ -358,7 +358,7 @@ def test_an_event_ends_the_run():
 def test_a_body_may_turn_beyond_180_degrees_without_a_policy():
     robot = free_body((20.0, 30.0, 40.0))
     v0 = np.array([0, 0, 0, 0, 0, math.pi])
-    motion = fflin.simulate(robot, v0=v0, duration=2.0, dt=0.01)
+    motion = fflin.simulate(robot, v0=v0, duration=2.0, dt=0.01, target=np.zeros(12))
     assert not motion.stopped
     assert motion.attitude_error.max() == pytest.approx(180.0, abs=1.0)
     assert motion.attitude_error[-1] == pytest.approx(0.0, abs=1e-6)

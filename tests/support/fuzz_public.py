@@ -121,7 +121,7 @@ def sound(folder):
             **{"robot": robot, "policy": None, "q0": q, "v0": v, "duration": 0.02, "dt": 0.01},
             **{"method": "cf4", "sample": None, "delay": 0.0, "limits": None, "events": ()},
             **{"disturbance": None, "callback": None, "linear": None, "every": 1, "x0": None},
-            **{"frame": "hybrid", "reference": None},
+            **{"frame": "hybrid", "reference": None, "target": None},
         },
         "StateFeedback": {"lin": lin, "K": gain.K},
         "StateMap": {"robot": robot, "reference": None, "frame": "hybrid"},

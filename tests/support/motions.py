@@ -60,6 +60,7 @@ def settling(robot, duration, *, reference=HOME, predicted=False):
         robot=robot.name,
         urdf_sha256=robot.urdf_sha256,
         stopped="",
+        wheels=tuple(robot.wheels),
     )
 
 

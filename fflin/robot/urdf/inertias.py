@@ -23,7 +23,7 @@ _POINT = 1e-6  # [m]
 _LOST_IN_BODY = 1e-6
 
 # Published figures have three digits or more, and a flat plate's lie on the bound.
-_TRIANGLE_SLACK = 1e-3
+TRIANGLE_SLACK = 1e-3
 
 
 def is_impossible(mass: float, moments: Sequence[float]) -> bool:
@@ -69,7 +69,7 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
                     f"{middle:.3g}, {largest:.3g} kg m^2; none can be negative: correct ixx ... izz"
                 )
             negligible.append(link.name)
-        elif largest - middle - least > _TRIANGLE_SLACK * abs(largest):
+        elif largest - middle - least > TRIANGLE_SLACK * abs(largest):
             unequal.append(link.name)
         if link.mass == 0.0 and any(link.inertia):
             weightless.append(link.name)

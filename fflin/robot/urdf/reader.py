@@ -113,6 +113,16 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
                 f"{path.name}: the {what} of {named('joint', list(values))} is not in the linear "
                 "model unless it is asked for"
             )
+    unlimited = {
+        what: [joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0]
+        for what in ("effort", "velocity")
+    }
+    zeros = [f"{what} 0 of {named('joint', names)}" for what, names in unlimited.items() if names]
+    if zeros:
+        notes.append(
+            f"{path.name}: {', '.join(zeros)}: taken as no limit; if a joint has no motor, name it "
+            "in passive"
+        )
     return Description(
         model,
         hashlib.sha256(document).hexdigest(),

@@ -1,0 +1,133 @@
+r"""Models with other masses, whose bodies are rigid bodies.
+
+A body of mass m, centre of mass c and inertia I about it is a distribution of mass with the second
+moments :math:`\Sigma = \tfrac12 \mathrm{tr}(I) E - I`. It exists if and only if its pseudo-inertia
+is positive (semi)definite, that is m and Sigma are (Wensing, Kim and Slotine, Linear matrix
+inequalities for physically-consistent inertial parameter identification, IEEE Robotics and
+Automation Letters 3(1), 2018).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import InputError, listed, unknown
+from fflin.base.names import by_name
+from fflin.base.validation import Array, as_double, number, vector, whole
+from fflin.base.validation import by_name as mapping
+from fflin.robot.frames import ROOT
+from fflin.robot.urdf.inertias import TRIANGLE_SLACK, is_impossible
+
+_KEYS = ("mass", "com", "inertia")
+_SYMMETRIC = 1e-9
+_ROUNDING = 1e-12
+
+
+def with_bodies(model: pin.Model, bodies: Any) -> pin.Model:
+    """Return a copy of a model with other bodies, as `Robot.with_mass_properties` takes them."""
+    given = mapping("bodies", bodies, "body")
+    index_of = {"base": ROOT, **{model.names[i]: i for i in range(ROOT, model.njoints)}}
+    links: dict[int, list[str]] = {}
+    for frame in model.frames.tolist():
+        if frame.type == pin.FrameType.BODY and frame.name not in index_of:
+            links.setdefault(frame.parentJoint, []).append(frame.name)
+    several = {name: index for index, many in links.items() if many[1:] for name in many}
+    index_of |= several | {many[0]: index for index, many in links.items()}
+    names, done, new = list(index_of), dict[int, Any](), model.copy()
+    for place, value in by_name("body", given, names).items():
+        name, index = names[place], index_of[names[place]]
+        body = "base" if index == ROOT else model.names[index]
+        if name in several:
+            raise InputError(
+                f"'{name}' is one of several links of the body '{body}': "
+                f"{listed(links[index])}; give that body as a whole"
+            )
+        if done.setdefault(index, value) is not value:
+            raise InputError(f"the body '{body}' is given twice, as '{name}' too; give it once")
+        new.inertias[index] = _given(name, value, model.inertias[index])
+    return new
+
+
+def _given(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
+    """Return a body that is given in part or as a whole."""
+    of = f"of '{name}'"
+    if isinstance(value, pin.Inertia):
+        value = {"mass": value.mass, "com": value.lever, "inertia": value.inertia}
+    if not isinstance(value, Mapping):
+        raise InputError(
+            f"'{name}' is a {type(value).__name__}, expected {{'mass': m, 'com': (3,), "
+            "'inertia': (3, 3)} or a pin.Inertia"
+        )
+    for key in value:
+        if key not in _KEYS:
+            raise unknown("mass property", key, _KEYS)
+    mass = number(f"mass {of}", value.get("mass", old.mass))
+    if "mass" in value and not mass > 0.0:
+        raise InputError(f"mass {of} is {mass:g} kg, expected more than 0")
+    com = vector(f"com {of}", value.get("com", old.lever), 3, "a point in the body's frame")
+    if "inertia" not in value:
+        return pin.Inertia(mass, com, old.inertia * (mass / old.mass if old.mass else 1.0))
+    inertia = as_double(f"inertia {of}", value["inertia"])
+    if inertia.shape != (3, 3) or not np.isfinite(inertia).all():
+        raise InputError(
+            f"inertia {of} has shape {inertia.shape}, expected (3, 3) finite numbers [kg m^2] "
+            "about the centre of mass"
+        )
+    if np.abs(inertia - inertia.T).max() > _SYMMETRIC * np.abs(inertia).max():
+        raise InputError(f"inertia {of} is not symmetric")
+    inertia = 0.5 * (inertia + inertia.T)
+    least, middle, largest = np.linalg.eigvalsh(inertia).tolist()
+    moments = f"inertia {of} has principal moments {least:.3g}, {middle:.3g}, {largest:.3g} kg m^2"
+    if is_impossible(mass, (least, middle, largest)):
+        raise InputError(f"{moments}; none can be negative")
+    if largest - middle - least > TRIANGLE_SLACK * largest:
+        raise InputError(f"{moments}; of a body none is more than the sum of the others")
+    return pin.Inertia(mass, com, inertia)
+
+
+def perturbed(model: pin.Model, seed: Any, **spreads: Any) -> pin.Model:
+    """Return a copy of a model with its bodies drawn at random, see `Robot.perturbed`."""
+    checked = {key: number(key, value) for key, value in spreads.items()}
+    for key, spread in checked.items():
+        if not 0.0 <= spread < 1.0:
+            raise InputError(f"{key} is {spread:g}, expected 0 or more and less than 1")
+    draw, new = np.random.default_rng(whole("seed", seed, 0)), model.copy()
+    for index in range(ROOT, model.njoints):
+        drawn = draw.uniform(-1.0, 1.0, 7)
+        new.inertias[index] = _drawn(model.inertias[index], drawn, **checked)
+    return new
+
+
+def _drawn(body: pin.Inertia, drawn: Array, mass: float, com: float, inertia: float) -> pin.Inertia:
+    r"""Return a body stretched along its frame's axes, shifted, and made heavier.
+
+    A stretch S is a congruence, :math:`S \Sigma S`, which keeps Sigma positive.
+    """
+    if not any((mass, com, inertia)):
+        return body
+    heavier = 1.0 + mass * float(drawn[0])
+    second = 0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia
+    # A body that is none, as some files have them, keeps its shape.
+    sound = np.linalg.eigvalsh(second)[0] >= -_ROUNDING * np.trace(second)
+    stretch = np.sqrt(1.0 + inertia * (drawn[4:] if sound else drawn[4]) * np.ones(3))
+    shift = np.zeros(3)
+    if body.mass:
+        shift = com * drawn[1:4] * np.sqrt(np.abs(second.diagonal()) / body.mass)
+    second = heavier * second * np.outer(stretch, stretch)
+    return pin.Inertia(
+        heavier * body.mass, body.lever + shift, np.trace(second) * np.eye(3) - second
+    )
+
+
+def identity(origin: str, model: pin.Model, before: pin.Model) -> str:
+    """Return the hash that tells a robot from those with other masses; its own for the same."""
+    new, old = (
+        b"".join(body.toDynamicParameters().tobytes() for body in each.inertias.tolist())
+        for each in (model, before)
+    )
+    return origin if new == old else sha256(origin.encode() + new).hexdigest()

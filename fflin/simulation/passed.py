@@ -1,0 +1,85 @@
+"""Which limits a motion passed, and which inputs were at theirs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from fflin.base.validation import Array
+
+# Beyond its limit is what is so by more than this share of it: less is the integration's.
+_SHARE = 1e-3
+
+_MOST = 8  # lines of a report
+
+# What has limits: its name, history (N,), unit, and least and largest value (2,).
+Limited: TypeAlias = "tuple[str, Array, str, Array]"
+
+
+class Passed(NamedTuple):
+    """A limit that was passed: the farthest value [unit], when [s], and the limit."""
+
+    name: str
+    value: float
+    time: float
+    limit: float
+    unit: str
+
+    def __str__(self) -> str:
+        group, _, entry = self.name.partition(".")
+        name = entry if group in ("q_m", "qdot_m") else self.name
+        value = f"{_shown(self.value)} {self.unit}".removesuffix(" 1")
+        return f"{name} {value} at {_shown(self.time)} s, limit {_shown(self.limit)}"
+
+
+class Saturated(NamedTuple):
+    """An input that was at its limit [unit] for a share of the run."""
+
+    name: str
+    limit: float
+    unit: str
+    share: float
+
+    def __str__(self) -> str:
+        size, share = f"{_shown(abs(self.limit))} {self.unit}", 100.0 * self.share
+        return f"{self.name} at its limit of {size} for {share:.2g} % of the run"
+
+
+def passed(t: Array, histories: Iterable[Limited]) -> tuple[Passed, ...]:
+    """Return what went beyond its limit, that first which did so by the largest share of it."""
+    found = []
+    for name, values, unit, limits in histories:
+        size = float(np.abs(limits[np.isfinite(limits)]).max())
+        excess = np.maximum(limits[0] - values, values - limits[1])
+        at = int(excess.argmax())
+        if excess[at] > max(_SHARE * size, 1e-12):
+            limit = float(limits[int(values[at] > limits[1])])
+            one = Passed(name, float(values[at]), float(t[at]), limit, unit)
+            found.append((-excess[at] / (size or 1e-12), one))
+    return tuple(one for _, one in sorted(found))
+
+
+def saturated(t: Array, histories: Iterable[Limited]) -> tuple[Saturated, ...]:
+    """Return what was at a limit other than zero, that first which was longest."""
+    held = np.diff(t, append=t[-1:])
+    found = [
+        Saturated(name, limit, unit, float(held[near].sum() / held.sum()))
+        for name, values, unit, limits in histories
+        for limit in limits[np.isfinite(limits) & (limits != 0.0)].tolist()
+        if held[near := np.abs(values - limit) <= 1e-9 * abs(limit)].any()
+    ]
+    return tuple(sorted(found, key=lambda each: -each.share))
+
+
+def lines(motion: Any) -> list[str]:
+    """Say in a report what a motion passed, and which inputs were at their limits."""
+    beyond = [f"beyond its limit: {each}" for each in motion.passed]
+    said = [*beyond, *map(str, motion.saturated)]
+    more = [f"and {len(said) - _MOST} more"] if len(said) > _MOST else []
+    return said[:_MOST] + more
+
+
+def _shown(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 1000.0 else f"{value:.0f}"

@@ -1,0 +1,233 @@
+"""What a robot can do: limits of the URDF, of its inputs, and given ones."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.robot.limits import limits_of, magnitudes_of
+
+INF = math.inf
+AT = ("base", (0, 0, 0), (1, 0, 0))
+
+
+def test_the_urdf_says_efforts_speeds_and_travels():
+    robot = fflin.load("servicer_7dof")
+    found = limits_of(robot)
+    assert found["tau_m.joint_1"] == (-300.0, 300.0)
+    assert found["qdot_m.joint_5"] == (-0.4, 0.4)
+    low, high = found["q_m.joint_2"]
+    assert (low, high) == pytest.approx((-2.094, 2.094), abs=1e-3)
+    sizes = magnitudes_of(robot)
+    assert sizes["q_m.joint_2"] == high - low
+    assert fflin.linearize(robot).limits == sizes
+    # What is no input has no limit as one.
+    arm = robot.replace(inputs=robot.inputs[2:5])
+    assert [name for name in limits_of(arm) if name.startswith("tau")] == [
+        f"tau_m.joint_{k}" for k in (1, 2, 3)
+    ]
+    assert not limits_of(fflin.load("ets_vii"))
+
+
+def test_limits_of_inputs_go_before_the_urdf_and_given_ones_before_both():
+    robot = fflin.load("servicer_7dof").replace(
+        inputs=[
+            fflin.BaseTorque(max=40.0),
+            fflin.BaseForce(max=(3, 2, 1), min=-0.5),
+            fflin.JointTorque("joint_1", max=7.0, min=-2.0),
+            fflin.JointTorque("joint_2"),
+            fflin.Thruster(*AT, max=22.0),
+            fflin.Thruster(*AT, name="main"),
+            fflin.ReactionWheel((0, 0, 1), inertia=0.03, max=0.2, max_speed=600.0, name="spin"),
+            fflin.ReactionWheel((0, 1, 0), momentum=1.0, max=0.1),
+        ],
+        limits={"q_m.joint_*": 1.0, "tau_m.joint_2": (-5.0, 6.0), "omega_b": 0.1, "main": 4.0},
+    )
+    found = limits_of(robot)
+    assert found["tau_b.y"] == (-40.0, 40.0)
+    assert [found[f"F_b.{axis}"] for axis in "xyz"] == [(-0.5, 3.0), (-0.5, 2.0), (-0.5, 1.0)]
+    assert found["tau_m.joint_1"] == (-2.0, 7.0)
+    assert found["tau_m.joint_2"] == (-5.0, 6.0)
+    assert found["thruster_1"] == (0.0, 22.0)
+    assert found["main"] == (0.0, 4.0)
+    assert found["spin"] == (-0.2, 0.2)
+    assert found["qdot_m.spin"] == (-600.0, 600.0)
+    assert found["wheel_2"] == (-0.1, 0.1)
+    assert found["q_m.joint_7"] == (-1.0, 1.0)
+    assert found["q_m.panel_left"] == (-0.6, 0.6)
+    assert found["omega_b.z"] == (-0.1, 0.1)
+    lin = fflin.linearize(robot)
+    assert lin.limits["spin"] == 0.2
+    assert lin.limits["thruster_1"] == 22.0
+    assert lin.limits["F_b.x"] == 0.5
+    # Given limits of what is gone say nothing, and count where it comes back.
+    bare = robot.replace(inputs=[fflin.BaseTorque()])
+    assert "main" not in limits_of(bare)
+    assert "tau_b.x" not in limits_of(bare)
+    assert limits_of(bare.replace(inputs=robot.inputs)) == found
+
+
+def test_a_pattern_goes_before_a_group_and_a_name_before_both():
+    limits = {"tau_m.joint_7": 1.0, "tau_m": 3.0, "joint_*": 2.0}
+    found = limits_of(fflin.load("servicer_7dof", limits=limits))
+    assert found["tau_m.joint_7"] == (-1.0, 1.0)
+    assert found["tau_m.joint_1"] == (-2.0, 2.0)
+    assert found["tau_m.panel_left"] == (-3.0, 3.0)
+
+
+def test_limits_are_kept_in_files_of_models(tmp_path):
+    inputs = [fflin.BaseTorque(max=4.0), *fflin.load("cubesat").inputs[1:]]
+    lin = fflin.linearize(fflin.load("cubesat", inputs=inputs))
+    assert lin.limits == {f"tau_b.{axis}": 4.0 for axis in "xyz"}
+    for ending in (".npz", ".mat", ".json", ".csv"):
+        lin.save(tmp_path / f"m{ending}")
+        assert fflin.LinearModel.load(tmp_path / f"m{ending}").limits == lin.limits
+
+
+def test_limits_make_no_second_input():
+    with pytest.raises(fflin.InputError, match="stands there twice"):
+        fflin.load("cubesat", inputs=[fflin.BaseForce(max=1.0), fflin.BaseForce(max=2.0)])
+    assert fflin.Thruster(*AT, max=2) == fflin.Thruster(*AT, max=2.0)
+    assert replace(fflin.Thruster(*AT), max=2.0, on_off=True).on_off
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: fflin.BaseTorque(max=-1.0), "base_torque max is -1, expected more than 0"),
+        (lambda: fflin.BaseTorque(max=(1, 0, 1)), "base_torque max is 0, expected more than 0"),
+        (lambda: fflin.BaseForce(max=(1, 2)), r"base_force max is \(1, 2\), expected three"),
+        (lambda: fflin.JointTorque("a", max=1, min=2), "min is 2, more than its max of 1"),
+        (lambda: fflin.JointTorque("a", max=(1, 2, 3)), "joint_torque max is .*expected a number"),
+        (lambda: fflin.JointTorque("a", max=math.nan), "max is nan, expected a finite number"),
+        (lambda: fflin.Thruster(*AT, max=1, min=-1), "thruster min is -1.*it never pulls"),
+        (lambda: fflin.Thruster(*AT, on_off=True), "on_off is set: it needs a max"),
+        (lambda: fflin.Thruster(*AT, on_off=True, max=2, min=1), "on_off is set: .* no min"),
+        (lambda: fflin.Thruster(*AT, on_off="yes", max=2), "on_off is a str, expected True or F"),
+        (lambda: fflin.Thruster(*AT, least_impulse=0), "least_impulse is 0 N s, expected more"),
+        (lambda: fflin.ReactionWheel((1, 0, 0), max_speed=3), "max_speed is 3 rad/s.*is no state"),
+        (
+            lambda: fflin.ReactionWheel((1, 0, 0), inertia=1, max_speed=-3),
+            "wheel max_speed is -3 rad/s, expected more than 0",
+        ),
+    ],
+)
+def test_limits_that_are_none_are_refused_in_a_line(make, said):
+    with pytest.raises(fflin.InputError, match=said):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("limits", "error", "said"),
+    [
+        ({"nosuch": 1.0}, fflin.UnknownNameError, "no input or state named 'nosuch'"),
+        ({"tau_b": -1.0}, fflin.InputError, "limit of 'tau_b' is -1.0, expected a magnitude"),
+        ({"tau_b": (2.0, 1.0)}, fflin.InputError, r"limit of 'tau_b' is \(2.0, 1.0\)"),
+        ({"tau_b": "much"}, fflin.InputError, "limit of 'tau_b' is 'much', expected a number"),
+    ],
+)
+def test_given_limits_that_are_none_are_refused_in_a_line(limits, error, said):
+    with pytest.raises(error, match=said):
+        fflin.load("cubesat", limits=limits)
+
+
+URDF = """<robot name="arm"><link name="base">{0}</link><link name="a">{0}</link>
+  <link name="b">{0}</link>
+  <joint name="hinge" type="revolute"><parent link="base"/><child link="a"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="0" velocity="0"/></joint>
+  <joint name="elbow" type="revolute"><parent link="a"/><child link="b"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="0" velocity="2"/></joint>
+</robot>""".format(
+    '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    "</inertial>"
+)
+
+
+def test_efforts_and_velocities_of_zero_are_said_once_and_are_none(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(URDF)
+    with pytest.warns(fflin.FflinWarning) as told:
+        robot = fflin.load(path)
+    said = [str(each.message) for each in told]
+    assert said == [
+        "arm.urdf: effort 0 of joints 'hinge', 'elbow', velocity 0 of joint 'hinge': taken as no "
+        "limit; if a joint has no motor, name it in passive"
+    ]
+    assert tuple(said) == robot.notes
+    assert not {"tau_m.hinge", "tau_m.elbow", "qdot_m.hinge"} & set(limits_of(robot))
+    assert limits_of(robot)["qdot_m.elbow"] == (-2.0, 2.0)
+    path.write_text(URDF.replace('effort="0"', 'effort="3"').replace('velocity="0"', ""))
+    assert not fflin.load(path).notes
+
+
+def test_toml_files_have_limits(tmp_path):
+    path = tmp_path / "inputs.toml"
+    path.write_text(
+        """
+[[input]]
+type = "base_torque"
+max = 40
+[[input]]
+type = "base_force"
+max = [3, 2, 1.5]
+min = -1
+[[input]]
+type = "thruster"
+frame = "base"
+position = [0, 0, 0]
+direction = [1, 0, 0]
+max = 22
+on_off = true
+least_impulse = 0.1
+[[input]]
+type = "reaction_wheel"
+axis = [0, 0, 1]
+inertia = 1e-3
+max = 0.2
+max_speed = 600
+"""
+    )
+    assert fflin.load_inputs(path) == (
+        fflin.BaseTorque(max=40.0),
+        fflin.BaseForce(max=(3.0, 2.0, 1.5), min=-1.0),
+        fflin.Thruster(*AT, max=22.0, on_off=True, least_impulse=0.1),
+        fflin.ReactionWheel((0, 0, 1), inertia=1e-3, max=0.2, max_speed=600.0),
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("type = 'base_torque'\nmax = 'a'", ":3: input 1: max is 'a', expected a finite number or"),
+        ("type = 'base_torque'\nmax = -2", ":3: input 1: base_torque max is -2, expected more"),
+        ("type = 'joint_torque'\njoint = 'a'\nmax = [1, 2, 3]", ":4: input 1: max is .* finite n"),
+        (
+            "type = 'joint_torque'\njoint = 'a'\nmin = 3\nmax = 1",
+            ":4: input 1: joint_torque min is",
+        ),
+        ("type = 'joint_torque'\njoint = 'a'\nlimit = 1", ":4: no key of a joint_torque named 'l"),
+        (
+            "type = 'base_force'\nmax = 1\n[[input]]\ntype = 'base_force'",
+            "stands in line 1 already",
+        ),
+    ],
+)
+def test_wrong_limits_in_toml_files_are_told_with_their_line(tmp_path, text, said):
+    path = tmp_path / "inputs.toml"
+    path.write_text(f"[[input]]\n{text}\n")
+    with pytest.raises(fflin.FflinError, match=said):
+        fflin.load_inputs(path)
+
+
+def test_the_range_of_a_travel_may_be_open_or_one_sided(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(
+        URDF.replace('lower="-1"', 'lower="0.5"', 1).replace('upper="1"', 'upper="inf"')
+    )
+    robot = fflin.load(path)
+    assert limits_of(robot)["q_m.hinge"] == (0.5, INF)
+    assert limits_of(robot)["q_m.elbow"] == (-1.0, INF)
+    assert "q_m.elbow" not in magnitudes_of(robot)
+    assert np.isfinite(list(fflin.linearize(robot).limits.values())).all()

@@ -1,0 +1,320 @@
+"""Limits in a run: what they cut, what saturates, what fires in pulses, and what was passed."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+
+import fflin
+from tests.support.robots import free_body
+
+AT = ("base", (0, 0, 0), (1, 0, 0))
+INERTIA, SPEED = 0.02, 300.0
+
+
+def spinner(**wheel):
+    """A body with a wheel about z that stores up to INERTIA SPEED = 6 N m s."""
+    options = {"inertia": INERTIA, "max_speed": SPEED, "max": 0.5} | wheel
+    wheel = fflin.ReactionWheel((0, 0, 1), name="spin", **options)
+    return free_body((20.0, 30.0, 40.0)).replace(inputs=[wheel])
+
+
+def test_limits_of_the_robot_cut_and_given_ones_go_first():
+    robot = fflin.load("servicer_7dof", limits={"tau_b": 40.0})
+    u = np.full(15, 1e3)
+
+    def acting(limits):
+        motion = fflin.simulate(robot, lambda t, q, v: u, duration=2e-4, dt=1e-4, limits=limits)
+        known = dict(zip(motion.limit_names, motion.limits.tolist(), strict=True))
+        assert motion.limits.shape == (len(known), 2)
+        return dict(zip(motion.input_names, motion.u[0], strict=True)), known
+
+    acted, known = acting(None)
+    assert set(acted.values()) == {1e3}
+    assert known["tau_b.x"] == [-40.0, 40.0]
+    assert known["tau_m.joint_5"] == [-100.0, 100.0]
+    assert known["qdot_m.joint_5"] == [-0.4, 0.4]
+    assert "F_b.x" not in known
+    acted, _ = acting("urdf")
+    assert (acted["tau_b.x"], acted["F_b.x"]) == (40.0, 1e3)
+    assert (acted["tau_m.joint_1"], acted["tau_m.panel_left"]) == (300.0, 50.0)
+    acted, known = acting(["urdf", {"joint_1": 7.0, "F_b": (-1.0, 2.0)}])
+    assert (acted["tau_m.joint_1"], acted["tau_m.joint_2"], acted["F_b.y"]) == (7.0, 300.0, 2.0)
+    assert known["F_b.z"] == [-1.0, 2.0]
+    assert known["tau_m.joint_1"] == [-7.0, 7.0]
+    acted, known = acting({"joint_1": 7.0})
+    assert (acted["tau_m.joint_1"], acted["tau_m.joint_2"]) == (7.0, 1e3)
+    assert known["tau_m.joint_1"] == [-7.0, 7.0]
+    acted, _ = acting(5.0)
+    assert set(acted.values()) == {5.0}
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("sample", [None, 0.5])
+@pytest.mark.parametrize("method", ["cf4", "semi_implicit_euler"])
+def test_a_wheel_saturates_and_no_momentum_is_lost(sign, sample, method):
+    robot = spinner()
+    motion = fflin.simulate(
+        robot,
+        lambda t, q, v: [sign],
+        duration=20.0,
+        sample=sample,
+        method=method,
+        limits="urdf",
+    )
+    speed = motion.x[:, motion.state_names.index("qdot_m.spin")]
+    assert np.abs(speed).max() <= SPEED * (1.0 + 1e-12)
+    assert speed[-1] == pytest.approx(sign * SPEED, rel=1e-9)
+    # Until then the motor gives what it can: 0.5 N m for about 12 s.
+    assert motion.u[0, 0] == 0.5 * sign
+    full = np.abs(motion.u[:, 0]) == 0.5
+    J = 1.0 / (1.0 / INERTIA + 1.0 / (40.0 - INERTIA))
+    assert motion.t[full][-1] == pytest.approx(J * SPEED / 0.5, abs=0.02)
+    assert np.abs(motion.u[-10:, 0]).max() < 1e-9
+    assert motion.momentum_drift.max() < 1e-14
+    # All that the body has is the wheel's: H = 0.
+    body = motion.x[-1, motion.state_names.index("omega_b.z")]
+    assert (40.0 - INERTIA) * body == pytest.approx(-INERTIA * (sign * SPEED + body), rel=1e-9)
+    (told,) = motion.saturated
+    assert (told.name, told.limit) == ("spin", 0.5 * sign)
+    assert told.share == pytest.approx(full.mean(), abs=1e-3)
+    assert not motion.passed
+
+
+def test_the_attitude_is_lost_where_the_wheel_is_full():
+    """A torque from outside of 0.1 N m fills 6 N m s in a minute; then the body turns."""
+    robot = spinner()
+
+    def hold(t, q, v):
+        # What turns the wheel turns the body back.
+        return [40.0 * (2.0 * 2.0 * q[5] + 2.0 * v[5])]
+
+    def push(t, q, v):
+        return [0, 0, 0, 0, 0, 0.1, 0]
+
+    runs = {
+        limits: fflin.simulate(
+            robot, hold, duration=100.0, dt=0.05, limits=limits, disturbance=push
+        )
+        for limits in (None, "urdf")
+    }
+    angle = {limits: 2.0 * np.degrees(np.arcsin(run.x[:, 2])) for limits, run in runs.items()}
+    early = runs["urdf"].t < 55.0
+    np.testing.assert_allclose(angle["urdf"][early], angle[None][early], atol=1e-9)
+    assert np.abs(angle[None]).max() < 0.1
+    # 40 s of 0.1 N m on 40 kg m^2: 2 rad.
+    assert angle["urdf"][-1] > 90.0
+    for run in runs.values():
+        assert run.momentum_drift.max() < 1e-13
+    assert not runs["urdf"].passed
+    (told,) = runs[None].passed
+    assert told.name == "qdot_m.spin"
+    assert told.value == pytest.approx(500.0, rel=1e-2)
+    assert re.fullmatch(r"spin 500 rad/s at 100 s, limit 300", str(told))
+
+
+def test_the_linear_model_foresees_the_wheel_that_saturates():
+    robot = spinner()
+    lin = fflin.linearize(robot.replace(inputs=[*robot.inputs, fflin.BaseTorque()]))
+    robot = robot.replace(inputs=[*robot.inputs, fflin.BaseTorque()])
+    K = np.zeros((4, len(lin.x0)))
+    K[0, lin.state_names.index("q_b.z")] = 8.0
+    x0 = lin.x0.copy()
+    x0[2] = math.sin(math.radians(0.5))
+    x0[lin.state_names.index("qdot_m.spin")] = 299.0
+    for model in (lin, lin.discretize(0.1)):
+        motion = fflin.simulate(
+            robot, fflin.StateFeedback(model, -K), x0=x0, duration=2.0, limits="urdf"
+        )
+        assert motion.u[0, 0] == pytest.approx(8.0 * x0[2])
+        assert motion.x[-1, -1] == pytest.approx(SPEED, rel=1e-6)
+        np.testing.assert_allclose(motion.linear[:, -1], motion.x[:, -1], atol=1e-3)
+
+
+def test_a_wheel_that_begins_too_fast_is_braked_within_its_torque():
+    robot = spinner()
+    motion = fflin.simulate(
+        robot,
+        lambda t, q, v: [0.0],
+        v0=fflin.velocity(robot, {"spin": 301.0}),
+        duration=0.5,
+        limits="urdf",
+    )
+    assert motion.u[0, 0] == -0.5
+    assert motion.x[-1, -1] == pytest.approx(SPEED, rel=1e-9)
+    (told,) = motion.passed
+    assert (told.name, told.value, told.time, told.limit) == ("qdot_m.spin", 301.0, 0.0, SPEED)
+
+
+def test_a_command_becomes_pulses_of_the_same_impulse():
+    robot = free_body((20.0, 30.0, 40.0)).replace(
+        inputs=[fflin.Thruster(*AT, max=2.0, on_off=True), fflin.BaseTorque()]
+    )
+    rng = np.random.default_rng(3)
+    told = np.column_stack((rng.uniform(-0.5, 2.5, 200), rng.normal(size=(200, 3))))
+    motion = fflin.simulate(
+        robot, lambda t, q, v: told[round(t / 0.1)], duration=20.0, dt=0.01, sample=0.1
+    )
+    thrust = motion.u[:-1, 0].reshape(200, 10)
+    assert set(thrust.ravel()) == {0.0, 2.0}
+    # One pulse from the beginning of each sample.
+    assert (np.diff(thrust, axis=1) <= 0.0).all()
+    given = np.cumsum(thrust.sum(axis=1) * 0.01)
+    asked = np.cumsum(np.clip(told[:, 0], 0.0, 2.0) * 0.1)
+    assert np.abs(given - asked).max() <= 0.5 * 2.0 * 0.01 + 1e-12
+    np.testing.assert_array_equal(motion.u[:-1:10, 1:], told[:, 1:])
+    assert robot.mass * motion.v[-1, :3] @ [1, 0, 0] < given[-1]
+    assert motion.momentum_drift.max() < 1e-13
+
+
+@pytest.mark.parametrize("on_off", [True, False])
+def test_what_is_below_the_least_impulse_is_carried_until_it_is_enough(on_off):
+    thruster = fflin.Thruster(*AT, max=2.0, on_off=on_off, least_impulse=0.05)
+    robot = free_body((20.0, 30.0, 40.0)).replace(inputs=[thruster])
+    motion = fflin.simulate(
+        robot, lambda t, q, v: [0.2], duration=2.0, dt=0.01, sample=0.1, limits="urdf"
+    )
+    impulse = motion.u[:-1, 0].reshape(20, 10).sum(axis=1) * 0.01
+    # 0.02 N s a sample: fired at the third (0.06), and so on; in steps of 0.02 N s where on-off.
+    assert set(np.round(impulse, 12)) == {0.0, 0.06}
+    assert np.flatnonzero(impulse).tolist() == [2, 5, 8, 11, 14, 17]
+    if on_off:
+        assert set(motion.u[:, 0]) == {0.0, 2.0}
+    else:
+        assert motion.u[25, 0] == pytest.approx(0.6)
+
+
+def test_pulses_are_late_where_there_is_a_delay_and_begin_with_what_the_model_asks():
+    robot = free_body((20.0, 30.0, 40.0)).replace(
+        inputs=[fflin.Thruster(*AT, max=1.0, on_off=True)]
+    )
+    lin = fflin.linearize(robot, u=[0.5]).discretize(0.1)
+    K = np.zeros((1, 12))
+    motion = fflin.simulate(
+        robot, fflin.StateFeedback(lin, K), duration=1.0, dt=0.01, delay=0.2, x0=lin.x0
+    )
+    np.testing.assert_array_equal(motion.u[:-1, 0].reshape(10, 10)[:, 4:6], [[1.0, 0.0]] * 10)
+    late = fflin.simulate(
+        robot, lambda t, q, v: [0.4], duration=1.0, dt=0.01, sample=0.1, delay=0.15
+    )
+    assert not late.u[:15].any()
+    np.testing.assert_array_equal(late.u[15:25, 0], [1.0] * 4 + [0.0] * 6)
+
+
+def test_the_linear_model_foresees_pulses():
+    robot = free_body((20.0, 30.0, 40.0)).replace(
+        inputs=[fflin.Thruster(*AT, max=1.0, on_off=True), fflin.BaseTorque()]
+    )
+    lin = fflin.linearize(robot)
+    K = np.zeros((4, 12))
+    K[0, 3] = K[0, 9] = 5.0
+    x0 = lin.x0.copy()
+    x0[3] = -0.1
+    for model in (lin.discretize(0.1), lin):
+        options = {} if model.dt else {"sample": 0.1}
+        policy = fflin.StateFeedback(model, K)
+        motion = fflin.simulate(robot, policy, x0=x0, duration=5.0, limits="urdf", **options)
+        assert set(motion.u[:, 0]) == {0.0, 1.0}
+        np.testing.assert_allclose(motion.linear, motion.x, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("thruster", "options", "said"),
+    [
+        ({"on_off": True}, {}, "thruster 'thruster_1' fires from sample to sample .*; give the"),
+        ({"least_impulse": 0.1}, {}, "fires from sample to sample"),
+        (
+            {"on_off": True, "least_impulse": 0.5},
+            {"sample": 0.1},
+            "least impulse of 0.5 N s, but gives 0.2 N s in a sample; take longer samples",
+        ),
+    ],
+)
+def test_pulses_without_samples_are_refused_in_a_line(thruster, options, said):
+    robot = free_body((20.0, 30.0, 40.0))
+    robot = robot.replace(inputs=[fflin.Thruster(*AT, max=2.0, **thruster)])
+    with pytest.raises(fflin.InputError, match=said):
+        fflin.simulate(robot, lambda t, q, v: [1.0], duration=1.0, limits="urdf", **options)
+    fflin.simulate(robot, duration=0.1)
+
+
+@pytest.mark.parametrize(
+    ("limits", "error", "said"),
+    [
+        ("none", fflin.InputError, "limits is 'none', expected 'urdf', a largest magnitude, "),
+        (["urdf", "x"], fflin.InputError, "limits is 'x', expected 'urdf'"),
+        (["urdf", {"nosuch": 1}], fflin.UnknownNameError, "no input or state named 'nosuch'"),
+        ({"tau_b": -1.0}, fflin.InputError, "limit of 'tau_b' is -1.0, expected a magnitude"),
+    ],
+)
+def test_limits_that_are_none_are_refused_in_a_line(limits, error, said):
+    with pytest.raises(error, match=said):
+        fflin.simulate(fflin.load("cubesat"), duration=0.1, limits=limits)
+
+
+def test_what_was_passed_is_told_with_value_time_and_limit():
+    robot = fflin.load("canadarm2")
+    asked = np.zeros(13)
+    asked[8] = 4000.0
+
+    def drive(t, q, v):
+        return asked * math.cos(math.pi * t)
+
+    run = fflin.simulate(robot, drive, duration=1.0)
+    told = {each.name: each for each in run.passed}
+    torque = told["tau_m.joint_3"]
+    assert (torque.value, torque.time, torque.limit) == (4000.0, 0.0, 3000.0)
+    assert str(torque) == "tau_m.joint_3 4000 N m at 0 s, limit 3000"
+    speed = told["qdot_m.joint_3"]
+    rate = run.x[:, run.state_names.index("qdot_m.joint_3")]
+    assert speed.value == rate[np.abs(rate).argmax()]
+    assert speed.time == run.t[np.abs(rate).argmax()]
+    assert re.fullmatch(r"joint_3 2\.\d+ rad/s at 0\.\d+ s, limit 0\.2", str(speed))
+    # The farthest first.
+    shares = [abs(each.value / each.limit) for each in run.passed]
+    assert shares == sorted(shares, reverse=True)
+    cut = fflin.simulate(robot, drive, duration=1.0, limits="urdf")
+    assert "tau_m.joint_3" not in {each.name for each in cut.passed}
+    low, high = sorted(cut.saturated, key=lambda each: each.limit)
+    assert (low.limit, high.limit) == (-3000.0, 3000.0)
+    at = math.acos(0.75) / math.pi
+    assert high.share == pytest.approx(at, abs=0.011)
+    assert low.share == pytest.approx(at, abs=0.011)
+    assert re.fullmatch(r"tau_m\.joint_3 at its limit of 3000 N m for 2\d % of the run", str(high))
+
+
+def test_travel_is_a_limit_too():
+    robot = fflin.load("servicer_7dof")
+    v0 = fflin.velocity(robot, {"panel_left": 0.5, "panel_right": -0.1})
+    (told,) = fflin.simulate(robot, v0=v0, duration=2.0).passed
+    assert told.name == "q_m.panel_left"
+    assert told.limit == 0.6
+    assert str(told).startswith("panel_left ")
+    assert str(told).endswith(" rad at 2 s, limit 0.6")
+
+
+@pytest.mark.parametrize("ending", [".npz", ".mat", ".json"])
+def test_limits_are_saved_and_loaded_and_older_files_have_none(tmp_path, ending):
+    robot = fflin.load("servicer_7dof", limits={"tau_b.x": (-1e9, 3.0)})
+    robot = robot.replace(inputs=[*robot.inputs, fflin.Thruster(*AT)])
+    motion = fflin.simulate(robot, duration=0.02)
+    assert np.isinf(motion.limits).any()
+    motion.save(tmp_path / f"m{ending}")
+    found = fflin.Motion.load(tmp_path / f"m{ending}")
+    assert found.limit_names == motion.limit_names
+    np.testing.assert_array_equal(found.limits, motion.limits)
+    bare = fflin.simulate(fflin.load("ets_vii"), duration=0.02)
+    assert bare.limits.shape == (0, 2)
+    bare.save(tmp_path / f"b{ending}")
+    assert fflin.Motion.load(tmp_path / f"b{ending}").limits.shape == (0, 2)
+    assert not bare.passed
+    assert not bare.saturated
+
+
+def test_a_file_that_has_no_limits_is_loaded(tmp_path):
+    fflin.simulate(fflin.load("cubesat"), duration=0.02).save(tmp_path / "m.npz")
+    with np.load(tmp_path / "m.npz") as file:
+        kept = {key: file[key] for key in file.files if "limit" not in key and key != "sha256"}
+    np.savez(tmp_path / "older.npz", **kept)
+    assert fflin.Motion.load(tmp_path / "older.npz").limits.shape == (0, 2)

@@ -1,0 +1,156 @@
+"""What the report of a motion says first, and what stands in its table."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.simulation.report import motion_report, saturated
+from tests.support.commands import run
+from tests.support.motions import settling
+
+
+def course(decay, *, robot="ets_vii", joint=0.5, **fields):
+    """A motion whose attitude and first joint go with decay(t) from 20 degrees and `joint`."""
+    robot = fflin.load(robot)
+    made = settling(robot, 20.0)
+    x = np.zeros_like(made.x)
+    share = decay(made.t)
+    x[:, 0] = np.sin(np.radians(20.0) / 2.0 * share)
+    x[:, 6] = joint * share
+    return replace(made, x=x, target=np.zeros(x.shape[1]), wheels=(), **fields)
+
+
+def first(motion):
+    return motion_report(motion).splitlines()[0]
+
+
+def cells(motion, title):
+    line = next(row for row in motion_report(motion).splitlines() if row.startswith(title + " "))
+    return line.removeprefix(title).split()
+
+
+def test_what_has_settled_says_so_first_and_when():
+    motion = course(lambda t: np.exp(-t / 2.0))
+    # 2 % of the largest is passed at 2 ln 50 = 7.82 s.
+    assert first(motion) == "settled: attitude 0.00091 deg and joints 2.3e-05 rad after 7.83 s"
+    assert cells(motion, "attitude") == ["deg", "20", "20", "0.000908", "7.83"]
+    assert motion_report(motion).splitlines()[1] == "ets_vii: 20 s, 2001 rows, frame hybrid"
+
+
+@pytest.mark.parametrize(("rate", "settled"), [(math.log(50.0) / 19.9, True), (0.19, False)])
+def test_the_margin_is_two_percent_of_the_largest_error(rate, settled):
+    motion = course(lambda t: np.exp(-rate * t))
+    assert first(motion).startswith("settled: " if settled else "not settled: attitude 0.4")
+    assert ("not yet" in motion_report(motion)) is not settled
+
+
+def test_what_stays_away_says_by_how_much():
+    motion = course(lambda t: np.exp(-t / 10.0))
+    assert first(motion) == "not settled: attitude 2.7 deg and joints 0.068 rad at the end"
+    motion = course(lambda t: np.exp(-t), joint=0.0)
+    x = motion.x.copy()
+    x[:, 7] = 1e-3 * motion.t
+    assert first(replace(motion, x=x)) == "not settled: joints 0.02 rad at the end"
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-17, 1e-12])
+def test_what_never_left_its_target_but_for_rounding_has_settled(size):
+    motion = course(lambda t: 0.0 * t)
+    noise = size * np.random.default_rng(0).normal(size=motion.x.shape)
+    motion = replace(motion, x=motion.x + noise)
+    assert first(motion) == "settled: at the target from first to last"
+    assert "not yet" not in motion_report(motion)
+
+
+def test_what_is_below_rounding_is_shown_as_none():
+    motion = course(lambda t: np.exp(-25.0 * t))
+    assert 0.0 < motion.x[-1, 6] < 1e-199
+    assert cells(motion, "joints") == ["rad", "0.5", "0.5", ".", "0.16"]
+
+
+def test_what_was_stopped_says_so_first():
+    motion = course(lambda t: np.exp(-t), stopped="diverged at t = 20 s")
+    assert first(motion) == "stopped: diverged at t = 20 s"
+    free = fflin.simulate(
+        fflin.load("ets_vii"), duration=1.0, dt=0.1, events=[lambda t, q, v: 0.45 - t]
+    )
+    assert first(free) == "stopped: <lambda> at t = 0.5 s"
+
+
+def test_a_motion_without_a_target_has_no_verdict():
+    report = motion_report(fflin.simulate(fflin.load("ets_vii"), duration=0.1))
+    assert report.startswith("ets_vii: 0.1 s")
+    assert not any(word in report for word in ("settled", "error", "largest inputs"))
+
+
+def test_wheels_are_no_joints():
+    robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
+    lin = fflin.linearize(robot)
+    x = np.zeros(len(lin.x0))
+    at = [lin.state_names.index(f"{group}.wheel_z") for group in ("q_m", "qdot_m")]
+    x[at] = 60.0, 3.0
+    motion = fflin.simulate(robot, x0=x, target=lin, duration=1.0)
+    assert motion.x[-1, at[0]] == pytest.approx(63.0)
+    report = motion_report(motion)
+    assert "joint" not in report
+    assert cells(motion, "wheel speeds") == ["rad/s", "3", "3", "3", "not", "yet"]
+    assert first(motion) == "settled: at the target from first to last"
+
+
+def test_lengths_and_angles_of_joints_have_rows_of_their_own():
+    motion = course(lambda t: np.exp(-t))
+    units = list(motion.state_units)
+    units[motion.state_names.index("q_m.joint_2")] = "m"
+    slides = replace(motion, state_units=tuple(units))
+    rows = [row.split()[:2] for row in motion_report(slides).splitlines() if "joints " in row]
+    assert ["joints", "rad"] in rows and ["joints", "m"] in rows
+
+
+def test_what_no_policy_steers_is_told_apart():
+    steered = tuple(n for n in course(np.exp).state_names if n.startswith(("q_m", "qdot_m")))
+    motion = course(lambda t: np.exp(-t), steered=steered)
+    x = motion.x.copy()
+    x[:, 0] = np.sin(np.radians(15.0))
+    said = first(replace(motion, x=x))
+    assert said == "settled: joints 1e-09 rad after 3.92 s; not steered: attitude 30 deg"
+
+
+def test_the_states_that_a_feedback_feeds_back_are_on_record():
+    robot = fflin.load("ets_vii")
+    lin = fflin.linearize(robot)
+    K = fflin.lqr(lin).K.copy()
+    K[:, [lin.state_names.index(f"r_b.{axis}") for axis in "xyz"]] = 0.0
+    motion = fflin.simulate(robot, fflin.StateFeedback(lin, K), duration=0.05)
+    assert set(lin.state_names) - set(motion.steered) == {"r_b.x", "r_b.y", "r_b.z"}
+
+
+def test_inputs_at_their_limits_all_along_are_named():
+    t = np.linspace(0.0, 1.0, 101)
+    u = np.column_stack((0 * t + 3.0, -3.0 + 0 * t, np.where(t < 0.8, 3.0, 0.0), 0 * t, 0 * t))
+    motion = SimpleNamespace(
+        input_names=("high", "low", "part", "thruster", "off"),
+        u=u,
+        limit_names=("high", "low", "part", "thruster", "off"),
+        limits=np.array([[-3.0, 3.0], [-3.0, 3.0], [-3.0, 3.0], [0.0, 3.0], [0.0, 0.0]]),
+    )
+    assert saturated(motion) == ["high", "low"]
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "begins"),
+    [
+        ((), 0, "settled: at the target from first to last"),
+        (("--rpy", 20, 0, 0), 0, "not settled: attitude "),
+        (("--free",), 0, "planar_detumble: 2 s"),
+        (("--free", "--velocity", "joint_1=400"), 1, "stopped: diverged at t = "),
+    ],
+)
+def test_the_command_says_it_first_and_unsettled_is_no_failure(options, code, begins):
+    found, out, _ = run("simulate", "planar_detumble", "--duration", 2, *options)
+    assert found == code
+    assert out.splitlines()[0].startswith(begins)
+    assert max(map(len, out.splitlines())) <= 80
