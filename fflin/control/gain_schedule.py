@@ -103,7 +103,8 @@ class GainSchedule(Design):
 
         Between the knots R^-1 B' P of B and P there; of samples that of the last one.
         """
-        if type(t) is not float or not self._first <= t <= self._last:
+        first, last = self._ends
+        if type(t) is not float or not first <= t <= last:
             t = self._within(t)
         k = bisect_right(self._starts, t) - 1
         if self.dt:
@@ -111,7 +112,7 @@ class GainSchedule(Design):
         x = t - self._starts[k]
         square = x * x
         powers = np.array((1.0, x, square, square * x, square * square))
-        K: Array = powers.dot(self._quartics[k]).reshape(self._shape)
+        K: Array = powers.dot(self._quartics[k]).reshape(self.K.shape[1:])
         return K
 
     def cost_to_go(self, t: float) -> Array:
@@ -121,27 +122,19 @@ class GainSchedule(Design):
         return P
 
     def _within(self, t: float) -> float:
-        t = number("t", t)
-        if not self._first <= t <= self._last:
-            raise InputError(f"t is {t:g} s, expected {self._first:g} to {self._last:g} s")
+        t, (first, last) = number("t", t), self._ends
+        if not first <= t <= last:
+            raise InputError(f"t is {t:g} s, expected {first:g} to {last:g} s")
         return t
 
     @cached_property
-    def _first(self) -> float:
-        return float(self.t[0])
-
-    @cached_property
-    def _last(self) -> float:
-        return float(self.t[-1])
-
-    @cached_property
-    def _shape(self) -> tuple[int, ...]:
-        return self.K.shape[1:]
+    def _ends(self) -> tuple[float, float]:
+        return float(self.t[0]), float(self.t[-1])
 
     @cached_property
     def _starts(self) -> list[float]:
         """Where each piece begins; a sample a little early, since clocks are rounded."""
-        early = [self._first, *(self.t[1:] - 1e-9 * self.dt).tolist()]
+        early = [self._ends[0], *(self.t[1:] - 1e-9 * self.dt).tolist()]
         return early if self.dt else self.t[:-1].tolist()
 
     @cached_property

@@ -16,7 +16,7 @@ from fflin.base.rotation import (
     rotation_matrix,
 )
 from fflin.base.validation import Array
-from fflin.dynamics.chart import SMALLEST_Q0, Chart
+from fflin.dynamics.chart import Chart
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
 
 Readout: TypeAlias = Callable[[Array, Array], Array]
@@ -39,37 +39,6 @@ def state_history(state: StateMap, q: Array, v: Array, near: Array | None = None
     for k in state.unbounded:
         q_m[:, k] = np.unwrap([before[k], *q_m[:, k]])[1:]
     return state.compose(chart, state.positions(q), q_m, state.velocities(v))
-
-
-def points_of(state: StateMap, x: Array) -> tuple[Chart, Array, Array]:
-    """Return the chart, q and v of states (N, nx): `StateMap.to_pinocchio` of many.
-
-    Raises
-    ------
-    ChartError, InputError
-        As that does.
-    """
-    robot, g, at = state.robot, state.groups, state.origin
-    q_b = x[:, g.q_b]
-    square = 1.0 - (q_b * q_b).sum(axis=1, keepdims=True)
-    if not (np.isfinite(x).all() and (square >= SMALLEST_Q0**2).all()):
-        for row in x:
-            state.to_pinocchio(row)  # says what is wrong
-    relative = np.concatenate((q_b, np.sqrt(square)), axis=1)
-    chart = Chart(q_b, relative[:, 3:], rotation_matrices(relative))
-    q = np.empty((len(x), robot.nq))
-    q[:, :3] = (x[:, g.r_b] - at.translation) @ at.rotation
-    q[:, 3:7] = relative @ product_matrix(conjugate(state.origin_quaternion)).T
-    for joint, angles in zip(robot.joints, x[:, g.q_m].T, strict=True):
-        q[:, joint.idx_q] = np.cos(angles) if joint.unbounded else angles
-        if joint.unbounded:
-            q[:, joint.idx_q + 1] = np.sin(angles)
-    nu = state.to_base(chart, x[:, 6 + robot.n :, None])[..., 0]
-    if not robot.followers:
-        return chart, q, state.spread(nu)
-    for row in q:
-        robot.follow(row)
-    return chart, q, np.array([state.spread(row) for row in nu])
 
 
 def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:

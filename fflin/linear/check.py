@@ -30,7 +30,6 @@ from fflin.linear.nonlinear import (
     difference_steps,
     flow_error,
     jacobian,
-    slopes,
 )
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
@@ -169,7 +168,7 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     ]
     rows += [
         Row("differences", f"{b.matrix}[{b.row}, {b.column}]", b.error, difference)
-        for b in compare(state, lin, M, *slopes(model, lin, M))
+        for b in compare(state, lin, M, *_differences(model, lin, M))
     ]
     rows += _output_rows(model, lin, M, difference)
     rows.append(Row("flow", "f", flow_error(robot, lin), difference))
@@ -218,6 +217,20 @@ def _point_errors(
     return errors
 
 
+def _differences(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
+    """Return A and B by central differences of the nonlinear model.
+
+    It is quadratic in the velocities, and linear in the inputs and in where the base is.
+    """
+    step, push = difference_steps(model.state, lin, M)
+    bends = np.arange(len(step)) < len(step) - len(M)
+    bends[model.state.groups.r_b] = False
+    A = jacobian(lambda x: model.rates(x, np.tile(lin.u0, (len(x), 1))), lin.x0, step, bends)
+    straight = np.zeros(len(push), dtype=bool)
+    B = jacobian(lambda u: model.rates(np.tile(lin.x0, (len(u), 1)), u), lin.u0, push, straight)
+    return A, B
+
+
 def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float) -> list[Row]:
     """Rows of C, D and y0 against differences of what the nonlinear model measures."""
     state = model.state
@@ -243,8 +256,9 @@ def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float)
 
     step_x, step_u = difference_steps(model.state, lin, M)
     here = y(lin.x0, lin.u0)
-    C = jacobian(lambda x: y(x, lin.u0), lin.x0, step_x)
-    D = jacobian(lambda u: y(lin.x0, u), lin.u0, step_u)
+    of_x, of_u = (np.ones(len(each), dtype=bool) for each in (step_x, step_u))
+    C = jacobian(lambda rows: np.array([y(x, lin.u0) for x in rows]), lin.x0, step_x, of_x)
+    D = jacobian(lambda rows: np.array([y(lin.x0, u) for u in rows]), lin.u0, step_u, of_u)
     # A slope below the rounding of y divided by the step is noise, and not compared more closely.
     scale = _ULPS * np.maximum(1.0, np.abs(here))[:, None]
     rows = [Row("outputs", "y0", _relative(lin.y0, here), tolerance)]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -11,7 +12,7 @@ from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.chart import Chart, times
 from fflin.dynamics.state import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR, StateMap
-from fflin.dynamics.state_rows import moving_error, points_of
+from fflin.dynamics.state_rows import moving_error
 from fflin.linear.certificate import mobilities
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -44,7 +45,7 @@ class Nonlinear:
 
     def _accelerations(self, x: Array, u: Array) -> tuple[Chart, Array, Array, Array]:
         """Return the chart, q, v and a of rows."""
-        chart, q, v = points_of(self.state, x)
+        chart, q, v = self.state.points(x)
         u = self.aba.actuation.in_base_axes(chart, u)
         observer = self._observer @ rotation_matrices(q[:, 3:7])
         seen = v.copy()
@@ -113,37 +114,19 @@ class ErrorDynamics(Nonlinear):
         return np.concatenate((0.5 * turning, flying, rates, state.velocities(a) - self._a), axis=1)
 
 
-def slopes(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
-    """Return A and B of a model's point by central differences, of sixth order where they bend.
+def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, bends: Any) -> Array:
+    """Return the slopes of f, of rows, at a point by central differences of the given steps.
 
-    f is quadratic in the velocities, and linear in the inputs and in where the base is.
+    Of sixth order where f `bends`; it is at most quadratic in the others, so that one is exact.
     """
-    groups, nx, x0, u0 = model.state.groups, len(lin.x0), lin.x0, lin.u0
-    step, push = difference_steps(model.state, lin, M)
-    bends = np.arange(nx) < nx - len(M)
-    bends[groups.r_b] = False
-    curved, straight = np.diag(step)[bends], np.diag(step)[~bends]
+    curved, straight = np.diag(steps)[bends], np.diag(steps)[~bends]
     ways = np.concatenate((*(k * curved for k in (1, 2, 3)), straight))
-    pushes = np.diag(push)
-    x = np.concatenate((x0 + ways, x0 - ways, np.tile(x0, (2 * len(push), 1))))
-    u = np.concatenate((np.tile(u0, (2 * len(ways), 1)), u0 + pushes, u0 - pushes))
-    of_x, of_u = np.split(model.rates(x, u), [2 * len(ways)])
-    first, last = np.split(of_x, 2)
-    parts = np.split(first - last, [len(curved) * k for k in (1, 2, 3)])
-    A: Array = np.empty((nx, nx))
-    A[:, bends] = np.tensordot(_WEIGHTS, parts[:3], axes=1).T
-    A[:, ~bends] = 0.5 * parts[3].T
-    first, last = np.split(of_u, 2)
-    return A / step, 0.5 * (first - last).T / push
-
-
-def jacobian(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:
-    """Return the slopes of f at a point by sixth-order central differences of the given steps."""
-
-    def slope(along: Array) -> Array:
-        return _derivative(lambda t: f(point + t * along), 1.0)
-
-    return np.column_stack([slope(along) for along in np.diag(steps)]) / steps
+    first, last = np.split(f(np.concatenate((point + ways, point - ways))), 2)
+    *near, rest = np.split(first - last, [len(curved) * k for k in (1, 2, 3)])
+    slopes: Array = np.empty((rest.shape[1], len(point)))
+    slopes[:, bends] = np.tensordot(_WEIGHTS, near, axes=1).T
+    slopes[:, ~bends] = 0.5 * rest.T
+    return slopes / steps
 
 
 def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array, Array]:

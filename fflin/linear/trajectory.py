@@ -74,7 +74,7 @@ class Trajectory(Design):
         times = vector("t", times, times.size, "times of the knots")
         if len(times) < 2 or (np.diff(times) <= 0.0).any():
             raise InputError("t must hold at least two times, each later than the one before")
-        if self.hold not in (None, "linear", "previous"):
+        if self.hold is not None and str(self.hold) not in ("linear", "previous"):
             raise InputError(f"hold is {self.hold!r}, expected 'linear' or 'previous'")
         count, u = len(times), as_double("u", self.u)
         short = u.shape == (count - 1, nu) and self.hold != "linear"

@@ -161,17 +161,8 @@ class Motion(Design):
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
         """Return the motion by knots, with inputs that are held or linear: what it holds to better.
 
-        Of inputs that change all the time the last, which no row has, is extrapolated.
-
-        Parameters
-        ----------
-        robot : Robot, optional
-            That moves; needed where the motion is read from a file.
-
-        Raises
-        ------
-        InputError
-            If there is no robot, or it is another one.
+        Of inputs that change all the time the last, which no row has, is extrapolated. A motion
+        that was read from a file needs the `robot`.
         """
         from fflin.linear.trajectory import Trajectory
         from fflin.linear.trajectory_files import arguments
@@ -186,12 +177,8 @@ class Motion(Design):
         held = Trajectory(robot, **values)
         if not (self.u - self.u[0]).any():
             return held
-        before, u = self.t[-4:-1], values["u"]
-        u[-1] = 0.0
-        for i, t in enumerate(before):
-            others = np.delete(before, i)
-            share = np.prod((self.t[-1] - others) / (t - others))
-            u[-1] += share * u[i - len(before) - 1]
+        before, u = self.t[-4:-1] - self.t[-1], values["u"]
+        u[-1] = np.linalg.solve(np.vander(before).T, np.eye(len(before))[-1]) @ u[-4:-1]
         smooth = Trajectory(robot, **values | {"hold": "linear", "u": u})
         return min(held, smooth, key=lambda each: float(each.residual.max()))
 
