@@ -21,6 +21,7 @@ from fflin.commands import (
     regulator,
     simulation,
     sweeps,
+    tracking,
     visual,
 )
 
@@ -103,6 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     models.add_commands(commands)
     analysis.add_commands(commands)
     regulator.add_commands(commands)
+    tracking.add_commands(commands)
     simulation.add_commands(commands)
     visual.add_commands(commands)
     sweeps.add_commands(commands)

@@ -18,6 +18,7 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import linear_model, load_robot
+from fflin.commands.tracking import add_trajectory, check_along, linearize_along
 
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
@@ -41,6 +42,7 @@ def add_commands(commands: Commands) -> None:
     linearize.add_argument(
         "--dt", metavar="H", type=number, help="sample it, with inputs held over H [s]"
     )
+    add_trajectory(linearize)
     add_output_file(
         linearize, "save to FILE: .npz, .mat, .json, or .csv (one file a matrix: NAME.A.csv, ...)"
     )
@@ -52,6 +54,7 @@ def add_commands(commands: Commands) -> None:
         "fflin check canadarm2 --rpy 20 0 0 --reference world --frame world",
     )
     add_point(check)
+    add_trajectory(check)
 
 
 def _robots(_: argparse.Namespace) -> int:
@@ -82,6 +85,8 @@ def _info(arguments: argparse.Namespace) -> int:
 
 
 def _linearize(arguments: argparse.Namespace) -> int:
+    if arguments.trajectory:
+        return linearize_along(arguments)
     if arguments.output_file:
         from fflin.base.writing import check_place
         from fflin.linear.files import FORMATS
@@ -101,6 +106,8 @@ def _linearize(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> int:
+    if arguments.trajectory:
+        return check_along(arguments)
     from fflin.linear.check import check
 
     robot, lin = linear_model(arguments)

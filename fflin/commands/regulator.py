@@ -25,6 +25,7 @@ from fflin.commands.arguments import (
 from fflin.commands.points import linear_model, once
 
 if TYPE_CHECKING:
+    from fflin.base.validation import Array
     from fflin.control.gain import Gain
     from fflin.linear.model import LinearModel
 
@@ -106,7 +107,8 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
         lin = lin.discretize(arguments.dt)
     try:
         if arguments.q or arguments.r or arguments.bryson:
-            gain = _weighed(lin, arguments)
+            *weights, rule = named_weights(lin, arguments)
+            gain = replace(lqr(lin, *weights), weights=rule)
         else:
             gain = lqr(lin, weights=arguments.weights)
     except StabilizabilityError as error:
@@ -117,10 +119,11 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     return gain
 
 
-def _weighed(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
-    """Return the regulator with weights that are named, and a rule's for what is not."""
+def named_weights(
+    lin: LinearModel, arguments: argparse.Namespace
+) -> tuple[Array, Array, Array | None, str]:
+    """Return Q, R and N with what is named, and a rule's for what is not; and the rule in words."""
     from fflin.control.default_weights import rule_weights
-    from fflin.control.lqr import lqr
     from fflin.control.weights import inverse_square, is_input
 
     values = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
@@ -134,8 +137,7 @@ def _weighed(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     if both:
         raise InputError(f"'{both[0]}' has a weight and a largest value; give either")
     q, r = values["q"] | of_states, values["r"] | of_inputs
-    *weights, rule = rule_weights(lin, arguments.weights, q, r)
-    return replace(lqr(lin, *weights), weights=rule)
+    return rule_weights(lin, arguments.weights, q, r)
 
 
 def _lqr(arguments: argparse.Namespace) -> int:

@@ -85,6 +85,12 @@ class GainSchedule(Design):
             f"residual={self.residual:.1e})"
         )
 
+    def __str__(self) -> str:
+        """Show what made it."""
+        return (
+            f"{super().__str__()}\nweights: {self.weights}" if self.weights else super().__str__()
+        )
+
     def trajectory(self, robot: Robot) -> Trajectory:
         """Return the trajectory that it keeps a robot on."""
         from fflin.linear.trajectory import Trajectory

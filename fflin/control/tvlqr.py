@@ -36,6 +36,7 @@ def tvlqr(
     sample: float | None = None,
     *,
     weights: str | None = None,
+    rule: str = "as given",
 ) -> GainSchedule:
     r"""Return the regulator along a trajectory, over its finite horizon.
 
@@ -68,6 +69,8 @@ def tvlqr(
         Sampling time [s], of which the duration is a multiple.
     weights : {"urdf", "identity"}, optional
         Instead of Q and R: the rule of `lqr`, about that same point.
+    rule : str
+        What made Q and R, in words.
 
     Returns
     -------
@@ -99,13 +102,13 @@ def tvlqr(
     if traj.dt:
         raise InputError("traj is sampled; give the continuous one, and sample=")
     names, dt = traj.state_names, 0.0 if sample is None else number("sample", sample)
-    steady, rule = isinstance(Qf, str), "as given"
+    steady = isinstance(Qf, str)
     if steady and Qf != "steady":
         raise InputError(f"Qf is {Qf!r}, expected 'steady' or a weight")
     by_rule = Q is None and R is None
     if not by_rule and (weights is not None or Q is None or R is None):
         raise InputError("give Q and R, both, or weights='urdf' or 'identity' without them")
-    end: Any = _steady_end(traj) if steady or by_rule else None
+    end: Any = steady_end(traj) if steady or by_rule else None
     given: Any = (Q, R)
     if by_rule:
         from fflin.control.default_weights import default_weights, rule_weights
@@ -135,7 +138,7 @@ def tvlqr(
     return replace(schedule, residual=_residual(schedule))
 
 
-def _steady_end(traj: LinearTrajectory) -> LinearModel:
+def steady_end(traj: LinearTrajectory) -> LinearModel:
     """Return the model at the end where that is steady, else at rest in the last configuration."""
     from fflin.linear.equilibrium import equilibrium
     from fflin.linear.ignorable import rotor_names

@@ -273,9 +273,13 @@ def _others(traj: Trajectory) -> Iterator[tuple[str, Trajectory]]:
     for frame in ("local", "hybrid", "world"):
         yield f"with u in frame {frame}", replace(traj, frame=frame)
     v = traj.v.copy()
-    for words, part in (("linear velocity", slice(0, 3)), ("velocities", slice(3, 6))):
+    for words, part, frame in (
+        ("linear velocity", slice(0, 3), "hybrid"),
+        ("velocities", slice(3, 6), "world"),
+    ):
         v[:, part] = (traj.v[:, None, part] @ R)[:, 0]
         yield f"with the {words} of the base in reference axes", replace(traj, v=v)
+        yield f"with u and v in frame {frame}", replace(traj, v=v, frame=frame)
     for words, has, fields_ in (
         ("without damping", any(robot.damping.values()), {"damping": {}}),
         ("without springs", any(robot.stiffness.values()), {"stiffness": {}}),

@@ -93,10 +93,10 @@ def _entries(columns: Record, state: StateMap) -> Record:
     rows = rows if any(rows.values()) else {"x": list(state.names)}
     rows["t"], inputs = ["t"], Actuation(state).names
     acting = {name: each for name in inputs for each in (f"u.{name}", name) if each in columns}
-    known = {each for names in (*rows.values(), acting.values()) for each in names}
+    known = [each for names in (*rows.values(), acting.values()) for each in names]
     wrong = next((name for name in columns if name not in {*known, "hold", "frame"}), None)
     if wrong is not None:
-        raise unknown("state or input", wrong, [*known, *inputs])
+        raise unknown("state or input", wrong, dict.fromkeys((*known, *inputs)))
     missing = next((name for name in known if name not in columns), None)
     if missing is not None:
         raise unknown("column", missing, columns)
