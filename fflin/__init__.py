@@ -5,106 +5,91 @@ from typing import TYPE_CHECKING, Any
 
 from fflin.base.version import __version__
 
-# Public name -> module. Each is imported when it is first asked for, so that a command which
-# needs no dynamics does not pay for them.
-_PUBLIC = {
-    "Accelerometer": "robot.outputs",
-    "Allocation": "control.policies",
-    "BaseForce": "robot.inputs",
-    "BasePose": "robot.outputs",
-    "BaseTorque": "robot.inputs",
-    "CenterOfMass": "robot.outputs",
-    "Certificate": "linear.model",
-    "ChartError": "base.errors",
-    "Check": "linear.check",
-    "Compensator": "control.kalman",
-    "Controllability": "analysis.controllability",
-    "DetectabilityError": "base.errors",
-    "Equilibrium": "linear.equilibrium",
-    "EquilibriumError": "base.errors",
-    "Estimator": "control.kalman",
-    "FflinError": "base.errors",
-    "FflinWarning": "base.errors",
-    "FileError": "base.errors",
-    "FramePose": "robot.outputs",
-    "FrameVelocity": "robot.outputs",
-    "FullState": "robot.outputs",
-    "Gain": "control.gain",
-    "GainBatch": "batch.gains",
-    "GainSchedule": "control.gain_schedule",
-    "Gramians": "analysis.gramians",
-    "Grid": "batch.configurations",
-    "Gyroscope": "robot.outputs",
-    "InputError": "base.errors",
-    "JointPositions": "robot.outputs",
-    "JointTorque": "robot.inputs",
-    "JointVelocities": "robot.outputs",
-    "LinearBatch": "batch.linear_batch",
-    "LinearModel": "linear.model",
-    "LinearTrajectory": "linear.linear_trajectory",
-    "Linearizer": "linear.linearization",
-    "MissingPackageError": "base.errors",
-    "Mode": "analysis.modes",
-    "ModelError": "base.errors",
-    "Modes": "analysis.modes",
-    "Momentum": "robot.outputs",
-    "Motion": "simulation.motion",
-    "Observability": "analysis.observability",
-    "OutputFeedback": "control.output_feedback",
-    "RandomConfigurations": "batch.configurations",
-    "ReactionWheel": "robot.inputs",
-    "RelativePose": "robot.outputs",
-    "ReducedModel": "analysis.momentum",
-    "Robot": "robot.robot",
-    "ScheduledFeedback": "batch.gains",
-    "SingularInertiaError": "base.errors",
-    "StabilizabilityError": "base.errors",
-    "StateFeedback": "control.policies",
-    "StateMap": "dynamics.state",
-    "SweepError": "base.errors",
-    "Thruster": "robot.inputs",
-    "Trajectory": "linear.trajectory",
-    "TrajectoryFeedback": "control.policies",
-    "UnknownNameError": "base.errors",
-    "UrdfError": "base.errors",
-    "Validity": "analysis.validity",
-    "acceleration_lqr": "control.acceleration_lqr",
-    "bryson": "control.weights",
-    "check": "linear.check",
-    "configuration": "dynamics.points",
-    "controllability": "analysis.controllability",
-    "effort": "dynamics.points",
-    "equilibrium": "linear.equilibrium",
-    "from_model": "robot.loading",
-    "generalized_inertia": "analysis.momentum",
-    "generalized_jacobian": "analysis.momentum",
-    "gramians": "analysis.gramians",
-    "grid": "batch.configurations",
-    "kalman": "control.kalman",
-    "linearize": "linear.linearization",
-    "linearize_trajectory": "linear.linear_trajectory",
-    "list_robots": "robot.catalog",
-    "load": "robot.loading",
-    "load_inputs": "robot.input_files",
-    "lqg": "control.kalman",
-    "lqr": "control.lqr",
-    "lqr_batch": "batch.gains",
-    "modes": "analysis.modes",
-    "momentum_reduction": "analysis.momentum",
-    "observability": "analysis.observability",
-    "plot_matrices": "analysis.plots",
-    "plot_motion": "simulation.motion",
-    "plot_poles": "analysis.plots",
-    "plot_validity": "analysis.plots",
-    "random_configurations": "batch.configurations",
-    "sampled_cost": "control.sampled_cost",
-    "simulate": "simulation.simulate",
-    "sweep": "batch.sweep",
-    "tvlqr": "control.tvlqr",
-    "validity": "analysis.validity",
-    "velocity": "dynamics.points",
-    "visualize": "view.visualize",
+# Public names by what they are for, each row after its module. A name is imported when it is first
+# asked for, so that a command which needs no dynamics does not pay for it.
+_NAMES = {
+    "Robots": (
+        "robot.loading load from_model",
+        "robot.catalog list_robots",
+        "robot.robot Robot",
+        "dynamics.points configuration velocity effort",
+    ),
+    "Inputs": (
+        "robot.inputs BaseTorque BaseForce JointTorque Thruster ReactionWheel",
+        "robot.input_files load_inputs",
+    ),
+    "Outputs": (
+        "robot.outputs FullState JointPositions JointVelocities BasePose FramePose",
+        "robot.outputs FrameVelocity RelativePose Gyroscope Accelerometer",
+        "robot.outputs CenterOfMass Momentum",
+    ),
+    "Linear models": (
+        "linear.linearization linearize Linearizer",
+        "linear.model LinearModel Certificate",
+        "dynamics.state StateMap",
+        "linear.equilibrium equilibrium Equilibrium",
+        "linear.trajectory Trajectory",
+        "linear.linear_trajectory linearize_trajectory LinearTrajectory",
+        "linear.check check Check",
+    ),
+    "Analysis": (
+        "analysis.controllability controllability Controllability",
+        "analysis.observability observability Observability",
+        "analysis.gramians gramians Gramians",
+        "analysis.modes modes Modes Mode",
+        "analysis.momentum momentum_reduction ReducedModel generalized_inertia",
+        "analysis.momentum generalized_jacobian",
+        "analysis.validity validity Validity",
+    ),
+    "Control": (
+        "control.lqr lqr",
+        "control.weights bryson",
+        "control.gain Gain",
+        "control.acceleration_lqr acceleration_lqr",
+        "control.sampled_cost sampled_cost",
+        "control.tvlqr tvlqr",
+        "control.gain_schedule GainSchedule",
+        "control.kalman kalman Estimator lqg Compensator",
+    ),
+    "Policies": (
+        "control.policies StateFeedback TrajectoryFeedback Allocation",
+        "control.output_feedback OutputFeedback",
+        "batch.gains ScheduledFeedback",
+    ),
+    "Simulation": (
+        "simulation.simulate simulate",
+        "simulation.motion Motion",
+        "view.visualize visualize",
+    ),
+    "Sweeps": (
+        "batch.sweep sweep",
+        "batch.linear_batch LinearBatch",
+        "batch.gains lqr_batch GainBatch",
+        "batch.configurations grid Grid random_configurations RandomConfigurations",
+    ),
+    "Figures": (
+        "analysis.plots plot_matrices plot_check plot_modes plot_validity",
+        "control.plots plot_poles plot_loops",
+        "simulation.motion plot_motion",
+    ),
+    "Errors": (
+        "base.errors FflinError InputError UnknownNameError FileError",
+        "base.errors MissingPackageError ModelError UrdfError ChartError",
+        "base.errors EquilibriumError SingularInertiaError StabilizabilityError",
+        "base.errors DetectabilityError SweepError FflinWarning",
+    ),
 }
+_PUBLIC = {
+    name: module
+    for rows in _NAMES.values()
+    for module, *names in map(str.split, rows)
+    for name in names
+}
+
+__doc__ = f"{__doc__}\n" + "\n".join(
+    f"\n{title}\n    " + "\n    ".join(", ".join(row.split()[1:]) for row in rows)
+    for title, rows in _NAMES.items()
+)
 
 __all__ = sorted(_PUBLIC)  # noqa: PLE0605 - the table above is the one list of public names
 
@@ -119,7 +104,7 @@ if TYPE_CHECKING:
         momentum_reduction,
     )
     from fflin.analysis.observability import Observability, observability
-    from fflin.analysis.plots import plot_matrices, plot_poles, plot_validity
+    from fflin.analysis.plots import plot_check, plot_matrices, plot_modes, plot_validity
     from fflin.analysis.validity import Validity, validity
     from fflin.base.errors import (
         ChartError,
@@ -147,6 +132,7 @@ if TYPE_CHECKING:
     from fflin.control.kalman import Compensator, Estimator, kalman, lqg
     from fflin.control.lqr import lqr
     from fflin.control.output_feedback import OutputFeedback
+    from fflin.control.plots import plot_loops, plot_poles
     from fflin.control.policies import Allocation, StateFeedback, TrajectoryFeedback
     from fflin.control.sampled_cost import sampled_cost
     from fflin.control.tvlqr import tvlqr

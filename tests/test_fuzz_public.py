@@ -199,7 +199,7 @@ def test_a_motion_that_does_not_fit_into_the_memory_is_refused():
         "pages = int(open('/proc/self/statm').read().split()[0])\n"
         "limit = pages * resource.getpagesize() + 2**28\n"
         "resource.setrlimit(resource.RLIMIT_AS, (limit, limit))\n"
-        "try: fflin.simulate(robot, duration=5e6, dt=1.0)\n"
+        "try: fflin.simulate(robot, duration=5e6, dt=1.0, every=1)\n"
         "except fflin.InputError as error: print(error)\n"
     )
     done = run(code, OPENBLAS_NUM_THREADS="1")

@@ -1,6 +1,7 @@
 """The list of public names, and what an import pays for."""
 
 import ast
+import pydoc
 import subprocess
 import sys
 from pathlib import Path
@@ -38,3 +39,14 @@ def test_import_pays_for_nothing_heavy():
         "from fflin.commands.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass"
     )
     assert not imported_by(help_text) & (heavy | {"numpy", "pinocchio"})
+
+
+def test_help_begins_with_the_public_names_each_under_one_title():
+    said = pydoc.plain(pydoc.render_doc(fflin))
+    first = said.partition("PACKAGE CONTENTS")[0]
+    assert max(map(len, first.splitlines())) <= 100
+    listed = [name for line in first.splitlines() for name in line.strip().split(", ")]
+    for name in fflin.__all__:
+        assert listed.count(name) == 1, name
+    titles = [line.strip() for line in fflin.__doc__.splitlines()[1:] if line[:1].strip()]
+    assert titles[0] == "Robots" and {"Control", "Figures", "Errors"} <= set(titles)

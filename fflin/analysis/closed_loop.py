@@ -13,11 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from fflin.analysis.momentum import regulated_part
+from fflin.analysis.names import rate_of
+from fflin.analysis.wheels import picked, wheel_inputs
 from fflin.base.errors import ChartError, InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, as_double
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
+from fflin.linear.fit import require_fit
 from fflin.linear.model import LinearModel
 from fflin.linear.nonlinear import Nonlinear
 from fflin.robot.robot import Robot
@@ -65,8 +68,6 @@ class Loop:
     def watched(self) -> Array:
         """Which of its entries are the model's states."""
         names = self.state.names
-        if not set(self.lin.state_names) <= set(names):
-            raise InputError(f"the model of '{self.lin.robot}' is not one of '{self.robot.name}'")
         return np.array([names.index(name) for name in self.lin.state_names], dtype=np.intp)
 
     @cached_property
@@ -88,8 +89,11 @@ class Loop:
         """P of the Lyapunov function of the linear loop that decays as its energy does."""
         from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
-        size = np.sqrt(self.lin.M.diagonal())
-        Q = np.diag(np.concatenate((self.decay * size, size)) ** 2)
+        names = self.lin.state_names
+        of = dict(zip(names[-len(self.lin.M) :], np.sqrt(self.lin.M.diagonal()), strict=True))
+        # A coordinate as its rate; a rate may stand without one.
+        size = [self.decay * of[rate_of(name)] for name in names if name not in of]
+        Q = np.diag(np.array([*size, *of.values()]) ** 2)
         solve = solve_discrete_lyapunov if self.lin.dt else solve_continuous_lyapunov
         P: Array = solve(self.rate.T, Q if self.lin.dt else -Q)
         return (P + P.T) / 2.0
@@ -262,11 +266,14 @@ def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
         raise InputError(f"K has shape {K.shape}, expected {lin.B.T.shape}")
     if not np.isfinite(K).all():
         raise InputError("K has entries that are NaN or infinite, expected finite numbers")
+    kept = getattr(gain, "regulated", ())
+    part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))
+    if part.state_names == kept:  # the others, which are left to themselves, do not settle
+        K, lin = K @ picked(kept, lin.state_names).T, part
     loop = Loop(robot, lin, K)
-    if Actuation(loop.state).names != lin.input_names or not len(loop.watched):
-        raise InputError(
-            f"the model's inputs are not those of '{robot.name}'; give the robot with its inputs"
-        )
+    require_fit(lin, robot, loop.state)
+    if not len(lin.x0):
+        raise InputError(f"the model of '{lin.robot}' has no states; nothing is to settle")
     if lin.moving or not lin.is_equilibrium() or lin.v.any():
         raise InputError("the point is no fixed point at rest; its loop cannot settle there")
     if not loop.decay > 0.0:

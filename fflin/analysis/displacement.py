@@ -41,8 +41,15 @@ def scaled(largest: dict[str, float], level: float) -> dict[str, float]:
     return {key: level * value for key, value in largest.items()}
 
 
-def shown(displacement: dict[str, float]) -> str:
+def joint_unit(lin: LinearModel) -> str:
+    """Return the unit of the joints, "rad|m" where some turn and others slide."""
+    pairs = zip(lin.state_names, lin.state_units, strict=True)
+    of = {unit for name, unit in pairs if name.startswith("q_m.")}
+    return of.pop() if len(of) == 1 else "rad|m"
+
+
+def shown(displacement: dict[str, float], of_joints: str = "rad|m") -> str:
     """Say in words what of a displacement is not zero."""
-    units = {"attitude": "deg", "position": "m", "joint": "rad|m"}
+    units = {"attitude": "deg", "position": "m", "joint": of_joints}
     words = [f"{displacement[key]:.3g} {unit}" for key, unit in units.items() if displacement[key]]
     return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:]))) or "0"

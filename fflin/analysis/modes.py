@@ -83,9 +83,11 @@ class Modes:
     equilibrium : bool
         Whether the point is a fixed point or a relative equilibrium; elsewhere the eigenvalues
         are those of a frozen model and say nothing about stability.
-    state_names : tuple of str
+    state_names, state_units : tuple of str
         Of the shapes.
     robot : str
+    lin : LinearModel
+        What they are modes of.
     """
 
     modes: tuple[Mode, ...]
@@ -94,7 +96,9 @@ class Modes:
     residual: float
     equilibrium: bool
     state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
     robot: str
+    lin: LinearModel
 
     @property
     def vibrations(self) -> tuple[Mode, ...]:
@@ -189,7 +193,9 @@ def modes(lin: LinearModel) -> Modes:
         found.residual,
         lin.is_equilibrium(),
         lin.state_names,
+        lin.state_units,
         lin.robot,
+        lin,
     )
 
 
@@ -236,20 +242,21 @@ def modes_report(found: Modes) -> str:
 
 
 def _moving_most(mode: Mode, names: Sequence[str], room: int) -> str:
-    """Name the positions that move most in a mode, as many as there is room for."""
+    """Name the positions that move by a tenth of the most or more, or say how many are left out."""
     shape = mode.shape[: len(names) // 2]
     sizes = abs(shape)
-    text = ""
-    for i in (-sizes.round(9)).argsort(kind="stable").tolist():
-        value = complex(shape[i])
-        if abs(value) < 0.1:
+    order = [i for i in (-sizes.round(9)).argsort(kind="stable").tolist() if sizes[i] >= 0.1]
+    words = [f"{names[i]} {_amount(complex(shape[i]))}" for i in order]
+    for count in range(len(words), 0, -1):
+        left = f"; + {len(words) - count} more" if count < len(words) else ""
+        text = ", ".join(words[:count]) + left
+        if len(text) <= room:
             break
-        amount = f"{value.real:.2g}"
-        if abs(value.imag) > 0.02 * abs(value):  # an angle of more than a degree
-            angle = math.degrees(math.atan2(value.imag, value.real))
-            amount = f"{abs(value):.2g} at {angle:.0f} deg"
-        longer = f"{text}, {names[i]} {amount}" if text else f"{names[i]} {amount}"
-        if text and len(longer) > room:
-            break
-        text = longer
     return text
+
+
+def _amount(value: complex) -> str:
+    if abs(value.imag) <= 0.02 * abs(value):  # an angle of a degree
+        return f"{value.real:.2g}"
+    angle = math.degrees(math.atan2(value.imag, value.real))
+    return f"{abs(value):.2g} at {angle:.0f} deg"

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -12,10 +11,20 @@ import pinocchio as pin
 from fflin.analysis.mechanics import checked, conserved
 from fflin.analysis.names import undecided
 from fflin.analysis.ranks import Margin
+from fflin.analysis.wheels import (
+    certified,
+    ignorable_wheels,
+    leaving,
+    part_of,
+    picked,
+    selected,
+    wheel_inputs,
+    without,
+)
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
-from fflin.linear.model import Certificate, LinearModel
+from fflin.linear.model import LinearModel
 from fflin.robot.frames import frame_index
 from fflin.robot.robot import Robot
 
@@ -54,7 +63,7 @@ class ReducedModel(LinearModel):
     notes: tuple[str, ...]
 
 
-def momentum_reduction(lin: LinearModel) -> ReducedModel:
+def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) -> ReducedModel:
     r"""Reduce a model to the part without its conserved momenta, exactly.
 
     A momentum :math:`W M \nu` that no input, spring or damper changes is zero for all time
@@ -71,18 +80,25 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
     Without springs the result is minimal; a vibration that no input drives stays in it. From
     inputs to joint states it has the transfer function of the whole model.
 
+    Reaction wheels leave too, whatever their momentum (9.4), and the attitude that they turn
+    stays. Wheels whose speeds are to be held, (9.5), stay with their angles, as do those whose
+    speeds matter: of a carrier that turns at the point, or with friction.
+
     Parameters
     ----------
     lin : LinearModel
         About rest, continuous or sampled.
+    wheel_speeds : bool, optional
+        Whether wheels stay whose speeds the inputs can hold; by default where inputs other than
+        wheels turn the base.
 
     Returns
     -------
     ReducedModel
         A `LinearModel` of 2 r states, r being nv less the number of conserved momenta, with
         the maps ``T`` and ``S``. Its ``M`` is that of the kept coordinates with the others
-        free to follow, and its outputs are those of `lin`. All states are kept where nothing is
-        conserved.
+        free to follow, and its outputs are those of `lin` but what sees wheels that have left,
+        of which ``T`` has zeros. All states are kept where nothing is conserved.
 
     Raises
     ------
@@ -95,7 +111,9 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
     ----------
     Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
     """
-    lin = checked(lin)
+    whole = checked(lin)
+    wheels = leaving(whole, wheel_speeds)
+    lin = without(whole, wheels) if len(wheels) else whole
     held = conserved(lin)
     z, T = held.selected, held.T
     judged = [name not in lin.ignorable for name in lin.state_names]
@@ -105,36 +123,41 @@ def momentum_reduction(lin: LinearModel) -> ReducedModel:
             f"the point is no fixed point: |f0| is {np.abs(lin.f0).max():.3g} and changes what "
             "the reduction leaves out; linearise at rest"
         )
-    S = np.zeros((len(z), len(T)))
-    S[np.arange(len(z)), z] = 1.0
-    M = held.rates.T @ lin.M @ held.rates
-    M.setflags(write=False)
     values = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
-    values |= {
-        "A": lin.A[z] @ T,
-        "B": lin.B[z],
-        "C": lin.C @ T,
-        "f0": lin.f0[z],
-        "x0": lin.x0[z],
-        "state_names": tuple(lin.state_names[i] for i in z),
-        "state_units": tuple(lin.state_units[i] for i in z),
-        "_ignorable": partial(_given, tuple(lin.state_names[i] for i in z if not judged[i])),
-        "_drift": None if lin.drift is None else lin.drift[z],
-        "_inertia": partial(_given, M),
-    }
+    M = held.rates.T @ lin.M @ held.rates
+    values |= part_of(lin, np.eye(len(T))[z], T, M) | {"C": lin.C @ T}
+    stays = picked(lin.state_names, whole.state_names)
     reduced = ReducedModel(
         **values,
-        T=T,
-        S=S,
-        momenta=held.momenta,
-        coordinates=held.coordinates,
+        T=stays.T @ T,
+        S=stays[z],
+        momenta=held.momenta @ stays,
+        coordinates=held.coordinates @ stays,
         margin=held.margin,
         notes=undecided(lin, held.margin, "kept by the reduction", len(z)),
     )
-    fingerprint, source = reduced.fingerprint, lin.generator
-    certify = partial(_same_certificate, lin, fingerprint)
-    of = (fingerprint, momentum_reduction(source)) if lin.dt and source is not None else None
-    return replace(reduced, _certify=certify, _source=of)
+    return certified(reduced, whole, partial(momentum_reduction, wheel_speeds=wheel_speeds))
+
+
+def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
+    """Return the model of the states that are regulated; `lin` itself where it has no wheels.
+
+    Wheels leave it as `momentum_reduction` says, the angles of the others too where nothing
+    depends on them, so that there are fewer positions than rates; and the position of the base in
+    the directions in which no input can push it.
+    """
+    if not wheel_inputs(lin):
+        return lin
+    part: LinearModel = momentum_reduction(lin, wheel_speeds=wheel_speeds)
+    still, _ = ignorable_wheels(lin)
+    wheels = {lin.state_names[i] for i in still}
+    left = set(lin.state_names[: len(lin.M)]) - set(part.state_names) - wheels
+    if any(not name.startswith("r_b.") for name in left):
+        # Something else is not held either, which whoever designs is to be told.
+        gone = [i for i in still if lin.state_names[i] not in part.state_names]
+        part = without(lin, np.array(gone, dtype=np.intp))
+    names = [name for name in part.state_names if name not in wheels]
+    return selected(lin, names, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
 
 
 def generalized_inertia(lin: LinearModel) -> Array:
@@ -215,12 +238,3 @@ def _following(M: Array) -> Array:
     """Return G (6, n), what the free base does when the joints move."""
     G: Array = -np.linalg.solve(M[:6, :6], M[:6, 6:])
     return G
-
-
-def _given(value: Any, _: LinearModel) -> Any:
-    return value
-
-
-def _same_certificate(whole: LinearModel, fingerprint: str, lin: LinearModel) -> Certificate:
-    lin.require(fingerprint)
-    return whole.certificate

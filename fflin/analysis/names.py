@@ -57,13 +57,15 @@ def grouped(names: tuple[str, ...]) -> list[str]:
 _RATES = {"q_b": "omega_b", "r_b": "v_b", "q_m": "qdot_m"}
 
 
+def rate_of(name: str) -> str:
+    """Return the name of the rate of a coordinate; of a rate none."""
+    group, _, member = name.partition(".")
+    return f"{_RATES[group]}.{member}" if group in _RATES else ""
+
+
 def with_rates(names: tuple[str, ...]) -> str:
     """List names in a sentence; a position and its rate are named together."""
-    pairs = {}
-    for name in names:
-        group, _, member = name.partition(".")
-        if group in _RATES and f"{_RATES[group]}.{member}" in names:
-            pairs[name] = f"{_RATES[group]}.{member}"
+    pairs = {name: rate_of(name) for name in names if rate_of(name) in names}
     if not pairs:
         return ", ".join(names) or "none"
     alone = [name for name in names if name not in pairs and name not in pairs.values()]
@@ -78,7 +80,7 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
     shown = [i for i in order if abs(weights[i]) * sizes[i] > 1e-6 * largest]
     terms = [_term(float(weights[i]), names[i], first=i == shown[0]) for i in shown[:most]]
     if len(shown) > most:
-        terms.append("+ ...")
+        terms.append(f"+ {len(shown) - most} more")
     return " ".join(terms)
 
 

@@ -1,4 +1,4 @@
-"""Figures of linear models: poles, the pattern of A and B, and how far they are valid."""
+"""Figures of linear models: A and B, modes, what a check found, and how far they reach."""
 
 from __future__ import annotations
 
@@ -8,112 +8,199 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fflin.analysis.displacement import shown
+from fflin.analysis.modes import Mode, Modes
+from fflin.analysis.validity import TRUSTED, Validity
 from fflin.base.errors import InputError
-from fflin.base.figures import COLORS, saved, styled, target_of
-from fflin.base.validation import Array, number
+from fflin.base.figures import COLORS, drawing, letters_of
+from fflin.base.names import input_keys, runs
+from fflin.base.tables import counted, rounding
+from fflin.linear.check import Check
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from fflin.analysis.validity import Validity
-
-
-def plot_poles(
-    poles: Any, path: str | Path | None = None, *, dt: float = 0.0, title: str = "poles"
-) -> Figure:
-    """Draw a pole map.
-
-    Parameters
-    ----------
-    poles : array_like or Gain or LinearModel
-        Poles [1/s], or what has them; several of these as {label: poles}.
-    path : str or Path, optional
-        .png, .pdf or .svg to save to.
-    dt : float
-        Sampling time of poles that are given as numbers; then the unit circle is drawn.
-    title : str
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    MissingPackageError, FileError
-        As in `plot_motion`.
-    """
-    target, dt = target_of(path), number("dt", dt)
-    sets = poles if isinstance(poles, dict) else {"": poles}
-    with styled() as figure_class:
-        figure = figure_class(figsize=(5.5, 5.0), layout="constrained")
-        axes = figure.add_subplot()
-        for place, (label, given) in enumerate(sets.items()):
-            values, own_dt = _poles_of(given)
-            dt = own_dt or dt
-            axes.plot(
-                values.real,
-                values.imag,
-                "x" if place == 0 else "+",
-                color=COLORS[place % len(COLORS)],
-                label=label or None,
-            )
-        if dt:
-            angle = np.linspace(0.0, 2.0 * np.pi, 201)
-            axes.plot(np.cos(angle), np.sin(angle), color="#888888", lw=0.8)
-            axes.set_aspect("equal")
-        else:
-            axes.axvline(0.0, color="#888888", lw=0.8)
-        unit = "" if dt else " [1/s]"
-        axes.set(xlabel=f"real part{unit}", ylabel=f"imaginary part{unit}", title=title)
-        if any(sets):
-            axes.legend()
-        return saved(figure, target)
+# Of the two routes to a block, one is drawn above its line and one below.
+_SHIFTS = (-0.15, 0.15, 0.0, 0.0, 0.0, 0.0)
 
 
 def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
-    """Draw which entries of A and B are not zero, and how large they are.
+    """Draw which entries of A and B are more than rounding, and how large they are, by groups.
 
     Parameters
     ----------
     lin : LinearModel
     path : str or Path, optional
-        .png, .pdf or .svg to save to.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    MissingPackageError, FileError
-        As in `plot_motion`.
+        .png, .pdf or .svg to save to; errors as in `plot_motion`.
     """
     if not isinstance(lin, LinearModel):
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
-    target = target_of(path)
-    with styled() as figure_class:
-        nx, nu = lin.B.shape
-        size = min(1.0, 24.0 / nx)
-        letters = min(8.0, 16.0 * size)
-        figure = figure_class(figsize=(2.8 + 0.26 * size * (nx + nu), 2.0 + 0.26 * size * nx))
-        figure.set_layout_engine("constrained")
+    nx, nu = lin.B.shape
+    cell = max(0.24 * min(1.0, 24.0 / nx), min(0.12, 12.0 / nx))  # inches
+    size = (4.2 + cell * (nx + nu), 2.6 + cell * nx)
+    with drawing(path, *size, layout="compressed") as figure:
+        from matplotlib.colors import LogNorm
+
         axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": (nx, nu)})
-        entries = np.abs(np.hstack((lin.A, lin.B)))
-        top = float(np.log10(entries.max() or 1.0))
-        # Entries below the rounding of the largest would use up the range of colours.
-        least = max(top - 12.0, float(np.log10(entries[entries > 0.0].min(initial=10.0**top))))
-        for ax, values, name, columns in zip(
-            axes, (lin.A, lin.B), "AB", (lin.state_names, lin.input_names), strict=True
-        ):
-            image = _spy(ax, values, columns, letters, (least, top))
-            ax.set_title(f"{name} ({values.shape[0]} x {values.shape[1]})")
-        axes[0].set_yticks(range(nx), lin.state_names, fontsize=letters)
+        drawn = [
+            np.ma.masked_where((m == 0.0) | (np.abs(m) < rounding(m)), np.abs(m))
+            for m in (lin.A, lin.B)
+        ]
+        entries = np.concatenate([m.compressed() for m in drawn])
+        top = float(entries.max(initial=0.0)) or 1.0
+        norm = LogNorm(float(entries.min(initial=top)), 1.01 * top)
+        rows = lin.state_names, lin.state_names, lin.state_units
+        inputs = lin.input_names, input_keys(lin), lin.input_units
+        letters = letters_of(1, 72.0 * cell)
+        for ax, sizes, columns in zip(axes, drawn, (rows, inputs), strict=True):
+            image = ax.imshow(sizes, cmap="viridis_r", norm=norm)
+            ax.grid(visible=False)
+            ax.spines[:].set_visible(True)
+            _name(ax.xaxis, ax.secondary_xaxis("top").xaxis, *columns, letters)
+            _name(ax.yaxis, ax.secondary_yaxis("right").yaxis, *rows, letters)
+            ax.tick_params("x", rotation=90)
+        axes[0].child_axes[1].set_yticks([])
         axes[1].set_yticks([])
-        figure.colorbar(image, ax=axes, shrink=0.7).set_label("log10 of the magnitude")
-        figure.suptitle(f"{lin.robot}, frame {lin.frame}")
-        return saved(figure, target)
+        axes[0].set_title(f"A ({nx} x {nx})")
+        axes[1].set_title(f"B ({nx} x {nu})")
+        of = "row" if lin.dt else "row's rate"
+        figure.colorbar(image, ax=axes, shrink=0.8).set_label(
+            f"size, each entry in SI units of its {of} per unit of its column"
+        )
+        time = f", sampled every {lin.dt:g} s" if lin.dt else ""
+        figure.suptitle(f"{lin.robot}, frame {lin.frame}{time}")
+    return figure
+
+
+def _name(
+    axis: Any,
+    opposite: Any,
+    names: Sequence[str],
+    keys: Sequence[str],
+    units: Sequence[str],
+    letters: float,
+) -> None:
+    """Name rows or columns on one side and their groups on the other, with lines between these."""
+    axis.set_ticks(range(len(names)), [n.rpartition(".")[2] for n in names], fontsize=letters)
+    found, side = runs(keys, units), "x" if axis.axis_name == "x" else "y"
+    opposite.set_ticks(
+        [(first + last) / 2.0 for first, last, _, _ in found],
+        [f"{group}{chr(10) if side == 'x' else ' '}[{of}]" for _, _, group, of in found],
+        # Three axes of the base are the narrowest group that stands beside others.
+        fontsize=max(4.0, min(7.0, 0.9 * letters)) if side == "x" else 7.0,
+    )
+    opposite.set_tick_params(length=0)
+    for first, *_ in found[1:]:
+        line = axis.axes.axvline if side == "x" else axis.axes.axhline
+        line(first - 0.5, color="#888888", lw=0.6)
+
+
+def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
+    """Draw the frequency and damping of each mode, and how far each position moves in it.
+
+    Parameters
+    ----------
+    modes : Modes
+    path : str or Path, optional
+        .png, .pdf or .svg to save to; errors as in `plot_motion`.
+    """
+    if not isinstance(modes, Modes):
+        raise InputError(f"modes is a {type(modes).__name__}, expected what fflin.modes returns")
+    count, half = len(modes.modes), len(modes.state_names) // 2
+    names, units = modes.state_names[:half], modes.state_units[:half]
+    title = (
+        f"{modes.robot}: {counted(len(modes.vibrations), 'vibration')}, "
+        f"{counted(count - len(modes.vibrations), 'real pole')}, "
+        f"{counted(modes.rigid_body, 'rigid-body mode')}"
+    )
+    if not count:
+        with drawing(path, 6.5, 1.0) as figure:
+            figure.suptitle(f"{title}\nnothing opposes a motion; a joint with a stiffness vibrates")
+        return figure
+    with drawing(path, 5.0 + 0.2 * half, 2.6 + 0.36 * count) as figure:
+        from matplotlib.patches import Patch
+
+        axes = figure.add_subplot()
+        colors = dict(zip(dict.fromkeys(units), COLORS, strict=False))
+        for place, mode in enumerate(modes.modes):
+            _bars(axes, place, mode.shape[:half], [colors[unit] for unit in units])
+        axes.set_xticks(range(half), names, rotation=90, fontsize=8)
+        axes.set_yticks(range(count), [_said(mode) for mode in modes.modes], fontsize=8)
+        axes.set(ylim=(count - 0.5, -0.5), xlim=(-0.6, half - 0.4))
+        figure.legend(
+            handles=[Patch(color=color, label=f"[{unit}]") for unit, color in colors.items()],
+            title="what moves most is 1; outline: modulus of what is out of phase",
+            loc="outside lower center",
+            ncols=len(colors),
+        )
+        figure.suptitle(title)
+    return figure
+
+
+def _bars(axes: Axes, place: int, shape: Any, colors: Sequence[str]) -> None:
+    """Draw a shape as bars about its line: filled what is in phase, outlined the modulus."""
+    x, tall = np.arange(len(shape)), -0.45  # for the axis points down
+    axes.axhline(place, color="#888888", lw=0.5)
+    axes.bar(x, tall * shape.real, 0.7, place, color=colors)
+    late = np.flatnonzero(np.abs(shape.imag) > 0.02 * np.abs(shape))
+    whole = tall * np.where(shape.real < 0.0, -1.0, 1.0) * np.abs(shape)
+    outline = [colors[i] for i in late.tolist()]
+    axes.bar(x[late], whole[late], 0.7, place, fill=False, edgecolor=outline, lw=0.6)
+
+
+def _said(mode: Mode) -> str:
+    if not mode.oscillates:
+        return f"real, {'grows' if mode.unstable else 'decays'} in {mode.time_constant:.3g} s"
+    return (
+        f"{mode.frequency:.3g} rad/s, {mode.frequency / (2.0 * np.pi):.3g} Hz, "
+        f"damping {mode.damping_ratio:.2g}"
+    )
+
+
+def plot_check(check: Check, path: str | Path | None = None) -> Figure:
+    """Draw each error that a check found beside what it must not exceed.
+
+    Parameters
+    ----------
+    check : Check
+    path : str or Path, optional
+        .png, .pdf or .svg to save to; errors as in `plot_motion`.
+    """
+    if not isinstance(check, Check):
+        raise InputError(f"check is a {type(check).__name__}, expected what fflin.check returns")
+    rows = [row for row in check.rows if row.error != 0.0]
+    tests = list(dict.fromkeys(row.test for row in rows))
+    names = list(dict.fromkeys(_place(row) for row in rows))
+    with drawing(path, 7.5, 2.2 + 0.2 * len(names)) as figure:
+        axes = figure.add_subplot()
+        for shift, test, color in zip(_SHIFTS, tests, COLORS, strict=False):
+            shown = [row for row in rows if row.test == test]
+            places = [names.index(_place(row)) + shift for row in shown]
+            axes.plot([row.error for row in shown], places, "o", color=color, ms=4, label=test)
+            axes.plot([row.tolerance for row in shown], places, "|", color=color, ms=7)
+        bad = [row for row in rows if not row.ok]
+        axes.plot([row.error for row in bad], [names.index(_place(row)) for row in bad], "rx")
+        axes.set_yticks(range(len(names)), names, fontsize=8)
+        axes.set(xscale="log", ylim=(max(len(names), 1) - 0.5, -0.5))
+        axes.set_xlabel("relative error (dot) and what it must not exceed (bar)")
+        held = (
+            f"FAILED: {len(bad)} of {len(check.rows)} figures"
+            if bad
+            else (f"OK: {len(check.rows)} figures hold")
+        )
+        exact = len(check.rows) - len(rows)
+        axes.set_title(
+            f"{check.title}\n{held}; {exact} agree to the last bit and are not drawn", loc="left"
+        )
+        figure.legend(loc="outside lower center", ncols=len(tests) or 1)
+    return figure
+
+
+def _place(row: Any) -> str:
+    both = ("ABA derivatives", "differences")
+    return row.block if row.test in both else f"{row.test}: {row.block}"
 
 
 def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
@@ -123,41 +210,24 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     ----------
     validity : Validity
     path : str or Path, optional
-        .png, .pdf or .svg to save to.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    MissingPackageError, FileError
-        As in `plot_motion`.
+        .png, .pdf or .svg to save to; errors as in `plot_motion`.
     """
-    from fflin.analysis.displacement import shown
-    from fflin.analysis.validity import TRUSTED, Validity
-
     if not isinstance(validity, Validity):
         raise InputError(
             f"validity is a {type(validity).__name__}, expected what fflin.validity returns"
         )
-    target = target_of(path)
     percent = 100.0
-    with styled() as figure_class:
-        figure = figure_class(figsize=(9.0, 4.0), layout="constrained")
+    with drawing(path, 9.0, 4.3) as figure:
         left, right = figure.subplots(1, 2)
         measured = np.isfinite(validity.prediction_error)
         levels, errors = (each[measured] for each in (validity.levels, validity.prediction_error))
-        left.loglog(percent * levels, percent * errors, "o-", color=COLORS[0], ms=3)
-        left.axhline(percent * TRUSTED, color="#888888", lw=0.8)
-        left.annotate(
-            f"trusted up to {percent * TRUSTED:g} %",
-            (0.01, percent * TRUSTED),
-            xytext=(0, 3),
-            xycoords=left.get_yaxis_transform(),
-            textcoords="offset points",
-            fontsize=8,
-        )
+        # Drawn is the error relative to the displacement, of an order less than the error's own.
+        order = "relative error"
+        if np.isfinite(validity.slope):
+            order += f", ~ displacement^{validity.slope - 1.0:.2f}"
+        left.loglog(percent * levels, percent * errors, "o-", color=COLORS[0], ms=3, label=order)
+        trust = f"trusted up to {percent * TRUSTED:g} %"
+        left.axhline(percent * TRUSTED, color="#888888", lw=0.8, label=trust)
         left.set_xticks(percent * validity.levels, [f"{percent * x:.3g}" for x in validity.levels])
         left.minorticks_off()
         left.set(
@@ -165,9 +235,6 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
             xlabel="displacement [% of the largest]",
             ylabel="error [% of the displacement]",
         )
-        if np.isfinite(validity.slope):
-            order = f"error ~ displacement^{validity.slope:.2f}"
-            left.text(0.97, 0.05, order, transform=left.transAxes, ha="right")
 
         settled = np.array([outcome == "settled" for outcome in validity.outcomes])
         edges = np.linspace(0.0, 1.0, 11)
@@ -182,36 +249,12 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
             ylabel="runs",
         )
         right.yaxis.get_major_locator().set_params(integer=True)
-        right.set_ylim(0.0, 1.25 * float(np.add(*counts).max()))
-        right.legend(loc="upper left", ncols=2)
+        right.set_ylim(0.0, 1.05 * float(np.add(*counts).max()))
+        figure.legend(loc="outside lower center", ncols=4)
         figure.suptitle(
-            f"{validity.robot}, up to {shown(validity.largest)}; {percent * low:.1f} to "
-            f"{percent * high:.1f} % settle ({percent * validity.confidence:g} % confidence)",
+            f"{validity.robot}, up to {shown(validity.largest, validity.joint_unit)}; "
+            f"{percent * low:.1f} to {percent * high:.1f} % settle "
+            f"({percent * validity.confidence:g} % confidence)",
             fontsize=10,
         )
-        return saved(figure, target)
-
-
-def _spy(
-    axes: Axes, values: Array, columns: Sequence[str], size: float, limits: tuple[float, float]
-) -> Any:
-    filled = np.abs(values) > 0.0
-    axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=size)
-    axes.grid(visible=False)
-    shown = np.full(values.shape, np.nan)
-    shown[filled] = np.maximum(np.log10(np.abs(values[filled])), limits[0])
-    return axes.imshow(shown, cmap="viridis", aspect="equal", vmin=limits[0], vmax=limits[1])
-
-
-def _poles_of(given: Any) -> tuple[Any, float]:
-    if isinstance(given, LinearModel):
-        return np.linalg.eigvals(given.A), given.dt
-    if hasattr(given, "poles"):
-        return np.asarray(given.poles), float(getattr(given, "dt", 0.0))
-    try:
-        poles = np.asarray(given)
-    except ValueError:
-        poles = np.asarray(None)  # its rows differ in length
-    if poles.dtype.kind not in "fiuc" or not np.isfinite(poles).all():
-        raise InputError(f"poles is a {type(given).__name__}, expected finite numbers or a Gain")
-    return poles.ravel(), 0.0
+    return figure

@@ -15,6 +15,7 @@ from fflin.analysis.observability import observability
 from fflin.analysis.ranks import Margin, judged
 from fflin.base.errors import (
     DetectabilityError,
+    FflinError,
     FflinWarning,
     InputError,
     StabilizabilityError,
@@ -29,9 +30,15 @@ if TYPE_CHECKING:
 # zero: repeated eigenvalues are computed with such errors.
 _RANK = 1e-7
 
+_UNSEEN = "which do not settle by themselves; add outputs"
+
 
 def require_stabilizable(lin: LinearModel) -> None:
     """Raise `StabilizabilityError` that names what no input can hold."""
+    if len(lin.A) < 2 * len(lin.M):  # with speeds of wheels without their angles
+        missed = "the inputs cannot hold {}; add inputs"
+        reached = lin.A, lin.B, "held by the inputs", missed, StabilizabilityError
+        return _warn_of_doubts(_checked_reach(lin, *reached))
     found = controllability(lin)
     if not found.stabilizable:
         weights = conserved(lin).weights
@@ -45,11 +52,15 @@ def require_stabilizable(lin: LinearModel) -> None:
 
 def require_detectable(lin: LinearModel) -> None:
     """Raise `DetectabilityError` that names what no output shows and what does not settle."""
+    if len(lin.A) < 2 * len(lin.M):
+        missed = f"the outputs do not show {{}}, {_UNSEEN}"
+        shown = lin.A.T, lin.C.T, "shown by the outputs", missed, DetectabilityError
+        return _warn_of_doubts(_checked_reach(lin, *shown))
     found = observability(lin)
     if not found.detectable:
         error = DetectabilityError(
-            f"the outputs do not show {with_rates(found.unobservable)}, which do not settle by "
-            f"themselves; add outputs{_doubts(found.notes)}"
+            f"the outputs do not show {with_rates(found.unobservable)}, {_UNSEEN}"
+            f"{_doubts(found.notes)}"
         )
         error.margin = found.margin
         raise error
@@ -95,16 +106,25 @@ def _root(W: Array) -> Array:
 
 
 def _checked_reach(
-    lin: LinearModel, A: Array, B: Array, what: str, complaint: str
+    lin: LinearModel,
+    A: Array,
+    B: Array,
+    what: str,
+    complaint: str,
+    error: type[FflinError] = InputError,
 ) -> tuple[str, ...]:
-    """Return what is undecided; raise `InputError` where B misses a mode on the boundary."""
+    """Return what is undecided; raise an error where B misses a mode on the boundary.
+
+    A growing mode may be missed by a weight or a disturbance, whose error is an `InputError`.
+    """
     discrete = bool(lin.dt)
     poles = np.linalg.eigvals(A)
     size = max(float(np.abs(poles - discrete).max()), 1e-300)
     beyond = np.abs(poles) - 1.0 if discrete else poles.real
     # Rounding moves a Jordan block of four by its fourth root.
     candidates = [complex(discrete)]
-    for pole in poles[(np.abs(beyond) <= 1e-3 * size) & (poles.imag >= 0.0)]:
+    growing = (beyond > 0.0) & (error is not InputError)
+    for pole in poles[((np.abs(beyond) <= 1e-3 * size) | growing) & (poles.imag >= 0.0)]:
         if all(abs(pole - other) > 1e-3 * size for other in candidates):
             candidates.append(complex(pole))
     missed, margin = [], Margin()
@@ -121,7 +141,7 @@ def _checked_reach(
     )
     if missed:
         words = _dominant(np.array(missed), lin.state_names)
-        raise InputError(f"{complaint.format(words)}{_doubts(doubts)}")
+        raise error(f"{complaint.format(words)}{_doubts(doubts)}")
     return doubts
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fflin.analysis.closed_loop import Loop, checked_loop
-from fflin.analysis.displacement import checked_displacement, scaled, shown
+from fflin.analysis.displacement import checked_displacement, joint_unit, scaled, shown
 from fflin.base.errors import FflinError, InputError
 from fflin.base.tables import folded
 from fflin.base.validation import Array, number, whole
@@ -51,7 +51,8 @@ class Validity:
         Order of the error itself in the displacement, over the four smallest levels: 2. NaN where
         one of these is of the size of the integration's errors, or left the chart.
     trusted : dict
-        {"attitude" [deg], "position" [m], "joint" [rad|m]} where `prediction_error` reaches 10 %.
+        {"attitude" [deg], "position" [m], "joint" [joint_unit]} where `prediction_error` reaches
+        10 %.
     sampled : ndarray (N,)
         Levels of the random runs, ascending.
     outcomes : tuple of str
@@ -65,6 +66,8 @@ class Validity:
     rate : tuple of float
         Interval (Clopper and Pearson) of the share of all displacements that settles.
     confidence : float
+    joint_unit : str
+        "rad" or "m" where all joints are of one kind, else "rad|m".
     """
 
     levels: Array
@@ -79,6 +82,7 @@ class Validity:
     rate: tuple[float, float]
     confidence: float
     largest: dict[str, float]
+    joint_unit: str
     robot: str
 
     def __post_init__(self) -> None:
@@ -91,6 +95,9 @@ class Validity:
         return self.outcomes.count("settled")
 
     def __str__(self) -> str:
+        trusted, holds, largest = (
+            shown(each, self.joint_unit) for each in (self.trusted, self.holds, self.largest)
+        )
         count, sure = len(self.outcomes), f"{100.0 * self.confidence:g} %"
         low, high = self.rate
         ends = Counter(self.outcomes)
@@ -99,15 +106,15 @@ class Validity:
         if np.isfinite(self.slope):
             order = f"the error grows with the displacement to the power {self.slope:.3f}"
         beyond = " and beyond" if self.trusted == self.largest else ""
-        first = {key: value * self.sampled[0] for key, value in self.largest.items()}
+        first = shown(scaled(self.largest, float(self.sampled[0])), self.joint_unit)
         lines = [
             f"{self.robot}: the linear loop foresees the nonlinear one within "
-            f"{100.0 * TRUSTED:g} % up to {shown(self.trusted)}{beyond}; {order}",
-            f"every loop settled up to {shown(self.holds)}: {self.inside} of {self.inside} runs, "
+            f"{100.0 * TRUSTED:g} % up to {trusted}{beyond}; {order}",
+            f"every loop settled up to {holds}: {self.inside} of {self.inside} runs, "
             f"so that at least {100.0 * self.inside_rate:.1f} % do ({sure} confidence)"
             if self.inside
-            else f"even from the smallest displacement tried, {shown(first)}, it did not settle",
-            f"of displacements up to {shown(self.largest)} {self.settled} of {count} runs settled: "
+            else f"even from the smallest displacement tried, {first}, it did not settle",
+            f"of displacements up to {largest} {self.settled} of {count} runs settled: "
             f"between {100.0 * low:.1f} and {100.0 * high:.1f} % do ({sure} confidence)"
             + (f"; {failures}" if failures else ""),
         ]
@@ -152,7 +159,8 @@ def validity(
         K, which makes the linear loop stable.
     attitude, position, joint : float
         Largest displacement of the base [deg], [m], and of the joint displaced most [rad|m]. What
-        is not among the states of a reduced model is not displaced, and given as 0.
+        is not among the states of a reduced model, or not regulated, is not displaced, and given
+        as 0.
     samples : int
         Number of random runs.
     seed : int
@@ -182,7 +190,7 @@ def validity(
     case of the binomial, Biometrika 26(4), 1934.
     """
     loop = checked_loop(robot, lin, gain)
-    largest = checked_displacement(lin, attitude, position, joint)
+    largest = checked_displacement(loop.lin, attitude, position, joint)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence = number("confidence", confidence)
     if not 0.0 < confidence < 1.0:
@@ -224,6 +232,7 @@ def validity(
         rate=_clopper_pearson(settled, samples, confidence),
         confidence=confidence,
         largest=largest,
+        joint_unit=joint_unit(lin),
         robot=lin.robot,
     )
 

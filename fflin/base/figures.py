@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import io
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from fflin.base.errors import MissingPackageError
 from fflin.base.writing import as_path, check_ending, write_whole
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from fflin.base.validation import Array
 
 FORMATS = (".png", ".pdf", ".svg")
 
@@ -44,6 +50,26 @@ def cycle(count: int) -> list[str]:
     return [to_hex(colormaps["turbo"](i / (count - 1))) for i in range(count)]
 
 
+def letters_of(count: float, room: float) -> float:
+    """Size of letters [pt] with which so many lines stand in a room [pt] without touching."""
+    return min(8.0, 0.75 * room / max(1, count))
+
+
+def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float) -> None:
+    """Scale an axis so that values which differ by more than a factor of 10 are told apart.
+
+    What is below the rounding of `unit` stands at zero.
+    """
+    sizes = [abs(value) for value in values.tolist() if abs(value) > 1e-9 * unit]
+    if not sizes or max(sizes) < 10.0 * min(sizes):
+        return
+    least = 10.0 ** math.floor(math.log10(min(sizes)))
+    getattr(axes, f"set_{axis}scale")("symlog", linthresh=least, linscale=0.5)
+    getattr(axes, f"{axis}axis").get_major_locator().set_params(numticks=9)
+    low, high = (2.0 * float(end) for end in (values.min(), values.max()))
+    getattr(axes, f"set_{axis}lim")(min(low, -0.5 * least), max(high, 0.5 * least))
+
+
 class styled:
     """The style, for as long as a figure is drawn, and the class of figures without a window."""
 
@@ -58,6 +84,16 @@ class styled:
 
     def __exit__(self, *problem: object) -> None:
         self._context.__exit__(None, None, None)
+
+
+@contextmanager
+def drawing(path: str | Path | None, width: float, height: float, **options: Any) -> Iterator[Any]:
+    """Give a figure of a size [in] in the style, without a window; saved where there is a path."""
+    target = target_of(path)
+    with styled() as figure_class:
+        figure = figure_class(**{"figsize": (width, height), "layout": "constrained"} | options)
+        yield figure
+        saved(figure, target)
 
 
 def require_matplotlib() -> None:

@@ -30,6 +30,19 @@ def input_keys(of: Any) -> tuple[str, ...]:
     )
 
 
+def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str, str]]:
+    """Return (first, last, group, units) of names of one group, or of one unit."""
+    found: list[tuple[int, int, str, list[str]]] = []
+    for i, (name, unit) in enumerate(zip(names, units, strict=True)):
+        group = name.partition(".")[0] if name.count(".") == 1 else name.rpartition(".")[0]
+        first, of = i, [unit]
+        if found and found[-1][2] == group and (group or unit in found[-1][3]):
+            first, _, _, of = found.pop()
+            of = list(dict.fromkeys((*of, unit)))
+        found.append((first, i, group, of))
+    return [(first, last, group, "|".join(of)) for first, last, group, of in found]
+
+
 def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
     """Return where the names are that a key stands for.
 

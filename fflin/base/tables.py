@@ -66,12 +66,9 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
     What is below the rounding of both its row's and its column's largest entry is shown as "~0".
     What is too wide is folded: the next columns follow below, under the rows that they need.
     """
-    sizes = abs(values)
-    rounding = _EPS * sizes.max(axis=1, initial=0.0)[:, None]
-    rounding = rounding.clip(max=_EPS * sizes.max(axis=0, initial=0.0))
     text = [
         [_number(x, below) for x, below in zip(row, limits, strict=True)]
-        for row, limits in zip(values.tolist(), rounding.tolist(), strict=True)
+        for row, limits in zip(values.tolist(), rounding(values).tolist(), strict=True)
     ]
     label = max(map(len, rows))
     folds: list[list[int]] = []
@@ -93,8 +90,15 @@ def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
     return "\n\n".join(blocks)
 
 
-def _number(x: float, rounding: float) -> str:
-    return "." if x == 0.0 else "~0" if abs(x) < rounding else f"{x:.5g}"
+def rounding(values: Array) -> Array:
+    """Return the rounding of both its row's and its column's largest entry, for each entry."""
+    sizes = abs(values)
+    by_row: Array = _EPS * sizes.max(axis=1, initial=0.0)[:, None]
+    return by_row.clip(max=_EPS * sizes.max(axis=0, initial=0.0))
+
+
+def _number(x: float, below: float) -> str:
+    return "." if x == 0.0 else "~0" if abs(x) < below else f"{x:.5g}"
 
 
 def counted(number: int, thing: str) -> str:

@@ -17,9 +17,9 @@ from fflin.batch.linear_batch import LinearBatch
 from fflin.batch.riccati import gains_at_rest
 from fflin.batch.rows import column, positions
 from fflin.control.lqr import lqr
-from fflin.control.policies import StateFeedback
 from fflin.control.weights import weight
 from fflin.dynamics.state import StateMap
+from fflin.linear.fit import require_fit
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
@@ -240,12 +240,11 @@ class ScheduledFeedback:
         Raises
         ------
         InputError
-            If the model is not one of this robot.
+            If the robot has not the model's states and inputs; its masses may be others.
         """
         lin, gains = self.lin, self.gains
-        # Refuses another robot.
-        StateFeedback(lin, np.zeros(lin.B.T.shape)).bind(robot)
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+        require_fit(lin, robot, state)
         columns = [column(joint) for joint in robot.joints]
 
         def policy(_: float, q: Array, v: Array) -> Array:

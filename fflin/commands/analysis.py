@@ -11,7 +11,7 @@ from fflin.commands import DONE
 from fflin.commands.arguments import Commands, add_point, command, file_name, number
 from fflin.commands.points import linear_model
 from fflin.commands.regulator import add_weights, gain_of, regulated_part
-from fflin.commands.visual import check_figure
+from fflin.commands.visual import add_figure, check_figure, draw
 
 if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
@@ -27,6 +27,7 @@ def add_commands(commands: Commands) -> None:
         "fflin analyze servicer_7dof --stiffness panel_left=100 --output joints",
     )
     add_point(analyze)
+    add_figure(analyze, "draw the modes")
     modes = command(
         commands,
         "modes",
@@ -35,6 +36,10 @@ def add_commands(commands: Commands) -> None:
         "fflin modes servicer_7dof --stiffness panel_left=100 --stiffness panel_right=100",
     )
     add_point(modes)
+    add_figure(modes, "draw frequencies, damping and shapes")
+    modes.add_argument(
+        "--html", metavar="FILE", type=file_name, help="write a page that plays the mode shapes"
+    )
     validity = command(
         commands,
         "validity",
@@ -54,9 +59,7 @@ def add_commands(commands: Commands) -> None:
     ):
         help = f"{what}; {default:g} by default"
         validity.add_argument(f"--{name}", metavar=metavar, type=read, default=default, help=help)
-    validity.add_argument(
-        "--plot", metavar="FILE", type=file_name, help="draw it into FILE: .png, .pdf or .svg"
-    )
+    add_figure(validity, "draw it")
 
 
 def _analyze(arguments: argparse.Namespace) -> int:
@@ -64,22 +67,37 @@ def _analyze(arguments: argparse.Namespace) -> int:
     from fflin.analysis.modes import modes
     from fflin.analysis.observability import observability
 
+    check_figure(arguments.plot)
     _, lin = linear_model(arguments)
+    found = modes(lin)
     parts = {
         "inputs": str(controllability(lin)),
         "momentum": _momentum(lin),
-        "modes": str(modes(lin)),
+        "modes": str(found),
         "outputs": str(observability(lin)),
     }
     print("\n\n".join(f"{title}\n{'-' * len(title)}\n{text}" for title, text in parts.items()))
+    draw(arguments.plot, "plot_modes", found)
     return DONE
 
 
 def _modes(arguments: argparse.Namespace) -> int:
     from fflin.analysis.modes import modes
 
-    _, lin = linear_model(arguments)
-    print(modes(lin))
+    check_figure(arguments.plot)
+    if arguments.html:
+        from fflin.base.writing import check_place
+
+        check_place(arguments.html, (".html",))
+    robot, lin = linear_model(arguments)
+    found = modes(lin)
+    print(found)
+    draw(arguments.plot, "plot_modes", found)
+    if arguments.html:
+        from fflin.view.visualize import visualize
+
+        visualize(robot, found, html=arguments.html)
+        print(f"wrote {arguments.html}: {arguments.html.stat().st_size / 1e6:.2f} MB")
     return DONE
 
 
@@ -93,11 +111,12 @@ def _momentum(lin: LinearModel) -> str:
         text = f"no reduction: {error}"
     else:
         count, left = len(reduced.momenta), len(reduced.A)
+        wheels = ", the wheels" * (len(lin.A) > left + 2 * count)
         text = "none is conserved: the inputs, springs and dampers act on all of them"
         if count:
             text = (
-                f"{count} momenta are conserved whatever the inputs do; without them and what "
-                f"they drive {left} states are left"
+                f"{count} momenta are conserved whatever the inputs do; without them{wheels} and "
+                f"what they drive {left} states are left"
             )
         elif not lin.is_equilibrium():
             text = "none can be split off: the model is one of a point that moves on"
@@ -113,8 +132,7 @@ def _validity(arguments: argparse.Namespace) -> int:
     if arguments.jobs < 1:
         raise InputError(f"--jobs is {arguments.jobs}, expected at least 1")
     robot, lin = linear_model(arguments)
-    if arguments.plot:
-        check_figure(arguments.plot)
+    check_figure(arguments.plot)
     lin = regulated_part(lin, arguments)
     gain = gain_of(lin, arguments)
     judged = lin.discretize(arguments.dt) if arguments.dt else lin
@@ -136,9 +154,5 @@ def _validity(arguments: argparse.Namespace) -> int:
     finally:
         bar.close()
     print(found)
-    if arguments.plot:
-        from fflin.analysis.plots import plot_validity
-
-        plot_validity(found, arguments.plot)
-        print(f"wrote {arguments.plot}")
+    draw(arguments.plot, "plot_validity", found)
     return DONE

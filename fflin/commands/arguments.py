@@ -23,6 +23,20 @@ def number(text: str) -> float:
     return value
 
 
+def whole(text: str) -> int:
+    """Read a whole number that is not negative."""
+    if not text.isascii() or not text.isdigit():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number")
+    return int(text)
+
+
+def count_of(text: str) -> int:
+    """Read a whole number from 1 on."""
+    if not (count := whole(text)):
+        raise argparse.ArgumentTypeError("0 is too few, expected 1 or more")
+    return count
+
+
 def file_name(text: str) -> Path:
     """Read the name of a file."""
     if not text:

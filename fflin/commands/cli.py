@@ -25,6 +25,15 @@ from fflin.commands import (
     visual,
 )
 
+# The commands by task, as the help lists them.
+TASKS = {
+    "look at robots": ("robots", "info", "view"),
+    "make and check a linear model": ("linearize", "check"),
+    "judge it": ("analyze", "modes", "validity"),
+    "close the loop": ("lqr", "tvlqr", "simulate"),
+    "go through many points": ("sweep",),
+}
+
 
 class _Parser(argparse.ArgumentParser):
     def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -96,16 +105,20 @@ def _tell(line: str) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="fflin",
+        usage="fflin [-h] [--version] COMMAND ...",
         description="Linear models of free-floating robots from URDF.",
         epilog="example: fflin linearize ets_vii -o ets_vii.mat",
     )
     parser.add_argument("--version", action="version", version=f"fflin {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    models.add_commands(commands)
-    analysis.add_commands(commands)
-    regulator.add_commands(commands)
-    tracking.add_commands(commands)
-    simulation.add_commands(commands)
-    visual.add_commands(commands)
-    sweeps.add_commands(commands)
+    commands = parser.add_subparsers(
+        prog="fflin", metavar="COMMAND", required=True, help=argparse.SUPPRESS
+    )
+    for module in (models, analysis, regulator, tracking, simulation, visual, sweeps):
+        module.add_commands(commands)
+    # argparse lists all in one group.
+    left = {command.dest: command for command in commands._choices_actions}
+    commands._choices_actions = []
+    for task, names in TASKS.items():
+        parser.add_argument_group(task)._group_actions += [left.pop(name) for name in names]
+    parser.add_argument_group("other")._group_actions += left.values()
     return parser

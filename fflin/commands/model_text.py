@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from fflin.base.tables import matrix, signals, width
+from fflin.base.names import runs
+from fflin.base.tables import grid, matrix, signals, width
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array
     from fflin.linear.model import LinearModel
+    from fflin.robot.robot import Robot
 
 
 # Below this rate [SI] nothing moves to speak of.
@@ -64,6 +67,20 @@ def model_report(lin: LinearModel) -> str:
     return "\n\n".join(parts)
 
 
+def inputs_report(robot: Robot) -> str:
+    """Show the inputs of a robot and their limits."""
+    from fflin.dynamics.actuation import Actuation
+    from fflin.dynamics.state import StateMap
+    from fflin.robot.limits import limits_of
+
+    acting, limits = Actuation(StateMap(robot)), limits_of(robot)
+    rows = [["input", "unit", "min", "max"]]
+    for name, unit in zip(acting.names, acting.units, strict=True):
+        ends = limits.get(name, (-math.inf, math.inf))
+        rows.append([name, unit, *(f"{end:.5g}" if math.isfinite(end) else "." for end in ends)])
+    return grid(rows, "ll")
+
+
 def _named_matrix(title: str, values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
     size = f"{title} ({values.shape[0]} x {values.shape[1]})"
     if not values.any():
@@ -83,20 +100,9 @@ def _units(lin: LinearModel) -> str:
 
 
 def _grouped(names: Sequence[str], units: Sequence[str]) -> str:
-    # Names without a group, such as a thruster's, stand together as long as their unit is one.
-    groups: list[tuple[str, list[str], list[str]]] = []
-    for name, unit in zip(names, units, strict=True):
-        group = name.partition(".")[0] if name.count(".") == 1 else name.rpartition(".")[0]
-        last = groups[-1] if groups else None
-        if last and last[0] == group and (group or unit in last[2]):
-            last[1].append(name)
-            last[2].append(unit)
-        else:
-            groups.append((group, [name], [unit]))
     return ", ".join(
-        f"{group or ' ... '.join(dict.fromkeys((members[0], members[-1])))} "
-        f"[{'|'.join(dict.fromkeys(of))}]"
-        for group, members, of in groups
+        f"{group or ' ... '.join(dict.fromkeys((names[first], names[last])))} [{of}]"
+        for first, last, group, of in runs(names, units)
     )
 
 

@@ -19,6 +19,7 @@ from fflin.commands.arguments import (
 )
 from fflin.commands.points import linear_model, load_robot
 from fflin.commands.tracking import add_trajectory, check_along, linearize_along
+from fflin.commands.visual import add_figure, check_figure, draw
 
 if TYPE_CHECKING:
     from fflin.robot.robot import Robot
@@ -31,6 +32,9 @@ def add_commands(commands: Commands) -> None:
         commands, "info", _info, "show tree, joints, masses and limits", "fflin info servicer_7dof"
     )
     add_robot(info)
+    info.add_argument(
+        "--inputs", metavar="FILE.toml", help="show these as well: a file, or a bundled one's name"
+    )
     linearize = command(
         commands,
         "linearize",
@@ -46,6 +50,7 @@ def add_commands(commands: Commands) -> None:
     add_output_file(
         linearize, "save to FILE: .npz, .mat, .json, or .csv (one file a matrix: NAME.A.csv, ...)"
     )
+    add_figure(linearize, "draw the pattern of A and B")
     check = command(
         commands,
         "check",
@@ -55,6 +60,7 @@ def add_commands(commands: Commands) -> None:
     )
     add_point(check)
     add_trajectory(check)
+    add_figure(check, "draw the errors beside what they must not exceed")
 
 
 def _robots(_: argparse.Namespace) -> int:
@@ -80,7 +86,12 @@ def _robots(_: argparse.Namespace) -> int:
 def _info(arguments: argparse.Namespace) -> int:
     from fflin.robot.summary import robot_info
 
-    print(robot_info(load_robot(arguments)))
+    robot = load_robot(arguments)
+    print(robot_info(robot))
+    if arguments.inputs is not None:
+        from fflin.commands.model_text import inputs_report
+
+        print(f"\n{inputs_report(robot)}")
     return DONE
 
 
@@ -92,6 +103,7 @@ def _linearize(arguments: argparse.Namespace) -> int:
         from fflin.linear.files import FORMATS
 
         check_place(arguments.output_file, FORMATS)
+    check_figure(arguments.plot)
     _, lin = linear_model(arguments)
     if arguments.dt is not None:
         lin = lin.discretize(arguments.dt)
@@ -102,6 +114,7 @@ def _linearize(arguments: argparse.Namespace) -> int:
         from fflin.commands.model_text import model_report
 
         print(model_report(lin))
+    draw(arguments.plot, "plot_matrices", lin)
     return DONE
 
 
@@ -110,7 +123,9 @@ def _check(arguments: argparse.Namespace) -> int:
         return check_along(arguments)
     from fflin.linear.check import check
 
+    check_figure(arguments.plot)
     robot, lin = linear_model(arguments)
     found = check(robot, lin)
     print(found)
+    draw(arguments.plot, "plot_check", found)
     return DONE if found.ok else FELL_SHORT

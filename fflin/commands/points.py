@@ -101,8 +101,7 @@ def placed(
         value, unit = joints[joint.name], "m" if joint.prismatic else "rad"
         if not low <= value <= high:
             warnings.warn(
-                f"joint '{joint.name}' is put at {value:g} {unit}, outside its limits from "
-                f"{low:g} to {high:g} {unit}",
+                f"joint '{joint.name}' at {value:g} {unit} is outside {low:g} to {high:g} {unit}",
                 FflinWarning,
                 stacklevel=2,
             )
@@ -123,11 +122,14 @@ def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
     return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
 
 
-def velocity_of(robot: Robot, arguments: argparse.Namespace) -> Array | None:
-    """Return the velocity (nv,) that --velocity says."""
+def velocity_of(robot: Robot, arguments: argparse.Namespace, *options: str) -> Array | None:
+    """Return the velocity (nv,) that --velocity says, or these options, the later before others."""
     from fflin.dynamics.points import velocity
 
-    return velocity(robot, once("--velocity", arguments.velocity)) if arguments.velocity else None
+    values: dict[str, float] = {}
+    for option in options or ("velocity",):
+        values |= once(f"--{option.replace('_', '-')}", getattr(arguments, option))
+    return velocity(robot, values) if values else None
 
 
 def inputs_at(

@@ -23,6 +23,7 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import linear_model, once
+from fflin.commands.visual import add_figure, check_figure, draw
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array
@@ -42,10 +43,11 @@ def add_commands(commands: Commands) -> None:
     add_point(lqr)
     add_weights(lqr)
     add_output_file(lqr, "save the gain to FILE: .npz, .mat or .json")
+    add_figure(lqr, "draw the loop of each input with its margins, and the poles,")
 
 
 def add_weights(command: argparse.ArgumentParser) -> None:
-    """Add what is regulated and at which cost: --q, --r, --bryson, --dt and --reduce."""
+    """Add what is regulated and at which cost: --q, --r, --bryson, --dt, --reduce and so on."""
     command.add_argument(
         "--weights",
         choices=("urdf", "identity"),
@@ -81,6 +83,12 @@ def add_weights(command: argparse.ArgumentParser) -> None:
         action="store_true",
         help="regulate the part that the inputs can hold where momentum is conserved",
     )
+    command.add_argument(
+        "--wheel-speeds",
+        action=argparse.BooleanOptionalAction,
+        help="bring the speeds of reaction wheels back to the point's: by default where thrusters "
+        "or a torque on the base can make them; also those that turn nothing else, or none",
+    )
 
 
 def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearModel:
@@ -89,7 +97,7 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
         return lin
     from fflin.analysis.momentum import momentum_reduction
 
-    return momentum_reduction(lin)
+    return momentum_reduction(lin, wheel_speeds=arguments.wheel_speeds)
 
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
@@ -108,9 +116,10 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     try:
         if arguments.q or arguments.r or arguments.bryson:
             *weights, rule = named_weights(lin, arguments)
-            gain = replace(lqr(lin, *weights), weights=rule)
+            gain = lqr(lin, *weights, wheel_speeds=arguments.wheel_speeds)
+            gain = replace(gain, weights=rule)
         else:
-            gain = lqr(lin, weights=arguments.weights)
+            gain = lqr(lin, weights=arguments.weights, wheel_speeds=arguments.wheel_speeds)
     except StabilizabilityError as error:
         hint = " (--reduce)" if "momentum_reduction" in str(error) else ""
         raise StabilizabilityError(f"{error}{hint}") from None
@@ -120,7 +129,7 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
 
 
 def named_weights(
-    lin: LinearModel, arguments: argparse.Namespace
+    lin: LinearModel, arguments: argparse.Namespace, hold: float = 0.0
 ) -> tuple[Array, Array, Array | None, str]:
     """Return Q, R and N with what is named, and a rule's for what is not; and the rule in words."""
     from fflin.control.default_weights import rule_weights
@@ -137,10 +146,12 @@ def named_weights(
     if both:
         raise InputError(f"'{both[0]}' has a weight and a largest value; give either")
     q, r = values["q"] | of_states, values["r"] | of_inputs
-    return rule_weights(lin, arguments.weights, q, r)
+    speeds = arguments.wheel_speeds
+    return rule_weights(lin, arguments.weights, q, r, wheel_speeds=speeds, hold=hold)
 
 
 def _lqr(arguments: argparse.Namespace) -> int:
+    check_figure(arguments.plot)
     _, lin = linear_model(arguments)
     if arguments.output_file:
         from fflin.base.record import FORMATS
@@ -153,4 +164,5 @@ def _lqr(arguments: argparse.Namespace) -> int:
     print(gain)
     if arguments.output_file:
         print(f"\nwrote {arguments.output_file}")
+    draw(arguments.plot, "plot_loops", gain)
     return DONE

@@ -6,7 +6,7 @@ import argparse
 import warnings
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import FflinWarning, InputError
+from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
@@ -17,6 +17,7 @@ from fflin.commands.arguments import (
     add_system,
     add_values,
     command,
+    count_of,
     file_name,
     number,
 )
@@ -25,6 +26,7 @@ from fflin.commands.regulator import add_weights, gain_of, regulated_part
 from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
 
 if TYPE_CHECKING:
+    from fflin.base.validation import Array
     from fflin.control.policies import StateFeedback
     from fflin.linear.model import LinearModel
     from fflin.robot.robot import Robot
@@ -52,6 +54,12 @@ def add_commands(commands: Commands) -> None:
         "--target-joint",
         "where a joint is to go [rad|m]; the others go to neutral, the base to the world's origin",
     )
+    add_values(
+        simulate,
+        "--target-velocity",
+        "a velocity of the target, such as the speed of a wheel that is to be held; it starts with "
+        "it where --velocity does not say otherwise",
+    )
     add_inputs_there(simulate)
     add_weights(simulate)
     simulate.add_argument(
@@ -70,10 +78,25 @@ def add_commands(commands: Commands) -> None:
         "--step", metavar="H", type=number, help="step of the integration [s]; chosen by default"
     )
     simulate.add_argument(
+        "--every",
+        metavar="N",
+        type=count_of,
+        help="steps from one recorded row to the next; chosen where there are many",
+    )
+    simulate.add_argument(
         "--method", default="cf4", help="cf4 (default), rkmk4 or semi_implicit_euler"
     )
+    simulate.add_argument(
+        "--limits",
+        choices=("urdf", "none"),
+        default="urdf",
+        help="what cuts the inputs: efforts of the URDF, max and min of the inputs and speeds of "
+        "wheels (urdf, default), or only what --limit says (none)",
+    )
     add_values(
-        simulate, "--limit", "largest magnitude of an input or of a group of them, such as tau_m"
+        simulate,
+        "--limit",
+        "largest magnitude of an input, a group of them such as tau_m, or a pattern; goes first",
     )
     simulate.add_argument(
         "--delay",
@@ -137,20 +160,23 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     """Return the motion that the arguments ask for."""
     from fflin.simulation.simulate import simulate
 
+    given = once("--limit", arguments.limit)
     options: dict[str, Any] = {
         "q0": configuration_of(robot, arguments),
-        "v0": velocity_of(robot, arguments),
+        "v0": velocity_of(robot, arguments, "target_velocity", "velocity"),
         "duration": arguments.duration,
         "dt": arguments.step,
+        "every": arguments.every,
         "method": arguments.method,
-        "limits": once("--limit", arguments.limit) or None,
+        "limits": [arguments.limits, given] if arguments.limits == "urdf" else given or None,
         "delay": arguments.delay,
     }
     if arguments.free:
         if arguments.limit or arguments.delay:
             raise InputError("--free has no input to limit or delay; leave one out")
         weighed = any((arguments.weights, arguments.q, arguments.r, arguments.bryson, arguments.dt))
-        if weighed or arguments.target_joint or arguments.reduce or arguments.allocate:
+        target = arguments.target_joint or arguments.target_velocity
+        if weighed or target or arguments.reduce or arguments.allocate:
             raise InputError(
                 "--free has no regulator to give weights, a target or thrusters; leave one out"
             )
@@ -165,11 +191,32 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     if gain.dt:
         lin = lin.discretize(gain.dt)
     policy = StateFeedback(lin, gain.K)
+    _require_held(robot, policy, options["q0"])
     if arguments.allocate:
         return simulate(robot, Allocation(policy, design), **options)
     motion = simulate(robot, policy, **options)
     _warn_of_cut_thrust(robot, motion, policy)
     return motion
+
+
+def _require_held(robot: Robot, policy: StateFeedback, q: Array) -> None:
+    """Warn of what starts beside the target and is not fed back; refuse a start of nothing else."""
+    from fflin.dynamics.state import StateMap
+
+    lin = policy.lin
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    start, target = (state.read(at, lin.v, near=state.read(lin.q, lin.v)) for at in (q, lin.q))
+    fed = {name for name, column in zip(lin.state_names, policy.K.T, strict=True) if column.any()}
+    beside = [name for name, x in zip(state.names, abs(start - target), strict=True) if x > 1e-9]
+    loose = [name for name in beside if name not in fed]
+    if loose and loose == beside:
+        raise InputError(
+            f"what starts beside the target is not regulated: {listed(loose)}; no input would act: "
+            "give inputs that move it, or another start"
+        )
+    if loose:
+        text = f"{listed(loose)} starts beside the target and is not regulated"
+        warnings.warn(text, FflinWarning, stacklevel=2)
 
 
 def _warn_of_cut_thrust(robot: Robot, motion: Motion, policy: StateFeedback) -> None:
@@ -210,5 +257,6 @@ def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
     from fflin.linear.linearization import linearize
 
     q = placed(robot, "--target-joint", arguments.target_joint)
-    u = inputs_at(robot, q, None, arguments)
-    return regulated_part(linearize(robot, q, None, u, frame=arguments.frame), arguments)
+    v = velocity_of(robot, arguments, "target_velocity")
+    u = inputs_at(robot, q, v, arguments)
+    return regulated_part(linearize(robot, q, v, u, frame=arguments.frame), arguments)

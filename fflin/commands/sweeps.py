@@ -21,8 +21,10 @@ from fflin.commands.arguments import (
     add_system,
     add_values,
     command,
+    count_of,
     file_name,
     number,
+    whole,
 )
 from fflin.commands.points import configuration_of, load_robot, once, velocity_of
 
@@ -59,7 +61,7 @@ def add_commands(commands: Commands) -> None:
         read=_axis,
     )
     points.add_argument(
-        "--random", metavar="N", type=_count, help="N points drawn evenly from the joints' limits"
+        "--random", metavar="N", type=count_of, help="N points drawn evenly from the joints' limits"
     )
     points.add_argument(
         "--configurations",
@@ -69,7 +71,7 @@ def add_commands(commands: Commands) -> None:
         "(N, nv) and u (N, nu)",
     )
     points.add_argument(
-        "--seed", metavar="S", type=_whole, default=0, help="of --random; 0 by default"
+        "--seed", metavar="S", type=whole, default=0, help="of --random; 0 by default"
     )
     add_values(
         points,
@@ -85,7 +87,7 @@ def add_commands(commands: Commands) -> None:
     sweep.add_argument(
         "--workers",
         metavar="N",
-        type=_count,
+        type=count_of,
         help="share the work among N processes, at most one for each core",
     )
     sweep.add_argument(
@@ -112,7 +114,7 @@ def _parts(text: str, form: str, example: str) -> tuple[str, list[str]]:
 
 def _axis(text: str) -> tuple[str, tuple[float, float, int]]:
     name, parts = _parts(text, "JOINT=LO:HI:N", "joint_1=-1:1:21")
-    low, high, count = number(parts[0]), number(parts[1]), _count(parts[2])
+    low, high, count = number(parts[0]), number(parts[1]), count_of(parts[2])
     if not (low < high or (count == 1 and low == high)):
         raise argparse.ArgumentTypeError(f"'{text}' is empty: LO must be less than HI")
     return name, (low, high, count)
@@ -121,20 +123,6 @@ def _axis(text: str) -> tuple[str, tuple[float, float, int]]:
 def _range(text: str) -> tuple[str, tuple[float, float]]:
     name, (low, high) = _parts(text, "JOINT=LO:HI", "joint_1=-1:1")
     return name, (number(low), number(high))
-
-
-def _whole(text: str) -> int:
-    """Read a whole number that is not negative."""
-    if not text.isascii() or not text.isdigit():
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number")
-    return int(text)
-
-
-def _count(text: str) -> int:
-    """Read a whole number from 1 on."""
-    if not (count := _whole(text)):
-        raise argparse.ArgumentTypeError("0 is too few, expected 1 or more")
-    return count
 
 
 def _sweep(arguments: argparse.Namespace) -> int:

@@ -98,7 +98,7 @@ def _tvlqr(arguments: argparse.Namespace) -> int:
     along = models_along(arguments)
     options: dict[str, Any] = {"sample": arguments.dt, "weights": arguments.weights}
     if arguments.q or arguments.r or arguments.bryson:
-        Q, R, _, rule = named_weights(steady_end(along), arguments)
+        Q, R, _, rule = named_weights(steady_end(along), arguments, arguments.dt or 0.0)
         options |= {"Q": Q, "R": R, "weights": None, "rule": rule}
     _say(tvlqr(along, Qf=once("--qf", arguments.qf) or "steady", **options), arguments)
     return DONE

@@ -81,13 +81,31 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
     )
 
 
-def check_figure(path: Path) -> None:
+def add_figure(command: argparse.ArgumentParser, what: str) -> None:
+    """Add --plot FILE."""
+    command.add_argument(
+        "--plot", metavar="FILE", type=file_name, help=f"{what} into FILE: .png, .pdf or .svg"
+    )
+
+
+def check_figure(path: Path | None) -> None:
     """Refuse a figure that cannot be drawn or written, before anything is done for it."""
+    if path is None:
+        return
     from fflin.base.figures import FORMATS, require_matplotlib
     from fflin.base.writing import check_place
 
     check_place(path, FORMATS)
     require_matplotlib()
+
+
+def draw(path: Path | None, figure: str, drawn: object) -> None:
+    """Draw what a public function of this name draws, where a path is given, and say so."""
+    if path is not None:
+        import fflin
+
+        getattr(fflin, figure)(drawn, path)
+        print(f"wrote {path}")
 
 
 def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:

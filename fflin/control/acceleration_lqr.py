@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fflin.analysis.momentum import regulated_part
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.validation import Array, dimension
-from fflin.control.gain import Gain, make_gain
+from fflin.control.gain import Gain, for_whole, make_gain
 from fflin.control.lqr import require_fixed_point
 from fflin.control.riccati import Riccati, Solution
 from fflin.control.weights import Weight, weight
@@ -30,7 +31,13 @@ class _Channel(NamedTuple):
 
 
 def acceleration_lqr(
-    lin: LinearModel, Qp: Weight, Qv: Weight, Ra: Weight, *, dt: float | None = None
+    lin: LinearModel,
+    Qp: Weight,
+    Qv: Weight,
+    Ra: Weight,
+    *,
+    dt: float | None = None,
+    wheel_speeds: bool | None = None,
 ) -> Gain:
     r"""Return the regulator that weighs accelerations, in closed form.
 
@@ -43,18 +50,22 @@ def acceleration_lqr(
               u = u_0 - L^{-1} [\operatorname{diag} k_p, \operatorname{diag} k_d]\,(x - x_0),
 
     the poles those of :math:`\lambda^2 + k_d \lambda + s k_p`. Under an exact hold the channels
-    stay apart, and each has a closed form too. The weight on u is :math:`L^T R_a L`, of which no
+    stay apart, and each has a closed form too. The speed of a reaction wheel whose angle is not
+    regulated is a single integrator with k_p = 0. The weight on u is :math:`L^T R_a L`, of which no
     number is formed for the gain, so that an ill-conditioned inertia costs no digits.
 
     Parameters
     ----------
     lin : LinearModel
-        At rest, without gravity, springs and dampers, every coordinate actuated; sampled or not.
+        At rest, without gravity, springs and dampers, every coordinate that `lqr` regulates
+        actuated; sampled or not.
     Qp, Qv, Ra : array_like (6 + n,) or float, or mapping
         Diagonal weights on the positions (q_b, r_b, q_m), the velocities and their
         accelerations: {name: weight} with names of states, those of velocities for `Qv` and `Ra`.
     dt : float, optional
         Samples a continuous model first.
+    wheel_speeds : bool, optional
+        As in `lqr`.
 
     Returns
     -------
@@ -69,7 +80,7 @@ def acceleration_lqr(
         If a coordinate is not actuated.
     InputError
         If the model is not of double integrators, or a weight is not a diagonal, negative, or zero
-        where it must not be: Qp and Ra are positive.
+        where it must not be: Qp and Ra are positive, and Qv of wheels' speeds.
     ModelError
         If the robot's model was changed after it was made.
 
@@ -81,30 +92,35 @@ def acceleration_lqr(
     require_fixed_point(lin)
     if dt is not None:
         lin = lin.discretize(dt)
+    whole, lin = lin, regulated_part(lin, wheel_speeds)
     rates, L = _integrators(lin)
-    m = len(rates)
-    positions, velocities = lin.state_names[:m], lin.state_names[m:]
+    m, half = len(rates), len(whole.A) // 2
+    positions, velocities = lin.state_names[:-m], lin.state_names[-m:]
     qp, qv, ra = (
-        _diagonal(name, value, names, definite=name != "Qv")
-        for name, value, names in (
-            ("Qp", Qp, positions),
-            ("Qv", Qv, velocities),
-            ("Ra", Ra, velocities),
+        _diagonal(name, value, names, kept, definite=name != "Qv")
+        for name, value, names, kept in (
+            ("Qp", Qp, whole.state_names[:half], positions),
+            ("Qv", Qv, whole.state_names[half:], velocities),
+            ("Ra", Ra, whole.state_names[half:], velocities),
         )
     )
+    if (rates + qv == 0.0).any():
+        name = velocities[int((rates + qv).argmin())]
+        raise InputError(f"Qv is 0 for {name}, expected a positive weight on a wheel's speed")
     with np.errstate(all="ignore"):
-        channel = _sampled(rates, qp, qv, ra, lin.dt) if lin.dt else _continuous(rates, qp, qv, ra)
+        channel = _channels(rates, qp, qv, ra, lin.dt)
     stable = np.abs(channel.poles) < 1.0 if lin.dt else channel.poles.real < 0.0
     if not stable.all() or not all(np.isfinite(part).all() for part in channel):
         raise InputError(_BEYOND)
     inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
-    K = inverse @ np.hstack((np.diag(channel.kp), np.diag(channel.kd)))
-    p12 = np.diag(channel.p12)
-    P = np.block([[np.diag(channel.p11), p12], [p12, np.diag(channel.p22)]])
+    pick = np.eye(m)[rates != 0.0]
+    K = inverse @ np.hstack((pick.T * channel.kp, np.diag(channel.kd)))
+    p12 = channel.p12[:, None] * pick
+    P = np.block([[np.diag(channel.p11), p12], [p12.T, np.diag(channel.p22)]])
     Q = np.diag(np.concatenate((qp, qv)))
     # The residual is that of the same equation with accelerations as inputs.
-    hold = np.vstack((np.diag(0.5 * lin.dt**2 * rates), lin.dt * np.eye(m)))
-    by_acceleration = hold if lin.dt else np.vstack((np.zeros((m, m)), np.eye(m)))
+    hold = np.vstack((0.5 * lin.dt**2 * rates * pick, lin.dt * np.eye(m)))
+    by_acceleration = hold if lin.dt else np.vstack((np.zeros_like(pick), np.eye(m)))
     equation = Riccati(lin.A, by_acceleration, Q, np.diag(ra), None, lin.dt)
     R = L.T @ (ra[:, None] * L)
     try:
@@ -113,32 +129,31 @@ def acceleration_lqr(
     except np.linalg.LinAlgError:
         raise InputError(_BEYOND) from None
     solution = Solution(P, K, channel.poles, residual, "closed form")
-    return make_gain(lin, solution, Q, 0.5 * (R + R.T), None)
+    gain = make_gain(lin, solution, Q, 0.5 * (R + R.T), None)
+    return for_whole(gain, whole)
 
 
 def _integrators(lin: LinearModel) -> tuple[Array, Array]:
-    """Return s (m,) and L (m, nu) of a model of double integrators."""
-    nx = len(lin.A)
-    m = nx // 2
-    h = lin.dt or 1.0
+    """Return s (m,), 0 of a rate without its coordinate, and L (m, nu) of integrators."""
+    nx, h = len(lin.A), lin.dt or 1.0
+    p = sum(name.startswith(("q_", "r_")) for name in lin.state_names)
     slope = (lin.A - np.eye(nx)) / h if lin.dt else lin.A
-    s = slope[:m, m:].diagonal().copy()
-    L = lin.B[m:] / h
+    s: Array = slope[:p, p:].sum(axis=0)
+    L, double = lin.B[p:] / h, np.diag(s)[s != 0.0]
     expected = np.zeros((nx, nx))
-    expected[:m, m:] = np.diag(s)
-    top = 0.5 * lin.dt * s[:, None] * L
+    expected[: len(double), p:] = double
     # A tolerance, since the division by the sampling time rounds.
     if (
-        nx != 2 * m
+        len(double) != p
         or not np.allclose(slope, expected, rtol=1e-12, atol=0.0)
-        or not np.allclose(lin.B[:m], h * top, rtol=1e-12, atol=0.0)
+        or not np.allclose(lin.B[:p], 0.5 * h * lin.dt * double @ L, rtol=1e-12, atol=0.0)
     ):
         raise InputError(
             "the model is not of double integrators alone, as one at rest without gravity, "
             "springs and dampers is; use lqr"
         )
     sizes = np.abs(L).max(axis=1, keepdims=True)
-    if not sizes.all() or np.linalg.matrix_rank(L / sizes, tol=1e-10) < m:
+    if not sizes.all() or np.linalg.matrix_rank(L / sizes, tol=1e-10) < len(s):
         from fflin.analysis.stabilizability import require_stabilizable
 
         require_stabilizable(lin)
@@ -146,10 +161,29 @@ def _integrators(lin: LinearModel) -> tuple[Array, Array]:
     return s, L
 
 
-def _diagonal(what: str, value: Weight, names: Sequence[str], *, definite: bool) -> Array:
+def _diagonal(
+    what: str, value: Weight, names: Sequence[str], kept: Sequence[str], *, definite: bool
+) -> Array:
+    """Return the diagonal of a weight on the states that are kept of those that it may name."""
     if not isinstance(value, Mapping) and dimension(what, value) == 2:
         raise InputError(f"{what} is a matrix; the closed form needs its diagonal alone, use lqr")
-    return weight(what, value, names, definite=definite).diagonal()
+    whole = weight(what, value, names, definite=definite and len(kept) == len(names))
+    diagonal = whole.diagonal()[[names.index(name) for name in kept]]
+    return weight(what, diagonal, kept, definite=definite).diagonal()
+
+
+def _channels(s: Array, qp: Array, qv: Array, ra: Array, h: float) -> _Channel:
+    """Solve all channels: double integrators where s is not zero, single ones elsewhere."""
+    double, single = s != 0.0, s == 0.0
+    those = s[double], qp, qv[double], ra[double]
+    found = _sampled(*those, h) if h else _continuous(*those)
+    kd, p22 = np.sqrt(qv / ra), np.sqrt(qv * ra)
+    if h:
+        step = _decaying((-(h**2) * qv / ra).astype(complex)).real
+        kd, p22 = step / h, ra * step / (h**2 * (1.0 - step))
+    poles = np.concatenate((found.poles, (1.0 - h * kd if h else -kd)[single]))
+    kd[double], p22[double] = found.kd, found.p22
+    return found._replace(kd=kd, p22=p22, poles=poles)
 
 
 def _continuous(s: Array, qp: Array, qv: Array, ra: Array) -> _Channel:

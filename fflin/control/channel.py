@@ -77,8 +77,6 @@ class Channel:
         Steps between samples; 0 for a law that is asked at every stage of every step.
     delay : int
         Steps between a sample and its effect.
-    speeds : callable
-        Returns the speeds of the wheels that have a largest one, of whatever the law is given.
     """
 
     def __init__(
@@ -88,17 +86,13 @@ class Channel:
         limits: Saturation,
         sample: int,
         delay: int,
-        speeds: Callable[..., Array],
     ) -> None:
         self._law, self._low, self._high = law, limits.low, limits.high
         self._sample, self._delay = sample, delay
         self._limited = bool(np.isfinite((limits.low, limits.high)).any())
-        self._wheels, self._speeds = limits.wheels, speeds
-        self._pulses = limits.pulses() if limits.pulses else None
-        initial = self._within(initial)
-        late = range(0, delay, sample) if sample else ()
-        self._pending: deque[tuple[int, Array]] = deque((step, initial) for step in late)
-        self._held = initial
+        self._wheels, self._pulses = limits.wheels, limits.pulses and limits.pulses()
+        self._pending: deque[tuple[int, Array]] = deque()
+        self._held = self._within(initial)
 
     @property
     def continuous(self) -> bool:
@@ -111,17 +105,19 @@ class Channel:
             return self.ask(*point)
         if step % self._sample == 0:
             self._pending.append((step + self._delay, self._within(self._law(*point))))
+            if self._pulses and step < self._delay:
+                self._pulses.begin(step, self._held)
         while self._pending and self._pending[0][0] <= step:
             self._held = self._pending.popleft()[1]
             if self._pulses:
                 self._pulses.begin(step, self._held)
         u = self._pulses.at(step) if self._pulses else self._held
-        return u if self._wheels is None else self._wheels.cut(u, self._speeds(*point))
+        return self._wheels.cut(u, *point) if self._wheels else u
 
     def ask(self, *point: Any) -> Array:
         """Return what acts of the law's command at once."""
         u = self._within(self._law(*point))
-        return u if self._wheels is None else self._wheels.cut(u, self._speeds(*point))
+        return self._wheels.cut(u, *point) if self._wheels else u
 
     def _within(self, u: Array) -> Array:
         return np.minimum(np.maximum(u, self._low), self._high) if self._limited else u

@@ -9,11 +9,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.linalg import eigh
 
+from fflin.analysis.momentum import regulated_part
+from fflin.analysis.ranks import Noisy, null_space
+from fflin.analysis.wheels import ignorable_wheels, picked, rigid_forces, without
 from fflin.base.errors import InputError, listed, unknown
 from fflin.base.names import input_keys
 from fflin.base.validation import Array
 from fflin.control.riccati import half_size, solve
 from fflin.control.sampled_cost import sampled_cost
+from fflin.control.saturation import warn_beyond
 from fflin.control.weights import reweighed
 
 if TYPE_CHECKING:
@@ -31,12 +35,17 @@ TURN, WAY, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 _TRIALS = 8
 
 
+# The speeds of wheels come back at this share of the bandwidth.
+_SPEEDS = 0.1
+
+
 class Weights(NamedTuple):
-    """Weights of a continuous cost (nx, nx) and (nu, nu), and the rule that made them."""
+    """Weights of a continuous cost (nx, nx) and (nu, nu), the rule that made them, and w."""
 
     Q: Array
     R: Array
     rule: str
+    bandwidth: float
 
 
 class _Limit(NamedTuple):
@@ -51,6 +60,9 @@ def rule_weights(
     name: str | None,
     q: Mapping[str, float] | None = None,
     r: Mapping[str, float] | None = None,
+    *,
+    wheel_speeds: bool | None = None,
+    hold: float = 0.0,
 ) -> tuple[Array, Array, Array | None, str]:
     """Return Q, R and N of a model by a rule, and the rule in words.
 
@@ -64,6 +76,10 @@ def rule_weights(
         "urdf" is `default_weights`, and the default; "identity" is 1 on every state and input.
     q, r : mapping
         {name of a state, an input or a group: weight} of those that have their own.
+    wheel_speeds : bool, optional
+        As in `lqr`.
+    hold : float
+        Time [s] that the inputs of a continuous model will be held for.
 
     Raises
     ------
@@ -72,7 +88,7 @@ def rule_weights(
     """
     source = lin.generator or lin
     if name is None or name == "urdf":
-        Q, R, rule = default_weights(source, lin.dt)
+        Q, R, rule = _of_regulated(source, lin.dt or hold, wheel_speeds)
     elif name == "identity":
         nx, nu = lin.B.shape
         Q, R, rule = np.eye(nx), np.eye(nu), "identity: 1 on every state and every input"
@@ -88,7 +104,35 @@ def rule_weights(
     return (*sampled_cost(source, lin.dt, Q, R), rule)
 
 
-def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:
+def _of_regulated(
+    lin: LinearModel, hold: float, wheel_speeds: bool | None
+) -> tuple[Array, Array, str]:
+    """Return Q (nx, nx), R and the rule of what is regulated of a model that may have wheels."""
+    part = regulated_part(lin, wheel_speeds)
+    if part is lin:
+        return default_weights(lin, hold)[:3]
+    wheels, _ = ignorable_wheels(lin)
+    body = regulated_part(without(lin, wheels))
+    at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
+    names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
+    room = [lin.limits[name] for name in names] - spin
+    momenta = dict(zip(names, lin.M.diagonal()[at] * room.clip(0.0), strict=True))
+    Q, R, rule, bandwidth = default_weights(body, hold, momenta)
+    S = picked(body.state_names, lin.state_names)
+    Q = S.T @ Q @ S
+    if speeds := [name for name in part.state_names if name not in body.state_names]:
+        S, slow = picked(speeds, lin.state_names), _SPEEDS * bandwidth
+        # Inputs R^-1/2 Z n that turn no body change the speeds at X n.
+        root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
+        X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
+        Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
+        rule = f"{rule}; wheel speeds at {slow:.3g} rad/s"
+    return Q, R, rule
+
+
+def default_weights(
+    lin: LinearModel, hold: float = 0.0, momenta: Mapping[str, float] | None = None
+) -> Weights:
     r"""Return weights with which a displaced robot comes back within the URDF's limits.
 
     With the forces S u of the inputs, a model at rest is :math:`M \dot\nu = S u`,
@@ -120,6 +164,8 @@ def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:
         Whole or reduced; of a sampled one, weights for the sum over its samples.
     hold : float
         Time [s] that the inputs will be held for.
+    momenta : mapping, optional
+        {qdot_m.WHEEL: most momentum [N m s] that it can take up} of wheels that are not states.
 
     Raises
     ------
@@ -164,9 +210,15 @@ def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:
     stiffness = back.T @ (ratios[:, None] ** 0.75 * to_modes)
     gain = (S / cost).T @ np.linalg.solve(reach, stiffness)
     rates = ratios**0.375
+    # The speeds of the coordinates, and the momenta of wheels, as the inputs add them up.
+    room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]}
+    room |= momenta or {}
+    added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
+    motors = [lin.input_names.index(name.removeprefix("qdot_m.")) for name in momenta or ()]
+    taken = np.vstack((T, added[motors]))
     limits = [
         _Limit(BANDWIDTH, ""),
-        *_of_speeds(lin, _fastest(T, rates, to_modes, size, lin)),
+        *_of_speeds(room, _fastest(taken, rates, to_modes, size, lin)),
         *_of_efforts(lin, _largest(gain, size, lin.state_names)),
     ]
     if hold or lin.dt:
@@ -175,7 +227,8 @@ def default_weights(lin: LinearModel, hold: float = 0.0) -> Weights:
     limit = min(limits)
     if A[m:].any() or A[:m, :m].any():
         limit = _slowed(lin, Q, cost, size, limit)
-    return Weights(h * Q, np.diag(h * cost / limit.bandwidth**4), _rule(lin, size, limit))
+    R = np.diag(h * cost / limit.bandwidth**4)
+    return Weights(h * Q, R, _rule(lin, size, limit), limit.bandwidth)
 
 
 def _displacements(lin: LinearModel) -> Array:
@@ -227,9 +280,9 @@ def _reach(S: Array, cost: Array, D: Array) -> Array:
 
 
 def _fastest(T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel) -> Array:
-    """Return the largest speed (m,) at w = 1 on the way back from any displacement."""
-    speeds = np.zeros(len(size))
-    if any(name in lin.limits for name in lin.state_names[len(size) :]):
+    """Return the largest of speeds (k,), T over the modes', on the way back at w = 1."""
+    speeds = np.zeros(len(T))
+    if any(name.startswith("qdot_m.") for name in lin.limits):
         for time in np.geomspace(0.1 / rates[-1], 3.0, 60):
             x = rates * time / math.sqrt(2.0)
             moving = math.sqrt(2.0) * rates * np.exp(-x) * np.sin(x)
@@ -238,13 +291,12 @@ def _fastest(T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearMo
     return speeds
 
 
-def _of_speeds(lin: LinearModel, speeds: Array) -> list[_Limit]:
+def _of_speeds(room: Mapping[str, float], speeds: Array) -> list[_Limit]:
     """Return what the limits of speeds leave of a bandwidth at which they are these times it."""
-    names = lin.state_names[len(speeds) :]
     return [
-        _Limit(lin.limits[name] / speed, f"the speed of {name.partition('.')[2]}")
-        for name, speed in zip(names, speeds, strict=True)
-        if name in lin.limits and speed > 0.0
+        _Limit(limit / speed, f"the speed of {name.partition('.')[2]}")
+        for (name, limit), speed in zip(room.items(), speeds, strict=True)
+        if 0.0 < limit < math.inf and speed > 0.0
     ]
 
 
@@ -254,7 +306,7 @@ def _of_efforts(lin: LinearModel, use: Array, bandwidth: float = 1.0) -> list[_L
     for name, used, at in zip(lin.input_names, use, lin.u0, strict=True):
         room = lin.limits.get(name, math.inf) - abs(at)
         if 0.0 < room < math.inf and used > 0.0:
-            what = f"the effort of {name.partition('.')[2]}"
+            what = f"the effort of {name.partition('.')[2] or name}"
             found.append(_Limit(bandwidth * math.sqrt(room / used), what))
     return found
 
@@ -273,6 +325,11 @@ def _slowed(lin: LinearModel, Q: Array, cost: Array, size: Array, limit: _Limit)
             return limit
         # What springs and gravity ask for stays however slow the loop.
         limit = least._replace(bandwidth=max(least.bandwidth, 0.3 * limit.bandwidth))
+        asked = np.abs(lin.u0) + use
+    else:
+        high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
+        where = "at the displacements of the default weights"
+        warn_beyond(lin, where, asked, -high, high)
     return limit._replace(what=f"{limit.what}, which is not enough for all displacements")
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from fflin.analysis.wheels import picked
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import grid, matrix, width
 from fflin.base.validation import Array
@@ -35,8 +36,8 @@ class Gain(Design):
     K : ndarray (nu, nx)
     P : ndarray (nx, nx)
         The cost from x on is ``(x - x0)' P (x - x0)``.
-    poles : ndarray (nx,) of complex
-        Eigenvalues of ``A - B K`` [1/s]; of a sampled model those of the step.
+    poles : ndarray (nz,) of complex
+        Eigenvalues of ``A - B K`` [1/s] over what is regulated; of a sampled model of the step.
     residual : float
         Of the Riccati equation: its norm relative to the sum of the norms of its terms.
     margin : float
@@ -55,6 +56,8 @@ class Gain(Design):
         Of the model.
     weights : str
         The rule that made the weights, in words.
+    regulated : tuple of str (nz,)
+        The states that are fed back, all where it is empty; K, P, Q and N are zero elsewhere.
     """
 
     VECTORS: ClassVar = ("poles", "x0", "u0")
@@ -80,6 +83,7 @@ class Gain(Design):
     frame: str
     robot: str
     weights: str = field(default_factory=str)
+    regulated: tuple[str, ...] = field(default_factory=tuple)
 
     def __repr__(self) -> str:
         nu, nx = self.K.shape
@@ -103,6 +107,8 @@ class Gain(Design):
             )
         figures = textwrap.fill(_figures(self), width())
         parts = [head, body, _poles(self), figures]
+        if left := _unregulated(self):
+            parts.append(textwrap.fill(f"not regulated: {left}", width()))
         if self.weights:
             parts.append(textwrap.fill(f"weights: {self.weights}", width()))
         if fragile := fragility(self):
@@ -118,7 +124,8 @@ class Gain(Design):
     @cached_property
     def margins(self) -> Margins:
         """Gain and phase margins at the inputs, computed when first asked for."""
-        return input_margins(self.A, self.B, self.K, self.R, self.dt)
+        S = picked(self.regulated or self.state_names, self.state_names)
+        return input_margins(S @ self.A @ S.T, S @ self.B, self.K @ S.T, self.R, self.dt)
 
 
 def make_gain(
@@ -140,8 +147,19 @@ def make_gain(
         R=R,
         N=np.zeros(lin.B.shape) if N is None else N,
         weights=weights,
+        regulated=lin.state_names,
         verified=lin.verified,
     )
+
+
+def for_whole(gain: Gain, lin: LinearModel) -> Gain:
+    """Return a gain of a part of a model as one of the model, with the rest not fed back."""
+    if gain.state_names == lin.state_names:
+        return gain
+    S = picked(gain.regulated, lin.state_names)
+    values = {key: getattr(lin, key) for key in _FROM_MODEL}
+    values |= {"K": gain.K @ S, "P": S.T @ gain.P @ S, "Q": S.T @ gain.Q @ S, "N": S.T @ gain.N}
+    return replace(gain, **values)
 
 
 _FROM_MODEL = (
@@ -168,6 +186,26 @@ def fragility(gain: Gain) -> str:
         f"{margins.disk:.2g}, below {_FRAGILE:g}): a small delay or error of the model makes it "
         f"unstable; {remedy}, as the default weights do"
     )
+
+
+def _unregulated(gain: Gain) -> str:
+    """Say which states are not fed back, and why."""
+    left = [name for name in gain.state_names if gain.regulated and name not in gain.regulated]
+    base = [name for name in left if name.startswith(("r_b.", "v_b."))]
+    shown = "r_b, v_b" if len(base) == 6 else ", ".join(base)
+    parts = [f"{shown} (no input pushes it)"] if base else []
+    if any(name.startswith("q_m.") for name in left):
+        parts.append("wheel angles (ignorable)")
+    if speeds := [name for name in left if name.startswith("qdot_m.")]:
+        B = gain.B / np.linalg.norm(gain.B, axis=1, keepdims=True).clip(1e-300)
+        held, both = (
+            np.linalg.matrix_rank(picked(names, gain.state_names) @ B)
+            for names in (gain.regulated, (*gain.regulated, *speeds))
+        )
+        tied = "tied to the body's rate by the conserved momentum"
+        why = tied if held == both else "wheel_speeds=True regulates those that can be"
+        parts.append(f"wheel speeds ({why})")
+    return ", ".join(parts)
 
 
 def _blocks(gain: Gain) -> str:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.base.errors import DetectabilityError, InputError, MissingPackageError
+from fflin.analysis.momentum import regulated_part
+from fflin.analysis.wheels import picked, seen_through
+from fflin.base.errors import DetectabilityError, InputError, MissingPackageError, listed
 from fflin.base.names import input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array
@@ -35,8 +37,8 @@ class Estimator(Design):
         ``L = A L_update`` of a sampled model; L itself for continuous time.
     P : ndarray (nx, nx)
         Covariance of the error of xh.
-    poles : ndarray (nx,) of complex
-        Eigenvalues of ``A - L C`` [1/s]; of a sampled model those of the step.
+    poles : ndarray (nz,) of complex
+        Eigenvalues of ``A - L C`` [1/s] over what is estimated; of a sampled model of the step.
     residual : float
         Of the Riccati equation, relative to the sum of the norms of its terms.
     margin : float
@@ -50,6 +52,8 @@ class Estimator(Design):
         Sampling time [s]; 0 for continuous time.
     state_names, input_names, output_names : tuple of str
     robot : str
+    estimated : tuple of str (nz,)
+        The states that are, all where it is empty; L, P and W are zero elsewhere.
     """
 
     VECTORS: ClassVar = ("poles", "x0", "u0", "y0")
@@ -74,6 +78,7 @@ class Estimator(Design):
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
     robot: str
+    estimated: tuple[str, ...] = field(default_factory=tuple)
 
     def __repr__(self) -> str:
         nx, ny = self.L.shape
@@ -92,10 +97,10 @@ class Compensator(Design):
 
     Attributes
     ----------
-    A : ndarray (nx, nx)
-    B : ndarray (nx, ny)
-    C : ndarray (nu, nx)
-    poles : ndarray (2 nx,) of complex
+    A : ndarray (nz, nz)
+    B : ndarray (nz, ny)
+    C : ndarray (nu, nz)
+    poles : ndarray (2 nz,) of complex
         Of the loop that it closes around the model: those of the gain and of the estimator.
     y0, u0 : ndarray
     dt : float
@@ -146,7 +151,14 @@ class Compensator(Design):
         )
 
 
-def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -> Estimator:
+def kalman(
+    lin: LinearModel,
+    W: Weight,
+    V: Weight,
+    G: ArrayLike | None = None,
+    *,
+    wheel_speeds: bool | None = None,
+) -> Estimator:
     r"""Return the steady Kalman filter of a model about a fixed point.
 
     The model is disturbed by white noises, ``dx/dt = ... + w`` and ``y = ... + n`` of intensities
@@ -154,7 +166,8 @@ def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -
 
     .. math:: A P + P A^T - P C^T V^{-1} C P + W = 0,\qquad L = P C^T V^{-1}
 
-    or its sampled counterpart, by SciPy's solver and Newton's method, see `lqr`.
+    or its sampled counterpart, by SciPy's solver and Newton's method, see `lqr`. Of a model with
+    reaction wheels what `lqr` regulates is estimated, by the outputs that see nothing else.
 
     Parameters
     ----------
@@ -167,6 +180,8 @@ def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -
     G : array_like (nx, nw), optional
         The disturbance acts through G and W is (nw, nw): ``G=lin.B`` for noisy inputs, whose
         names W then takes.
+    wheel_speeds : bool, optional
+        As in `lqr`.
 
     Returns
     -------
@@ -195,6 +210,10 @@ def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -
 
     require_fixed_point(lin)
     W, V = _disturbance(lin, W, G), weight("V", V, lin.output_names, definite=True)
+    whole, noises, lin = lin, V, regulated_part(lin, wheel_speeds)
+    S = picked(lin.state_names, whole.state_names)
+    seen = seen_through(whole, S)
+    W, V = S @ W @ S.T, seen @ V @ seen.T
     require_detectable(lin)
     require_disturbed(lin, W)
     C = np.ascontiguousarray(lin.C)
@@ -209,16 +228,17 @@ def kalman(lin: LinearModel, W: Weight, V: Weight, G: ArrayLike | None = None) -
         L_update = np.linalg.solve(C @ solution.P @ C.T + V, C @ solution.P).T
     poles, margin = solution.ordered(lin.dt)
     return Estimator(
-        L,
-        L_update,
-        solution.P,
+        S.T @ L @ seen,
+        S.T @ L_update @ seen,
+        S.T @ solution.P @ S,
         poles,
         solution.residual,
         margin,
-        W=W,
-        V=V,
+        W=S.T @ W @ S,
+        V=noises,
+        estimated=lin.state_names,
         verified=lin.verified,
-        **{key: getattr(lin, key) for key in _FROM_MODEL},
+        **{key: getattr(whole, key) for key in _FROM_MODEL},
     )
 
 
@@ -243,22 +263,29 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     Raises
     ------
     InputError
-        If the two are of different models.
+        If the two are of different models, or the gain feeds back what is not estimated.
     """
     if not isinstance(gain, Gain) or not isinstance(estimator, Estimator):
         raise InputError("lqg takes a Gain, as lqr returns it, and an Estimator, as kalman does")
     e = estimator
     if gain.dt != e.dt or not (np.array_equal(gain.A, e.A) and np.array_equal(gain.B, e.B)):
         raise InputError("the gain and the estimator are of different models; use one for both")
+    names = e.estimated or e.state_names
+    if unseen := [name for name in gain.regulated if name not in names]:
+        raise InputError(
+            f"the gain feeds back {listed(unseen)}, which the estimator does not estimate; give "
+            "the same wheel_speeds to both"
+        )
+    S = picked(names, e.state_names)
     return Compensator(
-        A=e.A - e.B @ gain.K - e.L @ (e.C - e.D @ gain.K),
-        B=e.L,
-        C=-gain.K,
+        A=S @ (e.A - e.B @ gain.K - e.L @ (e.C - e.D @ gain.K)) @ S.T,
+        B=S @ e.L,
+        C=-gain.K @ S.T,
         poles=np.concatenate((gain.poles, e.poles)),
         y0=e.y0,
         u0=e.u0,
         dt=e.dt,
-        state_names=e.state_names,
+        state_names=names,
         input_names=e.output_names,
         output_names=e.input_names,
         robot=e.robot,

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fflin.analysis.momentum import regulated_part
+from fflin.analysis.wheels import picked
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.base.validation import Array
 from fflin.control.default_weights import rule_weights
-from fflin.control.gain import Gain, make_gain
+from fflin.control.gain import Gain, for_whole, make_gain
 from fflin.control.weights import Weight, cost_weights
 from fflin.linear.model import LinearModel
 
@@ -34,6 +36,7 @@ def lqr(
     N: ArrayLike | None = None,
     *,
     weights: str | None = None,
+    wheel_speeds: bool | None = None,
 ) -> Gain:
     r"""Return the linear quadratic regulator of a model about a fixed point.
 
@@ -54,6 +57,10 @@ def lqr(
     turned by 30 deg and the joints by 0.3 rad; see `fflin.control.default_weights`. Every input
     then bears 60 deg of phase, and any gain from a half up.
 
+    Of a model with reaction wheels what can be is regulated, and named in ``gain.regulated``:
+    wheels' angles are ignorable, their speeds follow the body's rate where only they turn it, and
+    no input may push the base, (9.4) of docs/derivation.md. Weights on these have no effect.
+
     Parameters
     ----------
     lin : LinearModel
@@ -68,6 +75,10 @@ def lqr(
     weights : {"urdf", "identity"}, optional
         Instead of Q and R: those above (default), or 1 on every state and input. Of a sampled
         model they are those of the continuous cost under the hold.
+    wheel_speeds : bool, optional
+        Whether wheels come back to the speeds of the point: by default where other inputs can
+        bring them; True also where wheels turn against each other, False none. The default
+        weights bring them back at a tenth of w.
 
     Returns
     -------
@@ -99,12 +110,16 @@ def lqr(
     require_fixed_point(lin)
     rule = "as given"
     if Q is None and R is None and N is None:
-        Q, R, N, rule = rule_weights(lin, weights)
+        Q, R, N, rule = rule_weights(lin, weights, wheel_speeds=wheel_speeds)
     elif weights is not None or Q is None or R is None:
         raise InputError("give Q and R, both, or weights='urdf' or 'identity' without them")
     Q, R, cross = cost_weights(lin, Q, R, N)
-    solution = _solve(lin, Q, R, cross)
-    return make_gain(lin, solution, Q, R, cross, rule)
+    part = regulated_part(lin, wheel_speeds)
+    if part is not lin:
+        S = picked(part.state_names, lin.state_names)
+        Q, cross = S @ Q @ S.T, None if cross is None else S @ cross
+    solution = _solve(part, Q, R, cross)
+    return for_whole(make_gain(part, solution, Q, R, cross, rule), lin)
 
 
 def require_fixed_point(lin: LinearModel) -> None:

@@ -15,6 +15,7 @@ from fflin.control.kalman import Compensator
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.outputs import Measuring, Sensing
 from fflin.dynamics.state import StateMap
+from fflin.linear.fit import require_fit, require_same
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
 
@@ -73,20 +74,15 @@ class OutputFeedback:
         Raises
         ------
         InputError
-            If the model is not one of this robot with these outputs.
+            If the robot has not the model's states, inputs and outputs; its masses may be others.
         """
-        from fflin.control.policies import require_same_robot
-
         lin, by = self.lin, self.compensator
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-        require_same_robot(lin, robot, state)
+        require_fit(lin, robot, state)
         full = robot.outputs == (FullState(),)
-        names = state.names if full else Sensing(state, robot.outputs).names
-        if names != lin.output_names:
-            raise InputError(
-                f"the model has {len(lin.output_names)} outputs, which are not the {len(names)} of "
-                f"'{robot.name}' as it is given; linearise this robot"
-            )
+        sensed = state if full else Sensing(state, robot.outputs)
+        own, there = (lin.output_names, lin.output_units), (sensed.names, sensed.units)
+        require_same(f"the model is one of '{lin.robot}'", robot, "output", own, there)
         measure = Measuring(state, lin.q)
         aba = Aba(state) if any(output.FEELS_ACCELERATION for output in robot.outputs) else None
         near = state.read(lin.q, lin.v)

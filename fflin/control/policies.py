@@ -16,7 +16,9 @@ from fflin.control.channel import Law
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moving_error, readout
+from fflin.linear.fit import require_fit, require_same, require_turns
 from fflin.linear.model import LinearModel
+from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -80,11 +82,11 @@ class StateFeedback:
         Raises
         ------
         InputError
-            If the model is not one of this robot.
+            If the robot has not the model's states and inputs; its masses may be others.
         """
         lin = self.lin
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-        require_same_robot(lin, robot, state)
+        require_fit(lin, robot, state)
         fed = np.array([state.names.index(name) for name in lin.state_names])
         near = np.zeros(state.nx)
         near[fed] = lin.x0
@@ -130,15 +132,14 @@ class TrajectoryFeedback:
         Raises
         ------
         InputError
-            If the trajectory is not one of this robot.
+            If the robot has not the trajectory's states and inputs; its masses may be others.
         """
         along = self.trajectory
-        if along.robot.joint_names != robot.joint_names or along.robot.inputs != robot.inputs:
-            raise InputError(
-                f"the trajectory is one of '{along.robot.name}' with its inputs, not of "
-                f"'{robot.name}' as it is given; simulate the robot that was linearised"
-            )
-        state = StateMap(robot, frame="local")
+        state, own = StateMap(robot, frame="local"), StateMap(along.robot, frame="local")
+        made = f"the trajectory is one of '{along.robot.name}'"
+        for kind, pair in (("input", map(Actuation, (own, state))), ("state", (own, state))):
+            require_same(made, robot, kind, *((each.names, each.units) for each in pair))
+        require_turns(made, along.robot.nq, robot)
         end = float(along.t[-1])
 
         def policy(t: float, q: Array, v: Array) -> Array:
@@ -152,7 +153,7 @@ class TrajectoryFeedback:
 
 @dataclass(frozen=True, eq=False)
 class Allocation:
-    """Thrusts, none of them negative, that come nearest to what a policy asks for.
+    """Thrusts, none negative or beyond its limit, that come nearest to what a policy asks for.
 
     The policy decides on the inputs of the robot `design`, such as torque and force on the base;
     the thrusters and motors of the simulated robot give the generalised force that it means, in
@@ -189,6 +190,7 @@ class Allocation:
             raise InputError(
                 f"the design's joints are not those of '{robot.name}'; allocate for the same robot"
             )
+        require_turns(f"the design is '{self.design.name}'", self.design.nq, robot)
         lin = self.lin
         asked, given = (
             StateMap(each, reference=lin.reference, frame=lin.frame) if lin else StateMap(each)
@@ -197,9 +199,9 @@ class Allocation:
         asking, giving = Actuation(asked), Actuation(given)
         free = np.full(len(asking.names), np.inf)
         inner = Law(bound(self.policy, self.design), asking.names, (-free, free), np.inf)
-        data = robot.create_data()
-        least = np.full(len(giving.names), -np.inf)
-        least[giving.groups.get("thrust", [])] = 0.0
+        data, own = robot.create_data(), self.design.create_data()
+        limits, open_ = limits_of(robot), (-np.inf, np.inf)
+        least, most = np.array([limits.get(name, open_) for name in giving.names]).T
 
         def policy(t: float, q: Array, v: Array) -> Array:
             u = inner(t, q, v)
@@ -208,7 +210,7 @@ class Allocation:
             for held in giving.held:
                 columns = columns.copy()
                 columns[:, held.columns] = columns[:, held.columns] @ given.chart(q).R.T
-            M = given.project(pin.crba(robot.model, data, q).T)
+            M = asked.project(pin.crba(self.design.model, own, q).T)
             factor = np.linalg.cholesky(M)
             A, b = np.linalg.solve(factor, columns), np.linalg.solve(factor, force)
             size = float(np.linalg.norm(b))
@@ -220,11 +222,11 @@ class Allocation:
             found = lsq_linear(
                 np.vstack((A / unit, 1e-7 * np.eye(len(least)))),
                 np.concatenate((b / size, np.zeros(len(least)))),
-                (least, np.full_like(least, np.inf)),
+                (least * (unit / size), most * (unit / size)),
                 method="bvls",
                 tol=1e-14,
             )
-            thrusts: Array = np.maximum(found.x, least) * (size / unit)
+            thrusts: Array = np.clip(found.x * (size / unit), least, most)
             return thrusts
 
         return policy
@@ -241,15 +243,8 @@ def bound(policy: Any, robot: Robot) -> Policy:
     return result
 
 
-def require_same_robot(lin: LinearModel, robot: Robot, state: StateMap) -> None:
-    """Raise `InputError` where a model is not one of a robot with its inputs."""
-    names = Actuation(state).names
-    if (
-        lin.urdf_sha256 != robot.urdf_sha256
-        or lin.input_names != names
-        or not set(lin.state_names) <= set(state.names)
-    ):
-        raise InputError(
-            f"the model is one of '{lin.robot}' with {len(lin.input_names)} inputs, not of "
-            f"'{robot.name}' as it is given with {len(names)}; linearise this robot"
-        )
+def feedback_of(policy: Any) -> tuple[LinearModel | None, Array | None]:
+    """Return the model that a policy was made for, and its K, where it has them."""
+    lin = getattr(policy, "lin", None)
+    decides = policy.policy if isinstance(policy, Allocation) else policy
+    return (lin if isinstance(lin, LinearModel) else None), getattr(decides, "K", None)

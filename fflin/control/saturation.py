@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple
@@ -10,8 +11,10 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.errors import FflinWarning, listed
 from fflin.base.validation import Array
 from fflin.control.pulses import Pulses
+from fflin.linear.model import LinearModel
 from fflin.robot.fields import Range
 from fflin.robot.inputs import Thruster, named_inputs
 from fflin.robot.robot import Robot
@@ -22,53 +25,33 @@ class Wheels(NamedTuple):
 
     Within a step of dt a torque u takes the speed w of a wheel by u dt / J further, where J is what
     it turns against the rest of the robot, both free: :math:`u \le J (w_{max} - w) / dt`, and
-    likewise below.
-
-    Attributes
-    ----------
-    names : list of str
-    at : list of int
-        Where their torques stand among the inputs.
-    speeds, torques : ndarray (2, k)
-        Least and largest [rad/s], [N m].
-    stiffness : ndarray (k,)
-        J / dt [N m s/rad].
+    likewise below, as far as the motor can.
     """
 
     names: list[str]
-    at: list[int]
-    speeds: Array
-    torques: Array
-    stiffness: Array
+    at: list[int]  # where their torques stand among the inputs
+    torques: Array  # least and largest (2, k) [N m]
+    limits: Array  # least and largest speed (2, k) [rad/s]
+    stiffness: Array  # J / dt (k,) [N m s/rad]
+    speeds: Callable[..., Array]  # (k,) [rad/s], of whatever the law is given
 
-    def cut(self, u: Array, speeds: Array) -> Array:
+    def cut(self, u: Array, *point: object) -> Array:
         """Return u (nu,) without what would take a wheel beyond its speed within a step."""
-        told = u[self.at]
-        # The motor's own limits are kept where a wheel is too fast already.
-        room = np.clip(self.stiffness * (self.speeds - speeds), *self.torques)
-        given = np.clip(told, *room)
-        if (given == told).all():
-            return u
-        u = u.copy()
-        u[self.at] = given
+        room = np.clip(self.stiffness * (self.limits - self.speeds(*point)), *self.torques)
+        given = np.clip(u[self.at], *room)
+        if (given != u[self.at]).any():
+            u = u.copy()
+            u[self.at] = given
         return u
 
 
 class Saturation(NamedTuple):
-    """What acts of a command of the inputs of a robot.
+    """What acts of a command of the inputs of a robot."""
 
-    Attributes
-    ----------
-    low, high : ndarray (nu,)
-    wheels : Wheels or None
-    pulses : callable or None
-        Makes the `Pulses` of a run.
-    """
-
-    low: Array
+    low: Array  # (nu,)
     high: Array
-    wheels: Wheels | None = None
-    pulses: Callable[[], Pulses] | None = None
+    wheels: Wheels | None
+    pulses: Callable[[], Pulses] | None  # makes those of a run
 
 
 def saturation(
@@ -79,21 +62,44 @@ def saturation(
     `limits` is {name of an input, or qdot_m of a wheel: (least, largest)}; `sample` is how many
     steps lie between samples, 0 where there are none.
     """
-    inputs = [(name, item) for item, names in named_inputs(robot.inputs) for name in names]
-    names = [name for name, _ in inputs]
-    open_ = (-math.inf, math.inf)
-    low, high = np.array([limits.get(name, open_) for name in names]).T
-    thrusters = [(k, x, item) for k, (x, item) in enumerate(inputs) if isinstance(item, Thruster)]
-    for k, *_ in thrusters:
-        low[k] = max(low[k], 0.0)
-    pulsed = [each for each in thrusters if each[2].on_off or each[2].least_impulse]
+    inputs = {name: item for item, names in named_inputs(robot.inputs) for name in names}
+    names = list(inputs)
+    low, high = np.array([limits.get(name, (-math.inf, math.inf)) for name in names]).T
+    low = np.maximum(low, [-math.inf if item.PULLS else 0.0 for item in inputs.values()])
+    pulsed = [
+        (names.index(name), name, item)
+        for name, item in inputs.items()
+        if isinstance(item, Thruster) and (item.on_off or item.least_impulse)
+    ]
     wheels = None
     if spun := [name for name in robot.wheels if f"qdot_m.{name}" in limits]:
-        at = [names.index(name) for name in spun]
-        speeds = np.array([limits[f"qdot_m.{name}"] for name in spun]).T
-        mobility = pin.computeMinverse(robot.model, robot.create_data(), q).diagonal()
-        stiffness = 1.0 / (mobility[[robot.joint(name).idx_v for name in spun]] * dt)
-        wheels = Wheels(spun, at, speeds, np.array((low, high))[:, at], stiffness)
-    return Saturation(
-        low, high, wheels, partial(Pulses, pulsed, high, sample, dt) if pulsed else None
-    )
+        at, of_v = [names.index(x) for x in spun], [robot.joint(x).idx_v for x in spun]
+        mobility = pin.computeMinverse(robot.model, robot.create_data(), q).diagonal()[of_v]
+        wheels = Wheels(
+            spun,
+            at,
+            np.array((low[at], high[at])),
+            np.array([limits[f"qdot_m.{name}"] for name in spun]).T,
+            1.0 / (mobility * dt),
+            lambda t, q, v: v[of_v],
+        )
+    pulses = partial(Pulses, pulsed, high, sample, dt) if pulsed else None
+    return Saturation(low, high, wheels, pulses)
+
+
+def warn_beyond(lin: LinearModel, where: str, asked: Array, low: Array, high: Array) -> None:
+    """Warn of inputs that are asked (nu,) for more than their limits."""
+    limits = np.where(asked > 0.0, high, low)
+    beyond = [
+        f"{name} is asked for {u:.3g} {unit}, limit {limit:g}"
+        for name, unit, u, limit in zip(
+            lin.input_names, lin.input_units, asked, limits, strict=True
+        )
+        if abs(u) > (1.0 + 1e-6) * abs(limit)
+    ]
+    if beyond:
+        warnings.warn(
+            f"the limits do not hold '{lin.robot}' {where}: {listed(beyond)}",
+            FflinWarning,
+            stacklevel=3,
+        )

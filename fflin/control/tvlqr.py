@@ -109,14 +109,11 @@ def tvlqr(
     if not by_rule and (weights is not None or Q is None or R is None):
         raise InputError("give Q and R, both, or weights='urdf' or 'identity' without them")
     end: Any = steady_end(traj) if steady or by_rule else None
-    given: Any = (Q, R)
+    given: list[Any] = [Q, R]
     if by_rule:
-        from fflin.control.default_weights import default_weights, rule_weights
+        from fflin.control.default_weights import rule_weights
 
-        if weights in (None, "urdf"):
-            *given, rule = default_weights(end, dt)
-        else:
-            *given, _, rule = rule_weights(end, weights)
+        *given, _, rule = rule_weights(end, weights, hold=dt)
     Q = weight("Q", given[0], names)
     R = weight("R", given[1], input_keys(Actuation(StateMap(traj.robot))), definite=True)
     Qf = _cost_from(end, Q, R, sample) if steady else weight("Qf", Qf, names)

@@ -23,6 +23,7 @@ from fflin.linear.certificate import (
     scaled_condition,
     speeds,
 )
+from fflin.linear.fit import require_same
 from fflin.linear.model import LinearModel
 from fflin.linear.nonlinear import (
     ErrorDynamics,
@@ -141,17 +142,10 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; check the continuous one")
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    if lin.state_names != state.names:
-        raise InputError(
-            f"the model has {len(lin.state_names)} states of '{lin.robot}', which are not the "
-            f"{state.nx} states of '{robot.name}'; check it against its own robot"
-        )
-    actuation = Actuation(state)
-    if (lin.input_names, lin.input_units) != (actuation.names, actuation.units):
-        raise InputError(
-            f"the model has {len(lin.input_names)} inputs, which are not the "
-            f"{len(actuation.names)} of '{robot.name}'; give the robot the same (Robot.replace)"
-        )
+    actuation, made = Actuation(state), f"the model is one of '{lin.robot}'"
+    states, inputs = (lin.state_names, lin.state_units), (lin.input_names, lin.input_units)
+    require_same(made, robot, "state", states, (state.names, state.units))
+    require_same(made, robot, "input", inputs, (actuation.names, actuation.units))
     q, v = robot.checked_configuration(lin.q), robot.checked_velocity(lin.v)
     M = inertia_matrix(robot, lin)
     condition = scaled_condition(M)
@@ -238,11 +232,10 @@ def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float)
     if state.robot.outputs != (FullState(),):
         sensing = Sensing(state, state.robot.outputs)
         names, units = sensing.names, sensing.units
-    if (lin.output_names, lin.output_units) != (names, units):
-        raise InputError(
-            f"the model has {len(lin.output_names)} outputs, which are not the {len(names)} of "
-            f"'{state.robot.name}'; give the robot the same (Robot.replace)"
-        )
+    outputs = (lin.output_names, lin.output_units)
+    require_same(
+        f"the model is one of '{lin.robot}'", state.robot, "output", outputs, (names, units)
+    )
     if state.robot.outputs == (FullState(),):
         errors = (lin.y0 - lin.x0, lin.C - np.eye(state.nx), lin.D)
         return [
@@ -291,9 +284,14 @@ def check_report(check: Check) -> str:
     states = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
     blocks = [row.block for row in check.rows]
     inputs = dict.fromkeys(b[:-1].split(", ")[1] for b in blocks if b.startswith("B["))
-    parts = [f"check of {check.title}"]
+    parts = [f"check of {check.title}\na dot is an error of exactly zero"]
     for test in ("ABA derivatives", "differences"):
         rows = {row.block: row for row in check.rows if row.test == test}
+        tolerance = next(iter(rows.values())).tolerance
+        title = f"A and B against {test}: "
+        if not any(row.error for row in rows.values()):
+            parts.append(f"{title}no difference in any of {len(rows)} blocks")
+            continue
         body = [
             [
                 state,
@@ -302,10 +300,7 @@ def check_report(check: Check) -> str:
             ]
             for state in states
         ]
-        tolerance = next(iter(rows.values())).tolerance
-        parts.append(
-            f"A and B against {test}: relative error of each block, at most {tolerance:.1e}"
-        )
+        parts.append(f"{title}relative error of each block, at most {tolerance:.1e}")
         parts.append(grid([["", *states, *inputs], *body]))
     single = [r for r in check.rows if r.test not in ("ABA derivatives", "differences")]
     rest = [[f"{r.test}: {r.block}", _error(r), f"at most {r.tolerance:.1e}"] for r in single]

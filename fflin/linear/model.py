@@ -233,10 +233,10 @@ class LinearModel(FrozenArrays):
 
     @cached_property
     def limits(self) -> Mapping[str, float]:
-        """{name of an input or state: limit} of those that the URDF limits, found on the robot.
+        """{name of an input or state: limit} of those that have one, found on the robot.
 
-        Of ``tau_m`` the largest effort [N m | N], of ``qdot_m`` the largest speed [rad/s | m/s],
-        of ``q_m`` the whole travel [rad | m].
+        Of inputs the largest force or torque, of ``qdot_m`` the largest speed [rad/s | m/s], of
+        ``q_m`` the whole travel [rad | m]; of the URDF, the inputs and `Robot.limits`.
         """
         return {} if self._limits is None else self._limits()
 

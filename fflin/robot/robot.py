@@ -170,11 +170,10 @@ class Robot:
         ----------
         bodies : mapping
             {body: {"mass": m [kg], "com": (3,) [m], "inertia": (3, 3) [kg m^2] about the centre of
-            mass} or pin.Inertia}, in the axes of the body's joint. A body is named by the joint
-            that moves it, ``base``, a pattern, or by its link where no other is fixed to it: links
-            that are fixed to each other are one body, whose properties are those of all together,
-            wheels included. What is left out stays; a mass without an inertia scales the inertia
-            with it, as another density does.
+            mass} or pin.Inertia}, in the axes of the body's joint. A body is named by its joint,
+            ``base``, a pattern, or its link where no other is fixed to that: links that are fixed
+            to each other are one body, given as a whole and with its wheels. What is left out
+            stays; a mass without an inertia scales that with it, as another density does.
 
         Returns
         -------
@@ -196,13 +195,11 @@ class Robot:
     def perturbed(
         self, *, mass: float = 0.1, com: float = 0.1, inertia: float = 0.1, seed: int = 0
     ) -> Robot:
-        r"""Return the same robot with masses drawn at random, each body still a rigid body.
+        """Return the same robot with masses drawn at random, each body still a rigid body.
 
-        Each mass is multiplied by 1 + mass d with d uniform in [-1, 1]; each body is stretched
-        along the axes of its frame so that its second moments per mass are multiplied by
-        1 + inertia d, and its moments of inertia per mass by something in between; its centre of
-        mass is shifted along each axis by com d times the body's radius of gyration there. The
-        pseudo-inertia goes through a congruence, which keeps it positive.
+        With d uniform in [-1, 1], anew for each body and axis, a mass is multiplied by
+        1 + mass d, the second moments per mass along the axes of the body's frame by
+        1 + inertia d, and the centre of mass is shifted by com d times the radius of gyration.
 
         Parameters
         ----------
@@ -215,12 +212,6 @@ class Robot:
         -------
         Robot
             As of `with_mass_properties`.
-
-        References
-        ----------
-        P. M. Wensing, S. Kim and J.-J. E. Slotine, Linear matrix inequalities for physically-
-        consistent inertial parameter identification, IEEE Robotics and Automation Letters 3(1),
-        2018.
         """
         from fflin.robot.mass_properties import perturbed
 

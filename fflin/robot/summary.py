@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Iterable
 
 from fflin.base.tables import counted, grid, width
+from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.robot import ROOT, Robot
 
 _LIMITS = "limits in rad, N m and rad/s; of a prismatic joint in m, N and m/s"
@@ -27,10 +28,11 @@ def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
 def robot_info(robot: Robot) -> str:
     """Show a robot's tree, masses and limits."""
     model = robot.model
+    inputs = sum(3 if isinstance(item, BaseTorque | BaseForce) else 1 for item in robot.inputs)
     source = str(robot.urdf) if robot.urdf else "a Pinocchio model"
     head = (
         f"{robot.name}: {counted(robot.n, 'joint')}, {12 + 2 * robot.n} states, "
-        f"{6 + robot.n} inputs, mass {robot.mass:.6g} kg\nfrom {source}"
+        f"{counted(inputs, 'input')}, mass {robot.mass:.6g} kg\nfrom {source}"
     )
     depth = {0: -1, 1: 0}
     rows = [["joint", "type", "mass [kg]", "lower", "upper", "effort", "velocity"]]

@@ -64,6 +64,8 @@ class Motion(Design):
         Why it ended before its time; empty where it did not.
     wheels : tuple of str
         The joints that are reaction wheels, whose angle is no error.
+    wheel_inertias : ndarray (k,)
+        Of those, about their axes [kg m^2]; none where a file does not tell.
     steered : tuple of str
         The states that the policy is known to feed back; empty where that is not known.
     notes : tuple of str
@@ -76,7 +78,14 @@ class Motion(Design):
     """
 
     OPEN: ClassVar = ("limits",)
-    VECTORS: ClassVar = ("t", "energy", "momentum_drift", "com_drift", "placement")
+    VECTORS: ClassVar = (
+        "t",
+        "energy",
+        "momentum_drift",
+        "com_drift",
+        "placement",
+        "wheel_inertias",
+    )
 
     t: Array
     q: Array
@@ -100,6 +109,7 @@ class Motion(Design):
     com_drift: Array = field(default_factory=lambda: np.zeros(0))
     _robot: Any = field(default=None, kw_only=True)  # that was simulated; no file has it
     wheels: tuple[str, ...] = field(default_factory=tuple)
+    wheel_inertias: Array = field(default_factory=lambda: np.zeros(0))
     steered: tuple[str, ...] = field(default_factory=tuple)
     notes: tuple[str, ...] = field(default_factory=tuple)
     limit_names: tuple[str, ...] = field(default_factory=tuple)
@@ -260,13 +270,16 @@ def plot_motion(motion: Motion, path: str | Path | None = None) -> Figure:
     from fflin.simulation.plots import Signals, draw
 
     motion = require_motion(motion)
+    limits = dict(zip(motion.limit_names, motion.limits, strict=True))
+    inertias = motion.wheel_inertias.tolist()
     title = f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"
     if motion.linear is not None:
         title += "; full: nonlinear, dashed: linear"
     return draw(
         motion.t,
-        Signals(motion.x, motion.state_names, motion.state_units),
-        Signals(motion.u, motion.input_names, motion.input_units),
+        Signals(motion.x, motion.state_names, motion.state_units, limits),
+        Signals(motion.u, motion.input_names, motion.input_units, limits),
+        dict.fromkeys(motion.wheels, 0.0) | dict(zip(motion.wheels, inertias, strict=False)),
         motion.linear,
         {"momentum": motion.momentum_drift, "centre of mass [m]": motion.com_drift},
         title=f"{title}\n{motion.stopped}" if motion.stopped else title,

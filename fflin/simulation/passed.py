@@ -44,7 +44,8 @@ class Saturated(NamedTuple):
 
     def __str__(self) -> str:
         size, share = f"{_shown(abs(self.limit))} {self.unit}", 100.0 * self.share
-        return f"{self.name} at its limit of {size} for {share:.2g} % of the run"
+        percent = f"{share:.2g}" if share < 10.0 else f"{share:.0f}"
+        return f"{self.name} at its limit of {size} for {percent} % of the run"
 
 
 def passed(t: Array, histories: Iterable[Limited]) -> tuple[Passed, ...]:

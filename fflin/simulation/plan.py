@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from fflin.base.errors import FflinWarning, InputError
-from fflin.base.validation import Array, number, vector, whole
+from fflin.base.errors import InputError
+from fflin.base.names import group_of
+from fflin.base.validation import Array, vector
 from fflin.control.channel import Channel, Law
-from fflin.control.policies import Allocation, bound
+from fflin.control.policies import bound, feedback_of
 from fflin.control.saturation import Saturation
 from fflin.dynamics.integrators import Integrator, integrator
 from fflin.dynamics.state import StateMap
@@ -21,59 +21,21 @@ from fflin.linear.model import LinearModel
 from fflin.robot.fields import Range
 from fflin.robot.robot import Robot
 from fflin.simulation.plant import Plant
+from fflin.simulation.times import Times
 
 Event: TypeAlias = Callable[[float, Array, Array], float]
+# Returns the command (nu,) at a deviation (nx,) from a linear model's point.
+LinearLaw: TypeAlias = Callable[[Array], Array]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 
 LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
-LARGEST_TURN = 1.0  # within one step [rad], beyond which no integrator follows
-_STEP = 0.01  # [s]
-_MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
-_MANY_STEPS = 100_000  # some seconds
-_LONGEST = 1e100  # [s]; the square of its inverse is still a number
 
 
-class Times(NamedTuple):
-    """The step `dt` [s], and how many steps there are in all and between what happens."""
+class Predictor(NamedTuple):
+    """A linear model, and what makes the law that it is under, which remembers nothing yet."""
 
-    dt: float
-    steps: int
-    every: int  # from one recorded row to the next
-    sample: int  # between samples of the law; 0 where it is asked at every stage of every step
-    delay: int  # from a sample to its effect
-    fastest: float  # magnitude of the loop's poles [1/s]; 0 where it is not known
-
-    @property
-    def rows(self) -> int:
-        """Most rows that are recorded."""
-        return self.steps // self.every + 2
-
-    @property
-    def slow(self) -> float:
-        """Square of the velocity up to which no turn within a step is too large."""
-        return float((LARGEST_TURN / self.dt) ** 2)
-
-    def require_room(self, width: int, *, chosen: bool) -> None:
-        """Raise `InputError` where rows of so many numbers, or the steps, are too many.
-
-        `chosen` says that the step was chosen here and not given; where the loop's fastest pole
-        asks for many steps, an `FflinWarning` says so.
-        """
-        forced = chosen and self.fastest * _STEP > 1.0
-        if self.rows * width > _MOST_ENTRIES or self.steps > _MOST_STEPS:
-            asked = f", which the loop's fastest pole at {self.fastest:.3g} 1/s asks for,"
-            raise InputError(
-                f"{self.steps * self.dt:g} s in steps of {self.dt:g} s"
-                f"{asked if forced else ''} are "
-                f"{self.steps:.3g} steps and {self.rows:.3g} rows; take a larger dt or `every`"
-            )
-        if forced and self.steps > _MANY_STEPS:
-            warnings.warn(
-                f"the loop's fastest pole at {self.fastest:.3g} 1/s asks for steps of "
-                f"{self.dt:.3g} s, {self.steps:,} in all; give dt=, or take a slower gain",
-                FflinWarning,
-                stacklevel=3,
-            )
+    lin: LinearModel
+    law: Callable[[], LinearLaw]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +48,6 @@ class Plan:
     law: Law | None  # nothing but `initial` acts where there is none
     initial: Array  # (nu,), what acts until the first command arrives
     limits: Saturation  # what acts of a command
-    rotors: list[int]  # velocities of the wheels that have a largest speed
     known: dict[str, Range]  # limits of states and inputs, whether they cut or not
     method: type[Integrator]
     project: bool  # whether momentum and centre of mass are kept
@@ -98,19 +59,14 @@ class Plan:
     near: Array | None  # the state (nx,) from which continuous joints count turns
     target: Array | None  # the state (nx,) that is steered to, where one is known
     steered: tuple[str, ...]  # the states that are known to be fed back
-    linear: LinearModel | None  # predicts the motion under u = u0 - K (x - x0)
-    K: Array | None  # (nu, nx)
+    notes: tuple[str, ...]  # what is to be said of the run
+    predictor: Predictor | None  # of the linear motion under the same law
 
     def channel(self) -> Channel | None:
         """Return the way of the law's commands to the inputs, with nothing on it yet."""
         if self.law is None:
             return None
-        times, rotors = self.times, self.rotors
-
-        def speeds(t: float, q: Array, v: Array) -> Array:
-            return v[rotors]
-
-        return Channel(self.law, self.initial, self.limits, times.sample, times.delay, speeds)
+        return Channel(self.law, self.initial, self.limits, self.times.sample, self.times.delay)
 
 
 def start_of(state: StateMap, x0: Any, q0: Any, v0: Any) -> tuple[Array, Array]:
@@ -139,55 +95,19 @@ def target_of(state: StateMap, target: Any) -> Array | None:
         goal: Array = vector("target", target, state.nx, "a state (12 + 2n)").copy()
         state.to_pinocchio(goal)  # refuses what is no attitude
         return goal
-    missing = [name for name in target.state_names if name not in state.names]
-    if missing or len(target.q) != state.robot.nq or target.moving:
+    theirs = set(target.state_names) <= set(state.names) and len(target.q) == state.robot.nq
+    if target.moving or not theirs:
         raise InputError(
-            f"target is a model of '{target.robot}', of which '{state.robot.name}' has no such "
-            "state; give one of this robot"
+            f"target is a model of '{target.robot}', expected a state of '{state.robot.name}' or a "
+            "model of it about a point that stays"
         )
     goal = state.read(target.q, target.v)
-    goal[[state.names.index(name) for name in target.state_names]] = target.x0
+    # Where the model has another reference or frame, its state of the base is another.
+    same = target.frame == state.frame and target.reference.isApprox(state.reference, 1e-12)
+    for name, value in zip(target.state_names, target.x0, strict=True):
+        if same or group_of(name) == "q_m":
+            goal[state.names.index(name)] = value
     return goal
-
-
-def times_of(
-    policy: Any,
-    duration: float,
-    dt: float | None,
-    every: int,
-    sample: float | None,
-    delay: float,
-) -> Times:
-    """Return the times of a simulation, whose arguments are those of `simulate`."""
-    if sample is not None:
-        sample = _positive("sample", sample)
-    else:
-        sample = getattr(getattr(policy, "lin", None), "dt", None) or None
-    fastest = 0.0 if sample else _fastest_pole(policy)
-    duration, delay = _positive("duration", duration), number("delay", delay)
-    if not 0.0 <= delay <= _LONGEST:
-        raise InputError(f"delay is {delay:g} s, expected 0 to {_LONGEST:g} s")
-    every = whole("every", every, 1)
-    if dt is None:
-        dt = _STEP
-        if fastest * dt > 1.0:
-            dt = float(0.5 ** np.ceil(np.log2(fastest)))
-        if sample or delay:
-            dt = _part_of(sample or delay, dt, duration, delay)
-    dt = _positive("the step dt", dt)
-    steps = max(1, round(duration / dt))
-    if abs(steps * dt - duration) > 1e-6 * duration:
-        if sample or delay:
-            raise InputError(
-                f"duration is {duration:g} s, expected a multiple of the step dt = {dt:g} s where "
-                "the input is sampled or late; choose the step so"
-            )
-        steps = int(np.ceil(duration / dt))
-        dt = duration / steps
-    if sample is None:
-        sample = dt if delay else 0.0
-    samples, late = _whole(dt, sample=sample, delay=delay)
-    return Times(dt, steps, every, samples, late, fastest)
 
 
 def method_of(name: str, times: Times) -> type[Integrator]:
@@ -224,22 +144,11 @@ def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law |
 
 def fed_back(policy: Any) -> tuple[str, ...]:
     """Return the names of the states that a policy about a model's point feeds back."""
-    lin = getattr(policy, "lin", None)
-    if not isinstance(lin, LinearModel):
+    lin, K = feedback_of(policy)
+    if lin is None:
         return ()
-    decides = policy.policy if isinstance(policy, Allocation) else policy
-    K = getattr(decides, "K", None)
     used = np.ones(len(lin.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
     return tuple(name for name, size in zip(lin.state_names, used, strict=True) if size)
-
-
-def _fastest_pole(policy: Any) -> float:
-    """Return the largest magnitude [1/s] of the poles of a continuous loop, where it has any."""
-    decides = policy.policy if isinstance(policy, Allocation) else policy
-    lin, K = getattr(policy, "lin", None), getattr(decides, "K", None)
-    if not isinstance(lin, LinearModel) or K is None or lin.dt:
-        return 0.0
-    return float(np.abs(np.linalg.eigvals(lin.A - lin.B @ K)).max())
 
 
 def turning(robot: Robot) -> Array:
@@ -250,31 +159,3 @@ def turning(robot: Robot) -> Array:
     rotors = rotor_names(robot)
     joints = [joint for joint in robot.joints if not joint.prismatic and joint.name not in rotors]
     return np.array([3, 4, 5, *(joint.idx_v for joint in joints)])
-
-
-def _whole(dt: float, **times: float) -> list[int]:
-    """Return named times [s] in steps."""
-    for name, time in times.items():
-        if abs(round(time / dt) * dt - time) > 1e-6 * dt:
-            raise InputError(
-                f"{name} is {time:g} s, expected a multiple of the step dt = {dt:g} s; "
-                "choose the step so"
-            )
-    return [round(time / dt) for time in times.values()]
-
-
-def _part_of(sample: float, largest: float, *times: float) -> float:
-    """Return a step of which the sample and, where there is one, the other times are multiples."""
-    least = int(np.ceil(sample / largest))
-    for parts in range(least, least + 1000):
-        dt = sample / parts
-        if all(abs(round(time / dt) * dt - time) <= 1e-6 * dt for time in times):
-            return dt
-    return sample / least
-
-
-def _positive(name: str, value: Any) -> float:
-    time = number(name, value)
-    if not 1.0 / _LONGEST < time <= _LONGEST:
-        raise InputError(f"{name} is {time:g} s, expected more than 0 and at most {_LONGEST:g} s")
-    return time

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -16,9 +17,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-_DASHES = ("-", "--", ":", "-.")
 _OF_JOINTS = ("q_m", "qdot_m")
+_SMOOTH = ("wheel speeds", "wheel momenta")
 _MOST_IN_A_PANEL = 6
+_NEAR = 1.0 / 3.0  # share of a limit that a curve comes to where it is drawn
 _GROUPS = {
     "q_b": "attitude q_b",
     "r_b": "position r_b",
@@ -30,18 +32,12 @@ _GROUPS = {
 
 
 class Signals(NamedTuple):
-    """Histories (N, k), with names GROUP.NAME and units."""
+    """Histories (N, k), with names GROUP.NAME and units, and limits (2,) by name."""
 
     values: Array
     names: Sequence[str]
     units: Sequence[str]
-
-    def groups(self) -> dict[str, list[int]]:
-        """Return the columns of each group."""
-        groups: dict[str, list[int]] = {}
-        for index, name in enumerate(self.names):
-            groups.setdefault(name.partition(".")[0] if "." in name else "", []).append(index)
-        return groups
+    limits: Mapping[str, Array]
 
     def unit(self, indices: Sequence[int]) -> str:
         """Return the units of some columns in brackets."""
@@ -49,47 +45,100 @@ class Signals(NamedTuple):
         return f"[{', '.join(shown)}]" if shown else ""
 
 
+class _Panel(NamedTuple):
+    """Columns of signals under a title, all of one unit."""
+
+    signals: Signals
+    indices: list[int]
+
+
 def draw(
     t: Array,
     states: Signals,
     inputs: Signals,
+    wheels: Mapping[str, float],
     linear: Array | None,
     drifts: Mapping[str, Array],
     *,
     title: str,
     path: str | Path | None = None,
 ) -> Figure:
-    """Draw states, those of the linear model dashed, inputs and {label: drift} over time."""
+    """Draw states, those of the linear model dashed, inputs and {label: drift} over time.
+
+    `wheels` is {name: inertia} of the joints that are wheels; their momenta are drawn where the
+    inertia is known.
+    """
     target = target_of(path)
+    groups: dict[str, list[int]] = {}
+    for index, name in enumerate(states.names):
+        group, _, entry = name.partition(".")
+        if group not in _OF_JOINTS or entry not in wheels:
+            groups.setdefault(group, []).append(index)
+    panels = _panels(states, inputs, wheels)
+    across = 3 if len(groups) > 4 else 4
+    # With the drift, in as few rows of up to four as there can be.
+    rows = math.ceil((len(panels) + 1) / 4)
     with styled() as figure_class:
         both = linear is not None
-        figure = figure_class(figsize=(11.0, 10.5 if both else 8.5), layout="constrained")
-        heights = [3.0, 1.2] * 2 if both else [3.0] * 2
-        grid = figure.add_gridspec(
-            len(heights) + 1, 3, height_ratios=[*heights, 3.0], hspace=0.06, wspace=0.06
-        )
-        lines: list[Line2D] = []
-        for place, (group, indices) in enumerate(states.groups().items()):
-            row, column = divmod(place, 3)
+        heights = [3.0, 1.2][: 1 + both] * math.ceil(len(groups) / across)
+        size = (11.0, 0.3 + 3.0 * rows + 0.9 * sum(heights))
+        figure = figure_class(figsize=size, layout="constrained")
+        above, below = figure.add_gridspec(2, 1, height_ratios=[sum(heights), 3.0 * rows])
+        spaces = {"hspace": 0.06, "wspace": 0.06}
+        grid = above.subgridspec(len(heights), across, height_ratios=heights, **spaces)
+        spots = below.subgridspec(rows, math.ceil((len(panels) + 1) / rows), **spaces)
+        places = (spots[k] for k in range(len(panels) + 1))
+        lines: dict[str, Line2D] = {}
+        for place, (group, indices) in enumerate(groups.items()):
+            row, column = divmod(place, across)
             axes = figure.add_subplot(grid[row * (1 + both), column])
             _histories(axes, t, states, linear, group, indices)
             if linear is not None:
-                below = figure.add_subplot(grid[2 * row + 1, column], sharex=axes)
-                _difference(below, t, states, linear, indices)
+                apart = figure.add_subplot(grid[2 * row + 1, column], sharex=axes)
+                _difference(apart, t, states, linear, indices)
                 axes.tick_params(labelbottom=False)
             else:
                 axes.set_xlabel("t [s]")
-            if group == "q_m":
-                lines = [line for line in axes.get_lines() if line.get_label()[0] != "_"]
-        colors = {str(line.get_label()): str(line.get_color()) for line in lines}
-        _inputs(figure, grid, t, inputs, len(heights), colors)
-        if lines:
+            if group in _OF_JOINTS:
+                lines |= _named(axes)
+        for what, panel in panels.items():
+            axes = figure.add_subplot(next(places))
+            _inputs(axes, t, panel, what, {name: x.get_color() for name, x in lines.items()})
+            if what.startswith("joint"):
+                lines |= {name: x for name, x in _named(axes).items() if name == "limit"}
+            elif len(panel.indices) > _MOST_IN_A_PANEL:
+                _below(figure, _named(axes), what, "right" if groups.get("q_m") else "center")
+        if groups.get("q_m"):
             # Joints are many, have long names, and are the same in three panels.
-            side: _Place = "outside lower left" if figure.legends else "outside lower center"
-            _below(figure, lines, "joints", side)
-        _drifts(figure.add_subplot(grid[len(heights), 2]), t, drifts)
+            limit = {"limit": lines.pop("limit")} if "limit" in lines else {}
+            _below(figure, lines | limit, "joints", "left" if figure.legends else "center")
+        _drifts(figure.add_subplot(next(places)), t, drifts)
         figure.suptitle(title, fontsize=11)
         return saved(figure, target)
+
+
+def _panels(states: Signals, inputs: Signals, wheels: Mapping[str, float]) -> dict[str, _Panel]:
+    """Return what acts and how wheels turn, by title."""
+    found: dict[str, _Panel] = {}
+    for i, (name, unit) in enumerate(zip(inputs.names, inputs.units, strict=True)):
+        title = "torques" if unit == "N m" else "forces"
+        if name in wheels:
+            title = "wheel torques"
+        elif name.startswith("tau_m."):
+            # Nearly always all turn, or all slide.
+            title = "joint inputs tau_m" if unit == "N m" else "joint forces tau_m"
+        found.setdefault(title, _Panel(inputs, [])).indices.append(i)
+    speeds = [i for i, x in enumerate(states.names) if x in {f"qdot_m.{name}" for name in wheels}]
+    if speeds:
+        torques = found.pop("wheel torques")
+        found |= {"wheel speeds": _Panel(states, speeds), "wheel torques": torques}
+        J = np.array([wheels[_short(states.names[i])] for i in speeds])
+        if J.all():
+            names = [states.names[i] for i in speeds]
+            limits = {x: J[k] * states.limits[x] for k, x in enumerate(names) if x in states.limits}
+            momenta = Signals(J * states.values[:, speeds], names, ["N m s"] * len(J), limits)
+            found["wheel momenta"] = _Panel(momenta, list(range(len(J))))
+    return found
 
 
 def _histories(
@@ -100,6 +149,7 @@ def _histories(
         axes.plot(times, shown[:, i], color=color, label=_short(states.names[i]))
         if linear is not None:
             axes.plot(t, linear[:, i], "--", color=color, lw=1.0)
+    _limits(axes, states, indices)
     axes.set(title=_GROUPS[group], ylabel=states.unit(indices))
     if group not in _OF_JOINTS:
         axes.legend(handlelength=1.2)
@@ -122,48 +172,54 @@ def _difference(axes: Axes, t: Array, states: Signals, linear: Array, indices: l
     axes.ticklabel_format(axis="y", scilimits=(-2, 3))
 
 
-def _inputs(
-    figure: Figure, grid: Any, t: Array, inputs: Signals, row: int, colors: dict[str, str]
-) -> None:
-    """Draw what drives the joints beside what pushes the base, whose sizes differ widely.
-
-    The joints have their colours; all other inputs are named in the panel or below the figure.
-    """
-    groups = inputs.groups()
-    joints = {"tau_m": groups.pop("tau_m")} if "tau_m" in groups else {}
-    panels = [panel for panel in (groups, joints) if panel]
-    places = (0, 1) if len(panels) == 2 else (slice(0, 2),)
-    for place, panel in zip(places, panels, strict=True):
-        axes = figure.add_subplot(grid[row, place])
-        shown = [i for indices in panel.values() for i in indices]
-        for style, indices in zip(_DASHES * len(panel), panel.values(), strict=False):
-            for color, i in zip(cycle(len(indices)), indices, strict=True):
-                name = inputs.names[i]
-                axes.step(
-                    *(t, inputs.values[:, i], style),
-                    color=colors[_short(name)] if panel is joints else color,
-                    where="post",
-                    label=name,
-                )
-        title = "joint inputs tau_m" if panel is joints else "inputs"
-        axes.set(title=title, xlabel="t [s]", ylabel=inputs.unit(shown))
-        axes.margins(x=0.0)
-        if panel is not joints and len(shown) <= _MOST_IN_A_PANEL:
-            axes.legend(ncols=2 if len(shown) > 3 else 1, handlelength=1.6)
-        elif panel is not joints:
-            corner: _Place = "outside lower right" if colors else "outside lower center"
-            _below(figure, axes.get_lines(), "inputs", corner)
+def _inputs(axes: Axes, t: Array, panel: _Panel, title: str, colors: Mapping[str, Any]) -> None:
+    """Draw a panel, in which joints have their colours."""
+    signals, indices = panel
+    for color, i in zip(cycle(len(indices)), indices, strict=True):
+        short = _short(signals.names[i])
+        axes.plot(
+            *(t, signals.values[:, i]),
+            color=colors.get(short, color),
+            drawstyle="default" if title in _SMOOTH else "steps-post",
+            label=short if title.startswith("wheel") else signals.names[i],
+        )
+    _limits(axes, signals, indices)
+    axes.set(title=title, xlabel="t [s]", ylabel=signals.unit(indices))
+    axes.margins(x=0.0)
+    if not title.startswith("joint") and len(indices) <= _MOST_IN_A_PANEL:
+        axes.legend(ncols=2 if len(indices) > 3 else 1, handlelength=1.6)
 
 
-_Place: TypeAlias = Literal["outside lower left", "outside lower center", "outside lower right"]
+def _limits(axes: Axes, signals: Signals, indices: Sequence[int]) -> None:
+    """Draw the limits that a curve comes near."""
+    levels = {
+        level
+        for i in indices
+        for level in signals.limits.get(signals.names[i], np.zeros(0)).tolist()
+        if level and math.isfinite(level) and (signals.values[:, i] / level).max() >= _NEAR
+    }
+    for level in sorted(levels):
+        label = "limit" if level == max(levels) else "_limit"
+        axes.axhline(level, ls="--", lw=0.9, color="#555555", label=label)
 
 
-def _below(figure: Figure, lines: Sequence[Line2D], title: str, place: _Place) -> None:
+def _named(axes: Axes) -> dict[str, Line2D]:
+    """Return the lines that a legend names."""
+    return {str(x.get_label()): x for x in axes.get_lines() if str(x.get_label())[0] != "_"}
+
+
+def _below(figure: Figure, lines: Mapping[str, Line2D], title: str, side: str) -> None:
     """Name lines below all panels, in as many columns as there is space for."""
-    letters = 150 if place == "outside lower center" else 75
-    longest = max(len(str(line.get_label())) for line in lines)
-    columns = min(len(lines), 8, max(1, letters // (longest + 6)))
-    figure.legend(handles=lines, loc=place, ncols=columns, handlelength=1.6, title=title)
+    letters = 150 if side == "center" else 75
+    columns = min(len(lines), 8, max(1, letters // (max(map(len, lines)) + 6)))
+    place: Any = f"outside lower {side}"
+    figure.legend(
+        handles=list(lines.values()),
+        loc=place,
+        ncols=columns,
+        handlelength=1.6,
+        title=title,
+    )
 
 
 def _drifts(axes: Axes, t: Array, drifts: Mapping[str, Array]) -> None:

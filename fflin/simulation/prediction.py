@@ -2,12 +2,107 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
+from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.control.channel import Channel
+from fflin.control.output_feedback import OutputFeedback
+from fflin.control.policies import Allocation, TrajectoryFeedback
 from fflin.linear.model import LinearModel
-from fflin.simulation.plan import Plan
+from fflin.simulation.plan import LinearLaw, Plan, Predictor
+from fflin.simulation.plant import Plant
+
+_WHY_NOT = {
+    Allocation: "an Allocation has thrusters that cannot pull, so that it is not linear",
+    TrajectoryFeedback: "a TrajectoryFeedback is linear along a trajectory, not about one point",
+}
+
+
+def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | None:
+    """Return what predicts a run: the policy's own model, or the one that is given.
+
+    Raises
+    ------
+    InputError
+        Where one is asked for that cannot.
+    """
+    if isinstance(linear, np.bool_):
+        linear = bool(linear)
+    if linear is False:
+        return None
+    own: Any = getattr(policy, "lin", None)
+    if not (linear is None or linear is True):
+        own = _checked(plant, policy, linear)
+    law = _law(policy, own) if isinstance(own, LinearModel) else None
+    whole = law is not None and own.state_names == plant.state.names
+    if law is not None and whole:
+        return Predictor(own, law)
+    if linear is None:
+        return None
+    why = _WHY_NOT.get(type(policy), f"a {type(policy).__name__} is not known to be linear")
+    if law is not None:
+        why = "this one's model is reduced: give linear= the whole model"
+    raise InputError(
+        f"linear predicts under a StateFeedback, an OutputFeedback or no policy; {why}; leave it "
+        "out"
+    )
+
+
+def _checked(plant: Plant, policy: Any, linear: Any) -> LinearModel:
+    """Return the model that is to predict, or raise `InputError` where it is of another run."""
+    if not isinstance(linear, LinearModel):
+        raise InputError(
+            f"linear is a {type(linear).__name__}, expected a fflin.LinearModel, True or False"
+        )
+    state = plant.state
+    names = (state.names, plant.actuation.names, state.frame)
+    same = (linear.state_names, linear.input_names, linear.frame) == names and not linear.moving
+    if isinstance(policy, OutputFeedback):
+        same = same and linear.output_names == policy.lin.output_names
+    if not same or not linear.reference.isApprox(state.reference, 1e-9):
+        raise InputError(
+            f"linear is a model of '{linear.robot}' that has not the states, inputs, frame and "
+            f"reference of the run of '{plant.robot.name}'; linearise that robot in the policy's "
+            "frame and reference"
+        )
+    return linear
+
+
+def _law(policy: Any, lin: LinearModel) -> Callable[[], LinearLaw] | None:
+    """Return what makes a policy's law of the deviation from a model's point, if it is linear."""
+    if policy is None:
+        return lambda: lambda _: np.zeros(len(lin.u0))
+    if isinstance(policy, OutputFeedback):
+        by = policy.compensator
+
+        def measured() -> LinearLaw:
+            z: Array = np.zeros(len(by.A))
+
+            def law(e: Array) -> Array:
+                nonlocal z
+                u: Array = by.u0 + by.C @ z
+                y = lin.y0 + lin.C @ e + lin.D @ (u - lin.u0)
+                z = by.A @ z + by.B @ (y - by.y0)
+                return u
+
+            return law
+
+        return measured
+    own, K = getattr(policy, "lin", None), getattr(policy, "K", None)
+    if K is None or not isinstance(own, LinearModel):
+        return None
+    fed = [lin.state_names.index(name) for name in own.state_names]
+    apart = lin.x0[fed] - own.x0
+
+    def feedback(e: Array) -> Array:
+        u: Array = own.u0 - K @ (e[fed] + apart)
+        return u
+
+    return lambda: feedback
 
 
 def predict(plan: Plan, x: Array, steps: int) -> Array:
@@ -22,41 +117,31 @@ def predict(plan: Plan, x: Array, steps: int) -> Array:
     steps : int
         That are taken; the last one has a row in any case.
     """
-    if plan.linear is None or plan.K is None:
+    if plan.predictor is None:
         return x[:0]
     # A prediction that overflows is none.
     with np.errstate(over="ignore", invalid="ignore"):
-        found = _states(plan.linear, plan.K, plan, x[0], steps)[: len(x)]
+        found = _states(plan.predictor, plan, x[0], steps)[: len(x)]
     return found if len(found) == len(x) and np.isfinite(found).all() else x[:0]
 
 
-def _states(lin: LinearModel, K: Array, plan: Plan, x: Array, steps: int) -> Array:
-    dt, _, every, sample, delay, _ = plan.times
-    x0, u0, limits = lin.x0, lin.u0, plan.limits
-    if limits.wheels or limits.pulses:
-        # Both change within a sample.
+def _states(predictor: Predictor, plan: Plan, x: Array, steps: int) -> Array:
+    dt, _, every, sample, delay, *_ = plan.times
+    lin, limits = predictor.lin, plan.limits
+    x0, u0 = lin.x0, lin.u0
+    finer = bool(limits.wheels or limits.pulses)  # than a sample
+    if finer:
         lin = lin.generator or lin
-    rotors = (
-        [lin.state_names.index(f"qdot_m.{name}") for name in limits.wheels.names]
-        if limits.wheels
-        else []
-    )
-
-    def law(e: Array) -> Array:
-        u: Array = u0 - K @ e
-        return u
-
-    def speeds(e: Array) -> Array:
-        return x0[rotors] + e[rotors]
-
-    channel = Channel(law, u0, limits, sample, delay, speeds)
+    if limits.wheels:
+        of = [lin.state_names.index(f"qdot_m.{name}") for name in limits.wheels.names]
+        limits = limits._replace(wheels=limits.wheels._replace(speeds=lambda e: (x0 + e)[of]))
+    channel = Channel(predictor.law(), plan.initial, limits, sample, delay)
     rows = []
     e = x - x0
     if lin.dt:
         # Between the samples of a sampled model there is nothing to say.
         whole = round(lin.dt / dt)
-        within = limits.wheels or limits.pulses
-        if within or sample != whole or any(count % whole for count in (delay, every, steps)):
+        if finer or sample != whole or any(count % whole for count in (delay, every, steps)):
             return np.zeros((0, len(x)))
         for step in range(0, steps, whole):
             u = channel.begin(step, e)

@@ -20,7 +20,7 @@ _SETTLED = 0.02
 # shown as none. Rounding moves a robot that stands still by less than either.
 _THERE, _NOTHING = 1e-9, 1e-14
 
-# Share of the rows with an input at its limit from which on it is there all along.
+# Share of the run with an input at its limit from which on it is there all along.
 _ALL_ALONG = 0.9
 
 _TITLES = {"r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
@@ -42,6 +42,11 @@ class Course(NamedTuple):
         return int(outside[-1]) + 1 if len(outside) else 0
 
     @property
+    def late(self) -> bool:
+        """Whether it has not settled."""
+        return self.settled == len(self.size)
+
+    @property
     def last(self) -> str:
         """Its last value, for a sentence."""
         return f"{self.title} {self.size[-1]:.2g} {self.unit}"
@@ -50,7 +55,7 @@ class Course(NamedTuple):
         """Return its row of the table."""
         values = (self.size[0], self.size.max(), self.size[-1])
         cells = ["." if value < _NOTHING else f"{value:.3g}" for value in values]
-        when = f"{t[self.settled]:.3g}" if self.settled < len(t) else "not yet"
+        when = "not yet" if self.late else f"{t[self.settled]:.3g}"
         if self.size.max() <= _THERE:
             when = "."
         return [self.title, self.unit, *cells, when]
@@ -64,11 +69,13 @@ def motion_report(motion: Motion) -> str:
     parts.extend(motion.notes)
     parts = [folded(parts)]
     if kinds:
-        rows = [["error", "unit", "first", "largest", "last", "settled after [s]"]]
+        settled = f"within {100.0 * _SETTLED:g} % after [s]"
+        rows = [["error", "unit", "first", "largest", "last", settled]]
         parts.append(f"\n{grid([*rows, *(kind.row(motion.t) for kind in kinds)], 'll')}\n")
     if kinds or motion.u.any():
         parts.append(_largest_inputs(motion))
-    parts += lines(motion)
+    if said := lines(motion):
+        parts.append(folded(said))
     energy = motion.energy
     parts.append(
         f"energy {energy[0]:.6g} J at first, {energy[-1]:.6g} J at last; "
@@ -119,34 +126,21 @@ def verdict(motion: Motion, kinds: list[Course]) -> str:
     places = [kind for kind in kinds if kind.title in _PLACES]
     judged = [kind for kind in places if kind.steered] or [k for k in kinds if k.steered]
     moved = [kind for kind in judged if kind.size.max() > _THERE]
-    late = [kind.last for kind in moved if kind.settled == len(motion.t)]
-    if late:
-        said = f"not settled: {_and(late)} at the end"
+    if failed := [kind.last for kind in moved if kind.late]:
+        said = f"not settled: {_and(failed)} at the end"
     elif moved:
         when = motion.t[max(kind.settled for kind in moved)]
         said = f"settled: {_and([kind.last for kind in moved])} after {when:.3g} s"
     else:
         said = "settled: at the target from first to last"
-    aside = [k.last for k in places if not k.steered and k.size[-1] > _THERE]
-    if aside:
+    if aside := [kind.last for kind in places if kind.late and not kind.steered]:
         said += f"; not steered: {_and(aside)}"
-    if full := saturated(motion):
+    shares: dict[str, float] = {}  # at either limit
+    for each in motion.saturated:
+        shares[each.name] = shares.get(each.name, 0.0) + each.share
+    if full := [name for name, share in shares.items() if share > _ALL_ALONG]:
         said += f"; at the limit all along: {', '.join(full)}"
     return said
-
-
-def saturated(motion: Motion) -> list[str]:
-    """Return the names of the inputs that are at their limits all along."""
-    names, values = getattr(motion, "limit_names", ()), getattr(motion, "limits", ())
-    limits = dict(zip(names, values, strict=True))
-    found = []
-    for name, u in zip(motion.input_names, motion.u.T, strict=True):
-        least, largest = limits.get(name, (-np.inf, np.inf))
-        # A thruster that rests is not at its limit, nor is what cannot act at all.
-        full = ((u >= largest) & (largest > 0.0)) | ((u <= least) & (least < 0.0))
-        if full.mean() > _ALL_ALONG:
-            found.append(name)
-    return found
 
 
 def _and(words: list[str]) -> str:

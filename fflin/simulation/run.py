@@ -13,8 +13,9 @@ from fflin.base.progress import Progress
 from fflin.base.validation import Array
 from fflin.control.channel import Channel
 from fflin.simulation.conservation import Conserved, Course
-from fflin.simulation.plan import LARGEST_SPEED, LARGEST_TURN, Plan
+from fflin.simulation.plan import LARGEST_SPEED, Plan
 from fflin.simulation.plant import Plant
+from fflin.simulation.times import LARGEST_TURN
 
 # Take one step from (t, q, v) under u as it begins; return q and v at its end.
 Advance: TypeAlias = Callable[[float, Array, Array, Array], tuple[Array, Array]]

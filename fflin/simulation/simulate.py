@@ -10,7 +10,8 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, truth
-from fflin.control.saturation import saturation
+from fflin.control.plants import notes_of
+from fflin.control.saturation import saturation, warn_beyond
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import state_history
 from fflin.linear.model import LinearModel
@@ -25,12 +26,12 @@ from fflin.simulation.plan import (
     method_of,
     start_of,
     target_of,
-    times_of,
     turning,
 )
 from fflin.simulation.plant import Plant
-from fflin.simulation.prediction import predict
+from fflin.simulation.prediction import predict, predictor
 from fflin.simulation.run import go
+from fflin.simulation.times import times_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -63,7 +64,7 @@ def simulate(
     target: LinearModel | ArrayLike | None = None,
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
-    every: int = 1,
+    every: int | None = None,
     progress: bool | None = None,
 ) -> Motion:
     r"""Simulate a robot under a policy.
@@ -114,16 +115,18 @@ def simulate(
     callback : callable, optional
         callback(t, q, v, u), called at every recorded row.
     linear : LinearModel or bool, optional
-        Predicts the motion under the same law; by default the policy's own model, False for none.
-        Sampled, it does so where every row is at a sample.
+        Predicts the motion under the same law, of a StateFeedback, an OutputFeedback without its
+        noise, or none; by default the policy's own model, False for none. Sampled, it does so
+        where every row is at a sample.
     target : LinearModel or array_like (nx,), optional
         State, or model whose point it is, that errors are counted from; by default the point of
         the policy's own model, and none under a policy without one.
     frame : {"hybrid", "local", "world"}, optional
     reference : pin.SE3, optional
         Chart of x and axes of u; the policy's model's by default, else hybrid and the identity.
-    every : int
-        Steps from one recorded row to the next.
+    every : int, optional
+        Steps from one recorded row to the next; by default 1, or where that would be more than
+        100,000 rows, as many as leave 10,000, which the motion's `notes` say.
     progress : bool, optional
         Whether a bar is shown on stderr; by default on a terminal, for runs that take long.
 
@@ -144,14 +147,14 @@ def simulate(
     Warns
     -----
     FflinWarning
-        If the loop's fastest pole asks for more than 100,000 steps.
+        If the loop's fastest pole, which is named, asks for more than 50,000 steps, or springs
+        and gravity at the target for more than the limits.
 
     References
     ----------
     E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
     """
     own: Any = getattr(policy, "lin", None)
-    K: Any = getattr(policy, "K", None)
     lin = own if isinstance(own, LinearModel) else None
     if lin is not None:
         if frame is not None or reference is not None:
@@ -159,7 +162,7 @@ def simulate(
         frame, reference = lin.frame, lin.reference
     state = StateMap(robot, reference=reference, frame="hybrid" if frame is None else frame)
     plant = Plant(state, disturbance)
-    predictor = _predictor(plant, K, lin, linear)
+    foresees = predictor(plant, policy, linear)
     q, v = start_of(state, x0, q0, v0)
     times = times_of(policy, duration, dt, every, sample, delay)
     times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=dt is None)
@@ -168,6 +171,8 @@ def simulate(
     law = law_of(policy, plant, within, times)
     # The model's inputs are others where they are allocated to the robot's.
     same = lin is not None and lin.input_names == plant.actuation.names
+    if lin is not None and same:
+        warn_beyond(lin, "at its target", lin.u0, within.low, within.high)
     goal = target_of(state, lin if target is None else target)
     plan = Plan(
         q=q,
@@ -176,10 +181,7 @@ def simulate(
         law=law,
         initial=lin.u0 if lin is not None and same else np.zeros(len(within.low)),
         limits=within,
-        rotors=[robot.joint(name).idx_v for name in within.wheels.names] if within.wheels else [],
-        known={
-            name: known[name] for name in (*state.names, *plant.actuation.names) if name in known
-        },
+        known=known,
         method=method_of(method, times),
         project=truth("project", project),
         turning=turning(robot),
@@ -190,8 +192,8 @@ def simulate(
         near=goal if x0 is None else np.asarray(x0, dtype=float),
         target=goal,
         steered=fed_back(policy),
-        linear=predictor,
-        K=K,
+        notes=(*notes_of(policy, robot), *times.notes),
+        predictor=foresees,
     )
     try:
         return _motion(plan, plant)
@@ -232,30 +234,9 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         stopped=run.stopped,
         _robot=robot,
         wheels=tuple(robot.wheels),
+        wheel_inertias=np.array(list(robot.wheels.values())),
         steered=plan.steered,
+        notes=plan.notes,
         limit_names=tuple(plan.known),
         limits=np.array(list(plan.known.values())).reshape(-1, 2),
     )
-
-
-def _predictor(
-    plant: Plant, K: Array | None, own: LinearModel | None, linear: Any
-) -> LinearModel | None:
-    """Return the model that predicts the run: the policy's own one, or the one that is given."""
-    if linear is None or isinstance(linear, bool | np.bool_):
-        fits = own is not None and own.state_names == plant.state.names
-        wanted = linear is None or bool(linear)
-        return own if wanted and fits and K is not None else None
-    if not isinstance(linear, LinearModel):
-        raise InputError(
-            f"linear is a {type(linear).__name__}, expected a fflin.LinearModel, True or False"
-        )
-    names = (plant.state.names, plant.actuation.names, plant.state.frame)
-    if (linear.state_names, linear.input_names, linear.frame) != names or linear.moving:
-        raise InputError(
-            f"linear is a model of '{linear.robot}' that has not the states, inputs and frame of "
-            f"the run of '{plant.robot.name}'; linearise that robot in the policy's frame"
-        )
-    if K is None:
-        raise InputError("linear predicts under a StateFeedback alone; leave it out")
-    return linear

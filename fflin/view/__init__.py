@@ -1,4 +1,4 @@
-"""Robots and motions in meshcat: one page, pictures, live; JavaScript in `view/assets`.
+"""Robots, motions and modes in meshcat: one page, pictures, live; JavaScript in `view/assets`.
 
-Imports `base`, `robot`, `dynamics` and `simulation`.
+Imports `base`, `robot`, `dynamics`, `linear`, `analysis` and `simulation`.
 """

@@ -72,7 +72,7 @@ def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes
     size : tuple of int
         Width and height of each picture [pixels].
     """
-    frames = _film(page, times, size, plain=len(times) > 1)
+    frames = _film(page, times, size, 1 if len(times) > 1 else -1)
     if len(frames) == 1:
         return frames[0]
     from PIL import Image
@@ -103,7 +103,7 @@ def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[in
     start, duration = span[0], span[1] - span[0]
     count = round(max(2, min(_GIF_FRAMES, duration / speed * _GIF_FPS)))
     times = [start + duration * index / (count - 1) for index in range(count)]
-    frames = _film(page, times, size, plain=True)
+    frames = _film(page, times, size, len(times))
     images = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
     palette = images[0].quantize(160)
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
@@ -114,18 +114,18 @@ def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[in
     return content.getvalue()
 
 
-def _film(page: Path, times: Sequence[float], size: tuple[int, int], *, plain: bool) -> list[bytes]:
-    """Return a PNG of the page at each time."""
+def _film(page: Path, times: Sequence[float], size: tuple[int, int], keys: int) -> list[bytes]:
+    """Return a PNG at each time, plain with a legend on so many; below 0: of all of the page."""
     program = find_chromium()
     try:
         with _browser(program, _PATIENCE + 3.0 * len(times)) as browser:
-            return list(_shots(browser, page, times, size, plain))
+            return list(_shots(browser, page, times, size, keys))
     except (OSError, _BrowserError) as error:
         raise FileError(f"{program} takes no picture of {page}: {error}") from None
 
 
 def _shots(
-    browser: _Browser, page: Path, times: Sequence[float], size: tuple[int, int], plain: bool
+    browser: _Browser, page: Path, times: Sequence[float], size: tuple[int, int], keys: int
 ) -> Iterator[bytes]:
     browser.open_tab()
     metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
@@ -133,9 +133,9 @@ def _shots(
     browser.tell("Page.navigate", url=page.resolve().as_uri() + "#pause")
     while not browser.evaluate("Boolean(window.fflin && window.fflin.ready)"):
         time.sleep(0.05)
-    if plain:
-        browser.evaluate("fflin.plain(true)")
-    for moment in times:
+    for index, moment in enumerate(times):
+        if keys >= 0:
+            browser.evaluate(f"fflin.plain(true, {json.dumps(index < keys)})")
         # Two frames: one that draws, one after which it is on the screen.
         browser.evaluate(
             f"fflin.seek({float(moment)!r}); new Promise(done => requestAnimationFrame(() => "

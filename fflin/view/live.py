@@ -83,7 +83,6 @@ class Live:
         info |= {
             "mode": "live",
             "follow": follow,
-            "legend": [],
             "points": rounded(corner_points(drawing, poses), info["size"]),
             "joints": self._joints,
             "names": [name.partition(".")[2] for name in self._state_map.names[-6 - robot.n :]],

@@ -57,8 +57,13 @@ def motion_page(
     drawing = Drawing(robot, scenery["robot"], sent=sent)
     moving = [(drawing, film.poses)]
     data = robot.model.createData()
-    if target is not None:
-        Drawing(robot, scenery["target"], "ghost", sent).place(body_poses(robot, data, target))
+    goal = _target(motion, state, shown) if target is None else target[None]
+    # One pose where it stands still, or one a frame.
+    goals = np.array([body_poses(robot, data, each) for each in goal])
+    if len(goal):
+        ghost = Drawing(robot, scenery["target"], "ghost", sent)
+        ghost.place(goals[0])
+        moving += [(ghost, goals)] if len(goal) > 1 else []
     if motion.linear is not None:
         predicted = [state.to_pinocchio(x)[0] for x in motion.linear[shown]]
         poses = np.array([body_poses(robot, data, each) for each in predicted])
@@ -72,26 +77,24 @@ def motion_page(
     about = f"{subtitle(robot)}, {t[-1] - t[0]:.4g} s"
     info = stage_info(robot, drawing, film.poses[0], scene=scene, subtitle=about)
     shown_points = frame_points(drawing, film, info["size"])
-    if target is not None:
-        goal = corner_points(drawing, body_poses(robot, data, target))
-        shown_points = np.concatenate((shown_points, goal))
+    for poses in goals[:: max(1, len(goals) // 24)]:
+        shown_points = np.concatenate((shown_points, corner_points(drawing, poses)))
     info["floor"][2] = float(shown_points[:, 2].min())
     if follow is None:
         # All of a long way at once, and nothing is to be seen of the robot.
         follow = bool(np.ptp(shown_points, axis=0).max() > _FAR * info["size"])
     if follow:
         shown_points = frame_points(drawing, film, info["size"], follow=True)
+    info |= panel(robot, motion, shown, goal)
     info |= marks(robot, film, tool, info["size"])
-    # A file may not tell how far the centre of mass drifts.
-    of_com = motion.com_drift[shown] if len(motion.com_drift) else None
-    info |= panel(robot, state, q, u, target, motion.momentum_drift[shown], of_com)
     info |= {
         "mode": "motion",
         "t": packed(t),
         "speed": speed,
         "follow": follow,
         "points": rounded(shown_points, info["size"]),
-        "legend": legend(info, ghost=target is not None, linear=motion.linear is not None),
+        "target": len(goal) > 0,
+        "linear": motion.linear is not None,
     }
     return build_page(info, window.commands()), drawing.notes
 
@@ -99,6 +102,13 @@ def motion_page(
 def chart_of(robot: Robot, motion: Motion) -> StateMap:
     """Return the map between a motion's states and configurations."""
     return StateMap(robot, reference=motion.reference, frame=cast("Frame", motion.frame))
+
+
+def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
+    """Return where a motion is steered to (k, nq): nowhere, one place, or one a frame."""
+    states = motion.target.reshape(-1, state.nx)
+    states = states[shown] if len(states) > 1 else states
+    return np.array([state.to_pinocchio(x)[0] for x in states]).reshape(-1, state.robot.nq)
 
 
 def subtitle(robot: Robot) -> str:
@@ -142,18 +152,7 @@ def corner_points(drawing: Drawing, poses: Array) -> Array:
 def stage_info(
     robot: Robot, drawing: Drawing, poses: Array, *, scene: str, subtitle: str
 ) -> dict[str, Any]:
-    """Return what the page's stage needs: sizes, light, floor and where the base is.
-
-    Parameters
-    ----------
-    robot : Robot
-    drawing : Drawing
-    poses : ndarray (njoints - 1, 7)
-        Of the first frame.
-    scene : str
-        "space" or "lab".
-    subtitle : str
-    """
+    """Return what the page's stage needs, of the first frame's poses (njoints - 1, 7)."""
     points = corner_points(drawing, poses)
     low, high = points.min(axis=0), points.max(axis=0)
     centre = (low + high) / 2.0
@@ -220,30 +219,10 @@ def marks(robot: Robot, film: Playback, tool: str | None, size: float) -> dict[s
                 "direction": direction.tolist(),
                 "values": packed(film.thrust[:, k]),
                 "most": most,
+                "name": name,
             }
-            for k, (joint, position, direction) in enumerate(thrusters(robot))
+            for k, (name, joint, position, direction) in enumerate(thrusters(robot))
             if most
         ],
         "triads": triads(robot, tool, size),
     }
-
-
-def legend(shown: dict[str, Any], *, ghost: bool, linear: bool) -> list[dict[str, Any]]:
-    """Return the entries of the legend, each of which can be switched off."""
-    entries = [
-        {"label": f"path of the {each['name']}", "colour": each["colour"],
-         "paths": [["meshcat", "trails", each["name"]]]}
-        for each in shown["trails"]
-    ]  # fmt: skip
-    entries += [
-        {"label": f"{each['kind']} on the base", "colour": each["colour"],
-         "paths": [["meshcat", "wrench", each["kind"]]]}
-        for each in shown["arrows"]
-    ]  # fmt: skip
-    if ghost:
-        entries.append({"label": "target", "colour": "#8fb4ff", "paths": [["meshcat", "target"]]})
-    if linear:
-        entries.append(
-            {"label": "linear model", "colour": "#ff7fc8", "paths": [["meshcat", "linear"]]}
-        )
-    return entries

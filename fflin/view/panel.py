@@ -1,114 +1,162 @@
-"""The figures beside a motion: errors, drift of the momentum and inputs over time."""
+"""The figures beside a motion: where it is, what drives it and its limits, over time."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.names import input_keys
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
 from fflin.view.page import packed
 
-# Titles of inputs of a group and a unit; of another group its own name.
-_TITLES = {
-    ("tau_b", "N m"): "base torque",
-    ("F_b", "N"): "base force",
-    ("tau_m", "N m"): "joint torques",
-    ("tau_m", "N"): "joint forces",
-    ("thrust", "N"): "thrusters",
-    ("wheel", "N m"): "wheel torques",
-}
+if TYPE_CHECKING:
+    from fflin.simulation.motion import Motion
+
+# A limit is drawn where a curve comes to this share of it.
+_NEAR = 1.0 / 3.0
+
+# What is below this, in SI units, is rounding.
+_NOTHING = 1e-14
+
+_OPEN = np.full(2, np.inf)
+
+# Titles of states and inputs of a group and a unit; in a family a name has one colour.
+_CHARTS: tuple[dict[tuple[str, str], str], ...] = (
+    {("tau_b", "N m"): "base torque"},
+    {("F_b", "N"): "base force"},
+    {
+        ("q_m", "rad"): "joints",
+        ("q_m", "m"): "slides",
+        ("qdot_m", "rad/s"): "joint rates",
+        ("qdot_m", "m/s"): "slide rates",
+        ("tau_m", "N m"): "joint torques",
+        ("tau_m", "N"): "joint forces",
+    },
+    {("thrust", "N"): "thrusters"},
+    {
+        ("speed", "rad/s"): "wheel speed",
+        ("wheel", "N m"): "wheel torque",
+        ("momentum", "N m s"): "wheel momentum",
+    },
+)
 
 
-def errors(robot: Robot, q: Array, target: Array) -> dict[str, Array]:
-    """Return the distance of configurations (N, nq) from a target (nq,).
+class _Line(NamedTuple):
+    """What a chart shows of one name: its values (N,), and limits (2,), infinite where open."""
+
+    name: str
+    values: Array
+    limits: Array
+
+
+def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]]:
+    """Return the distance of configurations (N, nq) from a target (1, nq) or targets (N, nq).
 
     Returns
     -------
     dict
-        attitude [deg], position [m] of the base, turns [deg] and slides [m]: the largest errors of
-        joints that turn and that slide, which reaction wheels do not count as; each (N,).
+        {what: (unit, values (N,))}: attitude and position of the base, and of joints that turn and
+        that slide, if there are any, the largest error; reaction wheels are none of them.
     """
     state = StateMap(robot)
-    goal = pin.XYZQUATToSE3(target[:7])
-    relative = [goal.actInv(pin.XYZQUATToSE3(each[:7])) for each in q]
-    joints = np.array([state.joint_positions(each) for each in q]) - state.joint_positions(target)
+    goals = map(pin.XYZQUATToSE3, np.broadcast_to(target, q.shape)[:, :7])
+    relative = [
+        goal.actInv(pin.XYZQUATToSE3(each[:7])) for goal, each in zip(goals, q, strict=True)
+    ]
+    joints = state.joint_positions(q) - state.joint_positions(target)
     for index, joint in enumerate(robot.joints):
         if joint.unbounded:
             joints[:, index] = np.angle(np.exp(1j * joints[:, index]))
     wheels = robot.wheels
     turns = [not j.prismatic and j.name not in wheels for j in robot.joints]
     slides = [j.prismatic for j in robot.joints]
-    return {
-        "attitude": np.degrees([np.linalg.norm(pin.log3(each.rotation)) for each in relative]),
-        "position": np.array([np.linalg.norm(each.translation) for each in relative]),
-        "turns": np.degrees(np.abs(joints[:, turns]).max(axis=1, initial=0.0)),
-        "slides": np.abs(joints[:, slides]).max(axis=1, initial=0.0),
+    found = {
+        "attitude": ("°", np.degrees([np.linalg.norm(pin.log3(x.rotation)) for x in relative])),
+        "position": ("m", np.array([np.linalg.norm(x.translation) for x in relative])),
     }
+    if any(turns):
+        found["largest joint"] = ("°", np.degrees(np.abs(joints[:, turns]).max(axis=1)))
+    if any(slides):
+        found["largest slide"] = ("m", np.abs(joints[:, slides]).max(axis=1))
+    return {k: (unit, np.where(x < _NOTHING, 0.0, x)) for k, (unit, x) in found.items()}
 
 
-def panel(
-    robot: Robot,
-    state: StateMap,
-    q: Array,
-    u: Array,
-    target: Array | None,
-    drift: Array,
-    of_com: Array | None = None,
-) -> dict[str, Any]:
-    """Return the readouts and plots of a motion's page.
+def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, Any]:
+    """Return the readouts and plots of a motion's page, of the rows (N,) that it shows.
 
-    Parameters
-    ----------
-    robot : Robot
-    state : StateMap
-    q : ndarray (N, nq)
-    u : ndarray (N, nu)
-    target : ndarray (nq,) or None
-        Without one there are no errors.
-    drift : ndarray (N,)
-        Of the momentum, relative.
-    of_com : ndarray (N,), optional
-        Distance of the centre of mass from its line [m].
+    Errors are counted from a target for all rows or one each, (k, nq); where there is none there
+    are no errors, and the change from the start is shown.
     """
-    found = {} if target is None else errors(robot, q, target)
-    slide = any(joint.prismatic for joint in robot.joints)
-    turn = robot.n > len(robot.wheels) + sum(joint.prismatic for joint in robot.joints)
-    shown = {"attitude error": ("°", "attitude"), "position error": ("m", "position")}
-    shown |= {"largest joint error": ("°", "turns")} if turn else {}
-    shown |= {"largest slide error": ("m", "slides")} if slide else {}
-    readouts = [(label, unit, found[key]) for label, (unit, key) in shown.items() if found]
-    plots = [_plot(label, unit, [("", values)]) for label, unit, values in readouts[:2]]
-    readouts.append(("momentum drift", "", drift))
-    if of_com is not None:
-        readouts.append(("centre of mass drift", "m", of_com))
-    actuation = Actuation(state)
-    for kind, indices in actuation.groups.items():
-        labels = "xyz" if kind in ("tau_b", "F_b") else [""] * len(indices)
-        for unit in dict.fromkeys(actuation.units[index] for index in indices):
-            lines = [
-                (label, u[:, index])
-                for label, index in zip(labels, indices, strict=True)
-                if actuation.units[index] == unit
-            ]
-            if any(values.any() for _, values in lines):
-                plots.append(_plot(_TITLES.get((kind, unit), kind), unit, lines))
+    found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
+    of = "{} error" if len(target) else "{} change"
+    readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]
+    plots = [
+        _plot(title, unit, [_Line("", values, _OPEN)])
+        for title, unit, values in readouts[:2]
+        if values.any()
+    ]
+    readouts.append(("momentum drift", "", motion.momentum_drift[shown]))
+    if len(motion.com_drift):  # a file may not tell
+        readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
+    lines = _lines(robot, motion, shown)
+    for family, charts in enumerate(_CHARTS):
+        for key, title in charts.items():
+            plot = _plot(title, key[1], lines.get(key, []), family)
+            # Of rates their limits alone are of interest.
+            if any(each["limits"] or not title.endswith("rates") for each in plot["lines"]):
+                plots.append(plot)
     return {
         "readouts": [
             {"label": label, "unit": unit, "values": packed(values)}
             for label, unit, values in readouts
         ],
         "plots": plots,
+        "passed": [[str(each), each.time] for each in motion.passed],
     }
 
 
-def _plot(title: str, unit: str, lines: list[tuple[str, Array]]) -> dict[str, Any]:
+def _lines(robot: Robot, motion: Motion, shown: Array) -> dict[tuple[str, str], list[_Line]]:
+    """Return the lines of states and inputs that are not zero all along, by group and unit."""
+    limits = dict(zip(motion.limit_names, motion.limits, strict=True))
+    found: dict[tuple[str, str], list[_Line]] = {}
+    for name, key, unit, column in (
+        *zip(motion.state_names, motion.state_names, motion.state_units, motion.x.T, strict=True),
+        *zip(motion.input_names, input_keys(motion), motion.input_units, motion.u.T, strict=True),
+    ):
+        group, _, entry = key.partition(".")
+        line = _Line(entry, column[shown], limits.get(name, _OPEN))
+        if np.abs(line.values).max() < _NOTHING:
+            continue
+        if group in ("q_m", "qdot_m") and entry in robot.wheels:
+            if group == "q_m":
+                continue
+            group, inertia = "speed", robot.wheels[entry]
+            momentum = _Line(entry, inertia * line.values, inertia * line.limits)
+            found.setdefault(("momentum", "N m s"), []).append(momentum)
+        found.setdefault((group, unit), []).append(line)
+    return found
+
+
+def _plot(title: str, unit: str, lines: list[_Line], family: int = -1) -> dict[str, Any]:
+    """Return a plot, with those limits of each line that it comes near."""
     return {
         "title": title,
         "unit": unit,
-        "lines": [{"label": label, "values": packed(values)} for label, values in lines],
+        "family": family,
+        "lines": [
+            {
+                "label": line.name,
+                "values": packed(line.values),
+                "limits": [
+                    level
+                    for level in line.limits[np.isfinite(line.limits)].tolist()
+                    if level and (line.values / level).max() >= _NEAR
+                ],
+            }
+            for line in lines
+        ],
     }

@@ -46,17 +46,7 @@ class Playback:
 
 
 def frame_indices(t: Array, fps: float, speed: float) -> Array:
-    """Return which samples of a motion to show: those nearest to a film's frames.
-
-    Parameters
-    ----------
-    t : ndarray (N,)
-        Times of the motion [s].
-    fps : float
-        Frames per second of watching.
-    speed : float
-        Seconds of motion per second of watching.
-    """
+    """Return which samples of a motion (N,) [s] to show: those nearest to a film's frames."""
     duration = float(t[-1] - t[0])
     count = min(round(duration * fps / speed), len(t) - 1, _MOST_FRAMES)
     wanted = np.linspace(t[0], t[-1], max(count, 1) + 1)
@@ -92,19 +82,7 @@ def body_poses(robot: Robot, data: pin.Data, q: Array) -> Array:
 def play_back(
     robot: Robot, state: StateMap, t: Array, q: Array, u: Array, tool: str | None
 ) -> Playback:
-    """Compute what is shown of a motion.
-
-    Parameters
-    ----------
-    robot : Robot
-    state : StateMap
-        Its frame says the axes of the base's wrench.
-    t : ndarray (N,)
-    q : ndarray (N, nq)
-    u : ndarray (N, nu)
-    tool : str or None
-        Frame of the model.
-    """
+    """Compute what is shown of rows of a motion; the state's frame says a wrench's axes."""
     model, data = robot.model, robot.model.createData()
     tool_id = frame_index(model, tool) if tool else None
     groups = Actuation(state).groups
@@ -128,12 +106,15 @@ def play_back(
     return Playback(t, poses, com, tools, force, torque, thrust)
 
 
-def thrusters(robot: Robot) -> list[tuple[int, Array, Array]]:
-    """Return joint, position and direction of push, in the joint's frame, of each thruster."""
-    found = []
+def thrusters(robot: Robot) -> list[tuple[str, int, Array, Array]]:
+    """Return name, joint, position and direction of push, in its frame, of each thruster."""
+    found: list[tuple[str, int, Array, Array]] = []
+    actuation = Actuation(StateMap(robot))
+    names = [actuation.names[index] for index in actuation.groups.get("thrust", ())]
     for item in robot.inputs:
         if isinstance(item, Thruster):
             joint, placement = find_frame(robot.model, item.frame)
             position = placement.act(np.array(item.position))
-            found.append((joint, position, placement.rotation @ np.array(item.direction)))
+            direction = placement.rotation @ np.array(item.direction)
+            found.append((names[len(found)], joint, position, direction))
     return found

@@ -20,6 +20,7 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from os import PathLike
 
+    from fflin.analysis.modes import Modes
     from fflin.simulation.motion import Motion
     from fflin.view.live import Live
 
@@ -34,7 +35,7 @@ _LONGEST = 60.0
 
 def visualize(
     robot: Robot,
-    motion: Motion | None = None,
+    motion: Motion | Modes | None = None,
     *,
     html: str | PathLike[str] | None = None,
     png: str | PathLike[str] | None = None,
@@ -61,8 +62,9 @@ def visualize(
     Parameters
     ----------
     robot : Robot
-    motion : Motion, optional
-        Of `simulate`. Without it the robot is shown live, with a slider for each joint.
+    motion : Motion or Modes, optional
+        Of `simulate`; or of `modes`, which the page plays one at a time, by their names and
+        frequencies. Without it the robot is shown live, with a slider for each joint.
     html : path, optional
         File to write; a temporary one by default.
     png, gif : path, optional
@@ -84,7 +86,7 @@ def visualize(
         would be a dot on its way.
     target : array_like (nq,), optional
         Configuration that errors are counted from; by default the one that the motion was steered
-        to. Without one no errors are shown.
+        to. Where there is none the change from the start is shown instead, and no ghost.
     tool : str, optional
         Frame whose trail is drawn; "tool" or the last link of the longest chain by default.
     q : array_like (nq,), optional
@@ -100,7 +102,8 @@ def visualize(
     Raises
     ------
     InputError
-        If the motion is another robot's, or a value is none; if the port is taken.
+        If the motion or modes are another robot's or of a reduced model, or a value is none; if
+        no mode oscillates, or pictures of modes are asked for; if the port is taken.
     FileError
         If a file cannot be written. No file is left half written.
     UnknownNameError
@@ -143,36 +146,42 @@ def visualize(
             live.open()
         return live
     outputs = check_outputs({".html": html, ".png": png, ".gif": gif})
-    _check_motion(robot, motion)
-    fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
-    from fflin.view.motion_page import chart_of, motion_page
+    from fflin.analysis.modes import Modes
 
-    if target is None and motion.target.size:
-        target = chart_of(robot, motion).to_pinocchio(motion.target)[0]
-    goal = None if target is None else _configuration(robot, "target", target)
+    contents: dict[Path, bytes] = {}
+    if isinstance(motion, Modes):
+        if {*outputs} - {".html"}:
+            raise InputError("pictures are taken of a motion; modes are shown by a page, html")
+        from fflin.view.mode_page import mode_page
 
-    page, notes = motion_page(
-        robot, motion, scene=scene, fps=fps, speed=speed, follow=follow, target=goal, tool=tool
-    )
+        page, notes = mode_page(robot, motion, scene=scene, tool=tool)
+    else:
+        _check_motion(robot, motion)
+        fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
+        from fflin.view.motion_page import motion_page
+
+        goal = None if target is None else _configuration(robot, "target", target)
+        page, notes = motion_page(
+            robot, motion, scene=scene, fps=fps, speed=speed, follow=follow, target=goal, tool=tool
+        )
+        contents = _pictures(page, outputs, motion, speed, times)
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)
-    contents = _pictures(page, outputs, motion, speed, times)
-    if ".html" in outputs:
-        contents[outputs[".html"]] = page.encode()
-    write_whole(contents)
-    shown = outputs.get(".html")
-    if not outputs:
-        name = re.sub(r"\W+", "_", robot.name, flags=re.ASCII)[:40]
-        with tempfile.NamedTemporaryFile(
-            "wb", prefix=f"fflin-{name}-", suffix=".html", delete=False
-        ) as file:
-            file.write(page.encode())
-        shown = Path(file.name)
+    shown = outputs.get(".html") if outputs else _temporary(robot.name)
+    write_whole(contents | ({shown: page.encode()} if shown else {}))
     if shown and (not outputs if opened is None else opened):
         import webbrowser
 
         webbrowser.open(shown.resolve().as_uri())
     return shown
+
+
+def _temporary(name: str) -> Path:
+    safe = re.sub(r"\W+", "_", name, flags=re.ASCII)[:40]
+    with tempfile.NamedTemporaryFile(
+        "wb", prefix=f"fflin-{safe}-", suffix=".html", delete=False
+    ) as file:
+        return Path(file.name)
 
 
 def _check_port(port: Any) -> None:

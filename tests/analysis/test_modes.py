@@ -391,3 +391,31 @@ def test_growth_within_rounding_is_told(robots, growth, doubtful):
     assert bool(found.notes) == doubtful
     assert ("note: undecided: whether the mode at" in str(found)) == doubtful
     assert not fflin.modes(lin).notes
+
+
+def test_what_moves_in_a_mode_is_named_or_counted():
+    lin = fflin.linearize(fflin.load("talos", stiffness=20.0))
+    found = fflin.modes(lin)
+    rows = str(found).splitlines()[3:]
+    for mode, row in zip(found.modes, rows, strict=True):
+        assert len(row) <= 80
+        sizes = np.abs(mode.shape[: len(lin.state_names) // 2])
+        said, _, left = row.partition("; + ")
+        named = [name for name in lin.state_names if f" {name} " in f"{said} "]
+        more = int(left.split()[0]) if left else 0
+        assert len(named) + more == np.count_nonzero(sizes >= 0.1)
+        largest = sorted(zip(-sizes, lin.state_names, strict=False))[: len(named)]
+        assert {lin.state_names.index(name) for name in named} or not largest
+        assert min(sizes[lin.state_names.index(name)] for name in named) >= max(
+            (size for name, size in zip(lin.state_names, sizes, strict=False) if name not in named),
+            default=0.0,
+        ) * (1.0 - 1e-8)
+    assert any("; + " in row for row in rows)
+
+
+def test_terms_of_a_combination_that_are_left_out_are_counted():
+    from fflin.analysis.names import combination
+
+    weights = np.array([1.0, -0.5, 0.25, 0.2, 0.0, 1e-9, 0.1])
+    shown = combination(weights, tuple("abcdefg"), np.ones(7))
+    assert shown == "a - 0.5 b + 0.25 c + 2 more"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.base.names import by_name, chosen, matching
+from fflin.base.names import by_name, chosen, matching, runs
 
 NAMES = ("q_b.x", "q_m.hinge_1", "q_m.hinge_2", "q_m.arm[1]", "qdot_m.hinge_1", "tau_m.boom.2")
 
@@ -107,3 +107,15 @@ def test_thrusters_and_wheels_have_groups_too():
         robot, lambda *_: np.full(9, 5.0), duration=0.02, limits={"thrust": 1.0, "wheel": 2.0}
     )
     assert motion.u[0, :3].tolist() == [1.0, 1.0, 2.0]
+
+
+def test_runs_are_of_one_group_or_of_one_unit():
+    names = ("q_b.x", "q_b.y", "q_m.a", "q_m.b", "up", "down", "turn", "tool.pose.x", "tool.pose.y")
+    units = ("1", "1", "rad", "m", "N", "N", "N m", "m", "m")
+    assert runs(names, units) == [
+        (0, 1, "q_b", "1"),
+        (2, 3, "q_m", "rad|m"),
+        (4, 5, "", "N"),
+        (6, 6, "", "N m"),
+        (7, 8, "tool.pose", "m"),
+    ]

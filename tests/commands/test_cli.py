@@ -68,7 +68,7 @@ def test_warnings_are_one_line_each_on_stderr_and_in_info():
         text=True,
         check=False,
     )
-    words = "the damping of joints 'joint_1', 'joint_2', 'joint_3' is not in the linear model"
+    words = "planar_detumble: damping unused: 'joint_1', 'joint_2', 'joint_3'"
     assert done.returncode == 0
     assert done.stderr.startswith("fflin: warning: ") and done.stderr.count("\n") == 1
     assert words in done.stderr
@@ -149,8 +149,7 @@ def test_joints_beyond_their_limits_are_named(command):
     )
     assert done.returncode == 0
     assert done.stderr == (
-        "fflin: warning: joint 'joint_2' is put at 9 rad, outside its limits from -2.094 to "
-        "2.094 rad\n"
+        "fflin: warning: joint 'joint_2' at 9 rad is outside -2.094 to 2.094 rad\n"
     )
 
 
@@ -397,6 +396,87 @@ def test_what_other_packages_warn_of_stands_before_no_error(monkeypatch, capsys)
     assert foreign == "fflin: RuntimeWarning: overflow encountered in multiply"
     assert error.endswith("fflin: warning: mind this\nfflin: error: too large\n")
     assert "RuntimeWarning" not in error
+
+
+def test_info_shows_the_inputs_of_a_file_with_the_limits_of_the_urdf():
+    code, out, err = run("info", "servicer_7dof", "--inputs", "servicer_7dof")
+    assert code == 0 and not err and "9 joints, 30 states, 17 inputs" in out
+    rows = [line.split() for line in out.split("\ninput ")[1].splitlines()[1:]]
+    limits = {row[0]: (row[-2], row[-1]) for row in rows}
+    model = fflin.load("servicer_7dof").model
+    effort = dict(zip(model.names.tolist()[2:], model.effortLimit[6:].tolist(), strict=True))
+    for name in ("joint_1", "joint_7"):
+        assert tuple(map(float, limits[f"tau_m.{name}"])) == (-effort[name], effort[name])
+    assert limits["F_b.x"] == (".", ".") and limits["back_left_top"] == ("0", ".")
+    assert len(limits) == 17
+    assert "\ninput " not in run("info", "servicer_7dof")[1]
+    assert "nosuch.toml" in refused("info", "cubesat", "--inputs", "./nosuch.toml")
+
+
+def test_check_says_what_a_dot_is_and_shows_no_table_of_zeros():
+    code, out, _ = run("check", "cubesat")
+    assert code == 0 and "a dot is an error of exactly zero" in out
+    title, single = (
+        next(line for line in out.splitlines() if line.startswith(f"A and B against {test}"))
+        for test in ("differences", "ABA")
+    )
+    assert "at most 1.0e-08" in title
+    assert single == "A and B against ABA derivatives: no difference in any of 48 blocks"
+    assert out.count("omega_b ") == 2  # a header and a row of the other table
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_warnings_of_bundled_robots_fit_a_terminal(name, capfd):
+    from fflin.commands import cli
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        robot = fflin.load(name)
+        warnings.simplefilter("always")
+        beyond = [f"--joint={joint}=99" for joint in robot.joint_names]
+        assert cli.main(["linearize", name, *beyond]) == 0
+    out, err = capfd.readouterr()
+    limited = sum(not joint.unbounded for joint in robot.joints)
+    bounded = robot.model.upperPositionLimit[7:].max(initial=0.0) < 99.0
+    assert len(err.splitlines()) == len(robot.notes) + limited * bounded
+    assert all(line.startswith("fflin: warning: ") for line in err.splitlines())
+    assert max(map(len, (out + err).splitlines())) <= 80
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("linearize", "cubesat"),
+        ("check", "cubesat"),
+        ("analyze", "planar_detumble", "--stiffness", "3"),
+        ("modes", "planar_detumble", "--stiffness", "3"),
+        ("lqr", "cubesat"),
+        ("validity", "cubesat", "--samples", "1"),
+    ],
+)
+def test_plot_draws_what_the_command_found(command, tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    code, out, _ = run(*command, "--plot", tmp_path / "a.svg")
+    assert code == 0 and out.endswith(f"wrote {tmp_path / 'a.svg'}\n")
+    assert (tmp_path / "a.svg").read_bytes().startswith(b"<?xml")
+    assert "ends in '.bmp'" in refused(*command, "--plot", tmp_path / "a.bmp")
+    assert "No such" in (said := refused(*command, "--plot", tmp_path / "no" / "a.png")) or (
+        "no folder" in said
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["a.svg"]
+
+
+def test_help_lists_every_command_once_by_its_task():
+    code, out, _ = run("--help")
+    assert code == 0 and max(map(len, out.splitlines())) <= 80
+    assert "other:" not in out  # a new command is to be put beside those of its task
+    listed = [line.split()[0] for line in out.splitlines() if line[:2] == "  " and line[2] > " "]
+    names = [name for name in listed if not name.startswith("-")]
+    assert sorted(names) == sorted({*names})
+    assert {"robots", "check", "modes", "lqr", "simulate", "sweep", "view"} <= {*names}
+    sections = [part for part in out.split("\n\n") if ":\n" in part]
+    close = next(part for part in sections if part.startswith("close the loop:"))
+    assert "lqr" in close and "simulate" in close and "info" not in close
 
 
 def test_help_has_an_example_in_every_command():

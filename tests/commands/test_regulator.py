@@ -102,3 +102,40 @@ def test_bad_input_is_one_line_and_leaves_no_file(capsys, tmp_path):
     assert code == 2 and "ends in '.csv'" in err
     code, out, err = run(capsys, "ets_vii", "-o", str(tmp_path / "nowhere" / "k.npz"))
     assert (code, out) == (2, "") and "cannot be written" in err
+
+
+WHEELS = "\n".join(
+    f'[[input]]\ntype = "reaction_wheel"\nname = "wheel_{name}"\naxis = {axis}\ninertia = 3e-6'
+    for name, axis in zip("xyz", ([1, 0, 0], [0, 1, 0], [0, 0, 1]), strict=True)
+)
+
+
+def test_three_wheels_hold_the_attitude_without_being_asked(capsys, tmp_path):
+    inputs, path = tmp_path / "wheels.toml", tmp_path / "gain.json"
+    inputs.write_text(WHEELS)
+    code, out, err = run(capsys, "cubesat", "--inputs", str(inputs), "-o", str(path))
+    assert (code, err) == (0, "")
+    assert max(map(len, out.splitlines()[:-1])) <= 80
+    assert "not regulated: r_b, v_b (no input pushes it), wheel angles (ignorable)" in out
+    saved = fflin.Gain.load(path)
+    robot = fflin.load("cubesat", inputs=fflin.load_inputs(inputs))
+    assert (saved.K == fflin.lqr(fflin.linearize(robot)).K).all() and len(saved.regulated) == 6
+    inputs.write_text(WHEELS.rpartition("[[input]]")[0])
+    code, out, err = run(capsys, "cubesat", "--inputs", str(inputs))
+    assert (code, out) == (2, "") and "cannot hold base attitude z and position" in err
+
+
+def test_the_speeds_of_wheels_are_chosen_and_weighed(capsys, tmp_path):
+    path = tmp_path / "gain.npz"
+    common = ("cubesat", "--inputs", "cubesat", "-o", str(path))
+    for options, speeds in (((), 3), (("--no-wheel-speeds",), 0), (("--wheel-speeds",), 3)):
+        assert run(capsys, *common, *options)[0] == 0
+        kept = fflin.Gain.load(path).regulated
+        assert sum(name.startswith("qdot_m.wheel_") for name in kept) == speeds
+    assert run(capsys, *common, "--dt", "0.1", "--bryson", "qdot_m.wheel_z=0.5")[0] == 0
+    quick = fflin.Gain.load(path)
+    assert run(capsys, *common, "--dt", "0.1")[0] == 0
+    slow = fflin.Gain.load(path)
+    at = slow.state_names.index("qdot_m.wheel_z")
+    assert np.abs(quick.K[:, at]).max() > 10.0 * np.abs(slow.K[:, at]).max()
+    assert quick.weights.startswith("qdot_m.wheel_z as given, the others from mass and size")

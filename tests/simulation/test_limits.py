@@ -2,6 +2,7 @@
 
 import math
 import re
+import warnings
 
 import numpy as np
 import pytest
@@ -318,3 +319,40 @@ def test_a_file_that_has_no_limits_is_loaded(tmp_path):
         kept = {key: file[key] for key in file.files if "limit" not in key and key != "sha256"}
     np.savez(tmp_path / "older.npz", **kept)
     assert fflin.Motion.load(tmp_path / "older.npz").limits.shape == (0, 2)
+
+
+def held_up(**limits):
+    """An arm under gravity, its model about the point where its inputs hold it, and their u."""
+    robot = fflin.load("canadarm2", gravity=(0.0, 0.0, -0.05), limits=limits)
+    q = fflin.configuration(robot, {"joint_2": 0.4})
+    return robot, q, fflin.equilibrium(robot, q).u
+
+
+def test_limits_that_cannot_hold_the_robot_are_said_before_the_run():
+    robot, q, u = held_up()
+    names = fflin.linearize(robot).input_names
+    most = int(np.abs(u[6:]).argmax()) + 6
+    small = float(f"{0.5 * abs(u[most]):.3g}")
+    robot, q, u = held_up(**{names[most]: small})
+    lin = fflin.linearize(robot, q, u=u)
+    gain = fflin.lqr(lin, weights="identity")
+    policy = fflin.StateFeedback(lin, gain.K)
+    said = f"the limits do not hold 'canadarm2' at its target: {names[most]} is asked for "
+    said += f"{u[most]:.3g} N m, limit {np.sign(u[most]) * small:g}"
+    with pytest.warns(fflin.FflinWarning, match=re.escape(said)) as told:
+        fflin.simulate(robot, policy, q0=q, duration=0.02, limits="urdf")
+    assert len(told) == 1
+    for limits in (None, ["urdf", {names[most]: 2.1 * small}]):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            fflin.simulate(robot, policy, q0=q, duration=0.02, limits=limits)
+
+
+def test_allocation_keeps_within_the_thrusters_and_shares_what_one_alone_cannot_give():
+    body = free_body((20.0, 30.0, 40.0))
+    thrusters = [fflin.Thruster(*AT, max=1.0), fflin.Thruster(*AT, max=9.0)]
+    design = body.replace(inputs=[fflin.BaseForce()])
+    asked = fflin.Allocation(lambda t, q, v: [5.0 if t < 0.05 else 20.0, 0.0, 0.0], design)
+    motion = fflin.simulate(body.replace(inputs=thrusters), asked, duration=0.1, dt=0.01)
+    np.testing.assert_allclose(motion.u[:4], [[1.0, 4.0]] * 4, rtol=1e-6)
+    np.testing.assert_allclose(motion.u[6:], [[1.0, 9.0]] * 5, rtol=1e-6)

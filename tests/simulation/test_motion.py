@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import fflin
@@ -65,6 +66,19 @@ def test_a_model_of_another_robot_is_no_target():
     lin = fflin.linearize(fflin.load("planar_detumble"))
     with pytest.raises(fflin.InputError, match="target is a model of 'planar_detumble'"):
         fflin.simulate(fflin.load("ets_vii"), duration=0.1, target=lin)
+
+
+def test_a_model_in_another_reference_and_frame_is_the_same_target():
+    robot = fflin.load("ets_vii")
+    turned = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 0.4), np.array([1.0, 2.0, 3.0]))
+    q = fflin.configuration(robot, {"joint_1": 0.5}, turned)
+    v = 0.1 * np.ones(robot.nv)
+    lin = fflin.linearize(robot, q, v, frame="local")
+    assert not lin.x0[:6].any()
+    motion = fflin.simulate(robot, q0=q, v0=v, duration=0.05, target=lin)
+    np.testing.assert_allclose(motion.error[0], 0.0, atol=1e-14)
+    assert motion.attitude_error[0] < 1e-6
+    assert np.abs(motion.target[:6]).min() > 0.01
 
 
 def test_a_target_may_differ_from_row_to_row():

@@ -42,7 +42,7 @@ def test_motion_shows_linear_beside_nonlinear_and_their_difference(loop):
     apart = differences[0].get_lines()[2].get_ydata()
     np.testing.assert_array_equal(apart, motion.x[:, 2] - motion.linear[:, 2])
     assert axes["velocity v_b"].get_ylabel() == "[m/s]"
-    torque = lines(axes["inputs"])["tau_b.z"]
+    torque = lines(axes["torques"])["tau_b.z"]
     np.testing.assert_array_equal(torque.get_ydata(), motion.u[:, 2])
     assert set(lines(axes["joint inputs tau_m"])) == {
         name for name in motion.input_names if name.startswith("tau_m")
@@ -69,7 +69,7 @@ def test_many_inputs_and_joints_are_named_beside_the_panels_each_in_its_colour()
     named = {legend.get_title().get_text(): legend for legend in figure.legends}
     shown = [text.get_text() for text in named["joints"].get_texts()]
     assert shown == list(robot.joint_names)
-    assert len(named["inputs"].get_texts()) == 12
+    assert len(named["forces"].get_texts()) == 12
     for legend in named.values():
         colors = {line.get_color() for line in legend.get_lines()}
         assert len(colors) == len(legend.get_lines())
@@ -88,46 +88,106 @@ def test_many_inputs_and_joints_are_named_beside_the_panels_each_in_its_colour()
         assert one.x1 <= figure.bbox.x1 + 1.0
 
 
+@pytest.fixture(scope="module")
+def limited():
+    """An arm with prismatic joint, thrusters and wheels, all with limits, some of which bind."""
+    robot = fflin.load("servicer_7dof", limits={"qdot_m": 0.05})
+    inputs = [
+        fflin.BaseTorque(max=8.0),
+        fflin.BaseForce(max=2e3),
+        *robot.inputs[2:],
+        fflin.Thruster("base", (0, 0, 0), (1, 0, 0), "main", max=22.0),
+        fflin.ReactionWheel((0, 0, 1), inertia=0.05, name="spin", max=2.0, max_speed=300.0),
+        fflin.ReactionWheel((1, 0, 0), inertia=0.05, name="idle", max=2.0, max_speed=300.0),
+    ]
+    robot = robot.replace(inputs=inputs)
+    u = np.zeros(18)
+    u[0], u[4], u[6], u[15], u[16] = 5.0, 400.0, 120.0, 30.0, 1.0
+
+    def policy(t, q, v):
+        return u * np.cos(0.2 * t) + u * (np.arange(18) == 16)
+
+    v0 = fflin.velocity(robot, {"spin": 290.0, "joint_1": 0.04})
+    return fflin.simulate(robot, policy, v0=v0, duration=0.02, dt=1e-3, limits="urdf")
+
+
+def panels(figure):
+    return {each.get_title(): each for each in figure.axes if each.get_title()}
+
+
+def test_each_axis_has_one_unit_and_wheels_have_panels_of_their_own(limited):
+    found = panels(limited.plot())
+    units = {title: axes.get_ylabel() for title, axes in found.items()}
+    assert units["torques"] == "[N m]"
+    assert units["forces"] == "[N]"
+    assert units["joint inputs tau_m"] == "[N m]"
+    assert units["wheel speeds"] == "[rad/s]"
+    assert units["wheel torques"] == "[N m]"
+    assert units["wheel momenta"] == "[N m s]"
+    assert {"tau_b.x", "tau_b.y", "tau_b.z"} == set(lines(found["torques"])) - {"limit"}
+    assert {"F_b.x", "F_b.y", "F_b.z", "main"} == set(lines(found["forces"])) - {"limit"}
+    for title in ("wheel speeds", "wheel torques", "wheel momenta"):
+        assert set(lines(found[title])) == {"spin", "idle", "limit"}
+    for title in ("joints q_m", "joint rates"):
+        assert not {"spin", "idle"} & set(lines(found[title]))
+    speed = limited.x[:, limited.state_names.index("qdot_m.spin")]
+    np.testing.assert_array_equal(lines(found["wheel speeds"])["spin"].get_ydata(), speed)
+    momentum = lines(found["wheel momenta"])["spin"].get_ydata()
+    np.testing.assert_allclose(momentum, 0.05 * speed)
+
+
+def levels(axes):
+    """The heights of the lines of limits, and how many of them the legend would name."""
+    dashed = [line for line in axes.get_lines() if line.get_linestyle() == "--"]
+    named = [line for line in dashed if line.get_label() == "limit"]
+    return sorted(float(line.get_ydata()[0]) for line in dashed), len(named)
+
+
+def test_limits_are_drawn_where_a_curve_comes_to_a_third_of_them(limited):
+    found = panels(limited.plot())
+    assert levels(found["torques"]) == ([8.0], 1)
+    assert levels(found["forces"]) == ([22.0], 1)
+    assert levels(found["joint inputs tau_m"]) == ([300.0], 1)
+    assert levels(found["wheel speeds"]) == ([300.0], 1)
+    assert levels(found["wheel momenta"]) == ([15.0], 1)
+    assert levels(found["joint rates"])[0] in ([0.05], [-0.05, 0.05])
+    assert levels(found["joints q_m"]) == ([], 0)
+    figure = limited.plot()
+    (named,) = [x for x in figure.legends if x.get_title().get_text() == "joints"]
+    assert [text.get_text() for text in named.get_texts()].count("limit") == 1
+
+
+def test_a_motion_without_limits_has_no_lines_of_them(loop):
+    _, _, motion = loop
+    assert not motion.limit_names
+    for axes in motion.plot().axes:
+        assert "limit" not in lines(axes)
+
+
+def test_panels_of_wheels_and_limits_do_not_lie_on_each_other(limited):
+    figure = limited.plot()
+    figure.draw_without_rendering()
+    boxes = [each.get_tightbbox() for each in (*figure.axes, *figure.legends)]
+    for i, one in enumerate(boxes):
+        assert not any(one.overlaps(other) for other in boxes[:i])
+        assert one.x0 >= 0.0
+        assert one.x1 <= figure.bbox.x1 + 1.0
+
+
+def test_the_inertias_of_wheels_are_saved_and_loaded(limited, tmp_path):
+    for ending in (".npz", ".mat", ".json"):
+        limited.save(tmp_path / f"m{ending}")
+        found = fflin.Motion.load(tmp_path / f"m{ending}")
+        np.testing.assert_array_equal(found.wheel_inertias, [0.05, 0.05])
+        assert found.wheels == ("spin", "idle") or found.wheels == ("idle", "spin")
+
+
 def test_attitude_through_180_degrees_has_a_gap():
     robot = fflin.load("cubesat")
     motion = fflin.simulate(robot, v0=[0, 0, 0, 0, 0, 2.0], duration=2.0)
     z = motion.plot().axes[0].get_lines()[2].get_ydata()
     assert np.isnan(z).sum() == 1
     assert np.nanmax(np.abs(np.diff(z))) < 0.1
-
-
-def test_pole_map_and_pattern(loop):
-    lin, gain, _ = loop
-    figure = fflin.plot_poles({"open": lin, "closed": gain})
-    shown = lines(figure.axes[0])["closed"]
-    np.testing.assert_array_equal(np.sort(shown.get_xdata()), np.sort(gain.poles.real))
-    sampled = fflin.plot_poles(lin.discretize(0.1))
-    assert sampled.axes[0].get_xlabel() == "real part"
-    assert len(sampled.axes[0].get_lines()) == 2  # with the unit circle
-
-    pattern = fflin.plot_matrices(lin)
-    left, right = pattern.axes[:2]
-    for axes, values, names in ((left, lin.A, lin.state_names), (right, lin.B, lin.input_names)):
-        image = axes.get_images()[0].get_array()
-        np.testing.assert_array_equal(np.ma.getmaskarray(np.ma.masked_invalid(image)), values == 0)
-        assert [label.get_text() for label in axes.get_xticklabels()] == list(names)
-
-
-def test_validity_shows_the_runs_and_the_order(tmp_path):
-    robot = fflin.load("cubesat")
-    lin = fflin.linearize(robot)
-    gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
-    found = fflin.validity(robot, lin, gain, attitude=170.0, samples=12)
-    figure = fflin.plot_validity(found, tmp_path / "validity.png")
-    left, right = figure.axes
-    curve = left.get_lines()[0]
-    known = np.isfinite(found.prediction_error)
-    np.testing.assert_allclose(curve.get_ydata(), 100.0 * found.prediction_error[known])
-    heights = [sum(bar.get_height() for bar in bars) for bars in right.containers]
-    assert heights == [found.settled, 12 - found.settled]
-    assert (tmp_path / "validity.png").exists()
-    with pytest.raises(fflin.InputError, match=r"expected what fflin\.validity returns"):
-        fflin.plot_validity(3)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".pdf", ".svg"])
@@ -146,8 +206,6 @@ def test_bad_figures_are_refused(loop, tmp_path, monkeypatch):
         motion.plot(tmp_path / "loop.bmp")
     with pytest.raises(fflin.InputError, match="expected a Motion"):
         fflin.plot_motion(3)
-    with pytest.raises(fflin.InputError, match="expected finite numbers or a Gain"):
-        fflin.plot_poles("stable")
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(fflin.MissingPackageError, match=r"pip install 'fflin\[plot\]'"):
         motion.plot()

@@ -2,13 +2,12 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import fflin
-from fflin.simulation.report import motion_report, saturated
+from fflin.simulation.report import motion_report
 from tests.support.commands import run
 from tests.support.motions import settling
 
@@ -129,15 +128,27 @@ def test_the_states_that_a_feedback_feeds_back_are_on_record():
 
 
 def test_inputs_at_their_limits_all_along_are_named():
-    t = np.linspace(0.0, 1.0, 101)
-    u = np.column_stack((0 * t + 3.0, -3.0 + 0 * t, np.where(t < 0.8, 3.0, 0.0), 0 * t, 0 * t))
-    motion = SimpleNamespace(
-        input_names=("high", "low", "part", "thruster", "off"),
-        u=u,
-        limit_names=("high", "low", "part", "thruster", "off"),
-        limits=np.array([[-3.0, 3.0], [-3.0, 3.0], [-3.0, 3.0], [0.0, 3.0], [0.0, 0.0]]),
-    )
-    assert saturated(motion) == ["high", "low"]
+    motion = course(lambda t: np.exp(-t))
+    t, u = motion.t, np.zeros_like(motion.u)
+    u[:, 0], u[:, 1], u[:, 2] = 3.0, -3.0, np.where(t < 16.0, 3.0, 0.0)
+    names = motion.input_names[:5]
+    limits = np.array([[-3.0, 3.0], [-3.0, 3.0], [-3.0, 3.0], [0.0, 3.0], [0.0, 0.0]])
+    motion = replace(motion, u=u, limit_names=names, limits=limits)
+    said = " ".join(motion_report(motion).split())
+    assert " after 3.92 s; at the limit all along: tau_b.x, tau_b.y ets_vii:" in said
+    assert "tau_b.y at its limit of 3 N m for 100 % of the run" in said
+    assert "tau_b.z at its limit of 3 N m for 80 % of the run" in said
+    assert "F_b" not in said
+
+
+def test_an_input_that_goes_from_limit_to_limit_is_at_its_limit_all_along():
+    motion = course(lambda t: np.exp(-t / 10.0), joint=0.0)
+    u = np.zeros_like(motion.u)
+    u[:, 0], u[:1000, 1] = -3.0, 2.0  # all of the run, and half of it
+    u[:1000, 0] = 3.0  # at the one limit or at the other
+    names, limits = ("tau_b.x", "tau_b.y"), np.array([[-3.0, 3.0], [-2.0, 2.0]])
+    said = first(replace(motion, u=u, limit_names=names, limits=limits))
+    assert said == "not settled: attitude 2.7 deg at the end; at the limit all along: tau_b.x"
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,7 @@ def test_the_default_step_divides_samples_delay_and_duration():
         ({"sample": 0.0}, "sample is 0 s, expected more than 0"),
         ({"sample": "often"}, "sample is 'often', expected a number"),
         ({"duration": 1e-200}, "expected more than 0"),
-        ({"dt": 1e-30}, "1e+30 rows"),
+        ({"dt": 1e-30}, "1e+30 steps"),
         ({"events": None}, "expected a list of functions"),
         ({"events": abs}, "expected a list of functions"),
         ({"events": [lambda t, q, v: None]}, "an event gave None at t = 0.01 s"),
@@ -183,7 +183,7 @@ def test_a_model_that_cannot_predict_is_refused():
     ):
         with pytest.raises(fflin.InputError, match="linearise that robot"):
             fflin.simulate(robot, policy, duration=1.0, linear=other)
-    with pytest.raises(fflin.InputError, match="under a StateFeedback alone"):
+    with pytest.raises(fflin.InputError, match="a function is not known to be linear"):
         fflin.simulate(robot, lambda t, q, v: np.zeros(len(lin.u0)), duration=1.0, linear=lin)
 
 

@@ -487,7 +487,7 @@ refuse("quaternion zero", arm(inside=AXIS + '<origin quat_xyzw="0 0 0 0"/>'), "l
 refuse("quaternion of three", arm(inside=AXIS + '<origin quat_xyzw="0 0 1"/>'), "has 3 entries")
 refuse("negative damping", arm(inside=AXIS + '<dynamics damping="-1"/>'), "damping", "negative")
 refuse("negative friction", arm(inside=AXIS + '<dynamics friction="-1"/>'), "friction", "negative")
-warn("damping", arm(inside=AXIS + '<dynamics damping="0.1"/>'), "damping", "'hinge'", "asked for")
+warn("damping", arm(inside=AXIS + '<dynamics damping="0.1"/>'), "damping unused: 'hinge'")
 warn("friction", arm(inside=AXIS + '<dynamics friction="0.1"/>'), "friction", "'hinge'")
 warn(
     "stiffness of a spring",

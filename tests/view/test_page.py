@@ -3,6 +3,7 @@
 import json
 import os
 import re
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -422,3 +423,58 @@ def test_on_a_long_way_the_camera_follows_unless_it_is_told_not_to(robots, tmp_p
         shown = page_data(path)
         assert shown["follow"] is expected
         assert (np.ptp(shown["points"], axis=0).max() > 5e3) is not expected
+
+
+def test_two_minutes_at_2048_rows_a_second_are_below_5_megabytes(robots, tmp_path):
+    robot = robots["servicer_7dof"]
+    motion = settling(robot, duration=120.0, predicted=True)
+    rows = np.arange(120 * 2048 + 1) * (len(motion.t) - 1) // (120 * 2048)
+    fields = ("q", "v", "x", "u", "energy", "momentum", "momentum_drift", "prediction")
+    many = {name: getattr(motion, name)[rows] for name in fields}
+    motion = replace(motion, t=np.linspace(0.0, 120.0, len(rows)), **many)
+    path = tmp_path / "long.html"
+    fflin.visualize(robot, motion, html=path)
+    assert path.stat().st_size < 5e6
+
+
+def test_without_a_target_there_is_no_ghost(robots, browser, tmp_path):
+    robot = robots["planar_detumble"]
+    motion = replace(settling(robot, duration=2.0), target=np.zeros(0))
+    path = tmp_path / "free.html"
+    fflin.visualize(robot, motion, html=path)
+    watched = Watched(browser, path.as_uri() + "#pause")
+    assert "target" not in watched.page.locator("#legend").text_content()
+    assert "error" not in watched.page.locator("#overlay").text_content()
+    children = watched.do("Object.keys(viewer.scene_tree.find(['meshcat']).children)")
+    assert "robot" in children and "target" not in children
+    # One that is asked for is there again.
+    fflin.visualize(robot, motion, html=path, target=robot.neutral())
+    watched.page.reload()
+    watched.page.wait_for_function("window.fflin && fflin.ready")
+    assert "target" in watched.page.locator("#legend").text_content()
+    assert largest_difference(watched, robot, robot.neutral(), "target") < EXACT
+    assert not watched.errors
+    watched.page.close()
+
+
+def test_a_target_that_moves_is_shown_where_it_is(robots, browser, tmp_path):
+    robot = robots["planar_detumble"]
+    motion = settling(robot, duration=4.0)
+    state = fflin.StateMap(robot, reference=motion.reference, frame=motion.frame)
+    # Steered along its own way, half a second ahead of where it is.
+    ahead = np.minimum(np.arange(len(motion.t)) + 250, len(motion.t) - 1)
+    motion = replace(motion, target=motion.x[ahead])
+    path = tmp_path / "along.html"
+    fflin.visualize(robot, motion, html=path)
+    watched = Watched(browser, path.as_uri() + "#pause")
+    for t in (0.0, 1.7, 4.0):
+        watched.do(f"fflin.seek({t})")
+        index = np.argmin(np.abs(motion.t - t))
+        target = state.to_pinocchio(motion.target[index])[0]
+        assert largest_difference(watched, robot, target, "target") < 2e-3  # between two frames
+        base, to = (pin.XYZQUATToSE3(q[:7]) for q in (motion.q[index], target))
+        angle = np.degrees(np.linalg.norm(pin.log3(to.actInv(base).rotation)))
+        value = watched.page.locator(".readouts b").first.text_content()
+        assert float(value.split()[0]) == pytest.approx(angle, rel=3e-2, abs=1e-3)
+    assert not watched.errors
+    watched.page.close()

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.robot.urdf.links import Link
-from fflin.robot.urdf.xml import named, quoted
+from fflin.robot.urdf.xml import enumerated, named, quoted
 
 # Rounding of the six numbers leaves a singular inertia with eigenvalues of about -1e-16 of the
 # largest when they are written in full; CAD programs write fewer digits.
@@ -80,10 +80,8 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
             "moment, of no account beside the links it is fixed to"
         )
     if unequal:
-        notes.append(
-            f"{origin}: the inertia of {named('link', unequal)} is not that of a rigid body: "
-            "one principal moment is more than the sum of the others"
-        )
+        # One principal moment is more than the sum of the others.
+        notes.append(f"{origin}: inertia of no rigid body: {enumerated(unequal)}")
     if weightless:
         notes.append(f"{origin}: an inertia and no mass: {named('link', weightless)}")
     return notes

@@ -18,7 +18,7 @@ from fflin.robot.urdf.mimics import counted_leaders, resolve_mimics
 from fflin.robot.urdf.tree import Urdf, read_description
 from fflin.robot.urdf.writer import write_urdf
 from fflin.robot.urdf.xacro import expand, first_xacro
-from fflin.robot.urdf.xml import Element, named, parse, told
+from fflin.robot.urdf.xml import Element, enumerated, named, parse, told
 
 _SIZE_LIMIT = 64 * 2**20
 
@@ -101,7 +101,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     mimics = resolve_mimics(urdf.joints)
     model = _build(urdf, path, root, counted_leaders(urdf.joints, mimics))
     notes += told(root)
-    notes += inertia_notes(urdf.links.values(), model, path.name)
+    notes += inertia_notes(urdf.links.values(), model, path.stem)
 
     meshes = (e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh")
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
@@ -109,20 +109,15 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     friction = {joint.name: joint.friction for joint in moving if joint.friction}
     for what, values in (("damping", damping), ("Coulomb friction", friction)):
         if values:
-            notes.append(
-                f"{path.name}: the {what} of {named('joint', list(values))} is not in the linear "
-                "model unless it is asked for"
-            )
-    unlimited = {
-        what: [joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0]
-        for what in ("effort", "velocity")
-    }
-    zeros = [f"{what} 0 of {named('joint', names)}" for what, names in unlimited.items() if names]
-    if zeros:
-        notes.append(
-            f"{path.name}: {', '.join(zeros)}: taken as no limit; if a joint has no motor, name it "
-            "in passive"
-        )
+            notes.append(f"{path.stem}: {what} unused: {enumerated(list(values))}")
+    unlimited: dict[tuple[str, ...], list[str]] = {}
+    for what in ("effort", "velocity"):
+        zero = tuple(joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0)
+        unlimited.setdefault(zero, []).append(what)
+    for zero, of in unlimited.items():
+        if zero:
+            joints = named("joint", list(zero)) if len(zero) < 3 else f"{len(zero)} joints"
+            notes.append(f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)")
     return Description(
         model,
         hashlib.sha256(document).hexdigest(),

@@ -32,9 +32,9 @@ function makeHeatMap(parent, names) {
   };
 }
 
-function makeSlider(parent, joint, send) {
+function makeSlider(parent, joint, long, send) {
   const row = document.createElement("label");
-  row.className = "slider";
+  row.className = long ? "slider long" : "slider";
   const name = document.createElement("span"), value = document.createElement("b"), slider = document.createElement("input");
   name.textContent = joint.name;
   slider.type = "range";
@@ -62,7 +62,8 @@ function makeLive({ viewer, aim, keepFramed }, info) {
     row.append(button);
   }
   if (info.joints.length) panel.append(row);
-  const sliders = info.joints.map((joint) => makeSlider(panel, joint, send));
+  const long = info.joints.some((joint) => joint.name.length > 11); // than there is room for beside a slider
+  const sliders = info.joints.map((joint) => makeSlider(panel, joint, long, send));
   const showHeat = makeHeatMap(panel, info.names);
   info.triads.forEach((each, k) => viewer.scene_tree.find([...each.path, `frame ${k}`]).object.add(triad(each)));
   const nodes = info.bodies.map((path) => viewer.scene_tree.find(path).object);

@@ -13,16 +13,31 @@ function problem(message) {
   box.hidden = !message;
 }
 
+// What is drawn beside the robot; each can be switched off.
+function legendOf(info) {
+  const entry = (label, colour, ...path) => ({ label, colour, path: ["meshcat", ...path] });
+  if (info.mode === "modes") return [entry("at rest", "#8fb4ff", "rest")];
+  const entries = [
+    ...info.trails.map(({ name, colour }) => entry(`path of the ${name}`, colour, "trails", name)),
+    ...info.arrows.map(({ kind, colour }) => entry(`${kind} on the base`, colour, "wrench", kind)),
+  ];
+  if (info.target) entries.push(entry("target", "#8fb4ff", "target"));
+  if (info.linear) entries.push(entry("linear model", "#ff7fc8", "linear"));
+  // In the panel thrusters are named in their plot; a strip of pictures has none.
+  return [...entries, ...info.plumes.map(({ name, colour }) => ({ label: name, colour, strip: true }))];
+}
+
 function makeLegend(viewer, entries) {
   const legend = document.getElementById("legend");
-  for (const { label, colour, paths, off } of entries) {
+  for (const { label, colour, path, strip } of entries) {
     const row = document.createElement("label"), check = document.createElement("input");
+    row.className = strip ? "strip" : "";
     const swatch = document.createElement("i");
     check.type = "checkbox";
-    check.checked = !off;
+    check.checked = true;
     swatch.style.setProperty("--swatch", colour);
     const set = () => {
-      for (const path of paths) viewer.set_property(path, "visible", check.checked);
+      if (path) viewer.set_property(path, "visible", check.checked);
       viewer.set_dirty();
     };
     check.addEventListener("change", set);
@@ -60,8 +75,13 @@ function main() {
     }
   });
   if (info.mode === "live") {
-    makeLegend(viewer, info.legend);
     window.fflin = makeLive(stage, info);
+    return;
+  }
+  if (info.mode === "modes") {
+    makeLegend(viewer, legendOf(info));
+    window.fflin = makeModes(stage, info);
+    if (!/[#&]pause\b/.test(location.hash)) window.fflin.play();
     return;
   }
 
@@ -69,9 +89,14 @@ function main() {
   for (const each of info.trails) each.points = floats(each.points);
   for (const each of [...info.arrows, ...info.plumes, ...info.readouts]) each.values = floats(each.values);
   for (const plot of info.plots) for (const line of plot.lines) line.values = floats(line.values);
+  paint(info.plots);
+  const thrusters = info.plots.filter((plot) => plot.title === "thrusters").flatMap((plot) => plot.lines);
+  info.plumes = info.plumes.filter((each) => thrusters.some(({ label }) => label === each.name)); // those that fire
+  for (const each of info.plumes) each.colour = thrusters.find(({ label }) => label === each.name).colour;
   const panel = document.getElementById("panel");
   const showMarks = makeMarks(viewer, info);
   const showFigures = makeReadouts(panel, info.readouts);
+  const stamp = document.getElementById("stamp");
   const base = viewer.scene_tree.find(info.base).object;
   const centre = yUp(info.centre), last = new THREE.Vector3().copy(base.position);
   const camera = viewer.camera, controls = viewer.controls;
@@ -81,6 +106,7 @@ function main() {
   const player = makePlayer(viewer, info, (i, time) => {
     showMarks(i);
     showFigures(i);
+    stamp.textContent = `t = ${figure(time, 3)} s`;
     for (const show of plots) show(i, time);
     const moved = base.position.clone().sub(last);
     last.copy(base.position);
@@ -89,9 +115,13 @@ function main() {
     centre.add(shift);
     aim(centre);
   });
-  plots = info.plots.map((plot) => makePlot(panel, info.t, plot, (time) => { player.pause(); player.seek(time); }));
+  const goTo = (time) => { player.pause(); player.seek(time); };
+  makePassed(panel, info.passed, goTo);
+  plots = info.plots.map((plot) => makePlot(panel, info.t, plot, goTo));
   if (plots.length) makeSpan(panel, info.t);
-  makeLegend(viewer, info.legend);
+  fitPlots(panel);
+  window.addEventListener("resize", () => { if (fitPlots(panel)) window.dispatchEvent(new Event("resize")); });
+  makeLegend(viewer, legendOf(info));
   const button = document.createElement("button");
   const press = () => button.setAttribute("aria-pressed", follow);
   button.textContent = "follow";
@@ -102,10 +132,11 @@ function main() {
   player.seek(player.first);
   keepFramed(() => [info.points.map(([x, y, z]) => [x + gone.x, y - gone.z, z + gone.y]), info.direction]);
   window.addEventListener("resize", () => requestAnimationFrame(() => player.seek(player.state.time)));
-  const plain = (on) => {
+  const plain = (on, keyed) => {
     document.body.classList.toggle("plain", on);
+    document.body.classList.toggle("keyed", Boolean(keyed));
     window.dispatchEvent(new Event("resize"));
   };
-  window.fflin = { ...player, plain, ready: true };
+  window.fflin = { ...player, plain, plots: info.plots, ready: true };
   if (!/[#&]pause\b/.test(location.hash)) player.play();
 }

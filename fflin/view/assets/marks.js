@@ -111,13 +111,13 @@ function torqueArrow({ colour, values, most, longest, size }) {
   return group;
 }
 
-function plume({ position, direction, values, most, size }) {
+function plume({ position, direction, values, most, size, colour }) {
   const length = 0.48 * size, radius = 0.07 * size;
   const cone = new THREE.ConeGeometry(radius, length, 28, 12, true);
   cone.translate(0, -length / 2, 0); // the nozzle at the origin, the gas along -y
   const material = new THREE.ShaderMaterial({
     transparent: true, depthWrite: false, side: THREE.DoubleSide, blending: THREE.AdditiveBlending,
-    uniforms: { length: { value: length }, power: { value: 0 } },
+    uniforms: { length: { value: length }, power: { value: 0 }, tint: { value: new THREE.Color(colour).convertSRGBToLinear() } },
     vertexShader: `
       varying float along; varying vec3 n; varying vec3 eye; uniform float length;
       void main() {
@@ -127,11 +127,11 @@ function plume({ position, direction, values, most, size }) {
         gl_Position = projectionMatrix * p;
       }`,
     fragmentShader: `
-      varying float along; varying vec3 n; varying vec3 eye; uniform float power;
+      varying float along; varying vec3 n; varying vec3 eye; uniform float power; uniform vec3 tint;
       void main() {
         float core = pow(abs(dot(normalize(n), normalize(eye))), 1.4);
         float fade = pow(1.0 - along, 1.8);
-        vec3 colour = mix(vec3(0.35, 0.55, 1.0), vec3(1.0, 0.93, 0.85), pow(1.0 - along, 5.0));
+        vec3 colour = mix(tint, vec3(1.0, 0.93, 0.85), pow(1.0 - along, 5.0));
         gl_FragColor = vec4(1.9 * colour * core * fade * (0.4 + 0.6 * power), 1.0);
       }`,
   });

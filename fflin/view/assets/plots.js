@@ -2,7 +2,10 @@
 
 const GUTTER = 44; // for the figures of the axis, right of the lines [CSS pixels]
 
-const LINES = ["#ff7a70", "#7ad97f", "#6aa5ff", "#f6c35b", "#c58bff", "#5fd6d0", "#ff9ed0", "#b6c46a", "#9aa7ff", "#d79a6a"];
+const COLOURS = ["#ff7a70", "#7ad97f", "#6aa5ff", "#f6c35b", "#c58bff", "#5fd6d0", "#ff9ed0", "#b6c46a", "#9aa7ff", "#d79a6a", "#4fb08c", "#e05fa8"];
+const NAMED = 8, UNNAMED = "#8a93a5"; // of more lines than colours those that change most are named
+
+const TALL = 62, LOW = 30; // heights of a plot where there is room, and at least
 
 function figure(value, digits) {
   if (value === 0) return "0";
@@ -25,6 +28,17 @@ function makeReadouts(parent, readouts) {
   return (i) => shows.forEach((show) => show(i));
 }
 
+// What went beyond its limit: the worst of it, which leads to its time; all of it on hovering.
+function makePassed(parent, passed, seek) {
+  if (!passed.length) return;
+  const line = document.createElement("button");
+  line.className = "passed";
+  line.textContent = `beyond its limit${passed.length > 1 ? `, the farthest of ${passed.length}` : ""}:\n${passed[0][0]}`;
+  line.title = passed.map(([text]) => text).join("\n");
+  line.addEventListener("click", () => seek(passed[0][1]));
+  parent.append(line);
+}
+
 // Where the time of the plots begins and ends.
 function makeSpan(parent, t) {
   const row = document.createElement("div");
@@ -37,27 +51,75 @@ function makeSpan(parent, t) {
   parent.append(row);
 }
 
+// Give the lines their colours: a name has one in all plots of a family, the first of which has keys.
+function paint(plots) {
+  const change = (line) => line.values.reduce((a, b) => Math.max(a, b), -Infinity) - line.values.reduce((a, b) => Math.min(a, b), Infinity);
+  for (const family of new Set(plots.map((plot) => plot.family))) {
+    const kin = plots.filter((plot) => plot.family === family), most = new Map();
+    for (const { lines } of kin) {
+      const changes = lines.map(change), largest = Math.max(...changes) || 1;
+      lines.forEach(({ label }, k) => most.set(label, Math.max(changes[k] / largest, most.get(label) || 0)));
+    }
+    let names = [...most.keys()];
+    if (names.length > COLOURS.length) {
+      const named = new Set([...names].sort((a, b) => most.get(b) - most.get(a)).slice(0, NAMED));
+      names = names.filter((name) => named.has(name));
+    }
+    const axes = names.every((name) => "xyz".includes(name));
+    const colours = new Map(names.map((name, k) => [name, COLOURS[axes ? "xyz".indexOf(name) : k]]));
+    for (const { lines } of kin) for (const line of lines) line.colour = colours.get(line.label) || UNNAMED;
+    if (names.some((name) => name)) kin[0].keys = [...colours];
+  }
+}
+
+// Which colour is whose, for this plot and those below it with the same names.
+function makeKeys(plot) {
+  if (!(plot.keys || []).length) return null;
+  const keys = document.createElement("div");
+  keys.className = "keys";
+  const grey = new Set(plot.lines.map((line) => line.label));
+  for (const [label, colour] of plot.keys) {
+    const key = document.createElement("span");
+    key.textContent = label;
+    key.style.setProperty("--swatch", colour);
+    keys.append(key);
+    grey.delete(label);
+  }
+  if (grey.size) keys.append(`and ${grey.size} in grey`);
+  return keys;
+}
+
+// Give the plots of a panel the height that is there for them, in a wide window in two columns
+// where one is too short. Returns whether the panel has another width by that.
+function fitPlots(panel) {
+  const count = panel.querySelectorAll(".plot").length, width = panel.clientWidth;
+  const over = () => Math.max(panel.scrollHeight - panel.clientHeight, panel.scrollWidth - panel.clientWidth);
+  const fit = (wide) => {
+    panel.classList.toggle("wide", wide);
+    for (let tall = TALL; ; tall = Math.max(LOW, tall - Math.max(2, Math.floor(over() / count)))) {
+      panel.style.setProperty("--tall", `${tall}px`);
+      if (over() <= 0 || tall === LOW || !count) return over() <= 0;
+    }
+  };
+  if (!fit(false) && window.innerWidth >= 1100) fit(true);
+  return panel.clientWidth !== width;
+}
+
 function makePlot(parent, t, plot, seek) {
   const box = document.createElement("div");
   box.className = "plot";
-  const name = document.createElement("div");
+  const name = document.createElement("div"), at = document.createElement("span");
   name.className = "name";
-  name.append(plot.unit ? `${plot.title} [${plot.unit}]` : plot.title);
-  const keys = document.createElement("span");
-  keys.className = "keys";
-  plot.lines.forEach((line, k) => {
-    if (!line.label) return;
-    const key = document.createElement("i");
-    key.textContent = line.label;
-    key.style.color = LINES[k % LINES.length];
-    keys.append(key);
-  });
-  if (plot.lines.length <= 4) name.append(keys);
+  name.append(plot.unit ? `${plot.title} [${plot.unit}]` : plot.title, at);
+  at.className = "at";
   const canvas = document.createElement("canvas");
-  box.append(name, canvas);
+  const keys = makeKeys(plot);
+  // x, y, z have room beside the title.
+  if (keys && keys.textContent.length < 6) name.append(keys);
+  box.append(name, ...(keys && !keys.parentNode ? [keys] : []), canvas);
   parent.append(box);
 
-  const values = plot.lines.flatMap((line) => Array.from(line.values)).filter(Number.isFinite);
+  const values = [...plot.lines.flatMap((line) => Array.from(line.values)).filter(Number.isFinite), ...plot.lines.flatMap((line) => line.limits)];
   let low = Math.min(0, ...[values.reduce((a, b) => Math.min(a, b), Infinity)]);
   let high = Math.max(0, ...[values.reduce((a, b) => Math.max(a, b), -Infinity)]);
   const least = low, most = high;
@@ -85,15 +147,23 @@ function makePlot(parent, t, plot, seek) {
     for (const level of [low, 0, high]) { context.moveTo(0, y(level)); context.lineTo(width - GUTTER * ratio, y(level)); }
     context.stroke();
     context.lineJoin = "round";
-    plot.lines.forEach((line, k) => {
-      context.strokeStyle = LINES[k % LINES.length];
+    context.setLineDash([5 * ratio, 4 * ratio]);
+    for (const { colour, limits } of plot.lines) for (const level of limits) {
+      context.strokeStyle = colour;
+      context.beginPath();
+      context.moveTo(0, y(level)); context.lineTo(width - GUTTER * ratio, y(level));
+      context.stroke();
+    }
+    context.setLineDash([]);
+    plot.lines.forEach((line) => {
+      context.strokeStyle = line.colour;
       context.lineWidth = 1.4 * ratio;
       context.beginPath();
       line.values.forEach((value, i) => context.lineTo(x(t[i]), y(value)));
       context.stroke();
     });
     context.fillStyle = style.getPropertyValue("--faint");
-    context.font = `${10 * ratio}px system-ui, sans-serif`;
+    context.font = `${11 * ratio}px system-ui, sans-serif`;
     context.textBaseline = "middle";
     context.textAlign = "right";
     const half = 6 * ratio, taken = [];
@@ -117,19 +187,30 @@ function makePlot(parent, t, plot, seek) {
     context.moveTo(x(time), 0); context.lineTo(x(time), height);
     context.stroke();
     context.globalAlpha = 1;
-    plot.lines.forEach((line, k) => {
-      context.fillStyle = LINES[k % LINES.length];
+    plot.lines.forEach((line) => {
+      context.fillStyle = line.colour;
       context.beginPath();
       context.arc(x(time), y(line.values[i]), 2.3 * ratio, 0, 7);
       context.fill();
     });
   };
-  const pick = (event) => {
+  const under = (event) => {
     const bounds = canvas.getBoundingClientRect();
-    seek(first + duration * Math.min(1, Math.max(0, (event.clientX - bounds.left) / (bounds.width - GUTTER))));
+    return first + duration * Math.min(1, Math.max(0, (event.clientX - bounds.left) / (bounds.width - GUTTER)));
+  };
+  const pick = (event) => seek(under(event));
+  // The line nearest to the pointer, by its name, and its value there.
+  const tell = (event) => {
+    const time = under(event), row = (event.clientY - canvas.getBoundingClientRect().top) * ratio;
+    const after = t.findIndex((each) => each >= time), i = after < 0 ? t.length - 1 : after;
+    const away = (line) => Math.abs(y(line.values[i]) - row);
+    const { label, values, colour } = plot.lines.reduce((a, b) => (away(b) < away(a) ? b : a));
+    at.textContent = `${label} ${figure(values[i], 3)}`.trim();
+    at.style.color = colour;
   };
   canvas.addEventListener("pointerdown", (event) => { canvas.setPointerCapture(event.pointerId); pick(event); });
-  canvas.addEventListener("pointermove", (event) => { if (event.buttons) pick(event); });
+  canvas.addEventListener("pointermove", (event) => { tell(event); if (event.buttons) pick(event); });
+  canvas.addEventListener("pointerleave", () => { at.textContent = ""; });
   window.addEventListener("resize", () => { drawn = null; });
   return show;
 }

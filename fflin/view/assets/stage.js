@@ -56,7 +56,10 @@ function makeStage(info) {
 
   // The part of the window that the panels leave free.
   const free = () => {
-    if (document.body.classList.contains("plain")) return { right: 0, top: 0, bottom: 0 };
+    if (document.body.classList.contains("plain")) {
+      const legend = document.getElementById("legend").getBoundingClientRect();
+      return { right: 0, top: 30, bottom: legend.height + 16 };
+    }
     const panel = document.getElementById("panel").getBoundingClientRect();
     const bar = document.getElementById("bar").getBoundingClientRect();
     const w = window.innerWidth, h = window.innerHeight;

@@ -244,7 +244,7 @@ def test_notes_name_six_joints_and_count_the_rest():
     damped = AXIS + '<dynamics damping="1"/>'
     joints = [joint(f"j{k}", "l0", f"l{k}", inside=damped) for k in range(1, 9)]
     (note,) = read(robot(*links, *joints)).notes
-    assert "the damping of joints 'j1', 'j2', 'j3', 'j4', 'j5', 'j6' and 2 more" in note
+    assert "damping unused: 'j1', 'j2', 'j3', 'j4', 'j5', 'j6' and 2 more" in note
 
 
 def test_blanks_at_the_end_of_a_name_are_seen():
@@ -261,7 +261,7 @@ def test_hash_is_of_the_file(tmp_path):
 def test_load_warns_and_keeps_the_notes(tmp_path):
     path = tmp_path / "r.urdf"
     path.write_text(arm(inside=AXIS + '<dynamics damping="1"/>'))
-    with pytest.warns(fflin.FflinWarning, match="damping of joint 'hinge'") as caught:
+    with pytest.warns(fflin.FflinWarning, match="damping unused: 'hinge'") as caught:
         loaded = fflin.load(path)
     assert [warning.filename for warning in caught] == [__file__]
     assert loaded.notes == tuple(str(warning.message) for warning in caught)
@@ -288,7 +288,7 @@ def test_info_lists_the_warnings(tmp_path):
     path.write_text(arm(inside=AXIS + '<dynamics damping="1"/>'))
     with pytest.warns(fflin.FflinWarning):
         text = robot_info(fflin.load(path))
-    assert "\nwarnings\n  r.urdf: the damping of joint 'hinge'" in text
+    assert "\nwarnings\n  r: damping unused: 'hinge'" in text
 
 
 def test_info_lists_mimic_joints_and_what_hangs_on_them(tmp_path):

@@ -1,0 +1,146 @@
+"""Reaction wheels in a linear model: whose angle and speed nothing else depends on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from functools import partial
+from typing import Any, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fflin.analysis.mechanics import second_order
+from fflin.analysis.ranks import Noisy, echelon, image, null_space
+from fflin.base.errors import InputError
+from fflin.base.names import input_keys
+from fflin.base.validation import Array
+from fflin.linear.model import Certificate, LinearModel
+
+Indices: TypeAlias = NDArray[np.intp]
+Make: TypeAlias = Callable[[LinearModel], LinearModel]
+Part = TypeVar("Part", bound=LinearModel)
+
+# What is smaller, relative to the rest, is rounding.
+_ROUNDING = 1e-9
+
+
+def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
+    """Return the names of the inputs that are wheels."""
+    keys = (key.partition(".") for key in input_keys(lin))
+    return tuple(name for group, _, name in keys if group == "wheel")
+
+
+def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
+    """Return the wheels (k,) on whose angle nothing depends, and those whose speed is so too.
+
+    A speed matters where the carrier turns at the point, and where the wheel has friction.
+    """
+    nv, wanted = len(lin.M), {f"q_m.{name}" for name in wheel_inputs(lin)}
+    at = np.flatnonzero([name in wanted for name in lin.state_names[:nv]])
+    if not len(at):
+        return at, at
+    system = second_order(lin.generator or lin)
+    units, spin = np.outer(system.size, system.size[at]), np.abs(lin.x0[nv + at])
+    # What balances at a speed leaves the rounding of its square, and no other to compare with.
+    still = np.abs(system.K.values[:, at]) <= _ROUNDING * spin**2 * units
+    free = np.abs(system.D.values[:, at]) <= _ROUNDING**2 * spin * units
+    angle = still.all(axis=0)
+    return at[angle], at[angle & free.all(axis=0)]
+
+
+def leaving(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
+    """Return the wheels (k,) that leave a design, (9.5) of docs/derivation.md.
+
+    Inputs that turn nothing at rest may still spin wheels: as many as they do so independently can
+    be held. By default these stay where something else turns the base.
+    """
+    if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
+        raise InputError(f"wheel_speeds is {wheel_speeds!r}, expected True, False or None")
+    _, free = ignorable_wheels(lin)
+    if len(free) and wheel_speeds is None:
+        turning = [name.startswith("q_b.") for name in lin.state_names[: len(lin.M)]]
+        wheel_speeds = bool(second_order(lin.generator or lin).S.values[turning].any())
+    if not len(free) or not wheel_speeds:
+        return free
+    forces = rigid_forces(without(lin.generator or lin, free))
+    sizes = np.linalg.norm(forces.values, axis=0)
+    idle = null_space(forces @ np.diag(1.0 / np.where(sizes > 0.0, sizes, 1.0)))[0]
+    motors = [lin.input_names.index(lin.state_names[i].removeprefix("q_m.")) for i in free]
+    spun = image(idle[motors], _ROUNDING)[0]
+    held: Any = echelon(spun, np.ones(len(free)))[1]
+    return np.delete(free, held)
+
+
+def rigid_forces(body: LinearModel) -> Noisy:
+    """Return what the inputs do to the rigid motions (r, nu), which no spring holds."""
+    system = second_order(body)
+    motions = null_space(system.K.T @ np.diag(1.0 / system.size))[0] / system.size[:, None]
+    return system.S.after(motions.T)
+
+
+def without(lin: LinearModel, left: Indices) -> LinearModel:
+    """Return a model without coordinates (k,) and their rates, exact whatever these do (9.4)."""
+    nv, M = len(lin.M), lin.M
+    kept = np.setdiff1d(np.arange(nv), left)
+    across = M[np.ix_(left, kept)]
+    rest = M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(M[np.ix_(left, left)], across)
+    names = [lin.state_names[i] for i in (*kept, *(kept + nv))]
+    return selected(lin, names, rest, partial(without, left=left))
+
+
+def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
+    """Return the model of some states, of the inertia M, and of the outputs that see no others."""
+    S = picked(names, lin.state_names)
+    seen = seen_through(lin, S)
+    values = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
+    values |= part_of(lin, S, S.T, M)
+    values |= {"C": seen @ lin.C @ S.T, "D": seen @ lin.D, "y0": seen @ lin.y0}
+    for key in ("output_names", "output_units"):
+        values[key] = tuple(getattr(lin, key)[i] for i in seen.argmax(axis=1))
+    return certified(LinearModel(**values), lin, make)
+
+
+def picked(names: Sequence[str], of: Sequence[str]) -> Array:
+    """Return S (k, n) that picks names from others."""
+    return np.eye(len(of))[[of.index(name) for name in names]]
+
+
+def seen_through(lin: LinearModel, S: Array) -> Array:
+    """Return O (k, ny) that picks the outputs which see none but the states S x."""
+    others = np.abs(lin.C - lin.C @ S.T @ S).max(axis=1, initial=0.0)
+    return np.eye(len(lin.C))[others <= 1e-12 * np.abs(lin.C).max(axis=1, initial=0.0)]
+
+
+def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, Any]:
+    """Return the fields of a model of the states z = S x of the inertia M, the others T z."""
+    M.setflags(write=False)
+    names = tuple(lin.state_names[i] for i in S.argmax(axis=1))
+    return {
+        "A": S @ lin.A @ T,
+        "B": S @ lin.B,
+        "f0": S @ lin.f0,
+        "x0": S @ lin.x0,
+        "state_names": names,
+        "state_units": tuple(lin.state_units[i] for i in S.argmax(axis=1)),
+        "_ignorable": partial(_given, tuple(name for name in names if name in lin.ignorable)),
+        "_drift": None if lin.drift is None else S @ lin.drift,
+        "_inertia": partial(_given, M),
+    }
+
+
+def certified(part: Part, lin: LinearModel, make: Make) -> Part:
+    """Return a part with the certificate of the whole, and with what made it of its source."""
+    fingerprint, source = part.fingerprint, lin.generator
+    certify = partial(_same_certificate, lin, fingerprint)
+    of = (fingerprint, make(source)) if lin.dt and source is not None else None
+    return replace(part, _certify=certify, _source=of)
+
+
+def _given(value: Any, _: LinearModel) -> Any:
+    return value
+
+
+def _same_certificate(whole: LinearModel, fingerprint: str, lin: LinearModel) -> Certificate:
+    lin.require(fingerprint)
+    return whole.certificate

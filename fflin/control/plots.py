@@ -1,0 +1,155 @@
+"""Figures of loops: where their poles are, and what each input bears."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.figures import COLORS, cycle, drawing, letters_of, logarithmic
+from fflin.base.validation import Array, number
+from fflin.control.gain import Gain
+from fflin.control.loops import Loop, input_loops
+from fflin.linear.model import LinearModel
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_LINE = "#888888"
+
+
+def plot_poles(
+    poles: Any, path: str | Path | None = None, *, dt: float = 0.0, title: str = "poles"
+) -> Figure:
+    """Draw a pole map; where poles differ by more than a factor of 10, on logarithmic axes.
+
+    Parameters
+    ----------
+    poles : array_like or Gain or LinearModel
+        Poles [1/s], or what has them; several of these as {label: poles}.
+    path : str or Path, optional
+        .png, .pdf or .svg to save to; errors as in `plot_motion`.
+    dt : float
+        Sampling time of poles that are given as numbers; then the unit circle is drawn.
+    title : str
+    """
+    dt = number("dt", dt)
+    sets = poles if isinstance(poles, dict) else {"": poles}
+    found = {str(label): _poles_of(given) for label, given in sets.items()}
+    dt = next((own for _, own in found.values() if own), dt)
+    with drawing(path, 6.0, 5.0) as figure:
+        axes = figure.add_subplot()
+        _pole_map(axes, {label: values for label, (values, _) in found.items()}, dt)
+        axes.set_title(title)
+        if any(sets):
+            figure.legend(loc="outside lower center", ncols=4)
+    return figure
+
+
+def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
+    """Draw the loop of each input, the others closed: Bode plot, margins, and the poles of all.
+
+    Parameters
+    ----------
+    gain : Gain
+    path : str or Path, optional
+        .png, .pdf or .svg to save to; errors as in `plot_motion`.
+    """
+    if not isinstance(gain, Gain):
+        raise InputError(f"gain is a {type(gain).__name__}, expected what fflin.lqr returns")
+    tall = max(8.5, 1.5 + 0.12 * len(gain.K))
+    with drawing(path, 11.0, tall) as figure:
+        w, response, loops = input_loops(gain)
+        sizes, phases, poles = figure.subplots(3, 1)
+        _bode(sizes, phases, w, response, loops)
+        names = (
+            f"{name}: {min(loop.phase, 180.0):.0f} deg, {loop.gain[0]:.2g} to {loop.gain[1]:.3g}"
+            for name, loop in zip(gain.input_names, loops, strict=True)
+        )
+        figure.legend(
+            sizes.get_lines()[: len(loops)],
+            names,
+            title="margins: phase, factors on the gain",
+            loc="outside right upper",
+            fontsize=letters_of(1.3 * len(loops), 72.0 * (tall - 1.5)),
+        )
+        # Those of a step lie close to one, and their rates apart.
+        rates = np.log(gain.poles[gain.poles != 0.0]) / gain.dt if gain.dt else gain.poles
+        _pole_map(poles, {"": rates}, 0.0)
+        poles.set_title("poles z of A - B K as rates ln(z)/dt" if gain.dt else "poles of A - B K")
+        low, high = gain.margins.gain
+        figure.suptitle(
+            f"{gain.robot}{f', sampled at {gain.dt:g} s' if gain.dt else ''}: loop of each input, "
+            f"the others closed\nall at once bear {gain.margins.phase:.3g} deg, {low:.2g} to "
+            f"{high:.3g} (disk margin {gain.margins.disk:.3g})",
+            x=0.02,
+            ha="left",
+        )
+    return figure
+
+
+def _bode(sizes: Axes, phases: Axes, w: Array, response: Any, loops: Sequence[Loop]) -> None:
+    colors = cycle(len(loops))
+    sizes.set_prop_cycle(color=colors)
+    sizes.loglog(w, np.abs(response), lw=1.0)
+    for color, values, loop in zip(colors, response.T, loops, strict=True):
+        angle = np.degrees(np.unwrap(np.angle(values)))
+        angle -= 360.0 * math.ceil(angle[-1] / 360.0)
+        phases.semilogx(w, angle, color=color, lw=1.0)
+        marked: dict[str, Any] = {"color": color, "ms": 3, "lw": 0.6, "markevery": [0]}
+        for at, _ in loop.crossings:
+            of = float(np.interp(math.log(at), np.log(w), angle))
+            sizes.plot([at], [1.0], "o", **marked)
+            phases.plot([at] * 2, [of, of - math.remainder(of - 180.0, 360.0)], "o-", **marked)
+        for at, size in loop.turns:
+            if w[0] <= at <= w[-1]:
+                sizes.plot([at, at], [size, 1.0], "s-", **marked)
+    sizes.axhline(1.0, color=_LINE, lw=0.8)
+    phases.axhline(-180.0, color=_LINE, lw=0.8)
+    phases.locator_params("y", nbins=6, steps=[1, 1.5, 3, 4.5, 6, 9, 10])
+    sizes.set(title="gain of the loop (dot: 1, square: phase -180 deg)", ylabel="|L|")
+    phases.set(title="phase of the loop", ylabel="[deg]")
+    for axes in (sizes, phases):
+        axes.set(xlabel="frequency [rad/s]", xlim=(w[0], w[-1]))
+
+
+def _pole_map(axes: Axes, sets: dict[str, Any], dt: float) -> None:
+    for place, (label, values) in enumerate(sets.items()):
+        axes.plot(
+            values.real,
+            values.imag,
+            "x" if place == 0 else "+",
+            color=COLORS[place % len(COLORS)],
+            label=label or None,
+        )
+    if dt:
+        angle = np.linspace(0.0, 2.0 * np.pi, 201)
+        axes.plot(np.cos(angle), np.sin(angle), color=_LINE, lw=0.8)
+        axes.set_aspect("equal")
+    else:
+        axes.axvline(0.0, color=_LINE, lw=0.8)
+        every = np.concatenate([np.ravel(values) for values in sets.values()])
+        unit = float(np.abs(every).max(initial=0.0))
+        logarithmic(axes, "x", every.real, unit)
+        logarithmic(axes, "y", every.imag, unit)
+    of = "" if dt else " [1/s]"
+    axes.set(xlabel=f"real part{of}", ylabel=f"imaginary part{of}")
+
+
+def _poles_of(given: Any) -> tuple[Any, float]:
+    if isinstance(given, LinearModel):
+        return np.linalg.eigvals(given.A), given.dt
+    if hasattr(given, "poles"):
+        return np.asarray(given.poles), float(getattr(given, "dt", 0.0))
+    try:
+        poles = np.asarray(given)
+    except ValueError:
+        poles = np.asarray(None)  # its rows differ in length
+    if poles.dtype.kind not in "fiuc" or not np.isfinite(poles).all():
+        raise InputError(f"poles is a {type(given).__name__}, expected finite numbers or a Gain")
+    return poles.ravel(), 0.0

@@ -1,0 +1,63 @@
+"""Whether what was made for one robot has the names and units of another."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeAlias
+
+from fflin.base.errors import InputError
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+
+if TYPE_CHECKING:
+    from fflin.linear.model import LinearModel
+    from fflin.robot.robot import Robot
+
+# Names and units, in their order.
+Signals: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
+
+_SHOWN = 4
+
+
+def require_fit(lin: LinearModel, robot: Robot, state: StateMap) -> None:
+    """Raise `InputError` where a model's states or inputs are not those of a robot.
+
+    Its masses may be others: a controller meets a robot that is not quite its model.
+    """
+    made, actuation = f"the model is one of '{lin.robot}'", Actuation(state)
+    inputs = (lin.input_names, lin.input_units)
+    require_same(made, robot, "input", inputs, (actuation.names, actuation.units))
+    # A reduced model has a part of the states.
+    units = dict(zip(state.names, state.units, strict=True))
+    there = tuple(name for name in lin.state_names if name in units)
+    states = (lin.state_names, lin.state_units)
+    require_same(made, robot, "state", states, (there, tuple(units[name] for name in there)))
+    require_turns(made, len(lin.q), robot)
+
+
+def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signals) -> None:
+    """Raise `InputError` that says which names and units differ from those of a robot."""
+    mine, others = (dict(zip(*each, strict=True)) for each in (own, there))
+    lacking, beside = ([n for n in a if n not in b] for a, b in ((mine, others), (others, mine)))
+    if names := lacking or beside:
+        shown = ", ".join([*names[:_SHOWN], *["..."] * bool(names[_SHOWN:])])
+        with_or_without = "without" if lacking else "with"
+        said = f"{with_or_without} the {kind}{'s' * bool(names[1:])} {shown}"
+    elif other := [name for name in mine if mine[name] != others[name]]:
+        said = f"whose {kind} {other[0]} is in {others[other[0]]}, not {mine[other[0]]}"
+    elif own != there:
+        said = f"whose {kind}s stand in another order"
+    else:
+        return
+    raise InputError(
+        f"{made}, not of '{robot.name}' as it is given, {said}; linearise "
+        "this robot, or give it the same (Robot.replace)"
+    )
+
+
+def require_turns(made: str, size: int, robot: Robot) -> None:
+    """Raise `InputError` where a configuration of that size is none of a robot."""
+    if size != robot.nq:
+        raise InputError(
+            f"{made}, not of '{robot.name}' as it is given, whose configuration has {robot.nq} "
+            f"entries, not {size}: other joints are continuous; linearise this robot"
+        )

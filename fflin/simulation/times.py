@@ -1,0 +1,178 @@
+"""The step of a simulation, and how many steps there are between what happens."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fflin.base.errors import FflinWarning, InputError
+from fflin.base.validation import number, whole
+from fflin.control.policies import feedback_of
+
+LARGEST_TURN = 1.0  # within one step [rad], beyond which no integrator follows
+_STEP = 0.01  # [s]
+_MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
+_MANY_STEPS, _ENDLESS = 50_000, 10_000_000  # half a minute, and some hours that nobody asked for
+_MANY_ROWS, _FEW_ROWS = 100_000, 10_000  # that nobody reads, and that a page or a plot shows
+_ALIKE = 1e-3  # parts in a mode, relative, of which the first is named
+_LONGEST = 1e100  # [s]; the square of its inverse is still a number
+
+
+class Times(NamedTuple):
+    """The step `dt` [s], and how many steps there are in all and between what happens."""
+
+    dt: float
+    steps: int
+    every: int  # from one recorded row to the next
+    sample: int  # between samples of the law; 0 where it is asked at every stage of every step
+    delay: int  # from a sample to its effect
+    fastest: float  # magnitude of the loop's poles [1/s]; 0 where it is not known
+    mode: str  # the state that moves most at that pole, where it asks for a small step
+    thinned: bool  # whether `every` was chosen here
+
+    @property
+    def rows(self) -> int:
+        """Most rows that are recorded."""
+        return self.steps // self.every + 2
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is to be said of the rows."""
+        said = f"one in {self.every} of {self.steps:,} steps is recorded; every=1 (--every 1) "
+        return (f"{said}records all",) if self.thinned else ()
+
+    @property
+    def slow(self) -> float:
+        """Square of the velocity up to which no turn within a step is too large."""
+        return float((LARGEST_TURN / self.dt) ** 2)
+
+    def require_room(self, width: int, *, chosen: bool) -> None:
+        """Raise `InputError` where rows of so many numbers, or the steps, are too many.
+
+        `chosen` says that the step was chosen here and not given; where the loop's fastest pole
+        asks for many steps, an `FflinWarning` says so.
+        """
+        forced = chosen and self.fastest * _STEP > 1.0
+        most = _ENDLESS if self.thinned else _MOST_STEPS
+        if self.rows * width > _MOST_ENTRIES or self.steps > most:
+            asked = f", which the loop's fastest pole at {self.fastest:.3g} 1/s asks for,"
+            raise InputError(
+                f"{self.steps * self.dt:g} s in steps of {self.dt:g} s"
+                f"{asked if forced else ''} are "
+                f"{self.steps:.3g} steps and {self.rows:.3g} rows; take a larger dt or `every`"
+                f"{self._moving if forced else ''}"
+            )
+        if forced and self.steps > _MANY_STEPS:
+            warnings.warn(
+                f"the loop's fastest pole at {self.fastest:.3g} 1/s asks for steps of "
+                f"{self.dt:.3g} s, {self.steps:,} in all; give dt= or sample=, or a slower gain"
+                f"{self._moving}",
+                FflinWarning,
+                stacklevel=3,
+            )
+
+    @property
+    def _moving(self) -> str:
+        return f": {self.mode} moves most there"
+
+
+def times_of(
+    policy: Any,
+    duration: float,
+    dt: float | None,
+    every: int | None,
+    sample: float | None,
+    delay: float,
+) -> Times:
+    """Return the times of a simulation, whose arguments are those of `simulate`."""
+    if sample is not None:
+        sample = _positive("sample", sample)
+    else:
+        sample = getattr(getattr(policy, "lin", None), "dt", None) or None
+    fastest, mode = (0.0, "") if sample else _fastest_pole(policy)
+    duration, delay = _positive("duration", duration), number("delay", delay)
+    if not 0.0 <= delay <= _LONGEST:
+        raise InputError(f"delay is {delay:g} s, expected 0 to {_LONGEST:g} s")
+    if every is not None:
+        every = whole("every", every, 1)
+    if dt is None:
+        dt = _STEP
+        if fastest * dt > 1.0:
+            dt = float(0.5 ** np.ceil(np.log2(fastest)))
+        if sample or delay:
+            dt = _part_of(sample or delay, dt, duration, delay)
+    dt = _positive("the step dt", dt)
+    steps = max(1, round(duration / dt))
+    if abs(steps * dt - duration) > 1e-6 * duration:
+        if sample or delay:
+            raise InputError(
+                f"duration is {duration:g} s, expected a multiple of the step dt = {dt:g} s where "
+                "the input is sampled or late; choose the step so"
+            )
+        steps = int(np.ceil(duration / dt))
+        dt = duration / steps
+    if sample is None:
+        sample = dt if delay else 0.0
+    samples, late = _whole(dt, sample=sample, delay=delay)
+    thinned = every is None and steps > _MANY_ROWS
+    if every is None:
+        every = _thinning(steps, samples) if thinned else 1
+    return Times(dt, steps, every, samples, late, fastest, mode, thinned)
+
+
+def _thinning(steps: int, sample: int) -> int:
+    """Return the steps from row to row, for rows that are few and fall on samples, if there are."""
+    least = -(-steps // _FEW_ROWS)
+    if least >= sample:
+        return max(sample, 1) * -(-least // max(sample, 1))
+    return next(part for part in range(least, sample + 1) if sample % part == 0)
+
+
+def _fastest_pole(policy: Any) -> tuple[float, str]:
+    """Return the largest magnitude [1/s] of the poles of a continuous loop, and what moves there.
+
+    The state is named that takes the largest part in the mode, by the products of its left and
+    right vectors, which have no unit; only where the pole asks for a step below the usual one.
+    """
+    lin, K = feedback_of(policy)
+    if lin is None or K is None or lin.dt:
+        return 0.0, ""
+    loop = lin.A - lin.B @ K
+    fastest = float(np.abs(np.linalg.eigvals(loop)).max())
+    if fastest * _STEP <= 1.0:
+        return fastest, ""
+    from scipy.linalg import eig
+
+    poles, left, right = eig(loop, left=True, right=True)
+    parts = np.abs(left * right)[:, np.abs(poles).argmax()]
+    return fastest, lin.state_names[int(np.argmax(parts > (1.0 - _ALIKE) * parts.max()))]
+
+
+def _whole(dt: float, **times: float) -> list[int]:
+    """Return named times [s] in steps."""
+    for name, time in times.items():
+        if abs(round(time / dt) * dt - time) > 1e-6 * dt:
+            raise InputError(
+                f"{name} is {time:g} s, expected a multiple of the step dt = {dt:g} s; "
+                "choose the step so"
+            )
+    return [round(time / dt) for time in times.values()]
+
+
+def _part_of(sample: float, largest: float, *times: float) -> float:
+    """Return a step of which the sample and, where there is one, the other times are multiples."""
+    least = int(np.ceil(sample / largest))
+    for parts in range(least, least + 1000):
+        dt = sample / parts
+        if all(abs(round(time / dt) * dt - time) <= 1e-6 * dt for time in times):
+            return dt
+    return sample / least
+
+
+def _positive(name: str, value: Any) -> float:
+    time = number(name, value)
+    if not 1.0 / _LONGEST < time <= _LONGEST:
+        raise InputError(f"{name} is {time:g} s, expected more than 0 and at most {_LONGEST:g} s")
+    return time

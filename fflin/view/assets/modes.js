@@ -1,0 +1,99 @@
+// Natural modes: the robot swings in one of them at a time, about where it stands.
+
+// Whether a phase [deg] is neither 0 nor 180, and the sign of what moves with it if it is one.
+const aside = (phase) => Math.abs(Math.sin((phase * Math.PI) / 180)) > 0.02;
+const sign = (phase) => (!aside(phase) && Math.abs(phase) > 90 ? "−" : "");
+
+// A mode by the two positions that move most, and whether they move alike.
+function nameOf({ shape }) {
+  const [first, second] = shape.map(([name]) => name.replace(/^q_m\./, ""));
+  if (!second || shape[1][2] < 0.5) return first;
+  return `${first} ${Math.abs(shape[1][3]) > 90 ? "−" : "+"} ${second}`;
+}
+
+function makeModes({ viewer, aim, keepFramed }, info) {
+  const panel = document.getElementById("panel"), bar = document.getElementById("bar");
+  const nodes = info.bodies.map((path) => viewer.scene_tree.find(path).object), n = nodes.length;
+  info.modes.forEach((mode) => { mode.poses = floats(mode.poses); });
+  info.triads.forEach((each, k) => viewer.scene_tree.find([...each.path, `frame ${k}`]).object.add(triad(each)));
+
+  const list = document.createElement("div"), shape = document.createElement("div");
+  const head = document.createElement("div");
+  list.className = "choices";
+  head.className = "figures";
+  const cells = (parent, texts) => texts.forEach((text) => parent.append(Object.assign(document.createElement("span"), { textContent: text })));
+  cells(head, ["rad/s", "Hz", "damping"]);
+  shape.className = "readouts shape";
+  const rows = info.modes.map((mode, k) => {
+    const row = document.createElement("button"), name = document.createElement("b"), figures = document.createElement("div");
+    name.textContent = nameOf(mode) + (mode.unstable ? " (unstable)" : "");
+    figures.className = "figures";
+    cells(figures, [figure(mode.frequency, 4), figure(mode.frequency / (2 * Math.PI), 4), figure(mode.damping, 3)]);
+    row.append(name, figures);
+    row.addEventListener("click", () => pick(k));
+    list.append(row);
+    return row;
+  });
+  panel.append(head, list, shape);
+  const button = document.createElement("button"), slider = document.createElement("input"), pace = document.createElement("output");
+  button.className = "play";
+  Object.assign(slider, { type: "range", min: 0, max: 1, step: "any", value: 0 });
+  slider.setAttribute("aria-label", "phase");
+  bar.append(button, slider, pace);
+
+  const state = { mode: 0, phase: 0, playing: false };
+  const position = new THREE.Vector3(), turn = new THREE.Quaternion();
+  let then = 0;
+  const seek = (phase) => {
+    state.phase = phase - Math.floor(phase);
+    const { poses } = info.modes[state.mode], count = poses.length / (7 * n);
+    const at = state.phase * count, i = Math.floor(at) % count, j = (i + 1) % count, share = at - Math.floor(at);
+    nodes.forEach((node, k) => {
+      const a = 7 * (i * n + k), b = 7 * (j * n + k);
+      node.position.fromArray(poses, a).lerp(position.fromArray(poses, b), share);
+      node.quaternion.fromArray(poses, a + 3).slerp(turn.fromArray(poses, b + 3), share);
+    });
+    slider.value = state.phase;
+    viewer.set_dirty();
+  };
+  const pick = (k) => {
+    state.mode = Math.min(rows.length - 1, Math.max(0, k));
+    rows.forEach((row, other) => row.setAttribute("aria-pressed", other === state.mode));
+    rows[state.mode].scrollIntoView({ block: "nearest" });
+    const mode = info.modes[state.mode], ratio = (mode.frequency / (2 * Math.PI)) * info.period;
+    pace.textContent = `shown at ${figure(1 / info.period, 2)} Hz, ${figure(Math.max(ratio, 1 / ratio), 2)}× ${ratio > 1 ? "slower" : "faster"}`;
+    shape.textContent = "";
+    for (const [name, unit, size, phase] of mode.shape) {
+      const left = document.createElement("span"), right = document.createElement("b");
+      left.textContent = name;
+      right.textContent = `${sign(phase)}${figure(size, 2)} ${unit === "1" ? "" : unit}${aside(phase) ? ` at ${phase.toFixed(0)}°` : ""}`.trim();
+      shape.append(left, right);
+    }
+    seek(state.phase);
+  };
+  const mark = () => {
+    button.textContent = state.playing ? "❚❚" : "▶";
+    button.setAttribute("aria-label", state.playing ? "pause" : "play");
+  };
+  const play = () => { state.playing = true; then = performance.now(); mark(); };
+  const pause = () => { state.playing = false; mark(); };
+  viewer.animator.update = () => {
+    if (!state.playing) return;
+    const now = performance.now();
+    seek(state.phase + (now - then) / 1000 / info.period);
+    then = now;
+  };
+  button.addEventListener("click", () => (state.playing ? pause() : play()));
+  slider.addEventListener("input", () => { pause(); seek(Number(slider.value)); });
+  window.addEventListener("keydown", (event) => {
+    if (event.target.matches("input")) return;
+    const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+    if (step) { event.preventDefault(); pick(state.mode + step); }
+    else if (event.key === " " && !event.target.matches("button")) { event.preventDefault(); state.playing ? pause() : play(); }
+  });
+  mark();
+  pick(0);
+  aim(yUp(info.centre));
+  keepFramed(() => [info.points, info.direction]);
+  return { seek, pick, play, pause, state, ready: true };
+}

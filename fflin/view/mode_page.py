@@ -1,0 +1,111 @@
+"""From natural modes to the page that plays them: the robot swings in one of them at a time."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.tables import counted
+from fflin.base.validation import Array
+from fflin.dynamics.state import StateMap
+from fflin.robot.robot import Robot
+from fflin.view.motion_page import corner_points, rounded, stage_info, subtitle, triads
+from fflin.view.page import build_page, packed
+from fflin.view.playback import body_poses
+from fflin.view.recorder import Recorder
+from fflin.view.scene import Drawing, Visualizer, body_paths
+
+if TYPE_CHECKING:
+    from fflin.analysis.modes import Mode, Modes
+    from fflin.linear.model import LinearModel
+
+# Poses of a swing, the time that it takes on the screen [s], and how far it goes: until something
+# has turned by so many radians or moved by this share of the robot's size.
+_PHASES, _PERIOD = 48, 2.0
+_ANGLE, _SHARE = 0.5, 0.14
+
+
+def mode_page(
+    robot: Robot, found: Modes, *, scene: str, tool: str | None
+) -> tuple[str, tuple[str, ...]]:
+    """Return the page of a robot's vibrations, and what could not be drawn; see `visualize`."""
+    lin = found.lin
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    if lin.urdf_sha256 != robot.urdf_sha256 or lin.state_names != state.names:
+        raise InputError(
+            f"the modes are of a model of '{lin.robot}' with {len(lin.state_names)} states, "
+            f"expected the {state.nx} of '{robot.name}'; give the robot that was linearised, whole"
+        )
+    if not found.vibrations:
+        raise InputError(
+            f"'{robot.name}' has no vibration to show: no mode oscillates; give the joints that "
+            "bend a stiffness"
+        )
+    window, sent = Recorder(), set[str]()
+    scenery = Visualizer(window=window)
+    drawing = Drawing(robot, scenery["robot"], sent=sent)
+    at_rest = body_poses(robot, robot.model.createData(), lin.q)
+    drawing.place(at_rest)
+    Drawing(robot, scenery["rest"], "ghost", sent).place(at_rest)
+    about = f"{subtitle(robot)}, {counted(len(found.vibrations), 'vibration')}"
+    info = stage_info(robot, drawing, at_rest, scene=scene, subtitle=about)
+    swings = [_swing(state, drawing, mode, lin, info["size"]) for mode in found.vibrations]
+    points = [corner_points(drawing, poses) for swing in swings for poses in swing[:: _PHASES // 4]]
+    info |= {
+        "mode": "modes",
+        "period": _PERIOD,
+        "bodies": [["meshcat", "robot", path] for path in body_paths(robot)],
+        "triads": triads(robot, tool, info["size"]),
+        "points": rounded(np.concatenate(points), info["size"]),
+        "modes": [
+            {
+                "frequency": mode.frequency,
+                "damping": mode.damping_ratio,
+                "unstable": bool(mode.unstable),
+                "shape": _shape(mode, lin),
+                "poses": packed(poses),
+            }
+            for mode, poses in zip(found.vibrations, swings, strict=True)
+        ],
+    }
+    return build_page(info, window.commands()), drawing.notes
+
+
+def _swing(state: StateMap, drawing: Drawing, mode: Mode, lin: LinearModel, size: float) -> Array:
+    """Return poses (_PHASES, njoints - 1, 7) over a period, of x0 + Re(a shape exp(i phase))."""
+    robot, half = state.robot, len(lin.x0) // 2
+    data = robot.model.createData()
+
+    def poses(amplitude: float) -> Array:
+        found = []
+        for phase in np.arange(_PHASES) * (2.0 * math.pi / _PHASES):
+            x = lin.x0.copy()
+            x[:half] += amplitude * (mode.shape[:half] * np.exp(1j * phase)).real
+            found.append(body_poses(robot, data, state.to_pinocchio(x)[0]))
+        return np.array(found)
+
+    # Of a small swing, what one of amplitude 1 would be.
+    small = 1e-4
+    rest = corner_points(drawing, body_poses(robot, data, lin.q))
+    moved = np.array([corner_points(drawing, each) - rest for each in poses(small)])
+    reach = float(np.linalg.norm(moved, axis=2).max()) / small
+    turned = np.abs(mode.shape[:half]) * [
+        {"1": 2.0, "rad": 1.0}.get(unit, 0.0) for unit in lin.state_units[:half]
+    ]
+    most = [_ANGLE / turned.max()] if turned.any() else []
+    most += [_SHARE * size / reach] if reach else []
+    return poses(min(most, default=0.0))
+
+
+def _shape(mode: Mode, lin: LinearModel) -> list[tuple[str, str, float, float]]:
+    """Return name, unit, size and phase [deg] of the positions that move most; one has size 1."""
+    sizes, phases = np.abs(mode.shape), np.angle(mode.shape, deg=True)
+    order = np.argsort(-sizes[: len(sizes) // 2].round(9), kind="stable")[:8].tolist()
+    return [
+        (lin.state_names[i], lin.state_units[i], float(sizes[i]), float(phases[i]))
+        for i in order
+        if sizes[i] > 0.01
+    ]

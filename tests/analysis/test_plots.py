@@ -1,0 +1,226 @@
+"""Figures of linear models: what they draw is what was computed, and can be read."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fflin
+from tests.support.figures import assert_legible, texts
+
+pytest.importorskip("matplotlib")
+
+
+@pytest.mark.parametrize(
+    ("name", "inputs"),
+    [("cubesat", "cubesat"), ("canadarm2", None), ("servicer_7dof", "servicer_7dof")],
+)
+def test_the_pattern_is_that_of_a_and_b_by_groups(name, inputs):
+    robot = fflin.load(name)
+    lin = fflin.linearize(robot.replace(inputs=fflin.load_inputs(inputs)) if inputs else robot)
+    figure = fflin.plot_matrices(lin)
+    assert_legible(figure)
+    for axes, values, names in zip(
+        figure.axes, (lin.A, lin.B), (lin.state_names, lin.input_names), strict=False
+    ):
+        drawn = axes.get_images()[0].get_array()
+        shown = ~np.ma.getmaskarray(drawn)
+        np.testing.assert_array_equal(drawn[shown], np.abs(values[shown]))
+        # What is left out is zero, or lost in the rounding of the largest.
+        assert np.abs(values[~shown]).max(initial=0.0) < 1e-15 * np.abs(values).max()
+        assert (values[~shown] == 0.0).mean() > 0.5
+        members = [label.get_text() for label in axes.get_xticklabels()]
+        assert members == [each.rpartition(".")[2] for each in names]
+    written = [text for text, _ in texts(figure)]
+    groups = {
+        "cubesat": ["thrust\n[N]", "wheel\n[N m]", "omega_b [rad/s]"],
+        "canadarm2": ["tau_m\n[N m]", "q_m\n[rad]", "v_b [m/s]"],
+        "servicer_7dof": ["F_b\n[N]", "thrust\n[N]", "qdot_m [rad/s]"],
+    }[name]
+    assert set(groups) <= set(written)
+    assert any("in SI units of its row's rate per unit of its column" in text for text in written)
+
+
+def test_groups_stand_in_the_middle_of_their_columns():
+    lin = fflin.linearize(fflin.load("ets_vii"))
+    left, right = fflin.plot_matrices(lin).axes[:2]
+    places = {}
+    for axes in (left, right):
+        top = axes.child_axes[0].xaxis
+        for tick, label in zip(top.get_majorticklocs(), top.get_majorticklabels(), strict=True):
+            places[label.get_text().partition("\n")[0]] = tick
+    assert places == {
+        **{"q_b": 1.0, "r_b": 4.0, "q_m": 8.5, "omega_b": 13.0, "v_b": 16.0, "qdot_m": 20.5},
+        **{"tau_b": 1.0, "F_b": 4.0, "tau_m": 8.5},
+    }
+
+
+def test_patterns_of_large_robots_and_of_none_can_be_read():
+    sampled = fflin.linearize(fflin.load("talos")).discretize(0.1)
+    figure = fflin.plot_matrices(sampled)
+    assert_legible(figure)
+    assert "talos, frame hybrid, sampled every 0.1 s" in [text for text, _ in texts(figure)]
+    empty = replace(
+        fflin.linearize(fflin.load("cubesat")), B=np.zeros((12, 6)), A=np.zeros((12, 12))
+    )
+    assert_legible(fflin.plot_matrices(empty))
+
+
+def bars(figure):
+    """Heights of the filled and of the outlined bars, by their line and column."""
+    filled, outlined = {}, {}
+    for bar in figure.axes[0].patches:
+        line, column = bar.get_y(), bar.get_x() + bar.get_width() / 2.0
+        (filled if bar.get_fill() else outlined)[line, round(column)] = bar.get_height()
+    return filled, outlined
+
+
+@pytest.mark.parametrize("name", ["servicer_7dof", "talos"])
+def test_bars_are_the_shapes_of_the_modes(name):
+    robot = fflin.load(name, stiffness=20.0, damping=0.3)
+    found = fflin.modes(fflin.linearize(robot))
+    figure = fflin.plot_modes(found)
+    assert_legible(figure)
+    filled, outlined = bars(figure)
+    half = len(found.state_names) // 2
+    shapes = np.array([mode.shape[:half] for mode in found.modes])
+    drawn = np.array([[filled[line, i] for i in range(half)] for line in range(len(shapes))])
+    # The axis points down, and a bar of 1 leaves room for that of the next line.
+    np.testing.assert_allclose(-drawn / 0.45, shapes.real, atol=1e-12)
+    late = np.abs(shapes.imag) > 0.02 * np.abs(shapes)
+    assert {place for place, shown in np.ndenumerate(late) if shown} == set(outlined)
+    for place, height in outlined.items():
+        assert abs(height) == pytest.approx(0.45 * abs(shapes[place]))
+    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    for label, mode in zip(labels, found.modes, strict=True):
+        if mode.oscillates:
+            hertz = mode.frequency / (2.0 * math.pi)
+            damping = f"damping {mode.damping_ratio:.2g}"
+            assert label == f"{mode.frequency:.3g} rad/s, {hertz:.3g} Hz, {damping}"
+        else:
+            assert label == f"real, decays in {mode.time_constant:.3g} s"
+
+
+def test_units_of_a_shape_have_their_colours():
+    lin = fflin.linearize(fflin.load("tiago_no_hand", stiffness=50.0))
+    figure = fflin.plot_modes(fflin.modes(lin))
+    legend = figure.legends[0]
+    of = {
+        text.get_text(): patch.get_facecolor()
+        for text, patch in zip(legend.get_texts(), legend.get_patches(), strict=True)
+    }
+    assert set(of) == {"[1]", "[m]", "[rad]"} and len(set(of.values())) == 3
+    first = figure.axes[0].patches[: len(lin.state_units) // 2]
+    for bar, unit in zip(first, lin.state_units, strict=False):
+        assert bar.get_facecolor() == of[f"[{unit}]"]
+
+
+def test_modes_that_grow_and_robots_without_modes():
+    robot = fflin.load("servicer_7dof", gravity=(0.0, 0.0, -9.81))
+    hover = fflin.linearize(robot, u=fflin.equilibrium(robot).u)
+    figure = fflin.plot_modes(fflin.modes(hover))
+    assert_legible(figure)
+    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    growing = [mode for mode in fflin.modes(hover).unstable if not mode.oscillates]
+    assert sum("grows in" in label for label in labels) == len(growing) > 0
+    floating = fflin.plot_modes(fflin.modes(fflin.linearize(fflin.load("canadarm2"))))
+    assert_legible(floating)
+    ((said, _),) = texts(floating)
+    assert said.startswith("canadarm2: 0 vibrations, 0 real poles, 13 rigid-body modes\n")
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_errors_of_a_check_stand_beside_what_they_must_not_exceed(wrong):
+    robot = fflin.load("servicer_7dof")
+    lin = fflin.linearize(robot)
+    found = fflin.check(robot, replace(lin, B=1.001 * lin.B) if wrong else lin)
+    assert found.ok is not wrong
+    figure = fflin.plot_check(found)
+    assert_legible(figure)
+    axes = figure.axes[0]
+    names = [label.get_text() for label in axes.get_yticklabels()]
+    lines = {(line.get_label(), line.get_marker()): line for line in axes.get_lines()}
+    shown = [row for row in found.rows if row.error]
+    for row in shown:
+        block = row.test in ("ABA derivatives", "differences")
+        place = names.index(row.block if block else f"{row.test}: {row.block}")
+        points = lines[row.test, "o"]
+        at = np.flatnonzero(np.abs(points.get_ydata() - place) < 0.4)
+        assert points.get_xdata()[at] == [row.error]
+        bounds = next(
+            line
+            for (_, marker), line in lines.items()
+            if marker == "|" and line.get_color() == points.get_color()
+        )
+        assert bounds.get_xdata()[at] == [row.tolerance]
+    failed = next(line for (_, marker), line in lines.items() if marker == "x")
+    assert sorted(failed.get_xdata()) == sorted(row.error for row in found.failures)
+    exact = len(found.rows) - len(shown)
+    title = axes.get_title(loc="left")
+    assert f"{exact} agree to the last bit" in title
+    assert ("FAILED" if wrong else "OK") in title
+    assert axes.get_xscale() == "log"
+
+
+@pytest.fixture(scope="module")
+def reach():
+    robot = fflin.load("ets_vii")
+    bent = {name: 0.3 + 0.1 * i for i, name in enumerate(robot.joint_names)}
+    lin = fflin.linearize(robot, fflin.configuration(robot, bent))
+    return fflin.validity(robot, lin, fflin.lqr(lin), attitude=60.0, samples=4)
+
+
+def test_validity_says_the_slope_that_is_drawn(reach):
+    figure = fflin.plot_validity(reach)
+    assert_legible(figure)
+    left, right = figure.axes
+    curve = left.get_lines()[0]
+    x, y = (np.log(each) for each in (curve.get_xdata(), curve.get_ydata()))
+    drawn = float(np.polyfit(x[:4], y[:4], 1)[0])
+    assert drawn == pytest.approx(1.0, abs=0.1)
+    assert curve.get_label() == f"relative error, ~ displacement^{drawn:.2f}"
+    np.testing.assert_allclose(curve.get_ydata(), 100.0 * reach.prediction_error)
+    heights = [sum(bar.get_height() for bar in group) for group in right.containers]
+    assert heights == [reach.settled, 4 - reach.settled]
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"), [("ets_vii", "rad"), ("cubesat", "rad|m"), ("tiago_no_hand", "rad|m")]
+)
+def test_joints_that_all_turn_are_displaced_by_radians(reach, name, unit):
+    from fflin.analysis.displacement import joint_unit
+
+    assert joint_unit(fflin.linearize(fflin.load(name))) == unit
+    assert reach.joint_unit == "rad"
+    assert "0.5 m and 1 rad;" in fflin.plot_validity(reach).get_suptitle()
+    assert "rad|m" not in str(reach) and "1 rad" in " ".join(str(reach).split())
+
+
+def test_validity_of_what_leaves_the_chart_can_be_drawn(tmp_path):
+    robot = fflin.load("cubesat")
+    lin = fflin.linearize(robot)
+    gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
+    found = fflin.validity(robot, lin, gain, attitude=170.0, samples=12)
+    figure = fflin.plot_validity(found, tmp_path / "validity.png")
+    assert_legible(figure)
+    known = np.isfinite(found.prediction_error)
+    curve = figure.axes[0].get_lines()[0]
+    np.testing.assert_allclose(curve.get_ydata(), 100.0 * found.prediction_error[known])
+    assert (tmp_path / "validity.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("function", "expected"),
+    [
+        ("plot_matrices", r"lin is a int, expected a fflin\.LinearModel"),
+        ("plot_modes", r"modes is a int, expected what fflin\.modes returns"),
+        ("plot_check", r"check is a int, expected what fflin\.check returns"),
+        ("plot_validity", r"expected what fflin\.validity returns"),
+        ("plot_loops", r"gain is a int, expected what fflin\.lqr returns"),
+        ("plot_poles", r"poles is a str, expected finite numbers or a Gain"),
+    ],
+)
+def test_what_is_no_result_is_refused(function, expected):
+    with pytest.raises(fflin.InputError, match=expected):
+        getattr(fflin, function)("stable" if function == "plot_poles" else 3)

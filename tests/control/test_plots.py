@@ -1,0 +1,108 @@
+"""Figures of loops: the responses and margins of each input, and poles that can be told apart."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.control.loops import input_loops
+from tests.support.figures import assert_legible, texts
+
+pytest.importorskip("matplotlib")
+
+
+def lines(axes):
+    return {line.get_label(): line for line in axes.get_lines()}
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.5])
+def test_bode_plots_are_of_the_loops_broken_one_at_a_time(dt):
+    lin = fflin.linearize(fflin.load("servicer_7dof"))
+    gain = fflin.lqr(lin.discretize(dt) if dt else lin)
+    figure = fflin.plot_loops(gain)
+    assert_legible(figure)
+    sizes, phases, _ = figure.axes
+    curves = sizes.get_lines()[: len(gain.K)]
+    for i in (0, 4, 12):
+        w, drawn = curves[i].get_data()
+        others = np.arange(len(gain.K)) != i
+        F = gain.A - gain.B[:, others] @ gain.K[others]
+        for k in (0, 150, 399):
+            s = np.exp(1j * w[k] * dt) if dt else 1j * w[k]
+            L = gain.K[i] @ np.linalg.solve(s * np.eye(len(F)) - F, gain.B[:, i])
+            assert drawn[k] == pytest.approx(abs(L), rel=1e-6)
+            angle = next(
+                line.get_ydata()[k]
+                for line in phases.get_lines()
+                if len(line.get_xdata()) == len(w) and line.get_color() == curves[i].get_color()
+            )
+            assert np.exp(1j * np.radians(angle)) == pytest.approx(L / abs(L), rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["cubesat", "canadarm2", "talos"])
+def test_margins_stand_beside_the_names(name):
+    gain = fflin.lqr(fflin.linearize(fflin.load(name)).discretize(0.2))
+    figure = fflin.plot_loops(gain)
+    assert_legible(figure)
+    *_, loops = input_loops(gain)
+    legend = figure.legends[0]
+    for text, each, name in zip(legend.get_texts(), loops, gain.input_names, strict=True):
+        low, high = each.gain
+        assert text.get_text() == f"{name}: {each.phase:.0f} deg, {low:.2g} to {high:.3g}"
+    colors = [line.get_color() for line in legend.get_lines()]
+    assert len(set(colors)) == len(colors)
+    # Each margin is marked: a dot on the curves where the gain is one, a line from there to -180.
+    phases = figure.axes[1]
+    marks = [line for line in phases.get_lines() if line.get_marker() == "o"]
+    drawn = [abs(np.diff(line.get_ydata())[0]) for line in marks]
+    expected = [abs(180.0 - abs(angle)) for loop in loops for _, angle in loop.crossings]
+    np.testing.assert_allclose(drawn, expected, atol=0.1)
+    assert f"(disk margin {gain.margins.disk:.3g})" in figure.get_suptitle()
+
+
+def test_poles_of_a_loop_are_all_told_apart():
+    poles = np.array([-640.0, -31.0, -1.0 + 0.3j, -1.0 - 0.3j, -0.2, -0.1])
+    figure = fflin.plot_poles(poles)
+    assert_legible(figure)
+    axes = figure.axes[0]
+    at = axes.transData.transform(np.column_stack((poles.real, poles.imag)))
+    for one, other in itertools.combinations(at, 2):
+        assert np.hypot(*(one - other)) > 8.0  # pixels: more than a marker
+    inside = axes.bbox.padded(1.0)
+    assert all(inside.contains(*point) for point in at)
+    line = axes.get_lines()[0]
+    np.testing.assert_array_equal(line.get_xdata() + 1j * line.get_ydata(), poles)
+
+
+def test_poles_that_lie_together_have_plain_axes():
+    axes = fflin.plot_poles([-1.0 + 2.0j, -1.0 - 2.0j, -3.0]).axes[0]
+    assert axes.get_xscale() == axes.get_yscale() == "linear"
+    # What rounding leaves of zero does not stretch an axis.
+    assert fflin.plot_poles([-1e-17 + 2.0j, -1e-17 - 2.0j, -3.0]).axes[0].get_xscale() == "linear"
+    unstable = fflin.plot_poles([-200.0, 0.5, 0.0]).axes[0]
+    assert unstable.get_xlim()[1] >= 0.5 and unstable.get_xlim()[0] <= -200.0
+
+
+def test_pole_map_has_the_poles_of_each_set():
+    lin = fflin.linearize(fflin.load("planar_detumble"))
+    gain = fflin.lqr(lin, 1.0, 1.0)
+    figure = fflin.plot_poles({"open": lin, "closed": gain})
+    assert_legible(figure)
+    shown = lines(figure.axes[0])["closed"]
+    np.testing.assert_array_equal(np.sort(shown.get_xdata()), np.sort(gain.poles.real))
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["open", "closed"]
+    sampled = fflin.plot_poles(lin.discretize(0.1))
+    assert sampled.axes[0].get_xlabel() == "real part"
+    assert len(sampled.axes[0].get_lines()) == 2  # with the unit circle
+
+
+def test_poles_of_a_sampled_loop_are_shown_as_rates():
+    lin = fflin.linearize(fflin.load("canadarm2"))
+    gain = fflin.lqr(lin.discretize(0.1))
+    figure = fflin.plot_loops(gain)
+    axes = figure.axes[2]
+    shown = axes.get_lines()[0]
+    z = np.exp(0.1 * (shown.get_xdata() + 1j * shown.get_ydata()))
+    np.testing.assert_allclose(np.sort_complex(z), np.sort_complex(gain.poles), rtol=1e-12)
+    assert "poles z of A - B K as rates ln(z)/dt" in [text for text, _ in texts(figure)]

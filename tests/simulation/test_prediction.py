@@ -1,0 +1,95 @@
+"""The linear motion beside the nonlinear one, under every policy that is linear."""
+
+import numpy as np
+import pytest
+
+import fflin
+from tests.support.measured import FELT, POSITIONS, designed, foreseen
+from tests.support.motions import displaced, motion, regulated
+from tests.support.weights import unit_weights
+
+
+@pytest.mark.parametrize("outputs", [POSITIONS, FELT], ids=["positions", "felt"])
+def test_a_measured_feedback_is_foreseen_with_its_filter(outputs):
+    robot, lin, compensator = designed(outputs, stiffness=3.0)
+    policy = fflin.OutputFeedback(lin, compensator)
+    x0 = lin.x0 + 1e-3 * np.cos(np.arange(len(lin.x0)))
+    options = {"x0": x0, "duration": 2.0, "dt": 0.01}
+    seldom = fflin.simulate(robot, policy, every=5, **options)
+    np.testing.assert_allclose(seldom.linear, foreseen(lin, compensator, x0, 40), atol=1e-12)
+    # Of the continuous model at every row, at the samples the same.
+    q = fflin.configuration(robot, {"joint_2": 0.4})
+    continuous = fflin.linearize(robot, q, None, fflin.equilibrium(robot, q).u)
+    often = fflin.simulate(robot, policy, linear=continuous, **options)
+    assert often.linear.shape == often.x.shape
+    np.testing.assert_allclose(often.linear[::5], seldom.linear, atol=1e-11)
+    assert np.abs(often.linear - often.x).max() < 0.1 * np.abs(often.x - lin.x0).max()
+
+
+def test_a_robot_that_nothing_drives_is_foreseen():
+    robot = fflin.load("ets_vii", stiffness=30.0, damping=3.0)
+    lin = fflin.linearize(robot)
+    x0 = lin.x0 + 1e-4 * np.cos(np.arange(len(lin.x0)))
+    free = fflin.simulate(robot, x0=x0, duration=3.0, linear=lin)
+    assert np.abs(free.linear - free.x).max() < 1e-7 < 1e-5 < np.abs(free.x - x0).max()
+
+
+def test_a_feedback_of_a_part_is_foreseen_by_the_whole_model():
+    robot = fflin.load("servicer_7dof")
+    robot = robot.replace(inputs=[each for each in robot.inputs if hasattr(each, "joint")])
+    lin = fflin.linearize(robot)
+    part = fflin.momentum_reduction(lin)
+    policy = fflin.StateFeedback(part, fflin.lqr(part, *unit_weights(part)).K)
+    x0 = lin.x0.copy()
+    x0[6 : 6 + robot.n] += 1e-4
+    run = fflin.simulate(robot, policy, x0=x0, duration=5.0, linear=lin)
+    moved = np.abs(run.x - x0).max(axis=0)
+    assert np.abs(run.linear - run.x).max() < 1e-7 < 1e-5 < moved[:3].max()
+    assert fflin.simulate(robot, policy, x0=x0, duration=0.1).linear is None
+    with pytest.raises(fflin.InputError, match="is reduced: give linear= the whole model"):
+        fflin.simulate(robot, policy, x0=x0, duration=0.1, linear=True)
+
+
+def test_a_model_about_another_point_foresees_with_the_policys_law():
+    robot, lin, gain = regulated("ets_vii")
+    q = fflin.configuration(robot, {"joint_1": 1e-3})
+    beside = fflin.linearize(robot, q)
+    policy, x0 = fflin.StateFeedback(lin, gain.K), displaced(lin, 0.05, 1e-3, 1e-3)
+    here = fflin.simulate(robot, policy, x0=x0, duration=10.0)
+    there = fflin.simulate(robot, policy, x0=x0, duration=10.0, linear=beside)
+    assert np.abs(there.linear - there.x).max() < 1e-5
+    np.testing.assert_allclose(there.linear[-1], here.linear[-1], atol=1e-5)
+
+
+def test_where_nothing_can_be_foreseen_the_reason_is_said():
+    robot, lin, gain = regulated("planar_detumble")
+    feedback = fflin.StateFeedback(lin, gain.K)
+    t, q, v, u = motion(robot)
+    along = fflin.linearize_trajectory(robot, t, q, v, u)
+    batch = fflin.sweep(robot, fflin.grid(robot, {"joint_1": [0.0, 1.0]}))
+    policies = {
+        "an Allocation has thrusters that cannot pull": fflin.Allocation(feedback, robot),
+        "a TrajectoryFeedback is linear along a trajectory": fflin.TrajectoryFeedback(
+            along, fflin.tvlqr(along, 1.0, 1.0, 1.0)
+        ),
+        "a ScheduledFeedback is not known to be linear": fflin.ScheduledFeedback(
+            lin, fflin.lqr_batch(batch, 1.0, 1.0)
+        ),
+        "a function is not known to be linear": feedback.bind(robot),
+    }
+    for why, policy in policies.items():
+        for linear in (lin, True):
+            with pytest.raises(fflin.InputError, match=why) as caught:
+                fflin.simulate(robot, policy, duration=0.1, linear=linear)
+            assert "\n" not in str(caught.value)
+        assert fflin.simulate(robot, policy, duration=0.02, sample=0.02).linear is None
+
+
+def test_a_model_in_another_reference_foresees_nothing():
+    robot, lin, gain = regulated("ets_vii")
+    moved = fflin.configuration(robot, {}, fflin.linearize(robot).reference)
+    moved[0] += 1.0
+    other = fflin.linearize(robot, moved)
+    policy = fflin.StateFeedback(lin, gain.K)
+    with pytest.raises(fflin.InputError, match="frame and reference of the run"):
+        fflin.simulate(robot, policy, duration=0.1, linear=other)

@@ -1,0 +1,93 @@
+"""How many rows a run records by itself, and what is said of a pole that makes it slow."""
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.simulation import times
+from fflin.simulation.report import motion_report
+from tests.support.commands import run
+from tests.support.motions import displaced, regulated
+
+
+def test_runs_of_up_to_100000_rows_are_recorded_step_by_step():
+    assert times.times_of(None, 1000.0, 0.01, None, None, 0.0).every == 1
+    many = times.times_of(None, 1000.01, 0.01, None, None, 0.0)
+    assert many.steps == 100_001 and many.every == 11
+    assert 5_000 < many.rows <= 10_002
+    asked = times.times_of(None, 1000.01, 0.01, 1, None, 0.0)
+    assert asked.every == 1 and not asked.notes
+    assert many.notes == (
+        "one in 11 of 100,001 steps is recorded; every=1 (--every 1) records all",
+    )
+
+
+@pytest.mark.parametrize(("sample", "every"), [(0.01, 24), (0.03, 24), (0.5, 25), (0.07, 28)])
+def test_what_is_recorded_of_a_sampled_loop_are_samples_or_parts_of_them(sample, every):
+    found = times.times_of(None, 2400.0 - 2400.0 % sample, 0.01, None, sample, 0.0)
+    assert found.every == every
+    assert found.every % found.sample == 0 or found.sample % found.every == 0
+    assert 5_000 < found.rows <= 10_002
+
+
+def test_a_thinned_run_is_the_run_at_some_of_its_rows(monkeypatch):
+    monkeypatch.setattr(times, "_MANY_ROWS", 100)
+    monkeypatch.setattr(times, "_FEW_ROWS", 10)
+    robot, lin, gain = regulated("ets_vii")
+    policy = fflin.StateFeedback(lin, gain.K)
+    options = {"x0": displaced(lin), "duration": 2.03, "dt": 0.01}
+    thin = fflin.simulate(robot, policy, **options)
+    full = fflin.simulate(robot, policy, every=1, **options)
+    kept = [*range(0, 203, 21), 203]
+    assert len(full.t) == 204 and not full.notes
+    for key in ("t", "x", "u", "linear", "energy"):
+        np.testing.assert_array_equal(getattr(thin, key), getattr(full, key)[kept])
+    assert "one in 21 of 203 steps is recorded; every=1 (--every 1) records all" in motion_report(
+        thin
+    )
+    short = fflin.simulate(robot, policy, **options | {"duration": 1.0})
+    assert len(short.t) == 101 and not short.notes
+
+
+def test_the_pole_that_makes_a_run_slow_is_named():
+    robot = fflin.load("ets_vii")
+    lin = fflin.linearize(robot)
+    K = fflin.lqr(lin).K.copy()
+    rate = lin.state_names.index("qdot_m.joint_5")
+    # Of the arm's own inertia about that joint, 640 1/s.
+    K[lin.input_names.index("tau_m.joint_5"), rate] += 640.0 / lin.B[rate, 10]
+    assert lin.input_names[10] == "tau_m.joint_5"
+    policy = fflin.StateFeedback(lin, K)
+
+    def at_once(t, q, v):
+        return -1.0
+
+    with pytest.warns(fflin.FflinWarning) as said:
+        motion = fflin.simulate(robot, policy, duration=120.0, events=[at_once])
+    fastest = np.abs(np.linalg.eigvals(lin.A - lin.B @ K)).max()
+    (line,) = [str(each.message) for each in said]
+    assert line == (
+        f"the loop's fastest pole at {fastest:.3g} 1/s asks for steps of 0.000977 s, 122,880 "
+        "in all; give dt= or sample=, or a slower gain: qdot_m.joint_5 moves most there"
+    )
+    assert motion.notes == (
+        "one in 13 of 122,880 steps is recorded; every=1 (--every 1) records all",
+    )
+    # A loop without such a pole is not analysed further.
+    calm = times.times_of(fflin.StateFeedback(lin, fflin.lqr(lin).K), 1.0, None, None, None, 0.0)
+    assert calm.mode == "" and calm.fastest > 0.0
+
+
+def test_hours_that_nobody_asked_for_are_refused():
+    robot = fflin.load("planar_detumble")
+    with pytest.raises(fflin.InputError, match=r"2e\+07 steps .* take a larger dt or `every`"):
+        fflin.simulate(robot, duration=2e5)
+    times.times_of(None, 2e5, 0.01, 1000, None, 0.0).require_room(55, chosen=True)
+
+
+def test_every_of_the_command(tmp_path):
+    command = ("simulate", "planar_detumble", "--duration", 1, "-o", "m.npz")
+    code, _, _ = run(*command, "--every", 25, cwd=tmp_path)
+    assert code == 0
+    np.testing.assert_allclose(fflin.Motion.load(tmp_path / "m.npz").t, [0, 0.25, 0.5, 0.75, 1.0])
+    assert run(*command, "--every", 0, cwd=tmp_path)[0] == 2

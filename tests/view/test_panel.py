@@ -1,0 +1,211 @@
+"""The figures of a page: of what the motion has, in its units, each with its name and colour."""
+
+import base64
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from fflin.view.motion_page import subtitle
+from fflin.view.panel import errors, panel
+from tests.support.motions import settling
+from tests.support.robots import random_pose
+
+
+def floats(packed):
+    return np.frombuffer(base64.b64decode(packed), dtype="<f4")
+
+
+def charts(shown):
+    """Return {title: {label: values}} of what a panel draws."""
+    return {
+        plot["title"]: {line["label"]: floats(line["values"]) for line in plot["lines"]}
+        for plot in shown["plots"]
+    }
+
+
+def limits_drawn(shown):
+    """Return {title: {label: limits}} of what a panel draws."""
+    return {
+        plot["title"]: {line["label"]: line["limits"] for line in plot["lines"]}
+        for plot in shown["plots"]
+    }
+
+
+def every(motion):
+    return np.arange(0, len(motion.t), 20)
+
+
+def limited(motion, limits):
+    """Return the motion with limits {name: (least, largest)}."""
+    return replace(motion, limit_names=tuple(limits), limits=np.array(list(limits.values())))
+
+
+def test_errors_are_those_of_the_pose(robots):
+    rng = np.random.default_rng(2)
+    robot = robots["ets_vii"]  # its joints are continuous
+    turns = dict(zip(robot.joint_names, (0.3, 3.0, -1.0, 0.0, 1.0, -3.0), strict=True))
+    target = fflin.configuration(robot, turns, random_pose(rng, 50.0))
+    step = np.concatenate((rng.normal(size=3), np.radians(37.0) * np.array([0.6, 0, 0.8])))
+    v = np.concatenate((np.zeros(6), [0.1, 0.7, 0.2, 0, 0, -1.1]))
+    q = pin.integrate(robot.model, target, v)
+    base = pin.XYZQUATToSE3(target[:7]) * pin.SE3(pin.exp3(step[3:]), step[:3])
+    q[:7] = pin.SE3ToXYZQUAT(base)
+    found = errors(robot, np.array([target, q]), target[None])
+    np.testing.assert_allclose(found["attitude"][1], [0, 37.0], atol=1e-6)
+    np.testing.assert_allclose(found["position"][1], [0, np.linalg.norm(step[:3])], atol=1e-12)
+    np.testing.assert_allclose(found["largest joint"][1], np.degrees([0, 1.1]), atol=1e-7)
+    assert "largest slide" not in found
+
+
+def test_errors_from_a_target_that_moves_are_those_of_the_same_moment(robots):
+    robot = robots["ets_vii"]
+    rng = np.random.default_rng(3)
+    targets = np.array(
+        [pin.integrate(robot.model, robot.neutral(), v) for v in rng.normal(size=(4, robot.nv))]
+    )
+    step = np.concatenate(
+        (np.zeros(3), np.radians(20.0) * np.array([0, 0.6, 0.8]), 0.2 * np.ones(6))
+    )
+    q = np.array([pin.integrate(robot.model, each, s * step) for s, each in enumerate(targets)])
+    found = errors(robot, q, targets)
+    np.testing.assert_allclose(found["attitude"][1], [0, 20, 40, 60], atol=1e-6)
+    np.testing.assert_allclose(found["largest joint"][1], np.degrees([0, 0.2, 0.4, 0.6]), atol=1e-7)
+
+
+def test_metres_are_not_taken_for_degrees_nor_wheels_for_joints():
+    robot = fflin.load("panda")  # its fingers slide
+    robot = robot.replace(inputs=[*robot.inputs, fflin.ReactionWheel((0, 0, 1), inertia=1e-3)])
+    target = robot.neutral()
+    q = fflin.configuration(robot, {"panda_joint2": -0.1, "panda_finger_joint1": 0.03})
+    robot.joint("wheel_1").place(q, 2.0)
+    found = errors(robot, np.array([q]), target[None])
+    assert found["largest joint"][1] == pytest.approx(np.degrees(0.1))
+    assert found["largest slide"][1] == pytest.approx(0.03)
+    motion = settling(robot, 1.0)
+    shown = panel(robot, motion, every(motion), target[None])
+    labels = {each["label"]: each["unit"] for each in shown["readouts"]}
+    assert labels["largest joint error"] == "°" and labels["largest slide error"] == "m"
+    assert subtitle(robot) == f"{robot.n - 1} joints, 1 wheel, 17.45 kg"
+
+
+def test_a_free_flyer_alone_has_no_joint_error():
+    robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
+    motion = settling(robot, 1.0)
+    shown = panel(robot, motion, every(motion), robot.neutral()[None])
+    assert not any("joint" in each["label"] for each in shown["readouts"])
+    assert subtitle(robot) == "0 joints, 3 wheels, 3.5 kg"
+
+
+def test_plots_have_the_units_of_the_model():
+    """Sliding joints are pushed, turning ones turned, and thrust is no torque."""
+    robot = fflin.load("panda")
+    assert {joint.prismatic for joint in robot.joints} == {True, False}
+    more = [
+        fflin.Thruster("panda_link0", (1, 0, 0), (0, 0, 1), "up"),
+        fflin.ReactionWheel((0, 0, 1)),
+    ]
+    robot = robot.replace(inputs=[*robot.inputs, *more])
+    motion = settling(robot, 1.0)
+    shown = panel(robot, motion, every(motion), robot.neutral()[None])["plots"]
+    expected = {("base torque", "N m"), ("base force", "N"), ("joints", "rad"), ("slides", "m")}
+    expected |= {("joint torques", "N m"), ("joint forces", "N")}
+    expected |= {("thrusters", "N"), ("wheel torque", "N m")}
+    assert {(plot["title"], plot["unit"]) for plot in shown[2:]} == expected
+    drawn = charts({"plots": shown})
+    for joint in robot.joints:
+        of, by = ("slides", "joint forces") if joint.prismatic else ("joints", "joint torques")
+        x = motion.x[every(motion), motion.state_names.index(f"q_m.{joint.name}")]
+        u = motion.u[every(motion), motion.input_names.index(f"tau_m.{joint.name}")]
+        np.testing.assert_allclose(drawn[of][joint.name], x, rtol=1e-6)
+        np.testing.assert_allclose(drawn[by][joint.name], u, rtol=1e-6)
+
+
+def test_wheels_have_charts_of_their_own():
+    """Speed, torque and momentum against saturation, and nothing of them among the joints."""
+    wheels = [fflin.ReactionWheel((0, 0, 1), name=f"w{k}", inertia=1e-3 * k) for k in (1, 2)]
+    robot = fflin.load("planar_detumble")
+    robot = robot.replace(inputs=[*robot.inputs, *wheels])
+    motion = settling(robot, 1.0)
+    x = motion.x.copy()
+    speeds = [motion.state_names.index(f"qdot_m.w{k}") for k in (1, 2)]
+    x[:, speeds] = np.outer(motion.t, [3.0, -5.0])
+    motion = limited(replace(motion, x=x), {"qdot_m.w1": (-4.0, 4.0), "qdot_m.w2": (-99.0, 99.0)})
+    shown = panel(robot, motion, every(motion), np.zeros((0, robot.nq)))
+    drawn, t = charts(shown), motion.t[every(motion)]
+    np.testing.assert_allclose(drawn["wheel speed"]["w1"], 3.0 * t, rtol=1e-6)
+    np.testing.assert_allclose(drawn["wheel momentum"]["w1"], 3e-3 * t, rtol=1e-6)
+    np.testing.assert_allclose(drawn["wheel momentum"]["w2"], -10e-3 * t, rtol=1e-6)
+    u = motion.u[every(motion), motion.input_names.index("w2")]
+    np.testing.assert_allclose(drawn["wheel torque"]["w2"], u, rtol=1e-6)
+    assert not {"w1", "w2"} & {*drawn["joints"], *drawn["joint torques"]}
+    drawn = limits_drawn(shown)
+    assert drawn["wheel speed"] == {"w1": [4.0], "w2": []}
+    assert drawn["wheel momentum"] == {"w1": [pytest.approx(4e-3)], "w2": []}
+
+
+@pytest.mark.parametrize("share", [0.32, 0.34, 1.2])
+def test_a_limit_is_drawn_where_a_curve_comes_to_a_third_of_it(robots, share):
+    robot = robots["planar_detumble"]
+    motion = settling(robot, 1.0)
+    names = [name for name in motion.input_names if name.startswith("tau_m")]
+    at = [motion.input_names.index(name) for name in names]
+    u = motion.u.copy()
+    u[:, at] = -1.0 - np.arange(len(at))
+    most = {name: (k + 1.0) / share for k, name in enumerate(names)}
+    motion = limited(replace(motion, u=u), {name: (-x, np.inf) for name, x in most.items()})
+    shown = panel(robot, motion, every(motion), robot.neutral()[None])
+    expected = {name.partition(".")[2]: [-x] * (share > 1 / 3) for name, x in most.items()}
+    assert limits_drawn(shown)["joint torques"] == expected
+
+
+def test_rates_of_joints_are_shown_where_they_come_near_a_limit(robots):
+    robot = robots["planar_detumble"]
+    motion = settling(robot, 1.0)
+    x = motion.x.copy()
+    x[:, motion.state_names.index(f"qdot_m.{robot.joint_names[0]}")] = -0.9 * motion.t
+    motion = replace(motion, x=x)
+    for limit, shown in ((3.0, False), (1.0, True)):
+        name = f"qdot_m.{robot.joint_names[0]}"
+        plots = panel(robot, limited(motion, {name: (-limit, limit)}), every(motion), motion.q[:1])
+        rates = limits_drawn(plots).get("joint rates")
+        assert rates == ({robot.joint_names[0]: [-1.0]} if shown else None)
+
+
+def test_thrusters_that_never_fire_are_not_drawn():
+    robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
+    motion = settling(robot, 1.0)
+    u = np.zeros_like(motion.u)
+    fired = [motion.input_names.index(name) for name in ("x_plus_top", "z_minus_left")]
+    u[:, fired] = (1.0, 2.0)
+    motion = replace(motion, u=u)
+    plots = panel(robot, motion, every(motion), robot.neutral()[None])["plots"]
+    (plot,) = (each for each in plots if each["title"] == "thrusters")
+    assert [line["label"] for line in plot["lines"]] == ["x_plus_top", "z_minus_left"]
+    assert [floats(line["values"])[3] for line in plot["lines"]] == [1.0, 2.0]
+
+
+def test_without_a_target_nothing_is_called_an_error(robots):
+    robot = robots["planar_detumble"]
+    motion = settling(robot, 1.0)
+    shown = panel(robot, motion, every(motion), np.zeros((0, robot.nq)))
+    labels = [each["label"] for each in shown["readouts"]]
+    titles = [each["title"] for each in shown["plots"]]
+    assert labels[0] == titles[0] == "attitude change"
+    assert not any("error" in text for text in labels + titles)
+    expected = errors(robot, motion.q[every(motion)], motion.q[:1])["attitude"][1]
+    assert expected[0] < 1e-6 < 1.0 < expected[-1]
+    np.testing.assert_allclose(charts(shown)[titles[0]][""], expected, rtol=1e-6, atol=1e-5)
+
+
+def test_what_was_passed_is_told_with_its_time(robots):
+    robot = robots["planar_detumble"]
+    motion = settling(robot, 1.0)
+    name = f"tau_m.{robot.joint_names[0]}"
+    u = np.zeros_like(motion.u)
+    u[700:, motion.input_names.index(name)] = 3.0
+    motion = limited(replace(motion, u=u), {name: (-2.0, 2.0)})
+    ((text, time),) = panel(robot, motion, every(motion), motion.q[:1])["passed"]
+    assert time == motion.t[700] and text == f"{name} 3 N m at 0.35 s, limit 2"
