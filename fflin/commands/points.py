@@ -24,7 +24,7 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
 
     with warnings.catch_warnings():
         if getattr(arguments, "damping", []):  # it is asked for
-            warnings.filterwarnings("ignore", ".*: the damping of", FflinWarning)
+            warnings.filterwarnings("ignore", ".*: damping unused", FflinWarning)
         robot = load(arguments.robot, lock=once("--lock", arguments.lock))
     fields: dict[str, Any] = {}
     for name in ("stiffness", "damping"):

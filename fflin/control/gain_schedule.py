@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.record import Design
+from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.validation import Array, number
 
 if TYPE_CHECKING:
@@ -86,10 +86,9 @@ class GainSchedule(Design):
         )
 
     def __str__(self) -> str:
-        """Show what made it."""
-        return (
-            f"{super().__str__()}\nweights: {self.weights}" if self.weights else super().__str__()
-        )
+        """Show the rule of its weights too."""
+        verdict = [] if self.verified else [NOT_VERIFIED]
+        return "\n".join([repr(self), f"weights: {self.weights or 'as given'}", *verdict])
 
     def trajectory(self, robot: Robot) -> Trajectory:
         """Return the trajectory that it keeps a robot on."""

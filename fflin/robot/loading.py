@@ -75,7 +75,7 @@ def load(
     description = read_urdf(found.path, found.prune)
     loaded = _robot(description.model, found.name, lock, description.mimics)
     # Where it is asked for, the damping is in the model.
-    notes = [n for n in description.notes if "damping" not in fields or ": the damping of" not in n]
+    notes = [n for n in description.notes if "damping" not in fields or ": damping unused" not in n]
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
     if idle_coordinates(loaded):
