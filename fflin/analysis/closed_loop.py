@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from fflin.analysis.momentum import regulated_part
 from fflin.analysis.names import rate_of
-from fflin.analysis.wheels import picked, wheel_inputs
+from fflin.analysis.wheels import picked, regulated_part, wheel_inputs
 from fflin.base.errors import ChartError, InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, as_double

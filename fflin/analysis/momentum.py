@@ -11,16 +11,7 @@ import pinocchio as pin
 from fflin.analysis.mechanics import checked, conserved
 from fflin.analysis.names import undecided
 from fflin.analysis.ranks import Margin
-from fflin.analysis.wheels import (
-    certified,
-    ignorable_wheels,
-    leaving,
-    part_of,
-    picked,
-    selected,
-    wheel_inputs,
-    without,
-)
+from fflin.analysis.wheels import certified, leaving, part_of, picked, without
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
@@ -137,27 +128,6 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
         notes=undecided(lin, held.margin, "kept by the reduction", len(z)),
     )
     return certified(reduced, whole, partial(momentum_reduction, wheel_speeds=wheel_speeds))
-
-
-def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
-    """Return the model of the states that are regulated; `lin` itself where it has no wheels.
-
-    Wheels leave it as `momentum_reduction` says, the angles of the others too where nothing
-    depends on them, so that there are fewer positions than rates; and the position of the base in
-    the directions in which no input can push it.
-    """
-    if not wheel_inputs(lin):
-        return lin
-    part: LinearModel = momentum_reduction(lin, wheel_speeds=wheel_speeds)
-    still, _ = ignorable_wheels(lin)
-    wheels = {lin.state_names[i] for i in still}
-    left = set(lin.state_names[: len(lin.M)]) - set(part.state_names) - wheels
-    if any(not name.startswith("r_b.") for name in left):
-        # Something else is not held either, which whoever designs is to be told.
-        gone = [i for i in still if lin.state_names[i] not in part.state_names]
-        part = without(lin, np.array(gone, dtype=np.intp))
-    names = [name for name in part.state_names if name not in wheels]
-    return selected(lin, names, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
 
 
 def generalized_inertia(lin: LinearModel) -> Array:

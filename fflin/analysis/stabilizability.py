@@ -165,7 +165,11 @@ def _left_null(matrix: Array) -> tuple[Array, Margin]:
 
 def _forces_missing(lin: LinearModel, weights: Array) -> str | None:
     """Say what the conserved momenta W M nu, W (k, nv), are those of; None of another model."""
-    names = lin.state_names[len(lin.M) :]
+    names = lin.state_names[-len(lin.M) :]
+    if names[:3] == _BASE_VELOCITIES[:3] and names[3:4] != ("v_b.x",):
+        # The position has left, which nothing pushes.
+        names = (*_BASE_VELOCITIES, *names[3:])
+        weights = np.insert(weights, [3, 3, 3], 0.0, axis=1)
     if names[:6] != _BASE_VELOCITIES:
         return None
     involved = np.abs(weights).max(axis=0) > 0.0

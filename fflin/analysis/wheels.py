@@ -41,10 +41,12 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
     if not len(at):
         return at, at
     system = second_order(lin.generator or lin)
-    units, spin = np.outer(system.size, system.size[at]), np.abs(lin.x0[nv + at])
-    # What balances at a speed leaves the rounding of its square, and no other to compare with.
-    still = np.abs(system.K.values[:, at]) <= _ROUNDING * spin**2 * units
-    free = np.abs(system.D.values[:, at]) <= _ROUNDING**2 * spin * units
+    # What balances in a spin leaves rounding, and may leave nothing else to compare it with.
+    turns = [x for x, unit in zip(lin.x0, lin.state_units, strict=True) if unit == "rad/s"]
+    rounding = 1e-14 * np.outer(system.size, system.size[at])
+    spin = float(np.abs(turns).max(initial=0.0))
+    still = np.abs(system.K.values[:, at]) <= rounding * spin**2
+    free = np.abs(system.D.values[:, at]) <= rounding * spin
     angle = still.all(axis=0)
     return at[angle], at[angle & free.all(axis=0)]
 
@@ -70,6 +72,27 @@ def leaving(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
     spun = image(idle[motors], _ROUNDING)[0]
     held: Any = echelon(spun, np.ones(len(free)))[1]
     return np.delete(free, held)
+
+
+def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
+    """Return the model of the states that are regulated; `lin` itself where it has no wheels.
+
+    What is `leaving` leaves it, the angles of other wheels too where nothing depends on them, so
+    that there are fewer positions than rates; and the base's position where no input pushes it.
+    """
+    if not wheel_inputs(lin):
+        return lin
+    source, nv = lin.generator or lin, len(lin.M)
+    idle = ~second_order(source).S.values.any(axis=1)
+    base = [i for i in range(nv) if idle[i] and lin.state_names[i].startswith("r_b.")]
+    columns = [*base, *(i + nv for i in base)]
+    if np.abs(np.delete(source.A[:, columns], columns, axis=0)).max(initial=0.0) > _ROUNDING:
+        base = []  # in axes that turn one direction is part of the others
+    left = np.union1d(base, leaving(lin, wheel_speeds)).astype(np.intp)
+    part = without(lin, left)
+    angles = {lin.state_names[i] for i in ignorable_wheels(lin)[0]}
+    rest = [name for name in part.state_names if name not in angles]
+    return selected(lin, rest, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
 
 
 def rigid_forces(body: LinearModel) -> Noisy:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.analysis.momentum import regulated_part
+from fflin.analysis.wheels import regulated_part
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.validation import Array, dimension
 from fflin.control.gain import Gain, for_whole, make_gain

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.linalg import eigh
 
-from fflin.analysis.momentum import regulated_part
 from fflin.analysis.ranks import Noisy, null_space
-from fflin.analysis.wheels import ignorable_wheels, picked, rigid_forces, without
+from fflin.analysis.wheels import ignorable_wheels, picked, regulated_part, rigid_forces, without
 from fflin.base.errors import InputError, listed, unknown
 from fflin.base.names import input_keys
 from fflin.base.validation import Array

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from fflin.analysis.momentum import regulated_part
-from fflin.analysis.wheels import picked, seen_through
+from fflin.analysis.wheels import picked, regulated_part, seen_through
 from fflin.base.errors import DetectabilityError, InputError, MissingPackageError, listed
 from fflin.base.names import input_keys
 from fflin.base.record import Design

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.analysis.momentum import regulated_part
-from fflin.analysis.wheels import picked
+from fflin.analysis.wheels import picked, regulated_part
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.base.validation import Array
 from fflin.control.default_weights import rule_weights

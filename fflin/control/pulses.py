@@ -12,25 +12,10 @@ from fflin.robot.inputs import Thruster
 
 
 class Pulses:
-    """What such thrusters make of the command of each sample.
+    """What such thrusters (place among the inputs, name, thruster) make of each sample's command.
 
     What it asks for and is not fired, for whole steps or the least impulse, is carried to the next.
-
-    Parameters
-    ----------
-    thrusters : sequence of (int, str, Thruster)
-        With their places among the inputs, and names.
-    high : ndarray (nu,)
-        Largest value of each input; of one that is on-off the thruster's own where it is infinite.
-    sample : int
-        Steps between samples.
-    dt : float
-        Step [s].
-
-    Raises
-    ------
-    InputError
-        If there are no samples, or a least impulse is more than what is given within one.
+    `high` (nu,) is what they give; where it is infinite, one that is on-off gives its own `max`.
     """
 
     def __init__(

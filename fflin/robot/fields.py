@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any, TypeAlias
 
 from fflin.base.errors import InputError, ModelError, UnknownNameError, unknown
-from fflin.base.names import by_name, joints_by_name
+from fflin.base.names import by_name, joints_by_name, matching
 from fflin.base.validation import dimension, number
 from fflin.robot.inputs import (
     KINDS,
@@ -24,6 +24,8 @@ from fflin.robot.outputs import Output
 
 # The least and the largest value; infinite where there is no limit.
 Range: TypeAlias = tuple[float, float]
+
+_OF_JOINTS = ("q_m", "qdot_m")
 
 FIELDS = ("inputs", "outputs", "stiffness", "damping", "rest", "gravity", "limits")
 
@@ -99,20 +101,8 @@ def validated_inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, .
 def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> dict[str, Range]:
     """Return {name of an input or state: (least, largest)} of what a caller gives.
 
-    Parameters
-    ----------
-    inputs : sequence of Input
-    joints : sequence of str
-    given : float or mapping
-        Largest magnitude of all inputs, or {name, group or pattern: largest magnitude, or (least,
-        largest)}. States may be named too. A thruster never pulls.
-
-    Raises
-    ------
-    InputError
-        If a limit is negative or not a number, or a range is empty.
-    UnknownNameError
-        If there is no such input, state or group.
+    Which is the largest magnitude of all inputs, or {name, group or pattern of inputs or states:
+    largest magnitude, or (least, largest)}. A thruster never pulls.
     """
     names: list[str] = []
     keys: list[str] = []
@@ -125,12 +115,21 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> 
     if not isinstance(given, Mapping):
         given = dict.fromkeys(dict.fromkeys(item.GROUP for item in inputs), given)
     ranges = {str(key): _range(key, value) for key, value in given.items()}
-    try:
-        found = by_name("input", ranges, keys)
-    except UnknownNameError:
-        states = states_of(joints)
-        names, floors = names + states, floors + [-math.inf] * len(states)
-        found = by_name("input or state", ranges, (*keys, *states))
+    of_states: dict[str, Range] = {}
+    for key in list(ranges):
+        try:
+            matching("input", key, keys)
+        except UnknownNameError:
+            of_states[key] = ranges.pop(key)
+    states = states_of(joints)
+    names, floors = names + states, floors + [-math.inf] * len(states)
+    # The group of all joints leaves wheels out, whose speeds are of another size.
+    wheels = {f"{group}.{name}" for group in _OF_JOINTS for name, _ in named_wheels(inputs)}
+    whole = {key: of_states.pop(key) for key in list(of_states) if key in _OF_JOINTS}
+    found = by_name("input or state", whole, (*keys, *states))
+    found = {i: limits for i, limits in found.items() if names[i] not in wheels}
+    found |= by_name("input or state", of_states, (*keys, *states))
+    found |= by_name("input", ranges, keys)
     return {
         names[i]: (max(low, floors[i]), max(high, floors[i])) for i, (low, high) in found.items()
     }

@@ -59,20 +59,20 @@ def chosen_limits(robot: Robot, limits: Any) -> tuple[dict[str, Range], dict[str
     `limits` is that of `simulate`: nothing, "urdf" for all that `limits_of` knows, what
     `given_limits` takes, or a list of the two, where what is given goes first.
     """
-    own = limits_of(robot)
-    parts = limits if isinstance(limits, list | tuple) else [limits]
-    words = [part for part in parts if isinstance(part, str)]
-    for word in words:
-        if word != "urdf":
-            raise InputError(
-                f"limits is '{word}', expected 'urdf', a largest magnitude, {{input: magnitude}}, "
-                "or ['urdf', {input: magnitude}]"
-            )
+    own, cutting = limits_of(robot), dict[str, Range]()
     given: dict[str, Range] = {}
-    for part in parts if words else [limits]:
-        if part is not None and not isinstance(part, str):
+    several = isinstance(limits, list | tuple) and any(isinstance(x, str) for x in limits)
+    for part in limits if several else [limits]:
+        if isinstance(part, str):
+            if part != "urdf":
+                raise InputError(
+                    f"limits is '{part}', expected 'urdf', a largest magnitude, {{input: "
+                    "magnitude}, or ['urdf', {input: magnitude}]"
+                )
+            cutting = own
+        elif part is not None:
             given |= given_limits(robot.inputs, robot.joint_names, part)
-    return (own if words else {}) | given, own | given
+    return cutting | given, own | given
 
 
 def _travel(robot: Robot, joint: Joint) -> Range:

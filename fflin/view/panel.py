@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import compress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,9 @@ _NEAR = 1.0 / 3.0
 
 # What is below this, in SI units, is rounding.
 _NOTHING = 1e-14
+
+# Nor is a line drawn that is below this share of the largest of its plot.
+_UNSEEN = 1e-6
 
 _OPEN = np.full(2, np.inf)
 
@@ -105,7 +109,9 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
     lines = _lines(robot, motion, shown)
     for family, charts in enumerate(_CHARTS):
         for key, title in charts.items():
-            plot = _plot(title, key[1], lines.get(key, []), family)
+            sizes = [np.abs(line.values).max() for line in lines.get(key, [])]
+            seen = [x > _UNSEEN * max(sizes) for x in sizes]
+            plot = _plot(title, key[1], list(compress(lines.get(key, []), seen)), family)
             # Of rates their limits alone are of interest.
             if any(each["limits"] or not title.endswith("rates") for each in plot["lines"]):
                 plots.append(plot)

@@ -295,8 +295,8 @@ def test_what_is_not_regulated_is_said(tmp_path):
 
 def test_what_cannot_be_held_is_refused():
     for count, words in (
-        (1, "base attitude y/z and position"),
-        (2, "base attitude z and position"),
+        (1, r"base attitude y/z \(angular momentum is conserved\)"),
+        (2, r"base attitude z \(angular momentum is conserved\)"),
     ):
         with pytest.raises(fflin.StabilizabilityError, match=rf"cannot hold {words}"):
             fflin.lqr(fflin.linearize(wheeled(ORTHOGONAL[:count])))
@@ -304,6 +304,25 @@ def test_what_cannot_be_held_is_refused():
     idle = arm.replace(inputs=[JointTorque("joint_1"), *wheels(ORTHOGONAL, 1.0)])
     with pytest.raises(fflin.StabilizabilityError, match=r"joints joint_2, joint_3"):
         fflin.lqr(fflin.linearize(idle))
+
+
+def test_a_body_that_turns_is_held_too():
+    """Dual spin, about the axis of a wheel: speeds matter to the body, and nothing is pushed."""
+    robot = wheeled(ORTHOGONAL, others=[BaseTorque()])
+    v = fflin.velocity(robot, {"omega_b.z": 0.1, "wheel_3": 50.0})
+    lin = fflin.linearize(robot, v=v, moving=True)
+    gain = fflin.lqr(lin, wheel_speeds=False)
+    assert not any(name.startswith(("r_b", "v_b", "q_m")) for name in gain.regulated)
+    assert {"qdot_m.wheel_1", "qdot_m.wheel_2"} < set(gain.regulated)
+    at = [lin.state_names.index(name) for name in gain.regulated]
+    S = np.eye(len(lin.A))[at]
+    assert np.abs(S @ lin.A - S @ lin.A @ S.T @ S).max() < 1e-15
+    assert gain.poles.real.max() < -0.05 and gain.margins.disk > 1.0
+    push = robot.replace(inputs=[*robot.inputs, Thruster("base", (0, 0, 0), (1, 0, 0))])
+    lin = fflin.linearize(push, v=v, moving=True)
+    # In axes that turn what pushes along x pushes along y later; z stays unpushed.
+    with pytest.raises(fflin.StabilizabilityError, match=r"v_b\.z"):
+        fflin.lqr(lin)
 
 
 def test_the_closed_form_holds_too():

@@ -43,7 +43,7 @@ def test_limits_of_inputs_go_before_the_urdf_and_given_ones_before_both():
             fflin.ReactionWheel((0, 0, 1), inertia=0.03, max=0.2, max_speed=600.0, name="spin"),
             fflin.ReactionWheel((0, 1, 0), momentum=1.0, max=0.1),
         ],
-        limits={"q_m.joint_*": 1.0, "tau_m.joint_2": (-5.0, 6.0), "omega_b": 0.1, "main": 4.0},
+        limits={"q_m.joint_*": 1.0, "joint_2": (-5.0, 6.0), "omega_b": 0.1, "main": 4.0},
     )
     found = limits_of(robot)
     assert found["tau_b.y"] == (-40.0, 40.0)
@@ -75,6 +75,16 @@ def test_a_pattern_goes_before_a_group_and_a_name_before_both():
     assert found["tau_m.joint_7"] == (-1.0, 1.0)
     assert found["tau_m.joint_1"] == (-2.0, 2.0)
     assert found["tau_m.panel_left"] == (-3.0, 3.0)
+
+
+def test_the_group_of_all_joints_leaves_wheels_out():
+    wheel = fflin.ReactionWheel((0, 0, 1), inertia=0.03, max_speed=600.0, name="spin")
+    robot = fflin.load("servicer_7dof", inputs=[wheel])
+    found = limits_of(robot.replace(limits={"qdot_m": 0.5, "qdot_m.joint_*": 0.2}))
+    assert found["qdot_m.panel_left"] == (-0.5, 0.5)
+    assert found["qdot_m.joint_1"] == (-0.2, 0.2)
+    assert found["qdot_m.spin"] == (-600.0, 600.0)
+    assert limits_of(robot.replace(limits={"qdot_m.spin": 50}))["qdot_m.spin"] == (-50.0, 50.0)
 
 
 def test_limits_are_kept_in_files_of_models(tmp_path):

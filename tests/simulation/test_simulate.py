@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from tests.support.motions import displaced, regulated
+from tests.support.motions import displaced, regulated, strong_thrusters
 from tests.support.robots import BUNDLED, free_body
 from tests.support.weights import unit_weights
 
@@ -242,8 +242,7 @@ def test_limits_by_name_and_group_and_thrusters_never_pull():
 
 def test_allocation_gives_the_wrench_with_thrusts_that_push():
     design = fflin.load("cubesat", inputs=[fflin.BaseTorque(), fflin.BaseForce()])
-    thrusters = [x for x in fflin.load_inputs("cubesat") if isinstance(x, fflin.Thruster)]
-    robot = design.replace(inputs=thrusters)
+    robot = design.replace(inputs=strong_thrusters())
     lin = fflin.linearize(design)
     gain = fflin.acceleration_lqr(lin, 0.04, 0.2, 1.0)
     policy = fflin.Allocation(fflin.StateFeedback(lin, gain.K), design)

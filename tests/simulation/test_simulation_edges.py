@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from tests.support.motions import displaced, regulated
+from tests.support.motions import displaced, regulated, strong_thrusters
 from tests.support.robots import free_body
 from tests.support.weights import unit_weights
 
@@ -260,9 +260,7 @@ def test_feedback_along_a_trajectory_does_not_see_the_quaternions_sign():
 
 def test_an_allocation_is_sampled_as_its_policy_is_and_refuses_what_is_no_command():
     design = fflin.load("cubesat", inputs=[fflin.BaseTorque(), fflin.BaseForce()])
-    robot = design.replace(
-        inputs=[x for x in fflin.load_inputs("cubesat") if isinstance(x, fflin.Thruster)]
-    )
+    robot = design.replace(inputs=strong_thrusters())
     lin = fflin.linearize(design)
     gain = fflin.acceleration_lqr(lin, 0.04, 0.2, 1.0)
     inner = fflin.StateFeedback(lin.discretize(0.1), gain.K)

@@ -1,6 +1,7 @@
 """Motions that several test files share, and what starts them."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -113,3 +114,9 @@ def displaced(lin, degrees=30.0, offset=0.5, spread=0.3):
     x[3:6] = offset * np.array([1.0, 2.0, -2.0]) / 3.0
     x[6 : 6 + n] += spread
     return x
+
+
+def strong_thrusters():
+    """The thrusters of the cubesat, each as strong as it is asked to be."""
+    inputs = fflin.load_inputs("cubesat")
+    return [replace(x, max=None) for x in inputs if isinstance(x, fflin.Thruster)]

@@ -180,6 +180,7 @@ def test_thrusters_that_never_fire_are_not_drawn():
     u = np.zeros_like(motion.u)
     fired = [motion.input_names.index(name) for name in ("x_plus_top", "z_minus_left")]
     u[:, fired] = (1.0, 2.0)
+    u[:, motion.input_names.index("y_plus_back")] = 1e-9  # what an allocation leaves
     motion = replace(motion, u=u)
     plots = panel(robot, motion, every(motion), robot.neutral()[None])["plots"]
     (plot,) = (each for each in plots if each["title"] == "thrusters")
