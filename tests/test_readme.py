@@ -31,7 +31,11 @@ def test_python_examples_run(tmp_path, page):
 
 
 def test_inputs_of_the_guide_are_read(tmp_path):
-    (block,) = code_blocks("toml", (ROOT / "docs" / "guide.md").read_text(encoding="utf-8"))
+    block, whole = code_blocks("toml", (ROOT / "docs" / "guide.md").read_text(encoding="utf-8"))
+    (tmp_path / "mysat.toml").write_text(whole)
+    mysat = fflin.load(tmp_path / "mysat.toml")
+    assert mysat.limits["q_m.joint_2"] == (-1.5, 1.5) and mysat.stiffness["panel_left"] == 100.0
+    assert len(fflin.linearize(mysat).u0) == 13
     path = tmp_path / "inputs.toml"
     path.write_text(block)
     robot = fflin.load("servicer_7dof", inputs=fflin.load_inputs(path))

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import InputError, UnknownNameError, unknown
 
 T = TypeVar("T")
 
@@ -81,6 +81,16 @@ def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
     return found
 
 
+def stands_for_any(key: str, names: Sequence[str]) -> bool:
+    """Whether a key stands for any of the names, or for entries of several groups."""
+    try:
+        return bool(matching("name", key, names))
+    except UnknownNameError:
+        return False
+    except InputError:
+        return True
+
+
 def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[int, T]:
     """Return {index: value} of {key: value}, with keys as `matching` reads them.
 
@@ -109,7 +119,7 @@ def joints_by_name(
     found = {joints[i]: value for i, value in by_name(kind, many, states).items()}
     for key, value in values.items():
         if key not in many:
-            found[find(key.removeprefix("q_m."))] = value
+            found[find(str(key).removeprefix("q_m."))] = value
     return found
 
 

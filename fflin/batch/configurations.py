@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number, whole
 from fflin.batch.rows import checked_configurations, follow_rows
 from fflin.dynamics.points import configuration
@@ -193,8 +194,8 @@ def random_configurations(
     seed : int
         The same seed gives the same configurations.
     ranges : mapping, optional
-        {joint: (low, high) [rad|m]} in place of its limits. What turns without limits is drawn
-        from one turn.
+        {joint or pattern: (low, high) [rad|m]} in place of its limits. What turns without limits
+        is drawn from one turn.
     base : pin.SE3, optional
         Placement of the base; the identity by default.
 
@@ -215,9 +216,8 @@ def random_configurations(
     start = configuration(robot, base=base)
     if not (ranges is None or isinstance(ranges, Mapping)):
         raise InputError(f"ranges is {ranges!r}, expected {{joint: (low, high)}}")
-    given = dict(ranges or {})
-    for name in given:
-        robot.joint(name)
+    names = robot.joint_names
+    given = joints_by_name("joint", ranges or {}, names, lambda name: robot.joint(name).name)
     checked = {joint.name: _range(robot, joint, given.get(joint.name)) for joint in robot.joints}
     start.setflags(write=False)
     return RandomConfigurations(robot, count, seed, checked, start)

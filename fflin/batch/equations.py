@@ -133,7 +133,7 @@ class PointEquations(BatchEquations):
         q_m = state.joint_positions(q)
         chart, r_b, within = self._place(q)
         u_base = actuation.in_base_axes(chart, u)
-        stiffness, damping, rest = state.robot.passive
+        stiffness, damping, rest = state.robot.springs
         forces = u_base @ actuation.fixed.T
         forces[:, 6:] -= stiffness * (q_m - rest) + damping * nu[:, 6:]
         A = out["A"] if "A" in out else np.empty((count, state.nx, state.nx))

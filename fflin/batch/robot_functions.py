@@ -38,6 +38,7 @@ def functions_of(
             "_inertia": partial(_refuse, "inertia M", name),
             "_ignorable": partial(_as_saved, ignorable),
             "_limits": dict,
+            "weights": {},
         }
     from fflin.linear.certificate import certify, inertia_matrix
     from fflin.linear.ignorable import ignorable_states
@@ -50,7 +51,10 @@ def functions_of(
         "_limits": magnitudes_of,
     }
     of_robot = {field: partial(function, robot) for field, function in functions.items()}
-    return of_robot | {"_require_unchanged": robot.require_unchanged}
+    return of_robot | {
+        "weights": robot.weights,
+        "_require_unchanged": robot.require_unchanged,
+    }
 
 
 def own_reference(root: Array, base: Array) -> Array:

@@ -23,7 +23,7 @@ from fflin.robot.frames import ROOT
 # Fields of a linear model that a batch has as arrays, or not at all.
 _OF_MODELS = (
     *("C", "D", "dt", "_inertia", "_certify", "_ignorable", "_limits"),
-    "_require_unchanged",
+    *("weights", "_require_unchanged"),
 )
 
 # Attributes of a robot that, with its model and its mappings, tell it from others.

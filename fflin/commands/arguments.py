@@ -96,24 +96,23 @@ def add_values(
     )
 
 
-def _add_vector(
-    command: Container, option: str, entries: str, help: str, default: Any = (0.0, 0.0, 0.0)
-) -> None:
+def _add_vector(command: Container, option: str, entries: str, help: str) -> None:
     """Add an option of three numbers, which its help calls by these letters."""
-    command.add_argument(
-        option, nargs=3, type=number, default=default, metavar=tuple(entries), help=help
-    )
+    command.add_argument(option, nargs=3, type=number, metavar=tuple(entries), help=help)
 
 
 def add_robot(command: argparse.ArgumentParser) -> None:
     """Add ROBOT and --lock."""
     command.add_argument(
-        "robot", metavar="ROBOT", help="a name of `fflin robots`, or the path of a URDF"
+        "robot",
+        metavar="ROBOT",
+        help="a name of `fflin robots`, or the path of a URDF or of a robot.toml",
     )
     add_values(
         command,
         "--lock",
-        "weld a joint, at VALUE [rad|m] or at neutral",
+        "weld a joint, at VALUE [rad|m] or at neutral; NAME may be a pattern, 'hinge_*', here and "
+        "below",
         metavar="NAME[=VALUE]",
         read=lock,
     )
@@ -181,19 +180,26 @@ def add_system(command: argparse.ArgumentParser) -> None:
         "--gravity",
         "XYZ",
         "uniform gravity in world axes [m/s^2]; none by default",
-        default=None,
+    )
+    add_values(
+        command,
+        "--passive",
+        "a joint without a motor: it gets no torque by default",
+        metavar="NAME",
+        read=str,
     )
     command.add_argument(
         "--inputs",
         metavar="FILE.toml",
         help="what acts on the robot, as fflin.load_inputs reads it: a file, or the name of a "
-        "bundled one; `joints` or `base`: those alone; by default torque and force on the base "
-        "and every joint's",
+        "bundled one; `joints` or `base`: those alone; by default those of a robot.toml, or torque "
+        "and force on the base and every joint's",
     )
     add_values(
         command,
         "--output",
-        "what is watched: state (default), base, joints, rates, com, momentum, frame:NAME (pose "
+        "what is watched: state (default), base, joints, rates, joints:NAME, rates:NAME (a joint "
+        "or a pattern), com, momentum, frame:NAME (pose "
         "and velocity), pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME; "
         "relative:NAME:TO, as another frame sees it",
         metavar="SPEC",

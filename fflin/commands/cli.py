@@ -17,6 +17,7 @@ from fflin.commands import (
     BAD_INPUT,
     DONE,
     analysis,
+    init,
     models,
     regulator,
     simulation,
@@ -27,7 +28,7 @@ from fflin.commands import (
 
 # The commands by task, as the help lists them.
 TASKS = {
-    "look at robots": ("robots", "info", "view"),
+    "look at robots": ("robots", "info", "init", "view"),
     "make and check a linear model": ("linearize", "check"),
     "judge it": ("analyze", "modes", "validity"),
     "close the loop": ("lqr", "tvlqr", "simulate"),
@@ -113,7 +114,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         prog="fflin", metavar="COMMAND", required=True, help=argparse.SUPPRESS
     )
-    for module in (models, analysis, regulator, tracking, simulation, visual, sweeps):
+    for module in (models, init, analysis, regulator, tracking, simulation, visual, sweeps):
         module.add_commands(commands)
     # argparse lists all in one group.
     left = {command.dest: command for command in commands._choices_actions}

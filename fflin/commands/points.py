@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import warnings
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinError, FflinWarning, InputError
@@ -20,12 +21,13 @@ if TYPE_CHECKING:
 
 def load_robot(arguments: argparse.Namespace) -> Robot:
     """Load the robot with the passive joints, inputs, outputs and gravity that are given."""
-    from fflin.robot.loading import load
+    from fflin.robot.loading import load, with_fields
 
-    with warnings.catch_warnings():
-        if getattr(arguments, "damping", []):  # it is asked for
-            warnings.filterwarnings("ignore", ".*: damping unused", FflinWarning)
-        robot = load(arguments.robot, lock=once("--lock", arguments.lock))
+    lock, passive = once("--lock", arguments.lock), getattr(arguments, "passive", [])
+    first: dict[str, Any] = {"passive": passive} if passive else {}
+    if getattr(arguments, "damping", None) == [(None, "urdf")]:
+        first["damping"] = "urdf"
+    robot = load(arguments.robot, lock=lock, **first)
     fields: dict[str, Any] = {}
     for name in ("stiffness", "damping"):
         values = getattr(arguments, name, [])
@@ -46,7 +48,7 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
         from fflin.robot.outputs import parse_output
 
         fields["outputs"] = [output for text in arguments.output for output in parse_output(text)]
-    return robot.replace(**fields) if fields else robot
+    return with_fields(robot, fields)
 
 
 def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:
@@ -55,7 +57,7 @@ def _inputs(robot: Robot, name: str) -> tuple[Input, ...]:
     if name == "joints":
         if not robot.n:
             raise InputError(f"--inputs joints: '{robot.name}' has no joints")
-        return tuple(JointTorque(joint) for joint in robot.joint_names)
+        return (JointTorque("*"),)
     if name == "base":
         return BaseTorque(), BaseForce()
     from fflin.robot.input_files import load_inputs
@@ -73,22 +75,36 @@ def once(option: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return values
 
 
-def configuration_of(robot: Robot, arguments: argparse.Namespace) -> Array:
-    """Return the configuration (nq,) that --joint, --rpy and --position say."""
+def configuration_of(
+    robot: Robot, arguments: argparse.Namespace, start: Mapping[str, Any] | None = None
+) -> Array:
+    """Return the configuration (nq,) that --joint, --rpy and --position say, before a start."""
     import pinocchio as pin
 
-    rotation = pin.rpy.rpyToMatrix(*(math.radians(angle) for angle in arguments.rpy))
-    base = pin.SE3(rotation, pin.SE3.Identity().translation + arguments.position)
-    return placed(robot, "--joint", arguments.joint, base)
+    start = start or {}
+    rpy, position = (
+        start.get(name, (0.0, 0.0, 0.0)) if given is None else given
+        for name, given in (("rpy", arguments.rpy), ("position", arguments.position))
+    )
+    rotation = pin.rpy.rpyToMatrix(*map(math.radians, rpy))
+    base = pin.SE3(rotation, pin.SE3.Identity().translation + position)
+    return placed(robot, "--joint", arguments.joint, base, start.get("joints"))
 
 
 def placed(
-    robot: Robot, option: str, pairs: list[tuple[str, Any]], base: pin.SE3 | None = None
+    robot: Robot,
+    option: str,
+    pairs: list[tuple[str, Any]],
+    base: pin.SE3 | None = None,
+    start: Mapping[str, float] | None = None,
 ) -> Array:
     """Return the configuration (nq,) with the joints that an option says; warn beyond limits."""
+    from fflin.base.names import joints_by_name
     from fflin.dynamics.points import configuration
 
-    joints = once(option, pairs)
+    joints = dict(start or {}) | joints_by_name(
+        "joint", once(option, pairs), robot.joint_names, lambda name: robot.joint(name).name
+    )
     q = configuration(robot, joints, base)
     model = robot.model
     for joint in robot.joints:
@@ -122,13 +138,26 @@ def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
     return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
 
 
-def velocity_of(robot: Robot, arguments: argparse.Namespace, *options: str) -> Array | None:
-    """Return the velocity (nv,) that --velocity says, or these options, the later before others."""
+def velocity_of(
+    robot: Robot,
+    arguments: argparse.Namespace,
+    *options: str,
+    start: Mapping[str, Any] | None = None,
+) -> Array | None:
+    """Return the velocity (nv,) that --velocity says, or these options, the later before others.
+
+    A start goes before all but --velocity.
+    """
     from fflin.dynamics.points import velocity
+    from fflin.robot.signals import rates_by_name
 
     values: dict[str, float] = {}
     for option in options or ("velocity",):
-        values |= once(f"--{option.replace('_', '-')}", getattr(arguments, option))
+        if option == "velocity":
+            values |= (start or {}).get("velocity", {})
+        given = once(f"--{option.replace('_', '-')}", getattr(arguments, option))
+        velocity(robot, given)  # says what is wrong with it
+        values |= rates_by_name(robot.joint_names, given)
     return velocity(robot, values) if values else None
 
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from fflin.base.errors import (
     EquilibriumError,
     FflinWarning,
-    InputError,
     StabilizabilityError,
 )
 from fflin.commands import DONE
@@ -26,7 +25,6 @@ from fflin.commands.points import linear_model, once
 from fflin.commands.visual import add_figure, check_figure, draw
 
 if TYPE_CHECKING:
-    from fflin.base.validation import Array
     from fflin.control.gain import Gain
     from fflin.linear.model import LinearModel
 
@@ -102,6 +100,7 @@ def regulated_part(lin: LinearModel, arguments: argparse.Namespace) -> LinearMod
 
 def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     """Return the regulator that the weights say, and warn of one that bears little."""
+    from fflin.control.default_weights import rule_weights
     from fflin.control.gain import fragility
     from fflin.control.lqr import lqr, require_fixed_point
 
@@ -114,40 +113,19 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
     if arguments.dt is not None:
         lin = lin.discretize(arguments.dt)
     try:
-        if arguments.q or arguments.r or arguments.bryson:
-            *weights, rule = named_weights(lin, arguments)
-            gain = lqr(lin, *weights, wheel_speeds=arguments.wheel_speeds)
-            gain = replace(gain, weights=rule)
+        given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
+        speeds = arguments.wheel_speeds
+        if any(given.values()):
+            *weights, rule = rule_weights(lin, arguments.weights, given, wheel_speeds=speeds)
+            gain = replace(lqr(lin, *weights, wheel_speeds=speeds), weights=rule)
         else:
-            gain = lqr(lin, weights=arguments.weights, wheel_speeds=arguments.wheel_speeds)
+            gain = lqr(lin, weights=arguments.weights, wheel_speeds=speeds)
     except StabilizabilityError as error:
         hint = " (--reduce)" if "momentum_reduction" in str(error) else ""
         raise StabilizabilityError(f"{error}{hint}") from None
     if fragile := fragility(gain):
         warnings.warn(fragile, FflinWarning, stacklevel=2)
     return gain
-
-
-def named_weights(
-    lin: LinearModel, arguments: argparse.Namespace, hold: float = 0.0
-) -> tuple[Array, Array, Array | None, str]:
-    """Return Q, R and N with what is named, and a rule's for what is not; and the rule in words."""
-    from fflin.control.default_weights import rule_weights
-    from fflin.control.weights import inverse_square, is_input
-
-    values = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
-    squares = {}
-    for name, value in values["bryson"].items():
-        squares[name] = inverse_square(f"largest value of '{name}' (--bryson)", value)
-    sides = {name: is_input("state or input", name, lin) for name in squares}
-    of_inputs = {name: value for name, value in squares.items() if sides[name]}
-    of_states = {name: value for name, value in squares.items() if not sides[name]}
-    both = [*(set(values["q"]) & set(of_states)), *(set(values["r"]) & set(of_inputs))]
-    if both:
-        raise InputError(f"'{both[0]}' has a weight and a largest value; give either")
-    q, r = values["q"] | of_states, values["r"] | of_inputs
-    speeds = arguments.wheel_speeds
-    return rule_weights(lin, arguments.weights, q, r, wheel_speeds=speeds, hold=hold)
 
 
 def _lqr(arguments: argparse.Namespace) -> int:

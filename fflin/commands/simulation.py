@@ -111,6 +111,13 @@ def add_commands(commands: Commands) -> None:
         type=file_name,
         help="draw linear beside nonlinear into FILE: .png, .pdf or .svg",
     )
+    add_values(
+        simulate,
+        "--show",
+        "what --plot draws: a state or input, a group or a pattern, such as q_m, '*.hinge_*'",
+        metavar="NAME",
+        read=str,
+    )
     add_output_file(simulate, "save the motion to FILE: .npz, .mat, .json or .csv")
     add_pictures(simulate)
 
@@ -138,7 +145,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
             motion.save(arguments.output_file)
             lines.append(f"wrote {arguments.output_file}")
         if arguments.plot:
-            motion.plot(arguments.plot)
+            motion.plot(arguments.plot, show=arguments.show or None)
             lines.append(f"wrote {arguments.plot}")
         lines += show_motion(robot, motion, arguments)
     finally:
@@ -162,8 +169,8 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
 
     given = once("--limit", arguments.limit)
     options: dict[str, Any] = {
-        "q0": configuration_of(robot, arguments),
-        "v0": velocity_of(robot, arguments, "target_velocity", "velocity"),
+        "q0": configuration_of(robot, arguments, robot.start),
+        "v0": velocity_of(robot, arguments, "target_velocity", "velocity", start=robot.start),
         "duration": arguments.duration,
         "dt": arguments.step,
         "every": arguments.every,

@@ -220,7 +220,7 @@ def _points(
     if arguments.configurations:
         if arguments.joint:
             raise InputError("--joint and --configurations both place joints; give either")
-        if any(arguments.rpy) or any(arguments.position):
+        if arguments.rpy or arguments.position:
             raise InputError("--rpy, --position and --configurations all place the base; give one")
         given = _given(arguments.configurations)
         for name, value in (("v", v), ("u", u)):

@@ -17,7 +17,7 @@ from fflin.commands.arguments import (
     file_name,
 )
 from fflin.commands.points import load_robot, once
-from fflin.commands.regulator import add_weights, named_weights
+from fflin.commands.regulator import add_weights
 
 if TYPE_CHECKING:
     from fflin.linear.linear_trajectory import LinearTrajectory
@@ -67,7 +67,9 @@ def models_along(arguments: argparse.Namespace) -> LinearTrajectory:
     for name in ("joint", "velocity", "effort", "equilibrium"):
         if getattr(arguments, name, None):
             raise InputError(f"--{name} says a point and --trajectory a motion; give either")
-    if any(getattr(arguments, "rpy", ())) or any(getattr(arguments, "position", ())):
+    if any(getattr(arguments, "rpy", None) or ()) or any(
+        getattr(arguments, "position", None) or ()
+    ):
         raise InputError("--rpy and --position say a point and --trajectory a motion; give either")
     robot, options = load_robot(arguments), {"hold": arguments.hold, "frame": arguments.frame}
     return linearize_trajectory(robot, Trajectory.load(arguments.trajectory, robot, **options))
@@ -91,14 +93,17 @@ def check_along(arguments: argparse.Namespace) -> int:
 
 
 def _tvlqr(arguments: argparse.Namespace) -> int:
+    from fflin.control.default_weights import rule_weights
     from fflin.control.tvlqr import steady_end, tvlqr
 
     if arguments.reduce:
         raise InputError("--reduce: over a finite time the inputs hold what they can; leave it out")
     along = models_along(arguments)
     options: dict[str, Any] = {"sample": arguments.dt, "weights": arguments.weights}
-    if arguments.q or arguments.r or arguments.bryson:
-        Q, R, _, rule = named_weights(steady_end(along), arguments, arguments.dt or 0.0)
+    given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
+    if any(given.values()):
+        end, hold = steady_end(along), arguments.dt or 0.0
+        Q, R, _, rule = rule_weights(end, arguments.weights, given, hold=hold)
         options |= {"Q": Q, "R": R, "weights": None, "rule": rule}
     _say(tvlqr(along, Qf=once("--qf", arguments.qf) or "steady", **options), arguments)
     return DONE

@@ -152,7 +152,7 @@ def _view(arguments: argparse.Namespace) -> int:
         scene=arguments.scene,
         follow=arguments.follow,
         tool=arguments.tool,
-        q=configuration_of(robot, arguments),
+        q=configuration_of(robot, arguments, robot.start),
         port=arguments.port,
     )
     assert isinstance(live, Live)  # for there is no motion

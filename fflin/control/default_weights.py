@@ -17,7 +17,7 @@ from fflin.base.validation import Array
 from fflin.control.riccati import half_size, solve
 from fflin.control.sampled_cost import sampled_cost
 from fflin.control.saturation import warn_beyond
-from fflin.control.weights import reweighed
+from fflin.control.weights import reweighed, weights_by_name
 
 if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
@@ -57,8 +57,7 @@ class _Limit(NamedTuple):
 def rule_weights(
     lin: LinearModel,
     name: str | None,
-    q: Mapping[str, float] | None = None,
-    r: Mapping[str, float] | None = None,
+    given: Mapping[str, Any] | None = None,
     *,
     wheel_speeds: bool | None = None,
     hold: float = 0.0,
@@ -72,9 +71,10 @@ def rule_weights(
     ----------
     lin : LinearModel
     name : {"urdf", "identity"} or None
-        "urdf" is `default_weights`, and the default; "identity" is 1 on every state and input.
-    q, r : mapping
-        {name of a state, an input or a group: weight} of those that have their own.
+        "urdf" is `default_weights`, "identity" 1 on every state and input; by default what the
+        robot has in its `weights`, and "urdf" where it has none.
+    given : mapping
+        Parts "q", "r", "bryson" of those that have their own, as `Robot.replace` takes them.
     wheel_speeds : bool, optional
         As in `lqr`.
     hold : float
@@ -86,6 +86,10 @@ def rule_weights(
         If there is no such rule, state or input.
     """
     source = lin.generator or lin
+    layers = [(given, False)] if given else []
+    if name is None and lin.weights:
+        layers.insert(0, (lin.weights, True))
+        name = lin.weights.get("rule")
     if name is None or name == "urdf":
         Q, R, rule = _of_regulated(source, lin.dt or hold, wheel_speeds)
     elif name == "identity":
@@ -93,11 +97,14 @@ def rule_weights(
         Q, R, rule = np.eye(nx), np.eye(nu), "identity: 1 on every state and every input"
     else:
         raise unknown("rule of weights", name, ("urdf", "identity"))
-    q, r = q or {}, r or {}
-    if q or r:
+    named: dict[str, None] = {}
+    for layer, of_robot in layers:
+        q, r = weights_by_name(lin, layer, of_robot=of_robot)
         Q = reweighed("state", Q, q, lin.state_names)
         R = reweighed("input", R, r, input_keys(lin))
-        rule = f"{', '.join((*q, *r))} as given, the others {rule}"
+        named |= dict.fromkeys((*q, *r))
+    if named:
+        rule = f"{', '.join(named)} as given, the others {rule}"
     if source.dt == lin.dt:
         return Q, R, None, rule
     return (*sampled_cost(source, lin.dt, Q, R), rule)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.names import by_name, input_keys, matching
+from fflin.base.names import by_name, input_keys, matching, stands_for_any
 from fflin.base.validation import Array, dimension, number, vector
 
 if TYPE_CHECKING:
@@ -84,6 +84,29 @@ def is_input(kind: str, key: str, lin: LinearModel) -> bool:
     if len(sides) > 1:
         raise InputError(f"{kind} '{key}' is of states and of inputs; name one group of them")
     return sides.pop()
+
+
+def weights_by_name(
+    lin: LinearModel, given: Mapping[str, Any], *, of_robot: bool
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return weights on states and on inputs of the parts "q", "r" and "bryson".
+
+    Of a robot's own weights, what a reduced model has not is left out.
+    """
+    parts = {part: dict(given.get(part, {})) for part in ("q", "r", "bryson")}
+    if of_robot:
+        names = (*lin.state_names, *input_keys(lin))
+        parts = {
+            part: {key: x for key, x in values.items() if stands_for_any(key, names)}
+            for part, values in parts.items()
+        }
+    q, r = parts["q"], parts["r"]
+    for name, size in parts["bryson"].items():
+        side = r if is_input("state or input", name, lin) else q
+        if name in side:
+            raise InputError(f"'{name}' has a weight and a largest value; give either")
+        side[name] = inverse_square(f"largest value of '{name}' (--bryson)", size)
+    return q, r
 
 
 def inverse_square(what: str, size: float) -> float:

@@ -35,7 +35,7 @@ class Aba:
         self._model = robot.model.copy()
         self._model.gravity.linear = np.array(robot.gravity)
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
-        self._resists = any(values.any() for values in robot.passive)
+        self._resists = any(values.any() for values in robot.springs)
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 
     def acceleration(self, q: Array, v: Array, u: Array, tau: Array | None = None) -> Array:
@@ -67,7 +67,7 @@ class Aba:
         holds d(B u)/dq too. B comes from the accelerations of unit inputs at rest.
         """
         state = self.state
-        stiffness, damping, _ = state.robot.passive
+        stiffness, damping, _ = state.robot.springs
         tau = state.lift(self.actuation.torques(u) + self._passive_force(q, v))
         external = self._wrenches(q, v, u)
         if state.S is None:
@@ -131,7 +131,7 @@ class Aba:
         return jacobian, turning
 
     def _passive_force(self, q: Array, v: Array) -> Array:
-        stiffness, damping, rest = self.state.robot.passive
+        stiffness, damping, rest = self.state.robot.springs
         force = np.zeros(6 + self.state.robot.n)
         force[6:] -= stiffness * (self.state.joint_positions(q) - rest)
         force[6:] -= damping * self.state.velocities(v)[6:]

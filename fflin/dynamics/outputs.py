@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.names import joints_by_name
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.output_kinds import KINDS, Carried, Point, Sensed, Slopes, World
@@ -187,8 +188,15 @@ def state_indices(state: StateMap, output: Output) -> list[int]:
     if not isinstance(output, JointPositions | JointVelocities):
         raise InputError(f"{output!r} is no output, as FramePose('tool') would be")
     group = groups.q_m if isinstance(output, JointPositions) else groups.qdot_m
-    names = robot.joint_names if output.joints is None else output.joints
-    return [group.start + robot.joints.index(robot.joint(name)) for name in names]
+    names = robot.joint_names
+    asked = names if output.joints is None else output.joints
+    return [
+        group.start + names.index(name)
+        for key in asked
+        for name in joints_by_name(
+            "joint", {str(key): 0}, names, lambda name: robot.joint(name).name
+        )
+    ]
 
 
 def _carried(state: StateMap, output: Output) -> tuple[Carried, ...]:

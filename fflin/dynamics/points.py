@@ -5,13 +5,16 @@ from collections.abc import Mapping
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, unknown
+from fflin.base import names
+from fflin.base.errors import InputError
+from fflin.base.names import input_keys, joints_by_name
 from fflin.base.validation import Array, by_name, number, placement
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT
 from fflin.robot.inputs import named_wheels
 from fflin.robot.robot import Robot
+from fflin.robot.signals import rates_by_name
 
 
 def configuration(
@@ -25,7 +28,8 @@ def configuration(
     ----------
     robot : Robot
     joints : mapping, optional
-        {joint: value [rad|m]} of independent joints; the others stay at neutral.
+        {joint: value [rad|m]} of independent joints; the others stay at neutral. A name may be
+        a pattern, ``hinge_*``.
     base : pin.SE3, optional
         Placement of the base in the world; the identity by default.
 
@@ -46,10 +50,24 @@ def configuration(
     if base is not None:
         root = robot.model.jointPlacements[ROOT]
         q[:7] = pin.SE3ToXYZQUAT(root.actInv(placement("base", base)))
-    for name, value in by_name("joints", {} if joints is None else joints, "joint").items():
-        robot.joint(name).place(q, number(f"joint '{name}'", value))
+    values = {
+        name: number(f"joint '{name}'", value)
+        for name, value in by_name("joints", {} if joints is None else joints, "joint").items()
+    }
+    found = joints_by_name("joint", values, robot.joint_names, lambda name: robot.joint(name).name)
+    for name, value in found.items():
+        robot.joint(name).place(q, value)
     robot.follow(q)
     return robot.checked_configuration(q)
+
+
+def start_of(robot: Robot) -> tuple[Array, Array]:
+    """Return the configuration (nq,) and velocity (nv,) at which a robot starts."""
+    start = robot.start
+    rotation = pin.rpy.rpyToMatrix(*np.radians(start.get("rpy", np.zeros(3))))
+    base = pin.SE3(rotation, np.array(start.get("position", np.zeros(3))))
+    q = configuration(robot, start.get("joints"), base)
+    return q, velocity(robot, start.get("velocity", {}))
 
 
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
@@ -60,7 +78,8 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     robot : Robot
     values : mapping
         {joint: rate [rad/s|m/s]}, and omega_b.x, .y, .z [rad/s] and v_b.x, .y, .z [m/s] of the
-        base in base axes; the others are zero.
+        base in base axes; the others are zero. A name may be a pattern, ``hinge_*``, or a
+        group, ``qdot_m``.
 
     Returns
     -------
@@ -73,20 +92,15 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     InputError
         If a value is not a finite number.
     """
-    state = StateMap(robot)
-    base = state.names[state.groups.omega_b] + state.names[state.groups.v_b]
-    nu = np.zeros(6 + robot.n)
-    for name, value in by_name("values", values, "velocity").items():
-        if name in base:
-            index = base.index(name)
-        elif name in robot.joint_names:
-            index = 6 + robot.joint_names.index(name)
-        elif name in (wheel for wheel, _ in named_wheels(robot.inputs)):
+    checked = {
+        name: number(f"velocity '{name}'", value)
+        for name, value in by_name("values", values, "velocity").items()
+    }
+    for name, _ in named_wheels(robot.inputs):
+        if name in checked and name not in robot.joint_names:
             robot.joint(name)  # says why it has no speed
-        else:
-            raise unknown("velocity", name, (*robot.joint_names, *base))
-        nu[index] = number(f"velocity '{name}'", value)
-    return state.spread(nu)
+    state, rates = StateMap(robot), rates_by_name(robot.joint_names, checked)
+    return state.spread(np.array([rates.get(name, 0.0) for name in state.names[6 + robot.n :]]))
 
 
 def effort(robot: Robot, values: Mapping[str, float]) -> Array:
@@ -96,7 +110,7 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     ----------
     robot : Robot
     values : mapping
-        {name of an input: value}; the others are zero.
+        {name of an input, group or pattern, such as ``tau_m``: value}; the others are zero.
 
     Returns
     -------
@@ -109,10 +123,10 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     InputError
         If a value is not a finite number.
     """
-    names = Actuation(StateMap(robot)).names
-    u = np.zeros(len(names))
-    for name, value in by_name("values", values, "input").items():
-        if name not in names:
-            raise unknown("input", name, names)
-        u[names.index(name)] = number(f"effort '{name}'", value)
-    return u
+    checked = {
+        name: number(f"effort '{name}'", value)
+        for name, value in by_name("values", values, "input").items()
+    }
+    keys = input_keys(Actuation(StateMap(robot)))
+    found = names.by_name("input", checked, keys)
+    return np.array([found.get(index, 0.0) for index in range(len(keys))])

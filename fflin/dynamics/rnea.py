@@ -80,8 +80,8 @@ class Accelerations:
         self._state, self._actuation, self._data = state, actuation, data
         self._model, self._nv = robot.model, 6 + robot.n
         self._inertia = Inertia(state, data)
-        self._passive = robot.passive
-        self._resists = any(values.any() for values in robot.passive)
+        self._passive = robot.springs
+        self._resists = any(values.any() for values in robot.springs)
         self._joints = np.arange(6, self._nv)
         self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
 

@@ -159,8 +159,8 @@ def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
         np.array(inputs, dtype=np.intp),
         np.array([index for index, _ in stored], dtype=np.intp),
         np.array([tree.axes[index].T @ h for index, h in stored]).reshape(-1, 3),
-        np.array(robot.passive.stiffness),
-        np.array(robot.passive.damping),
+        np.array(robot.springs.stiffness),
+        np.array(robot.springs.damping),
     )
 
 

@@ -175,7 +175,7 @@ def _rounding(robot: Robot, lin: LinearModel) -> Array:
     speed = np.abs(state.velocities(lin.v))
     rate = max(float(speed[:3].max()), float(speed[6:].max(initial=0.0)))
     terms = rate * (np.abs(lin.M) @ speed)
-    stiffness, _, rest = robot.passive
+    stiffness, _, rest = robot.springs
     terms[6:] += stiffness * (np.abs(state.joint_positions(lin.q)) + np.abs(rest))
     return _ROUNDING * terms
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,8 @@ _LISTS = (
     *("locked", "ignorable", "limit_names"),
 )
 # Which older files have not.
-_LATER: Record = {"ignorable": (), "drift": (), "limit_names": (), "limits": ()}
-_TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version")
+_LATER: Record = {"ignorable": (), "drift": (), "limit_names": (), "limits": (), "weights": "{}"}
+_TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version", "weights")
 _CERTIFICATE = ("condition", "inertia_residual", "route_A", "route_B", "f0")
 
 # Of csv, the last of which has the digest of all.
@@ -49,7 +50,8 @@ def record_of(lin: Any) -> Record:
     entries["limits"] = np.array(list(lin.limits.values()))
     entries |= {key: list(getattr(lin, key)) for key in _LISTS[:-1]}
     entries["limit_names"] = list(lin.limits)
-    entries |= {key: getattr(lin, key) for key in _TEXTS}
+    entries |= {key: getattr(lin, key) for key in _TEXTS[:-1]}
+    entries["weights"] = json.dumps(dict(lin.weights))
     entries["dt"], entries["moving"] = float(lin.dt), float(lin.moving)
     entries["certificate"] = {key: getattr(lin.certificate, key) for key in _CERTIFICATE}
     return entries
@@ -108,12 +110,20 @@ def _fields(entries: Record) -> dict[str, Any]:
     return fields | {
         "dt": figure(entries["dt"]),
         "moving": bool(figure(entries["moving"])),
+        "weights": _weights(fields.pop("weights")),
         "_reference": reference,
         "_drift": drift if drift.size else None,
         "_inertia": partial(given, M),
         "_ignorable": partial(given, fields.pop("ignorable")),
         "_limits": partial(dict, dict(zip(names, limits.tolist(), strict=True))),
     }
+
+
+def _weights(written: str) -> dict[str, Any]:
+    found = json.loads(written)
+    if not isinstance(found, dict) or not all(isinstance(x, dict | str) for x in found.values()):
+        raise ValueError("weights are no table")
+    return found
 
 
 def _numbers(key: str, raw: Any) -> Any:
@@ -202,7 +212,10 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
     }
     for key in _LISTS[-3:]:
         entries[key] = [entry for entry in info.get(key, "").split(";") if entry]
-    return {**entries, **{key: info[key] for key in (*_TEXTS, "dt", "moving")}}, bool(mark)
+    return {
+        **entries,
+        **{key: info[key] for key in (*_TEXTS, "dt", "moving") if key in info},
+    }, bool(mark)
 
 
 def _csv_path(path: Path, key: str) -> Path:

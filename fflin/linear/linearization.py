@@ -97,7 +97,7 @@ class Linearizer:
         self._standing: Chart = Standing()
         nv, nx = ready.map.nx // 2, ready.map.nx
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
-        given = hypot(*robot.gravity, *np.concatenate(robot.passive).tolist())
+        given = hypot(*robot.gravity, *np.concatenate(robot.springs).tolist())
         self._moderate = given < _MODERATE
         # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
         self._known = ready.free and ready.own_reference and ready.actuation.default

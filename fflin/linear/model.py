@@ -88,6 +88,8 @@ class LinearModel(FrozenArrays):
     verified : bool
         Whether it is as it was made; False of a file that has no digest to tell damage by, and of
         what is made of it.
+    weights : mapping
+        What `lqr` weighs where it is given nothing, as `Robot.replace` takes it.
     """
 
     A: Array
@@ -124,6 +126,7 @@ class LinearModel(FrozenArrays):
     _source: tuple[str, LinearModel] | None = None
     verified: bool = True
     _limits: Callable[[], Mapping[str, float]] | None = None
+    weights: Mapping[str, Any] = field(default_factory=dict)
     # Raises `ModelError` where the robot that it was made of was changed.
     _require_unchanged: Callable[[], None] | None = None
 

@@ -90,7 +90,7 @@ def prepare(
         from fflin.dynamics.outputs import Sensing
 
         sensing = Sensing(state, robot.outputs, own_reference=reference is None)
-    acts = any(robot.gravity) or robot.stored_momentum or any(x.any() for x in robot.passive)
+    acts = any(robot.gravity) or robot.stored_momentum or any(x.any() for x in robot.springs)
     nu = len(actuation.names)
     seen = sensing or state
     return Prepared(
@@ -123,6 +123,7 @@ def prepare(
             "_certify": partial(certify, robot),
             "_ignorable": partial(ignorable_states, robot),
             "_limits": partial(magnitudes_of, robot),
+            "weights": robot.weights,
             "_require_unchanged": robot.require_unchanged,
         },
         rest={

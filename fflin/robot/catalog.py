@@ -81,7 +81,7 @@ def list_robots() -> tuple[str, ...]:
     return tuple({**_bundled(), **_example_robot_data()})
 
 
-def find_robot(robot: str | Path) -> RobotFile:
+def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
     """Find the description of a robot by its name or by the path of its URDF.
 
     A bundled name comes first, then a path that exists, then a name of example-robot-data.
@@ -89,7 +89,9 @@ def find_robot(robot: str | Path) -> RobotFile:
     Parameters
     ----------
     robot : str or Path
-        Name or path.
+        Name or path, of a URDF or of a robot file; ``servicer_7dof.toml`` is a bundled one.
+    folder : str or Path
+        What the path is relative to.
 
     Returns
     -------
@@ -108,15 +110,17 @@ def find_robot(robot: str | Path) -> RobotFile:
         raise InputError(f"robot is a {type(robot).__name__}, expected a name or a path")
     if isinstance(robot, str) and robot in _bundled():
         return _bundled()[robot]
-    path = Path(robot)
-    text = str(robot)
+    path, text = Path(folder, robot), str(robot)
+    bundled = bundled_directory() / text
+    if not os.path.exists(path) and bundled in bundled_directory().glob("*.toml"):
+        path = bundled
     # Unlike Path.exists, this takes a name that is too long for one that does not exist.
-    if os.path.exists(robot) and not (path.is_dir() and text in _example_robot_data()):
+    if os.path.exists(path) and not (path.is_dir() and text in _example_robot_data()):
         # The name of a file need not be text.
         name = path.stem.encode(errors="backslashreplace").decode()
         return RobotFile(name, path, "file", (path.resolve().parent,))
-    if isinstance(robot, Path) or path.suffix or len(path.parts) != 1:
-        raise FileError(f"no file at '{robot}'; give a URDF's path or a name of `fflin robots`")
+    if isinstance(robot, Path) or path.suffix or len(Path(robot).parts) != 1:
+        raise FileError(f"no file at '{path}'; give a URDF's path or a name of `fflin robots`")
     if text == "cassie":
         raise UrdfError("'cassie' comes as SDF only, which Pinocchio's wheels cannot read")
     if text not in _example_robot_data():

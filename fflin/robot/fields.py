@@ -21,13 +21,17 @@ from fflin.robot.inputs import (
 )
 from fflin.robot.joints import Joint
 from fflin.robot.outputs import Output
+from fflin.robot.signals import input_keys_of, state_keys
 
 # The least and the largest value; infinite where there is no limit.
 Range: TypeAlias = tuple[float, float]
 
 _OF_JOINTS = ("q_m", "qdot_m")
 
-FIELDS = ("inputs", "outputs", "stiffness", "damping", "rest", "gravity", "limits")
+FIELDS = (
+    *("inputs", "outputs", "stiffness", "damping", "rest", "gravity", "limits"),
+    *("passive", "weights", "start"),
+)
 
 
 def validated_fields(
@@ -75,7 +79,9 @@ def validated_fields(
     return checked
 
 
-def validated_inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, ...]:
+def validated_inputs(
+    value: Any, find: Callable[[str], Joint], joints: Sequence[str], passive: Sequence[str]
+) -> tuple[Input, ...]:
     """Return the inputs as a robot holds them; `find` returns the joint of a name or raises."""
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise InputError(f"inputs is a {type(value).__name__}, expected a sequence of inputs")
@@ -86,8 +92,9 @@ def validated_inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, .
             raise InputError(
                 f"{item!r} is not an input; expected {', '.join(kind.__name__ for kind in KINDS)}"
             )
-        if isinstance(item, JointTorque):
-            find(item.joint)
+    value = [one for item in value for one in _spread(item, find, joints, passive)]
+    if not value:
+        raise InputError("inputs are torques of joints that all are passive; name another input")
     names = [item.name for item in value if isinstance(item, Thruster) and item.name]
     names += [name for name, _ in named_wheels(value)]
     kinds = BaseTorque | BaseForce | JointTorque
@@ -98,19 +105,29 @@ def validated_inputs(value: Any, find: Callable[[str], Joint]) -> tuple[Input, .
     return tuple(value)
 
 
+def _spread(
+    item: Input, find: Callable[[str], Joint], joints: Sequence[str], passive: Sequence[str]
+) -> list[Input]:
+    """Return a joint torque for each joint with a motor that its name, or pattern, stands for."""
+    if not isinstance(item, JointTorque):
+        return [item]
+    found = joints_by_name("joint", {str(item.joint): None}, joints, lambda name: find(name).name)
+    if item.joint in found and item.joint in passive:
+        raise InputError(f"joint '{item.joint}' is passive and has a joint torque; leave one out")
+    return [replace(item, joint=name) for name in found if name not in passive]
+
+
 def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> dict[str, Range]:
     """Return {name of an input or state: (least, largest)} of what a caller gives.
 
     Which is the largest magnitude of all inputs, or {name, group or pattern of inputs or states:
     largest magnitude, or (least, largest)}. A thruster never pulls.
     """
+    keys = input_keys_of(inputs)
     names: list[str] = []
-    keys: list[str] = []
     floors: list[float] = []
     for item, own in named_inputs(inputs):
         names += own
-        group = f"{item.GROUP}."
-        keys += [name if name.startswith(group) else group + name for name in own]
         floors += [-math.inf if item.PULLS else 0.0] * len(own)
     if not isinstance(given, Mapping):
         given = dict.fromkeys(dict.fromkeys(item.GROUP for item in inputs), given)
@@ -121,8 +138,8 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> 
             matching("input", key, keys)
         except UnknownNameError:
             of_states[key] = ranges.pop(key)
-    states = states_of(joints)
-    names, floors = names + states, floors + [-math.inf] * len(states)
+    states = state_keys(joints)
+    names, floors = [*names, *states], floors + [-math.inf] * len(states)
     # The group of all joints leaves wheels out, whose speeds are of another size.
     wheels = {f"{group}.{name}" for group in _OF_JOINTS for name, _ in named_wheels(inputs)}
     whole = {key: of_states.pop(key) for key in list(of_states) if key in _OF_JOINTS}
@@ -133,12 +150,6 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> 
     return {
         names[i]: (max(low, floors[i]), max(high, floors[i])) for i, (low, high) in found.items()
     }
-
-
-def states_of(joints: Sequence[str]) -> list[str]:
-    """Return the names of the states of a robot with such joints."""
-    base = [f"{group}.{axis}" for group in ("q_b", "r_b", "omega_b", "v_b") for axis in "xyz"]
-    return base + [f"{group}.{name}" for group in ("q_m", "qdot_m") for name in joints]
 
 
 def _outputs(value: Any) -> tuple[Output, ...]:

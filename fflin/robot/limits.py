@@ -6,8 +6,9 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import InputError
-from fflin.robot.fields import Range, given_limits, states_of
+from fflin.robot.fields import Range, given_limits
 from fflin.robot.inputs import JointTorque, ReactionWheel, named_inputs
+from fflin.robot.signals import state_keys
 
 if TYPE_CHECKING:
     from fflin.robot.joints import Joint
@@ -35,7 +36,7 @@ def limits_of(robot: Robot) -> dict[str, Range]:
             found[names[0]] = _either(float(effort))
         if isinstance(item, ReactionWheel) and item.max_speed is not None:
             found[f"qdot_m.{names[0]}"] = _either(item.max_speed)
-    known = {*found, *states_of(robot.joint_names)}
+    known = {*found, *state_keys(robot.joint_names)}
     found |= {name: limits for name, limits in robot.limits.items() if name in known}
     return {name: limits for name, limits in found.items() if limits != _OPEN}
 

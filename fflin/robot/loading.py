@@ -14,7 +14,7 @@ from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
 from fflin.base.writing import remember
-from fflin.robot.catalog import find_robot
+from fflin.robot.catalog import RobotFile, find_robot
 from fflin.robot.frames import ROOT
 from fflin.robot.joints import Follower, Joint
 from fflin.robot.massless import idle_coordinates, massless_note
@@ -22,7 +22,7 @@ from fflin.robot.model_checks import check_model
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
 from fflin.robot.urdf.mesh_files import find_mesh
-from fflin.robot.urdf.reader import read_urdf
+from fflin.robot.urdf.reader import Advice, read_urdf
 
 Lock = Mapping[str, float | None] | Iterable[str]
 
@@ -39,7 +39,8 @@ def load(
     Parameters
     ----------
     robot : str or Path
-        Bundled name, example-robot-data name, or path to a URDF. No mesh is loaded.
+        Bundled name, example-robot-data name, or path to a URDF or to a robot file, a TOML that
+        names a URDF and what else is known of the robot; see the guide. No mesh is loaded.
     lock : mapping or iterable of str, optional
         {joint: value [rad|m]} welded at that value (None: at neutral), or names; a name
         may be a pattern, ``hinge_*``. What mimics a locked joint is welded with it.
@@ -47,7 +48,9 @@ def load(
         Folders in which ``package://`` paths of meshes are looked up when the robot is drawn,
         before those that the URDF lies in.
     **fields
-        inputs, outputs, stiffness, damping, rest, gravity, limits: see `Robot.replace`.
+        inputs, outputs, stiffness, damping, rest, gravity, limits, passive, weights, start: see
+        `Robot.replace`. What is given here goes before what a robot file says; of locks, limits,
+        springs and dampers name by name.
 
     Returns
     -------
@@ -72,16 +75,54 @@ def load(
         Of what the file holds and the model does not, and of what cannot be quite right in it.
     """
     found = find_robot(robot)
-    description = read_urdf(found.path, found.prune)
-    loaded = _robot(description.model, found.name, lock, description.mimics)
-    # Where it is asked for, the damping is in the model.
-    notes = [n for n in description.notes if "damping" not in fields or ": damping unused" not in n]
+    if found.path.suffix.lower() != ".toml":
+        loaded, advice = _load(found, [lock], _folders(package_dirs))
+    else:
+        from fflin.robot.robot_files import RobotToml
+
+        file = RobotToml(found.path, found.name)
+        folders = (*_folders(package_dirs), *file.package_dirs)
+        with file.placed("lock"):
+            loaded, advice = _load(file.found, [file.lock or None, lock], folders)
+        loaded = file.applied(loaded)
+    loaded = with_fields(loaded, fields)
+    gone = {name.rpartition("=")[0] for name in loaded.locked}
+    notes = [*loaded.notes]
+    for field, names, text in advice:
+        said = {*getattr(loaded, field, ()), *gone}
+        said |= {x.joint.name for x in loaded.followers if x.leader.name in said}
+        if not {*names} <= said:
+            notes.append(text)
     for note in notes:
         warnings.warn(note, FflinWarning, stacklevel=2)
     if idle_coordinates(loaded):
         # No warning: whatever needs the inverse of M refuses with this.
         notes.append(massless_note(loaded))
-    folders = (*_folders(package_dirs), *found.package_dirs)
+    return replace(loaded, notes=tuple(notes))
+
+
+def with_fields(robot: Robot, fields: Mapping[str, Any]) -> Robot:
+    """Return a robot with fields, those of joints beside what it has of others."""
+    if not fields:
+        return robot
+    if robot.passive and isinstance(given := fields.get("passive"), list | tuple):
+        fields = {**fields, "passive": [*robot.passive, *given]}
+    changed = robot.replace(**fields)
+    over: dict[str, Any] = {
+        name: {**getattr(robot, name), **getattr(changed, name)}
+        for name in ("stiffness", "damping", "rest", "limits")
+        if name in fields and getattr(robot, name)
+    }
+    return replace(changed, **over)
+
+
+def _load(
+    found: RobotFile, locks: Sequence[Lock | None], package_dirs: tuple[Path, ...]
+) -> tuple[Robot, tuple[Advice, ...]]:
+    """Return the robot of a URDF, and what is to be told of it where its fields say no more."""
+    description = read_urdf(found.path, found.prune)
+    loaded = _robot(description.model, found.name, locks, description.mimics)
+    folders = (*package_dirs, *found.package_dirs)
     # They are read when the robot is drawn, and no output may take their place before.
     meshes = (find_mesh(uri, found.path, folders) for uri in description.meshes)
     remember(*filter(None, meshes))
@@ -89,11 +130,11 @@ def load(
         loaded,
         urdf=found.path,
         urdf_sha256=description.sha256,
-        notes=tuple(notes),
+        notes=description.notes,
         package_dirs=folders,
         urdf_damping=_independent_damping(loaded, description.damping),
     )
-    return loaded.replace(**fields) if fields else loaded
+    return loaded, description.advice
 
 
 def from_model(
@@ -131,7 +172,7 @@ def from_model(
     copy.gravity.setZero()
     name = name or model.name or "model"
     check_model(copy, name)
-    robot = _robot(copy, name, lock, {})
+    robot = _robot(copy, name, [lock], {})
     own = {joint.name: float(robot.model.damping[joint.idx_v]) for joint in robot.joints}
     robot = replace(robot, urdf_damping=own)
     return robot.replace(**fields) if fields else robot
@@ -145,11 +186,13 @@ def _folders(package_dirs: Any) -> tuple[Path, ...]:
     return tuple(as_path(folder) for folder in package_dirs)
 
 
-def _robot(model: pin.Model, name: str, lock: Lock | None, mimics: Mapping[str, Mimic]) -> Robot:
+def _robot(
+    model: pin.Model, name: str, locks: Sequence[Lock | None], mimics: Mapping[str, Mimic]
+) -> Robot:
     _check_root(model, name)
     locked: tuple[str, ...] = ()
-    if lock is not None:
-        model, mimics, locked = _locked(model, lock, mimics)
+    if any(lock is not None for lock in locks):
+        model, mimics, locked = _locked(model, locks, mimics)
     all_joints = [_joint(model, index) for index in range(ROOT + 1, model.njoints)]
     by_name = {joint.name: joint for joint in all_joints}
     robot = Robot(
@@ -196,13 +239,12 @@ def _check_root(model: pin.Model, name: str) -> None:
 
 
 def _locked(
-    model: pin.Model, lock: Lock, mimics: Mapping[str, Mimic]
+    model: pin.Model, locks: Sequence[Lock | None], mimics: Mapping[str, Mimic]
 ) -> tuple[pin.Model, dict[str, Mimic], tuple[str, ...]]:
-    """Weld joints, and what mimics them.
+    """Weld joints, and what mimics them; of several locks the last goes first.
 
     Returns the smaller model, the mimics that are left, and "joint=value" of what was welded.
     """
-    keys = [lock] if isinstance(lock, str) else _listed(lock)
     movable = list(model.names)[ROOT + 1 :]
 
     def movable_one(name: str) -> str:
@@ -210,8 +252,11 @@ def _locked(
             raise unknown("joint to lock", name, movable)
         return name
 
-    asked = {key: lock[key] if isinstance(lock, Mapping) else None for key in keys}
-    given = joints_by_name("joint to lock", asked, movable, movable_one)
+    given: dict[str, float | None] = {}
+    for lock in (lock for lock in locks if lock is not None):
+        keys = [lock] if isinstance(lock, str) else _listed(lock)
+        asked = {key: lock[key] if isinstance(lock, Mapping) else None for key in keys}
+        given |= joints_by_name("joint to lock", asked, movable, movable_one)
     names, q = list(given), pin.neutral(model)
     values = {
         name: None if given.get(name) is None else number(f"lock '{name}'", given[name])

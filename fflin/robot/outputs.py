@@ -71,7 +71,8 @@ class JointPositions(Output):
     Parameters
     ----------
     joints : tuple of str, optional
-        Independent joints, in the order wanted; all of them, in state order, by default.
+        Independent joints, or patterns, in the order wanted; all of them, in state order, by
+        default.
     """
 
     WORD = "joints"
@@ -88,7 +89,8 @@ class JointVelocities(Output):
     Parameters
     ----------
     joints : tuple of str, optional
-        Independent joints, in the order wanted; all of them, in state order, by default.
+        Independent joints, or patterns, in the order wanted; all of them, in state order, by
+        default.
     """
 
     WORD = "rates"
@@ -219,7 +221,8 @@ def parse_output(text: str) -> tuple[Output, ...]:
     Parameters
     ----------
     text : str
-        ``state``, ``base``, ``joints``, ``rates``, ``com`` or ``momentum``; or of a frame
+        ``state``, ``base``, ``joints``, ``rates``, ``com`` or ``momentum``; of some joints
+        ``joints:NAME``, ``rates:NAME``, where a name may be a pattern; or of a frame
         ``pose:NAME``, ``velocity:NAME``, both as ``frame:NAME``, ``gyroscope:NAME``,
         ``accelerometer:NAME``; or of two ``relative:NAME:TO``.
 
@@ -240,6 +243,8 @@ def parse_output(text: str) -> tuple[Output, ...]:
         raise unknown("output", word, tuple(kinds))
     wanted = [item.name for item in fields(kinds[word][0])]
     if not issubclass(kinds[word][0], FrameOutput):
+        if rest and word in ("joints", "rates"):
+            return (JointPositions((rest,)) if word == "joints" else JointVelocities((rest,)),)
         if colon:
             raise InputError(f"output '{text}' is of the whole robot; write {word}")
         return (kinds[word][0](),)

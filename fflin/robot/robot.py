@@ -20,6 +20,7 @@ from fflin.robot.inputs import Input, default_inputs, named_wheels
 from fflin.robot.joints import Follower, Joint, check_followers_rates, followed
 from fflin.robot.model_checks import change_in
 from fflin.robot.outputs import FullState, Output
+from fflin.robot.start import checked_passive, checked_start, checked_weights, kept_start
 from fflin.robot.wheels import stored_momentum, with_wheels
 
 _CONFIGURATION = "a configuration in Pinocchio's order"
@@ -32,8 +33,8 @@ _DATA_BYTES_PER_NV3 = 32
 _DATA_LIMIT = 2**30
 
 
-class Passive(NamedTuple):
-    """What passive joints do: -stiffness (q_m - rest) - damping qdot_m, each (n,)."""
+class Springs(NamedTuple):
+    """What springs and dampers do: -stiffness (q_m - rest) - damping qdot_m, each (n,)."""
 
     stiffness: Array
     damping: Array
@@ -72,13 +73,19 @@ class Robot:
     outputs : tuple of Output
         What is watched of it; the full state by default.
     stiffness, damping : mapping
-        {joint: value [N m/rad | N/m], [N m s/rad | N s/m]} of passive joints.
+        {joint: value [N m/rad | N/m], [N m s/rad | N s/m]} of springs and dampers.
     rest : mapping
         {joint: position [rad|m]} where a spring is relaxed; 0 where not named.
     gravity : tuple of float (3,)
         Uniform acceleration [m/s^2] in Pinocchio's world axes. `model` itself has none.
     package_dirs : tuple of Path
         Folders in which ``package://`` paths of meshes are looked up when it is drawn.
+    passive : tuple of str
+        Joints without a motor.
+    weights : mapping
+        What `lqr` weighs by default, where it is not the rule's: see `replace`.
+    start : mapping
+        Where `simulate` and `visualize` begin by default: see `replace`.
     limits : mapping
         {name of an input or state: (least, largest)} in place of what the URDF and the inputs say.
     """
@@ -99,6 +106,9 @@ class Robot:
     rest: Mapping[str, float] = field(default_factory=dict)
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     package_dirs: tuple[Path, ...] = ()
+    passive: tuple[str, ...] = ()
+    weights: Mapping[str, Any] = field(default_factory=dict)
+    start: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, Range] = field(default_factory=dict)
     # Where some of its joints are wheels: the same robot without them.
     _wheelless: Robot | None = None
@@ -118,7 +128,8 @@ class Robot:
         ----------
         inputs : sequence of Input
             What acts on it, in the order of u. Wheels with an inertia among them become joints
-            of the robot; those that it had before and that are not among them go.
+            of the robot; those that it had before and that are not among them go. The joint of
+            a `JointTorque` may be a pattern, ``*``, for all that it fits and that have a motor.
         outputs : sequence of Output
             What is watched of it, in the order of y.
         stiffness : mapping or float
@@ -131,6 +142,15 @@ class Robot:
             {joint: position [rad|m]} where its spring is relaxed.
         gravity : sequence of float (3,)
             Uniform acceleration [m/s^2] in Pinocchio's world axes.
+        passive : sequence of str
+            Joints without a motor: their torques leave the inputs.
+        weights : mapping
+            What `lqr` weighs where it is given nothing: ``rule`` ("urdf", "identity"), ``q``,
+            ``r``, ``bryson``: {state, input, group or pattern: weight or largest value}.
+        start : mapping
+            Where `simulate` begins where it is not told: ``joints`` {joint: position [rad|m]},
+            ``rpy`` (3,) [deg] about fixed axes, ``position`` (3,) [m] of the base, ``velocity``
+            {joint or state: rate}, as `fflin.velocity` takes it.
         limits : mapping
             {name, group or pattern of inputs or states: largest magnitude, or (least, largest)},
             in place of what the URDF and the inputs say of them.
@@ -152,11 +172,20 @@ class Robot:
         """
         self.require_unchanged()
         robot = self
+        if "passive" in fields:
+            robot = robot._without_motors(fields.pop("passive"))
         if "inputs" in fields:
-            robot = self._with_inputs(fields.pop("inputs"))
+            robot = robot._with_inputs(fields.pop("inputs"))
+        joints = robot.joint_names
         if "limits" in fields:
-            limits = given_limits(robot.inputs, robot.joint_names, fields.pop("limits"))
+            limits = given_limits(robot.inputs, joints, fields.pop("limits"))
             robot = replace(robot, limits=limits)
+        if "weights" in fields:
+            weights = checked_weights(fields.pop("weights"), joints, robot.inputs)
+            robot = replace(robot, weights=weights)
+        if "start" in fields:
+            start = checked_start(fields.pop("start"), robot.joint, joints)
+            robot = replace(robot, start=start)
         own = (robot._wheelless or robot).joint_names
         robot = replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
         for name in robot.used_frames:
@@ -236,9 +265,9 @@ class Robot:
         return stored_momentum(self.model, self.inputs)
 
     @cached_property
-    def passive(self) -> Passive:
+    def springs(self) -> Springs:
         """Stiffness, damping and rest positions (n,) in state order."""
-        return Passive(
+        return Springs(
             *(
                 np.array([values.get(name, 0.0) for name in self.joint_names])
                 for values in (self.stiffness, self.damping, self.rest)
@@ -368,10 +397,19 @@ class Robot:
         check_followers_rates(self.followers, v)
         return v
 
+    def _without_motors(self, passive: Any) -> Robot:
+        """Return the robot without the torques of joints that have no motor."""
+        bare = self._wheelless or self
+        joints = checked_passive(passive, bare.joint, bare.joint_names, self.locked)
+        inputs = tuple(item for item in self.inputs if getattr(item, "joint", None) not in joints)
+        if not inputs:
+            raise InputError("passive leaves no input; a model needs at least one")
+        return replace(self, passive=joints, inputs=inputs)
+
     def _with_inputs(self, inputs: Any) -> Robot:
         """Return the robot with other inputs, and with the wheels among them as joints."""
         bare = self._wheelless or self
-        checked = validated_inputs(inputs, bare.joint)
+        checked = validated_inputs(inputs, bare.joint, bare.joint_names, self.passive)
         wheels = [(name, wheel) for name, wheel in named_wheels(checked) if wheel.inertia]
         model, joints, followers = with_wheels(bare.model, bare.joints, bare.followers, wheels)
         names = {joint.name for joint in joints}
@@ -379,7 +417,7 @@ class Robot:
             {name: x for name, x in values.items() if name in names}
             for values in (self.stiffness, self.damping, self.rest)
         )
-        return replace(
+        robot = replace(
             self,
             model=model,
             joints=joints,
@@ -389,6 +427,9 @@ class Robot:
             damping=damping,
             rest=rest,
             _wheelless=bare if wheels else None,
+        )
+        return (
+            replace(robot, start=kept_start(self.start, robot.joint_names)) if self.start else robot
         )
 
     def _of_model(self, model: pin.Model) -> Robot:

@@ -129,7 +129,7 @@ class Conserved:
                 momentum[i, 3:] += self._of_wheels()
         if self._weight is not None:
             energy -= (center + self._root.rotation @ self._start[:3]) @ self._weight
-        stiffness, _, rest = self._robot.passive
+        stiffness, _, rest = self._robot.springs
         if stiffness.any():
             positions = [[joint.value(q_i) for joint in self._robot.joints] for q_i in q]
             energy += 0.5 * (np.array(positions) - rest) ** 2 @ stiffness

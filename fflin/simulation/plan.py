@@ -14,6 +14,7 @@ from fflin.base.validation import Array, vector
 from fflin.control.channel import Channel, Law
 from fflin.control.policies import bound, feedback_of
 from fflin.control.saturation import Saturation
+from fflin.dynamics import points
 from fflin.dynamics.integrators import Integrator, integrator
 from fflin.dynamics.state import StateMap
 from fflin.linear.ignorable import rotor_names
@@ -76,6 +77,8 @@ def start_of(state: StateMap, x0: Any, q0: Any, v0: Any) -> tuple[Array, Array]:
         if q0 is not None or v0 is not None:
             raise InputError("x0 is given with q0 or v0; give either")
         q, v = state.to_pinocchio(x0)
+    elif robot.start and q0 is None and v0 is None:
+        q, v = points.start_of(robot)
     else:
         q = robot.neutral() if q0 is None else robot.checked_configuration(q0).copy()
         v = np.zeros(robot.nv) if v0 is None else robot.checked_velocity(v0).copy()

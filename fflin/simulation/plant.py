@@ -56,7 +56,7 @@ class Plant:
             state.S is None
             and not self.actuation.carried
             and not robot.stored_momentum
-            and not any(values.any() for values in robot.passive)
+            and not any(values.any() for values in robot.springs)
             and not any(robot.gravity)
         )
 

@@ -39,6 +39,11 @@ class Signals(NamedTuple):
     units: Sequence[str]
     limits: Mapping[str, Array]
 
+    def only(self, indices: Sequence[int]) -> Signals:
+        """Return some of the columns."""
+        names, units = ([of[i] for i in indices] for of in (self.names, self.units))
+        return Signals(self.values[:, indices], names, units, self.limits)
+
     def unit(self, indices: Sequence[int]) -> str:
         """Return the units of some columns in brackets."""
         shown = sorted({self.units[i] for i in indices} - {"1"})
@@ -80,7 +85,7 @@ def draw(
     rows = math.ceil((len(panels) + 1) / 4)
     with styled() as figure_class:
         both = linear is not None
-        heights = [3.0, 1.2][: 1 + both] * math.ceil(len(groups) / across)
+        heights = [3.0, 1.2][: 1 + both] * math.ceil(len(groups) / across) or [0.01]
         size = (11.0, 0.3 + 3.0 * rows + 0.9 * sum(heights))
         figure = figure_class(figsize=size, layout="constrained")
         above, below = figure.add_gridspec(2, 1, height_ratios=[sum(heights), 3.0 * rows])
@@ -130,8 +135,8 @@ def _panels(states: Signals, inputs: Signals, wheels: Mapping[str, float]) -> di
         found.setdefault(title, _Panel(inputs, [])).indices.append(i)
     speeds = [i for i, x in enumerate(states.names) if x in {f"qdot_m.{name}" for name in wheels}]
     if speeds:
-        torques = found.pop("wheel torques")
-        found |= {"wheel speeds": _Panel(states, speeds), "wheel torques": torques}
+        torques = {x: found.pop(x) for x in ("wheel torques",) if x in found}
+        found |= {"wheel speeds": _Panel(states, speeds)} | torques
         J = np.array([wheels[_short(states.names[i])] for i in speeds])
         if J.all():
             names = [states.names[i] for i in speeds]
@@ -144,7 +149,7 @@ def _panels(states: Signals, inputs: Signals, wheels: Mapping[str, float]) -> di
 def _histories(
     axes: Axes, t: Array, states: Signals, linear: Array | None, group: str, indices: list[int]
 ) -> None:
-    times, shown = _broken(t, states.values) if group == "q_b" else (t, states.values)
+    times, shown = _broken(t, states.values, indices) if group == "q_b" else (t, states.values)
     for color, i in zip(cycle(len(indices)), indices, strict=True):
         axes.plot(times, shown[:, i], color=color, label=_short(states.names[i]))
         if linear is not None:
@@ -156,9 +161,9 @@ def _histories(
     axes.margins(x=0.0)
 
 
-def _broken(t: Array, x: Array) -> tuple[Array, Array]:
+def _broken(t: Array, x: Array, indices: list[int]) -> tuple[Array, Array]:
     """Return times and states with a gap where the attitude goes through a turn of 180 degrees."""
-    q_b = x[:, :3]
+    q_b = x[:, indices]
     # The vector part of a unit quaternion whose sign has changed.
     jumps = 1 + np.flatnonzero((q_b[1:] * q_b[:-1]).sum(axis=1) < -0.5)
     return np.insert(t, jumps, t[jumps]), np.insert(x, jumps, np.nan, axis=0)

@@ -86,7 +86,7 @@ def simulate(
     q0 : array_like (nq,), optional
     v0 : array_like (nv,), optional
         Initial configuration and velocity in Pinocchio's order, instead of `x0`; neutral and at
-        rest by default.
+        rest by default, or the robot's `start` where nothing of these is given.
     duration : float
         [s]
     dt : float, optional

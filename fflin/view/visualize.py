@@ -13,6 +13,7 @@ from fflin.base.errors import FflinWarning, FileError, InputError
 from fflin.base.validation import Array, number, truth
 from fflin.base.writing import as_path, check_distinct, check_place, write_whole
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.points import start_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import find_frame
 from fflin.robot.robot import Robot
@@ -90,7 +91,7 @@ def visualize(
     tool : str, optional
         Frame whose trail is drawn; "tool" or the last link of the longest chain by default.
     q : array_like (nq,), optional
-        Where a live robot stands first; neutral by default.
+        Where a live robot stands first; by default at its `start`, or neutral.
     port : int
         Of the live page; a free one by default.
 
@@ -133,7 +134,7 @@ def visualize(
         if any(file is not None for file in (html, png, gif)):
             raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
         _check_port(port)
-        start = robot.neutral() if q is None else _configuration(robot, "q", q)
+        start = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
 
         pace = _speed(speed, 1.0)

@@ -157,7 +157,7 @@ def test_poles_are_the_eigenvalues(name, damped):
             # The free-free pencil over all joints, M* by the Schur complement of the base.
             M = fflin.linearize(bare, q).M
             M_star = M[6:, 6:] - M[6:, :6] @ np.linalg.solve(M[:6, :6], M[:6, 6:])
-            squares = eigh(np.diag(robot.passive.stiffness), M_star, eigvals_only=True)
+            squares = eigh(np.diag(robot.springs.stiffness), M_star, eigvals_only=True)
             expected = np.sqrt(squares[-len(some) :])
             assert found.frequencies == pytest.approx(expected, rel=1e-10)
 

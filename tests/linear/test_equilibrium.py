@@ -40,7 +40,7 @@ def test_what_is_balanced_is_a_fixed_point(name):
     floating = robot.replace(gravity=(0, 0, 0))
     u = fflin.equilibrium(floating, q).u
     state = StateMap(robot)
-    stiffness, _, rest = robot.passive
+    stiffness, _, rest = robot.springs
     expected = np.concatenate((np.zeros(6), stiffness * (state.joint_positions(q) - rest)))
     assert u == pytest.approx(expected, rel=1e-10, abs=1e-10)
 

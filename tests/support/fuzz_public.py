@@ -102,7 +102,7 @@ def sound(folder):
         "plot_loops": {"gain": gain, "path": None},
         "plot_matrices": {"lin": lin, "path": None},
         "plot_modes": {"modes": fflin.modes(filtered_model), "path": None},
-        "plot_motion": {"motion": motion, "path": None},
+        "plot_motion": {"motion": motion, "path": None, "show": None},
         "plot_poles": {"poles": gain, "path": None, "dt": 0.0, "title": "x"},
         "plot_validity": {"validity": None, "path": None},
         "random_configurations": {
@@ -169,7 +169,8 @@ def sound(folder):
         "Robot.with_mass_properties": {"self": robot, "bodies": {"base": {"mass": 1.0}}},
         "Robot.replace": {
             **{"self": robot, "inputs": robot.inputs, "outputs": robot.outputs, "gravity": vector},
-            **{"stiffness": 1.0, "damping": {}, "rest": {}},
+            **{"stiffness": 1.0, "damping": {}, "rest": {}, "passive": [], "weights": {}},
+            "start": {},
         },
         "StateMap.to_pinocchio": {"self": fflin.StateMap(robot), "x": lin.x0},
         "StateMap.to_state": {"self": fflin.StateMap(robot), "q": q, "v": v},

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import pinocchio as pin
 
@@ -30,6 +31,14 @@ _SHALLOW = 100
 _STACK = 16 * 2**20
 
 
+class Advice(NamedTuple):
+    """A warning that falls away where a field of the robot names all of the joints."""
+
+    field: str
+    joints: tuple[str, ...]
+    note: str
+
+
 @dataclass(frozen=True, eq=False)
 class Description:
     """A robot as its file describes it.
@@ -48,6 +57,8 @@ class Description:
         Mesh files that it names, as it names them; they are not read.
     notes : tuple of str
         Warnings, one line each.
+    advice : tuple of Advice
+        Warnings of those joints that the robot's fields leave as they are.
     """
 
     model: pin.Model
@@ -57,6 +68,7 @@ class Description:
     friction: dict[str, float]
     meshes: tuple[str, ...]
     notes: tuple[str, ...]
+    advice: tuple[Advice, ...] = ()
 
 
 def read_urdf(path: Path, prune: Sequence[str] = ()) -> Description:
@@ -107,9 +119,14 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
     damping = {joint.name: joint.damping for joint in moving if joint.damping}
     friction = {joint.name: joint.friction for joint in moving if joint.friction}
-    for what, values in (("damping", damping), ("Coulomb friction", friction)):
+    advice = []
+    for what, key, values in (
+        ("damping", "damping", damping),
+        ("Coulomb friction", "friction", friction),
+    ):
         if values:
-            notes.append(f"{path.stem}: {what} unused: {enumerated(list(values))}")
+            text = f"{path.stem}: {what} unused: {enumerated(list(values))}"
+            advice.append(Advice(key, tuple(values), text))
     unlimited: dict[tuple[str, ...], list[str]] = {}
     for what in ("effort", "velocity"):
         zero = tuple(joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0)
@@ -117,7 +134,8 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     for zero, of in unlimited.items():
         if zero:
             joints = named("joint", list(zero)) if len(zero) < 3 else f"{len(zero)} joints"
-            notes.append(f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)")
+            text = f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)"
+            advice.append(Advice("passive", zero, text))
     return Description(
         model,
         hashlib.sha256(document).hexdigest(),
@@ -126,6 +144,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
         friction,
         tuple(dict.fromkeys(meshes)),
         tuple(notes),
+        tuple(advice),
     )
 
 

@@ -1,0 +1,148 @@
+"""TOML files, and the lines on which what they hold stands."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from fflin.base.errors import FflinError, InputError, UnknownNameError
+from fflin.base.writing import read_input
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+# Some 1,000 inputs.
+_SIZE_LIMIT = 2**17
+
+# The time for a dotted key grows with the square of its parts.
+_DOTS_LIMIT = 1_000
+
+# What may hold a line that looks like a key: strings of several lines. Those of one line and
+# comments are found too, for they may hold the quotes of the former.
+_TEXTS = re.compile(
+    r'"""(?:\\.|[^\\])*?"""+'
+    r"|'''.*?'''+"
+    r'|"(?:\\.|[^"\\\n])*"'
+    r"|'[^'\n]*'"
+    r"|#[^\n]*",
+    re.DOTALL,
+)
+_PART = r"""(?:[\w-]+|"[^"]*"|'[^']*')"""
+_KEY = rf"({_PART}(?:\s*\.\s*{_PART})*)\s*"
+_LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
+
+
+class TomlFile:
+    """What a TOML file holds, in tables and keys whose lines are known.
+
+    A place in it is written as keys and, in an array of tables, indices: ``input``, 3, ``axis``.
+
+    Attributes
+    ----------
+    path : Path
+    record : dict
+        As tomllib reads it.
+
+    Raises
+    ------
+    FileError
+        If it is not a regular file that can be read, or too large.
+    InputError
+        If it is not TOML; with file and line.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        content = read_input(path, "TOML", _SIZE_LIMIT)
+        try:
+            text = content.decode("utf-8-sig").replace("\r\n", "\n")
+        except UnicodeDecodeError as error:
+            line = content.count(b"\n", 0, error.start) + 1
+            raise InputError(f"{path}:{line}: is not UTF-8 text; save it as UTF-8") from None
+        for number, written in enumerate(text.split("\n"), start=1):
+            if written.count(".") > _DOTS_LIMIT:
+                raise InputError(f"{path}:{number}: has more than {_DOTS_LIMIT} dots; shorten it")
+        try:
+            self.record: dict[str, Any] = tomllib.loads(text)
+        except RecursionError:
+            raise InputError(f"{path}: is nested too deeply; expected tables of values") from None
+        except ValueError as error:
+            raise InputError(_explain(path, text, str(error))) from None
+        self._lines = _lines_of(_TEXTS.sub(_blank, text))
+
+    def line(self, *place: str | int) -> int:
+        """Return the line of a place, or that of the table that holds it."""
+        way = ".".join(map(str, place))
+        while way and way not in self._lines:
+            way = way.rpartition(".")[0]
+        return self._lines.get(way, 1)
+
+    def error(self, message: str, *place: str | int) -> InputError:
+        """Build an error that says where a place stands."""
+        return InputError(f"{self.path}:{self.line(*place)}: {message}")
+
+    def unknown(self, problem: FflinError | str, *place: str | int) -> UnknownNameError:
+        """Build the same for a name that does not exist."""
+        return UnknownNameError(f"{self.path}:{self.line(*place)}: {problem}")
+
+
+def flat(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table in which ``a.b = 1``, read as a table in a table, is the name "a.b"."""
+    while any(isinstance(value, dict) and value for value in table.values()):
+        pairs = []
+        for key, value in table.items():
+            inner = value if isinstance(value, dict) and value else {"": value}
+            pairs += [(f"{key}.{below}" if below else key, x) for below, x in inner.items()]
+        table = dict(pairs)
+    return dict(table)
+
+
+def _lines_of(text: str) -> dict[str, int]:
+    """Return the lines of tables and keys, by their parts joined by dots."""
+    lines: dict[str, int] = {}
+    counts: dict[str, int] = {}
+    table = ""
+    for number, line in enumerate(text.split("\n"), start=1):
+        found = _LINE.match(line)
+        if not found:
+            continue
+        brackets, header, key = found.groups()
+        name = ".".join(part.strip("\"'") for part in re.findall(_PART, header or key))
+        if brackets:
+            first, _, below = name.partition(".")
+            if brackets == "[[":
+                counts[name] = counts.get(name, -1) + 1
+                lines.setdefault(name, number)
+                name = f"{name}.{counts[name]}"
+            elif first in counts and below:  # a table in the last of an array's
+                name = f"{first}.{counts[first]}.{below}"
+            table = name
+        else:
+            name = f"{table}.{name}" if table else name
+        lines.setdefault(name, number)
+        # `a.b = 1` has a line of `a` too.
+        head = name.rpartition(".")[0]
+        while head and head not in lines:
+            lines[head] = number
+            head = head.rpartition(".")[0]
+    return lines
+
+
+def _explain(path: Path, text: str, problem: str) -> str:
+    """Put the place that a TOML error names at its end in front of it."""
+    found = re.fullmatch(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)", problem)
+    what, line, column = found.groups() if found else (problem, None, None)
+    if line is None:
+        place = f"{path}:{text.rstrip().count(chr(10)) + 1}" if found else str(path)
+        return f"{place}: not TOML: {what}; mend it"
+    return f"{path}:{line}: not TOML: {what} at column {column}; mend it there"
+
+
+def _blank(found: re.Match[str]) -> str:
+    # Keys may be quoted: what stands on one line is left, and is no line of its own.
+    return found[0] if "\n" not in found[0] else "\n" * found[0].count("\n")

@@ -1,0 +1,53 @@
+"""The command that writes a robot file to begin with."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+from fflin.base.errors import FileError, InputError
+from fflin.commands import DONE
+from fflin.commands.arguments import Commands, command, file_name
+
+
+def add_commands(commands: Commands) -> None:
+    """Add init."""
+    init = command(
+        commands,
+        "init",
+        _init,
+        "write a robot.toml with what a URDF suggests: inputs, limits, joints without a motor",
+        "fflin init my.urdf && fflin simulate my.toml",
+    )
+    init.add_argument("robot", metavar="URDF", help="its path, or a name of `fflin robots`")
+    init.add_argument(
+        "-o",
+        "--output-file",
+        metavar="FILE.toml",
+        dest="output_file",
+        type=file_name,
+        help="where to; by default the URDF's name with .toml, in this folder",
+    )
+    init.add_argument("--force", action="store_true", help="write over a file that is there")
+
+
+def _init(arguments: argparse.Namespace) -> int:
+    from fflin.base.writing import check_place, write_whole
+    from fflin.robot.catalog import find_robot
+    from fflin.robot.draft import draft
+    from fflin.robot.loading import load
+
+    found = find_robot(arguments.robot)
+    if found.path.suffix.lower() == ".toml":
+        raise InputError(f"{found.path} is a robot file already; give a URDF")
+    target = arguments.output_file or Path(f"{found.name}.toml")
+    check_place(target, (".toml",))
+    if target.exists() and not arguments.force:
+        raise FileError(f"{target} is there already; name another with -o, or add --force")
+    urdf = found.name
+    if found.origin == "file":
+        urdf = os.path.relpath(os.path.realpath(found.path), os.path.realpath(target.parent))
+    write_whole({target: draft(load(arguments.robot), urdf).encode()})
+    print(f"wrote {target}; try: fflin simulate {target}")
+    return DONE

@@ -1,0 +1,228 @@
+"""`fflin init`, and the robot files that it writes, as a user runs them."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.robot.catalog import bundled_directory
+from tests.support.commands import refused, run
+from tests.support.robots import BUNDLED
+
+BODY = (
+    '<inertial><mass value="{mass}"/><inertia ixx="{xx}" iyy="0.4" izz="0.5" ixy="0" ixz="0" '
+    'iyz="0"/></inertial>'
+)
+LINKS = {"base": (50, 0.3), "hinged panel": (4, 0.3), "rw_x": (1, 0.7), "RCS_1": (0.1, 0.3)}
+OWN = (
+    '<robot name="own">'
+    + "".join(
+        f'<link name="{name}">{BODY.format(mass=m, xx=x)}</link>' for name, (m, x) in LINKS.items()
+    )
+    + '<joint name="hinge 1" type="revolute"><parent link="base"/><child link="hinged panel"/>'
+    '<origin xyz="0 1 0"/><axis xyz="0 1 0"/>'
+    '<limit lower="-1" upper="2" effort="0" velocity="3"/><dynamics damping="0.3"/></joint>'
+    '<joint name="spin" type="continuous"><parent link="base"/><child link="rw_x"/>'
+    '<origin xyz="0 0 0.5" rpy="0 0 1.5707963267948966"/><axis xyz="1 0 0"/>'
+    '<limit effort="2" velocity="500"/></joint>'
+    '<joint name="nozzle mount" type="fixed"><parent link="base"/><child link="RCS_1"/>'
+    '<origin xyz="-1 0 0" rpy="0 1.5707963267948966 0"/></joint>'
+    "</robot>"
+)
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_what_init_writes_of_a_bundled_robot_flies(tmp_path, name):
+    code, out, err = run("init", name, "-o", "own.toml", cwd=tmp_path)
+    assert (code, err) == (0, "") and out == "wrote own.toml; try: fflin simulate own.toml\n"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        plain = fflin.load(name)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*(effort.* 0 of|damping unused)")
+        robot = fflin.load(tmp_path / "own.toml")
+    assert robot.urdf == plain.urdf and robot.model == plain.model
+    assert robot.start["rpy"] == (10.0, 0.0, 0.0)
+    idle = [x.name for x in plain.joints if plain.model.effortLimit[x.idx_v] == 0.0]
+    assert list(robot.passive) == idle == list(robot.stiffness)
+    damped = {joint: d for joint, d in plain.urdf_damping.items() if d}
+    assert {joint: robot.damping[joint] for joint in damped} == pytest.approx(damped)
+    code, out, err = run("simulate", "own.toml", "--duration", 5, "-o", "m.npz", cwd=tmp_path)
+    assert code in (0, 1) and err == "" and "own: 5 s" in out
+    motion = fflin.Motion.load(tmp_path / "m.npz")
+    assert motion.attitude_error[0] == pytest.approx(10.0)
+    assert motion.attitude_error[-1] < motion.attitude_error[0] and not motion.stopped
+
+
+def test_all_that_init_suggests_can_be_taken(tmp_path):
+    """Every comment that is a line of TOML, uncommented, gives a robot that loads."""
+    (tmp_path / "own.urdf").write_text(OWN)
+    code, _, _ = run("init", "own.urdf", cwd=tmp_path)
+    assert code == 0
+    text = (tmp_path / "own.toml").read_text()
+    assert 'effort is 0 in the URDF.\npassive = ["hinge 1"]\n' in text
+    assert '# Link "rw_x" at [0, 0, 0.5], axis [0, 1, 0] in the robot\'s axes:' in text
+    assert '# Link "RCS_1" at [-1, 0, 0], direction [1, 0, 0] in the robot\'s axes:' in text
+    taken = re.sub(r"(?m)^# (?=\[|[a-z_]+ = |\"[\w. ]+\" = )", "", text)
+    # The wheel takes the place of its joint, which no other line may then speak of.
+    taken = taken.replace('lock = ["hinge 1"]', 'lock = ["spin"]')
+    taken = re.sub(r'(?m)^"\w+\.spin".*\n', "", taken)
+    (tmp_path / "all.toml").write_text(taken)
+    robot = fflin.load(tmp_path / "all.toml")
+    assert robot.locked == ("spin=0.0",) and robot.passive == ("hinge 1",)
+    assert robot.inputs == (
+        fflin.BaseTorque(max=1.0),
+        fflin.BaseForce(max=1.0),
+        fflin.Thruster("RCS_1", (0, 0, 0), (0, 0, 1), "RCS_1"),
+        fflin.ReactionWheel((1, 0, 0), "rw_x", inertia=0.7, name="rw_x_rotor"),
+    )
+    assert robot.outputs == (fflin.CenterOfMass(),) and robot.gravity[2] == -9.81
+    assert robot.weights == {"rule": "urdf", "bryson": {"q_b": 0.05}}
+    assert robot.limits["q_m.hinge 1"] == (-1.0, 2.0)
+    assert robot.start["velocity"] == {"qdot_m.hinge 1": 0.01}
+    # The spring that is guessed: 0.5 Hz with the base held.
+    inertia = 0.4  # about y, through the panel's centre
+    assert robot.stiffness["hinge 1"] == pytest.approx(inertia * np.pi**2, rel=1e-5)
+    assert robot.damping["hinge 1"] == 0.3
+
+
+def test_joints_that_all_have_no_effort_keep_their_motors(tmp_path):
+    text = (bundled_directory() / "canadarm2.urdf").read_text()
+    (tmp_path / "zero.urdf").write_text(re.sub(r'effort="[^"]*"', 'effort="0"', text))
+    code, _, _ = run("init", "zero.urdf", "-o", "sub.toml", cwd=tmp_path)
+    text = (tmp_path / "sub.toml").read_text()
+    assert code == 0 and "Of every joint the effort is 0, as some exporters" in text
+    with pytest.warns(fflin.FflinWarning, match="effort 0 of 7 joints"):
+        robot = fflin.load(tmp_path / "sub.toml")
+    assert robot.passive == () and len(fflin.linearize(robot).u0) == 13
+
+
+def test_a_file_names_its_urdf_from_where_it_lies(tmp_path):
+    (tmp_path / "deep" / "er").mkdir(parents=True)
+    (tmp_path / "a b.urdf").write_text(OWN)
+    code, out, _ = run("init", tmp_path / "a b.urdf", "-o", "deep/er/x.toml", cwd=tmp_path)
+    assert code == 0 and out.startswith("wrote deep/er/x.toml")
+    assert fflin.load(tmp_path / "deep" / "er" / "x.toml").name == "x"
+    assert 'urdf = "../../a b.urdf"\n' in (tmp_path / "deep" / "er" / "x.toml").read_text()
+
+
+def test_init_writes_over_nothing_unless_told(tmp_path):
+    code, out, _ = run("init", "ets_vii", cwd=tmp_path)
+    assert code == 0 and out.startswith("wrote ets_vii.toml")
+    path = tmp_path / "ets_vii.toml"
+    path.write_text("mine")
+    assert "ets_vii.toml is there already; name another with -o, or add --force" in refused(
+        "init", "ets_vii", cwd=tmp_path
+    )
+    assert path.read_text() == "mine"
+    assert run("init", "ets_vii", "--force", cwd=tmp_path)[0] == 0
+    assert path.read_text().startswith("# What is known of ets_vii: 6 joints")
+    for words, arguments in {
+        "is a robot file already; give a URDF": ("ets_vii.toml", "-o", "b.toml"),
+        "ends in '.urdf', expected one of .toml": ("ets_vii", "-o", "b.urdf"),
+        "no robot named 'ets_vi'": ("ets_vi",),
+        "there is no folder": ("ets_vii", "-o", "none/b.toml"),
+    }.items():
+        assert words in refused("init", *arguments, cwd=tmp_path)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["ets_vii.toml"]
+
+
+SAT = """
+urdf = "servicer_7dof"
+passive = ["panel_*"]
+outputs = ["com"]
+stiffness = 100
+[weights]
+rule = "identity"
+[weights.bryson]
+tau_b = 2
+[start]
+rpy = [20, 0, 0]
+joints = { joint_2 = 0.4 }
+velocity = { omega_b.z = 0.01 }
+"""
+
+
+@pytest.fixture
+def sat(tmp_path):
+    (tmp_path / "sat.toml").write_text(SAT)
+    return tmp_path
+
+
+def test_a_robot_file_stands_wherever_a_robot_does(sat):
+    for arguments in (
+        *(("info", "sat.toml"), ("linearize", "sat.toml"), ("check", "sat.toml")),
+        *(("analyze", "sat.toml"), ("modes", "sat.toml"), ("lqr", "sat.toml")),
+        ("sweep", "sat.toml", "--random", 3, "-o", "s.npz"),
+        ("validity", "sat.toml", "--samples", 2),
+        ("lqr", "servicer_7dof.toml", "--stiffness", 100, "--lock", "panel_right"),
+    ):
+        code, out, err = run(*arguments, cwd=sat)
+        assert code == 0 and out and "fflin: error" not in err, arguments
+    lin = fflin.LinearBatch.load(sat / "s.npz")
+    assert lin.input_names[-1] == "tau_m.joint_7" and lin.output_names == (
+        "com.x",
+        "com.y",
+        "com.z",
+    )
+
+
+def test_options_go_before_the_file(sat):
+    def saved(*options):
+        code, _, err = run("linearize", "sat.toml", *options, "-o", "m.npz", cwd=sat)
+        assert code == 0, err
+        return fflin.LinearModel.load(sat / "m.npz")
+
+    assert saved().output_names[0] == "com.x" and not saved().q[:3].any()
+    assert saved("--output", "base").output_names[0] == "q_b.x"
+    assert saved("--inputs", "joints").input_names == tuple(f"tau_m.joint_{k}" for k in range(1, 8))
+    assert saved("--inputs", "joints", "--passive", "joint_1").input_names[0] == "tau_m.joint_2"
+    assert "inputs are torques of joints that all are passive" in refused(
+        "linearize", "sat.toml", "--inputs", "joints", "--passive", "joint_?", cwd=sat
+    )
+
+
+def test_passive_on_the_command_line(sat):
+    robot = ("linearize", "servicer_7dof", "-o", "m.npz")
+    assert run(*robot, "--passive", "panel_*", "--passive", "joint_1", cwd=sat)[0] == 0
+    names = fflin.LinearModel.load(sat / "m.npz").input_names
+    assert names[6:] == tuple(f"tau_m.joint_{k}" for k in range(2, 8))
+    assert "no joint named 'hinge_*'" in refused(*robot[:2], "--passive", "hinge_*", cwd=sat)
+
+
+def test_simulate_begins_and_weighs_as_the_file_says(sat):
+    def simulated(*options):
+        code, _, err = run(
+            "simulate", "sat.toml", "--duration", 1, "-o", "m.npz", *options, cwd=sat
+        )
+        assert code in (0, 1), err
+        return fflin.Motion.load(sat / "m.npz")
+
+    robot = fflin.load(sat / "sat.toml")
+    motion = simulated()
+    x = dict(zip(motion.state_names, motion.x[0], strict=True))
+    assert x["q_b.x"] == pytest.approx(np.sin(np.radians(10.0)))
+    assert x["q_m.joint_2"] == 0.4 and x["omega_b.z"] == 0.01
+    lin = fflin.linearize(robot, fflin.configuration(robot), reference=motion.reference)
+    law = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    again = fflin.simulate(robot, law, duration=1.0, limits="urdf")
+    np.testing.assert_allclose(again.x, motion.x, atol=1e-9)
+    assert fflin.lqr(lin).weights.startswith("tau_b as given, the others identity")
+    turned = simulated("--rpy", 0, 0, 5, "--joint", "joint_*=0.1", "--velocity", "joint_1=0.2")
+    x = dict(zip(turned.state_names, turned.x[0], strict=True))
+    assert x["q_b.x"] == 0.0 and x["q_b.z"] == pytest.approx(np.sin(np.radians(2.5)))
+    assert x["q_m.joint_2"] == x["q_m.joint_7"] == 0.1 and x["q_m.panel_left"] == 0.0
+    assert x["omega_b.z"] == 0.01 and x["qdot_m.joint_1"] == 0.2
+
+
+def test_lqr_on_the_command_line_weighs_what_the_file_says(sat):
+    def weights(*options):
+        code, out, err = run("lqr", "sat.toml", *options, cwd=sat)
+        assert code == 0, err
+        return " ".join(out.split())
+
+    assert "weights: tau_b as given, the others identity" in weights()
+    assert "weights: tau_b, q_b as given, the others identity" in weights("--q", "q_b=3")
+    assert "from the limits of the URDF" in weights("--weights", "urdf")
