@@ -28,7 +28,8 @@ _NAMES = {
         "linear.model LinearModel Certificate",
         "dynamics.state StateMap",
         "linear.equilibrium equilibrium Equilibrium",
-        "linear.trajectory linearize_trajectory LinearTrajectory",
+        "linear.trajectory Trajectory",
+        "linear.linear_trajectory linearize_trajectory LinearTrajectory",
         "linear.check check Check",
     ),
     "Analysis": (
@@ -46,7 +47,8 @@ _NAMES = {
         "control.gain Gain",
         "control.acceleration_lqr acceleration_lqr",
         "control.sampled_cost sampled_cost",
-        "control.tvlqr tvlqr GainSchedule",
+        "control.tvlqr tvlqr",
+        "control.gain_schedule GainSchedule",
         "control.kalman kalman Estimator lqg Compensator",
     ),
     "Policies": (
@@ -126,21 +128,23 @@ if TYPE_CHECKING:
     from fflin.batch.sweep import sweep
     from fflin.control.acceleration_lqr import acceleration_lqr
     from fflin.control.gain import Gain
+    from fflin.control.gain_schedule import GainSchedule
     from fflin.control.kalman import Compensator, Estimator, kalman, lqg
     from fflin.control.lqr import lqr
     from fflin.control.output_feedback import OutputFeedback
     from fflin.control.plots import plot_loops, plot_poles
     from fflin.control.policies import Allocation, StateFeedback, TrajectoryFeedback
     from fflin.control.sampled_cost import sampled_cost
-    from fflin.control.tvlqr import GainSchedule, tvlqr
+    from fflin.control.tvlqr import tvlqr
     from fflin.control.weights import bryson
     from fflin.dynamics.points import configuration, effort, velocity
     from fflin.dynamics.state import StateMap
     from fflin.linear.check import Check, check
     from fflin.linear.equilibrium import Equilibrium, equilibrium
+    from fflin.linear.linear_trajectory import LinearTrajectory, linearize_trajectory
     from fflin.linear.linearization import Linearizer, linearize
     from fflin.linear.model import Certificate, LinearModel
-    from fflin.linear.trajectory import LinearTrajectory, linearize_trajectory
+    from fflin.linear.trajectory import Trajectory
     from fflin.robot.catalog import list_robots
     from fflin.robot.input_files import load_inputs
     from fflin.robot.inputs import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster

@@ -272,6 +272,11 @@ class Design(FrozenArrays):
         FileError
             If the file cannot be read, is damaged or is another thing.
         """
+        return cls._read(path)
+
+    @classmethod
+    def _read(cls: type[Kind], path: str | Path, **given: Any) -> Kind:
+        """Do what `load` does; what no file has is `given`."""
         source, name = as_path(path), cls.__name__
         with reading(source, name):
             record, verified = read_record(source)
@@ -284,11 +289,16 @@ class Design(FrozenArrays):
                 if item.name in record or item.default_factory is MISSING
             ]
             values = {item.name: _value(cls, item, record[item.name]) for item in stored}
-            return cls(**values, verified=verified)
+            return cls(**given, **values, verified=verified)
 
 
 def _saved(cls: type[Design]) -> list[Field[Any]]:
-    return [item for item in fields(cls) if item.name != "verified"]
+    """Return the fields that files have."""
+    return [
+        item
+        for item in fields(cls)
+        if item.name != "verified" and item.name[0] != "_" and item.type != "Robot"
+    ]
 
 
 def _value(cls: type[Design], item: Field[Any], raw: Any) -> Any:
@@ -296,7 +306,7 @@ def _value(cls: type[Design], item: Field[Any], raw: Any) -> Any:
     kind = str(item.type)
     if kind == "float":
         return figure(raw)
-    if kind == "str":
+    if kind.startswith("str"):
         return text(raw)
     if kind.startswith("tuple"):
         return texts(raw)

@@ -22,6 +22,7 @@ from fflin.commands import (
     regulator,
     simulation,
     sweeps,
+    tracking,
     visual,
 )
 
@@ -30,7 +31,7 @@ TASKS = {
     "look at robots": ("robots", "info", "init", "view"),
     "make and check a linear model": ("linearize", "check"),
     "judge it": ("analyze", "modes", "validity"),
-    "close the loop": ("lqr", "simulate"),
+    "close the loop": ("lqr", "tvlqr", "simulate"),
     "go through many points": ("sweep",),
 }
 
@@ -113,7 +114,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         prog="fflin", metavar="COMMAND", required=True, help=argparse.SUPPRESS
     )
-    for module in (models, init, analysis, regulator, simulation, visual, sweeps):
+    for module in (models, init, analysis, regulator, tracking, simulation, visual, sweeps):
         module.add_commands(commands)
     # argparse lists all in one group.
     left = {command.dest: command for command in commands._choices_actions}

@@ -62,7 +62,7 @@ def model_report(lin: LinearModel) -> str:
     c = lin.certificate
     parts.append(
         f"A and B against ABA derivatives: {c.route_A:.1e} and {c.route_B:.1e}; M M^-1 - E: "
-        f"{c.inertia_residual:.1e};\ncond(M): {c.condition:.1e}; |f0|: {c.f0:.1e}"
+        f"{c.inertia_residual:.1e};\ncond(M), scaled: {c.condition:.1e}; |f0|: {c.f0:.1e}"
     )
     return "\n\n".join(parts)
 

@@ -18,6 +18,7 @@ from fflin.commands.arguments import (
     number,
 )
 from fflin.commands.points import linear_model, load_robot
+from fflin.commands.tracking import add_trajectory, check_along, linearize_along
 from fflin.commands.visual import add_figure, check_figure, draw
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ def add_commands(commands: Commands) -> None:
     linearize.add_argument(
         "--dt", metavar="H", type=number, help="sample it, with inputs held over H [s]"
     )
+    add_trajectory(linearize)
     add_output_file(
         linearize, "save to FILE: .npz, .mat, .json, or .csv (one file a matrix: NAME.A.csv, ...)"
     )
@@ -57,6 +59,7 @@ def add_commands(commands: Commands) -> None:
         "fflin check canadarm2 --rpy 20 0 0 --reference world --frame world",
     )
     add_point(check)
+    add_trajectory(check)
     add_figure(check, "draw the errors beside what they must not exceed")
 
 
@@ -93,6 +96,8 @@ def _info(arguments: argparse.Namespace) -> int:
 
 
 def _linearize(arguments: argparse.Namespace) -> int:
+    if arguments.trajectory:
+        return linearize_along(arguments)
     if arguments.output_file:
         from fflin.base.writing import check_place
         from fflin.linear.files import FORMATS
@@ -114,6 +119,8 @@ def _linearize(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> int:
+    if arguments.trajectory:
+        return check_along(arguments)
     from fflin.linear.check import check
 
     check_figure(arguments.plot)

@@ -177,4 +177,4 @@ def inputs_at(
         raise InputError("--effort and --equilibrium both say the inputs at the point; give either")
     from fflin.linear.equilibrium import equilibrium
 
-    return equilibrium(robot, q, v=v, frame=arguments.frame, reference=reference).u
+    return equilibrium(robot, q, v=v, frame=arguments.frame or "hybrid", reference=reference).u

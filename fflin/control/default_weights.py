@@ -60,6 +60,7 @@ def rule_weights(
     given: Mapping[str, Any] | None = None,
     *,
     wheel_speeds: bool | None = None,
+    hold: float = 0.0,
 ) -> tuple[Array, Array, Array | None, str]:
     """Return Q, R and N of a model by a rule, and the rule in words.
 
@@ -76,6 +77,8 @@ def rule_weights(
         Parts "q", "r", "bryson" of those that have their own, as `Robot.replace` takes them.
     wheel_speeds : bool, optional
         As in `lqr`.
+    hold : float
+        Time [s] that the inputs of a continuous model will be held for.
 
     Raises
     ------
@@ -88,7 +91,7 @@ def rule_weights(
         layers.insert(0, (lin.weights, True))
         name = lin.weights.get("rule")
     if name is None or name == "urdf":
-        Q, R, rule = _of_regulated(source, lin.dt, wheel_speeds)
+        Q, R, rule = _of_regulated(source, lin.dt or hold, wheel_speeds)
     elif name == "identity":
         nx, nu = lin.B.shape
         Q, R, rule = np.eye(nx), np.eye(nu), "identity: 1 on every state and every input"

@@ -9,10 +9,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
 from fflin.base.validation import Array
-
-# Weights of the commutator-free method of order four, and its Gauss nodes.
-_HEAVY, _LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0
-NODES = (0.5 - 3.0**0.5 / 6.0, 0.5 + 3.0**0.5 / 6.0)
+from fflin.linear.sampling import GAUSS, HEAVY, LIGHT
 
 
 class Coefficients(NamedTuple):
@@ -89,10 +86,10 @@ def step_back(start: Coefficients, end: Coefficients, S: Array, P: Array, h: flo
         Coefficients(*((1.0 - c) * a + c * b for a, b in zip(start, end, strict=True)))._replace(
             S=at_node
         )
-        for c, at_node in zip(NODES, S, strict=True)
+        for c, at_node in zip(GAUSS, S, strict=True)
     )
     for first, second in ((late, early), (early, late)):
-        mixed = Coefficients(*(_HEAVY * a + _LIGHT * b for a, b in zip(first, second, strict=True)))
+        mixed = Coefficients(*(HEAVY * a + LIGHT * b for a, b in zip(first, second, strict=True)))
         P = _passage(mixed, 0.5 * h).back(P)
     return P
 

@@ -139,8 +139,13 @@ def require_fixed_point(lin: LinearModel) -> None:
     )
     more = f" and {len(rows) - _SHOWN_RESIDUALS} more" if len(rows) > _SHOWN_RESIDUALS else ""
     raise EquilibriumError(
-        f"the point is not a fixed point: {shown}{more}; linearise about one, with the inputs of "
-        "fflin.equilibrium, or about a steady motion with moving=True"
+        f"the point is not a fixed point: {shown}{more}; "
+        + (
+            "the reference does not move steadily; take fflin.tvlqr along its trajectory"
+            if lin.moving
+            else "linearise about one, with the inputs of fflin.equilibrium, or about a steady "
+            "motion with moving=True"
+        )
     )
 
 

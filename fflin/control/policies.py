@@ -11,21 +11,20 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
-from fflin.base.rotation import conjugate, quaternion_product, rotation_matrix
 from fflin.base.validation import Array, as_double
 from fflin.control.bounded import nearest
 from fflin.control.channel import Law
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.dynamics.state_rows import readout
+from fflin.dynamics.state_rows import moving_error, readout
 from fflin.linear.fit import require_fit, require_same, require_turns
 from fflin.linear.model import LinearModel
 from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from fflin.control.tvlqr import GainSchedule
-    from fflin.linear.trajectory import LinearTrajectory
+    from fflin.control.gain_schedule import GainSchedule
+    from fflin.linear.linear_trajectory import LinearTrajectory
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
@@ -147,7 +146,7 @@ class TrajectoryFeedback:
         def policy(t: float, q: Array, v: Array) -> Array:
             t = min(max(t, float(along.t[0])), end)
             q_star, v_star, u_star = along.point(t)
-            u: Array = u_star - self.schedule.gain(t).dot(_error(state, q_star, v_star, q, v))
+            u: Array = u_star - self.schedule.gain(t).dot(moving_error(state, q_star, v_star, q, v))
             return u
 
         return policy
@@ -234,16 +233,3 @@ def feedback_of(policy: Any) -> tuple[LinearModel | None, Array | None]:
     lin = getattr(policy, "lin", None)
     decides = policy.policy if isinstance(policy, Allocation) else policy
     return (lin if isinstance(lin, LinearModel) else None), getattr(decides, "K", None)
-
-
-def _error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Array) -> Array:
-    """Return the error (nx,) from a moving reference, in its axes."""
-    g = state.groups
-    e = np.empty(state.nx)
-    turned = quaternion_product(conjugate(q_star[3:7]), q[3:7])
-    e[g.q_b] = turned[:3] if turned[3] >= 0.0 else -turned[:3]
-    e[g.r_b] = rotation_matrix(q_star[3:7]).T @ (q[:3] - q_star[:3])
-    apart = pin.difference(state.robot.model, q_star, q)
-    e[g.q_m] = state.velocities(apart)[6:]
-    e[-6 - state.robot.n :] = state.velocities(v - v_star)
-    return e

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.base.errors import InputError
+from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
 from fflin.base.names import input_keys
-from fflin.base.record import Design
 from fflin.base.validation import Array, number
-from fflin.control.differential_riccati import NODES, Coefficients, step_back
+from fflin.control.differential_riccati import Coefficients, step_back
+from fflin.control.gain_schedule import GainSchedule
 from fflin.control.weights import Weight, weight
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
+from fflin.linear.sampling import GAUSS
 
 if TYPE_CHECKING:
-    from scipy.interpolate import CubicHermiteSpline
-
-    from fflin.linear.trajectory import LinearTrajectory
+    from fflin.linear.linear_trajectory import LinearTrajectory
+    from fflin.linear.model import LinearModel
 
 # Between two knots P is a cubic; knots are added until it is this accurate, relative to P.
 _ACCURACY = 1e-7
@@ -29,84 +28,16 @@ _KNOTS_LIMIT = 100_000
 _TOO_FAST = "P changes too fast at {}; give smaller weights or a larger R"
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class GainSchedule(Design):
-    r"""A time-varying feedback ``u = u*(t) - K(t) e`` of the error e from a trajectory.
-
-    Attributes
-    ----------
-    t : ndarray (M,)
-        Times of the knots [s]: the trajectory's and those that P needs.
-    K : ndarray (M, nu, nx)
-    P : ndarray (M, nx, nx)
-        The cost from t on is e' P(t) e.
-    A : ndarray (M, nx, nx)
-    B : ndarray (M, nx, nu)
-        The model at the knots, linear in between.
-    Q, R, Qf : ndarray
-    residual : float
-        Largest residual of the differential Riccati equation midway between the knots, relative
-        to the sum of the norms of its terms.
-    state_names, input_names : tuple of str
-    robot : str
-    """
-
-    VECTORS: ClassVar = ("t",)
-
-    t: Array
-    K: Array
-    P: Array
-    A: Array
-    B: Array
-    Q: Array
-    R: Array
-    Qf: Array
-    residual: float
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    robot: str
-
-    def __repr__(self) -> str:
-        return (
-            f"GainSchedule('{self.robot}', {len(self.t)} knots, {self.t[0]:g} to "
-            f"{self.t[-1]:g} s, nx={self.P.shape[1]}, nu={self.K.shape[1]}, "
-            f"residual={self.residual:.1e})"
-        )
-
-    def __call__(self, t: float) -> Array:
-        """Return K (nu, nx) at a time."""
-        return self.gain(t)
-
-    def gain(self, t: float) -> Array:
-        """Return K (nu, nx) at a time; InputError where it is not within the knots."""
-        P = self.cost_to_go(t)
-        i = min(int(np.searchsorted(self.t, t, side="right")) - 1, len(self.t) - 2)
-        share = (t - self.t[i]) / (self.t[i + 1] - self.t[i])
-        B = (1.0 - share) * self.B[i] + share * self.B[i + 1]
-        K: Array = np.linalg.solve(self.R, B.T @ P)
-        return K
-
-    def cost_to_go(self, t: float) -> Array:
-        """Return P (nx, nx) at a time, a cubic between the knots with their values and slopes."""
-        t = number("t", t)
-        if not self.t[0] <= t <= self.t[-1]:
-            raise InputError(f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s")
-        P: Array = self._cubics(t)
-        return P
-
-    @cached_property
-    def _cubics(self) -> CubicHermiteSpline:
-        """P over time."""
-        from scipy.interpolate import CubicHermiteSpline
-
-        drift, across = self.P @ self.A, (0, 2, 1)
-        spent = self.K.transpose(across) @ self.R @ self.K
-        return CubicHermiteSpline(
-            self.t, self.P, spent - drift - drift.transpose(across) - self.Q, extrapolate=False
-        )
-
-
-def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSchedule:
+def tvlqr(
+    traj: LinearTrajectory,
+    Q: Weight | None = None,
+    R: Weight | None = None,
+    Qf: Weight | str = "steady",
+    sample: float | None = None,
+    *,
+    weights: str | None = None,
+    rule: str = "as given",
+) -> GainSchedule:
     r"""Return the regulator along a trajectory, over its finite horizon.
 
     From any time t to the end T it minimises
@@ -120,13 +51,26 @@ def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSched
     horizon. The method is of order four in the trajectory's changes and exact where it does not
     change; knots are added until halving and interpolation agree to 1e-7.
 
+    With `sample` it is the regulator of a computer that measures e every so often and holds
+    :math:`\delta u` in between, at the same cost, by (10.1) and (10.3) along the motion.
+
     Parameters
     ----------
     traj : LinearTrajectory
-    Q, Qf : array_like (nx, nx) or (nx,), float, or mapping
-        Weights on the error and on that at the end, as `lqr` takes them; positive semidefinite.
-    R : array_like (nu, nu) or (nu,), float, or mapping
+    Q : array_like (nx, nx) or (nx,), float, or mapping, optional
+        Weight on the error, as `lqr` takes it; positive semidefinite.
+    R : array_like (nu, nu) or (nu,), float, or mapping, optional
         Positive definite.
+    Qf : "steady", or as Q
+        Weight on the error at the end. "steady" is the cost from there on of `lqr` about the robot
+        at rest in the last configuration, or in its motion there if that is steady; what the
+        inputs cannot hold is left out, see `momentum_reduction`.
+    sample : float, optional
+        Sampling time [s], of which the duration is a multiple.
+    weights : {"urdf", "identity"}, optional
+        Instead of Q and R: the rule of `lqr`, about that same point.
+    rule : str
+        What made Q and R, in words.
 
     Returns
     -------
@@ -135,10 +79,12 @@ def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSched
     Raises
     ------
     InputError
-        If a weight is of a wrong size or not positive (semi)definite, or P changes so fast that
-        the knots run out.
+        If a weight is of a wrong size or not positive (semi)definite, P changes so fast that
+        the knots run out, or the sampling time does not divide the duration.
     UnknownNameError
         If a name does not exist.
+    EquilibriumError, StabilizabilityError
+        If Qf is "steady" and no inputs hold the robot there.
 
     References
     ----------
@@ -146,16 +92,37 @@ def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSched
     E. Celledoni, A. Marthinsen and B. Owren, Commutator-free Lie group methods, Future Generation
     Computer Systems 19(3), 2003.
     """
-    from fflin.linear.trajectory import LinearTrajectory
+    from fflin.linear.linear_trajectory import LinearTrajectory
 
     if not isinstance(traj, LinearTrajectory):
         raise InputError(
             f"traj is a {type(traj).__name__}, expected a LinearTrajectory; "
             "fflin.linearize_trajectory makes one"
         )
-    names = traj.state_names
-    Q, Qf = weight("Q", Q, names), weight("Qf", Qf, names)
-    R = weight("R", R, input_keys(Actuation(StateMap(traj.robot))), definite=True)
+    if traj.dt:
+        raise InputError("traj is sampled; give the continuous one, and sample=")
+    names, dt = traj.state_names, 0.0 if sample is None else number("sample", sample)
+    steady = isinstance(Qf, str)
+    if steady and Qf != "steady":
+        raise InputError(f"Qf is {Qf!r}, expected 'steady' or a weight")
+    by_rule = Q is None and R is None
+    if not by_rule and (weights is not None or Q is None or R is None):
+        raise InputError("give Q and R, both, or weights='urdf' or 'identity' without them")
+    end: Any = steady_end(traj) if steady or by_rule else None
+    given: list[Any] = [Q, R]
+    if by_rule:
+        from fflin.control.default_weights import rule_weights
+
+        *given, _, rule = rule_weights(end, weights, hold=dt)
+    Q = weight("Q", given[0], names)
+    R = weight("R", given[1], input_keys(Actuation(StateMap(traj.robot))), definite=True)
+    Qf = _cost_from(end, Q, R, sample) if steady else weight("Qf", Qf, names)
+    fields: dict[str, Any] = {key: getattr(traj, key) for key in ("q", "v", "u", "hold", "frame")}
+    fields |= {"state_names": names, "input_names": traj.input_names, "robot": traj.robot.name}
+    fields |= {"Q": Q, "R": R, "Qf": Qf, "weights": rule, "knots": traj.t}
+    fields |= {"verified": traj.verified, "dt": dt}
+    if sample is not None:
+        return GainSchedule(**fields, **_sampled(traj, dt, Q, R, Qf))
     try:
         # A P that overflows is refused below, so that NumPy need not warn of it.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -164,10 +131,81 @@ def tvlqr(traj: LinearTrajectory, Q: Weight, R: Weight, Qf: Weight) -> GainSched
         raise InputError(_TOO_FAST.format("some time")) from None
     A, B = map(np.array, zip(*(traj.matrices(float(x)) for x in t), strict=True))
     K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
-    schedule = GainSchedule(
-        t, K, P, A, B, Q, R, Qf, math.inf, names, traj.input_names, traj.robot.name
-    )
+    schedule = GainSchedule(t=t, K=K, P=P, A=A, B=B, residual=math.inf, **fields)
     return replace(schedule, residual=_residual(schedule))
+
+
+def steady_end(traj: LinearTrajectory) -> LinearModel:
+    """Return the model at the end where that is steady, else at rest in the last configuration."""
+    from fflin.linear.equilibrium import equilibrium
+    from fflin.linear.ignorable import rotor_names
+    from fflin.linear.linearization import Linearizer
+
+    lin, robot = traj[-1], traj.robot
+    if lin.is_equilibrium():
+        return lin
+    rotors = rotor_names(robot)
+    spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
+    v = np.zeros(robot.nv)
+    v[spinning] = lin.v[spinning]
+    try:
+        return Linearizer(robot, moving=True)(lin.q, v, equilibrium(robot, lin.q, v=v).u)
+    except EquilibriumError as error:
+        raise EquilibriumError(f"at the end: {error}; give Q, R and Qf") from None
+
+
+def _cost_from(lin: Any, Q: Array, R: Array, sample: float | None) -> Array:
+    """Return the cost P (nx, nx) of a regulator about a steady point."""
+    from fflin.analysis.momentum import momentum_reduction
+    from fflin.control.lqr import lqr
+    from fflin.control.sampled_cost import sampled_cost
+
+    def cost(lin: LinearModel, Q: Array) -> Array:
+        if sample is None:
+            return lqr(lin, Q, R).P
+        return lqr(lin.discretize(sample), *sampled_cost(lin, sample, Q, R)).P
+
+    try:
+        return cost(lin, Q)
+    except StabilizabilityError:
+        part = momentum_reduction(lin)
+        P: Array = part.S.T @ cost(part, part.T.T @ Q @ part.T) @ part.S
+        return P
+
+
+def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) -> dict[str, Any]:
+    """Return t, K, P, A, B and the residual of the regulator whose inputs are held."""
+    from fflin.analysis.gramians import held_cost
+    from fflin.linear.trajectory_sampling import transitions
+
+    nx, nu = len(Q), len(R)
+    W = np.zeros((nx + nu, nx + nu))
+    W[:nx, :nx], W[nx:, nx:] = Q, R
+    maps, gains, costs, worst = [], [], [P], 0.0
+    for steps, whole in reversed(list(transitions(traj, dt))):
+        total, way = np.zeros_like(W), np.eye(nx + nu)
+        for F, h, step in steps:
+            total += way.T @ held_cost(F, W, h) @ way
+            way[:nx] = step @ way
+        total += whole.T @ P @ whole
+        K = np.linalg.solve(total[nx:, nx:], total[nx:, :nx])
+        # A sum of squares, which stays positive.
+        law = np.vstack((np.eye(nx), -K))
+        P = law.T @ total @ law
+        P = 0.5 * (P + P.T)
+        terms = P, total[:nx, :nx], total[:nx, nx:] @ K
+        size = sum(float(np.linalg.norm(each)) for each in terms)
+        worst = max(worst, float(np.linalg.norm(terms[0] - terms[1] + terms[2])) / (size or 1.0))
+        if not np.isfinite(P).all():
+            raise InputError(_TOO_FAST.format("some time"))
+        maps.append(whole)
+        gains.append(K)
+        costs.append(P)
+    maps.reverse()
+    held = np.array(maps)
+    gains = [*gains[::-1], gains[0]]
+    found = {"t": traj.samples(dt), "K": np.array(gains), "P": np.array(costs[::-1])}
+    return found | {"A": held[:, :, :nx], "B": held[:, :, nx:], "residual": worst}
 
 
 def _solve(traj: LinearTrajectory, Q: Array, R: Array, Qf: Array) -> tuple[Array, Array]:
@@ -176,7 +214,7 @@ def _solve(traj: LinearTrajectory, Q: Array, R: Array, Qf: Array) -> tuple[Array
         return Coefficients(A, _spread(B, R), Q)
 
     def back(a: float, b: float, P: Array) -> Array:
-        nodes = np.array([_spread(traj.matrices(a + c * (b - a))[1], R) for c in NODES])
+        nodes = np.array([_spread(traj.matrices(a + c * (b - a))[1], R) for c in GAUSS])
         return step_back(at(a), at(b), nodes, P, b - a)
 
     times, values = [float(traj.t[-1])], [Qf]

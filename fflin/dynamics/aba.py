@@ -35,6 +35,7 @@ class Aba:
         self._model = robot.model.copy()
         self._model.gravity.linear = np.array(robot.gravity)
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
+        self._resists = any(values.any() for values in robot.springs)
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 
     def acceleration(self, q: Array, v: Array, u: Array, tau: Array | None = None) -> Array:
@@ -42,10 +43,22 @@ class Aba:
 
         `tau` (nv,), in Pinocchio's order, is a force besides.
         """
-        forces = self.actuation.torques(u) + self._passive_force(q, v)
+        forces = self.actuation.torques(u)
+        if self._resists:
+            forces += self._passive_force(q, v)
         if tau is not None:
             forces += self.state.forces(tau)
         return self._accelerate(self._model, q, v, forces, self._wrenches(q, v, u))
+
+    def terms(self, q: Array, v: Array, u: Array) -> Array:
+        """Return the size (6 + n,) of the terms that add up to the accelerations; `u` as above."""
+        state, data = self.state, self._data
+        M = state.project(pin.crba(self._model, data, q).T)
+        columns = self.actuation.columns(data, q)
+        bias = state.forces(pin.nonLinearEffects(self._model, data, q, v))
+        forces = np.abs(columns) @ np.abs(u) + np.abs(bias) + np.abs(self._passive_force(q, v))
+        size: Array = np.abs(np.linalg.inv(M)) @ forces
+        return size
 
     def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return d(nudot)/d(tangent of q, nu, u) in state order, (6 + n, ...); `u` in base axes.

@@ -7,6 +7,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
+from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
@@ -146,6 +147,13 @@ class Actuation:
             return u
         in_base: Array = chart.to_base(self._held, u[..., None])[..., 0]
         return in_base
+
+    def rows_in_base_axes(self, q: Array, u: Array) -> Array:
+        """Return rows u (N, nu) in base axes at valid configurations (N, nq), at any turn."""
+        if not self._held:
+            return u
+        R = self._state.origin.rotation @ rotation_matrices(q[:, 3:7])
+        return self.in_base_axes(Chart(q[:, 3:6], q[:, 6:7], R), u)
 
     def over_inputs(self, chart: Chart, by_u: Array, *, out: Array | None = None) -> Array:
         """Return slopes (.., k, nu) over `in_base_axes` as slopes over u: F_u^T of (4.7)."""

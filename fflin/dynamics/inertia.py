@@ -24,6 +24,10 @@ _WARNING_COUPLING, _LARGEST_COUPLING = 1e-9 / _EPS, 1e-2 / _EPS
 # added up, bounds their rounding; up to here they are taken, beyond it a factor of M.
 _QUICK_COUPLING = 1e-11 / _EPS
 
+# The same for each coordinate alone, from where on it has next to no inertia of its own: of robots
+# that are described well it is below 1e6.
+_LARGEST_SHARE = 1e9
+
 STROKE = 1.0  # [m] that a sliding joint is taken to be out at most, for those moments
 
 # From this size on LAPACK is quicker than a sparse factor.
@@ -70,6 +74,7 @@ class Inertia:
         if robot not in _BOUNDS:
             _BOUNDS[robot] = inertia_bounds(robot.model)
         self._bounds = None if self._constrained else _BOUNDS[robot]
+        self._in_order = np.zeros(0) if self._bounds is None else state.velocities(self._bounds)
         self._slides = [joint.idx_q for joint in robot.joints if joint.prismatic]
         # The base at the world's origin: M does not depend on where it is, but Pinocchio works in
         # world axes and would lose digits to a base far away.
@@ -109,6 +114,20 @@ class Inertia:
         # Written so that NaN, from a pivot that is zero, fails too.
         if not self.least_coupling < coupling < _WARNING_COUPLING:
             self._judge(coupling, self._state.project(upper.T))
+        elif self._bounds is not None and not self._in_order.dot(out.diagonal()) < _LARGEST_SHARE:
+            self._name_the_lightest(1.0 / out.diagonal())
+
+    def _name_the_lightest(self, inertias: Array) -> None:
+        name, allowed = self._state.robot.name, self._in_order
+        worst = int((inertias / allowed).argmin())
+        warnings.warn(
+            f"M of '{name}': {coordinate_names(self._state.robot)[worst]} moves an inertia of "
+            f"{inertias[worst]:.1e} only, where mass and place of its links would allow "
+            f"{allowed[worst]:.1e}, and B is as large as {1.0 / inertias[worst]:.1e}; give the "
+            "links their inertia, or lock it",
+            FflinWarning,
+            stacklevel=6,
+        )
 
     def _judge(self, coupling: float, M: Array) -> None:
         """Refuse or warn of an M whose inverse has lost its digits; name what moves with it."""

@@ -7,7 +7,13 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import ChartError, InputError
-from fflin.base.rotation import conjugate, quaternion_product, rotation_matrix
+from fflin.base.rotation import (
+    conjugate,
+    product_matrix,
+    quaternion_product,
+    rotation_matrices,
+    rotation_matrix,
+)
 from fflin.base.validation import Array, placement, vector
 from fflin.dynamics.chart import SMALLEST_Q0, Chart
 from fflin.dynamics.names import groups_of, states_of
@@ -239,36 +245,43 @@ class StateMap:
         InputError
             If the size is wrong or an entry is not finite.
         """
-        x = vector("x", x, self.nx, "a state (12 + 2n)")
+        _, q, v = self.points(vector("x", x, self.nx, "a state (12 + 2n)")[None])
+        return q[0], v[0]
+
+    def points(self, x: Array) -> tuple[Chart, Array, Array]:
+        """Do what `to_pinocchio` does for rows of states (N, nx); return the charts too."""
         g = self.groups
-        q_b = x[g.q_b]
-        square = 1.0 - float(q_b @ q_b)
-        if square < SMALLEST_Q0**2:
+        if not np.isfinite(x).all():
+            raise InputError("x has entries that are not finite")
+        square = 1.0 - (x[:, g.q_b] ** 2).sum(axis=1, keepdims=True)
+        if not (square >= SMALLEST_Q0**2).all():
             raise ChartError(
-                f"|q_b| is {np.sqrt(1.0 - square):.9g}, expected less than 1: at 1 the base is "
-                "turned by 180 deg from the reference, where the attitude chart is singular"
+                f"|q_b| is {np.sqrt(1.0 - square.min()):.9g}, expected less than 1: at 1 the base "
+                "is turned by 180 deg from the reference, where the attitude chart is singular"
             )
-        relative = np.array((*q_b, np.sqrt(square)))
-        q = np.empty(self.robot.nq)
-        q[:3] = self._rotation.T @ (x[g.r_b] - self._position)
-        q[3:7] = quaternion_product(conjugate(self._quaternion), relative)
-        angles = x[g.q_m]
-        q[self._idx_q] = angles
-        q[self._cos] = np.cos(angles[self.unbounded])
-        q[self._sin] = np.sin(angles[self.unbounded])
-        self.robot.follow(q)
-        chart = Chart(q_b, float(relative[3]), rotation_matrix(relative))
-        return q, self.spread(self.to_base(chart, x[6 + self.robot.n :, None])[:, 0])
+        relative = np.concatenate((x[:, g.q_b], np.sqrt(square)), axis=1)
+        chart = Chart(relative[:, :3], relative[:, 3:], rotation_matrices(relative))
+        q = np.empty((len(x), self.robot.nq))
+        q[:, :3] = (x[:, g.r_b] - self._position) @ self._rotation
+        turned = relative @ product_matrix(conjugate(self._quaternion)).T
+        q[:, 3:7] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        angles = x[:, g.q_m]
+        q[:, self._idx_q] = angles
+        q[:, self._cos] = np.cos(angles[:, self.unbounded])
+        q[:, self._sin] = np.sin(angles[:, self.unbounded])
+        for row in q if self.robot.followers else ():
+            self.robot.follow(row)
+        return chart, q, self.spread(self.to_base(chart, x[:, 6 + self.robot.n :, None])[..., 0])
 
     def velocities(self, v: Array) -> Array:
         """Return (omega_b, v_b, qdot_m) (.., 6 + n) in base axes of Pinocchio's v (.., nv)."""
         return v.take(self._order, axis=-1)
 
     def spread(self, nu: Array) -> Array:
-        """Return Pinocchio's v (nv,) of (omega_b, v_b, qdot_m) in base axes: v = S nu."""
-        v = nu.take(self._place)
+        """Return Pinocchio's v (.., nv) of (omega_b, v_b, qdot_m) in base axes: v = S nu."""
+        v = nu.take(self._place, axis=-1)
         for joint, leader, multiplier, _ in self.robot.followers:
-            v[joint.idx_v] = multiplier * v[leader.idx_v]
+            v[..., joint.idx_v] = multiplier * v[..., leader.idx_v]
         return v
 
     def lift(self, forces: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The states of a whole motion at once, and linear feedback of the state of one point."""
+"""The states of a whole motion at once, linear feedback of a state, and errors from a motion."""
 
 from __future__ import annotations
 
@@ -8,7 +8,13 @@ from typing import TypeAlias
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.rotation import product_matrix, rotation_matrices
+from fflin.base.rotation import (
+    conjugate,
+    product_matrix,
+    quaternion_product,
+    rotation_matrices,
+    rotation_matrix,
+)
 from fflin.base.validation import Array
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
@@ -97,3 +103,16 @@ def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:
         return result
 
     return f
+
+
+def moving_error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Array) -> Array:
+    """Return the error (nx,) from a moving reference, in its axes."""
+    g = state.groups
+    e = np.empty(state.nx)
+    turned = quaternion_product(conjugate(q_star[3:7]), q[3:7])
+    e[g.q_b] = turned[:3] if turned[3] >= 0.0 else -turned[:3]
+    e[g.r_b] = rotation_matrix(q_star[3:7]).T @ (q[:3] - q_star[:3])
+    apart = pin.difference(state.robot.model, q_star, q)
+    e[g.q_m] = state.velocities(apart)[6:]
+    e[-6 - state.robot.n :] = state.velocities(v - v_star)
+    return e

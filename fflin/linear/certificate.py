@@ -1,6 +1,6 @@
 """A second route to A and B, by Pinocchio's ABA derivatives, and how far two routes differ."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -157,14 +157,17 @@ def compare(state: StateMap, lin: LinearModel, M: Array, A: Array, B: Array) -> 
     column_scale = np.where(np.arange(state.nx)[:, None] < state.nx - nv, 1.0, input_mobility)
     difference_B = np.abs(lin.B - B) / row_scale / column_scale
     inputs = Actuation(state).groups
+    of_point = speeds(state, lin.v), _largest(state.chart(lin.q).J)
 
     groups = state.groups._asdict()
     blocks = []
     for row, rows in groups.items():
         for column, columns in groups.items():
-            cancelling = _cancelling_terms(state, lin, (mobility, input_mobility), row, column)
-            scale = max(_largest(scaled_A[rows, columns]), cancelling) or 1.0
-            error = _largest(difference_A[rows, columns]) / scale
+            error = _largest(difference_A[rows, columns])
+            if error:
+                scales = mobility, input_mobility, *of_point
+                cancelling = _cancelling_terms(state, lin, scales, row, column)
+                error /= max(_largest(scaled_A[rows, columns]), cancelling) or 1.0
             blocks.append(Block("A", row, column, error))
         for column, columns in inputs.items():
             blocks.append(Block("B", row, column, _largest(difference_B[rows, columns])))
@@ -180,19 +183,17 @@ def mobilities(M: Array, B: Array) -> tuple[Array, Array]:
 
 
 def _cancelling_terms(
-    state: StateMap, lin: LinearModel, scales: tuple[Array, Array], row: str, column: str
+    state: StateMap, lin: LinearModel, scales: tuple[Any, ...], row: str, column: str
 ) -> float:
     """Size of the terms that may cancel in a block of A, in its scaled units.
 
     The base's own velocity has no influence but in its own axes, and counts for what its
     rounding can do to Pinocchio's derivatives only.
     """
-    mobility, input_mobility = scales
-    chart = state.chart(lin.q)
-    steepness = _largest(chart.J) if column == "q_b" else 1.0
-    speed, rate, momentum = speeds(state, lin.v)
+    mobility, input_mobility, (speed, rate, momentum), steepest = scales
+    steepness = steepest if column == "q_b" else 1.0
     # What the momentum of wheels does to a turning link, in the units of the rows.
-    spin = momentum * _largest(mobility[np.r_[ANGULAR, 6 : len(mobility)]])
+    spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
     still = speed.copy()
     still[LINEAR] *= _ROUNDING_SHARE
     moving = {"omega_b", "v_b", "qdot_m"}

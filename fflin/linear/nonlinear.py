@@ -1,18 +1,20 @@
 """The nonlinear model in the chart, its slopes by differences, and the flow that it must follow."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.rotation import rotation_matrix
+from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
+from fflin.dynamics.chart import Chart, times
 from fflin.dynamics.state import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR, StateMap
+from fflin.dynamics.state_rows import moving_error
 from fflin.linear.certificate import mobilities
 from fflin.linear.model import LinearModel
-from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
 # Where the base flies faster than this [m/s], the rounding of its speed would hide the rest.
@@ -38,15 +40,22 @@ class Nonlinear:
 
     def acceleration(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return (q, v, a) in Pinocchio's order."""
-        q, v = self.state.to_pinocchio(x)
-        u = self.aba.actuation.in_base_axes(self.state.chart(q), u)
-        seen, observer = v.copy(), rotation_matrix(q[3:7]).T @ self._observer
-        seen[PIN_LINEAR] -= observer
-        a = self.aba.acceleration(q, seen, u).copy()
-        a[PIN_LINEAR] -= np.cross(v[PIN_ANGULAR], observer)
-        return q, v, a
+        _, q, v, a = self._accelerations(x[None], u[None])
+        return q[0], v[0], a[0]
 
-    def passing(self, x: Array, motion: tuple[Array, Array, Array], t: float) -> Array:
+    def _accelerations(self, x: Array, u: Array) -> tuple[Chart, Array, Array, Array]:
+        """Return the chart, q, v and a of rows."""
+        chart, q, v = self.state.points(x)
+        u = self.aba.actuation.in_base_axes(chart, u)
+        observer = self._observer @ rotation_matrices(q[:, 3:7])
+        seen = v.copy()
+        seen[:, PIN_LINEAR] -= observer
+        rows = zip(q, seen, u, strict=True)
+        a = np.array([self.aba.acceleration(*each).copy() for each in rows])
+        a[:, PIN_LINEAR] -= times(skew(v[:, PIN_ANGULAR]), observer)
+        return chart, q, v, a
+
+    def passing(self, x: Array, motion: Sequence[Array], t: float) -> Array:
         """Return the state a time t after x on a motion that has (q, v, a) there."""
         q, v, a = motion
         after = pin.integrate(self.state.robot.model, q, t * v)
@@ -54,21 +63,21 @@ class Nonlinear:
 
     def __call__(self, x: Array, u: Array) -> Array:
         """Return dx/dt (nx,)."""
+        return self.rates(x[None], u[None])[0]
+
+    def rates(self, x: Array, u: Array) -> Array:
+        """Return dx/dt (N, nx) of rows x (N, nx) and u (N, nu)."""
         state = self.state
-        q, v, a = self.acceleration(x, u)
-        chart = state.chart(q)
-        linear, angular = v[PIN_LINEAR], v[PIN_ANGULAR]
+        chart, _, v, a = self._accelerations(x, u)
+        linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
         rate = state.velocities(a)
         if state.axes[1]:
-            rate[LINEAR] += np.cross(angular, linear)  # of the velocity's reference-axis components
-        return np.concatenate(
-            (
-                0.5 * (chart.q0 * angular + np.cross(chart.q_b, angular)),
-                chart.R @ linear,
-                state.velocities(v)[6:],
-                state.to_frame(chart, rate[:, None])[:, 0],
-            )
-        )
+            # Of the velocity's reference-axis components.
+            rate[:, LINEAR] += times(skew(angular), linear)
+        turning = chart.q0 * angular + times(skew(chart.q_b), angular)
+        flying, rates = times(chart.R, linear), state.velocities(v)[:, 6:]
+        rate = state.to_frame(chart, rate[..., None])[..., 0]
+        return np.concatenate((0.5 * turning, flying, rates, rate), axis=1)
 
 
 class ErrorDynamics(Nonlinear):
@@ -84,37 +93,40 @@ class ErrorDynamics(Nonlinear):
         self._q[:3] = 0.0
         self._a = state.velocities(self.acceleration(lin.x0, lin.u0)[2])
 
-    def passing(self, x: Array, motion: tuple[Array, Array, Array], t: float) -> Array:
+    def passing(self, x: Array, motion: Sequence[Array], t: float) -> Array:
         """Return the error when reference and robot, at x, have both moved on for a time t."""
-        error = super().passing(x, motion, t)
-        robot = self.state.robot
-        q, v, _ = motion
-        q_star = pin.integrate(robot.model, self._q, t * self._v)
-        reference = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(q_star[:7])
-        moved = StateMap(robot, reference=reference, frame="local")
-        error[:6] = moved.to_state(pin.integrate(robot.model, q, t * v), v)[:6]
-        error[6:] -= t * np.concatenate((self.state.velocities(self._v)[6:], self._a))
+        model, (q, v, a) = self.state.robot.model, motion
+        ahead = pin.integrate(model, self._q, t * self._v), self._v
+        error = moving_error(self.state, *ahead, pin.integrate(model, q, t * v), v + t * a)
+        error[-len(self._a) :] -= t * self._a
         return error
 
-    def __call__(self, x: Array, u: Array) -> Array:
-        """Return the rate of the error (nx,)."""
-        state, g = self.state, self.state.groups
-        q, v, a = self.acceleration(x, u)
-        chart = state.chart(q)
-        (linear, angular), (at_linear, at_angular) = (w[:6].reshape(2, 3) for w in (v, self._v))
-        turning = chart.q0 * (angular - at_angular) + np.cross(chart.q_b, angular + at_angular)
-        flying = chart.R @ linear - at_linear - np.cross(at_angular, x[g.r_b])
-        rates = state.velocities(v)[6:] - state.velocities(self._v)[6:]
-        return np.concatenate((0.5 * turning, flying, rates, state.velocities(a) - self._a))
+    def rates(self, x: Array, u: Array) -> Array:
+        """Return the rates of the error (N, nx) of rows."""
+        state = self.state
+        chart, _, v, a = self._accelerations(x, u)
+        linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
+        at_linear, at_angular = self._v[PIN_LINEAR], self._v[PIN_ANGULAR]
+        turning = chart.q0 * (angular - at_angular)
+        turning += times(skew(chart.q_b), angular + at_angular)
+        flying = times(chart.R, linear) - at_linear - x[:, state.groups.r_b] @ skew(at_angular).T
+        rates = state.velocities(v - self._v)[:, 6:]
+        return np.concatenate((0.5 * turning, flying, rates, state.velocities(a) - self._a), axis=1)
 
 
-def jacobian(f: Callable[[Array], Array], point: Array, steps: Array) -> Array:
-    """Return the slopes of f at a point by sixth-order central differences of the given steps."""
+def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, bends: Any) -> Array:
+    """Return the slopes of f, of rows, at a point by central differences of the given steps.
 
-    def slope(along: Array) -> Array:
-        return _derivative(lambda t: f(point + t * along), 1.0)
-
-    return np.column_stack([slope(along) for along in np.diag(steps)]) / steps
+    Of sixth order where f `bends`; it is at most quadratic in the others, so that one is exact.
+    """
+    curved, straight = np.diag(steps)[bends], np.diag(steps)[~bends]
+    ways = np.concatenate((*(k * curved for k in (1, 2, 3)), straight))
+    first, last = np.split(f(np.concatenate((point + ways, point - ways))), 2)
+    *near, rest = np.split(first - last, [len(curved) * k for k in (1, 2, 3)])
+    slopes: Array = np.empty((rest.shape[1], len(point)))
+    slopes[:, bends] = np.tensordot(_WEIGHTS, near, axes=1).T
+    slopes[:, ~bends] = 0.5 * rest.T
+    return slopes / steps
 
 
 def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array, Array]:
@@ -148,17 +160,19 @@ def flow_error(robot: Robot, lin: LinearModel) -> float:
     turned = pin.SE3(lin.reference.rotation, np.zeros(3))
     state = StateMap(robot, reference=turned, frame=lin.frame)
     model = (ErrorDynamics if lin.moving else Nonlinear)(state, lin)
+    x = np.tile(lin.x0, (7, 1))
+    x[:, state.groups.r_b] = 0.0
+    x[1:, 6 + robot.n : 12 + robot.n] += np.eye(6)
+    u = np.tile(lin.u0, (7, 1))
+    chart, *motions = model._accelerations(x, u)
     worst = 0.0
-    for unit in (None, *range(6)):
-        x = lin.x0.copy()
-        x[state.groups.r_b] = 0.0
-        if unit is not None:
-            x[6 + robot.n + unit] += 1.0
-        motion = _, v, _ = model.acceleration(x, lin.u0)
-        h = 1e-2 * float(state.chart(motion[0]).q0) / (1.0 + float(np.abs(v[3:]).max()))
-        rate = _derivative(partial(model.passing, x, motion), h)
+    for at, q0, expected, *motion in zip(
+        x, np.asarray(chart.q0), model.rates(x, u), *motions, strict=True
+    ):
+        v = motion[1]
+        h = 1e-2 * float(q0[0]) / (1.0 + float(np.abs(v[3:]).max()))
+        rate = _derivative(partial(model.passing, at, motion), h)
         floor = 1.0 + float(np.abs(v).max())
-        expected = model(x, lin.u0)
         scale = max(floor, float(np.abs(expected).max()))
         worst = max(worst, float(np.abs(expected - rate).max()) / scale)
     return worst

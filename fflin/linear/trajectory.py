@@ -1,106 +1,35 @@
-"""The time-varying linear model along a motion."""
+"""A motion of a robot by knots, with inputs that are held or linear in between."""
+
+from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
-import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from fflin.base.errors import FflinWarning, InputError
-from fflin.base.rotation import rotation_matrix
+from fflin.base.errors import FflinError, FflinWarning, InputError
+from fflin.base.frozen import frozen
+from fflin.base.record import Design
+from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array, as_double, number, vector
-from fflin.dynamics.aba import Aba
+from fflin.base.writing import as_path
+from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
-from fflin.linear.linearization import Linearizer
-from fflin.linear.model import LinearModel
+from fflin.linear.flow import Flow
 from fflin.robot.robot import Robot
 
-# Error of the trapezoidal rule over an interval, relative to the largest rate of the motion: from
-# the first on the knots are called coarse, from the second on they are no motion of the robot.
-_COARSE, _NO_MOTION = 1e-2, 0.1
-
-# Round-off of positions, and of accelerations that are sums of terms that may cancel.
-_EPS = float(np.finfo(float).eps)
-_OF_PLACES, _OF_SUMS = 16.0 * _EPS, 1e3 * _EPS
+# A residual from which on the knots are in doubt as a motion of the robot.
+_IN_DOUBT = 1e-2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearTrajectory:
-    r"""Error dynamics along a motion, ``d(dx)/dt = A(t) dx + B(t) du``.
-
-    The error is taken in the moving base's own axes, see `Linearizer` (``moving=True``).
-
-    Attributes
-    ----------
-    t : ndarray (N,)
-        Times of the knots [s].
-    A : ndarray (N, nx, nx)
-    B : ndarray (N, nx, nu)
-    q : ndarray (N, nq)
-    v : ndarray (N, nv)
-    u : ndarray (N, nu)
-        The motion, configuration and velocity in Pinocchio's order.
-    residual : ndarray (N,)
-        How far the knots around each are from a motion of the robot, by the trapezoidal rule,
-        relative to the largest rates of the motion; of second order in the time step. An
-        observer who flies along with the base's mean velocity takes them, so that an orbit hides
-        nothing, and each rotor counts for itself, so that a fast wheel does not either.
-    state_names, input_names : tuple of str
-    robot : Robot
-    """
-
-    t: Array
-    A: Array
-    B: Array
-    q: Array
-    v: Array
-    u: Array
-    residual: Array
-    state_names: tuple[str, ...]
-    input_names: tuple[str, ...]
-    robot: Robot
-
-    def __post_init__(self) -> None:
-        for array in (self.t, self.A, self.B, self.q, self.v, self.u, self.residual):
-            array.setflags(write=False)
-
-    def __repr__(self) -> str:
-        return (
-            f"LinearTrajectory('{self.robot.name}', {len(self.t)} knots, "
-            f"{self.t[0]:g} to {self.t[-1]:g} s, nx={self.A.shape[1]}, nu={self.B.shape[2]})"
-        )
-
-    def matrices(self, t: float) -> tuple[Array, Array]:
-        """Return A (nx, nx) and B (nx, nu) at a time, linear between the knots."""
-        A, B = self._between(t, self.A, self.B)
-        return A, B
-
-    def point(self, t: float) -> tuple[Array, Array, Array]:
-        """Return (q, v, u) at a time: q along the manifold, v and u linear between the knots."""
-        index, share = self._place(t)
-        q = pin.interpolate(self.robot.model, self.q[index], self.q[index + 1], share)
-        v, u = self._between(t, self.v, self.u)
-        return q, v, u
-
-    def _between(self, t: float, *of_knots: Array) -> list[Array]:
-        """Return what is linear between the knots at a time."""
-        index, share = self._place(t)
-        return [(1.0 - share) * knots[index] + share * knots[index + 1] for knots in of_knots]
-
-    def _place(self, t: float) -> tuple[int, float]:
-        t = number("t", t)
-        if not self.t[0] <= t <= self.t[-1]:
-            raise InputError(f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s")
-        index = min(int(np.searchsorted(self.t, t, side="right")) - 1, len(self.t) - 2)
-        return index, float((t - self.t[index]) / (self.t[index + 1] - self.t[index]))
-
-
-def linearize_trajectory(
-    robot: Robot, t: ArrayLike, q: ArrayLike, v: ArrayLike, u: ArrayLike
-) -> LinearTrajectory:
-    """Linearise along a motion of the robot.
+class Trajectory(Design):
+    """A motion of a robot by knots; the arrays are copied and read-only.
 
     Parameters
     ----------
@@ -108,126 +37,271 @@ def linearize_trajectory(
     t : array_like (N,)
         Times of the knots [s], increasing.
     q : array_like (N, nq)
-        Configurations in Pinocchio's order.
+        Configurations in Pinocchio's order; each continuous joint may have one column, its angle,
+        instead of the two of (cos, sin).
     v : array_like (N, nv)
         Velocities in Pinocchio's order.
-    u : array_like (N, nu)
-        Inputs over the robot's, those on the base in base axes.
-
-    Returns
-    -------
-    LinearTrajectory
+    u : array_like (N, nu) or (N - 1, nu)
+        Over the robot's inputs; of N - 1 rows each acts over an interval.
+    hold : {"linear", "previous"}, optional
+        Whether inputs are linear between the knots, or stay what they were at the knot before, as
+        those of a computer. Linear by default, and held where u has N - 1 rows.
+    frame : {"local", "hybrid", "world"}
+        Axes of the inputs on the base, in which they are held too: those of the base, or of the
+        world for the force (hybrid) or for force and torque (world).
+    verified : bool
+        False of a file that has no digest to tell damage by.
 
     Raises
     ------
     InputError
-        If a size is wrong, the times do not increase, or the arrays jump or are not a motion of
-        the robot under its inputs; the message names the time.
-
-    Warns
-    -----
-    FflinWarning
-        If the knots are so coarse that the motion between them is in doubt.
+        If a size is wrong, the times do not increase, or a row is no configuration or velocity.
     """
-    times = as_double("t", t)
-    times = vector("t", times, times.size, "times of the knots")
-    if len(times) < 2 or (np.diff(times) <= 0.0).any():
-        raise InputError("t must hold at least two times, each later than the one before")
-    linearizer = Linearizer(robot, moving=True)
-    knots: dict[str, NDArray[np.floating]] = {}
-    for name, value, size in (("q", q, robot.nq), ("v", v, robot.nv)):
-        knots[name] = _rows(name, value, len(times), size)
-    models = [
-        linearizer(*point)
-        for point in zip(knots["q"], knots["v"], _rows("u", u, len(times), None), strict=True)
-    ]
-    inputs = np.array([lin.u0 for lin in models])
-    residual = _residual(robot, times, models)
-    worst = int(residual.argmax())
-    said = f"at t = {times[worst]:g} s they miss it by {residual[worst]:.1%} of its largest rate"
-    if residual[worst] > _NO_MOTION:
-        raise InputError(
-            f"t, q, v, u are not a motion of '{robot.name}': {said}; give those of one motion "
-            "under the robot's own inputs, springs and gravity, or closer knots"
+
+    VECTORS: ClassVar = ("t",)
+
+    robot: Robot
+    t: Array
+    q: Array
+    v: Array
+    u: Array
+    hold: str | None = field(default=None, kw_only=True)
+    frame: str = field(default="local", kw_only=True)
+
+    def __post_init__(self) -> None:
+        robot, nu = self.robot, len(Actuation(self._state).names)
+        times = as_double("t", self.t)
+        times = vector("t", times, times.size, "times of the knots")
+        if len(times) < 2 or (np.diff(times) <= 0.0).any():
+            raise InputError("t must hold at least two times, each later than the one before")
+        if self.hold is not None and str(self.hold) not in ("linear", "previous"):
+            raise InputError(f"hold is {self.hold!r}, expected 'linear' or 'previous'")
+        count, u = len(times), as_double("u", self.u)
+        short = u.shape == (count - 1, nu) and self.hold != "linear"
+        if not short and u.shape != (count, nu):
+            expected = f"({count}, {nu}), or ({count - 1}, {nu}) where each acts over an interval"
+            raise InputError(f"u has shape {u.shape}, expected {expected}")
+        v = as_double("v", self.v)
+        if v.shape != (count, robot.nv):
+            raise InputError(f"v has shape {v.shape}, expected ({count}, {robot.nv})")
+        rows: dict[str, list[Array]] = {"q": [], "v": [], "u": []}
+        u = np.vstack((u, u[-1:])) if short else u
+        for t, *row in zip(times, _configurations(robot, self.q, count), v, u, strict=True):
+            try:
+                rows["q"].append(robot.checked_configuration(row[0]))
+                rows["v"].append(robot.checked_velocity(row[1]))
+                rows["u"].append(vector("u", row[2], nu, "the robot's inputs"))
+            except FflinError as error:
+                raise InputError(f"at t = {t:g} s: {error}") from None
+        values: dict[str, Any] = {name: frozen(np.array(each)) for name, each in rows.items()}
+        values |= {"t": times, "hold": self.hold or ("previous" if short else "linear")}
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        super().__post_init__()
+
+    def __repr__(self) -> str:
+        how = "held" if self.hold == "previous" else "linear"
+        return (
+            f"{type(self).__name__}('{self.robot.name}', {len(self.t)} knots, {self.t[0]:g} to "
+            f"{self.t[-1]:g} s, inputs {how}, frame='{self.frame}')"
         )
-    if residual[worst] > _COARSE:
-        warnings.warn(f"the knots are coarse for a motion: {said}", FflinWarning, stacklevel=2)
-    return LinearTrajectory(
-        times.copy(),
-        np.array([lin.A for lin in models]),
-        np.array([lin.B for lin in models]),
-        np.array([lin.q for lin in models]),
-        np.array([lin.v for lin in models]),
-        inputs,
-        residual,
-        models[0].state_names,
-        models[0].input_names,
-        robot,
-    )
+
+    def __str__(self) -> str:
+        """Show how good a motion of the robot it is."""
+        return f"{super().__str__()}\n{self._doubt() or f'residual {self.residual.max():.1e}'}"
+
+    @property
+    def _state(self) -> StateMap:
+        axes: Any = self.frame
+        return StateMap(self.robot, frame=axes)
+
+    @cached_property
+    def flow(self) -> Flow:
+        """The motion between the knots."""
+        return Flow(self._state, self.t, self.q, self.v, self.u, self.hold == "previous")
+
+    @cached_property
+    def u_base(self) -> Array:
+        """The inputs (N, nu) from the knots on, those on the base in base axes."""
+        return frozen(Actuation(self._state).rows_in_base_axes(self.q, self.u))
+
+    @property
+    def residual(self) -> Array:
+        """How far the knots are from a motion (N,): what the intervals around each miss.
+
+        An interval is integrated from its first knot under its inputs; what its end misses the
+        next knot by, as a rate, is relative to the largest rate of the motion, see `Flow`.
+        """
+        found = self.flow.residual
+        return np.maximum(np.append(found, 0.0), np.append(0.0, found))
+
+    def point(self, t: float) -> tuple[Array, Array, Array]:
+        """Return q, v, and u in base axes at a time.
+
+        Between knots q and v are cubics with the robot's own velocities and accelerations.
+
+        Raises
+        ------
+        InputError
+            If the time is not within the knots.
+        """
+        return self.flow.at(self._within(t))
+
+    def resampled(self, dt: float) -> Trajectory:
+        """Return the same motion with knots dt [s] apart, and one at the end, see `point`.
+
+        Inputs that are held stay what they were where each old knot is a new one.
+        """
+        times = self.samples(dt)
+        if times[-1] < self.t[-1]:
+            times = np.append(times, self.t[-1])
+        q, v, _ = map(np.array, zip(*map(self.flow.at, times), strict=True))
+        u = np.array([self.flow.input(t) for t in times])
+        kept = {"hold": self.hold, "frame": self.frame, "verified": self.verified}
+        return Trajectory(self.robot, times, q, v, u, **kept)  # type: ignore[arg-type]
+
+    def samples(self, dt: float) -> Array:
+        """Return the times every dt [s] that are within the knots."""
+        dt, duration = number("dt", dt), float(self.t[-1] - self.t[0])
+        if not dt >= 1e-7 * duration:
+            raise InputError(
+                f"dt is {dt:g} s, expected a positive time of 1e-7 of the {duration:g} s or more"
+            )
+        times: Array = self.t[0] + dt * np.arange(int(duration / dt * (1.0 + 1e-9)) + 1)
+        if abs(times[-1] - self.t[-1]) <= 1e-6 * dt:
+            times[-1] = self.t[-1]
+        return times
+
+    def require(self, *, strict: bool = False) -> None:
+        """Warn of knots that are no motion of the robot to 1e-2, or refuse them where `strict`.
+
+        It is said when they miss it and by how much, and what would mend it.
+        """
+        doubt = self._doubt()
+        if doubt and strict:
+            raise InputError(doubt)
+        if doubt:
+            warnings.warn(doubt, FflinWarning, stacklevel=3)
+
+    def save(self, path: str | Path) -> None:
+        """Write it to a .npz, .mat, .json or .csv file, whole or not at all; see `load`."""
+        from fflin.linear.trajectory_files import write_csv
+
+        target = as_path(path)
+        if type(self) is Trajectory and target.suffix == ".csv":
+            write_csv(target, self)
+        else:
+            super().save(target)
+
+    @staticmethod
+    def load(  # type: ignore[override]
+        path: str | Path, robot: Robot, *, hold: str | None = None, frame: str | None = None
+    ) -> Trajectory:
+        """Read a trajectory that `save`, `Motion.save` or another program wrote.
+
+        A .npz, .mat or .json file has t (N,), q and v, or the states x (N, nx) of `StateMap`, and
+        u, a row for each knot. A .csv file has named columns: t; q[0] ... and v[0] ..., or the
+        names of the states, such as q_b.x; and those of the inputs, such as tau_m.joint_1, which
+        are zero where left out. The texts `hold` and `frame` may be there too, in a .csv in every
+        row.
+
+        Parameters
+        ----------
+        path : str or Path
+        robot : Robot
+        hold, frame : str, optional
+            What the file says by default, else what `Trajectory` takes; of x the frame says the
+            axes of the velocities too.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read, is damaged, or has not these entries.
+        InputError
+            If what it has is no trajectory of this robot.
+        """
+        from fflin.linear.trajectory_files import read
+
+        source = as_path(path)
+        values = read(source, robot, hold, frame)
+        try:
+            return Trajectory(robot, **values)
+        except InputError as error:
+            raise InputError(f"{source}: {error}") from None
+
+    def _within(self, t: float) -> float:
+        t = number("t", t)
+        if not self.t[0] <= t <= self.t[-1]:
+            raise InputError(f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s")
+        return t
+
+    def _doubt(self) -> str:
+        """Say when the knots are no motion of the robot, and what would mend it."""
+        found = self.flow.residual
+        worst = int(found.argmax())
+        if found[worst] <= _IN_DOUBT:
+            return ""
+        said = (
+            f"t, q, v, u are not quite a motion of '{self.robot.name}': from t = "
+            f"{self.t[worst]:g} to {self.t[worst + 1]:g} s they miss it by {found[worst]:.2g} of "
+            "its largest rate"
+        )
+        size, plain, how = float(found[worst]), Trajectory(**self._given), list[str]()
+        while size > _IN_DOUBT and len(how) < 2:
+            tried = {words: other for words, other in _others(plain) if words not in how}
+            sizes = {words: float(other.flow.residual.max()) for words, other in tried.items()}
+            words = min(sizes, key=sizes.__getitem__)
+            if sizes[words] > 0.3 * size:
+                break
+            size, plain = sizes[words], tried[words]
+            how.append(words)
+        if how:
+            return f"{said}; {', '.join(how)} they hold to {size:.0e}"
+        return f"{said}; give those of one motion under the robot's own inputs, springs and gravity"
+
+    @property
+    def _given(self) -> dict[str, Any]:
+        return {item.name: getattr(self, item.name) for item in fields(Trajectory)}
 
 
-def _rows(name: str, value: ArrayLike, count: int, size: int | None) -> NDArray[np.floating]:
-    array = as_double(name, value)
-    if array.ndim != 2 or len(array) != count or (size is not None and array.shape[1] != size):
-        expected = f"({count}, {'nu' if size is None else size})"
-        raise InputError(f"{name} has shape {array.shape}, expected {expected}")
-    return array
-
-
-def _residual(robot: Robot, t: Array, models: list[LinearModel]) -> Array:
-    """Return (N,): the trapezoidal rule's error of q and v in the intervals around each knot."""
-    state = StateMap(robot, frame="local")
-    q, v, u = (np.array([getattr(lin, name) for lin in models]) for name in ("q", "v", "u0"))
-    q, v, of_q = _seen_flying_along(t, q, v)
-    aba = Aba(state)
-    a = np.array([aba.acceleration(*point) for point in zip(q, v, u, strict=True)])
-    h = np.diff(t)[:, None]
-    moved = np.array([pin.difference(robot.model, *pair) for pair in pairwise(q)])
-    for column in (joint.idx_v for joint in robot.joints if joint.unbounded):
-        # The knots have a fast wheel's angle only within a turn; its speed says how many turns.
-        by_rate = 0.5 * h[:, 0] * (v[1:, column] + v[:-1, column])
-        turns = np.round((by_rate - moved[:, column]) / (2.0 * np.pi))
-        moved[:, column] += 2.0 * np.pi * turns
-    of_a = _OF_SUMS * np.max([np.abs(state.spread(_terms(lin))) for lin in models], axis=0)
-    rotors = [f"q_m.{name}" in models[0].ignorable for name in robot.joint_names]
-    errors = []
-    for given, rate, digits in (
-        (moved / h, v, of_q / h),
-        (np.diff(v, axis=0) / h, a, of_a + of_q / h),
+def _others(traj: Trajectory) -> Iterator[tuple[str, Trajectory]]:
+    """Yield what else a trajectory may have been meant to be, and how to say it."""
+    robot, R = traj.robot, rotation_matrices(traj.q[:, 3:7])
+    yield "with the input of the knot before", replace(traj, hold="previous")
+    yield "with the input of the knot after", replace(traj, u=traj.u[1:], hold="previous")
+    yield "with inputs linear between the knots", replace(traj, hold="linear")
+    for frame in ("local", "hybrid", "world"):
+        yield f"with u in frame {frame}", replace(traj, frame=frame)
+    v = traj.v.copy()
+    for words, part, frame in (
+        ("linear velocity", slice(0, 3), "hybrid"),
+        ("velocities", slice(3, 6), "world"),
     ):
-        miss = np.abs(given - 0.5 * (rate[1:] + rate[:-1]))
-        miss = np.maximum(miss - digits, 0.0)
-        for part in _measured_together(robot, rotors):
-            scale = np.abs(rate[:, part]).max() or 1.0
-            errors.append(miss[:, part].max(axis=1) / scale)
-    interval = np.max(errors, axis=0)
-    return np.maximum(np.append(interval, 0.0), np.append(0.0, interval))
+        v[:, part] = (traj.v[:, None, part] @ R)[:, 0]
+        yield f"with the {words} of the base in reference axes", replace(traj, v=v)
+        yield f"with u and v in frame {frame}", replace(traj, v=v, frame=frame)
+    for words, has, fields_ in (
+        ("without damping", any(robot.damping.values()), {"damping": {}}),
+        ("without springs", any(robot.stiffness.values()), {"stiffness": {}}),
+        ("without gravity", any(robot.gravity), {"gravity": (0.0, 0.0, 0.0)}),
+        ('with damping="urdf"', any(robot.urdf_damping.values()), {"damping": "urdf"}),
+    ):
+        if has:
+            yield words, replace(traj, robot=robot.replace(**fields_))
 
 
-def _seen_flying_along(t: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
-    """Return q and v seen by an observer with the base's mean velocity, and their rounding (nv,).
-
-    The dynamics are the same for all such observers (Galilei).
-    """
-    rotations = [rotation_matrix(quaternion) for quaternion in q[:, 3:7]]
-    velocities = np.array([R @ linear for R, linear in zip(rotations, v[:, :3], strict=True)])
-    mean = velocities.mean(axis=0)
-    q, v, flown = q.copy(), v.copy(), np.outer(t - t[0], mean)
-    digits = np.full(v.shape[1], _OF_PLACES * max(1.0, float(np.abs(q[:, 7:]).max(initial=0.0))))
-    digits[:3] = _OF_PLACES * max(float(np.abs(x).max()) for x in (q[:, :3], flown, velocities))
-    q[:, :3] -= q[0, :3] + flown
-    v[:, :3] -= [R.T @ mean for R in rotations]
-    return q, v, digits
-
-
-def _terms(lin: LinearModel) -> Array:
-    """Return the size (6 + n,) of the terms that make up the accelerations at a point."""
-    rows = slice(len(lin.x0) // 2, None)
-    return np.abs(lin.A[rows]) @ np.abs(lin.x0) + np.abs(lin.B[rows]) @ np.abs(lin.u0)
-
-
-def _measured_together(robot: Robot, rotors: list[bool]) -> list[list[int]]:
-    """Return groups of columns of v: the base's, each rotor's, and all other joints'."""
-    alone = [[joint.idx_v] for joint, rotor in zip(robot.joints, rotors, strict=True) if rotor]
-    others = sorted(set(range(6, robot.nv)) - {column for group in alone for column in group})
-    return [[0, 1, 2], [3, 4, 5], *alone, *([others] if others else [])]
+def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
+    """Return q (count, nq), where it is narrower with the cosine and sine of each angle."""
+    rows, cosines = as_double("q", q), np.array(list(robot.unbounded), dtype=int)
+    narrow = (count, robot.nq - len(cosines))
+    if rows.shape == (count, robot.nq):
+        return rows
+    if rows.shape != narrow:
+        hint = ": continuous joints take two columns, (cos, sin); `Trajectory` takes angles too, "
+        hint = f"{hint}{narrow}" if len(cosines) else ""
+        raise InputError(f"q has shape {rows.shape}, expected ({count}, {robot.nq}){hint}")
+    wide = np.empty((count, robot.nq))
+    wide[:, np.delete(np.arange(robot.nq), cosines + 1)] = rows
+    angles = wide[:, cosines]
+    wide[:, cosines], wide[:, cosines + 1] = np.cos(angles), np.sin(angles)
+    return wide

@@ -13,9 +13,9 @@ from scipy.linalg.lapack import dposv
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
+from fflin.dynamics.integrators import Integrator
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
-from fflin.simulation.integrators import Integrator
 
 _crba = pin.crba
 _placement = pin.XYZQUATToSE3

@@ -25,6 +25,9 @@ FORMATS = (*record.FORMATS, ".csv")
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from fflin.linear.trajectory import Trajectory
+    from fflin.robot.robot import Robot
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Motion(Design):
@@ -105,6 +108,7 @@ class Motion(Design):
     urdf_sha256: str
     stopped: str
     com_drift: Array = field(default_factory=lambda: np.zeros(0))
+    _robot: Any = field(default=None, kw_only=True)  # that was simulated; no file has it
     wheels: tuple[str, ...] = field(default_factory=tuple)
     wheel_inertias: Array = field(default_factory=lambda: np.zeros(0))
     steered: tuple[str, ...] = field(default_factory=tuple)
@@ -164,6 +168,30 @@ class Motion(Design):
         sines: Array = np.minimum(1.0, np.linalg.norm(vector, axis=1))
         cosines = np.abs(target_scalar * scalar + (at * to).sum(axis=1, keepdims=True))[:, 0]
         return np.degrees(2.0 * np.arctan2(sines, cosines))
+
+    def trajectory(self, robot: Robot | None = None) -> Trajectory:
+        """Return the motion by knots, with inputs that are held or linear: what it holds to better.
+
+        Of inputs that change all the time the last, which no row has, is extrapolated. A motion
+        that was read from a file needs the `robot`.
+        """
+        from fflin.linear.trajectory import Trajectory
+        from fflin.linear.trajectory_files import arguments
+
+        robot = robot or self._robot
+        if robot is None:
+            raise InputError(
+                "the motion is from a file, without its robot; give the one that moves"
+            )
+        entries = {name: getattr(self, name) for name in ("t", "q", "v", "u", "placement")}
+        values = arguments(entries, robot, "previous", self.frame, self.verified)
+        held = Trajectory(robot, **values)
+        if not (self.u - self.u[0]).any():
+            return held
+        before, u = self.t[-4:-1] - self.t[-1], values["u"]
+        u[-1] = np.linalg.solve(np.vander(before).T, np.eye(len(before))[-1]) @ u[-4:-1]
+        smooth = Trajectory(robot, **values | {"hold": "linear", "u": u})
+        return min(held, smooth, key=lambda each: float(each.residual.max()))
 
     @property
     def passed(self) -> tuple[Passed, ...]:

@@ -15,12 +15,12 @@ from fflin.control.channel import Channel, Law
 from fflin.control.policies import bound, feedback_of
 from fflin.control.saturation import Saturation
 from fflin.dynamics import points
+from fflin.dynamics.integrators import Integrator, integrator
 from fflin.dynamics.state import StateMap
 from fflin.linear.ignorable import rotor_names
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import Range
 from fflin.robot.robot import Robot
-from fflin.simulation.integrators import Integrator, integrator
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import Times
 

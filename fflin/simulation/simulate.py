@@ -232,6 +232,7 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         robot=robot.name,
         urdf_sha256=robot.urdf_sha256,
         stopped=run.stopped,
+        _robot=robot,
         wheels=tuple(robot.wheels),
         wheel_inertias=np.array(list(robot.wheels.values())),
         steered=plan.steered,

@@ -337,3 +337,13 @@ def test_a_gain_prints_in_80_columns(gain, lin):
         assert max(map(len, text.splitlines())) <= 80
         assert f"{each.residual:.1e}" in text and f"{each.margin:.5g}" in text
     assert "norms of its blocks" in str(gain) and "qdot_m.joint_3" in str(small)
+
+
+def test_a_motion_that_is_not_steady_is_sent_to_its_trajectory():
+    robot = fflin.load("ets_vii")
+    v = fflin.velocity(robot, {"omega_b.x": 0.1, "omega_b.y": 0.2, "joint_1": 0.1})
+    with pytest.raises(fflin.EquilibriumError, match="with moving=True"):
+        fflin.lqr(fflin.linearize(robot, None, v), 1, 1)
+    with pytest.raises(fflin.EquilibriumError, match=r"fflin\.tvlqr along") as error:
+        fflin.lqr(fflin.linearize(robot, None, v, moving=True), 1, 1)
+    assert "moving=True" not in str(error.value)

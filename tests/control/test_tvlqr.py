@@ -152,3 +152,155 @@ def test_schedules_are_kept_and_bad_input_is_told(moving, tmp_path):
         fflin.tvlqr(moving, Q, R, -1.0)
     with pytest.raises(fflin.InputError, match="P changes too fast"):
         fflin.tvlqr(replace(moving, A=moving.A * 1e12), Q, R, 1.0)
+
+
+@pytest.fixture(scope="module")
+def tumbling():
+    """A tumbling robot under inputs that change at every knot, and its linear model."""
+    robot = fflin.load("planar_detumble")
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=(8, 9)) * np.r_[np.ones(6), 0.02 * np.ones(3)]
+    run = fflin.simulate(
+        *(robot, lambda t, q, v: u[min(int(t / 0.25 + 1e-9), 7)]),
+        v0=fflin.velocity(robot, {"omega_b.z": 0.3, "omega_b.x": 0.1, "joint_1": 0.4}),
+        **{"duration": 2.0, "dt": 0.005, "sample": 0.25, "every": 10, "frame": "local"},
+    )
+    traj = fflin.linearize_trajectory(robot, run.trajectory(), strict=True)
+    assert traj.hold == "previous"
+    return robot, traj
+
+
+def test_held_inputs_have_the_cost_that_is_promised_and_no_other_is_less(tumbling):
+    robot, traj = tumbling
+    Q, R = weights(traj)
+    schedule = fflin.tvlqr(traj, Q, R, 3.0, sample=0.1)
+    assert (schedule.dt, len(schedule.t), schedule.residual < 1e-12) == (0.1, 21, True)
+    linearizer = fflin.Linearizer(robot, moving=True)
+    e = np.random.default_rng(0).normal(size=len(Q))
+
+    def cost(gain):
+        y = np.append(e, 0.0)
+        for k, (start, end) in enumerate(pairwise(schedule.t)):
+            u = -gain(k) @ y[:-1]
+
+            def rate(t, y, u=u):
+                lin = linearizer(*traj.point(t))
+                return np.append(lin.A @ y[:-1] + lin.B @ u, y[:-1] @ (Q * y[:-1]) + u @ (R * u))
+
+            late = end - 1e-13
+            cuts = [start, *traj.t[(traj.t > start + 1e-9) & (traj.t < end - 1e-9)], end]
+            y = integrated(lambda t, y, late=late: rate(min(t, late), y), cuts, y)
+        return y[-1] + 3.0 * y[:-1] @ y[:-1]
+
+    promised = e @ schedule.P[0] @ e
+    assert cost(lambda k: schedule.gain(float(schedule.t[k]))) == pytest.approx(promised, rel=1e-7)
+    rng = np.random.default_rng(1)
+    for size in (1e-2, 1e-1):
+        other = schedule.K * (1.0 + size * rng.normal(size=schedule.K.shape))
+        assert cost(lambda k, other=other: other[k]) > promised
+    for k, t in enumerate(schedule.t[:-1]):
+        for late in (0.0, 0.03, 0.0999):
+            assert (schedule.gain(t + late) == schedule.K[k]).all()
+            assert (schedule.cost_to_go(t + late) == schedule.P[k]).all()
+        # A clock that is a rounding early is not a sample late.
+        assert (schedule.gain(float(t) + 0.1 - 1e-13) == schedule.K[k + 1]).all()
+    assert (schedule.gain(2.0) == schedule.K[-2]).all()
+
+
+def test_held_inputs_at_rest_are_those_of_the_sampled_regulator():
+    robot, traj = resting("ets_vii", 200.0)
+    Q, R = weights(traj)
+    lin = fflin.linearize(robot, moving=True)
+    gain = fflin.lqr(lin.discretize(0.5), *fflin.sampled_cost(lin, 0.5, Q, R))
+    schedule = fflin.tvlqr(traj, Q, R, 0.0, sample=0.5)
+    assert schedule.gain(0.0) == pytest.approx(gain.K, rel=1e-8, abs=1e-9 * gain.K.max())
+    steady = fflin.tvlqr(traj, Q, R, "steady", sample=0.5)
+    assert np.abs(steady.K - gain.K).max() < 1e-8 * gain.K.max()
+    with pytest.raises(fflin.InputError, match=r"dt is 0\.3 s, expected a part of the 200 s"):
+        fflin.tvlqr(traj, Q, R, 0.0, sample=0.3)
+
+
+def test_a_steady_end_goes_on_as_the_regulator_does(tumbling):
+    robot, traj = resting("ets_vii", 5.0)
+    Q, R = weights(traj)
+    gain = fflin.lqr(fflin.linearize(robot, moving=True), Q, R)
+    schedule = fflin.tvlqr(traj, Q, R)
+    assert np.abs(schedule.K - gain.K).max() < 1e-8 * gain.K.max()
+    # Where the motion does not end steadily: at rest in its last configuration.
+    robot, traj = tumbling
+    Q, R = weights(traj)
+    at_rest = fflin.lqr(fflin.linearize(robot, traj.q[-1], moving=True), Q, R)
+    assert fflin.tvlqr(traj, Q, R, "steady").P[-1] == pytest.approx(at_rest.P)
+    hung = fflin.linearize_trajectory(
+        robot.replace(inputs=robot.inputs[2:], gravity=(0.0, 0.0, -9.81)),
+        *(traj.t, traj.q, traj.v, traj.u[:, 6:] - 5.0),
+    )
+    with pytest.raises(fflin.EquilibriumError, match=r"at the end: .*give Q, R and Qf"):
+        fflin.tvlqr(hung, Q, R[6:])
+
+
+@pytest.mark.filterwarnings("ignore:t, q, v, u are not quite")
+def test_a_steady_end_leaves_out_what_inputs_cannot_hold(tumbling):
+    robot, traj = tumbling
+    robot = robot.replace(inputs=robot.inputs[2:])
+    traj = fflin.linearize_trajectory(robot, traj.t, traj.q, traj.v, traj.u[:, 6:])
+    Q, R = weights(traj)
+    part = fflin.momentum_reduction(fflin.linearize(robot, traj.q[-1], moving=True))
+    for sample in (None, 0.1):
+        schedule = fflin.tvlqr(traj, Q, R[6:], sample=sample)
+        cost, lin = (part.T.T @ np.diag(Q) @ part.T, R[6:]), part
+        if sample:
+            cost, lin = fflin.sampled_cost(part, sample, *cost), part.discretize(sample)
+        held = fflin.lqr(lin, *cost).P
+        assert part.T.T @ schedule.P[-1] @ part.T == pytest.approx(held, rel=1e-9)
+        # Of what the joints do not hold nothing is asked at the end.
+        values = np.linalg.eigvalsh(schedule.P[-1])
+        assert (np.abs(values) > 1e-9 * values[-1]).sum() == 6
+
+
+def test_weights_are_those_of_lqr(tumbling):
+    _, traj = tumbling
+    with pytest.raises(fflin.InputError, match="give Q and R, both"):
+        fflin.tvlqr(traj, 1.0)
+    with pytest.raises(fflin.InputError, match="Qf is 'stedy', expected 'steady'"):
+        fflin.tvlqr(traj, 1.0, 1.0, "stedy")
+    with pytest.raises(fflin.UnknownNameError, match="no rule of weights named 'none'"):
+        fflin.tvlqr(traj, weights="none")
+    with pytest.raises(fflin.UnknownNameError, match="q_x"):
+        fflin.tvlqr(traj, {"q_x": 1.0}, 1.0)
+    end = fflin.linearize(traj.robot, traj.q[-1], moving=True)
+    assert "come back at" in fflin.tvlqr(traj).weights
+    assert fflin.tvlqr(traj).Q == pytest.approx(fflin.lqr(end).Q)
+    slow, quick = (fflin.tvlqr(traj, sample=dt).R.max() for dt in (1.0, 0.25))
+    assert slow > 10.0 * quick
+    assert (fflin.tvlqr(traj, weights="identity").R == np.eye(9)).all()
+    named = fflin.tvlqr(traj, {"q_b": 2.0, "q_m.joint_*": 3.0}, {"tau_b": 1.0, "*.*": 2.0}, 1.0)
+    assert named.Q.diagonal().tolist() == [2.0] * 3 + [0.0] * 3 + [3.0] * 3 + [0.0] * 9
+
+
+def test_a_schedule_keeps_its_trajectory(tumbling, tmp_path):
+    robot, traj = tumbling
+    schedule = fflin.tvlqr(traj, 1.0, 1.0, 1.0, sample=0.5)
+    schedule.save(tmp_path / "schedule.mat")
+    again = fflin.GainSchedule.load(tmp_path / "schedule.mat")
+    assert (again.gain(0.7) == schedule.gain(0.7)).all()
+    motion = again.trajectory(robot)
+    assert (motion.q == traj.q).all()
+    assert (motion.u == traj.u).all()
+    assert (motion.hold, motion.frame, again.dt) == ("previous", "local", 0.5)
+
+
+def test_asking_for_a_gain_solves_nothing(moving, monkeypatch):
+    Q, R = weights(moving)
+    schedule = fflin.tvlqr(moving, Q, R, 1.0)
+    asked = np.linspace(0.0, 0.4, 57)
+    expected = [
+        np.linalg.solve(np.diag(R), moving.matrices(t)[1].T @ schedule.cost_to_go(t)) for t in asked
+    ]
+    schedule.gain(0.0)
+    monkeypatch.setattr(np.linalg, "solve", None)
+    for t, K in zip(asked, expected, strict=True):
+        assert schedule.gain(t) == pytest.approx(K, rel=1e-9, abs=1e-12 * np.abs(K).max())
+    for odd in (None, "x", np.nan, -1.0, 1j):
+        with pytest.raises(fflin.InputError, match="t is"):
+            schedule.gain(odd)

@@ -5,8 +5,8 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.dynamics.integrators import integrator
 from fflin.dynamics.state_rows import readout, state_history
-from fflin.simulation.integrators import integrator
 from tests.support.robots import BUNDLED, FRAMES, random_pose
 from tests.support.weights import unit_weights
 

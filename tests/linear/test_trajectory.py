@@ -1,123 +1,295 @@
-"""The linear model along a motion."""
+"""A motion by knots: what holds, what does not and why, and files of other programs."""
+
+import csv
+import json
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.io import savemat
 
 import fflin
 from tests.support.motions import motion
 
 
-def test_knots_are_the_moving_models_and_errors_are_carried_along():
-    robot = fflin.load("astrobee_arm", gravity=(0.0, 0.1, -0.2), damping=0.05)
-    t, q, v, u = motion(robot)
-    along = fflin.linearize_trajectory(robot, t, q, v, u)
-    assert along.residual.max() < 1e-2 and len(along.residual) == len(t)
-    lin = fflin.linearize(robot, q[30], v[30], u[30], moving=True)
-    assert (along.A[30] == lin.A).all() and (along.B[30] == lin.B).all()
-    assert along.state_names == lin.state_names
-
-    # A second motion from a nearby start: its error is what the time-varying model carries.
-    def error(knot, q1, v1):
-        reference = pin.XYZQUATToSE3(q[knot][:7])
-        relative = fflin.StateMap(robot, reference=reference, frame="local")
-        return relative.to_state(q1, v1) - relative.to_state(q[knot], v[knot])
-
-    dx = 1e-6 * np.random.default_rng(2).normal(size=len(lin.x0))
-    first = fflin.StateMap(robot, reference=pin.XYZQUATToSE3(q[0][:7]), frame="local")
-    q1, v1 = first.to_pinocchio(first.to_state(q[0], v[0]) + dx)
-    _, q_near, v_near, _ = motion(robot, (q1, v1))
-    solution = solve_ivp(
-        lambda time, y: along.matrices(min(time, t[-1]))[0] @ y,
-        (t[0], t[-1]),
-        dx,
-        rtol=1e-10,
-        atol=1e-14,
-    ).y[:, -1]
-    # Matrices that are linear between knots leave 1e-5 of it, the second order in dx 1e-6.
-    drift = error(-1, q_near[-1], v_near[-1])
-    assert drift == pytest.approx(solution, abs=1e-4 * np.abs(solution).max())
+def arrays(along):
+    return along.t, along.q, along.v, along.u
 
 
-def test_interpolation_is_on_the_manifold():
+@pytest.fixture(scope="module")
+def loop():
+    """A loop around a robot with continuous joints, from a state off its point."""
+    robot = fflin.load("planar_detumble")
+    lin = fflin.linearize(robot)
+    x0 = 0.1 * np.random.default_rng(0).normal(size=len(lin.x0))
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+
+    def run(**options):
+        return fflin.simulate(robot, policy, x0=x0, duration=2.0, dt=0.01, **options)
+
+    return robot, run
+
+
+@pytest.mark.parametrize("knots", [3, 11, 101])
+def test_one_step_of_torque_holds_at_every_spacing(knots):
+    robot = fflin.load("planar_detumble")
+    u = np.zeros((knots, 6 + robot.n))
+    u[knots // 2 :, -1] = 0.02
+    times = np.linspace(0.0, 2.0, knots)
+
+    def policy(t, q, v):
+        return u[min(int(t / times[1] + 1e-9), knots - 1)]
+
+    run = fflin.simulate(
+        *(robot, policy), duration=2.0, dt=0.005, sample=times[1], every=round(times[1] / 0.005)
+    )
+    held = fflin.Trajectory(robot, run.t, run.q, run.v, u[:-1], frame="hybrid")
+    assert held.hold == "previous"
+    assert held.residual.max() < 1e-8
+    assert fflin.linearize_trajectory(robot, held, strict=True).A.shape == (knots, 18, 18)
+    # And only so: the step is no slope.
+    assert replace(held, hold="linear").residual.max() > 1e-2
+
+
+@pytest.mark.parametrize(
+    ("options", "hold", "largest"),
+    [
+        ({}, "linear", 1e-4),
+        ({"every": 5}, "linear", 2.5e-3),
+        ({"sample": 0.1}, "previous", 1e-8),
+        ({"sample": 0.1, "every": 10}, "previous", 1e-8),
+        ({"sample": 0.1, "every": 5, "delay": 0.05}, "previous", 1e-8),
+        ({"sample": 0.4, "every": 40, "method": "rkmk4"}, "previous", 1e-6),
+    ],
+)
+def test_what_is_simulated_holds(loop, options, hold, largest):
+    """Held inputs to the integrator's order; of others the knots have what is linear between."""
+    _, run = loop
+    found = run(**options)
+    along = found.trajectory()
+    assert (along.hold, along.frame) == (hold, "hybrid")
+    assert along.residual.max() < largest
+    if hold == "linear":
+        every = {"every": 2 * options.get("every", 1)}
+        coarse = run(**every).trajectory().residual.max()
+        assert coarse / along.residual.max() == pytest.approx(4.0, abs=0.8)
+
+
+def test_axes_of_inputs_are_those_of_the_frame():
     robot = fflin.load("ets_vii")
-    along = fflin.linearize_trajectory(robot, *motion(robot))
-    middle = 0.5 * (along.t[3] + along.t[4])
-    q, v, _ = along.point(middle)
-    assert robot.checked_configuration(q) is not None
-    assert np.linalg.norm(q[3:7]) == pytest.approx(1.0, abs=1e-14)
-    assert v == pytest.approx(0.5 * (along.v[3] + along.v[4]))
-    half = pin.difference(robot.model, along.q[3], along.q[4]) / 2
-    assert pin.difference(robot.model, along.q[3], q) == pytest.approx(half, abs=1e-14)
-    assert (along.matrices(along.t[5])[0] == along.A[5]).all()
-    assert (along.matrices(along.t[-1])[1] == along.B[-1]).all()
-    with pytest.raises(fflin.InputError, match=r"t is 9 s, expected 0 to 0\.4 s"):
-        along.point(9.0)
-    with pytest.raises(ValueError, match="read-only"):
-        along.A[0] = 0.0
+    reference = pin.SE3(pin.rpy.rpyToMatrix(0.4, -0.2, 0.9), np.array([1.0, 2.0, 3.0]))
+    v0 = fflin.velocity(robot, {"omega_b.x": 0.5, "omega_b.y": -0.3, "v_b.z": 0.1})
+    u = np.r_[3.0, -2.0, 1.0, 5.0, -3.0, 2.0, 0.2 * np.ones(robot.n)]
+    for frame in ("local", "hybrid", "world"):
+        run = fflin.simulate(
+            *(robot, lambda t, q, v: u),
+            v0=v0,
+            duration=2.0,
+            dt=0.005,
+            sample=0.5,
+            every=50,
+            frame=frame,
+            reference=reference,
+        )
+        along = run.trajectory()
+        assert along.residual.max() < 1e-8
+        for other in {"local", "hybrid", "world"} - {frame}:
+            assert replace(along, frame=other).residual.max() > 1e-3
+        q, _, u_base = along.point(1.1)
+        of_world = pin.Quaternion(q[3:7]).matrix() @ u_base[3:6]
+        expected = reference.rotation @ u[3:6]
+        if frame == "local":
+            assert u_base == pytest.approx(u)
+        else:
+            assert of_world == pytest.approx(expected)
 
 
-def test_what_is_no_motion_is_refused_with_the_time():
-    robot = fflin.load("ets_vii")
-    t, q, v, u = motion(robot)
-    jump = q.copy()
-    jump[40:, 0] += 0.1
-    cases = {
-        r"not a motion of 'ets_vii': at t = 0\.(195|2) s": (t, jump, v, u),
-        "not a motion": (t, q, v, np.zeros_like(u)),
-        "each later than the one before": (t[::-1], q, v, u),
-        r"q has shape \(80, 19\), expected \(81, 19\)": (t, q[:-1], v, u),
-        r"v has shape \(81, 11\), expected \(81, 12\)": (t, q, v[:, 1:], u),
-        r"u has shape \(11,\), expected \(12,\)": (t, q, v, u[:, 1:]),
-        "u holds": (t, q, v, "none"),
-    }
-    for words, arguments in cases.items():
-        with pytest.raises(fflin.InputError, match=words):
-            fflin.linearize_trajectory(robot, *arguments)
+def test_causes_are_tried_out():
+    robot = fflin.load("astrobee_arm", damping=0.05)
+    free = robot.replace(damping={})
+    t, q, v, u = motion(free)
+
+    def said(along):
+        with pytest.warns(fflin.FflinWarning) as found:
+            fflin.linearize_trajectory(along.robot, along)
+        return str(found[0].message)
+
+    given = fflin.Trajectory(robot, t, q, v, u)
+    assert "without damping they hold to" in said(given)
+    assert "without damping they hold to" in str(given)
+    R = np.array([pin.Quaternion(each[3:7]).matrix() for each in q])
+    turned = v.copy()
+    turned[:, :3] = (R @ v[:, :3, None])[..., 0]
+    words = "with the linear velocity of the base in reference axes they hold to"
+    assert words in said(fflin.Trajectory(free, t, q, turned, u))
+    turned[:, 3:6] = (R @ v[:, 3:6, None])[..., 0]
+    words = "with the velocities of the base in reference axes they hold to"
+    assert words in said(fflin.Trajectory(free, t, q, turned, u))
+    hung = free.replace(gravity=(0.0, 0.0, -9.81))
+    assert "without gravity they hold to" in said(fflin.Trajectory(hung, t, q, v, u))
+    sprung = fflin.Trajectory(free.replace(stiffness=5.0, damping=0.05), t, q, v, u)
+    both = said(sprung)
+    assert "without springs" in both
+    assert "without damping" in both
+
+    robot = fflin.load("planar_detumble")
+    lin = fflin.linearize(robot)
+    run = fflin.simulate(
+        *(robot, fflin.StateFeedback(lin, fflin.lqr(lin).K)),
+        x0=0.1 * np.ones(18),
+        duration=2.0,
+        sample=0.2,
+        every=20,
+    )
+    given = fflin.Trajectory(robot, run.t, run.q, run.v, run.u, frame="hybrid")
+    assert "with the input of the knot before they hold to" in said(given)
+    given = fflin.Trajectory(robot, run.t, run.q, run.v, run.u[:-1])
+    assert "with u in frame hybrid they hold to" in said(given)
+    u = np.vstack((run.u[:1], run.u[:-1]))
+    given = fflin.Trajectory(robot, run.t, run.q, run.v, u, hold="previous", frame="hybrid")
+    assert "with the input of the knot after they hold to" in said(given)
 
 
-def test_coarse_knots_are_warned_of():
-    robot = fflin.load("ets_vii")
-    t, q, v, u = motion(robot, knots=4)
-    with pytest.warns(fflin.FflinWarning, match="coarse for a motion: at t ="):
-        fflin.linearize_trajectory(robot, t, q, v, u)
+def test_continuous_joints_may_be_angles(loop):
+    robot, run = loop
+    along = run(sample=0.1).trajectory()
+    angles = fflin.StateMap(robot).joint_positions(along.q)
+    narrow = np.column_stack((along.q[:, :7], angles))
+    again = fflin.Trajectory(robot, along.t, narrow, along.v, along.u)
+    assert again.q == pytest.approx(along.q, abs=1e-15)
+    said = (
+        r"q has shape \(201, 11\), expected \(201, 13\): continuous joints take two columns, "
+        r"\(cos, sin\); `Trajectory` takes angles too, \(201, 10\)"
+    )
+    with pytest.raises(fflin.InputError, match=said):
+        fflin.linearize_trajectory(robot, along.t, along.q[:, 2:], along.v, along.u)
 
 
-def test_an_orbit_and_a_fast_wheel_hide_nothing():
-    wheel = fflin.ReactionWheel((0, 0, 1), inertia=0.01)
-    robot = fflin.load("ets_vii", inputs=[fflin.BaseForce(), wheel])
-    t = np.linspace(0.0, 1.0, 51)
-    v = np.tile(fflin.velocity(robot, {"v_b.x": 7000.0, "wheel_1": 500.0}), (len(t), 1))
-    q0 = fflin.configuration(robot, base=pin.SE3(np.eye(3), np.array([7e6, 0.0, 0.0])))
-    q = np.array([pin.integrate(robot.model, q0, time * v[0]) for time in t])
-    u = np.zeros((len(t), 4))
-    assert fflin.linearize_trajectory(robot, t, q, v, u).residual.max() < 1e-9
-    for column in (2, robot.joints[0].idx_v):  # along z; a joint of the arm
-        step = 0.01 * np.eye(robot.nv)[column]
-        jump = np.array([pin.integrate(robot.model, x, (k >= 25) * step) for k, x in enumerate(q)])
-        with pytest.raises(fflin.InputError, match=r"at t = 0\.(48|5) s"):
-            fflin.linearize_trajectory(robot, t, jump, v, u)
-    drifting = v.copy()
-    drifting[:, robot.joints[0].idx_v] = 0.01
-    with pytest.raises(fflin.InputError, match="not a motion"):
-        fflin.linearize_trajectory(robot, t, q, drifting, u)
+def test_resampled_is_the_same_motion(loop):
+    robot, run = loop
+    along = run(sample=0.1, every=10).trajectory()
+    fine = along.resampled(0.05)
+    assert (fine.hold, fine.frame, len(fine.t)) == ("previous", "hybrid", 41)
+    assert (fine.u[::2] == along.u).all()
+    assert (fine.u[1::2] == along.u[:-1]).all()
+    assert fine.q[::2] == pytest.approx(along.q, abs=1e-15)
+    assert fine.residual.max() < 1e-3  # what the cubics miss
+    expected = run(sample=0.1, every=5)
+    apart = [pin.difference(robot.model, *pair) for pair in zip(fine.q, expected.q, strict=True)]
+    assert np.abs(apart).max() < 1e-5
+    uneven = along.resampled(0.3)
+    assert uneven.t == pytest.approx([0.0, 0.3, 0.6, 0.9, 1.2, 1.5, 1.8, 2.0])
+    for dt in (0.0, -1.0, 1e-12, "x"):
+        with pytest.raises(fflin.InputError, match="dt is"):
+            along.resampled(dt)
 
 
-def test_an_orbit_changes_no_residual():
-    robot = fflin.load("ets_vii")
-    t, q, v, u = motion(robot)
-    still = fflin.linearize_trajectory(robot, t, q, v, u).residual
-    q[:, :3] += np.outer(t, [0.0, 7000.0, 100.0])
-    v[:, :3] += [pin.Quaternion(x[3:7]).matrix().T @ [0.0, 7000.0, 100.0] for x in q]
-    orbit = fflin.linearize_trajectory(robot, t, q, v, u).residual
-    assert orbit == pytest.approx(still, rel=1e-2)
+def test_a_fast_wheel_turns_between_knots():
+    wheel = fflin.ReactionWheel((0, 0, 1), inertia=0.001)
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(), wheel])
+    v0 = fflin.velocity(robot, {"wheel_1": 500.0})
+    run = fflin.simulate(robot, v0=v0, duration=0.2, dt=0.001, every=20)
+    at = run.trajectory().point(0.03)[0]
+    exact = fflin.simulate(robot, v0=v0, duration=0.03, dt=0.001).q[-1]
+    assert np.abs(pin.difference(robot.model, at, exact)).max() < 1e-9
 
 
-def test_holding_still_in_gravity_is_a_motion():
-    robot = fflin.load("servicer_7dof", gravity=(0.3, 0.2, -9.81), stiffness=20.0)
-    q = fflin.configuration(robot, {"joint_2": 0.7, "joint_4": -0.4, "panel_left": 0.2})
-    u = fflin.equilibrium(robot, q).u
-    t = np.linspace(0.0, 1.0, 5)
-    still = (np.tile(x, (len(t), 1)) for x in (q, np.zeros(robot.nv), u))
-    assert fflin.linearize_trajectory(robot, t, *still).residual.max() < 1e-9
+@pytest.mark.parametrize("ending", ["npz", "mat", "json", "csv"])
+def test_what_is_saved_is_read_to_the_last_bit(loop, tmp_path, ending):
+    robot, run = loop
+    along = run(sample=0.1, every=10).trajectory()
+    along.save(tmp_path / f"a.{ending}")
+    again = fflin.Trajectory.load(tmp_path / f"a.{ending}", robot)
+    for name in ("t", "q", "v", "u"):
+        assert (getattr(again, name) == getattr(along, name)).all()
+    assert (again.hold, again.frame) == ("previous", "hybrid")
+    assert again.verified == (ending != "csv")
+    assert ("not verified" in str(again)) == (ending == "csv")
+
+
+def test_files_of_other_programs_are_read(loop, tmp_path):
+    robot, run = loop
+    found = run(sample=0.1, every=10)
+    along = found.trajectory()
+    state = fflin.StateMap(robot, frame="world")
+    x = np.array([state.to_state(*each) for each in zip(along.q, along.v, strict=True)])
+    turned = replace(along, frame="world", u=_of_world(along))
+
+    # An input that does nothing may be left out.
+    along, turned = (replace(each, u=each.u * (np.arange(9) != 7)) for each in (along, turned))
+
+    def same(path, **options):
+        again = fflin.Trajectory.load(path, robot, **options)
+        assert again.q == pytest.approx(along.q, abs=1e-12)
+        assert again.v == pytest.approx(along.v, abs=1e-12)
+        assert again.hold == "previous"
+        assert again.u_base[:-1] == pytest.approx(along.u_base[:-1], abs=1e-12)
+        assert not again.verified
+
+    columns = {"t": along.t} | dict(zip(state.names, x.T, strict=True))
+    acting = zip(found.input_names, turned.u.T, strict=True)
+    columns |= {name: u for name, u in acting if name != "tau_m.joint_2"}
+    path = tmp_path / "by_hand.csv"
+
+    def write(columns, last=None):
+        with path.open("w", newline="", encoding="utf-8-sig") as file:
+            rows = [list(map(repr, map(float, row))) for row in zip(*columns.values(), strict=True)]
+            if last is not None:
+                rows[-1][19:] = [last] * (len(columns) - 19)
+            csv.writer(file).writerows([columns, *rows])
+
+    write(columns, last="")
+    same(path, frame="world")
+    write(columns)
+    same(path, frame="world", hold="previous")
+    write({name if name in ("t", *state.names) else f"u.{name}": x for name, x in columns.items()})
+    same(path, frame="world", hold="previous")
+
+    savemat(tmp_path / "a.mat", {"t": along.t, "x": x, "u": turned.u[:-1], "frame": "world"})
+    same(tmp_path / "a.mat")
+    struct = {"t": along.t, "q": along.q, "v": along.v, "u": along.u_base, "hold": "previous"}
+    savemat(tmp_path / "b.mat", {"traj": struct})
+    same(tmp_path / "b.mat", frame="local")
+    np.savez(tmp_path / "c.npz", t=along.t, q=along.q, v=along.v, u=along.u[:-1])
+    same(tmp_path / "c.npz", frame="hybrid")
+    plain = {"t": along.t, "x": x, "u": turned.u, "hold": "previous", "frame": "world"}
+    lists = {name: x.tolist() if isinstance(x, np.ndarray) else x for name, x in plain.items()}
+    (tmp_path / "d.json").write_text(json.dumps(lists))
+    same(tmp_path / "d.json")
+
+    found.save(tmp_path / "motion.npz")
+    again = fflin.Trajectory.load(tmp_path / "motion.npz", robot, hold="previous")
+    assert again.residual.max() < 1e-8
+    with pytest.raises(fflin.InputError, match="give the one that moves"):
+        fflin.Motion.load(tmp_path / "motion.npz").trajectory()
+    assert fflin.Motion.load(tmp_path / "motion.npz").trajectory(robot).residual.max() < 1e-8
+
+    write(columns | {"tau_m.nosuch": along.t})
+    with pytest.raises(
+        fflin.UnknownNameError, match=r"by_hand\.csv: no state or input named 'tau_m"
+    ):
+        fflin.Trajectory.load(path, robot)
+    write({name: x for name, x in columns.items() if name != "r_b.y"})
+    with pytest.raises(fflin.UnknownNameError, match=r"no column named 'r_b\.y'"):
+        fflin.Trajectory.load(path, robot)
+    path.write_text("t,t\n1,2\n")
+    with pytest.raises(fflin.FileError, match="two of its columns have one name"):
+        fflin.Trajectory.load(path, robot)
+    np.savez(tmp_path / "e.npz", t=along.t, u=along.u)
+    with pytest.raises(fflin.FileError, match="it has the entries t, u; expected t, u, and either"):
+        fflin.Trajectory.load(tmp_path / "e.npz", robot)
+    with pytest.raises(fflin.FileError, match=r"expected one of \.npz"):
+        fflin.Trajectory.load(tmp_path / "e.txt", robot)
+    np.savez(tmp_path / "e.npz", t=along.t, x=x[:, 1:], u=along.u)
+    with pytest.raises(fflin.InputError, match=r"x has shape \(21, 17\), expected \(N, 18\)"):
+        fflin.Trajectory.load(tmp_path / "e.npz", robot)
+
+
+def _of_world(along):
+    """Inputs held in world axes that are, at the knots, those of the trajectory."""
+    u = along.u_base.copy()
+    for row, q in zip(u, along.q, strict=True):
+        R = pin.Quaternion(q[3:7]).matrix()
+        row[:3], row[3:6] = R @ row[:3], R @ row[3:6]
+    return u

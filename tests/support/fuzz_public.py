@@ -80,7 +80,8 @@ def sound(folder):
         "JointVelocities": {"joints": (joint,)},
         "kalman": {"lin": lin, "W": 1.0, "V": 1.0, "G": lin.B},
         "linearize": found | place,
-        "linearize_trajectory": {"robot": robot, "t": t, "q": rows[0], "v": rows[1], "u": rows[2]},
+        "linearize_trajectory": dict(zip("tqvu", (t, *rows), strict=True))
+        | {"robot": robot, "strict": False, "hold": "previous", "frame": "world"},
         "Linearizer": {"robot": robot} | place,
         "list_robots": {},
         "load": {
@@ -139,8 +140,10 @@ def sound(folder):
             **{"frame": "base", "position": vector, "direction": vector, "name": "t"},
             **{"max": 1.0, "min": None, "on_off": True, "least_impulse": 0.1},
         },
+        "Trajectory": dict(zip("tqvu", (t, *rows), strict=True))
+        | {"robot": robot, "hold": None, "frame": "local"},
         "TrajectoryFeedback": {"trajectory": along, "schedule": schedule},
-        "tvlqr": {"traj": along, "Qf": 1.0} | weights,
+        "tvlqr": {"traj": along, "Qf": 1.0, "sample": None, "weights": None} | weights,
         "validity": {
             **{"robot": robot, "lin": lin, "gain": None, "attitude": 5.0, "position": 0.1},
             **{"joint": 0.1, "samples": 1, "seed": 0, "confidence": 0.9, "executor": None},
@@ -150,6 +153,13 @@ def sound(folder):
             **{"robot": robot, "motion": motion, "html": folder / "a.html", "open": False},
             **{"tool": None, "fps": 10.0, "speed": 1.0, "scene": "space"},
         },
+        "LinearTrajectory.discretize": {"self": along, "dt": 0.01},
+        "LinearTrajectory.load": {"path": "nosuch.npz", "robot": robot},
+        "LinearTrajectory.matrices": {"self": along, "t": 0.015},
+        "Trajectory.load": {"path": "nosuch.csv", "robot": robot, "hold": None, "frame": None},
+        "Trajectory.point": {"self": along, "t": 0.015},
+        "Trajectory.resampled": {"self": along, "dt": 0.01},
+        "Trajectory.save": {"self": along, "path": folder / "c.npz"},
         "LinearModel.discretize": {"self": lin, "dt": 0.1},
         "LinearModel.is_equilibrium": {"self": lin, "tol": 1e-9},
         "LinearModel.load": {"path": "nosuch.npz"},

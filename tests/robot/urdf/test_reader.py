@@ -270,6 +270,17 @@ def test_load_warns_and_keeps_the_notes(tmp_path):
         assert fflin.load(path).notes == loaded.notes
 
 
+def test_damping_that_is_asked_for_is_not_warned_of(tmp_path):
+    path = tmp_path / "r.urdf"
+    path.write_text(arm(inside=AXIS + '<dynamics damping="1" friction="2"/>'))
+    with pytest.warns(fflin.FflinWarning) as caught:
+        loaded = fflin.load(path, damping="urdf")
+    (note,) = loaded.notes
+    assert [str(warning.message) for warning in caught] == [note]
+    assert "Coulomb friction" in note
+    assert loaded.damping == {"hinge": 1.0}
+
+
 def test_info_lists_the_warnings(tmp_path):
     from fflin.robot.summary import robot_info
 

@@ -1,0 +1,117 @@
+"""What the commands do along a trajectory, and the regulator along one."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from fflin.base.errors import InputError
+from fflin.commands import DONE, FELL_SHORT
+from fflin.commands.arguments import (
+    Commands,
+    add_output_file,
+    add_robot,
+    add_system,
+    add_values,
+    command,
+    file_name,
+)
+from fflin.commands.points import load_robot, once
+from fflin.commands.regulator import add_weights
+
+if TYPE_CHECKING:
+    from fflin.linear.linear_trajectory import LinearTrajectory
+
+
+def add_commands(commands: Commands) -> None:
+    """Add tvlqr."""
+    tvlqr = command(
+        commands,
+        "tvlqr",
+        _tvlqr,
+        "design the regulator along a trajectory: the gains over time",
+        "fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --dt 0.1 -o gains.npz",
+    )
+    add_robot(tvlqr)
+    add_system(tvlqr)
+    add_trajectory(tvlqr, required=True)
+    add_weights(tvlqr)
+    add_values(tvlqr, "--qf", "weight at the end; by default that of the steady regulator there")
+    add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json")
+
+
+def add_trajectory(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
+    """Add --trajectory and --hold; then --frame is by default what the file says."""
+    parser.add_argument(
+        "--trajectory",
+        metavar="FILE",
+        type=file_name,
+        required=required,
+        help="go along the motion in FILE, .npz, .mat, .json or .csv with named columns, as "
+        "fflin.Trajectory.load reads it; --frame says the axes that it is in",
+    )
+    parser.add_argument(
+        "--hold",
+        choices=("linear", "previous"),
+        help="how the inputs of FILE go on between its knots, where it does not say so: linear "
+        "(default), or as they were at the knot before",
+    )
+    parser.set_defaults(frame=None)
+
+
+def models_along(arguments: argparse.Namespace) -> LinearTrajectory:
+    """Return the linear models along the trajectory that is given."""
+    from fflin.linear.linear_trajectory import linearize_trajectory
+    from fflin.linear.trajectory import Trajectory
+
+    for name in ("joint", "velocity", "effort", "equilibrium"):
+        if getattr(arguments, name, None):
+            raise InputError(f"--{name} says a point and --trajectory a motion; give either")
+    if any(getattr(arguments, "rpy", None) or ()) or any(
+        getattr(arguments, "position", None) or ()
+    ):
+        raise InputError("--rpy and --position say a point and --trajectory a motion; give either")
+    robot, options = load_robot(arguments), {"hold": arguments.hold, "frame": arguments.frame}
+    return linearize_trajectory(robot, Trajectory.load(arguments.trajectory, robot, **options))
+
+
+def linearize_along(arguments: argparse.Namespace) -> int:
+    """Show or save the models along a trajectory."""
+    along = models_along(arguments)
+    if getattr(arguments, "dt", None) is not None:
+        along = along.discretize(arguments.dt)
+    _say(along, arguments)
+    return DONE
+
+
+def check_along(arguments: argparse.Namespace) -> int:
+    """Check the models along a trajectory."""
+    along = models_along(arguments)
+    found = along.check()
+    print(f"{along}\n\n{found}")
+    return DONE if found.ok else FELL_SHORT
+
+
+def _tvlqr(arguments: argparse.Namespace) -> int:
+    from fflin.control.default_weights import rule_weights
+    from fflin.control.tvlqr import steady_end, tvlqr
+
+    if arguments.reduce:
+        raise InputError("--reduce: over a finite time the inputs hold what they can; leave it out")
+    along = models_along(arguments)
+    options: dict[str, Any] = {"sample": arguments.dt, "weights": arguments.weights}
+    given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
+    if any(given.values()):
+        end, hold = steady_end(along), arguments.dt or 0.0
+        Q, R, _, rule = rule_weights(end, arguments.weights, given, hold=hold)
+        options |= {"Q": Q, "R": R, "weights": None, "rule": rule}
+    _say(tvlqr(along, Qf=once("--qf", arguments.qf) or "steady", **options), arguments)
+    return DONE
+
+
+def _say(made: Any, arguments: argparse.Namespace) -> None:
+    if arguments.output_file:
+        made.save(arguments.output_file)
+    print(made)
+    if arguments.output_file:
+        print(f"wrote {arguments.output_file}")

@@ -1,0 +1,170 @@
+"""What a robot does between the knots of a trajectory, and how far it misses the next one."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.rotation import rotation_matrices
+from fflin.base.validation import Array
+from fflin.dynamics.aba import Aba
+from fflin.dynamics.integrators import CommutatorFree4
+from fflin.dynamics.state import StateMap
+from fflin.linear.ignorable import rotor_names
+
+# Steps are halved until the end of an interval is this accurate, relative to the largest rates.
+_ACCURACY, _MOST_STEPS = 1e-8, 128
+
+# Round-off of positions, and of accelerations that are sums of terms that may cancel.
+_EPS = float(np.finfo(float).eps)
+_OF_PLACES, _OF_SUMS = 16.0 * _EPS, 1e3 * _EPS
+
+# A time this near to a knot, relative to the interval, is the knot's.
+_NEAR = 1e-9
+
+
+class Flow:
+    """The motion between knots, q, v, u and t of N rows; the frame of `state` is that of u.
+
+    An input stays until the next knot where it is `held`, and is linear in between else.
+    """
+
+    def __init__(self, state: StateMap, t: Array, q: Array, v: Array, u: Array, held: bool) -> None:
+        self._model, self._aba, self._held = state.robot.model, Aba(state), held
+        self._t, self._q, self._v, self._u = t, q, v, u
+
+    @cached_property
+    def residual(self) -> Array:
+        """How far each interval's end is from the next knot (N - 1,).
+
+        The rates that are missing on the way, relative to the largest of the motion. An observer
+        who flies along with the base's mean velocity takes them (Galilei), and each rotor counts
+        for itself: neither an orbit nor a fast wheel hides anything.
+        """
+        t, u, state = self._t, self._u, self._aba.state
+        rotations, q, v = rotation_matrices(self._q[:, 3:7]), self._q.copy(), self._v.copy()
+        velocities = (rotations @ v[:, :3, None])[..., 0]
+        mean = velocities.mean(axis=0)
+        flown = np.outer(t - t[0], mean)
+        digits = np.full(
+            v.shape[1], _OF_PLACES * max(1.0, float(np.abs(q[:, 7:]).max(initial=0.0)))
+        )
+        digits[:3] = _OF_PLACES * max(float(np.abs(x).max()) for x in (q[:, :3], flown, velocities))
+        q[:, :3] -= q[0, :3] + flown
+        v[:, :3] -= mean @ rotations
+        knots = list(zip(q, v, u, strict=True))
+        sums = np.max([state.spread(self._aba.terms(*each)) for each in knots], axis=0)
+        rotors = rotor_names(state.robot)
+        alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
+        others = sorted({*range(6, len(digits))} - {*alone})
+        groups = [[0, 1, 2], [3, 4, 5], *([each] for each in alone), *([others] if others else [])]
+        speed, push = (
+            np.abs(v).max(axis=0),
+            np.abs([self._rate(*each) for each in knots]).max(axis=0),
+        )
+        for group in groups:
+            speed[group], push[group] = (x[group].max() or 1.0 for x in (speed, push))
+
+        def size(of_q: Array, of_v: Array, h: float) -> float:
+            miss = np.maximum(np.abs(of_q) - digits, 0.0) / (speed * h)
+            jump = np.maximum(np.abs(of_v) - digits - _OF_SUMS * sums * h, 0.0) / (push * h)
+            return float(np.maximum(miss, jump).max())
+
+        found, steps = [], 1
+        # What is no motion may diverge, which the residual says.
+        with np.errstate(all="ignore"):
+            for k, h in enumerate(np.diff(t)):
+                steps = max(1, steps // 4)
+                end = self._end(k, steps, q[k], v[k])
+                while steps < _MOST_STEPS:
+                    before, steps = end, 2 * steps
+                    end = self._end(k, steps, q[k], v[k])
+                    if (
+                        size(
+                            pin.difference(self._model, *(before[0], end[0])), end[1] - before[1], h
+                        )
+                        <= _ACCURACY
+                    ):
+                        break
+                found.append(
+                    size(pin.difference(self._model, end[0], q[k + 1]), v[k + 1] - end[1], h)
+                )
+        return np.where(np.isfinite(found), found, np.inf)
+
+    def _end(self, k: int, steps: int, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return q and v at the end of an interval by steps of CF4 (11.1) from q and v on."""
+        start, h = self._t[k], self._t[k + 1] - self._t[k]
+        method = CommutatorFree4(self._model, h / steps)
+        for step in range(steps):
+            q, v = method.step(
+                lambda t, q, v: self._rate(q, v, self._input(k, (t - start) / h)),
+                start + step * method.dt,
+                q,
+                v,
+            )
+        return q, v
+
+    def at(self, t: float) -> tuple[Array, Array, Array]:
+        """Return q, v and u in base axes from a time on: cubics with the robot's own rates."""
+        k, s = placed(self._t, t)
+        powers, (turns, speeds) = np.array((1.0, s, s * s, s**3)), self._cubics
+        q: Array = pin.integrate(self._model, self._q[k], powers.dot(turns[k]))
+        return q, powers.dot(speeds[k]), self._in_base_axes(q, self._input(k, s))
+
+    def input(self, t: float) -> Array:
+        """Return the inputs (nu,) that act from a time on, in the frame's axes."""
+        return self._input(*placed(self._t, t))
+
+    def _input(self, k: int, share: float) -> Array:
+        u: Array = self._u[k]
+        return u if self._held else u + share * (self._u[k + 1] - u)
+
+    def _in_base_axes(self, q: Array, u: Array) -> Array:
+        return self._aba.actuation.rows_in_base_axes(q[None], u[None])[0]
+
+    def _rate(self, q: Array, v: Array, u: Array) -> Array:
+        return self._aba.acceleration(q, v, self._in_base_axes(q, u)).copy()
+
+    @cached_property
+    def _cubics(self) -> tuple[Array, Array]:
+        """Coefficients (N - 1, 4, nv) of the way in the tangent at the first knot, and of v."""
+        q, v, h = self._q, self._v, np.diff(self._t)[:, None]
+        begin = np.array([self._rate(*each) for each in zip(q, v, self._u, strict=True)])
+        end = begin[1:]
+        if self._held:
+            end = np.array([self._rate(*each) for each in zip(q[1:], v[1:], self._u, strict=False)])
+        way = np.array([pin.difference(self._model, *pair) for pair in pairwise(q)])
+        wheels = [joint.idx_v for joint in self._aba.state.robot.joints if joint.unbounded]
+        # The knots have a fast wheel's angle only within a turn; its speed says how many turns.
+        turns = (0.5 * h * (v[1:] + v[:-1]) - way)[:, wheels] / (2.0 * np.pi)
+        way[:, wheels] += 2.0 * np.pi * np.round(turns)
+        slopes = [
+            pin.dDifference(self._model, *pair, pin.ArgumentPosition.ARG1) @ speed
+            for pair, speed in zip(pairwise(q), v[1:], strict=True)
+        ]
+        return (
+            _cubic(np.zeros_like(way), way, h * v[:-1], h * slopes),
+            _cubic(v[:-1], v[1:], h * begin[:-1], h * end),
+        )
+
+
+def placed(t: Array, time: float) -> tuple[int, float]:
+    """Return which interval of times a time is in, and the share of it that is over.
+
+    A knot belongs to the interval that begins there, as do times that only rounding keeps from it.
+    """
+    last = len(t) - 2
+    k = max(0, min(int(np.searchsorted(t, time, side="right")) - 1, last))
+    share = float((time - t[k]) / (t[k + 1] - t[k]))
+    if share > 1.0 - _NEAR and k < last:
+        return k + 1, 0.0
+    return k, 0.0 if share < _NEAR else min(share, 1.0)
+
+
+def _cubic(first: Array, last: Array, rate: Array, end_rate: Array) -> Array:
+    """Return the coefficients (N - 1, 4, nv) of cubics over [0, 1] with these values and slopes."""
+    way = last - first
+    return np.stack((first, rate, 3 * way - 2 * rate - end_rate, rate + end_rate - 2 * way), axis=1)

@@ -1,0 +1,179 @@
+"""The time-varying linear model along a motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.linear.flow import placed
+from fflin.linear.linearization import Linearizer
+from fflin.linear.model import LinearModel
+from fflin.linear.trajectory import Trajectory
+from fflin.linear.trajectory_sampling import transitions
+from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from fflin.linear.check import Check
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearTrajectory(Trajectory):
+    r"""Error dynamics along a motion, ``d(dx)/dt = A(t) dx + B(t) du``, ``dy = C dx + D du``.
+
+    The error is taken in the moving base's own axes, see `Linearizer` (``moving=True``), and du on
+    the base in base axes. With ``dt`` the left side is the error at the next knot instead. Its
+    items are the linear models at the knots.
+
+    Attributes
+    ----------
+    A : ndarray (N, nx, nx)
+    B : ndarray (N, nx, nu)
+        N - 1 with ``dt``: what takes a knot to the next.
+    C : ndarray (N, ny, nx)
+    D : ndarray (N, ny, nu)
+    y : ndarray (N, ny)
+        Outputs on the motion.
+    state_names, input_names, output_names : tuple of str
+    dt : float
+        Time [s] that du is held; 0 for continuous time.
+    robot, t, q, v, u, hold, frame : see `Trajectory`
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    y: Array
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    dt: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.state_names != self._state.names:
+            raise InputError(f"it is no model of '{self.robot.name}' as it is given")
+
+    def __len__(self) -> int:
+        return len(self.A)
+
+    def __getitem__(self, index: int) -> LinearModel:
+        """Return the linear model at a knot."""
+        return self._model(Linearizer(self.robot, moving=True), range(len(self))[index])
+
+    def __iter__(self) -> Iterator[LinearModel]:
+        linearizer = Linearizer(self.robot, moving=True)
+        return (self._model(linearizer, k) for k in range(len(self)))
+
+    def _model(self, linearizer: Linearizer, k: int) -> LinearModel:
+        lin = linearizer(self.q[k], self.v[k], self.u_base[k])
+        own = {name: getattr(self, name)[k] for name in "ABCD"}
+        lin = lin.discretize(self.dt) if self.dt else lin
+        return replace(lin, **own, y0=self.y[k], verified=self.verified)
+
+    def matrices(self, t: float) -> tuple[Array, Array]:
+        """Return A (nx, nx) and B (nx, nu) at a time, linear between the knots or held."""
+        k, share = placed(self.t, self._within(t))
+        if self.dt or not share:
+            return self.A[k], self.B[k]
+        A, B = ((1.0 - share) * each[k] + share * each[k + 1] for each in (self.A, self.B))
+        return A, B
+
+    def check(self) -> Check:
+        """Check every knot as `fflin.check` does: the worst of each figure."""
+        from fflin.linear.check import check_all
+
+        return check_all(self.robot, self, f"{self.robot.name}, {len(self)} knots")
+
+    def discretize(self, dt: float) -> LinearTrajectory:
+        r"""Sample it along the motion, du held from sample to sample.
+
+        The transition of :math:`\dot\Phi = F(t)\,\Phi`, F = [[A, B], [0, 0]] (10.3), by two
+        exponentials a step with F on the motion itself: of order four, exact where F does not
+        change, in steps so short that their halves agree to 1e-8.
+
+        Parameters
+        ----------
+        dt : float
+            Sampling time [s], of which the duration is a multiple.
+
+        Raises
+        ------
+        InputError
+            If dt is no such time, or it is sampled already.
+        """
+        if self.dt:
+            raise InputError(f"the model is sampled already, at dt = {self.dt:g} s")
+        found = np.array([transition for _, transition in transitions(self, dt)])
+        nx, models = len(self.state_names), along(self.resampled(dt))
+        return replace(models, A=found[:, :nx, :nx], B=found[:, :nx, nx:], dt=float(dt))
+
+    @classmethod
+    def load(cls, path: str | Path, robot: Robot) -> LinearTrajectory:  # type: ignore[override]
+        """Read what `save` wrote of this robot; every figure is the same to the last bit."""
+        return cls._read(path, robot=robot)
+
+
+def linearize_trajectory(
+    robot: Robot,
+    t: ArrayLike | Trajectory,
+    q: ArrayLike | None = None,
+    v: ArrayLike | None = None,
+    u: ArrayLike | None = None,
+    *,
+    strict: bool = False,
+    **options: Any,
+) -> LinearTrajectory:
+    """Linearise along a motion of the robot.
+
+    Parameters
+    ----------
+    robot : Robot
+    t : Trajectory or array_like (N,)
+        The motion; or the times of its knots [s] with q, v and u as `Trajectory` takes them.
+    q, v, u : array_like, optional
+    strict : bool
+        Whether knots that are no motion of the robot to 1e-2 are refused.
+    **options
+        hold and frame, see `Trajectory`.
+
+    Returns
+    -------
+    LinearTrajectory
+
+    Raises
+    ------
+    InputError
+        If the arrays are no `Trajectory`, or no motion and `strict`.
+
+    Warns
+    -----
+    FflinWarning
+        Of knots that are no motion of the robot: when, by how much, and what would mend it.
+    """
+    if isinstance(t, Trajectory):
+        if options or not q is v is u is None:
+            raise InputError("the trajectory has q, v, u, hold and frame; leave them out")
+        motion = t if t.robot is robot else replace(t, robot=robot)
+    else:
+        arrays: Any = (t, q, v, u)
+        motion = Trajectory(robot, *arrays, **options)
+    motion.require(strict=strict)
+    return along(motion)
+
+
+def along(motion: Trajectory) -> LinearTrajectory:
+    """Return the linear models along a motion."""
+    linearizer = Linearizer(motion.robot, moving=True)
+    models = [linearizer(*each) for each in zip(motion.q, motion.v, motion.u_base, strict=True)]
+    values = motion._given | {name: np.array([getattr(x, name) for x in models]) for name in "ABCD"}
+    names = ("state_names", "input_names", "output_names")
+    values |= {name: getattr(models[0], name) for name in names}
+    return LinearTrajectory(**values, y=np.array([lin.y0 for lin in models]))

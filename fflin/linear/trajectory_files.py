@@ -1,0 +1,119 @@
+"""Trajectories that other programs wrote: npz, mat and json by entries, csv by named columns."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base import record
+from fflin.base.errors import FflinError, FileError, InputError, unknown
+from fflin.base.record import Record, read_record, reading, text
+from fflin.base.validation import Array, as_double
+from fflin.base.writing import check_ending, read_input, write_whole
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.robot.robot import Robot
+
+FORMATS = (*record.FORMATS, ".csv")
+
+
+def write_csv(path: Path, traj: Any) -> None:
+    """Write named columns, as `Trajectory.load` reads them."""
+    columns = [f"{name}[{i}]" for name in "qv" for i in range(getattr(traj, name).shape[1])]
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(["t", *columns, *Actuation(StateMap(traj.robot)).names, "hold", "frame"])
+    for row in np.column_stack((traj.t, traj.q, traj.v, traj.u)).tolist():
+        writer.writerow([*row, traj.hold, traj.frame])
+    write_whole({path: table.getvalue().encode()})
+
+
+def read(source: Path, robot: Robot, hold: str | None, frame: str | None) -> dict[str, Any]:
+    """Return what `Trajectory` takes of a file, see `Trajectory.load`."""
+    check_ending(source, FORMATS)
+    state = StateMap(robot)
+    with reading(source, "trajectory"):
+        table = source.suffix == ".csv"
+        entries, verified = (_columns(source), False) if table else read_record(source)
+        if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
+            entries = struct  # of MATLAB
+    try:
+        entries = _entries(entries, state) if table else entries
+        hold = hold or (text(entries["hold"]) if "hold" in entries else None)
+        frame = frame or (text(entries["frame"]) if "frame" in entries else "local")
+        return arguments(entries, robot, hold, frame, verified)
+    except FflinError as error:
+        raise type(error)(f"{source}: {error}") from None
+
+
+def arguments(
+    entries: Record, robot: Robot, hold: str | None, frame: Any, verified: bool
+) -> dict[str, Any]:
+    """Return what `Trajectory` takes of named entries, t, u and q, v or x."""
+    states = "q" in entries and "v" in entries
+    if not {"t", "u"} <= {*entries} or not (states or "x" in entries):
+        found = ", ".join(sorted(entries))
+        raise FileError(f"it has the entries {found}; expected t, u, and either q and v or x")
+    reference = pin.XYZQUATToSE3(np.ravel(entries.get("placement", [0, 0, 0, 0, 0, 0, 1.0])))
+    state = StateMap(robot, reference=reference, frame=frame)
+    u = as_double("u", entries["u"])
+    u = u[:, None] if u.ndim == 1 else u.copy()
+    for vector in Actuation(state).held:
+        # In the axes of the world, which those of the reference may not be.
+        u[:, vector.columns] = u[:, vector.columns] @ reference.rotation.T
+    found_as: dict[str, Any] = {"t": as_double("t", entries["t"]).ravel(), "u": u}
+    found_as |= {"hold": hold, "frame": frame, "verified": verified}
+    if states:
+        return found_as | {name: entries[name] for name in "qv"}
+    x = as_double("x", entries["x"])
+    if x.ndim != 2 or x.shape[1] != state.nx:
+        raise InputError(f"x has shape {x.shape}, expected (N, {state.nx}), the states")
+    q, v = map(np.array, zip(*map(state.to_pinocchio, x), strict=True))
+    return found_as | {"q": q, "v": v}
+
+
+def _columns(path: Path) -> Record:
+    """Return the columns of a csv by their names, as texts."""
+    lines = csv.reader(io.StringIO(read_input(path, ".csv").decode("utf-8-sig"), newline=""))
+    header, *rows = [[cell.strip() for cell in line] for line in lines if any(line)]
+    if len({*header}) < len(header):
+        raise ValueError("two of its columns have one name")
+    return dict(zip(header, zip(*rows, strict=True), strict=True))
+
+
+def _entries(columns: Record, state: StateMap) -> Record:
+    """Return the entries that the named columns of a csv are."""
+    rows = {name: [f"{name}[{i}]" for i in range(len(columns))] for name in "qv"}
+    rows = {name: [each for each in names if each in columns] for name, names in rows.items()}
+    rows = rows if any(rows.values()) else {"x": list(state.names)}
+    rows["t"], inputs = ["t"], Actuation(state).names
+    acting = {name: each for name in inputs for each in (f"u.{name}", name) if each in columns}
+    known = [each for names in (*rows.values(), acting.values()) for each in names]
+    wrong = next((name for name in columns if name not in {*known, "hold", "frame"}), None)
+    if wrong is not None:
+        raise unknown("state or input", wrong, dict.fromkeys((*known, *inputs)))
+    missing = next((name for name in known if name not in columns), None)
+    if missing is not None:
+        raise unknown("column", missing, columns)
+    entries: Record = {key: columns[key][0] for key in ("hold", "frame") if key in columns}
+    count = len(columns["t"])
+    # Of held inputs the last row may be empty.
+    short = bool(acting) and not any(columns[name][-1] for name in acting.values())
+    for key, names in rows.items():
+        entries[key] = np.column_stack([_numbers(name, columns[name]) for name in names])
+    u = np.zeros((count - short, len(inputs)))
+    for name, column in acting.items():
+        u[:, inputs.index(name)] = _numbers(column, columns[column][: len(u)])
+    return entries | {"u": u}
+
+
+def _numbers(name: str, cells: tuple[str, ...]) -> Array:
+    try:
+        return np.array(cells, dtype=float)
+    except ValueError:
+        raise InputError(f"column {name} has a cell that is no number") from None
