@@ -3,12 +3,17 @@
 import contextlib
 import getpass
 import os
+import signal
 import tempfile
 from pathlib import Path
 
 # Matrices are small and the tests run side by side: threads would only wait for one another.
 # Before NumPy is loaded, and for the processes that tests start.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# What a shell runs in the background ignores Ctrl-C, and so would all that tests start and stop.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # What these packages keep stays in the checkout, and out of the home directory.
 os.environ.setdefault("MPLCONFIGDIR", str(Path(__file__).parents[1] / ".pytest_cache/matplotlib"))
