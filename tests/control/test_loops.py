@@ -94,10 +94,8 @@ def test_what_is_not_regulated_has_no_part_in_the_loops():
     grid, values, loops = input_loops(gain)
     A, B, K = lin.A[np.ix_(fed, fed)], lin.B[fed], gain.K[:, fed]
     for k in (0, 100, len(grid) - 1):
-        back = np.linalg.inv(1j * grid[k] * np.eye(len(fed)) - A)
         for i in (0, 13):
             others = [j for j in range(len(K)) if j != i]
             closed = np.linalg.inv(1j * grid[k] * np.eye(len(fed)) - A + B[:, others] @ K[others])
             assert values[k, i] == pytest.approx((K[i] @ closed @ B[:, i]), rel=1e-6)
-        assert np.isfinite(back).all()
-    assert all(np.isfinite(loop.phase) for loop in loops)
+    assert all(loop.phase > 59.9 for loop in loops)
