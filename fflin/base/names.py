@@ -97,7 +97,8 @@ def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[in
     A pattern goes before a group, and a name before both, whichever stands first.
     """
     found: dict[int, T] = {}
-    for key in sorted(values, key=lambda key: _rank(key, names)):
+    groups = {*map(group_of, names)}
+    for key in sorted(values, key=lambda key: 1 if _is_pattern(key) else 2 * (key not in groups)):
         found |= dict.fromkeys(matching(kind, key, names), values[key])
     return found
 
@@ -125,11 +126,6 @@ def joints_by_name(
 
 def _is_pattern(key: Any) -> bool:
     return "*" in str(key) or "?" in str(key)
-
-
-def _rank(key: str, names: Sequence[str]) -> int:
-    """Return 0 for groups, 1 for patterns, 2 for names: what comes later goes before."""
-    return 2 if key in names else int(_is_pattern(key))
 
 
 def _pattern(key: str) -> re.Pattern[str]:

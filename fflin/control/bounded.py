@@ -25,6 +25,7 @@ def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
     rows = np.vstack((A / unit, _LEAST * np.eye(len(least))))
     wanted = np.concatenate((b / size, np.zeros(len(least))))
     low, high = least * (unit / size), most * (unit / size)
+    high = np.maximum(high, low + 1e-15)  # the solver takes no bounds that are equal
     pushing = least == 0.0
     free, given = rows[:, ~pushing], np.zeros(len(least))
     # Most often no other bound is met: thrusts without a largest one, the others without any.

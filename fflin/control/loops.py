@@ -43,7 +43,8 @@ def input_loops(gain: Gain) -> tuple[Array, Any, list[Loop]]:
     With :math:`T = K (s E - A + B K)^{-1} B` the loop of input i is
     :math:`L_i = T_{ii}/(1 - T_{ii})`, of a sampled model at :math:`s = e^{j \omega h}`.
     """
-    F, B, K, dt = gain.closed_loop, gain.B, gain.K, gain.dt
+    fed = [gain.state_names.index(name) for name in gain.regulated or gain.state_names]
+    F, B, K, dt = gain.closed_loop[np.ix_(fed, fed)], gain.B[fed], gain.K[:, fed], gain.dt
 
     def response(w: float) -> Any:
         s = np.exp(1j * w * dt) if dt else 1j * w

@@ -38,7 +38,8 @@ class Wheels(NamedTuple):
     def cut(self, u: Array, *point: object) -> Array:
         """Return u (nu,) without what would take a wheel beyond its speed within a step."""
         room = np.clip(self.stiffness * (self.limits - self.speeds(*point)), *self.torques)
-        given = np.clip(u[self.at], *room)
+        # It cuts, and drives nothing of itself.
+        given = np.clip(u[self.at], np.minimum(room[0], 0.0), np.maximum(room[1], 0.0))
         if (given != u[self.at]).any():
             u = u.copy()
             u[self.at] = given
@@ -83,6 +84,8 @@ def saturation(
             1.0 / (mobility * dt),
             lambda t, q, v: v[of_v],
         )
+    for place, _, item in pulsed:
+        high[place] = min(high[place], math.inf if item.max is None else item.max)
     pulses = partial(Pulses, pulsed, high, sample, dt) if pulsed else None
     return Saturation(low, high, wheels, pulses)
 

@@ -25,20 +25,27 @@ _placement = pin.XYZQUATToSE3
 _TURN = 2.0 * np.pi
 
 
-def state_history(state: StateMap, q: Array, v: Array, near: Array | None = None) -> Array:
+def state_history(
+    state: StateMap, q: Array, v: Array, near: Array | None = None, t: Array | None = None
+) -> Array:
     """Return the states (N, nx) of a motion, rows of valid q (N, nq) and v (N, nv).
 
-    Continuous joints go on counting turns, from the turn nearest to `near` (nx,). A turn of pi,
-    where the chart ends, gives one of its two values.
+    Continuous joints go on counting turns, from the turn nearest to `near` (nx,); with the times t
+    (N,) as many as their rates make between rows, else less than half of one. A turn of pi, where
+    the chart ends, gives one of its two values.
     """
     quaternion = q[:, 3:7] @ product_matrix(state.origin_quaternion).T
     quaternion *= np.where(quaternion[:, 3:] < 0.0, -1.0, 1.0)
     chart = Chart(quaternion[:, :3], quaternion[:, 3:], rotation_matrices(quaternion))
     q_m = state.joint_positions(q)
     before = np.zeros(len(q_m[0])) if near is None else near[state.groups.q_m]
+    rates = state.velocities(v)
     for k in state.unbounded:
         q_m[:, k] = np.unwrap([before[k], *q_m[:, k]])[1:]
-    return state.compose(chart, state.positions(q), q_m, state.velocities(v))
+        if t is not None:
+            turned = 0.5 * np.diff(t) * (rates[1:, 6 + k] + rates[:-1, 6 + k])
+            q_m[1:, k] += _TURN * np.round((turned - np.diff(q_m[:, k])) / _TURN).cumsum()
+    return state.compose(chart, state.positions(q), q_m, rates)
 
 
 def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:

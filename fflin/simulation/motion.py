@@ -200,9 +200,9 @@ class Motion(Design):
 
     @property
     def saturated(self) -> tuple[Saturated, ...]:
-        """Inputs that were at their limit, with the share of the run, the longest first."""
-        of_inputs = (each for each in self._limited() if each[0] in self.input_names)
-        return saturated(self.t, of_inputs)
+        """Inputs at their limit and wheels at their speed, the longest share of the run first."""
+        names = {*self.input_names, *(f"qdot_m.{name}" for name in self.wheels)}
+        return saturated(self.t, (each for each in self._limited() if each[0] in names))
 
     def _limited(self) -> Iterator[Limited]:
         names = (*self.state_names, *self.input_names)

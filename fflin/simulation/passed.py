@@ -26,16 +26,16 @@ class Passed(NamedTuple):
     time: float
     limit: float
     unit: str
+    at_first: bool  # whether it was beyond from the start
 
     def __str__(self) -> str:
-        group, _, entry = self.name.partition(".")
-        name = entry if group in ("q_m", "qdot_m") else self.name
         value = f"{_shown(self.value)} {self.unit}".removesuffix(" 1")
-        return f"{name} {value} at {_shown(self.time)} s, limit {_shown(self.limit)}"
+        said = f"{_name(self.name)} {value} at {_shown(self.time)} s, limit {_shown(self.limit)}"
+        return f"{said}, from the start" if self.at_first else said
 
 
 class Saturated(NamedTuple):
-    """An input that was at its limit [unit] for a share of the run."""
+    """An input, or a wheel's speed, that was at its limit [unit] for a share of the run."""
 
     name: str
     limit: float
@@ -43,9 +43,9 @@ class Saturated(NamedTuple):
     share: float
 
     def __str__(self) -> str:
-        size, share = f"{_shown(abs(self.limit))} {self.unit}", 100.0 * self.share
+        size, share = f"{_shown(self.limit)} {self.unit}", 100.0 * self.share
         percent = f"{share:.2g}" if share < 10.0 else f"{share:.0f}"
-        return f"{self.name} at its limit of {size} for {percent} % of the run"
+        return f"{_name(self.name)} at its limit of {size} for {percent} % of the run"
 
 
 def passed(t: Array, histories: Iterable[Limited]) -> tuple[Passed, ...]:
@@ -57,7 +57,8 @@ def passed(t: Array, histories: Iterable[Limited]) -> tuple[Passed, ...]:
         at = int(excess.argmax())
         if excess[at] > max(_SHARE * size, 1e-12):
             limit = float(limits[int(values[at] > limits[1])])
-            one = Passed(name, float(values[at]), float(t[at]), limit, unit)
+            first = name.startswith("q_m.") and bool(excess[0] > max(_SHARE * size, 1e-12))
+            one = Passed(name, float(values[at]), float(t[at]), limit, unit, first)
             found.append((-excess[at] / (size or 1e-12), one))
     return tuple(one for _, one in sorted(found))
 
@@ -69,7 +70,10 @@ def saturated(t: Array, histories: Iterable[Limited]) -> tuple[Saturated, ...]:
         Saturated(name, limit, unit, float(held[near].sum() / held.sum()))
         for name, values, unit, limits in histories
         for limit in limits[np.isfinite(limits) & (limits != 0.0)].tolist()
-        if held[near := np.abs(values - limit) <= 1e-9 * abs(limit)].any()
+        # The speed of a wheel creeps up to its limit, an input is cut to it.
+        if held[
+            near := np.abs(values - limit) <= (1e-3 if "qdot_m." in name else 1e-9) * abs(limit)
+        ].any()
     ]
     return tuple(sorted(found, key=lambda each: -each.share))
 
@@ -80,6 +84,11 @@ def lines(motion: Any) -> list[str]:
     said = [*beyond, *map(str, motion.saturated)]
     more = [f"and {len(said) - _MOST} more"] if len(said) > _MOST else []
     return said[:_MOST] + more
+
+
+def _name(name: str) -> str:
+    group, _, entry = name.partition(".")
+    return entry if group in ("q_m", "qdot_m") else name
 
 
 def _shown(value: float) -> str:

@@ -209,7 +209,7 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
     state, robot = plant.state, plant.robot
     conserved = Conserved(robot, plan.q)
     run = go(plan, plant, conserved)
-    x = state_history(state, run.q, run.v, plan.near)
+    x = state_history(state, run.q, run.v, plan.near, run.t)
     history = conserved.histories(run.q, run.v)
     return Motion(
         t=run.t,

@@ -43,6 +43,9 @@ def test_a_name_goes_before_a_pattern_and_that_before_a_group():
     values = {"q_m.hinge_1": 3, "q_m.hinge_*": 2, "q_m": 1}
     for order in (values, dict(reversed(values.items()))):
         assert by_name("state", order, NAMES) == {1: 3, 2: 2, 3: 1}
+    # So does an entry that stands for itself.
+    for values in ({"arm[1]": 3, "q_m": 1}, {"q_m": 1, "arm[1]": 3}, {"arm*": 2, "arm[1]": 3}):
+        assert by_name("state", values, NAMES)[3] == 3
     assert chosen("state", ["qdot_m", "q_m.hinge_*", "q_m.hinge_1"], NAMES) == [1, 2, 4]
 
 

@@ -83,3 +83,19 @@ def test_a_loop_is_unstable_just_beyond_its_margins_and_no_sooner(lin):
             )
             assert growth(gain, i, inside) < 0.0 < growth(gain, i, outside)
     assert held
+
+
+def test_what_is_not_regulated_has_no_part_in_the_loops():
+    robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
+    lin = fflin.linearize(robot)
+    gain = fflin.lqr(lin)
+    assert len(gain.regulated) < len(gain.state_names)
+    fed = [lin.state_names.index(name) for name in gain.regulated]
+    grid, values, loops = input_loops(gain)
+    A, B, K = lin.A[np.ix_(fed, fed)], lin.B[fed], gain.K[:, fed]
+    for k in (0, 100, len(grid) - 1):
+        for i in (0, 13):
+            others = [j for j in range(len(K)) if j != i]
+            closed = np.linalg.inv(1j * grid[k] * np.eye(len(fed)) - A + B[:, others] @ K[others])
+            assert values[k, i] == pytest.approx((K[i] @ closed @ B[:, i]), rel=1e-6)
+    assert all(loop.phase > 59.9 for loop in loops)

@@ -241,3 +241,10 @@ def test_the_range_of_a_travel_may_be_open_or_one_sided(tmp_path):
     assert limits_of(robot)["q_m.elbow"] == (-1.0, INF)
     assert "q_m.elbow" not in magnitudes_of(robot)
     assert np.isfinite(list(fflin.linearize(robot).limits.values())).all()
+
+
+def test_one_side_of_a_motor_leaves_the_other_to_the_urdf():
+    robot = fflin.load("servicer_7dof")
+    effort = limits_of(robot)["tau_m.joint_1"][1]
+    own = robot.replace(inputs=[fflin.JointTorque("joint_1", min=-1.0), fflin.BaseTorque()])
+    assert limits_of(own)["tau_m.joint_1"] == (-1.0, effort)

@@ -77,9 +77,10 @@ def test_a_wheel_saturates_and_no_momentum_is_lost(sign, sample, method):
     # All that the body has is the wheel's: H = 0.
     body = motion.x[-1, motion.state_names.index("omega_b.z")]
     assert (40.0 - INERTIA) * body == pytest.approx(-INERTIA * (sign * SPEED + body), rel=1e-9)
-    (told,) = motion.saturated
-    assert (told.name, told.limit) == ("spin", 0.5 * sign)
-    assert told.share == pytest.approx(full.mean(), abs=1e-3)
+    told = {each.name: each for each in motion.saturated}
+    assert told["spin"].limit == 0.5 * sign and told["qdot_m.spin"].limit == SPEED * sign
+    assert told["spin"].share == pytest.approx(full.mean(), abs=1e-3)
+    assert told["qdot_m.spin"].share == pytest.approx(1.0 - full.mean(), abs=2e-3)
     assert not motion.passed
 
 
@@ -133,18 +134,18 @@ def test_the_linear_model_foresees_the_wheel_that_saturates():
         np.testing.assert_allclose(motion.linear[:, -1], motion.x[:, -1], atol=1e-3)
 
 
-def test_a_wheel_that_begins_too_fast_is_braked_within_its_torque():
+@pytest.mark.parametrize("asked", [0.0, 0.5, -0.2])
+def test_a_wheel_that_begins_too_fast_takes_no_torque_but_what_brakes_it(asked):
     robot = spinner()
     motion = fflin.simulate(
         robot,
-        lambda t, q, v: [0.0],
+        lambda t, q, v: [asked],
         v0=fflin.velocity(robot, {"spin": 301.0}),
         duration=0.5,
         limits="urdf",
     )
-    assert motion.u[0, 0] == -0.5
-    assert motion.x[-1, -1] == pytest.approx(SPEED, rel=1e-9)
-    (told,) = motion.passed
+    np.testing.assert_array_equal(motion.u[:, 0], min(asked, 0.0))
+    told = motion.passed[0]
     assert (told.name, told.value, told.time, told.limit) == ("qdot_m.spin", 301.0, 0.0, SPEED)
 
 
