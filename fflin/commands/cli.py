@@ -62,11 +62,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     # What other packages warn of is shown at the end of what went well: an error says why.
     held: list[str] = []
+    told: set[str] = set()  # each once, however many models a command makes
 
     def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
         text = " ".join(str(message).split())
         if issubclass(category, FflinWarning):
-            _tell(f"fflin: warning: {text}")
+            if text not in told:
+                _tell(f"fflin: warning: {text}")
+            told.add(text)
         else:
             held.append(f"fflin: {category.__name__}: {text}")
 

@@ -96,10 +96,11 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
         name: number(f"velocity '{name}'", value)
         for name, value in by_name("values", values, "velocity").items()
     }
+    state = StateMap(robot)
     for name, _ in named_wheels(robot.inputs):
         if name in checked and name not in robot.joint_names:
             robot.joint(name)  # says why it has no speed
-    state, rates = StateMap(robot), rates_by_name(robot.joint_names, checked)
+    rates = rates_by_name(robot.joint_names, checked)
     return state.spread(np.array([rates.get(name, 0.0) for name in state.names[6 + robot.n :]]))
 
 

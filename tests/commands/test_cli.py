@@ -407,7 +407,7 @@ def test_info_shows_the_inputs_of_a_file_with_the_limits_of_the_urdf():
     effort = dict(zip(model.names.tolist()[2:], model.effortLimit[6:].tolist(), strict=True))
     for name in ("joint_1", "joint_7"):
         assert tuple(map(float, limits[f"tau_m.{name}"])) == (-effort[name], effort[name])
-    assert limits["F_b.x"] == (".", ".") and limits["back_left_top"] == ("0", ".")
+    assert limits["F_b.x"] == ("-40", "40") and limits["back_left_top"] == ("0", "22")
     assert len(limits) == 17
     assert "\ninput " not in run("info", "servicer_7dof")[1]
     assert "nosuch.toml" in refused("info", "cubesat", "--inputs", "./nosuch.toml")

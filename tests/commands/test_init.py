@@ -134,6 +134,7 @@ urdf = "servicer_7dof"
 passive = ["panel_*"]
 outputs = ["com"]
 stiffness = 100
+damping = 5
 [weights]
 rule = "identity"
 [weights.bryson]

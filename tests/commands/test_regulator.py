@@ -141,4 +141,4 @@ def test_the_speeds_of_wheels_are_chosen_and_weighed(capsys, tmp_path):
     slow = fflin.Gain.load(path)
     at = slow.state_names.index("qdot_m.wheel_z")
     assert np.abs(quick.K[:, at]).max() > 10.0 * np.abs(slow.K[:, at]).max()
-    assert quick.weights.startswith("qdot_m.wheel_z as given, the others from mass and size")
+    assert quick.weights.startswith("qdot_m.wheel_z as given, the others from the limits")

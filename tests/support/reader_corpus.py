@@ -146,7 +146,7 @@ refuse("com of two entries", arm(child=inertial(origin='<origin xyz="0 0"/>')), 
 refuse("rpy beyond anything", arm(inside=f'{AXIS}<origin rpy="1e40 0 0"/>'), "beyond anything")
 refuse("xyz of 1e29", arm(inside=f'{AXIS}<origin xyz="0 -1e29 0"/>'), ":4:", "'hinge'", "1e+07 m")
 refuse("xyz of 1e8", arm(inside=f'{AXIS}<origin xyz="1e8 0 0"/>'), ":4:", "'hinge'", "1e+08 m")
-accept("xyz of 1e7", arm(inside=f'{AXIS}<origin xyz="1e7 0 0"/>'))
+warn("xyz of 1e7", arm(inside=f'{AXIS}<origin xyz="1e7 0 0"/>'), "moves an inertia of 1.0e+00 only")
 refuse(
     "mimic offset of 1e29",
     arm(

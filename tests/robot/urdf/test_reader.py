@@ -234,17 +234,18 @@ def test_a_pruned_mimic_is_gone_and_a_pruned_leader_is_missed():
 def test_damping_and_friction_are_recorded_and_noted():
     found = read(arm(inside=AXIS + '<dynamics damping="0.25" friction="0.5"/>'))
     assert (found.damping, found.friction) == ({"hinge": 0.25}, {"hinge": 0.5})
-    assert ["damping" in note for note in found.notes] == [True, False]
-    assert all("'hinge'" in note for note in found.notes)
-    assert read(arm()).notes == ()
+    texts = [each.note for each in found.advice]
+    assert ["damping" in text for text in texts] == [True, False]
+    assert all("'hinge'" in text for text in texts)
+    assert read(arm()).notes == read(arm()).advice == ()
 
 
 def test_notes_name_six_joints_and_count_the_rest():
     links = [link(f"l{k}") for k in range(9)]
     damped = AXIS + '<dynamics damping="1"/>'
     joints = [joint(f"j{k}", "l0", f"l{k}", inside=damped) for k in range(1, 9)]
-    (note,) = read(robot(*links, *joints)).notes
-    assert "damping unused: 'j1', 'j2', 'j3', 'j4', 'j5', 'j6' and 2 more" in note
+    (advice,) = read(robot(*links, *joints)).advice
+    assert "damping unused: 'j1', 'j2', 'j3', 'j4', 'j5', 'j6' and 2 more" in advice.note
 
 
 def test_blanks_at_the_end_of_a_name_are_seen():
