@@ -123,9 +123,12 @@ def _of_regulated(
     body = regulated_part(without(lin, wheels))
     at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
     names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
-    room = [lin.limits[name] for name in names] - spin
-    momenta = dict(zip(names, lin.M.diagonal()[at] * room.clip(0.0), strict=True))
-    Q, R, rule, bandwidth = default_weights(body, hold, momenta)
+    most = np.array([lin.limits[name] for name in names])
+    # A wheel that is at its limit already is counted as one at rest, and told.
+    room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
+    Q, R, rule, bandwidth = default_weights(body, hold, dict(zip(names, room, strict=True)))
+    if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
+        rule += f"; the point alone asks {listed(beyond)} for more than the URDF allows"
     S = picked(body.state_names, lin.state_names)
     Q = S.T @ Q @ S
     if speeds := [name for name in part.state_names if name not in body.state_names]:
