@@ -13,6 +13,7 @@ from fflin.analysis.mechanics import conserved
 from fflin.analysis.names import grouped, with_rates
 from fflin.analysis.observability import observability
 from fflin.analysis.ranks import Margin, judged
+from fflin.analysis.wheels import damped_wheels
 from fflin.base.errors import (
     DetectabilityError,
     FflinError,
@@ -36,7 +37,7 @@ _UNSEEN = "which do not settle by themselves; add outputs"
 def require_stabilizable(lin: LinearModel) -> None:
     """Raise `StabilizabilityError` that names what no input can hold."""
     if len(lin.A) < 2 * len(lin.M):  # with speeds of wheels without their angles
-        missed = "the inputs cannot hold {}; add inputs"
+        missed = f"the inputs cannot hold {{}}{damped_wheels(lin) or '; add inputs'}"
         reached = lin.A, lin.B, "held by the inputs", missed, StabilizabilityError
         return _warn_of_doubts(_checked_reach(lin, *reached))
     found = controllability(lin)

@@ -10,9 +10,9 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fflin.analysis.mechanics import second_order
+from fflin.analysis.mechanics import second_order, slopes
 from fflin.analysis.ranks import Noisy, echelon, image, null_space
-from fflin.base.errors import InputError
+from fflin.base.errors import InputError, StabilizabilityError, listed
 from fflin.base.names import input_keys
 from fflin.base.validation import Array
 from fflin.linear.model import Certificate, LinearModel
@@ -92,7 +92,21 @@ def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> Linear
     part = without(lin, left)
     angles = {lin.state_names[i] for i in ignorable_wheels(lin)[0]}
     rest = [name for name in part.state_names if name not in angles]
+    if len(rest) == len(part.M):
+        raise StabilizabilityError(f"the model is of speeds of wheels alone{damped_wheels(part)}")
     return selected(lin, rest, part.M, partial(regulated_part, wheel_speeds=wheel_speeds))
+
+
+def damped_wheels(part: LinearModel) -> str:
+    """Return what to do where wheels have damping, of a model that may be without their angles."""
+    nv, rates = len(part.M), slopes(part)[-len(part.M) :, -len(part.M) :]
+    least = _ROUNDING * (np.abs(part.M) @ np.abs(rates)).diagonal()
+    dragged = -(part.M @ rates).diagonal() > least
+    names = [part.state_names[i - nv].removeprefix("qdot_m.") for i in np.flatnonzero(dragged)]
+    damped = [name for name in names if name in wheel_inputs(part)]
+    if not damped:
+        return ""
+    return f": {listed(damped)} have damping, with which speeds stay; leave damping off the wheels"
 
 
 def rigid_forces(body: LinearModel) -> Noisy:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.linalg import eigh
 
+from fflin.analysis.mechanics import second_order
 from fflin.analysis.ranks import Noisy, null_space
 from fflin.analysis.wheels import ignorable_wheels, picked, regulated_part, rigid_forces, without
 from fflin.base.errors import InputError, listed, unknown
@@ -33,6 +34,10 @@ TURN, WAY, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 # So many times the loops of springs and gravity are slowed.
 _TRIALS = 8
 
+# So many times the bandwidth is sought at which damping counts.
+_PASSES = 4
+
+_NOT_ENOUGH = ", which is not enough for all displacements"
 
 # The speeds of wheels come back at this share of the bandwidth.
 _SPEEDS = 0.1
@@ -121,9 +126,12 @@ def _of_regulated(
     body = regulated_part(without(lin, wheels))
     at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
     names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
-    room = [lin.limits[name] for name in names] - spin
-    momenta = dict(zip(names, lin.M.diagonal()[at] * room.clip(0.0), strict=True))
-    Q, R, rule, bandwidth = default_weights(body, hold, momenta)
+    most = np.array([lin.limits[name] for name in names])
+    # A wheel that is at its limit already is counted as one at rest, and told.
+    room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
+    Q, R, rule, bandwidth = default_weights(body, hold, dict(zip(names, room, strict=True)))
+    if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
+        rule += f"; the point alone asks {listed(beyond)} for more than the URDF allows"
     S = picked(body.state_names, lin.state_names)
     Q = S.T @ Q @ S
     if speeds := [name for name in part.state_names if name not in body.state_names]:
@@ -162,7 +170,9 @@ def default_weights(
     Where nothing limits them, the poles do not depend on the units of mass and length.
 
     Springs, gravity and motion are in the model, not in the weights; where there are any, the loop
-    is solved and slowed until its inputs hold the limits, or found to need more.
+    is solved and slowed until its inputs hold the limits, or found to need more. Viscous damping
+    B, the semidefinite part of :math:`-M A_{22}`, is what light joints must be moved against: M is
+    :math:`M + B / w` in the weights.
 
     Parameters
     ----------
@@ -192,10 +202,33 @@ def default_weights(
             f"the model of '{lin.robot}' has not the coordinates and their rates as states, which "
             "the default weights are made for; give Q and R"
         )
-    size = _displacements(lin)
-    inverse = np.linalg.inv(N)
+    damping, w = _damping(lin), BANDWIDTH
+    for _ in range(_PASSES if damping.any() else 1):
+        found = _of_inertia(lin, lin.M + damping / w, np.linalg.inv(N), hold, momenta or {})
+        w, before = found.bandwidth, w
+        if _NOT_ENOUGH in found.rule or w > 0.97 * before:
+            break
+    return found
+
+
+def _damping(lin: LinearModel) -> Array:
+    """Return B (m, m) of viscous dampers, 0 where there are none."""
+    D = second_order(lin).D.values
+    rates, modes = eigh(0.5 * (D + D.T), lin.M)
+    # What motion brings to one, it takes from another.
+    damped: Any = rates.sum() > 1e-9 * np.abs(rates).sum()
+    forces = lin.M @ modes
+    return (forces * rates.clip(0.0)) @ forces.T * damped
+
+
+def _of_inertia(
+    lin: LinearModel, M: Array, inverse: Array, hold: float, momenta: Mapping[str, float]
+) -> Weights:
+    """Return the weights of an inertia M (m, m) that damping adds to; N^-1 is `inverse`."""
+    h, m, size = lin.dt or 1.0, len(M), _displacements(lin)
+    A = lin.A - np.eye(len(lin.A)) if lin.dt else lin.A
     theta = np.abs(inverse) @ size
-    D = np.abs(lin.M) @ theta / theta
+    D = np.abs(M) @ theta / theta
     S = lin.M @ lin.B[m:] / h
     cost = (S**2 / D[:, None]).sum(axis=0)
     if not cost.all():
@@ -204,8 +237,8 @@ def default_weights(
             "Q and R"
         )
     reach = _reach(S, cost, D)
-    ratios, T = eigh(reach, lin.M)
-    back = T.T @ lin.M  # T^-1
+    ratios, T = eigh(reach, M)
+    back = T.T @ M  # T^-1
     # The slowest is to have the bandwidth w.
     cost, reach, ratios = cost * ratios[0], reach / ratios[0], ratios / ratios[0]
     to_modes = back @ inverse
@@ -216,15 +249,16 @@ def default_weights(
     stiffness = back.T @ (ratios[:, None] ** 0.75 * to_modes)
     gain = (S / cost).T @ np.linalg.solve(reach, stiffness)
     rates = ratios**0.375
+    mass = np.ones(m) if (lin.M == M).all() else np.diag(T.T @ lin.M @ T)
     # The speeds of the coordinates, and the momenta of wheels, as the inputs add them up.
     room = {name: lin.limits.get(name, math.inf) for name in lin.state_names[m:]}
-    room |= momenta or {}
+    room |= momenta
     added = (S / cost).T @ np.linalg.solve(reach, lin.M @ T)
-    motors = [lin.input_names.index(name.removeprefix("qdot_m.")) for name in momenta or ()]
+    motors = [lin.input_names.index(name.removeprefix("qdot_m.")) for name in momenta]
     taken = np.vstack((T, added[motors]))
     limits = [
         _Limit(BANDWIDTH, ""),
-        *_of_speeds(room, _fastest(taken, rates, to_modes, size, lin)),
+        *_of_speeds(room, _fastest(taken, rates, to_modes, size, lin, mass)),
         *_of_efforts(lin, _largest(gain, size, lin.state_names)),
     ]
     if hold or lin.dt:
@@ -234,7 +268,8 @@ def default_weights(
     if A[m:].any() or A[:m, :m].any():
         limit = _slowed(lin, Q, cost, size, limit)
     R = np.diag(h * cost / limit.bandwidth**4)
-    return Weights(h * Q, R, _rule(lin, size, limit), limit.bandwidth)
+    rule = _rule(lin, size, limit) + ("; damping is counted in" if (lin.M != M).any() else "")
+    return Weights(h * Q, R, rule, limit.bandwidth)
 
 
 def _displacements(lin: LinearModel) -> Array:
@@ -285,13 +320,23 @@ def _reach(S: Array, cost: Array, D: Array) -> Array:
     return reach
 
 
-def _fastest(T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel) -> Array:
-    """Return the largest of speeds (k,), T over the modes', on the way back at w = 1."""
+def _fastest(
+    T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel, mass: Array
+) -> Array:
+    """Return the largest of speeds (k,), T over the modes', on the way back at w = 1.
+
+    Modes are of mass (m,), 1 where nothing damps them: what is left is their damping.
+    """
+    most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
+    root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
     speeds = np.zeros(len(T))
     if any(name.startswith("qdot_m.") for name in lin.limits):
-        for time in np.geomspace(0.1 / rates[-1], 3.0, 60):
+        for time in np.geomspace(0.1 / rates[-1] ** (1 if (mass == 1.0).all() else 2), 3.0, 60):
             x = rates * time / math.sqrt(2.0)
             moving = math.sqrt(2.0) * rates * np.exp(-x) * np.sin(x)
+            if (mass < 1.0).any():
+                fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
+                moving = (rates**2 * (slow - fast) / root).real
             now = _largest(T @ (moving[:, None] * to_modes), size, lin.state_names)
             speeds = np.maximum(speeds, now)
     return speeds
@@ -336,7 +381,7 @@ def _slowed(lin: LinearModel, Q: Array, cost: Array, size: Array, limit: _Limit)
         high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
         where = "at the displacements of the default weights"
         warn_beyond(lin, where, asked, -high, high)
-    return limit._replace(what=f"{limit.what}, which is not enough for all displacements")
+    return limit._replace(what=f"{limit.what}{_NOT_ENOUGH}")
 
 
 def _rule(lin: LinearModel, size: Array, limit: _Limit) -> str:

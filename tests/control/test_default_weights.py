@@ -337,3 +337,39 @@ def test_bundled_inputs_fly_within_what_they_say_they_give(name, fields):
     motion = fflin.simulate(robot, policy, q0=q0, duration=60.0, limits="urdf", every=10)
     assert not motion.stopped and not motion.passed and not motion.saturated
     assert motion.attitude_error[-1] < 0.1 * ANGLE
+
+
+@pytest.mark.parametrize("damping", [0.2, 5.0, 20.0])
+def test_damped_joints_come_back_as_soon_as_it_is_said(damping):
+    """Light joints are moved against their dampers, not against their inertia."""
+    panels = dict.fromkeys(("panel_left", "panel_right"), 100.0)
+    bare = fflin.load("servicer_7dof", stiffness=panels)
+    robot = bare.replace(damping=dict.fromkeys(bare.joint_names, damping))
+    lin = fflin.linearize(robot)
+    gain = fflin.lqr(lin)
+    bandwidth = float(re.search(r"come back at ([\d.]+) rad/s", gain.weights)[1])
+    vibrations = np.abs(gain.poles.imag) > 5.0 * np.abs(gain.poles.real)
+    assert gain.weights.endswith("; damping is counted in")
+    assert vibrations.sum() == 4
+    assert -gain.poles.real[~vibrations].max() > 0.6 * bandwidth > 0.03
+    assert gain.margins.disk > 0.6
+    arm = [f"joint_{k}" for k in range(1, 8)]
+    rng = np.random.default_rng(7)
+    for _ in range(2):
+        turn = pin.exp3(np.radians(ANGLE) * (axis := rng.normal(size=3)) / np.linalg.norm(axis))
+        places = dict(zip(arm, 0.3 * rng.choice((-1.0, 1.0), size=7), strict=True))
+        q0 = fflin.configuration(robot, places, pin.SE3(turn, np.zeros(3)))
+        policy = fflin.StateFeedback(lin, gain.K)
+        duration, dt = 10.0 / bandwidth, min(0.01, 2.5 / np.abs(gain.poles).max())
+        motion = fflin.simulate(
+            robot, policy, q0=q0, duration=duration, dt=dt, every=5, linear=False
+        )
+        assert not motion.stopped
+        signals = {
+            **dict(zip(motion.input_names, motion.u.T, strict=True)),
+            **dict(zip(motion.state_names, motion.x.T, strict=True)),
+        }
+        for name in arm:
+            assert abs(signals[f"q_m.{name}"][-1]) < 0.02 * 0.3, name
+            for signal in (f"qdot_m.{name}", f"tau_m.{name}"):
+                assert np.abs(signals[signal]).max() <= 1.01 * lin.limits[signal], signal

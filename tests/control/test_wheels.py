@@ -1,5 +1,6 @@
 """Reaction wheels hold an attitude: beside the textbook's feedback, with joints, held speeds."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -207,6 +208,36 @@ def test_the_speed_of_a_wheel_limits_the_loop(spin):
     assert 0.85 * 6.0 < largest < 1.03 * 6.0
 
 
+@pytest.mark.parametrize("axis", ORTHOGONAL)
+def test_a_large_wheel_turns_against_the_rest_of_the_robot(axis):
+    """Its speed per momentum is that of both, the carrier free: a fifth more than of it alone."""
+    added = [ReactionWheel(each, inertia=3e-3, max_speed=0.05) for each in ORTHOGONAL]
+    robot = fflin.load("cubesat").replace(inputs=added)
+    lin = fflin.linearize(robot)
+    gain = fflin.lqr(lin)
+    assert re.search("set by the speed of wheel_[12]$", gain.weights)
+    turn = pin.SE3(pin.exp3(np.radians(30.0) * unit(axis)), np.zeros(3))
+    motion = fflin.simulate(
+        robot,
+        fflin.StateFeedback(lin, gain.K),
+        q0=fflin.configuration(robot, base=turn),
+        duration=2.0 / gain.margin,
+        linear=False,
+    )
+    assert 0.4 * 0.05 < np.abs(motion.v[:, 6:]).max() <= 1.01 * 0.05
+
+
+@pytest.mark.parametrize("spin", [-1.0, 3.0])
+def test_a_wheel_that_is_at_its_limit_is_told_and_quickens_nothing(spin):
+    added = [ReactionWheel(each, inertia=J, max_speed=1.0) for each in ORTHOGONAL]
+    robot = body().replace(inputs=added)
+    still = fflin.lqr(fflin.linearize(robot)).weights
+    said = fflin.lqr(fflin.linearize(robot, v=fflin.velocity(robot, {"wheel_2": spin}))).weights
+    assert "set by the speed of wheel_2" in still
+    words = "; the point alone asks qdot_m.wheel_2 for more than the URDF allows"
+    assert said == still + words
+
+
 def test_spinning_wheels_are_held_about_their_speed():
     """A bias: the momentum stays where it is, the attitude returns, and with it the speeds."""
     robot = wheeled(AXES[:3])
@@ -304,6 +335,23 @@ def test_what_cannot_be_held_is_refused():
     idle = arm.replace(inputs=[JointTorque("joint_1"), *wheels(ORTHOGONAL, 1.0)])
     with pytest.raises(fflin.StabilizabilityError, match=r"joints joint_2, joint_3"):
         fflin.lqr(fflin.linearize(idle))
+
+
+def test_damping_of_wheels_is_said_to_be_why_nothing_is_held():
+    """Their speeds stay in the model with it, and the momentum of all that no input changes."""
+    names = [f"wheel_{k}" for k in (1, 2, 3)]
+    lin = fflin.linearize(wheeled(ORTHOGONAL).replace(damping=dict.fromkeys(names, 1e-7)))
+    words = "wheel_1, wheel_2, wheel_3 have damping.*leave damping off the wheels"
+    reduced = fflin.momentum_reduction(lin)
+    for model in (lin, lin.discretize(0.1), reduced):
+        for weights in ((), (1.0, 1.0)):
+            with pytest.raises(fflin.StabilizabilityError, match=words):
+                fflin.lqr(model, *weights)
+    with pytest.raises(fflin.StabilizabilityError) as told:
+        fflin.lqr(fflin.linearize(wheeled(ORTHOGONAL[:1])))
+    assert "damping" not in str(told.value)
+    helped = wheeled(ORTHOGONAL, others=[BaseTorque()]).replace(damping={"wheel_1": 1e-7})
+    assert fflin.lqr(fflin.linearize(helped)).margin > 0.0
 
 
 def test_a_body_that_turns_is_held_too():
