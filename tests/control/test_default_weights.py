@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.control.default_weights import BANDWIDTH
+from fflin.control.default_weights import BANDWIDTH, _damping
 from fflin.dynamics.state import StateMap
 from fflin.robot.catalog import find_robot
 
@@ -197,6 +197,12 @@ def test_thrusters_springs_gravity_and_reduced_models_have_weights_too():
         "servicer_7dof", inputs=fflin.load_inputs("servicer_7dof"), stiffness=panels
     )
     assert fflin.lqr(fflin.linearize(servicer)).margins.disk > 0.6
+    # Neither springs that are sampled nor a motion count as dampers.
+    sampled = replace(fflin.linearize(servicer).discretize(0.05), _source=None)
+    bare = fflin.load("cubesat")
+    spun = fflin.velocity(bare, {"omega_b.x": 0.3, "omega_b.y": 0.2})
+    for model in (sampled, fflin.linearize(bare, v=spun)):
+        assert not _damping(model).any()
     arm = fflin.load("ets_vii")
     arm = arm.replace(inputs=[fflin.JointTorque(name) for name in arm.joint_names])
     reduced = fflin.momentum_reduction(fflin.linearize(arm))
