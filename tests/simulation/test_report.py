@@ -165,3 +165,8 @@ def test_the_command_says_it_first_and_unsettled_is_no_failure(options, code, be
     assert found == code
     assert out.splitlines()[0].startswith(begins)
     assert max(map(len, out.splitlines())) <= 80
+
+
+def test_a_printed_motion_is_its_report():
+    motion = fflin.simulate(fflin.load("cubesat"), duration=0.1)
+    assert str(motion) == motion_report(motion) != repr(motion)
