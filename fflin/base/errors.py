@@ -1,5 +1,6 @@
 """Errors that fflin raises; each message says what was given, what was expected, what to do."""
 
+import re
 from collections.abc import Iterable
 from typing import Any
 
@@ -8,7 +9,9 @@ class FflinError(Exception):
     """Base of every error that a public call of fflin raises on purpose; reads as one line."""
 
     def __str__(self) -> str:
-        return " ".join(line.strip() for line in super().__str__().splitlines())
+        text = " ".join(line.strip() for line in super().__str__().splitlines())
+        # A name in a file may hold what commands the terminal.
+        return re.sub(r"[\x00-\x1f\x7f-\x9f]", lambda found: repr(found[0])[1:-1], text)
 
 
 class InputError(FflinError, ValueError):

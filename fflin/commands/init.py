@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import warnings
 from pathlib import Path
 
 from fflin.base.errors import FileError, InputError
@@ -48,6 +49,10 @@ def _init(arguments: argparse.Namespace) -> int:
     urdf = found.name
     if found.origin == "file":
         urdf = os.path.relpath(os.path.realpath(found.path), os.path.realpath(target.parent))
-    write_whole({target: draft(load(arguments.robot), urdf).encode()})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        robot = load(arguments.robot)
+    write_whole({target: draft(robot, urdf).encode()})
+    load(target)  # warns of what the file leaves open
     print(f"wrote {target}; try: fflin simulate {target}")
     return DONE

@@ -7,6 +7,7 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinWarning, InputError, listed
+from fflin.base.names import chosen, input_keys
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
@@ -138,7 +139,16 @@ def _simulate(arguments: argparse.Namespace) -> int:
     if arguments.plot:
         check_figure(arguments.plot)
     check_pictures(robot, arguments)
-    motion = simulated(robot, arguments)
+    if arguments.show:
+        from fflin.linear.linearization import linearize
+
+        lin = linearize(robot)
+        chosen("state or input", arguments.show, (*lin.state_names, *input_keys(lin)))
+    try:
+        motion = simulated(robot, arguments)
+    except InputError as error:
+        hint = " (--dt)" if "time between samples" in str(error) else ""
+        raise InputError(f"{error}{hint}") from None
     interrupted = motion.stopped.startswith("interrupted")
     left = _leave_earlier(arguments) if interrupted else []
 

@@ -8,6 +8,7 @@ import re
 from collections.abc import Mapping
 from importlib.resources import files
 from string import Template
+from textwrap import fill
 
 import numpy as np
 import pinocchio as pin
@@ -92,8 +93,9 @@ def _candidate(robot: Robot, index: int) -> str:
     key = "axis" if kind == "reaction_wheel" else "direction"
     at, along = _vector(placement.translation), _vector(placement.rotation @ axis)
     position = "" if inertia or key == "axis" else "# position = [0, 0, 0]  # [m], in that frame\n"
+    said = f"# Link {_text(frame.name)} at {at}, {key} {along} in the robot's axes:"
     return (
-        f"# Link {_text(frame.name)} at {at}, {key} {along} in the robot's axes:\n"
+        f"{fill(said, 80, subsequent_indent='# ', break_long_words=False)}\n"
         f'# [[input]]\n# type = "{kind}"\n# name = {_text(name)}\n# frame = {_text(frame.name)}\n'
         f"{position}# {key} = {_vector(axis)}\n{inertia}"
     )

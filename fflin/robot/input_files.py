@@ -91,6 +91,9 @@ def check_keys(document: TomlFile) -> None:
     known, hint = (ROBOT_KEYS, "") if whole else (("input",), "; write [[input]]")
     for key in document.record:
         if key not in known:
+            if not whole and key in ROBOT_KEYS:
+                missing = 'has no `urdf`; a robot file begins with it: add urdf = "my.urdf"'
+                raise InputError(f"{document.path}: {missing}")
             problem = unknown("key of a robot file" if whole else "table", key, known)
             raise document.unknown(f"{problem}{hint}", key)
 

@@ -138,6 +138,11 @@ class Motion(Design):
             f"com drift {self.com_drift.max(initial=0.0):.1e} m{stopped})"
         )
 
+    def __str__(self) -> str:
+        from fflin.simulation.report import motion_report
+
+        return motion_report(self)
+
     @property
     def reference(self) -> pin.SE3:
         """Placement that attitude and position are relative to."""

@@ -1,6 +1,8 @@
 """`fflin init`, and the robot files that it writes, as a user runs them."""
 
 import re
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -54,6 +56,16 @@ def test_what_init_writes_of_a_bundled_robot_flies(tmp_path, name):
     motion = fflin.Motion.load(tmp_path / "m.npz")
     assert motion.attitude_error[0] == pytest.approx(10.0)
     assert motion.attitude_error[-1] < motion.attitude_error[0] and not motion.stopped
+
+
+def test_init_warns_of_what_its_file_leaves_open_alone(tmp_path):
+    text = OWN.replace('damping="0.3"', 'damping="0.3" friction="0.1"').replace("RCS_1", "thr " * 9)
+    (tmp_path / "own.urdf").write_text(text.replace("thr thr", "thr-thr"))
+    command = [sys.executable, "-m", "fflin", "init", "own.urdf"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=True)
+    assert done.stderr == "fflin: warning: own: Coulomb friction unused: 'hinge 1'\n"
+    comments = [x for x in (tmp_path / "own.toml").read_text().splitlines() if x.startswith("#")]
+    assert max(map(len, comments)) <= 80 and "direction [1, 0, 0]" in "".join(comments)
 
 
 def test_all_that_init_suggests_can_be_taken(tmp_path):

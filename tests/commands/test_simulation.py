@@ -326,3 +326,20 @@ def test_what_nothing_regulates_is_not_passed_over(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0
     assert "warning: r_b.x starts beside the target and is not regulated" in done.stderr
+
+
+def test_show_is_checked_before_the_run(tmp_path):
+    said = refused(
+        *("simulate", "ets_vii", "--show", "q_x", "--plot", tmp_path / "a.png"),
+        *("--limit", "nothing=1"),  # what the run itself would refuse
+    )
+    assert "no state or input named 'q_x'" in said
+
+
+def test_an_on_off_thruster_without_samples_is_told_of_dt(tmp_path):
+    (tmp_path / "t.toml").write_text(
+        'urdf = "cubesat"\n[[input]]\ntype = "base_torque"\n[[input]]\ntype = "thruster"\n'
+        'frame = "base"\nposition = [0, 0, 0]\ndirection = [1, 0, 0]\nmax = 1\non_off = true\n'
+    )
+    said = refused("simulate", tmp_path / "t.toml", "--no-allocate", "--rpy", 9, 0, 0, "--reduce")
+    assert said.endswith("or a policy on a sampled model (--dt)\n")

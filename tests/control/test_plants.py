@@ -1,10 +1,14 @@
 """Controllers of the nominal robot on another: run where the names agree, and said."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.control.plants import notes_of
 from fflin.simulation.report import motion_report
 from tests.support.motions import displaced, motion
 from tests.support.weights import unit_weights
@@ -64,6 +68,66 @@ def test_a_lock_at_another_value_is_another_robot():
     lin = fflin.linearize(here)
     policy = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
     assert told(fflin.simulate(there, policy, duration=0.02)) > 1.0
+
+
+def changed_servicer(**change):
+    wheel = fflin.ReactionWheel((0, 1, 0), inertia=0.05, name="wheel")
+    inputs = [*fflin.load_inputs("servicer_7dof"), wheel]
+    for i, each in enumerate(inputs):
+        if isinstance(each, fflin.ReactionWheel) and "wheel" in change:
+            inputs[i] = replace(each, inertia=change["wheel"] * each.inertia)
+        if isinstance(each, fflin.Thruster) and "thruster" in change:
+            inputs[i] = replace(each, position=np.add(each.position, change["thruster"]))
+    fields = {"stiffness": {"panel_left": 20.0}, "damping": {"panel_left": 0.5}} | {
+        key: value for key, value in change.items() if key not in ("wheel", "thruster")
+    }
+    return fflin.load("servicer_7dof", inputs=inputs, **fields)
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.05])
+@pytest.mark.parametrize(
+    ("change", "what", "percent"),
+    [
+        ({"wheel": 10.0}, "inputs", None),
+        ({"thruster": (0.0, 0.2, 0.0)}, "inputs", None),
+        ({"stiffness": {"panel_left": 40.0}}, "states", 100.0),
+        ({"damping": {"panel_left": 1.0}}, "states", 100.0),
+        ({"damping": {"panel_right": 0.2}}, "states", 100.0),
+        ({"gravity": (0.0, 0.0, -1.6)}, "states", 100.0),
+    ],
+)
+def test_what_is_said_of_a_robot_beside_its_urdf_makes_another(change, what, percent, dt):
+    lin = fflin.linearize(changed_servicer())
+    lin = lin.discretize(dt) if dt else lin
+    policy = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
+    (note,) = notes_of(policy, changed_servicer(**change))
+    far = float(re.search(f"that its {what} cause differ by up to (.+?) %", note)[1])
+    assert far > 1.0
+    assert dt or percent is None or far == pytest.approx(percent, rel=0.1)
+    assert notes_of(policy, changed_servicer()) == ()
+
+
+def test_reduced_models_are_held_against_the_same():
+    arm = fflin.load("ets_vii", stiffness=5.0)
+    robot = arm.replace(inputs=[fflin.JointTorque(name) for name in arm.joint_names])
+    part = fflin.momentum_reduction(fflin.linearize(robot))
+    later = fflin.momentum_reduction(fflin.linearize(robot).discretize(0.1))
+    for lin in (part, part.discretize(0.1), later):
+        policy = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
+        assert notes_of(policy, robot) == ()
+        (note,) = notes_of(policy, robot.replace(stiffness=10.0))
+        assert "that its states cause differ by up to" in note
+        assert float(note.split()[-2]) == pytest.approx(100.0, rel=0.3)
+
+
+def test_an_allocation_has_the_wheels_of_the_robot():
+    robot = changed_servicer()
+    wheels = [each for each in robot.inputs if isinstance(each, fflin.ReactionWheel)]
+    design = robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce(), *wheels])
+    lin = fflin.linearize(design)
+    law = fflin.Allocation(fflin.StateFeedback(lin, np.zeros(lin.B.T.shape)), design)
+    assert notes_of(law, changed_servicer(thruster=(0.0, 0.2, 0.0))) == ()
+    assert "its inputs cause" in notes_of(law, changed_servicer(wheel=10.0))[0]
 
 
 def test_measured_feedback_runs_on_another_robot(nominal):

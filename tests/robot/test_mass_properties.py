@@ -127,6 +127,15 @@ def test_the_spreads_are_reached_and_the_seed_decides():
         assert not np.array_equal(full.model.inertias[i].lever, again.model.inertias[i].lever)
 
 
+def test_bodies_are_shifted_either_way_and_a_plate_is_a_body():
+    robot = fflin.load("ets_vii")
+    before = robot.model.inertias[ROOT].lever
+    shifts = [robot.perturbed(com=0.1, seed=k).model.inertias[ROOT].lever for k in range(20)]
+    signs = np.sign(np.array(shifts) - before)
+    assert (signs.min(axis=0) == -1.0).all() and (signs.max(axis=0) == 1.0).all()
+    assert robot.with_mass_properties({"base": {"inertia": np.diag([1.0, 1.0, 2.0])}})
+
+
 def test_every_route_works_on_them():
     rng = np.random.default_rng(0)
     for robot in (fflin.load("servicer_7dof"), wheeled(), random_tree(rng, 4)):
@@ -178,6 +187,7 @@ def test_results_of_the_one_are_not_taken_for_the_others(tmp_path):
         ({"base": {"inertia": np.ones(3)}}, r"inertia of 'base' has shape \(3,\), expected \(3, 3"),
         ({"base": {"inertia": np.triu(np.ones((3, 3)))}}, "inertia of 'base' is not symmetric"),
         ({"base": {"inertia": np.diag([1.0, 1.0, 3.0])}}, "one is more than the sum of the other"),
+        ({"base": {"inertia": np.diag([1.0, 1.0, 2.1])}}, "one is more than the sum"),
         ({"base": {"inertia": np.diag([1.0, 1.0, -1.0])}}, "none can be negative"),
         ({"base": {"masses": 1.0}}, "no mass property named 'masses'; did you mean mass"),
         ({"base": 3.0}, "base' is a float, expected {'mass': "),

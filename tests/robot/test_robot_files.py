@@ -184,6 +184,9 @@ INPUT = "[[input]]\ntype = "
 CASES = {
     INPUT + "'base_force'": "sat.toml: holds inputs alone; add urdf = ",
     "": "sat.toml: holds inputs alone; add urdf",
+    "passive = ['a']": "sat.toml: has no `urdf`; a robot file begins with it: add urdf = ",
+    URDF + '"a\\u001b[31m\\u0007" = 1': r"named 'a\x1b[31m\x07'",
+    URDF + '[stiffness]\n"a\\u001b" = "x"': r": stiffness.a\x1b is 'x', expected",
     URDF + "pasive = ['panel_left']": ":2: no key of a robot file named 'pasive'; did you mean pas",
     URDF + "orbit = 1\n": ":2: no key of a robot file named 'orbit'",
     URDF + "[[inputs]]\ntype = 'base_force'": ":2: no key of a robot file named 'inputs'; did you",
