@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from fflin.base.names import group_of, input_keys
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array
-from fflin.simulation.motion import Motion
 from fflin.simulation.passed import lines
+
+if TYPE_CHECKING:
+    from fflin.simulation.motion import Motion
 
 # An error has settled once it stays below this share of its largest.
 _SETTLED = 0.02

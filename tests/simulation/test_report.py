@@ -168,7 +168,6 @@ def test_the_command_says_it_first_and_unsettled_is_no_failure(options, code, be
     assert max(map(len, out.splitlines())) <= 80
 
 
-<<<<<<< HEAD
 @pytest.mark.parametrize("duration", [10.0, 30.0, 40.0, 50.0, 60.0])
 def test_what_tumbles_or_swings_through_its_target_has_not_settled(duration):
     robot = fflin.load("cubesat")
@@ -213,8 +212,8 @@ def test_the_angle_of_a_fast_wheel_counts_all_its_turns(speed, every):
     motion = fflin.simulate(robot, v0=v0, duration=10.0, every=every)
     angle = motion.x[:, motion.state_names.index("q_m.fast")]
     np.testing.assert_allclose(angle, speed * motion.t, rtol=1e-6, atol=1e-9)
-=======
+
+
 def test_a_printed_motion_is_its_report():
     motion = fflin.simulate(fflin.load("cubesat"), duration=0.1)
     assert str(motion) == motion_report(motion) != repr(motion)
->>>>>>> small
