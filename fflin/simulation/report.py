@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,9 +10,6 @@ from fflin.base.names import group_of, input_keys
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array
 from fflin.simulation.passed import lines
-
-if TYPE_CHECKING:
-    from fflin.simulation.motion import Motion
 
 # An error has settled once it stays below this share of its largest.
 _SETTLED = 0.02
@@ -65,7 +62,7 @@ class Course(NamedTuple):
         return [self.title, self.unit, *cells, when]
 
 
-def motion_report(motion: Motion) -> str:
+def motion_report(motion: Any) -> str:
     """Show whether a motion arrived, what it took, and the figures that prove it."""
     kinds = courses(motion)
     parts = [verdict(motion, kinds)] if kinds or motion.stopped else []
@@ -101,7 +98,7 @@ def motion_report(motion: Motion) -> str:
     return "\n".join(parts)
 
 
-def courses(motion: Motion) -> list[Course]:
+def courses(motion: Any) -> list[Course]:
     """Return the errors of each kind, none where there is no target; wheels are no joints."""
     if motion.error is None or motion.attitude_error is None:
         return []
@@ -125,7 +122,7 @@ def courses(motion: Motion) -> list[Course]:
     ]
 
 
-def verdict(motion: Motion, kinds: list[Course]) -> str:
+def verdict(motion: Any, kinds: list[Course]) -> str:
     """Say in a line whether a motion arrived at its target and what hindered it."""
     if motion.stopped:
         return f"stopped: {motion.stopped}"
@@ -153,7 +150,7 @@ def _and(words: list[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
 
 
-def _largest_inputs(motion: Motion) -> str:
+def _largest_inputs(motion: Any) -> str:
     largest = np.abs(motion.u).max(axis=0)
     kinds: dict[tuple[str, str], float] = {}
     for name, unit, value in zip(input_keys(motion), motion.input_units, largest, strict=True):
