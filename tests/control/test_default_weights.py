@@ -101,9 +101,7 @@ def test_two_hundred_loops_with_errors_of_ten_percent_are_stable(loops, name):
     assert (slowest < -0.5 * gain.margin).sum() == 200
 
 
-@pytest.mark.parametrize(
-    "name", (*BUNDLED, "a1", "kinova", "double_pendulum", "pr2", "so100", "talos_arm", "ur5")
-)
+@pytest.mark.parametrize("name", (*BUNDLED, *OTHERS))
 def test_slews_of_the_nonlinear_robot_settle_within_the_limits(loops, name):
     robot, lin, gain = loops(name)
     q0 = displaced(robot, lin, np.random.default_rng(30))
