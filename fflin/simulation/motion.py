@@ -141,7 +141,8 @@ class Motion(Design):
     def __str__(self) -> str:
         from fflin.simulation.report import motion_report
 
-        return motion_report(self)
+        report = motion_report(self)
+        return report if self.verified else f"{report}\n{record.NOT_VERIFIED}"
 
     @property
     def reference(self) -> pin.SE3:

@@ -255,7 +255,7 @@ def test_inputs_are_cut_to_the_limits_of_the_robot_unless_told_otherwise(tmp_pat
 
     size, out = largest()
     assert size == 1e-3
-    assert "\ntau_b.x at its limit of 0.001 N m for " in out and "beyond" not in out
+    assert "\ntau_b.x at its limit of -0.001 N m for " in out and "beyond" not in out
     size, _ = largest("--limit", "tau_b=2e-3")
     assert size == 2e-3
     size, out = largest("--limits", "none")
