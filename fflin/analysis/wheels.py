@@ -15,7 +15,8 @@ from fflin.analysis.ranks import Noisy, echelon, image, null_space
 from fflin.base.errors import InputError, StabilizabilityError, listed
 from fflin.base.names import input_keys
 from fflin.base.validation import Array
-from fflin.linear.model import Certificate, LinearModel
+from fflin.linear.files import given
+from fflin.linear.model import LinearModel, same_certificate
 
 Indices: TypeAlias = NDArray[np.intp]
 Make: TypeAlias = Callable[[LinearModel], LinearModel]
@@ -160,24 +161,15 @@ def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, Any]:
         "x0": S @ lin.x0,
         "state_names": names,
         "state_units": tuple(lin.state_units[i] for i in S.argmax(axis=1)),
-        "_ignorable": partial(_given, tuple(name for name in names if name in lin.ignorable)),
+        "_ignorable": partial(given, tuple(name for name in names if name in lin.ignorable)),
         "_drift": None if lin.drift is None else S @ lin.drift,
-        "_inertia": partial(_given, M),
+        "_inertia": partial(given, M),
     }
 
 
 def certified(part: Part, lin: LinearModel, make: Make) -> Part:
     """Return a part with the certificate of the whole, and with what made it of its source."""
     fingerprint, source = part.fingerprint, lin.generator
-    certify = partial(_same_certificate, lin, fingerprint)
+    certify = partial(same_certificate, lin, fingerprint)
     of = (fingerprint, make(source)) if lin.dt and source is not None else None
     return replace(part, _certify=certify, _source=of)
-
-
-def _given(value: Any, _: LinearModel) -> Any:
-    return value
-
-
-def _same_certificate(whole: LinearModel, fingerprint: str, lin: LinearModel) -> Certificate:
-    lin.require(fingerprint)
-    return whole.certificate

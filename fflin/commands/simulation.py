@@ -228,14 +228,14 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
 
 def _require_held(robot: Robot, policy: StateFeedback, q: Array) -> None:
     """Warn of what starts beside the target and is not fed back; refuse a start of nothing else."""
+    from fflin.control.policies import fed_back
     from fflin.dynamics.state import StateMap
 
     lin = policy.lin
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     start, target = (state.read(at, lin.v, near=state.read(lin.q, lin.v)) for at in (q, lin.q))
-    fed = {name for name, column in zip(lin.state_names, policy.K.T, strict=True) if column.any()}
     beside = [name for name, x in zip(state.names, abs(start - target), strict=True) if x > 1e-9]
-    loose = [name for name in beside if name not in fed]
+    loose = [name for name in beside if name not in fed_back(policy)]
     if loose and loose == beside:
         raise InputError(
             f"what starts beside the target is not regulated: {listed(loose)}; no input would act: "

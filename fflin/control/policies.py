@@ -233,3 +233,12 @@ def feedback_of(policy: Any) -> tuple[LinearModel | None, Array | None]:
     lin = getattr(policy, "lin", None)
     decides = policy.policy if isinstance(policy, Allocation) else policy
     return (lin if isinstance(lin, LinearModel) else None), getattr(decides, "K", None)
+
+
+def fed_back(policy: Any) -> tuple[str, ...]:
+    """Return the names of the states that a policy about a model's point feeds back."""
+    lin, K = feedback_of(policy)
+    if lin is None:
+        return ()
+    used = np.ones(len(lin.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
+    return tuple(name for name, size in zip(lin.state_names, used, strict=True) if size)

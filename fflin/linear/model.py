@@ -298,7 +298,7 @@ class LinearModel(FrozenArrays):
         sampled = replace(
             self, A=Ad, B=held[:, :-1], f0=held[:, -1], dt=dt, _inertia=partial(_same_M, self)
         )
-        certify = partial(_same_certificate, self, sampled.fingerprint)
+        certify = partial(same_certificate, self, sampled.fingerprint)
         return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))
 
     def to_scipy(self) -> Any:
@@ -368,15 +368,14 @@ class LinearModel(FrozenArrays):
 
         values, certificate = read_model(as_path(path))
         lin = LinearModel(**values, _certify=partial(given, Certificate(**certificate)))
-        return replace(lin, _certify=partial(_same_certificate, lin, lin.fingerprint))
+        return replace(lin, _certify=partial(same_certificate, lin, lin.fingerprint))
 
 
 def _same_M(continuous: LinearModel, _: LinearModel) -> Array:
     return continuous.M
 
 
-def _same_certificate(
-    continuous: LinearModel, fingerprint: str, sampled: LinearModel
-) -> Certificate:
-    sampled.require(fingerprint)
-    return continuous.certificate
+def same_certificate(whole: LinearModel, fingerprint: str, made: LinearModel) -> Certificate:
+    """Return the certificate of what a model was made of, which that of a fingerprint has too."""
+    made.require(fingerprint)
+    return whole.certificate

@@ -12,7 +12,7 @@ from fflin.base.errors import InputError
 from fflin.base.names import group_of
 from fflin.base.validation import Array, vector
 from fflin.control.channel import Channel, Law
-from fflin.control.policies import bound, feedback_of
+from fflin.control.policies import bound
 from fflin.control.saturation import Saturation
 from fflin.dynamics import points
 from fflin.dynamics.integrators import Integrator, integrator
@@ -143,15 +143,6 @@ def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law |
         return None
     within = (limits.low, limits.high)
     return Law(bound(policy, plant.robot), plant.actuation.names, within, times.slow)
-
-
-def fed_back(policy: Any) -> tuple[str, ...]:
-    """Return the names of the states that a policy about a model's point feeds back."""
-    lin, K = feedback_of(policy)
-    if lin is None:
-        return ()
-    used = np.ones(len(lin.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
-    return tuple(name for name, size in zip(lin.state_names, used, strict=True) if size)
 
 
 def turning(robot: Robot) -> Array:

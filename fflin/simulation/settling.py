@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from fflin.base.validation import Array
-from fflin.control.policies import StateFeedback
+from fflin.control.policies import StateFeedback, fed_back
 from fflin.dynamics.state import StateMap
 from fflin.linear.sampling import held_exponential
 from fflin.robot.robot import Robot
@@ -32,7 +32,7 @@ def time_to_settle(robot: Robot, policy: StateFeedback, q: Array, v: Array | Non
         loop = held_exponential(loop, np.zeros((len(loop), 0)), step)[0]
     places = [f"q_m.{name}" for name in robot.joint_names if name not in robot.wheels]
     kinds = [[f"{group}.{axis}" for axis in "xyz"] for group in ("q_b", "r_b")] + [places]
-    fed = {name for name, column in zip(lin.state_names, policy.K.T, strict=True) if column.any()}
+    fed = {*fed_back(policy)}
     rows = [[i for i, name in enumerate(lin.state_names) if name in fed & {*k}] for k in kinds]
     course = [e]
     for _ in range(math.ceil(LONGEST / step)):

@@ -11,6 +11,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, truth
 from fflin.control.plants import notes_of
+from fflin.control.policies import fed_back
 from fflin.control.saturation import saturation, warn_beyond
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import state_history
@@ -21,7 +22,6 @@ from fflin.simulation.motion import Motion
 from fflin.simulation.plan import (
     Plan,
     events_of,
-    fed_back,
     law_of,
     method_of,
     start_of,
