@@ -47,3 +47,9 @@ def test_thrusters_that_push_every_way():
     assert not pushes_every_way(np.eye(6), np.arange(6) < 3)
     assert pushes_every_way(np.eye(6), np.zeros(6, dtype=bool))
     assert pushes_every_way(np.hstack((np.eye(6), -np.eye(6))), np.ones(12, dtype=bool))
+
+
+def test_what_is_limited_to_nothing_gives_nothing():
+    u = nearest(np.ones((1, 3)), np.array([3.0]), np.array([0, -1.0, 0]), np.array([0, 1.0, 5.0]))
+    assert u[0] == pytest.approx(0.0, abs=1e-12)
+    assert u[1:] == pytest.approx([1.0, 2.0])

@@ -149,6 +149,17 @@ def test_a_wheel_that_begins_too_fast_takes_no_torque_but_what_brakes_it(asked):
     assert (told.name, told.value, told.time, told.limit) == ("qdot_m.spin", 301.0, 0.0, SPEED)
 
 
+def test_an_on_off_thruster_gives_its_own_thrust_whatever_the_run_allows():
+    robot = free_body((20.0, 30.0, 40.0)).replace(
+        inputs=[fflin.Thruster(*AT, max=2.0, on_off=True), fflin.BaseTorque()]
+    )
+    for limits, given in ((5.0, 2.0), (1.0, 1.0)):
+        motion = fflin.simulate(
+            robot, lambda t, q, v: [9.0, 0, 0, 0], duration=1.0, sample=0.1, limits=limits
+        )
+        assert motion.u[:-1, 0].max() == given
+
+
 def test_a_command_becomes_pulses_of_the_same_impulse():
     robot = free_body((20.0, 30.0, 40.0)).replace(
         inputs=[fflin.Thruster(*AT, max=2.0, on_off=True), fflin.BaseTorque()]

@@ -66,3 +66,18 @@ def test_which_thrusters_push_every_way():
     assert not thrusters_push_every_way(inspector.replace(inputs=fewer))
     helped = [*fewer, fflin.BaseTorque(), fflin.BaseForce()]
     assert thrusters_push_every_way(inspector.replace(inputs=helped))
+
+
+def test_what_is_not_fed_back_does_not_lengthen_or_shorten_a_run():
+    wheels = [fflin.ReactionWheel(axis, inertia=1e-4) for axis in np.eye(3).tolist()]
+    robot = fflin.load("cubesat", inputs=wheels)
+    lin = fflin.linearize(robot)
+    slow = fflin.bryson(lin, {"q_b": 1.0, "omega_b": 1.0}), fflin.bryson(lin, {"wheel": 5e-5})
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin, *slow).K)
+    q = fflin.configuration(robot)
+    q[3:7] = [np.sin(0.2), 0.0, 0.0, np.cos(0.2)]
+    beside = q.copy()
+    beside[0] = 1.0  # which no wheel takes back
+    time = time_to_settle(robot, policy, q, None)
+    assert 60.0 < time < 600.0
+    assert time_to_settle(robot, policy, beside, None) == time
