@@ -33,10 +33,10 @@ class Loads(NamedTuple):
 
     Attributes
     ----------
-    body, wrench, input : ndarray (k,), (k, 6), (k,)
+    body, wrench, input : ndarray (k,), (6 k,), (k,)
         Of every input that is carried: its body, the moment and force of a unit about the joint's
         origin, in the body's axes, and its number.
-    stored_body, stored : ndarray (s,), (s, 3)
+    stored_body, stored : ndarray (s,), (3 s,)
         Angular momentum that bodies store, in their axes.
     stiffness, damping : ndarray (n,)
     """
@@ -135,9 +135,10 @@ def inverse_inertias(tree: Tree, q: Array, out: Array) -> Array:
 
 
 def _work_space(size: int) -> Array:
-    space = np.empty(size + LANES)
+    space = np.empty((size + 1) * LANES)
     # The kernel's vectors are 64 bytes; where they begin at such an address it is faster.
-    return space[-(space.ctypes.data // 8) % LANES :]
+    first = -(space.ctypes.data // 8) % LANES
+    return space[first : first + size * LANES].reshape(size, LANES)
 
 
 def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
@@ -155,10 +156,10 @@ def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
     stored = [(joint - ROOT, momentum) for joint, momentum in robot.stored_momentum]
     return Loads(
         np.array(body, dtype=np.intp),
-        np.array(wrenches).reshape(-1, 6),
+        np.array(wrenches).ravel(),
         np.array(inputs, dtype=np.intp),
         np.array([index for index, _ in stored], dtype=np.intp),
-        np.array([tree.axes[index].T @ h for index, h in stored]).reshape(-1, 3),
+        np.array([tree.axes[index].T @ h for index, h in stored]).ravel(),
         np.array(robot.springs.stiffness),
         np.array(robot.springs.damping),
     )
@@ -172,4 +173,4 @@ def _layout(tree: Tree, carried: int) -> Layout:
         *(bodies * MOTION, bodies * LOAD, size, size, size * carried),
         *(size * 2 * size, size * 6),
     )
-    return Layout(*(tree.size + int(x) * LANES for x in np.cumsum([0, *sizes])))
+    return Layout(*(tree.size + int(x) for x in np.cumsum([0, *sizes])))

@@ -1,4 +1,4 @@
-r"""The slopes of all joint forces at eight points at once: RNEA differentiated.
+r"""The slopes of all joint forces: RNEA differentiated.
 
 RNEA is differentiated in closed form: with the spatial axis S of a joint, the velocity v and
 acceleration a of what carries it, and Psi' = v x S, Psi'' = a x S + v x Psi', the slopes of the
@@ -22,9 +22,7 @@ using spatial vector algebra, IEEE Robotics and Automation Letters 7(2), 2022.
 
 from __future__ import annotations
 
-import numba
-
-from fflin.kernel.lanes import splat, store
+from fflin.kernel.lanes import inlined, load, store
 from fflin.kernel.rnea import (
     FORCE,
     LOAD,
@@ -38,7 +36,7 @@ from fflin.kernel.rnea import (
     joint_axis,
     spatial_inertia_times,
 )
-from fflin.kernel.tree import INERTIA, LANES, PLACE
+from fflin.kernel.tree import INERTIA, PLACE
 from fflin.kernel.vectors import (
     add,
     add3,
@@ -56,7 +54,7 @@ from fflin.kernel.vectors import (
 )
 
 
-@numba.njit(forceinline=True)
+@inlined
 def _coriolis(work, at, w):
     """Return 2 B w, moment and force, of what a joint carries."""
     G = get_columns(work, at + MOMENTS)
@@ -67,7 +65,7 @@ def _coriolis(work, at, w):
     return moment, plus(force, force)
 
 
-@numba.njit(forceinline=True)
+@inlined
 def _coriolis_transposed(work, at, along):
     """Return 2 B^T s of a motion vector s, which is a moment."""
     G = get_columns(work, at + MOMENTS)
@@ -78,37 +76,36 @@ def _coriolis_transposed(work, at, along):
     return plus(plus(moment, moment), cross(get3(work, at + STORED), w))
 
 
-@numba.njit(forceinline=True)
+@inlined
 def _passive_slopes(work, tree, layout, loads):
     """Write those of springs and dampers, and zeros."""
     size = len(tree.row)
     n, width = size - 6, 2 * size
-    zero = splat(0.0)
     for entry in range(size * width):
-        store(work, layout.lower + entry * LANES, zero)
+        store(work, layout.lower + entry, 0.0)
     for index in range(n):
-        row = layout.lower + (6 + index) * width * LANES
-        store(work, row + (6 + index) * LANES, splat(loads.stiffness[index]))
-        store(work, row + (12 + n + index) * LANES, splat(loads.damping[index]))
+        row = layout.lower + (6 + index) * width
+        store(work, row + (6 + index), load(loads.stiffness, index))
+        store(work, row + (12 + n + index), load(loads.damping, index))
 
 
-@numba.njit(forceinline=True)
+@inlined
 def _add_column(work, at, width, force):
     """Add a moment and force to the rows of the base in a column."""
     for index in range(3):
-        add(work, at + index * width * LANES, force[0][index])
-        add(work, at + (3 + index) * width * LANES, force[1][index])
+        add(work, at + index * width, force[0][index])
+        add(work, at + (3 + index) * width, force[1][index])
 
 
-@numba.njit(forceinline=True)
+@inlined
 def _joint_slopes(work, tree, layout):
     """Add those over each joint, and those of each joint's force over omega_b."""
     n, width = len(tree.row) - 6, 2 * len(tree.row)
     spin = get3(work, layout.motion)
     for body in range(len(tree.parent) - 1, 0, -1):
-        at = layout.load + body * LOAD * LANES
-        moving = layout.motion + body * MOTION * LANES
-        inertia = tree.inertias + body * INERTIA * LANES
+        at = layout.load + body * LOAD
+        moving = layout.motion + body * MOTION
+        inertia = tree.inertias + body * INERTIA
         column = tree.coordinate[body]
         axis = joint_axis(work, tree, body)
         psi, psi2 = get6(work, moving + PSI), get6(work, moving + PSI2)
@@ -120,37 +117,37 @@ def _joint_slopes(work, tree, layout):
         by_q = plus6(by_q, turned)
         weight = spatial_inertia_times(work, inertia, psi)
         by_v = plus6(_coriolis(work, at, axis[0]), plus6(weight, weight))
-        own = layout.lower + column * width * LANES
-        q, v = column * LANES, (column + 6 + n) * LANES
+        own = layout.lower + column * width
+        q, v = column, (column + 6 + n)
         above = body
         while above > 0:
-            place = tree.places + above * PLACE * LANES
+            place = tree.places + above * PLACE
             other = tree.coordinate[above]
             axis = joint_axis(work, tree, above)
-            row = layout.lower + other * width * LANES
+            row = layout.lower + other * width
             add(work, row + q, dot6(axis, by_q))
             add(work, row + v, dot6(axis, by_v))
             if above != body:
-                moving = layout.motion + above * MOTION * LANES
+                moving = layout.motion + above * MOTION
                 psi, psi2 = get6(work, moving + PSI), get6(work, moving + PSI2)
                 value = dot(coriolis, psi[0]) + dot6(momentum, psi2)
-                add(work, own + other * LANES, value)
+                add(work, own + other, value)
                 value = dot6(momentum, psi)
                 value = dot(coriolis, axis[0]) + (value + value)
-                add(work, own + (other + 6 + n) * LANES, value)
+                add(work, own + (other + 6 + n), value)
             momentum = at_parent(work, place, momentum)
             by_q, by_v = at_parent(work, place, by_q), at_parent(work, place, by_v)
             above = tree.parent[above]
-        add3(work, own + (6 + n) * LANES, plus(coriolis, cross(momentum[0], spin)))
+        add3(work, own + (6 + n), plus(coriolis, cross(momentum[0], spin)))
         _add_column(work, layout.lower + q, width, by_q)
         _add_column(work, layout.lower + v, width, by_v)
 
 
-@numba.njit(forceinline=True)
+@inlined
 def _base_slopes(work, tree, layout):
     """Write those of the base's force over omega_b."""
     n, width = len(tree.row) - 6, 2 * len(tree.row)
-    zero, one = splat(0.0), splat(1.0)
+    zero, one = 0.0, 1.0
     spin = get3(work, layout.motion)
     axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for index in range(3):
@@ -158,12 +155,12 @@ def _base_slopes(work, tree, layout):
         weight = spatial_inertia_times(work, tree.inertias, (cross(spin, e), (zero, zero, zero)))
         moment, force = plus6(_coriolis(work, layout.load, e), weight)
         for axis in range(3):
-            row = layout.lower + (axis * width + 6 + n + index) * LANES
+            row = layout.lower + (axis * width + 6 + n + index)
             store(work, row, moment[axis])
-            store(work, row + 3 * width * LANES, force[axis])
+            store(work, row + 3 * width, force[axis])
 
 
-@numba.njit(forceinline=True)
+@inlined
 def differentiate(work, tree, layout, loads):
     """Write the slopes of M c + bias less the forces over the state, rows of 12 + 2 n.
 

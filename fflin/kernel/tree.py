@@ -1,4 +1,4 @@
-"""A robot's tree as the arrays that the batch kernel reads."""
+"""A robot's tree as the arrays that the kernel reads."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ class Tree(NamedTuple):
     ----------
     parent : ndarray (bodies,)
         Body that carries each.
-    fixed : ndarray (bodies, 12)
-        Rotation, row by row, and origin of each joint in its parent, z along the joint's axis.
+    fixed : ndarray (12 bodies,)
+        Columns of the rotation, and origin, of each joint in its parent, z along the joint's axis.
     index : ndarray (bodies,)
         Entry of q of each joint: its angle, length or cosine.
     unbounded : ndarray (bodies,) of bool
         Whether it is stored as (cos, sin).
     turns, slides : ndarray (bodies,)
         Turn and displacement along z for a unit of the joint's coordinate.
-    bodies : ndarray (bodies, 10)
+    bodies : ndarray (10 bodies,), or (10 bodies, 8) of others in each lane
         Mass, times centre, and inertia about the joint's origin (xx xy xz yy yz zz).
     axes : ndarray (bodies, 3, 3)
         Rotation of the frame in which all this stands, z along the joint's axis, in Pinocchio's.
@@ -55,7 +55,7 @@ class Tree(NamedTuple):
         The coordinate of every packed entry.
     common : ndarray (6 + n, 6 + n)
         How many coordinates two rows have in common.
-    entries, places, inertias, packed, scaled, diagonal, square, size : int
+    entries, places, own, inertias, packed, scaled, diagonal, square, size : int
         Entries of the packed M; where the parts of the work space begin; its size.
     """
 
@@ -78,6 +78,7 @@ class Tree(NamedTuple):
     common: Any
     entries: int
     places: int
+    own: int
     inertias: int
     packed: int
     scaled: int
@@ -111,7 +112,7 @@ def _tree(robot: Robot) -> Tree | None:
         if body:
             before = places[parent[body]].inverse()
             placement = before * model.jointPlacements[ROOT + body] * places[body]
-            fixed[body] = np.concatenate((placement.rotation.ravel(), placement.translation))
+            fixed[body] = np.concatenate((placement.rotation.ravel("F"), placement.translation))
         inertia = places[body].actInv(model.inertias[ROOT + body])
         inertias[body, 0] = inertia.mass
         inertias[body, 1:4] = inertia.mass * inertia.lever
@@ -133,16 +134,24 @@ def _tree(robot: Robot) -> Tree | None:
     size = 6 + robot.n
     common = _common(paths)
     entries = int(sum(map(len, paths)))
-    sizes = (bodies * PLACE, bodies * INERTIA, entries, entries, size, size * size)
-    starts = [int(x) for x in np.cumsum([0, *sizes]) * LANES]
+    sizes = (
+        bodies * PLACE,
+        bodies * INERTIA,
+        bodies * INERTIA,
+        entries,
+        entries,
+        size,
+        size * size,
+    )
+    starts = [int(x) for x in np.cumsum([0, *sizes])]
     return Tree(
         parent,
-        fixed,
+        fixed.ravel(),
         np.array([joint.idx_q for joint in joints]),
         np.array([joint.nq == 2 for joint in joints]),
         np.array(turns),
         np.array(slides),
-        inertias,
+        inertias.ravel(),
         np.array([place.rotation for place in places]),
         np.array(coordinate),
         np.array(factor),
