@@ -36,6 +36,7 @@ class Integrator:
     weights: ClassVar[tuple[float, ...]]
     moments: ClassVar[tuple[float, ...]]
     reach: ClassVar[float]
+    origins: ClassVar[tuple[int, ...]] = ()  # empty where its steps are no such combinations
 
     def __init__(self, model: pin.Model, dt: float) -> None:
         self.model, self.dt = model, dt
@@ -60,22 +61,40 @@ class CommutatorFree4(Integrator):
     weights = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
     moments = (1.0 / 6.0, 1.0 / 6.0, 1.0 / 6.0, 0.0)
     reach = 2.78
+    origins = (0, 0, 1, 0)
+
+    @classmethod
+    def shares(cls, dt: float) -> tuple[Array, Array]:
+        """Return those of v, l1, ..., l4 in what moves q after each stage, and in the new v.
+
+        The stages' displacements begin where `origins` says, at the step's first place or at the
+        second stage's; the end is reached by two, one after the other.
+        """
+        h, half, twelfth = dt, 0.5 * dt, dt * dt / 12.0
+        way = [
+            [half, 0.0, 0.0, 0.0, 0.0],
+            [half, half * half, 0.0, 0.0, 0.0],
+            [half, 0.0, h * half, 0.0, 0.0],
+            [half, twelfth, twelfth, -twelfth, 0.0],
+            [half, twelfth, twelfth, 3.0 * twelfth, 0.0],
+        ]
+        speed = [
+            [1.0, half, 0.0, 0.0, 0.0],
+            [1.0, 0.0, half, 0.0, 0.0],
+            [1.0, 0.0, 0.0, h, 0.0],
+            [1.0, *(h * weight for weight in cls.weights)],
+        ]
+        return np.array(way), np.array(speed)
 
     def __init__(self, model: pin.Model, dt: float) -> None:
         super().__init__(model, dt)
-        h, half, twelfth = dt, 0.5 * dt, dt * dt / 12.0
         self._stages = np.zeros((5, model.nv))  # v, l1, ..., l4
         self._two, self._three, self._four = (self._stages[:k] for k in (2, 3, 4))
-        self._after_1 = np.array([[half, 0.0], [1.0, half], [half, half * half]])
-        self._after_2 = np.array([[1.0, 0.0, half], [half, 0.0, h * half]])
-        self._after_3 = np.array(
-            [
-                [1.0, 0.0, 0.0, h],
-                [half, twelfth, twelfth, -twelfth],
-                [half, twelfth, twelfth, 3.0 * twelfth],
-            ]
-        )
-        self._after_4 = np.array([1.0, *(h * weight for weight in self.weights)])
+        way, speed = self.shares(dt)
+        self._after_1 = np.array((way[0], speed[0], way[1]))[:, :2].copy()
+        self._after_2 = np.array((speed[1], way[2]))[:, :3].copy()
+        self._after_3 = np.array((speed[2], way[3], way[4]))[:, :4].copy()
+        self._after_4 = speed[3]
         self._new_1, self._new_3 = np.empty((3, model.nv)), np.empty((3, model.nv))
         self._new_2 = np.empty((2, model.nv))
         self._rows = (*self._stages, *self._new_1, *self._new_2, *self._new_3)
@@ -131,6 +150,12 @@ class SemiImplicitEuler(Integrator):
 
     weights = moments = (1.0,)
     reach = 2.0
+    origins = (0,)
+
+    @classmethod
+    def shares(cls, dt: float) -> tuple[Array, Array]:
+        """Return those of v and its rate in what moves q, and in the new v."""
+        return np.array([[dt, dt * dt], [0.0, 0.0]]), np.array([[1.0, dt]])
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and v one step later."""

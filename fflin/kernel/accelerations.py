@@ -88,9 +88,9 @@ class BatchAccelerations:
     """
 
     def __init__(self, state: StateMap, actuation: Actuation, tree: Tree) -> None:
-        self._tree, self._loads = tree, _loads(state.robot, actuation, tree)
+        self._tree, self._loads = tree, loads_of(state.robot, actuation, tree)
         self.carried = self._loads.input
-        self._layout = _layout(tree, len(self.carried))
+        self._layout = layout_of(tree, len(self.carried))
 
     def rates(self, q: Array, nu: Array, forces: Array, u: Array, A: Array) -> BatchRates:
         """Return the rates and write their slopes; N is the number of lanes at least.
@@ -141,7 +141,8 @@ def _work_space(size: int) -> Array:
     return space[first : first + size * LANES].reshape(size, LANES)
 
 
-def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
+def loads_of(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
+    """Return what acts on a robot."""
     body: list[int] = []
     inputs: list[int] = []
     wrenches: list[Array] = []
@@ -165,7 +166,8 @@ def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
     )
 
 
-def _layout(tree: Tree, carried: int) -> Layout:
+def layout_of(tree: Tree, carried: int) -> Layout:
+    """Return the work space for a tree with so many inputs that are carried."""
     from fflin.kernel.rnea import LOAD, MOTION
 
     size, bodies = len(tree.row), len(tree.parent)

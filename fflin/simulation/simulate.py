@@ -17,6 +17,7 @@ from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import state_history
 from fflin.linear.model import LinearModel
 from fflin.robot.limits import chosen_limits
+from fflin.simulation.compiled import engine_of, run
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import (
@@ -30,7 +31,6 @@ from fflin.simulation.plan import (
 )
 from fflin.simulation.plant import Plant
 from fflin.simulation.prediction import predict, predictor
-from fflin.simulation.run import go
 from fflin.simulation.times import times_of
 
 if TYPE_CHECKING:
@@ -66,6 +66,7 @@ def simulate(
     reference: pin.SE3 | None = None,
     every: int | None = None,
     progress: bool | None = None,
+    engine: str | None = None,
 ) -> Motion:
     r"""Simulate a robot under a policy.
 
@@ -129,6 +130,10 @@ def simulate(
         100,000 rows, as many as leave 10,000, which the motion's `notes` say.
     progress : bool, optional
         Whether a bar is shown on stderr; by default on a terminal, for runs that take long.
+    engine : {"python", "compiled"}, optional
+        What runs the loop; by default the compiled one where it can and is the quicker. It needs
+        numba, and no policy, event, callback or disturbance in Python. Both give the same to
+        rounding.
 
     Returns
     -------
@@ -178,6 +183,7 @@ def simulate(
         q=q,
         v=v,
         times=times,
+        policy=policy,
         law=law,
         initial=lin.u0 if lin is not None and same else np.zeros(len(within.low)),
         limits=within,
@@ -196,7 +202,7 @@ def simulate(
         predictor=foresees,
     )
     try:
-        return _motion(plan, plant)
+        return _motion(plan, plant, engine_of(engine, plan, plant))
     except MemoryError:
         raise InputError(
             f"{times.steps // times.every} rows of '{robot.name}' do not fit into the memory; take "
@@ -204,25 +210,25 @@ def simulate(
         ) from None
 
 
-def _motion(plan: Plan, plant: Plant) -> Motion:
+def _motion(plan: Plan, plant: Plant, engine: str) -> Motion:
     """Return the motion that a plan leads to."""
     state, robot = plant.state, plant.robot
     conserved = Conserved(robot, plan.q)
-    run = go(plan, plant, conserved)
-    x = state_history(state, run.q, run.v, plan.near, run.t)
-    history = conserved.histories(run.q, run.v)
+    ran = run(plan, plant, conserved, engine)
+    x = state_history(state, ran.q, ran.v, plan.near, ran.t)
+    history = conserved.histories(ran.q, ran.v)
     return Motion(
-        t=run.t,
-        q=run.q,
-        v=run.v,
+        t=ran.t,
+        q=ran.q,
+        v=ran.v,
         x=x,
-        u=run.u,
+        u=ran.u,
         target=np.zeros(0) if plan.target is None else plan.target,
-        prediction=predict(plan, x, run.steps),
+        prediction=predict(plan, x, ran.steps),
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
-        momentum_drift=conserved.momentum_drift(history, run.momentum),
-        com_drift=np.linalg.norm(history.center - run.center, axis=1),
+        momentum_drift=conserved.momentum_drift(history, ran.momentum),
+        com_drift=np.linalg.norm(history.center - ran.center, axis=1),
         placement=pin.SE3ToXYZQUAT(state.reference),
         state_names=state.names,
         input_names=plant.actuation.names,
@@ -231,7 +237,8 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         frame=state.frame,
         robot=robot.name,
         urdf_sha256=robot.urdf_sha256,
-        stopped=run.stopped,
+        stopped=ran.stopped,
+        engine=ran.engine,
         _robot=robot,
         wheels=tuple(robot.wheels),
         wheel_inertias=np.array(list(robot.wheels.values())),

@@ -1,0 +1,128 @@
+"""How a command reaches the robot in the loop, as `control.channel` has it for one in Python."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from fflin.kernel.lanes import chosen, inlined, load, store, whole
+
+
+class Wheels(NamedTuple):
+    """Wheels with largest speeds (k,): their inputs, coordinates, torques, speeds, and J / dt."""
+
+    at: Any
+    row: Any
+    least_torque: Any
+    most_torque: Any
+    least_speed: Any
+    most_speed: Any
+    stiffness: Any
+
+
+class Pulses(NamedTuple):
+    """Thrusters that fire in pulses (k,), and what is left of their commands, see `Pulses`.
+
+    `level` acts until the step `end`; `time` is that of a sample.
+    """
+
+    at: Any
+    on_off: Any
+    most: Any
+    least: Any
+    quantum: Any
+    left: Any
+    level: Any
+    end: Any
+    time: float
+
+
+class Channel(NamedTuple):
+    """Limits (nu,) of commands, and those on their way: `pending` has (slots, nu) of samples."""
+
+    low: Any
+    high: Any
+    held: Any
+    pending: Any
+    slots: int
+    sample: int
+    delay: int
+    wheels: Wheels
+    pulses: Pulses
+
+
+@inlined
+def clipped(value, low, high):
+    """Return a number within limits; what is no number stays none."""
+    value = chosen(value, low, low, value)
+    return chosen(high, value, high, value)
+
+
+@inlined
+def limit(channel, u):
+    """Cut inputs to their limits."""
+    for index in range(len(channel.low)):
+        value = clipped(load(u, index), load(channel.low, index), load(channel.high, index))
+        store(u, index, value)
+
+
+@inlined
+def send(channel, step, u):
+    """Put the command of a sample on its way."""
+    count = len(channel.low)
+    first = (step // channel.sample) % channel.slots * count
+    for index in range(count):
+        store(channel.pending, first + index, load(u, index))
+
+
+@inlined
+def arrive(channel, step, u):
+    """Write what acts in a step of what has arrived."""
+    count, since = len(channel.low), step - channel.delay
+    arrives = since >= 0 and since % channel.sample == 0
+    if arrives:
+        first = (since // channel.sample) % channel.slots * count
+        for index in range(count):
+            store(channel.held, index, load(channel.pending, first + index))
+    if arrives or (since < 0 and step % channel.sample == 0):
+        _begin_pulses(channel.pulses, step, channel.sample, channel.held)
+    for index in range(count):
+        store(u, index, load(channel.held, index))
+    pulses = channel.pulses
+    for index in range(len(pulses.at)):
+        level = chosen(float(step), load(pulses.end, index), load(pulses.level, index), 0.0)
+        store(u, pulses.at[index], level)
+
+
+@inlined
+def _begin_pulses(pulses, step, sample, u):
+    """Take the command of a sample, and carry on what is not fired of it."""
+    for index in range(len(pulses.at)):
+        most, least = load(pulses.most, index), load(pulses.least, index)
+        command = load(u, pulses.at[index])
+        wanted = chosen(most, command, most, command) * pulses.time + load(pulses.left, index)
+        if pulses.on_off[index]:
+            quantum = load(pulses.quantum, index)
+            length = clipped(whole(wanted / quantum), 0.0, float(sample))
+            level, fired = most + 0.0 * wanted, length * quantum
+        else:
+            level = clipped(wanted / pulses.time, 0.0, most)
+            length, fired = float(sample) + 0.0 * wanted, level * pulses.time
+        # An impulse that misses the least one by rounding is the least one.
+        fires = chosen(0.0, fired, chosen(fired, (1.0 - 1e-9) * least, 0.0, 1.0), 0.0)
+        store(pulses.left, index, wanted - fires * fired)
+        store(pulses.end, index, float(step) + fires * length)
+        store(pulses.level, index, level)
+
+
+@inlined
+def spare_wheels(channel, nu, u):
+    """Cut what would take a wheel beyond its speed within a step; it drives nothing of itself."""
+    wheels = channel.wheels
+    for index in range(len(wheels.at)):
+        least, most = load(wheels.least_torque, index), load(wheels.most_torque, index)
+        speed, stiffness = load(nu, wheels.row[index]), load(wheels.stiffness, index)
+        low = clipped(stiffness * (load(wheels.least_speed, index) - speed), least, most)
+        high = clipped(stiffness * (load(wheels.most_speed, index) - speed), least, most)
+        low, high = chosen(low, 0.0, low, 0.0), chosen(0.0, high, high, 0.0)
+        at = wheels.at[index]
+        store(u, at, clipped(load(u, at), low, high))

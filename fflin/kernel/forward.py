@@ -1,0 +1,150 @@
+"""Forward dynamics with all that acts on a robot, one configuration or eight at once.
+
+CRBA's M, the bias forces of RNEA and a factor of M. All stands in base axes and the base neither is
+anywhere nor moves along, as no acceleration but those of (3.1) depends on either.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from fflin.kernel.accelerations import Layout, Loads
+from fflin.kernel.crba import inwards, outwards
+from fflin.kernel.factor import factorise, solve
+from fflin.kernel.lanes import angle, inlined, load, store
+from fflin.kernel.places import attitude, columns_of
+from fflin.kernel.rnea import at_parent, carried_wrench, collect, load_bodies, move_bodies
+from fflin.kernel.tree import PLACE, Tree
+from fflin.kernel.vectors import (
+    across,
+    add,
+    cross,
+    get3,
+    get6,
+    minus,
+    plus,
+    plus6,
+    put3,
+    times6,
+)
+
+
+class Mechanics(NamedTuple):
+    """A robot as the loop reads it; each array of doubles may have a second axis of eight lanes.
+
+    Attributes
+    ----------
+    gravity : ndarray (3,)
+        In reference axes.
+    index, circling, springy : ndarray (n,), (n,) of bool, (n,) of bool
+        Entry of q of each joint, whether it is the cosine of an angle, and whether the joint has a
+        spring or a damper.
+    rest : ndarray (n,)
+        Positions at which springs are at rest.
+    row : ndarray (nu,)
+        The coordinate that each input drives; -1 for one that is carried.
+    held : ndarray (k,)
+        First of three inputs each that are a vector on the base in reference axes.
+    """
+
+    tree: Tree
+    layout: Layout
+    loads: Loads
+    gravity: Any
+    index: Any
+    circling: Any
+    springy: Any
+    rest: Any
+    row: Any
+    held: Any
+
+
+class Point(NamedTuple):
+    """Where a robot is, q (nq,) and nu (6 + n,) in base axes, and the inputs (nu,) there.
+
+    `u` is as it is commanded, `pushing` in base axes.
+    """
+
+    q: Any
+    nu: Any
+    u: Any
+    pushing: Any
+
+
+@inlined
+def configure(work, robot, q):
+    """Write the places of all bodies and the packed M at a configuration."""
+    outwards(work, robot.tree, q)
+    inwards(work, robot.tree)
+
+
+@inlined
+def joint_position(robot, q, joint):
+    """Return a joint's angle, in (-pi, pi] where it turns without end, or length."""
+    at = robot.index[joint]
+    value = load(q, at)
+    if robot.circling[joint]:
+        value = angle(load(q, at + 1), value)
+    return value
+
+
+@inlined
+def turn_inputs(robot, point):
+    """Write the inputs in base axes."""
+    for index in range(len(robot.row)):
+        store(point.pushing, index, load(point.u, index))
+    for index in range(len(robot.held)):
+        at = robot.held[index]
+        axes = columns_of(attitude(point.q))
+        put3(point.pushing, at, across(axes, get3(point.u, at)))
+
+
+@inlined
+def accelerate(work, robot, point, rates, to):
+    """Write the rates of nu at a point that is configured into `rates` from `to` on.
+
+    Its M is overwritten by its factor.
+    """
+    tree, layout, loads, nu = robot.tree, robot.layout, robot.loads, point.nu
+    move_bodies(work, tree, layout, nu)
+    load_bodies(work, tree, layout, loads, point.pushing)
+    collect(work, tree, layout)
+    force, size = layout.bias, len(tree.row)
+    for index in range(size):
+        store(work, force + index, -load(work, force + index))
+    for index in range(len(robot.row)):
+        if robot.row[index] >= 0:
+            add(work, force + robot.row[index], load(point.pushing, index))
+    for joint in range(len(robot.index)):
+        if robot.springy[joint]:
+            stretch = joint_position(robot, point.q, joint) - load(robot.rest, joint)
+            pull = load(loads.stiffness, joint) * stretch
+            pull = pull + load(loads.damping, joint) * load(nu, 6 + joint)
+            add(work, force + 6 + joint, -pull)
+    factorise(work, tree)
+    solve(work, tree, force)
+    for index in range(size):
+        store(rates, to + index, load(work, force + index))
+    # What falls and what turns takes the base's origin along.
+    fall = across(columns_of(attitude(point.q)), get3(robot.gravity, 0))
+    fall = minus(fall, cross(get3(nu, 0), get3(nu, 3)))
+    put3(rates, to + 3, plus(get3(rates, to + 3), fall))
+
+
+@inlined
+def push(work, robot, point):
+    """Return the wrench on the robot at its base's origin (moment, force) of all its inputs."""
+    tree, loads = robot.tree, robot.loads
+    for index in range(6):
+        store(work, robot.layout.bias + index, 0.0)
+    for index in range(len(robot.row)):
+        if 0 <= robot.row[index] < 6:
+            add(work, robot.layout.bias + robot.row[index], load(point.pushing, index))
+    total = get6(work, robot.layout.bias)
+    for index in range(len(loads.body)):
+        body, wrench = loads.body[index], carried_wrench(work, tree, loads, index)
+        while body > 0:
+            wrench = at_parent(work, tree.places + body * PLACE, wrench)
+            body = tree.parent[body]
+        total = plus6(total, times6(wrench, load(point.pushing, loads.input[index])))
+    return total

@@ -1,0 +1,108 @@
+"""The policies of the loop: feedback of the state, and of outputs by a filter."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fflin.kernel.forward import joint_position
+from fflin.kernel.lanes import chosen, inlined, load, splat, store, whole
+from fflin.kernel.places import attitude, columns_of
+from fflin.kernel.vectors import get3, product, put3, times
+
+NOTHING, STATE, OUTPUT = range(3)
+
+
+class Law(NamedTuple):
+    """A policy; each array of doubles may have a second axis of eight lanes.
+
+    Attributes
+    ----------
+    kind : int
+        NOTHING, STATE (u = offset - K x) or OUTPUT (u = offset + C z, z' = A z + B (y - y0), y
+        being states).
+    turned : ndarray (2,) of bool
+        Whether omega_b and v_b of the state stand in reference axes.
+    near : ndarray (n,)
+        Positions whose turn is taken of joints that go round.
+    K, offset : ndarray (nu nx,), (nu,)
+    A, B, C, y0, measured : ndarray
+        Of the filter, matrices row by row, and the states that are outputs.
+    x, z, next : ndarray (nx,), (nz,), (nz,)
+        Work space, and the filter's state.
+    """
+
+    kind: int
+    turned: Any
+    near: Any
+    K: Any
+    offset: Any
+    A: Any
+    B: Any
+    C: Any
+    y0: Any
+    measured: Any
+    x: Any
+    z: Any
+    next: Any
+
+
+@inlined
+def read_state(robot, law, point):
+    """Write the state in the chart."""
+    x, q, nu, n = law.x, point.q, point.nu, len(robot.index)
+    vector, scalar = attitude(q)
+    sign = chosen(scalar, 0.0, -1.0, 1.0)
+    put3(x, 0, times(vector, sign))
+    put3(x, 3, get3(q, 0))
+    for joint in range(n):
+        value = joint_position(robot, q, joint)
+        if robot.circling[joint]:
+            turns = whole((load(law.near, joint) - value) * (0.5 / np.pi))
+            value = value + 2.0 * np.pi * turns
+        store(x, 6 + joint, value)
+    axes = columns_of((vector, scalar))
+    for part in range(2):
+        rate = get3(nu, 3 * part)
+        if law.turned[part]:
+            rate = product(axes, rate)
+        put3(x, 6 + n + 3 * part, rate)
+    for joint in range(n):
+        store(x, 12 + n + joint, load(nu, 6 + joint))
+
+
+@inlined
+def _times(matrix, row, x):
+    """Return a row of a matrix times a vector."""
+    total, width = load(matrix, row * len(x)) * load(x, 0), len(x)
+    for index in range(1, width):
+        total = total + load(matrix, row * width + index) * load(x, index)
+    return total
+
+
+@inlined
+def command(robot, law, point):
+    """Write the inputs that a policy asks for."""
+    read_state(robot, law, point)
+    if law.kind == STATE:
+        for index in range(len(law.offset)):
+            store(point.u, index, load(law.offset, index) - _times(law.K, index, law.x))
+    else:
+        _filter(law, point.u)
+
+
+@inlined
+def _filter(law, u):
+    """Write what the estimate asks for, and bring it up to the next sample."""
+    for index in range(len(law.offset)):
+        store(u, index, load(law.offset, index) + _times(law.C, index, law.z))
+    outputs = len(law.measured)
+    for row in range(len(law.z)):
+        total = splat(law.z, 0.0) + _times(law.A, row, law.z)
+        for index in range(outputs):
+            y = load(law.x, law.measured[index]) - load(law.y0, index)
+            total = total + load(law.B, row * outputs + index) * y
+        store(law.next, row, total)
+    for row in range(len(law.z)):
+        store(law.z, row, load(law.next, row))

@@ -1,0 +1,199 @@
+"""The closed loop, step after step: a policy, forward dynamics, and steps on the manifold."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from fflin.kernel.channel import arrive, limit, send, spare_wheels
+from fflin.kernel.course import (
+    add_wrench,
+    begin_step,
+    center_of,
+    end_step,
+    impose,
+    momentum_of,
+)
+from fflin.kernel.forward import accelerate, configure, turn_inputs
+from fflin.kernel.lanes import below, compiled, inlined, load, store
+from fflin.kernel.laws import NOTHING, command
+from fflin.kernel.places import displace
+from fflin.kernel.vectors import put3
+
+
+class Method(NamedTuple):
+    """Steps of a method, by what its displacements and velocities are made of.
+
+    Attributes
+    ----------
+    h : float
+        Step [s].
+    origin : ndarray (s,) of int
+        After each stage: whether the way begins at the step's first place or at its second stage.
+    way : ndarray ((s + 1) (s + 1),)
+        Row by row, shares of v and the stages' accelerations in the displacement after each stage,
+        and in the second one after the last.
+    speed : ndarray (s (s + 1),)
+        In the velocity there.
+    weights, moments : ndarray (s,)
+        Of the stages in sums along, with h and h^2.
+    twice : bool
+        Whether there is a second displacement.
+    """
+
+    h: float
+    origin: Any
+    way: Any
+    speed: Any
+    weights: Any
+    moments: Any
+    twice: bool
+
+
+class Watch(NamedTuple):
+    """When to stop: squares of speeds (6 + n,), and the sign (1,) of q0 or 0 for any."""
+
+    squares: Any
+    sign: Any
+
+
+class Stages(NamedTuple):
+    """Work space: v and the accelerations of the stages, a displacement, and two stages' q.
+
+    `u` (nu,) is what acted as the last step began.
+    """
+
+    rates: Any
+    along: Any
+    first: Any
+    second: Any
+    u: Any
+
+
+@inlined
+def _combine(shares, row, rates, out):
+    """Write a combination of v and the accelerations of the stages."""
+    size = len(out)
+    count = len(rates) // size
+    for index in range(size):
+        total = load(shares, row * count) * load(rates, index)
+        for stage in range(1, count):
+            part = load(rates, stage * size + index)
+            total = total + load(shares, row * count + stage) * part
+        store(out, index, total)
+
+
+@inlined
+def _copy(source, target):
+    for index in range(len(target)):
+        store(target, index, load(source, index))
+
+
+@inlined
+def _record(rows, row, point, course, t):
+    """Write a row: q, nu, u, and momentum and centre of mass as they are to be."""
+    at = row * (len(point.q) + len(point.nu) + len(point.u) + 9)
+    for values in (point.q, point.nu, point.u):
+        for index in range(len(values)):
+            store(rows, at + index, load(values, index))
+        at += len(values)
+    linear, angular = momentum_of(course)
+    put3(rows, at, linear)
+    put3(rows, at + 3, angular)
+    put3(rows, at + 6, center_of(course, t))
+
+
+@inlined
+def _goes_on(watch, point):
+    """Whether all is finite, within bounds, and in the chart."""
+    good = below(-(load(watch.sign, 0) * load(point.q, 6)), 1e-300)
+    for index in range(len(watch.squares)):
+        rate = load(point.nu, index)
+        good = good and below(rate * rate, load(watch.squares, index))
+    return good
+
+
+@inlined
+def _act(channel, law, robot, point, step, stage):
+    """Write the inputs at a stage, as they are commanded and in base axes."""
+    sample = channel.sample
+    if law.kind != NOTHING and (sample == 0 or stage == 0):
+        if sample == 0 or step % sample == 0:
+            command(robot, law, point)
+            limit(channel, point.u)
+            if sample > 0:
+                send(channel, step, point.u)
+        if sample > 0:
+            arrive(channel, step, point.u)
+        spare_wheels(channel, point.nu, point.u)
+    turn_inputs(robot, point)
+
+
+@compiled
+def advance(
+    robot, method, law, channel, course, watch, point, stages, clock, last, every, rows, work
+):
+    """Go on with a run up to a step, or to one that led where `watch` stops.
+
+    The point, the sums of the course, and what law and channel remember are brought up to there.
+
+    Parameters
+    ----------
+    robot : Mechanics
+    method : Method
+    law : Law
+    channel : Channel
+    course : tuple of Course, bool, bool
+        And whether it is imposed, and whether anything pushes from outside.
+    watch : Watch
+    point : Point
+    stages : Stages
+    clock : ndarray (1,) of int
+        How many steps are done.
+    last : int
+        How many are to be done.
+    every : int
+        Steps from row to row; 0 where none is recorded.
+    rows : ndarray (rows * width,) or (rows * width, 8)
+        Gets q, nu, u, and the momentum (6,) and centre of mass (3,) that are kept, row by row.
+    work : ndarray
+        Work space of `Layout.size`.
+    """
+    kept, project, pushed = course
+    tree, h, count = robot.tree, method.h, len(method.origin)
+    row = 0
+    configure(work, robot, point.q)
+    for step in range(clock[0], last):
+        begin_step(kept)
+        _copy(point.q, stages.first)
+        for index in range(len(point.nu)):
+            store(stages.rates, index, load(point.nu, index))
+        for stage in range(count):
+            _act(channel, law, robot, point, step, stage)
+            if stage == 0:
+                _copy(point.u, stages.u)
+                if every > 0 and step % every == 0:
+                    _record(rows, row, point, kept, step * h)
+                    row += 1
+            if pushed:
+                weight, moment = method.weights[stage], method.moments[stage]
+                add_wrench(work, robot, kept, point, weight, moment)
+            accelerate(work, robot, point, stages.rates, (1 + stage) * len(point.nu))
+            if stage == 1:
+                _copy(point.q, stages.second)
+            _combine(method.way, stage, stages.rates, stages.along)
+            _combine(method.speed, stage, stages.rates, point.nu)
+            if method.origin[stage] == 0:
+                displace(tree, stages.first, stages.along, point.q)
+            else:
+                displace(tree, stages.second, stages.along, point.q)
+            if stage == count - 1 and method.twice:
+                _combine(method.way, count, stages.rates, stages.along)
+                displace(tree, point.q, stages.along, point.q)
+            configure(work, robot, point.q)
+        if pushed:
+            end_step(kept, h)
+        if project:
+            impose(work, robot, kept, point, (step + 1) * h)
+        clock[0] = step + 1
+        if not _goes_on(watch, point):
+            break
