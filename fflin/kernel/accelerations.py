@@ -110,10 +110,11 @@ class BatchAccelerations:
         """
         (count, nv), carried = nu.shape, len(self.carried)
         inverse, c, couplings = np.empty((count, nv * nv)), np.empty((count, nv)), np.empty(count)
-        columns = np.empty((count, nv * carried))
+        columns, points = np.empty((count, nv * carried)), (q, nu, forces, u)
         kernel("linearise", "linearise")(
-            *(self._tree, self._layout, self._loads, (q, nu, forces, u)),
+            *(self._tree, self._layout, self._loads, points),
             (inverse, c, A.reshape(count, -1), columns, couplings),
+            tuple(_work_space(each.shape[1]) for each in points),
             _work_space(self._layout.size),
         )
         inverse, columns = inverse.reshape(count, nv, nv), columns.reshape(count, nv, carried)
@@ -130,7 +131,8 @@ def inverse_inertias(tree: Tree, q: Array, out: Array) -> Array:
     """
     couplings = np.empty(len(q))
     flat = out.reshape(len(q), -1)
-    kernel("factor", "invert")(tree, q, flat, couplings, _work_space(tree.size))
+    spaces = _work_space(q.shape[1]), _work_space(tree.size)
+    kernel("factor", "invert")(tree, q, flat, couplings, *spaces)
     return couplings
 
 

@@ -7,8 +7,6 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, section 6.5.
 
 from __future__ import annotations
 
-import numpy as np
-
 from fflin.kernel.crba import inwards, outwards
 from fflin.kernel.lanes import compiled, inlined, load, scatter, splat, store, transpose
 from fflin.kernel.tree import LANES
@@ -111,17 +109,17 @@ def pack(rows, first, lanes):
 @inlined
 def unpack(work, start, entries, out, first, offset):
     """Write entries that stand lane beside lane to the rows of eight points, from a column on."""
-    flat, stride = out.reshape(-1), out.shape[1]
+    stride = out.shape[1]
     whole = entries - entries % LANES
     to = first * stride + offset
     for entry in range(0, whole, LANES):
-        transpose(work, start + entry, flat, to + entry, stride)
+        transpose(work, start + entry, out, to + entry, stride)
     for entry in range(whole, entries):
-        scatter(flat, to + entry, stride, load(work, start + entry))
+        scatter(out, to + entry, stride, load(work, start + entry))
 
 
 @compiled
-def invert(tree, q, out, couplings, work):
+def invert(tree, q, out, couplings, lanes, work):
     """Write M^-1 of each configuration.
 
     Parameters
@@ -133,11 +131,10 @@ def invert(tree, q, out, couplings, work):
         Results.
     couplings : ndarray (count,)
         The sums of M_ii (M^-1)_ii, which tell how singular M is.
-    work : ndarray
+    lanes, work : ndarray (nq, 8), (size, 8)
         Work space.
     """
     count, entries = out.shape
-    lanes = np.empty((q.shape[1], LANES))
     for block in range(0, count, LANES):
         # The last block begins early enough to fill the lanes; some points are done twice.
         first = min(block, count - LANES)

@@ -36,8 +36,9 @@ _VECTOR = ir.VectorType(_DOUBLE, LANES)
 _BYTES = 8  # alignment of a double
 
 # A product and a sum may become one fused instruction, which rounds once; a quotient by zero is
-# infinite.
-_OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy"}
+# infinite; and no references to arrays are counted, which takes three quarters of the time else,
+# and makes no function able to allocate.
+_OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
 inlined = numba.njit(forceinline=True, **_OPTIONS)
 compiled = numba.njit(nogil=True, cache=True, boundscheck=False, **_OPTIONS)
 
@@ -122,12 +123,16 @@ def _held(array: Any) -> Any:
     return lanes if array.ndim == 2 else double
 
 
+def _flat_place(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
+    """Return where a double of a contiguous array is, all of its axes taken for one."""
+    return builder.gep(context.make_array(kind)(context, builder, array).data, [index])
+
+
 def _place(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
-    data = context.make_array(kind)(context, builder, array).data
     if _held(kind) == double:
-        return builder.gep(data, [index])
-    place = builder.gep(data, [builder.mul(index, ir.Constant(index.type, LANES))])
-    return builder.bitcast(place, _VECTOR.as_pointer())
+        return _flat_place(context, builder, kind, array, index)
+    index = builder.mul(index, ir.Constant(index.type, LANES))
+    return builder.bitcast(_flat_place(context, builder, kind, array, index), _VECTOR.as_pointer())
 
 
 def _write(builder: Any, value: Any, place: Any) -> None:
@@ -258,13 +263,13 @@ def _angle(sine: Any, cosine: Any) -> Any:
 
 @intrinsic
 def scatter(typing: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
-    """Write eight doubles to an array of one axis, `stride` apart, from an index on."""
+    """Write eight doubles to a contiguous array, `stride` apart, from an index on."""
 
     def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
         values, first, step, eight = arguments
         for lane in range(LANES):
             at = builder.add(first, builder.mul(step, ir.Constant(step.type, lane)))
-            place = _place(context, builder, array, values, at)
+            place = _flat_place(context, builder, array, values, at)
             builder.store(builder.extract_element(eight, _INT32(lane)), place)
         return context.get_dummy_value()
 
@@ -302,7 +307,7 @@ def transpose(typing: Any, source: Any, index: Any, target: Any, start: Any, str
                     )
         for row, value in enumerate(rows):
             at = builder.add(begin, builder.mul(step, ir.Constant(step.type, row)))
-            place = _place(context, builder, target, out, at)
+            place = _flat_place(context, builder, target, out, at)
             _write(builder, value, builder.bitcast(place, _VECTOR.as_pointer()))
         return context.get_dummy_value()
 

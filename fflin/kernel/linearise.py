@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from fflin.kernel.crba import inwards, outwards
 from fflin.kernel.factor import (
     factorise,
@@ -65,7 +63,7 @@ def _solve_slopes(work, tree, layout):
 
 
 @compiled
-def linearise(tree, layout, loads, points, out, work):
+def linearise(tree, layout, loads, points, out, lanes, work):
     """Write M^-1, c, the lower half of A, and the columns of the carried inputs, of each point.
 
     Parameters
@@ -81,13 +79,14 @@ def linearise(tree, layout, loads, points, out, work):
         M^-1 (count, size * size), c (count, size), lower half of A (count, stride) of which the
         last size * 2 size entries, columns (count, size * carried), and couplings (count,), the
         sums of M_ii (M^-1)_ii.
-    work : ndarray
+    lanes : tuple of ndarray
+        Work space for a row of each array of `points`, (entries, 8).
+    work : ndarray (size, 8)
     """
     q, nu, forces, u = points
     inverse, c, A, columns, couplings = out
     count, size = len(q), len(tree.row)
-    q_of, nu_of = np.empty((q.shape[1], LANES)), np.empty((size, LANES))
-    forces_of, u_of = np.empty((size, LANES)), np.empty((u.shape[1], LANES))
+    q_of, nu_of, forces_of, u_of = lanes
     lower = 2 * size * size
     for block in range(0, count, LANES):
         # The last block begins early enough to fill the lanes; some points are done twice.

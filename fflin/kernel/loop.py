@@ -128,6 +128,21 @@ def _act(channel, law, robot, point, step, stage):
     turn_inputs(robot, point)
 
 
+@inlined
+def _move(robot, method, stages, point, stage):
+    """Go from a stage, whose acceleration is there, to the next one, or to the end of the step."""
+    rates, along, last = stages.rates, stages.along, stage == len(method.origin) - 1
+    if stage == 1:
+        _copy(point.q, stages.second)
+    _combine(method.way, stage, rates, along)
+    _combine(method.speed, stage, rates, point.nu)
+    begin = stages.first if method.origin[stage] == 0 else stages.second
+    displace(robot.tree, begin, along, point.q)
+    if last and method.twice:
+        _combine(method.way, stage + 1, rates, along)
+        displace(robot.tree, point.q, along, point.q)
+
+
 @compiled
 def advance(
     robot, method, law, channel, course, watch, point, stages, clock, last, every, rows, work
@@ -159,15 +174,14 @@ def advance(
         Work space of `Layout.size`.
     """
     kept, project, pushed = course
-    tree, h, count = robot.tree, method.h, len(method.origin)
-    row = 0
+    h, row = method.h, 0
     configure(work, robot, point.q)
     for step in range(clock[0], last):
         begin_step(kept)
         _copy(point.q, stages.first)
         for index in range(len(point.nu)):
             store(stages.rates, index, load(point.nu, index))
-        for stage in range(count):
+        for stage in range(len(method.origin)):
             _act(channel, law, robot, point, step, stage)
             if stage == 0:
                 _copy(point.u, stages.u)
@@ -178,17 +192,7 @@ def advance(
                 weight, moment = method.weights[stage], method.moments[stage]
                 add_wrench(work, robot, kept, point, weight, moment)
             accelerate(work, robot, point, stages.rates, (1 + stage) * len(point.nu))
-            if stage == 1:
-                _copy(point.q, stages.second)
-            _combine(method.way, stage, stages.rates, stages.along)
-            _combine(method.speed, stage, stages.rates, point.nu)
-            if method.origin[stage] == 0:
-                displace(tree, stages.first, stages.along, point.q)
-            else:
-                displace(tree, stages.second, stages.along, point.q)
-            if stage == count - 1 and method.twice:
-                _combine(method.way, count, stages.rates, stages.along)
-                displace(tree, point.q, stages.along, point.q)
+            _move(robot, method, stages, point, stage)
             configure(work, robot, point.q)
         if pushed:
             end_step(kept, h)

@@ -49,26 +49,28 @@ def engine_of(engine: Any, plan: Plan, plant: Plant) -> str:
 
 def _reason(plan: Plan, plant: Plant) -> str:
     """Say what keeps a plan from the compiled loop; nothing where it can run it."""
-    policy, times = plan.policy, plan.times
+    policy, robot = plan.policy, plant.robot
     kind = type(policy)
-    if not numba_is_there():
-        return "numba is not installed (pip install fflin[numba])"
-    if plan.events or plan.callback or plant.disturbance:
-        return "events, callbacks and disturbances are functions in Python"
-    if not plan.method.origins:
-        return f"the method {plan.method.__name__} is there in Python alone"
-    if batch_tree(plant.robot) is None:
-        return f"'{plant.robot.name}' has a joint that is no screw about a fixed axis"
-    if policy is not None and kind not in (StateFeedback, OutputFeedback):
-        return f"a {kind.__name__} decides in Python"
+    keeps = {
+        "numba is not installed (pip install 'fflin[fast]')": not numba_is_there(),
+        "events, callbacks and disturbances are functions in Python": bool(
+            plan.events or plan.callback or plant.disturbance
+        ),
+        f"the method {plan.method.__name__} is there in Python alone": not plan.method.origins,
+        f"'{robot.name}' has a joint that is no screw about a fixed axis": batch_tree(robot)
+        is None,
+        f"a {kind.__name__} decides in Python": policy is not None
+        and kind not in (StateFeedback, OutputFeedback),
+    }
     if kind is OutputFeedback:
-        if policy.noise is not None:
-            return "the noise is a function in Python"
-        if abs(times.sample * times.dt - policy.lin.dt) > 1e-6 * policy.lin.dt:
-            return "the samples are not those of the compensator"
-        if measured_states(plant.state) is None:
-            return "outputs that are no states are measured in Python"
-    return ""
+        late = abs(plan.times.sample * plan.times.dt - policy.lin.dt) > 1e-6 * policy.lin.dt
+        keeps |= {
+            "the noise is a function in Python": policy.noise is not None,
+            "the samples are not those of the compensator": late,
+            "outputs that are no states are measured in Python": measured_states(plant.state)
+            is None,
+        }
+    return next((reason for reason, holds in keeps.items() if holds), "")
 
 
 def _small(plant: Plant) -> bool:
@@ -114,7 +116,7 @@ def _fly(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
         bar.close()
     steps = int(clock[0])
     count = -(-steps // times.every)
-    t = times.dt * times.every * np.arange(count + 1)
+    t = times.every * np.arange(count + 1) * times.dt
     if not stopped.startswith(("diverged", "interrupted")):
         t[count] = steps * times.dt
         of_course = kept.start[:9] + kept.sums[:9]
