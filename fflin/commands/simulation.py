@@ -34,6 +34,11 @@ if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
 
+_GROUPS = (
+    *("where it starts", "where it is to be", "what regulates it", "the run", "the robot"),
+    "what is kept and shown of it",
+)
+
 # The options that name a file to write.
 _OUTPUTS = ("output_file", "plot", "html", "png", "gif")
 
@@ -44,75 +49,58 @@ def add_commands(commands: Commands) -> None:
         commands,
         "simulate",
         _simulate,
-        "let a regulator bring the nonlinear robot from where it is put to the target",
+        "let a regulator bring the nonlinear robot from where it is put to the target, or "
+        "along a trajectory",
         "fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png",
     )
     add_robot(simulate)
-    add_pose(simulate)
-    add_system(simulate)
+    start, goal, law, run, system, shown = map(simulate.add_argument_group, _GROUPS)
+    add_system(system)
+    add_pose(start)
     add_values(
-        simulate,
+        start,
+        "--offset",
+        "how far from the trajectory's start it starts, in the base's axes there: a state, group "
+        "or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw [deg]",
+    )
+    add_values(
+        goal,
         "--target-joint",
         "where a joint is to go [rad|m]; the others go to neutral, the base to the world's origin",
     )
     add_values(
-        simulate,
+        goal,
         "--target-velocity",
         "a velocity of the target, such as the speed of a wheel that is to be held; it starts with "
         "it where --velocity does not say otherwise",
     )
-    add_inputs_there(simulate)
-    add_trajectory(simulate)
-    simulate.add_argument(
+    add_inputs_there(goal)
+    add_trajectory(goal)
+    add_weights(law)
+    law.add_argument(
         "--schedule",
         metavar="FILE",
         type=file_name,
         help="follow the trajectory with these gains, as tvlqr saves them; without it they are "
         "designed",
     )
-    add_values(
-        simulate,
-        "--offset",
-        "how far from the trajectory's start it starts, in the base's axes there: a state, group "
-        "or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw [deg]",
-    )
-    simulate.add_argument(
+    law.add_argument(
         "--gain",
         metavar="FILE",
         type=file_name,
         help="regulate with this gain, as lqr saves it, about the point it was designed for",
     )
-    add_weights(simulate)
-    simulate.add_argument(
+    law.add_argument(
         "--allocate",
         action=argparse.BooleanOptionalAction,
         help="whether to design with torque and force on the base, and let the thrusters, none of "
         "which pulls, give what comes nearest; by default where they push every way; else a "
         "thrust below zero is cut",
     )
-    simulate.add_argument(
+    law.add_argument(
         "--free", action="store_true", help="let it move without a regulator or any input"
     )
-    simulate.add_argument(
-        "--duration",
-        metavar="T",
-        type=number,
-        help="time [s]; by default that of the trajectory, or from 60 to 600, what the linear loop "
-        "takes to settle",
-    )
-    simulate.add_argument(
-        "--step", metavar="H", type=number, help="step of the integration [s]; chosen by default"
-    )
-    simulate.add_argument(
-        "--every",
-        metavar="N",
-        type=count_of,
-        help="steps from one recorded row to the next; chosen where there are many",
-    )
-    simulate.add_argument(
-        "--method", default="cf4", help="cf4 (default), rkmk4 or semi_implicit_euler"
-    )
-    simulate.add_argument(
+    law.add_argument(
         "--limits",
         choices=("urdf", "none"),
         default="urdf",
@@ -120,32 +108,49 @@ def add_commands(commands: Commands) -> None:
         "wheels (urdf, default), or only what --limit says (none)",
     )
     add_values(
-        simulate,
+        law,
         "--limit",
         "largest magnitude of an input, a group of them such as tau_m, or a pattern; goes first",
     )
-    simulate.add_argument(
+    law.add_argument(
         "--delay",
         metavar="T",
         type=number,
         default=0.0,
         help="time from a sample to its effect [s]",
     )
-    simulate.add_argument(
+    run.add_argument(
+        "--duration",
+        metavar="T",
+        type=number,
+        help="time [s]; by default that of the trajectory, or from 60 to 600, what the linear loop "
+        "takes to settle",
+    )
+    run.add_argument(
+        "--step", metavar="H", type=number, help="step of the integration [s]; chosen by default"
+    )
+    run.add_argument(
+        "--every",
+        metavar="N",
+        type=count_of,
+        help="steps from one recorded row to the next; chosen where there are many",
+    )
+    run.add_argument("--method", default="cf4", help="cf4 (default), rkmk4 or semi_implicit_euler")
+    shown.add_argument(
         "--plot",
         metavar="FILE",
         type=file_name,
         help="draw linear beside nonlinear into FILE: .png, .pdf or .svg",
     )
     add_values(
-        simulate,
+        shown,
         "--show",
         "what --plot draws: a state or input, a group or a pattern, such as q_m, '*.hinge_*'",
         metavar="NAME",
         read=str,
     )
-    add_output_file(simulate, "save the motion to FILE: .npz, .mat, .json or .csv")
-    add_pictures(simulate)
+    add_output_file(shown, "save the motion to FILE: .npz, .mat, .json or .csv")
+    add_pictures(shown)
 
 
 def _simulate(arguments: argparse.Namespace) -> int:

@@ -9,6 +9,7 @@ from fflin.base.errors import InputError
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
+    Container,
     add_output_file,
     add_robot,
     add_system,
@@ -42,7 +43,7 @@ def add_commands(commands: Commands) -> None:
     add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json")
 
 
-def add_trajectory(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
+def add_trajectory(parser: Container, *, required: bool = False) -> None:
     """Add --trajectory and --hold; then --frame is by default what the file says."""
     parser.add_argument(
         "--trajectory",
