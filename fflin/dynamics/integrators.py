@@ -29,6 +29,9 @@ class Integrator:
         Of the stages, in what is summed along: v of the end is v + h sum(weights a).
     moments : tuple of float
         Of the stages, in the sum of a sum: a free place of the end is r + h v + h^2 sum(moments a).
+    origins : tuple of int
+        After each stage: 0 where the way to the next begins at the step's first place, 1 where at
+        the second stage's. Empty where a step is no such combination.
     reach : float
         Largest pole times step with which it is stable on the negative real axis.
     """
@@ -36,10 +39,15 @@ class Integrator:
     weights: ClassVar[tuple[float, ...]]
     moments: ClassVar[tuple[float, ...]]
     reach: ClassVar[float]
-    origins: ClassVar[tuple[int, ...]] = ()  # empty where its steps are no such combinations
+    origins: ClassVar[tuple[int, ...]] = ()
 
     def __init__(self, model: pin.Model, dt: float) -> None:
         self.model, self.dt = model, dt
+
+    @classmethod
+    def shares(cls, dt: float) -> tuple[Array, Array]:
+        """Return those of v and its rates in what moves q, and in the new v, see `origins`."""
+        raise NotImplementedError
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and v one step later."""
@@ -65,11 +73,7 @@ class CommutatorFree4(Integrator):
 
     @classmethod
     def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return those of v, l1, ..., l4 in what moves q after each stage, and in the new v.
-
-        The stages' displacements begin where `origins` says, at the step's first place or at the
-        second stage's; the end is reached by two, one after the other.
-        """
+        """Return those of v, l1, ..., l4; the end is reached by two displacements."""
         h, half, twelfth = dt, 0.5 * dt, dt * dt / 12.0
         way = [
             [half, 0.0, 0.0, 0.0, 0.0],
@@ -154,7 +158,7 @@ class SemiImplicitEuler(Integrator):
 
     @classmethod
     def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return those of v and its rate in what moves q, and in the new v."""
+        """Return those of v and its rate."""
         return np.array([[dt, dt * dt], [0.0, 0.0]]), np.array([[1.0, dt]])
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:

@@ -78,7 +78,7 @@ def _small(plant: Plant) -> bool:
     return tree is not None and int((tree.depth**2).sum()) < _LARGEST_FACTOR
 
 
-def run(plan: Plan, plant: Plant, conserved: Conserved, engine: str) -> Recording:
+def carried_out(plan: Plan, plant: Plant, conserved: Conserved, engine: str) -> Recording:
     """Run a plan to its end by an engine; `plant` and `conserved` are of the robot that moves."""
     return go(plan, plant, conserved) if engine == "python" else _fly(plan, plant, conserved)
 

@@ -136,25 +136,29 @@ def _mechanics(plant: Plant, tree: Tree) -> forward.Mechanics:
 
 def _law(plan: Plan, plant: Plant) -> laws.Law:
     state, policy = plant.state, plan.policy
-    none, nowhere = np.zeros(0), np.zeros(0, dtype=np.intp)
-    turned, n = np.array(state.axes), state.robot.n
-    x = np.zeros(state.nx)
+    none, nowhere, joints = np.zeros(0), np.zeros(0, dtype=np.intp), state.groups.q_m
+    law = laws.Law(
+        *(laws.NOTHING, np.array(state.axes), np.zeros(state.robot.n), none, none),
+        *(none, none, none, none, nowhere, np.zeros(state.nx), none, none),
+    )
     if isinstance(policy, StateFeedback):
         K, offset, near = policy.terms(state)
-        near = near[state.groups.q_m].copy()
-        terms = (K.ravel(), offset, none, none, none, none, nowhere, x, none, none)
-        return laws.Law(laws.STATE, turned, near, *terms)
+        law = law._replace(kind=laws.STATE, near=near[joints].copy(), K=K.ravel(), offset=offset)
     if isinstance(policy, OutputFeedback):
-        by, lin = policy.compensator, policy.lin
-        near = state.read(lin.q, lin.v)[state.groups.q_m].copy()
-        filter_ = (np.array(each).ravel() for each in (by.A, by.B, by.C, by.y0))
-        of_states = np.array(measured_states(state), dtype=np.intp)
-        z, u0 = np.zeros(len(by.A)), np.array(by.u0)
-        return laws.Law(
-            laws.OUTPUT, turned, near, none, u0, *filter_, of_states, x, z, np.zeros_like(z)
+        by, lin, count = policy.compensator, policy.lin, len(policy.compensator.A)
+        law = law._replace(
+            kind=laws.OUTPUT,
+            near=state.read(lin.q, lin.v)[joints].copy(),
+            offset=np.array(by.u0),
+            A=np.array(by.A).ravel(),
+            B=np.array(by.B).ravel(),
+            C=np.array(by.C).ravel(),
+            y0=np.array(by.y0),
+            measured=np.array(measured_states(state), dtype=np.intp),
+            z=np.zeros(count),
+            next=np.zeros(count),
         )
-    terms = (none, none, none, none, none, none, nowhere, x, none, none)
-    return laws.Law(laws.NOTHING, turned, np.zeros(n), *terms)
+    return law
 
 
 def _channel(plan: Plan, plant: Plant) -> channel.Channel:
@@ -165,20 +169,20 @@ def _channel(plan: Plan, plant: Plant) -> channel.Channel:
     if w is not None:
         first = plant.state.groups.omega_b.start
         rows = [names.index(f"qdot_m.{name}") - first for name in w.names]
-        parts = (*w.torques, *w.limits, w.stiffness)
         wheels = channel.Wheels(
-            *(np.array(each, dtype=np.intp) for each in (w.at, rows)),
-            *(np.array(each, dtype=float) for each in parts),
+            np.array(w.at, dtype=np.intp),
+            np.array(rows, dtype=np.intp),
+            *(np.array(each, dtype=float) for each in (*w.torques, *w.limits, w.stiffness)),
         )
-    fired = channel.Pulses(nowhere, none.astype(bool), *(none for _ in range(6)), 1.0)
+    fired = channel.Pulses(nowhere, none.astype(bool), none, none, none, none, none, none, 1.0)
     if pulses is not None:
-        parts = (pulses.most, pulses.least, pulses.quantum)
+        most, least, quantum = (
+            np.array(each, dtype=float) for each in (pulses.most, pulses.least, pulses.quantum)
+        )
+        left, level, end = np.zeros((3, len(most)))
         fired = channel.Pulses(
-            np.array(pulses.places, dtype=np.intp),
-            np.array(pulses.on_off, dtype=bool),
-            *(np.array(each, dtype=float) for each in parts),
-            *(np.zeros(len(pulses.places)) for _ in range(3)),
-            float(pulses.time),
+            *(np.array(pulses.places, dtype=np.intp), np.array(pulses.on_off, dtype=bool)),
+            *(most, least, quantum, left, level, end, float(pulses.time)),
         )
     held: Array = np.minimum(np.maximum(plan.initial, limits.low), limits.high)
     slots = times.delay // times.sample + 1 if times.sample else 1
