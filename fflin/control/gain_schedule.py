@@ -121,19 +121,19 @@ class GainSchedule(Design):
         first, last = self._ends
         if type(t) is not float or not first <= t <= last:
             t = self._within(t)
-        k = bisect_right(self._starts, t) - 1
+        k = bisect_right(self.starts, t) - 1
         if self.dt:
             return self.K[k]
-        x = t - self._starts[k]
+        x = t - self.starts[k]
         square = x * x
         powers = np.array((1.0, x, square, square * x, square * square))
-        K: Array = powers.dot(self._quartics[k]).reshape(self.K.shape[1:])
+        K: Array = powers.dot(self.quartics[k]).reshape(self.K.shape[1:])
         return K
 
     def cost_to_go(self, t: float) -> Array:
         """Return P (nx, nx) at a time: a cubic between the knots, or that of the last sample."""
         t = self._within(t)
-        P: Array = self.P[bisect_right(self._starts, t) - 1] if self.dt else self._cubics(t)
+        P: Array = self.P[bisect_right(self.starts, t) - 1] if self.dt else self._cubics(t)
         return P
 
     def _within(self, t: float) -> float:
@@ -147,7 +147,7 @@ class GainSchedule(Design):
         return float(self.t[0]), float(self.t[-1])
 
     @cached_property
-    def _starts(self) -> list[float]:
+    def starts(self) -> list[float]:
         """Where each piece begins; a sample a little early, since clocks are rounded."""
         early = [self._ends[0], *(self.t[1:] - 1e-9 * self.dt).tolist()]
         return early if self.dt else self.t[:-1].tolist()
@@ -164,7 +164,7 @@ class GainSchedule(Design):
         )
 
     @cached_property
-    def _quartics(self) -> Array:
+    def quartics(self) -> Array:
         """Coefficients (M - 1, 5, nu nx) of K in the time since the knot."""
         reach = np.linalg.solve(self.R, self.B.transpose(0, 2, 1))
         slope = np.diff(reach, axis=0) / np.diff(self.t)[:, None, None]

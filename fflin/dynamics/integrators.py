@@ -25,6 +25,8 @@ class Integrator:
 
     Attributes
     ----------
+    nodes : tuple of float
+        Of the stages, in a step of length 1.
     weights : tuple of float
         Of the stages, in what is summed along: v of the end is v + h sum(weights a).
     moments : tuple of float
@@ -36,6 +38,7 @@ class Integrator:
         Largest pole times step with which it is stable on the negative real axis.
     """
 
+    nodes: ClassVar[tuple[float, ...]]
     weights: ClassVar[tuple[float, ...]]
     moments: ClassVar[tuple[float, ...]]
     reach: ClassVar[float]
@@ -66,6 +69,7 @@ class CommutatorFree4(Integrator):
     in the work space, and the next step overwrites it.
     """
 
+    nodes = (0.0, 0.5, 0.5, 1.0)
     weights = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
     moments = (1.0 / 6.0, 1.0 / 6.0, 1.0 / 6.0, 0.0)
     reach = 2.78
@@ -123,6 +127,7 @@ class CommutatorFree4(Integrator):
 class RungeKuttaMuntheKaas4(Integrator):
     """Order 4 in the tangent at q, with the inverse of dexp at each stage."""
 
+    nodes = CommutatorFree4.nodes
     weights, moments = CommutatorFree4.weights, CommutatorFree4.moments
     reach = 2.78
 
@@ -152,7 +157,7 @@ class RungeKuttaMuntheKaas4(Integrator):
 class SemiImplicitEuler(Integrator):
     """Order 1: the new velocity moves the configuration."""
 
-    weights = moments = (1.0,)
+    nodes, weights, moments = (0.0,), (1.0,), (1.0,)
     reach = 2.0
     origins = (0,)
 

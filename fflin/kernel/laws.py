@@ -1,4 +1,4 @@
-"""The policies of the loop: feedback of the state, and of outputs by a filter."""
+"""The policies of the loop: feedback of the state, of outputs by a filter, and on a path."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 from fflin.kernel.forward import joint_position
 from fflin.kernel.lanes import chosen, inlined, load, splat, store, whole
 from fflin.kernel.places import attitude, columns_of
+from fflin.kernel.tracking import Path, track
 from fflin.kernel.vectors import get3, product, put3, times
 
-NOTHING, STATE, OUTPUT = range(3)
+NOTHING, STATE, OUTPUT, TRACK = range(4)
 
 
 class Law(NamedTuple):
@@ -20,8 +21,8 @@ class Law(NamedTuple):
     Attributes
     ----------
     kind : int
-        NOTHING, STATE (u = offset - K x) or OUTPUT (u = offset + C z, z' = A z + B (y - y0), y
-        being states).
+        NOTHING, STATE (u = offset - K x), OUTPUT (u = offset + C z, z' = A z + B (y - y0), y
+        being states) or TRACK (u = u* - K e along `path`).
     turned : ndarray (2,) of bool
         Whether omega_b and v_b of the state stand in reference axes.
     near : ndarray (n,)
@@ -46,6 +47,7 @@ class Law(NamedTuple):
     x: Any
     z: Any
     next: Any
+    path: Path
 
 
 @inlined
@@ -82,8 +84,11 @@ def _times(matrix, row, x):
 
 
 @inlined
-def command(robot, law, point):
+def command(robot, law, point, t):
     """Write the inputs that a policy asks for."""
+    if law.kind == TRACK:
+        track(robot, law.path, point, t)
+        return
     read_state(robot, law, point)
     if law.kind == STATE:
         for index in range(len(law.offset)):

@@ -34,8 +34,8 @@ class Method(NamedTuple):
         and in the second one after the last.
     speed : ndarray (s (s + 1),)
         In the velocity there.
-    weights, moments : ndarray (s,)
-        Of the stages in sums along, with h and h^2.
+    nodes, weights, moments : ndarray (s,)
+        Of the stages: their times [s], and shares in sums along, with h and h^2.
     twice : bool
         Whether there is a second displacement.
     """
@@ -44,6 +44,7 @@ class Method(NamedTuple):
     origin: Any
     way: Any
     speed: Any
+    nodes: Any
     weights: Any
     moments: Any
     twice: bool
@@ -113,12 +114,12 @@ def _goes_on(watch, point):
 
 
 @inlined
-def _act(channel, law, robot, point, step, stage):
+def _act(channel, law, robot, point, step, stage, t):
     """Write the inputs at a stage, as they are commanded and in base axes."""
     sample = channel.sample
     if law.kind != NOTHING and (sample == 0 or stage == 0):
         if sample == 0 or step % sample == 0:
-            command(robot, law, point)
+            command(robot, law, point, t)
             limit(channel, point.u)
             if sample > 0:
                 send(channel, step, point.u)
@@ -182,7 +183,7 @@ def advance(
         for index in range(len(point.nu)):
             store(stages.rates, index, load(point.nu, index))
         for stage in range(len(method.origin)):
-            _act(channel, law, robot, point, step, stage)
+            _act(channel, law, robot, point, step, stage, step * h + method.nodes[stage])
             if stage == 0:
                 _copy(point.u, stages.u)
                 if every > 0 and step % every == 0:

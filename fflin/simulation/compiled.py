@@ -11,6 +11,7 @@ from fflin.base.errors import InputError, unknown
 from fflin.base.progress import Progress
 from fflin.control.output_feedback import OutputFeedback, measured_states
 from fflin.control.policies import StateFeedback
+from fflin.control.tracking import TrajectoryFeedback
 from fflin.kernel.compiled import kernel, loop_pays, numba_is_there
 from fflin.kernel.tree import batch_tree
 from fflin.simulation.conservation import Conserved
@@ -60,7 +61,7 @@ def _reason(plan: Plan, plant: Plant) -> str:
         f"'{robot.name}' has a joint that is no screw about a fixed axis": batch_tree(robot)
         is None,
         f"a {kind.__name__} decides in Python": policy is not None
-        and kind not in (StateFeedback, OutputFeedback),
+        and kind not in (StateFeedback, OutputFeedback, TrajectoryFeedback),
     }
     if kind is OutputFeedback:
         late = abs(plan.times.sample * plan.times.dt - policy.lin.dt) > 1e-6 * policy.lin.dt
@@ -70,6 +71,9 @@ def _reason(plan: Plan, plant: Plant) -> str:
             "outputs that are no states are measured in Python": measured_states(plant.state)
             is None,
         }
+    if kind is TrajectoryFeedback and policy.trajectory.flow.held:
+        aligned = plant.state.origin.isIdentity(0.0)
+        keeps["the trajectory's inputs stand in other axes than the run's"] = not aligned
     return next((reason for reason, holds in keeps.items() if holds), "")
 
 

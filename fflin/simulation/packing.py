@@ -6,12 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fflin.base.rotation import conjugate, product_matrix, quaternion_product
+from fflin.base.rotation import conjugate, product_matrix, quaternion_product, rotation_matrix
 from fflin.base.validation import Array
 from fflin.control.output_feedback import OutputFeedback, measured_states
 from fflin.control.policies import StateFeedback
+from fflin.control.tracking import TrajectoryFeedback
 from fflin.dynamics.state import StateMap
-from fflin.kernel import channel, course, forward, laws, loop
+from fflin.kernel import channel, course, forward, laws, loop, tracking
 from fflin.kernel.accelerations import layout_of, loads_of
 from fflin.kernel.tree import Tree
 from fflin.robot.frames import ROOT
@@ -88,6 +89,7 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> Packed
         np.array(plan.method.origins),
         way.ravel(),
         speed.ravel(),
+        h * np.array(plan.method.nodes),
         h * np.array(plan.method.weights),
         h * h * np.array(plan.method.moments),
         bool(way[-1].any()),
@@ -140,6 +142,7 @@ def _law(plan: Plan, plant: Plant) -> laws.Law:
     law = laws.Law(
         *(laws.NOTHING, np.array(state.axes), np.zeros(state.robot.n), none, none),
         *(none, none, none, none, nowhere, np.zeros(state.nx), none, none),
+        _path(plan, plant),
     )
     if isinstance(policy, StateFeedback):
         K, offset, near = policy.terms(state)
@@ -158,7 +161,48 @@ def _law(plan: Plan, plant: Plant) -> laws.Law:
             z=np.zeros(count),
             next=np.zeros(count),
         )
+    if isinstance(policy, TrajectoryFeedback):
+        law = law._replace(kind=laws.TRACK)
     return law
+
+
+def _path(plan: Plan, plant: Plant) -> tracking.Path:
+    policy, state, seen = plan.policy, plant.state, Seen(plant.state)
+    none, nowhere, size, nu = np.zeros(0), np.zeros(0, dtype=np.intp), state.nx // 2, plan.initial
+    point = forward.Point(plan.q.copy(), np.zeros(size), nu.copy(), none)
+    path = tracking.Path(
+        *(none, none, none, none, none, False, False, nowhere, 0.0, none, none, 1),
+        *(np.zeros(size), np.zeros(state.nx), point),
+    )
+    if not isinstance(policy, TrajectoryFeedback):
+        return path
+    motion, schedule = policy.trajectory, policy.schedule
+    way, speed = (state.velocities(each).ravel() for each in motion.flow.cubics)
+    q, u = list(motion.q), list(motion.u)
+    steps, dt = plan.times.steps, plan.times.dt
+    ends = max(steps * dt, (steps - 1) * dt + dt) > policy.duration
+    held = np.array([each.columns.start for each in motion.flow.held], dtype=np.intp)
+    if ends:
+        q.append(policy.end.q)
+        u.append(policy.end.u0.copy())
+        speed = np.append(speed, state.velocities(policy.end.v))
+        for at in held:
+            u[-1][at : at + 3] = rotation_matrix(q[-1][3:7]) @ u[-1][at : at + 3]
+    pieces = schedule.K[:, None] if schedule.dt else schedule.quartics
+    return path._replace(
+        t=np.array(motion.t),
+        q=np.concatenate([seen.from_reference(each) for each in q]),
+        u=np.concatenate(u),
+        way=way,
+        speed=speed,
+        hold=motion.hold == "previous",
+        ends=bool(ends),
+        held=held,
+        last=float(schedule.t[-1] - schedule.t[0]),
+        starts=np.array(schedule.starts),
+        K=np.array(pieces).ravel(),
+        order=pieces.shape[1],
+    )
 
 
 def _channel(plan: Plan, plant: Plant) -> channel.Channel:
@@ -179,10 +223,10 @@ def _channel(plan: Plan, plant: Plant) -> channel.Channel:
         most, least, quantum = (
             np.array(each, dtype=float) for each in (pulses.most, pulses.least, pulses.quantum)
         )
-        left, level, end = np.zeros((3, len(most)))
+        at, on_off = np.array(pulses.places, dtype=np.intp), np.array(pulses.on_off, dtype=bool)
+        left, level, end = np.zeros((3, len(at)))
         fired = channel.Pulses(
-            *(np.array(pulses.places, dtype=np.intp), np.array(pulses.on_off, dtype=bool)),
-            *(most, least, quantum, left, level, end, float(pulses.time)),
+            at, on_off, most, least, quantum, left, level, end, float(pulses.time)
         )
     held: Array = np.minimum(np.maximum(plan.initial, limits.low), limits.high)
     slots = times.delay // times.sample + 1 if times.sample else 1

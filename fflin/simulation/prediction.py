@@ -152,7 +152,7 @@ def _states(predictor: Predictor, plan: Plan, x: Array, steps: int) -> Array:
         limits = limits._replace(wheels=limits.wheels._replace(speeds=lambda e: (x0 + e)[of]))
     channel = Channel(predictor.law(), plan.initial, limits, sample, delay)
     rows = []
-    e = x - x0
+    e: Array = x - x0
     if lin.dt:
         # Between the samples of a sampled model there is nothing to say.
         whole = round(lin.dt / dt)
@@ -175,7 +175,8 @@ def _states(predictor: Predictor, plan: Plan, x: Array, steps: int) -> Array:
         whole: Array = e + dt / 6.0 * (stages[0] + 2.0 * (stages[1] + stages[2]) + stages[3])
         return whole
 
-    shift, transition = np.zeros(0), np.zeros((0, 0))
+    shift: Array = np.zeros(0)
+    transition: Array = np.zeros((0, 0))
     if not sample and not channel.cuts:  # then a step is a matrix and a shift
         shift = after(np.zeros(len(e)))
         transition = np.column_stack([after(unit) - shift for unit in np.eye(len(e))])

@@ -12,6 +12,7 @@ import fflin
 from fflin.simulation import compiled
 from tests.support.measured import POSITIONS, designed
 from tests.support.motions import HOME, displaced
+from tests.support.motions import motion as trajectory
 from tests.support.robots import BUNDLED, FRAMES, LINKS, MIMIC, free_body, random_point, random_tree
 from tests.support.weights import unit_weights
 
@@ -152,6 +153,35 @@ def test_output_feedback():
     robot, lin, compensator = designed(POSITIONS)
     policy = fflin.OutputFeedback(lin, compensator)
     both(robot, policy, x0=displaced(lin), duration=10.0)
+
+
+@pytest.fixture(scope="module")
+def schedule():
+    """A slew of a robot with joints that go round, in the axes of the world."""
+    robot = fflin.load("ets_vii")
+    lin = fflin.linearize(robot)
+    x0 = displaced(lin, degrees=50.0)
+    slew = fflin.simulate(robot, feedback(robot), x0=x0, duration=6.0, dt=0.1, engine="python")
+    path = fflin.Trajectory(robot, slew.t + 2.0, slew.q, slew.v, slew.u, frame="hybrid")
+    return fflin.tvlqr(fflin.linearize_trajectory(robot, path), *unit_weights(lin))
+
+
+@pytest.mark.parametrize("case", [{}, {"duration": 3.0}, {"sample": 0.05, "delay": 0.05}])
+def test_feedback_along_a_trajectory(robots, schedule, case):
+    q = schedule.q[0].copy()
+    q[:3] += 0.1
+    q[7:9] = np.cos(2.0), np.sin(2.0)
+    both(robots["ets_vii"], schedule, q0=q, **case)
+    both(robots["ets_vii"].replace(gravity=(0.0, 0.01, 0.0)), schedule, duration=3.0)
+
+
+def test_a_trajectory_is_followed_from_sample_to_sample(robots):
+    robot = robots["astrobee_arm"]
+    t, q, v, u = trajectory(robot, duration=0.4, knots=9)
+    for inputs in (u, u[:-1]):
+        along = fflin.linearize_trajectory(robot, t, q, v, inputs)
+        gains = fflin.tvlqr(along, *unit_weights(fflin.linearize(robot, q[0])), sample=0.05)
+        both(robot, gains, dt=0.01, duration=0.4, v0=1.1 * v[0], q0=q[0])
 
 
 STOPS = {

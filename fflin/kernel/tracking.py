@@ -1,0 +1,141 @@
+"""Feedback along a trajectory, which is the same for all lanes."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fflin.kernel.forward import Point
+from fflin.kernel.lanes import angle, chosen, inlined, load, splat, store
+from fflin.kernel.places import attitude, columns_of, displace, quaternion_times
+from fflin.kernel.vectors import across, get3, minus, put3, times
+
+_NEAR = 1e-9  # a time this near to a knot, relative to the interval, is the knot's
+
+
+class Path(NamedTuple):
+    """A trajectory and its gains, piece by piece.
+
+    Attributes
+    ----------
+    t : ndarray (N,)
+        Times of the knots [s].
+    q, u : ndarray (N nq,), (N nu,)
+        At the knots, and where the run goes on after the end.
+    way, speed : ndarray (4 (N - 1) (6 + n),)
+        Cubics in the share of an interval of the displacement from its knot, and of nu; of nu
+        what it is after the end, too.
+    hold, ends : bool
+        Whether u stays until the next knot, and whether the run goes on after the end.
+    held : ndarray (k,)
+        First of three inputs each that stand in reference axes.
+    last : float
+        Time [s] of the last gain since the first.
+    starts, K : ndarray (M,), (M order nu nx,)
+        Where the pieces of K begin, and their coefficients in the time since.
+    order : int
+    along : ndarray (6 + n,)
+        Work space.
+    e : ndarray (nx,)
+        The error.
+    point : Point
+        What is followed.
+    """
+
+    t: Any
+    q: Any
+    u: Any
+    way: Any
+    speed: Any
+    hold: bool
+    ends: bool
+    held: Any
+    last: float
+    starts: Any
+    K: Any
+    order: int
+    along: Any
+    e: Any
+    point: Point
+
+
+@inlined
+def _cubic(coefficients, k, s, out):
+    size = len(out)
+    for index in range(size):
+        at = 4 * k * size + index
+        value = coefficients[at + 2 * size] + s * coefficients[at + 3 * size]
+        out[index] = coefficients[at] + s * (coefficients[at + size] + s * value)
+
+
+@inlined
+def _follow(robot, path, t):
+    """Write what is followed at a time of the run, its inputs in base axes."""
+    point, last, knots = path.point, len(path.t) - 2, path.t
+    time, after = knots[0] + max(t, 0.0), path.ends and t > knots[-1] - knots[0]
+    k = max(0, min(np.searchsorted(knots, time, side="right") - 1, last))
+    s = (time - knots[k]) / (knots[k + 1] - knots[k])
+    if s > 1.0 - _NEAR and k < last:
+        k, s = k + 1, 0.0
+    s = 0.0 if s < _NEAR else min(s, 1.0)
+    if after:
+        k, s = last + 2, 0.0
+    for index in range(len(point.q)):
+        point.q[index] = path.q[k * len(point.q) + index]
+    count = len(point.u)
+    for index in range(count):
+        value = path.u[k * count + index]
+        if s > 0.0 and not path.hold:
+            value += s * (path.u[(k + 1) * count + index] - value)
+        point.u[index] = value
+    if after:
+        for index in range(len(point.nu)):
+            point.nu[index] = path.speed[4 * (last + 1) * len(point.nu) + index]
+    else:
+        _cubic(path.way, k, s, path.along)
+        _cubic(path.speed, k, s, point.nu)
+        displace(robot.tree, point.q, path.along, point.q)
+    for index in range(len(path.held)):
+        at = path.held[index]
+        put3(point.u, at, across(columns_of(attitude(point.q)), get3(point.u, at)))
+
+
+@inlined
+def _error(robot, path, point):
+    """Write the error from what is followed, in its axes."""
+    e, q, there, n = path.e, point.q, path.point, len(robot.index)
+    (x, y, z), w = attitude(there.q)
+    vector, scalar = quaternion_times(((-x, -y, -z), w), attitude(q))
+    put3(e, 0, times(vector, chosen(scalar, 0.0, -1.0, 1.0)))
+    apart = minus(get3(q, 0), get3(there.q, 0))
+    put3(e, 3, across(columns_of(((x, y, z), w)), apart))
+    for joint in range(n):
+        at = robot.index[joint]
+        if robot.circling[joint]:
+            c, s = load(q, at), load(q, at + 1)
+            c_0, s_0 = load(there.q, at), load(there.q, at + 1)
+            store(e, 6 + joint, angle(s * c_0 - c * s_0, c * c_0 + s * s_0))
+        else:
+            store(e, 6 + joint, load(q, at) - load(there.q, at))
+    for index in range(6 + n):
+        store(e, 6 + n + index, load(point.nu, index) - load(there.nu, index))
+
+
+@inlined
+def track(robot, path, point, t):
+    """Write the inputs u* - K e at a time of the run."""
+    _follow(robot, path, t)
+    _error(robot, path, point)
+    starts, count, width = path.starts, len(path.point.u), len(path.e)
+    since = path.starts[0] + min(max(t, 0.0), path.last)
+    k = max(0, np.searchsorted(starts, since, side="right") - 1)
+    since, first, size = since - starts[k], k * path.order * count * width, count * width
+    for row in range(count):
+        total = splat(point.u, path.point.u[row])
+        for column in range(width):
+            at, gain = first + row * width + column, 0.0
+            for power in range(path.order - 1, -1, -1):
+                gain = gain * since + path.K[at + power * size]
+            total = total - gain * load(path.e, column)
+        store(point.u, row, total)
