@@ -14,21 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from fflin.kernel import vectors as vec
 from fflin.kernel.lanes import floor, inlined, load, splat, store
 from fflin.kernel.tree import INERTIA, PLACE
-from fflin.kernel.vectors import (
-    add,
-    add3,
-    cross,
-    dot,
-    get3,
-    get_columns,
-    minus,
-    plus,
-    product,
-    put3,
-    times,
-)
 
 
 @inlined
@@ -65,69 +53,69 @@ def cosine_and_sine(x):
 @inlined
 def _place(work, at, parent, fixed, first, cosine, sine, shift):
     """Write the place of a body into `work` at `at`, that of its parent being at `parent`."""
-    axes = get_columns(work, parent)
-    x = product(axes, get3(fixed, first))
-    y = product(axes, get3(fixed, first + 3))
-    z = product(axes, get3(fixed, first + 6))
-    origin = product(axes, get3(fixed, first + 9))
-    put3(work, at, plus(times(x, cosine), times(y, sine)))
-    put3(work, at + 3, minus(times(y, cosine), times(x, sine)))
-    put3(work, at + 6, z)
-    put3(work, at + 9, plus(origin, times(z, shift)))
+    axes = vec.get_columns(work, parent)
+    x = vec.product(axes, vec.get3(fixed, first))
+    y = vec.product(axes, vec.get3(fixed, first + 3))
+    z = vec.product(axes, vec.get3(fixed, first + 6))
+    origin = vec.product(axes, vec.get3(fixed, first + 9))
+    vec.put3(work, at, vec.plus(vec.times(x, cosine), vec.times(y, sine)))
+    vec.put3(work, at + 3, vec.minus(vec.times(y, cosine), vec.times(x, sine)))
+    vec.put3(work, at + 6, z)
+    vec.put3(work, at + 9, vec.plus(origin, vec.times(z, shift)))
 
 
 @inlined
 def _inertia(work, at, place, bodies, first):
     """Write a body's inertia about its joint: m, m c, and R I R^T by way of the columns of R I."""
-    axes = get_columns(work, place)
+    axes = vec.get_columns(work, place)
     store(work, at, load(bodies, first))
-    put3(work, at + 1, product(axes, get3(bodies, first + 1)))
-    xx, xy, xz = get3(bodies, first + 4)
-    yy, yz, zz = get3(bodies, first + 7)
-    u = product(axes, (xx, xy, xz))
-    v = product(axes, (xy, yy, yz))
-    w = product(axes, (xz, yz, zz))
-    _, yy, yz = product(axes, (u[1], v[1], w[1]))
-    zz = product(axes, (u[2], v[2], w[2]))[2]
-    put3(work, at + 4, product(axes, (u[0], v[0], w[0])))
-    put3(work, at + 7, (yy, yz, zz))
+    vec.put3(work, at + 1, vec.product(axes, vec.get3(bodies, first + 1)))
+    xx, xy, xz = vec.get3(bodies, first + 4)
+    yy, yz, zz = vec.get3(bodies, first + 7)
+    u = vec.product(axes, (xx, xy, xz))
+    v = vec.product(axes, (xy, yy, yz))
+    w = vec.product(axes, (xz, yz, zz))
+    _, yy, yz = vec.product(axes, (u[1], v[1], w[1]))
+    zz = vec.product(axes, (u[2], v[2], w[2]))[2]
+    vec.put3(work, at + 4, vec.product(axes, (u[0], v[0], w[0])))
+    vec.put3(work, at + 7, (yy, yz, zz))
 
 
 @inlined
 def _carry(work, at, above, place):
     """Add a composite inertia, seen from the parent's joint, to the parent's."""
     m = load(work, at)
-    h = get3(work, at + 1)
-    xx, xy, xz = get3(work, at + 4)
-    yy, yz, zz = get3(work, at + 7)
-    d = get3(work, place + 9)
-    e = plus(h, times(d, m))
+    h = vec.get3(work, at + 1)
+    xx, xy, xz = vec.get3(work, at + 4)
+    yy, yz, zz = vec.get3(work, at + 7)
+    d = vec.get3(work, place + 9)
+    e = vec.plus(h, vec.times(d, m))
     px, py, pz = d[0] * (h[0] + e[0]), d[1] * (h[1] + e[1]), d[2] * (h[2] + e[2])
     xy = xy - (d[0] * e[1] + h[0] * d[1])
     xz = xz - (d[0] * e[2] + h[0] * d[2])
     yz = yz - (d[1] * e[2] + h[1] * d[2])
-    add(work, above, m)
-    add3(work, above + 1, e)
-    add3(work, above + 4, (xx + (py + pz), xy, xz))
-    add3(work, above + 7, (yy + (px + pz), yz, zz + (px + py)))
+    vec.add(work, above, m)
+    vec.add3(work, above + 1, e)
+    vec.add3(work, above + 4, (xx + (py + pz), xy, xz))
+    vec.add3(work, above + 7, (yy + (px + pz), yz, zz + (px + py)))
 
 
 @inlined
 def inertia_times(work, at, w):
     """Return I w of the inertia at `at`."""
-    xx, xy, xz = get3(work, at + 4)
-    yy, yz, zz = get3(work, at + 7)
-    return dot((xx, xy, xz), w), dot((xy, yy, yz), w), dot((xz, yz, zz), w)
+    xx, xy, xz = vec.get3(work, at + 4)
+    yy, yz, zz = vec.get3(work, at + 7)
+    return vec.dot((xx, xy, xz), w), vec.dot((xy, yy, yz), w), vec.dot((xz, yz, zz), w)
 
 
 @inlined
 def _momentum(work, at, axis, turns, slides):
     """Return the momentum (angular, linear) about its joint of an inertia that the joint moves."""
     m = load(work, at)
-    lever = cross(get3(work, at + 1), axis)
+    lever = vec.cross(vec.get3(work, at + 1), axis)
     return (
-        plus(times(inertia_times(work, at, axis), turns), times(lever, slides)),
-        minus(times(times(axis, m), slides), times(lever, turns)),
+        vec.plus(vec.times(inertia_times(work, at, axis), turns), vec.times(lever, slides)),
+        vec.minus(vec.times(vec.times(axis, m), slides), vec.times(lever, turns)),
     )
 
 
@@ -136,9 +124,9 @@ def outwards(work, tree, q):
     """Write the places of all bodies and their own inertias, outwards."""
     places, own = tree.places, tree.own
     one, zero = splat(work, 1.0), splat(work, 0.0)
-    put3(work, places, (1.0, 0.0, 0.0))
-    put3(work, places + 3, (0.0, 1.0, 0.0))
-    put3(work, places + 6, (0.0, 0.0, 1.0))
+    vec.put3(work, places, (1.0, 0.0, 0.0))
+    vec.put3(work, places + 3, (0.0, 1.0, 0.0))
+    vec.put3(work, places + 6, (0.0, 0.0, 1.0))
     _inertia(work, own, places, tree.bodies, 0)
     for body in range(1, len(tree.parent)):
         at = places + body * PLACE
@@ -169,29 +157,29 @@ def inwards(work, tree):
     for body in range(bodies - 1, 0, -1):
         at = inertias + body * INERTIA
         place = places + body * PLACE
-        z = get3(work, place + 6)
+        z = vec.get3(work, place + 6)
         moment, force = _momentum(work, at, z, tree.turns[body], tree.slides[body])
         _carry(work, at, inertias + tree.parent[body] * INERTIA, place)
         above = body
         while above > 0:
             place = places + above * PLACE
-            z = get3(work, place + 6)
-            value = tree.turns[above] * dot(z, moment)
-            value = value + tree.slides[above] * dot(z, force)
-            add(work, packed + tree.target[pair], tree.share[pair] * value)
+            z = vec.get3(work, place + 6)
+            value = tree.turns[above] * vec.dot(z, moment)
+            value = value + tree.slides[above] * vec.dot(z, force)
+            vec.add(work, packed + tree.target[pair], tree.share[pair] * value)
             pair += 1
             # The moment about the parent's joint.
-            moment = plus(moment, cross(get3(work, place + 9), force))
+            moment = vec.plus(moment, vec.cross(vec.get3(work, place + 9), force))
             above = tree.parent[above]
         start, share = packed + tree.target[pair], tree.share[pair]
         pair += 1
-        add3(work, start, times(moment, share))
-        add3(work, start + 3, times(force, share))
+        vec.add3(work, start, vec.times(moment, share))
+        vec.add3(work, start + 3, vec.times(force, share))
     # The base's block (I, [m c]x, m), packed as the rows of a chain of six coordinates.
     m = load(work, inertias)
-    hx, hy, hz = get3(work, inertias + 1)
-    xx, xy, xz = get3(work, inertias + 4)
-    yy, yz, zz = get3(work, inertias + 7)
+    hx, hy, hz = vec.get3(work, inertias + 1)
+    xx, xy, xz = vec.get3(work, inertias + 4)
+    yy, yz, zz = vec.get3(work, inertias + 7)
     own = (xx, xy, yy, xz, yz, zz)
     for index in range(6):
         store(work, packed + index, own[index])
@@ -216,4 +204,4 @@ def inwards(work, tree):
         store(work, packed + (6 + index), linear[index])
     for index in range(len(tree.row)):
         at = packed + (tree.row[index] + tree.depth[index])
-        add(work, at, tree.armature[index])
+        vec.add(work, at, tree.armature[index])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from fflin.kernel import vectors as vec
 from fflin.kernel.accelerations import Layout, Loads
 from fflin.kernel.crba import inwards, outwards
 from fflin.kernel.factor import factorise, solve
@@ -15,18 +16,6 @@ from fflin.kernel.lanes import angle, inlined, load, store
 from fflin.kernel.places import attitude, columns_of
 from fflin.kernel.rnea import at_parent, carried_wrench, collect, load_bodies, move_bodies
 from fflin.kernel.tree import PLACE, Tree
-from fflin.kernel.vectors import (
-    across,
-    add,
-    cross,
-    get3,
-    get6,
-    minus,
-    plus,
-    plus6,
-    put3,
-    times6,
-)
 
 
 class Mechanics(NamedTuple):
@@ -96,7 +85,7 @@ def turn_inputs(robot, point):
     for index in range(len(robot.held)):
         at = robot.held[index]
         axes = columns_of(attitude(point.q))
-        put3(point.pushing, at, across(axes, get3(point.u, at)))
+        vec.put3(point.pushing, at, vec.across(axes, vec.get3(point.u, at)))
 
 
 @inlined
@@ -114,21 +103,21 @@ def accelerate(work, robot, point, rates, to):
         store(work, force + index, -load(work, force + index))
     for index in range(len(robot.row)):
         if robot.row[index] >= 0:
-            add(work, force + robot.row[index], load(point.pushing, index))
+            vec.add(work, force + robot.row[index], load(point.pushing, index))
     for joint in range(len(robot.index)):
         if robot.springy[joint]:
             stretch = joint_position(robot, point.q, joint) - load(robot.rest, joint)
             pull = load(loads.stiffness, joint) * stretch
             pull = pull + load(loads.damping, joint) * load(nu, 6 + joint)
-            add(work, force + 6 + joint, -pull)
+            vec.add(work, force + 6 + joint, -pull)
     factorise(work, tree)
     solve(work, tree, force)
     for index in range(size):
         store(rates, to + index, load(work, force + index))
     # What falls and what turns takes the base's origin along.
-    fall = across(columns_of(attitude(point.q)), get3(robot.gravity, 0))
-    fall = minus(fall, cross(get3(nu, 0), get3(nu, 3)))
-    put3(rates, to + 3, plus(get3(rates, to + 3), fall))
+    fall = vec.across(columns_of(attitude(point.q)), vec.get3(robot.gravity, 0))
+    fall = vec.minus(fall, vec.cross(vec.get3(nu, 0), vec.get3(nu, 3)))
+    vec.put3(rates, to + 3, vec.plus(vec.get3(rates, to + 3), fall))
 
 
 @inlined
@@ -139,12 +128,12 @@ def push(work, robot, point):
         store(work, robot.layout.bias + index, 0.0)
     for index in range(len(robot.row)):
         if 0 <= robot.row[index] < 6:
-            add(work, robot.layout.bias + robot.row[index], load(point.pushing, index))
-    total = get6(work, robot.layout.bias)
+            vec.add(work, robot.layout.bias + robot.row[index], load(point.pushing, index))
+    total = vec.get6(work, robot.layout.bias)
     for index in range(len(loads.body)):
         body, wrench = loads.body[index], carried_wrench(work, tree, loads, index)
         while body > 0:
             wrench = at_parent(work, tree.places + body * PLACE, wrench)
             body = tree.parent[body]
-        total = plus6(total, times6(wrench, load(point.pushing, loads.input[index])))
+        total = vec.plus6(total, vec.times6(wrench, load(point.pushing, loads.input[index])))
     return total

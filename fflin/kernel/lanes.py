@@ -39,9 +39,7 @@ _BYTES = 8  # alignment of a double
 # infinite; and no references to arrays are counted, which takes three quarters of the time else,
 # and makes no function able to allocate.
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
-inlined = numba.njit(
-    forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS
-)
+inlined = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
 compiled = numba.njit(nogil=True, cache=True, boundscheck=False, **_OPTIONS)
 
 

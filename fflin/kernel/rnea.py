@@ -9,27 +9,10 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, chapter 5.
 
 from __future__ import annotations
 
+from fflin.kernel import vectors as vec
 from fflin.kernel.crba import inertia_times
 from fflin.kernel.lanes import inlined, load, splat, store
 from fflin.kernel.tree import INERTIA, PLACE
-from fflin.kernel.vectors import (
-    add,
-    add3,
-    add6,
-    cross,
-    dot6,
-    get3,
-    get6,
-    get_columns,
-    minus6,
-    plus,
-    plus6,
-    product,
-    put3,
-    put6,
-    times,
-    times6,
-)
 
 # Where the motion vectors of every body begin: velocity, Psi', acceleration without c, that of c
 # alone, and Psi''.
@@ -46,38 +29,38 @@ _NONE = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 @inlined
 def joint_axis(work, tree, body):
     """Return the spatial axis of a joint, angular and linear, for a unit of its coordinate."""
-    z = get3(work, tree.places + (body * PLACE + 6))
+    z = vec.get3(work, tree.places + (body * PLACE + 6))
     share = tree.factor[body]
-    return times(z, share * tree.turns[body]), times(z, share * tree.slides[body])
+    return vec.times(z, share * tree.turns[body]), vec.times(z, share * tree.slides[body])
 
 
 @inlined
 def motion_cross(velocity, along):
     """Return the rate of a motion vector `along` that is carried by a velocity."""
     w, v = velocity
-    return cross(w, along[0]), plus(cross(w, along[1]), cross(v, along[0]))
+    return vec.cross(w, along[0]), vec.plus(vec.cross(w, along[1]), vec.cross(v, along[0]))
 
 
 @inlined
 def spatial_inertia_times(work, at, motion):
     """Return inertia times a motion vector, moment and force."""
-    m, h = load(work, at), get3(work, at + 1)
+    m, h = load(work, at), vec.get3(work, at + 1)
     w, v = motion
-    moment = plus(inertia_times(work, at, w), cross(h, v))
-    return moment, plus(times(v, m), cross(w, h))
+    moment = vec.plus(inertia_times(work, at, w), vec.cross(h, v))
+    return moment, vec.plus(vec.times(v, m), vec.cross(w, h))
 
 
 @inlined
 def at_joint(work, at, place):
     """Return a motion vector of the carrier at a joint's own origin."""
-    w, v = get6(work, at)
-    return w, plus(v, cross(w, get3(work, place + 9)))
+    w, v = vec.get6(work, at)
+    return w, vec.plus(v, vec.cross(w, vec.get3(work, place + 9)))
 
 
 @inlined
 def at_parent(work, place, force):
     """Return a force at a joint's origin as one at its parent's."""
-    return plus(force[0], cross(get3(work, place + 9), force[1])), force[1]
+    return vec.plus(force[0], vec.cross(vec.get3(work, place + 9), force[1])), force[1]
 
 
 @inlined
@@ -85,7 +68,7 @@ def move_bodies(work, tree, layout, nu):
     """Write the velocities, and the accelerations without c, outwards; the base does not slide."""
     for entry in range(MOTION):
         store(work, layout.motion + entry, 0.0)
-    put3(work, layout.motion, get3(nu, 0))
+    vec.put3(work, layout.motion, vec.get3(nu, 0))
     for body in range(1, len(tree.parent)):
         at = layout.motion + body * MOTION
         above = layout.motion + tree.parent[body] * MOTION
@@ -95,9 +78,9 @@ def move_bodies(work, tree, layout, nu):
         velocity = at_joint(work, above + VELOCITY, place)
         psi = motion_cross(velocity, axis)
         bias = at_joint(work, above + BIAS, place)
-        put6(work, at + VELOCITY, plus6(velocity, times6(axis, rate)))
-        put6(work, at + PSI, psi)
-        put6(work, at + BIAS, plus6(bias, times6(psi, rate)))
+        vec.put6(work, at + VELOCITY, vec.plus6(velocity, vec.times6(axis, rate)))
+        vec.put6(work, at + PSI, psi)
+        vec.put6(work, at + BIAS, vec.plus6(bias, vec.times6(psi, rate)))
 
 
 @inlined
@@ -107,21 +90,21 @@ def load_bodies(work, tree, layout, loads, u):
         at = layout.load + body * LOAD + FORCE
         moving = layout.motion + body * MOTION
         own = tree.own + body * INERTIA
-        w, v = get6(work, moving + VELOCITY)
+        w, v = vec.get6(work, moving + VELOCITY)
         turning, p = spatial_inertia_times(work, own, (w, v))
-        moment, force = spatial_inertia_times(work, own, get6(work, moving + BIAS))
-        moment = plus(moment, plus(cross(w, turning), cross(v, p)))
-        put6(work, at, (moment, plus(force, cross(w, p))))
+        moment, force = spatial_inertia_times(work, own, vec.get6(work, moving + BIAS))
+        moment = vec.plus(moment, vec.plus(vec.cross(w, turning), vec.cross(v, p)))
+        vec.put6(work, at, (moment, vec.plus(force, vec.cross(w, p))))
     for index in range(len(loads.stored_body)):
         body = loads.stored_body[index]
-        turning = cross(
-            get3(work, layout.motion + body * MOTION), stored_momentum(work, tree, loads, index)
+        turning = vec.cross(
+            vec.get3(work, layout.motion + body * MOTION), stored_momentum(work, tree, loads, index)
         )
-        add3(work, layout.load + body * LOAD + FORCE, turning)
+        vec.add3(work, layout.load + body * LOAD + FORCE, turning)
     for index in range(len(loads.body)):
-        pushed = minus6(_NONE, carried_wrench(work, tree, loads, index))
+        pushed = vec.minus6(_NONE, carried_wrench(work, tree, loads, index))
         at = layout.load + loads.body[index] * LOAD + FORCE
-        add6(work, at, times6(pushed, load(u, loads.input[index])))
+        vec.add6(work, at, vec.times6(pushed, load(u, loads.input[index])))
 
 
 @inlined
@@ -131,39 +114,39 @@ def load_momenta(work, tree, layout, loads):
     for body in range(len(tree.parent)):
         at = layout.load + body * LOAD
         own = tree.own + body * INERTIA
-        w, v = get6(work, layout.motion + body * MOTION + VELOCITY)
-        h = get3(work, own + 1)
-        put3(work, at + MOMENTUM, spatial_inertia_times(work, own, (w, v))[1])
+        w, v = vec.get6(work, layout.motion + body * MOTION + VELOCITY)
+        h = vec.get3(work, own + 1)
+        vec.put3(work, at + MOMENTUM, spatial_inertia_times(work, own, (w, v))[1])
         # The second moments of mass are half the trace of I, less I.
-        xx, xy, xz = get3(work, own + 4)
-        yy, yz, zz = get3(work, own + 7)
+        xx, xy, xz = vec.get3(work, own + 4)
+        yy, yz, zz = vec.get3(work, own + 7)
         trace = 0.5 * (xx + yy + zz)
         x = trace - xx, -xy, -xz
         y = -xy, trace - yy, -yz
         z = -xz, -yz, trace - zz
-        put3(work, at + MOMENTS, plus(times(v, h[0]), cross(w, x)))
-        put3(work, at + MOMENTS + 3, plus(times(v, h[1]), cross(w, y)))
-        put3(work, at + MOMENTS + 6, plus(times(v, h[2]), cross(w, z)))
-        put3(work, at + STORED, (zero, zero, zero))
-        put6(work, at + CARRIED, ((zero, zero, zero), (zero, zero, zero)))
+        vec.put3(work, at + MOMENTS, vec.plus(vec.times(v, h[0]), vec.cross(w, x)))
+        vec.put3(work, at + MOMENTS + 3, vec.plus(vec.times(v, h[1]), vec.cross(w, y)))
+        vec.put3(work, at + MOMENTS + 6, vec.plus(vec.times(v, h[2]), vec.cross(w, z)))
+        vec.put3(work, at + STORED, (zero, zero, zero))
+        vec.put6(work, at + CARRIED, ((zero, zero, zero), (zero, zero, zero)))
     for index in range(len(loads.stored_body)):
         at = layout.load + loads.stored_body[index] * LOAD + STORED
-        add3(work, at, stored_momentum(work, tree, loads, index))
+        vec.add3(work, at, stored_momentum(work, tree, loads, index))
 
 
 @inlined
 def stored_momentum(work, tree, loads, index):
     """Return momentum that a body stores."""
-    axes = get_columns(work, tree.places + loads.stored_body[index] * PLACE)
-    return product(axes, get3(loads.stored, 3 * index))
+    axes = vec.get_columns(work, tree.places + loads.stored_body[index] * PLACE)
+    return vec.product(axes, vec.get3(loads.stored, 3 * index))
 
 
 @inlined
 def carried_wrench(work, tree, loads, index):
     """Return the wrench of a unit of a carried input at its body's joint."""
-    axes = get_columns(work, tree.places + loads.body[index] * PLACE)
-    moment, force = get6(loads.wrench, 6 * index)
-    return product(axes, moment), product(axes, force)
+    axes = vec.get_columns(work, tree.places + loads.body[index] * PLACE)
+    moment, force = vec.get6(loads.wrench, 6 * index)
+    return vec.product(axes, moment), vec.product(axes, force)
 
 
 @inlined
@@ -175,8 +158,8 @@ def write_columns(work, tree, layout, loads):
     for index in range(count):
         body, wrench = loads.body[index], carried_wrench(work, tree, loads, index)
         while body > 0:
-            value = dot6(joint_axis(work, tree, body), wrench)
-            add(work, layout.columns + tree.coordinate[body] * count + index, value)
+            value = vec.dot6(joint_axis(work, tree, body), wrench)
+            vec.add(work, layout.columns + tree.coordinate[body] * count + index, value)
             wrench = at_parent(work, tree.places + body * PLACE, wrench)
             body = tree.parent[body]
         for axis in range(3):
@@ -191,12 +174,12 @@ def collect(work, tree, layout):
     for index in range(len(tree.row)):
         store(work, layout.bias + index, 0.0)
     for body in range(len(tree.parent) - 1, 0, -1):
-        force = get6(work, layout.load + body * LOAD + FORCE)
-        value = dot6(joint_axis(work, tree, body), force)
-        add(work, layout.bias + tree.coordinate[body], value)
+        force = vec.get6(work, layout.load + body * LOAD + FORCE)
+        value = vec.dot6(joint_axis(work, tree, body), force)
+        vec.add(work, layout.bias + tree.coordinate[body], value)
         to = layout.load + tree.parent[body] * LOAD + FORCE
-        add6(work, to, at_parent(work, tree.places + body * PLACE, force))
-    add6(work, layout.bias, get6(work, layout.load + FORCE))
+        vec.add6(work, to, at_parent(work, tree.places + body * PLACE, force))
+    vec.add6(work, layout.bias, vec.get6(work, layout.load + FORCE))
 
 
 @inlined
@@ -205,20 +188,20 @@ def collect_momenta(work, tree, layout):
     for body in range(len(tree.parent) - 1, 0, -1):
         at = layout.load + body * LOAD
         above = layout.load + tree.parent[body] * LOAD
-        d = get3(work, tree.places + body * PLACE + 9)
-        p = get3(work, at + MOMENTUM)
-        add3(work, above + MOMENTUM, p)
-        add3(work, above + STORED, get3(work, at + STORED))
-        columns = get_columns(work, at + MOMENTS)
+        d = vec.get3(work, tree.places + body * PLACE + 9)
+        p = vec.get3(work, at + MOMENTUM)
+        vec.add3(work, above + MOMENTUM, p)
+        vec.add3(work, above + STORED, vec.get3(work, at + STORED))
+        columns = vec.get_columns(work, at + MOMENTS)
         for index in range(3):
-            column = plus(columns[index], times(p, d[index]))
-            add3(work, above + MOMENTS + 3 * index, column)
+            column = vec.plus(columns[index], vec.times(p, d[index]))
+            vec.add3(work, above + MOMENTS + 3 * index, column)
 
 
 @inlined
 def accelerate_bodies(work, tree, layout):
     """Complete the accelerations with c: write Psi'' outwards, and the forces of c inwards."""
-    put6(work, layout.motion + ADDED, get6(work, layout.c))
+    vec.put6(work, layout.motion + ADDED, vec.get6(work, layout.c))
     for body in range(1, len(tree.parent)):
         at = layout.motion + body * MOTION
         above = layout.motion + tree.parent[body] * MOTION
@@ -226,21 +209,25 @@ def accelerate_bodies(work, tree, layout):
         rate = load(work, layout.c + tree.coordinate[body])
         axis = joint_axis(work, tree, body)
         added = at_joint(work, above + ADDED, place)
-        acceleration = plus6(added, at_joint(work, above + BIAS, place))
+        acceleration = vec.plus6(added, at_joint(work, above + BIAS, place))
         velocity = at_joint(work, above + VELOCITY, place)
-        psi = get6(work, at + PSI)
-        put6(work, at + PSI2, plus6(motion_cross(acceleration, axis), motion_cross(velocity, psi)))
-        put6(work, at + ADDED, plus6(added, times6(axis, rate)))
+        psi = vec.get6(work, at + PSI)
+        vec.put6(
+            work,
+            at + PSI2,
+            vec.plus6(motion_cross(acceleration, axis), motion_cross(velocity, psi)),
+        )
+        vec.put6(work, at + ADDED, vec.plus6(added, vec.times6(axis, rate)))
     for body in range(len(tree.parent) - 1, 0, -1):
         at = layout.load + body * LOAD
         inertia = tree.inertias + body * INERTIA
         place = tree.places + body * PLACE
         above = layout.motion + tree.parent[body] * MOTION
         rate = load(work, layout.c + tree.coordinate[body])
-        own = spatial_inertia_times(work, inertia, times6(joint_axis(work, tree, body), rate))
-        carried = plus6(get6(work, at + CARRIED), own)
+        own = spatial_inertia_times(work, inertia, vec.times6(joint_axis(work, tree, body), rate))
+        carried = vec.plus6(vec.get6(work, at + CARRIED), own)
         shared = spatial_inertia_times(work, inertia, at_joint(work, above + ADDED, place))
-        add6(work, at + FORCE, plus6(carried, shared))
+        vec.add6(work, at + FORCE, vec.plus6(carried, shared))
         if tree.parent[body] > 0:
             to = layout.load + tree.parent[body] * LOAD + CARRIED
-            add6(work, to, at_parent(work, place, carried))
+            vec.add6(work, to, at_parent(work, place, carried))

@@ -22,6 +22,7 @@ using spatial vector algebra, IEEE Robotics and Automation Letters 7(2), 2022.
 
 from __future__ import annotations
 
+from fflin.kernel import vectors as vec
 from fflin.kernel.lanes import inlined, load, store
 from fflin.kernel.rnea import (
     FORCE,
@@ -37,43 +38,30 @@ from fflin.kernel.rnea import (
     spatial_inertia_times,
 )
 from fflin.kernel.tree import INERTIA, PLACE
-from fflin.kernel.vectors import (
-    add,
-    add3,
-    cross,
-    dot,
-    dot6,
-    get3,
-    get6,
-    get_columns,
-    minus,
-    plus,
-    plus6,
-    product,
-    times,
-)
 
 
 @inlined
 def _coriolis(work, at, w):
     """Return 2 B w, moment and force, of what a joint carries."""
-    G = get_columns(work, at + MOMENTS)
+    G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
-    moment = minus(times(w, trace), product(G, w))
-    moment = plus(plus(moment, moment), cross(w, get3(work, at + STORED)))
-    force = cross(w, get3(work, at + MOMENTUM))
-    return moment, plus(force, force)
+    moment = vec.minus(vec.times(w, trace), vec.product(G, w))
+    moment = vec.plus(vec.plus(moment, moment), vec.cross(w, vec.get3(work, at + STORED)))
+    force = vec.cross(w, vec.get3(work, at + MOMENTUM))
+    return moment, vec.plus(force, force)
 
 
 @inlined
 def _coriolis_transposed(work, at, along):
     """Return 2 B^T s of a motion vector s, which is a moment."""
-    G = get_columns(work, at + MOMENTS)
+    G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     w = along[0]
-    carried = dot(G[0], w), dot(G[1], w), dot(G[2], w)
-    moment = plus(minus(times(w, trace), carried), cross(get3(work, at + MOMENTUM), along[1]))
-    return plus(plus(moment, moment), cross(get3(work, at + STORED), w))
+    carried = vec.dot(G[0], w), vec.dot(G[1], w), vec.dot(G[2], w)
+    moment = vec.plus(
+        vec.minus(vec.times(w, trace), carried), vec.cross(vec.get3(work, at + MOMENTUM), along[1])
+    )
+    return vec.plus(vec.plus(moment, moment), vec.cross(vec.get3(work, at + STORED), w))
 
 
 @inlined
@@ -93,30 +81,33 @@ def _passive_slopes(work, tree, layout, loads):
 def _add_column(work, at, width, force):
     """Add a moment and force to the rows of the base in a column."""
     for index in range(3):
-        add(work, at + index * width, force[0][index])
-        add(work, at + (3 + index) * width, force[1][index])
+        vec.add(work, at + index * width, force[0][index])
+        vec.add(work, at + (3 + index) * width, force[1][index])
 
 
 @inlined
 def _joint_slopes(work, tree, layout):
     """Add those over each joint, and those of each joint's force over omega_b."""
     n, width = len(tree.row) - 6, 2 * len(tree.row)
-    spin = get3(work, layout.motion)
+    spin = vec.get3(work, layout.motion)
     for body in range(len(tree.parent) - 1, 0, -1):
         at = layout.load + body * LOAD
         moving = layout.motion + body * MOTION
         inertia = tree.inertias + body * INERTIA
         column = tree.coordinate[body]
         axis = joint_axis(work, tree, body)
-        psi, psi2 = get6(work, moving + PSI), get6(work, moving + PSI2)
+        psi, psi2 = vec.get6(work, moving + PSI), vec.get6(work, moving + PSI2)
         momentum = spatial_inertia_times(work, inertia, axis)
         coriolis = _coriolis_transposed(work, at, axis)
-        moment, force = get6(work, at + FORCE)
-        by_q = plus6(_coriolis(work, at, psi[0]), spatial_inertia_times(work, inertia, psi2))
-        turned = plus(cross(axis[0], moment), cross(axis[1], force)), cross(axis[0], force)
-        by_q = plus6(by_q, turned)
+        moment, force = vec.get6(work, at + FORCE)
+        by_q = vec.plus6(_coriolis(work, at, psi[0]), spatial_inertia_times(work, inertia, psi2))
+        turned = (
+            vec.plus(vec.cross(axis[0], moment), vec.cross(axis[1], force)),
+            vec.cross(axis[0], force),
+        )
+        by_q = vec.plus6(by_q, turned)
         weight = spatial_inertia_times(work, inertia, psi)
-        by_v = plus6(_coriolis(work, at, axis[0]), plus6(weight, weight))
+        by_v = vec.plus6(_coriolis(work, at, axis[0]), vec.plus6(weight, weight))
         own = layout.lower + column * width
         q, v = column, (column + 6 + n)
         above = body
@@ -125,20 +116,20 @@ def _joint_slopes(work, tree, layout):
             other = tree.coordinate[above]
             axis = joint_axis(work, tree, above)
             row = layout.lower + other * width
-            add(work, row + q, dot6(axis, by_q))
-            add(work, row + v, dot6(axis, by_v))
+            vec.add(work, row + q, vec.dot6(axis, by_q))
+            vec.add(work, row + v, vec.dot6(axis, by_v))
             if above != body:
                 moving = layout.motion + above * MOTION
-                psi, psi2 = get6(work, moving + PSI), get6(work, moving + PSI2)
-                value = dot(coriolis, psi[0]) + dot6(momentum, psi2)
-                add(work, own + other, value)
-                value = dot6(momentum, psi)
-                value = dot(coriolis, axis[0]) + (value + value)
-                add(work, own + (other + 6 + n), value)
+                psi, psi2 = vec.get6(work, moving + PSI), vec.get6(work, moving + PSI2)
+                value = vec.dot(coriolis, psi[0]) + vec.dot6(momentum, psi2)
+                vec.add(work, own + other, value)
+                value = vec.dot6(momentum, psi)
+                value = vec.dot(coriolis, axis[0]) + (value + value)
+                vec.add(work, own + (other + 6 + n), value)
             momentum = at_parent(work, place, momentum)
             by_q, by_v = at_parent(work, place, by_q), at_parent(work, place, by_v)
             above = tree.parent[above]
-        add3(work, own + (6 + n), plus(coriolis, cross(momentum[0], spin)))
+        vec.add3(work, own + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin)))
         _add_column(work, layout.lower + q, width, by_q)
         _add_column(work, layout.lower + v, width, by_v)
 
@@ -148,12 +139,14 @@ def _base_slopes(work, tree, layout):
     """Write those of the base's force over omega_b."""
     n, width = len(tree.row) - 6, 2 * len(tree.row)
     zero, one = 0.0, 1.0
-    spin = get3(work, layout.motion)
+    spin = vec.get3(work, layout.motion)
     axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for index in range(3):
         e = axes[index]
-        weight = spatial_inertia_times(work, tree.inertias, (cross(spin, e), (zero, zero, zero)))
-        moment, force = plus6(_coriolis(work, layout.load, e), weight)
+        weight = spatial_inertia_times(
+            work, tree.inertias, (vec.cross(spin, e), (zero, zero, zero))
+        )
+        moment, force = vec.plus6(_coriolis(work, layout.load, e), weight)
         for axis in range(3):
             row = layout.lower + (axis * width + 6 + n + index)
             store(work, row, moment[axis])
