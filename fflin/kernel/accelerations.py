@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import namedtuple
 
 import numpy as np
 
@@ -15,20 +15,11 @@ from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
 
-class Layout(NamedTuple):
+class Layout(namedtuple("Layout", "motion load bias c columns lower held size")):
     """Where the parts of the kernel's work space begin, beyond those of the tree; its size."""
 
-    motion: int
-    load: int
-    bias: int
-    c: int
-    columns: int
-    lower: int
-    held: int
-    size: int
 
-
-class Loads(NamedTuple):
+class Loads(namedtuple("Loads", "body wrench input stored_body stored stiffness damping")):
     """What acts on the bodies and joints of a robot.
 
     Attributes
@@ -41,16 +32,8 @@ class Loads(NamedTuple):
     stiffness, damping : ndarray (n,)
     """
 
-    body: Any
-    wrench: Any
-    input: Any
-    stored_body: Any
-    stored: Any
-    stiffness: Any
-    damping: Any
 
-
-class BatchRates(NamedTuple):
+class BatchRates(namedtuple("BatchRates", "inverse c columns couplings")):
     """What the kernel finds about N points, all in base axes.
 
     Attributes
@@ -64,11 +47,6 @@ class BatchRates(NamedTuple):
     couplings : ndarray (N,)
         Sums of M_ii (M^-1)_ii, which tell how singular M is.
     """
-
-    inverse: Array
-    c: Array
-    columns: Array
-    couplings: Array
 
 
 class BatchAccelerations:

@@ -2,52 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import namedtuple
 
 from fflin.kernel.lanes import chosen, inlined, load, store, whole
 
 
-class Wheels(NamedTuple):
+class Wheels(
+    namedtuple("Wheels", "at row least_torque most_torque least_speed most_speed stiffness")
+):
     """Wheels with largest speeds (k,): their inputs, coordinates, torques, speeds, and J / dt."""
 
-    at: Any
-    row: Any
-    least_torque: Any
-    most_torque: Any
-    least_speed: Any
-    most_speed: Any
-    stiffness: Any
 
-
-class Pulses(NamedTuple):
+class Pulses(namedtuple("Pulses", "at on_off most least quantum left level end time")):
     """Thrusters that fire in pulses (k,), and what is left of their commands, see `Pulses`.
 
     `level` acts until the step `end`; `time` is that of a sample.
     """
 
-    at: Any
-    on_off: Any
-    most: Any
-    least: Any
-    quantum: Any
-    left: Any
-    level: Any
-    end: Any
-    time: float
 
-
-class Channel(NamedTuple):
+class Channel(namedtuple("Channel", "low high held pending slots sample delay wheels pulses")):
     """Limits (nu,) of commands, and those on their way: `pending` has (slots, nu) of samples."""
-
-    low: Any
-    high: Any
-    held: Any
-    pending: Any
-    slots: int
-    sample: int
-    delay: int
-    wheels: Wheels
-    pulses: Pulses
 
 
 @inlined

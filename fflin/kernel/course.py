@@ -8,7 +8,7 @@ about the base's origin at the start, in reference axes, and places are seen fro
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import namedtuple
 
 from fflin.kernel import vectors as vec
 from fflin.kernel.forward import push
@@ -21,7 +21,7 @@ IMPULSE, WAY, STEP_IMPULSE, STEP_WAY = 0, 6, 9, 15
 SUMS = 18
 
 
-class Course(NamedTuple):
+class Course(namedtuple("Course", "start weight per_mass sums")):
     """What is kept; each array of doubles may have a second axis of eight lanes.
 
     Attributes
@@ -33,11 +33,6 @@ class Course(NamedTuple):
     sums : ndarray (18,)
         Impulse (6,) and way besides that of the initial velocity (3,), so far and of the step.
     """
-
-    start: Any
-    weight: Any
-    per_mass: Any
-    sums: Any
 
 
 @inlined

@@ -6,19 +6,20 @@ anywhere nor moves along, as no acceleration but those of (3.1) depends on eithe
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import namedtuple
 
 from fflin.kernel import vectors as vec
-from fflin.kernel.accelerations import Layout, Loads
 from fflin.kernel.crba import inwards, outwards
 from fflin.kernel.factor import factorise, solve
 from fflin.kernel.lanes import angle, inlined, load, store
 from fflin.kernel.places import attitude, columns_of
 from fflin.kernel.rnea import at_parent, carried_wrench, collect, load_bodies, move_bodies
-from fflin.kernel.tree import PLACE, Tree
+from fflin.kernel.tree import PLACE
 
 
-class Mechanics(NamedTuple):
+class Mechanics(
+    namedtuple("Mechanics", "tree layout loads gravity index circling springy rest row held")
+):
     """A robot as the loop reads it; each array of doubles may have a second axis of eight lanes.
 
     Attributes
@@ -36,28 +37,12 @@ class Mechanics(NamedTuple):
         First of three inputs each that are a vector on the base in reference axes.
     """
 
-    tree: Tree
-    layout: Layout
-    loads: Loads
-    gravity: Any
-    index: Any
-    circling: Any
-    springy: Any
-    rest: Any
-    row: Any
-    held: Any
 
-
-class Point(NamedTuple):
+class Point(namedtuple("Point", "q nu u pushing")):
     """Where a robot is, q (nq,) and nu (6 + n,) in base axes, and the inputs (nu,) there.
 
     `u` is as it is commanded, `pushing` in base axes.
     """
-
-    q: Any
-    nu: Any
-    u: Any
-    pushing: Any
 
 
 @inlined

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import namedtuple
 
 import numpy as np
 
 from fflin.kernel.forward import joint_position
 from fflin.kernel.lanes import chosen, inlined, load, splat, store, whole
 from fflin.kernel.places import attitude, columns_of
-from fflin.kernel.tracking import Path, track
+from fflin.kernel.tracking import track
 from fflin.kernel.vectors import get3, product, put3, times
 
 NOTHING, STATE, OUTPUT, TRACK = range(4)
 
 
-class Law(NamedTuple):
+class Law(namedtuple("Law", "kind turned near K offset A B C y0 measured x z next path")):
     """A policy; each array of doubles may have a second axis of eight lanes.
 
     Attributes
@@ -33,21 +33,6 @@ class Law(NamedTuple):
     x, z, next : ndarray (nx,), (nz,), (nz,)
         Work space, and the filter's state.
     """
-
-    kind: int
-    turned: Any
-    near: Any
-    K: Any
-    offset: Any
-    A: Any
-    B: Any
-    C: Any
-    y0: Any
-    measured: Any
-    x: Any
-    z: Any
-    next: Any
-    path: Path
 
 
 @inlined

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import namedtuple
 
 from fflin.kernel.channel import arrive, limit, send, spare_wheels
 from fflin.kernel.course import (
@@ -20,7 +20,7 @@ from fflin.kernel.places import displace
 from fflin.kernel.vectors import put3
 
 
-class Method(NamedTuple):
+class Method(namedtuple("Method", "h origin way speed nodes weights moments twice")):
     """Steps of a method, by what its displacements and velocities are made of.
 
     Attributes
@@ -40,34 +40,16 @@ class Method(NamedTuple):
         Whether there is a second displacement.
     """
 
-    h: float
-    origin: Any
-    way: Any
-    speed: Any
-    nodes: Any
-    weights: Any
-    moments: Any
-    twice: bool
 
-
-class Watch(NamedTuple):
+class Watch(namedtuple("Watch", "squares sign")):
     """When to stop: squares of speeds (6 + n,), and the sign (1,) of q0 or 0 for any."""
 
-    squares: Any
-    sign: Any
 
-
-class Stages(NamedTuple):
+class Stages(namedtuple("Stages", "rates along first second u")):
     """Work space: v and the accelerations of the stages, a displacement, and two stages' q.
 
     `u` (nu,) is what acted as the last step began.
     """
-
-    rates: Any
-    along: Any
-    first: Any
-    second: Any
-    u: Any
 
 
 @inlined

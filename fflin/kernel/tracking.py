@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import namedtuple
 
 import numpy as np
 
-from fflin.kernel.forward import Point
 from fflin.kernel.lanes import angle, chosen, inlined, load, splat, store
 from fflin.kernel.places import attitude, columns_of, displace, quaternion_times
 from fflin.kernel.vectors import across, get3, minus, put3, times
@@ -14,7 +13,7 @@ from fflin.kernel.vectors import across, get3, minus, put3, times
 _NEAR = 1e-9  # a time this near to a knot, relative to the interval, is the knot's
 
 
-class Path(NamedTuple):
+class Path(namedtuple("Path", "t q u way speed hold ends held last starts K order along e point")):
     """A trajectory and its gains, piece by piece.
 
     Attributes
@@ -42,22 +41,6 @@ class Path(NamedTuple):
     point : Point
         What is followed.
     """
-
-    t: Any
-    q: Any
-    u: Any
-    way: Any
-    speed: Any
-    hold: bool
-    ends: bool
-    held: Any
-    last: float
-    starts: Any
-    K: Any
-    order: int
-    along: Any
-    e: Any
-    point: Point
 
 
 @inlined

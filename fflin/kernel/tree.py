@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import namedtuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -23,7 +24,14 @@ PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 PLACE, INERTIA = 12, 10
 
 
-class Tree(NamedTuple):
+class Tree(
+    namedtuple(
+        "Tree",
+        "parent fixed index unbounded turns slides bodies axes coordinate factor armature "
+        "target share row depth path common entries places own inertias packed scaled "
+        "diagonal square size",
+    )
+):
     """Bodies in Pinocchio's order, 0 the base; coordinates in state order, 0 to 5 the base's.
 
     Attributes
@@ -58,33 +66,6 @@ class Tree(NamedTuple):
     entries, places, own, inertias, packed, scaled, diagonal, square, size : int
         Entries of the packed M; where the parts of the work space begin; its size.
     """
-
-    parent: Any
-    fixed: Any
-    index: Any
-    unbounded: Any
-    turns: Any
-    slides: Any
-    bodies: Any
-    axes: Any
-    coordinate: Any
-    factor: Any
-    armature: Any
-    target: Any
-    share: Any
-    row: Any
-    depth: Any
-    path: Any
-    common: Any
-    entries: int
-    places: int
-    own: int
-    inertias: int
-    packed: int
-    scaled: int
-    diagonal: int
-    square: int
-    size: int
 
 
 # By robot, as long as it is alive; robots do not change.
