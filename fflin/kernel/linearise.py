@@ -9,6 +9,7 @@ from fflin.kernel.factor import (
     keep_diagonal,
     multiply,
     pack,
+    solve,
     unpack,
 )
 from fflin.kernel.lanes import compiled, inlined, load, splat, store
@@ -28,17 +29,11 @@ from fflin.kernel.vectors import get6, minus6, put6, times6
 
 @inlined
 def _accelerations(work, tree, layout, forces):
-    """Write c = M^-1 (forces - bias)."""
-    size = len(tree.row)
-    for index in range(size):
-        at = layout.bias + index
-        store(work, at, load(forces, index) - load(work, at))
-    for row in range(size):
-        total = load(work, tree.square + row * size) * load(work, layout.bias)
-        for index in range(1, size):
-            entry = load(work, tree.square + (row * size + index))
-            total = total + entry * load(work, layout.bias + index)
-        store(work, layout.c + row, total)
+    """Write c = M^-1 (forces - bias), by the factor of M."""
+    for index in range(len(tree.row)):
+        value = load(forces, index) - load(work, layout.bias + index)
+        store(work, layout.c + index, value)
+    solve(work, tree, layout.c)
 
 
 @inlined
@@ -105,9 +100,9 @@ def linearise(tree, layout, loads, points, out, lanes, work):
         collect_momenta(work, tree, layout)
         keep_diagonal(work, tree)
         factorise(work, tree)
+        _accelerations(work, tree, layout, forces_of)
         invert_factor(work, tree)
         multiply(work, tree, couplings, first)
-        _accelerations(work, tree, layout, forces_of)
         accelerate_bodies(work, tree, layout)
         differentiate(work, tree, layout, loads)
         _solve_slopes(work, tree, layout)
