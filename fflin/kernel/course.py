@@ -3,7 +3,7 @@ r"""Momentum and centre of mass as the impulse from outside takes them, and thei
 .. math:: H(t) = H(0) + \int w\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
 
 (11.2) of docs/derivation.md, as `simulation.conservation` has it; momentum is linear, then angular
-about the base's origin at the start, in reference axes, and places are seen from there.
+about where the base's origin was at the start, and places are seen from there.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections import namedtuple
 from fflin.kernel import vectors as vec
 from fflin.kernel.forward import push
 from fflin.kernel.lanes import inlined, load, store
-from fflin.kernel.places import attitude, columns_of
+from fflin.kernel.places import axes_of
 from fflin.kernel.rnea import spatial_inertia_times, stored_momentum
 
 # Where these begin in the sums: impulse and way so far, and of the step.
@@ -45,7 +45,7 @@ def begin_step(course):
 @inlined
 def add_wrench(work, robot, course, point, weight, moment):
     """Add to the sums of a step what pushes at a stage, which counts by its weight and moment."""
-    axes = columns_of(attitude(point.q))
+    axes = axes_of(point.q)
     moments, force = push(work, robot, point)
     place = vec.minus(vec.get3(point.q, 0), vec.get3(course.start, 9))
     lever = vec.product(axes, vec.get3(work, robot.tree.inertias + 1))
@@ -90,7 +90,7 @@ def impose(work, robot, course, point, t):
     The velocity is corrected by what the momentum lacks, so that rounding is of second order.
     """
     tree, nu = robot.tree, point.nu
-    axes = columns_of(attitude(point.q))
+    axes = axes_of(point.q)
     m, lever = load(work, tree.inertias), vec.get3(work, tree.inertias + 1)
     per_mass = 1.0 / m
     place = vec.minus(center_of(course, t), vec.times(vec.product(axes, lever), per_mass))

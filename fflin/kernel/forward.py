@@ -12,20 +12,19 @@ from fflin.kernel import vectors as vec
 from fflin.kernel.crba import inwards, outwards
 from fflin.kernel.factor import factorise, solve
 from fflin.kernel.lanes import angle, inlined, load, store
-from fflin.kernel.places import attitude, columns_of
+from fflin.kernel.places import attitude, axes_of, columns_of, quaternion_times
 from fflin.kernel.rnea import at_parent, carried_wrench, collect, load_bodies, move_bodies
 from fflin.kernel.tree import PLACE
 
 
 class Mechanics(
-    namedtuple("Mechanics", "tree layout loads gravity index circling springy rest row held")
+    namedtuple("Mechanics", "tree layout loads gravity index circling springy rest row held origin")
 ):
     """A robot as the loop reads it; each array of doubles may have a second axis of eight lanes.
 
     Attributes
     ----------
     gravity : ndarray (3,)
-        In reference axes.
     index, circling, springy : ndarray (n,), (n,) of bool, (n,) of bool
         Entry of q of each joint, whether it is the cosine of an angle, and whether the joint has a
         spring or a damper.
@@ -35,6 +34,8 @@ class Mechanics(
         The coordinate that each input drives; -1 for one that is carried.
     held : ndarray (k,)
         First of three inputs each that are a vector on the base in reference axes.
+    origin : ndarray (7,)
+        Placement of the world's origin seen from the reference, in Pinocchio's order.
     """
 
 
@@ -63,13 +64,19 @@ def joint_position(robot, q, joint):
 
 
 @inlined
+def seen(robot, q):
+    """Return the base's quaternion seen from the reference."""
+    return quaternion_times(attitude(robot.origin), attitude(q))
+
+
+@inlined
 def turn_inputs(robot, point):
     """Write the inputs in base axes."""
     for index in range(len(robot.row)):
         store(point.pushing, index, load(point.u, index))
     for index in range(len(robot.held)):
         at = robot.held[index]
-        axes = columns_of(attitude(point.q))
+        axes = columns_of(seen(robot, point.q))
         vec.put3(point.pushing, at, vec.across(axes, vec.get3(point.u, at)))
 
 
@@ -100,7 +107,7 @@ def accelerate(work, robot, point, rates, to):
     for index in range(size):
         store(rates, to + index, load(work, force + index))
     # What falls and what turns takes the base's origin along.
-    fall = vec.across(columns_of(attitude(point.q)), vec.get3(robot.gravity, 0))
+    fall = vec.across(axes_of(point.q), vec.get3(robot.gravity, 0))
     fall = vec.minus(fall, vec.cross(vec.get3(nu, 0), vec.get3(nu, 3)))
     vec.put3(rates, to + 3, vec.plus(vec.get3(rates, to + 3), fall))
 

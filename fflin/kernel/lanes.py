@@ -12,7 +12,6 @@ choice. Where a machine has narrower registers, LLVM splits the eight over sever
 
 from __future__ import annotations
 
-import math
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -24,7 +23,6 @@ from numba.extending import (
     intrinsic,
     lower_builtin,
     models,
-    overload,
     register_model,
     type_callable,
 )
@@ -223,42 +221,22 @@ def below(typing: Any, value: Any, bound: Any) -> Any:
 
 
 @intrinsic
-def _lane(typing: Any, value: Any, index: Any) -> Any:
-    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        return builder.extract_element(*arguments)
-
-    return double(lanes, numba.types.intp), generate
-
-
-@intrinsic
-def _with_lane(typing: Any, value: Any, index: Any, one: Any) -> Any:
-    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        return builder.insert_element(arguments[0], arguments[2], arguments[1])
-
-    return lanes(lanes, numba.types.intp, double), generate
-
-
-def angle(sine: Any, cosine: Any) -> Any:
+def angle(typing: Any, sine: Any, cosine: Any) -> Any:
     """Return the angle of a sine and a cosine, in (-pi, pi]."""
 
-
-@overload(angle, inline="always")
-def _angle(sine: Any, cosine: Any) -> Any:
-    if sine == double:
-
-        def alone(sine: Any, cosine: Any) -> Any:
-            return math.atan2(sine, cosine)
-
-        return alone
-
-    def of_lanes(sine: Any, cosine: Any) -> Any:
-        result = sine
-        for index in range(LANES):
-            one = math.atan2(_lane(sine, index), _lane(cosine, index))
-            result = _with_lane(result, index, one)
+    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        kind = ir.FunctionType(_DOUBLE, [_DOUBLE, _DOUBLE])
+        atan2 = cgutils.get_or_insert_function(builder.module, kind, "atan2")
+        pair = _alike(builder, arguments)
+        if pair[0].type == _DOUBLE:
+            return builder.call(atan2, pair)
+        result = ir.Constant(_VECTOR, ir.Undefined)
+        for lane in map(_INT32, range(LANES)):
+            one = builder.call(atan2, [builder.extract_element(each, lane) for each in pair])
+            result = builder.insert_element(result, one, lane)
         return result
 
-    return of_lanes
+    return _together(sine, cosine)(sine, cosine), generate
 
 
 @intrinsic

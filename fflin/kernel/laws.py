@@ -6,11 +6,11 @@ from collections import namedtuple
 
 import numpy as np
 
-from fflin.kernel.forward import joint_position
+from fflin.kernel.forward import joint_position, seen
 from fflin.kernel.lanes import chosen, inlined, load, splat, store, whole
-from fflin.kernel.places import attitude, columns_of
+from fflin.kernel.places import axes_of, columns_of
 from fflin.kernel.tracking import track
-from fflin.kernel.vectors import get3, product, put3, times
+from fflin.kernel.vectors import get3, plus, product, put3, times
 
 NOTHING, STATE, OUTPUT, TRACK = range(4)
 
@@ -39,10 +39,10 @@ class Law(namedtuple("Law", "kind turned near K offset A B C y0 measured x z nex
 def read_state(robot, law, point):
     """Write the state in the chart."""
     x, q, nu, n = law.x, point.q, point.nu, len(robot.index)
-    vector, scalar = attitude(q)
+    vector, scalar = seen(robot, q)
     sign = chosen(scalar, 0.0, -1.0, 1.0)
     put3(x, 0, times(vector, sign))
-    put3(x, 3, get3(q, 0))
+    put3(x, 3, plus(get3(robot.origin, 0), product(axes_of(robot.origin), get3(q, 0))))
     for joint in range(n):
         value = joint_position(robot, q, joint)
         if robot.circling[joint]:

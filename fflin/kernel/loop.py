@@ -13,7 +13,7 @@ from fflin.kernel.course import (
     impose,
     momentum_of,
 )
-from fflin.kernel.forward import accelerate, configure, turn_inputs
+from fflin.kernel.forward import accelerate, configure, seen, turn_inputs
 from fflin.kernel.lanes import below, compiled, inlined, load, store
 from fflin.kernel.laws import NOTHING, command
 from fflin.kernel.places import displace
@@ -42,7 +42,7 @@ class Method(namedtuple("Method", "h origin way speed nodes weights moments twic
 
 
 class Watch(namedtuple("Watch", "squares sign")):
-    """When to stop: squares of speeds (6 + n,), and the sign (1,) of q0 or 0 for any."""
+    """When to stop: squares of speeds (6 + n,), and the sign (1,) of q0 in the chart, or 0."""
 
 
 class Stages(namedtuple("Stages", "rates along first second u")):
@@ -86,9 +86,9 @@ def _record(rows, row, point, course, t):
 
 
 @inlined
-def _goes_on(watch, point):
+def _goes_on(robot, watch, point):
     """Whether all is finite, within bounds, and in the chart."""
-    good = below(-(load(watch.sign, 0) * load(point.q, 6)), 1e-300)
+    good = below(-(load(watch.sign, 0) * seen(robot, point.q)[1]), 1e-300)
     for index in range(len(watch.squares)):
         rate = load(point.nu, index)
         good = good and below(rate * rate, load(watch.squares, index))
@@ -182,5 +182,5 @@ def advance(
         if project:
             impose(work, robot, kept, point, (step + 1) * h)
         clock[0] = step + 1
-        if not _goes_on(watch, point):
+        if not _goes_on(robot, watch, point):
             break

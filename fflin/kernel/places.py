@@ -1,7 +1,6 @@
 """Attitudes, and displacements of a configuration along its tangent.
 
-A configuration is Pinocchio's with the base as seen from the reference; a displacement has the
-order of the state: the base's turn and way in base axes, then the joints.
+A displacement has the order of the state: the base's turn and way in base axes, then the joints.
 """
 
 from __future__ import annotations
@@ -71,6 +70,12 @@ def attitude(q):
 
 
 @inlined
+def axes_of(q):
+    """Return the base's axes in the world."""
+    return columns_of(attitude(q))
+
+
+@inlined
 def displace(tree, q, along, out):
     """Write q displaced along a tangent vector, the base by its exponential."""
     w, v = get3(along, 0), get3(along, 3)
@@ -80,7 +85,7 @@ def displace(tree, q, along, out):
     shift = plus(times(v, sine * cosine), times(cross(w, v), 0.5 * sine * sine))
     shift = plus(shift, times(w, dot(w, v) * _sixth(square) * (1.0 / 6.0)))
     quaternion = attitude(q)
-    put3(out, 0, plus(get3(q, 0), product(columns_of(quaternion), shift)))
+    put3(out, 0, plus(get3(q, 0), product(axes_of(q), shift)))
     vector, scalar = quaternion_times(quaternion, (times(w, 0.5 * sine), cosine))
     short = 1.5 - 0.5 * (dot(vector, vector) + scalar * scalar)
     put3(out, 3, times(vector, short))

@@ -7,7 +7,7 @@ from collections import namedtuple
 import numpy as np
 
 from fflin.kernel.lanes import angle, chosen, inlined, load, splat, store
-from fflin.kernel.places import attitude, columns_of, displace, quaternion_times
+from fflin.kernel.places import attitude, axes_of, displace, quaternion_times
 from fflin.kernel.vectors import across, get3, minus, put3, times
 
 _NEAR = 1e-9  # a time this near to a knot, relative to the interval, is the knot's
@@ -28,7 +28,7 @@ class Path(namedtuple("Path", "t q u way speed hold ends held last starts K orde
     hold, ends : bool
         Whether u stays until the next knot, and whether the run goes on after the end.
     held : ndarray (k,)
-        First of three inputs each that stand in reference axes.
+        First of three inputs each that stand in the world's axes.
     last : float
         Time [s] of the last gain since the first.
     starts, K : ndarray (M,), (M order nu nx,)
@@ -81,7 +81,7 @@ def _follow(robot, path, t):
         displace(robot.tree, point.q, path.along, point.q)
     for index in range(len(path.held)):
         at = path.held[index]
-        put3(point.u, at, across(columns_of(attitude(point.q)), get3(point.u, at)))
+        put3(point.u, at, across(axes_of(point.q), get3(point.u, at)))
 
 
 @inlined
@@ -92,7 +92,7 @@ def _error(robot, path, point):
     vector, scalar = quaternion_times(((-x, -y, -z), w), attitude(q))
     put3(e, 0, times(vector, chosen(scalar, 0.0, -1.0, 1.0)))
     apart = minus(get3(q, 0), get3(there.q, 0))
-    put3(e, 3, across(columns_of(((x, y, z), w)), apart))
+    put3(e, 3, across(axes_of(there.q), apart))
     for joint in range(n):
         at = robot.index[joint]
         if robot.circling[joint]:

@@ -2,119 +2,53 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
-from fflin.base.rotation import conjugate, product_matrix, quaternion_product, rotation_matrix
+from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array
 from fflin.control.output_feedback import OutputFeedback, measured_states
 from fflin.control.policies import StateFeedback
 from fflin.control.tracking import TrajectoryFeedback
-from fflin.dynamics.state import StateMap
 from fflin.kernel import channel, course, forward, laws, loop, tracking
 from fflin.kernel.accelerations import layout_of, loads_of
 from fflin.kernel.tree import Tree
-from fflin.robot.frames import ROOT
 from fflin.simulation.conservation import Conserved, Course
 from fflin.simulation.plan import LARGEST_SPEED, Plan
 from fflin.simulation.plant import Plant
 from fflin.simulation.times import LARGEST_TURN
 
 
-class Seen:
-    """The world as seen from the reference, in which the kernel has the base, and back.
-
-    Momentum and centre of mass are those of `Conserved`.
-    """
-
-    def __init__(self, state: StateMap) -> None:
-        self._state, self._origin = state, state.origin
-        self._R = state.reference.rotation
-        self._root = state.robot.model.jointPlacements[ROOT].translation
-
-    def from_reference(self, q: Array) -> Array:
-        """Return q (nq,) with the base as seen from the reference."""
-        seen = q.copy()
-        seen[:3] = self._state.positions(q)
-        seen[3:7] = quaternion_product(self._state.origin_quaternion, q[3:7])
-        return seen
-
-    def in_world(self, q: Array) -> Array:
-        """Return rows q (N, nq) in Pinocchio's coordinates."""
-        if self._origin.isIdentity(0.0):
-            return q
-        rows = q.copy()
-        rows[:, :3] = (q[:, :3] - self._origin.translation) @ self._origin.rotation
-        rows[:, 3:7] = q[:, 3:7] @ product_matrix(conjugate(self._state.origin_quaternion)).T
-        return rows
-
-    def vector(self, a: Array) -> Array:
-        """Return a vector (3,) of the world in reference axes."""
-        turned: Array = a @ self._R
-        return turned
-
-    def kept(self, momentum: Array, center: Array) -> Array:
-        """Return momentum (6,) and centre of mass (3,), together in reference axes."""
-        p, angular = np.split(momentum, 2)
-        turned = p, angular - np.cross(self._root, p), center - self._root
-        return np.concatenate([self.vector(each) for each in turned])
-
-    def kept_in_world(self, kept: Array) -> tuple[Array, Array]:
-        """Return rows (N, 6) of momentum and (N, 3) of the centre of mass."""
-        p, angular, center = (part @ self._R.T for part in np.split(kept, 3, axis=1))
-        return np.hstack((p, angular + np.cross(self._root, p))), center + self._root
-
-
-class Packed(NamedTuple):
-    """What `kernel.loop.advance` takes, but for the slice of the run and its rows."""
-
-    robot: forward.Mechanics
-    method: loop.Method
-    law: laws.Law
-    channel: channel.Channel
-    course: tuple[course.Course, bool, bool]
-    watch: loop.Watch
-    point: forward.Point
-    stages: loop.Stages
-
-
-def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> Packed:
-    """Return a plan, whose policy and method the kernel knows, as arrays of its own."""
-    seen, h, state = Seen(plant.state), plan.times.dt, plant.state
-    size = 6 + state.robot.n
-    way, speed = plan.method.shares(h)
-    method = loop.Method(
-        h,
-        np.array(plan.method.origins),
-        way.ravel(),
-        speed.ravel(),
-        h * np.array(plan.method.nodes),
-        h * np.array(plan.method.weights),
-        h * h * np.array(plan.method.moments),
-        bool(way[-1].any()),
+def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> tuple[Any, ...]:
+    """Return what `kernel.loop.advance` takes of a plan whose policy and method it knows."""
+    h, state, u = plan.times.dt, plant.state, plan.initial
+    size, (way, speed) = 6 + state.robot.n, plan.method.shares(h)
+    nodes, weights, moments = (
+        np.array(each) * h for each in (plan.method.nodes, plan.method.weights, plan.method.moments)
     )
-    q, start = seen.from_reference(plan.q), Course(conserved, plan.method, h, plan.q, plan.v)
+    origins, twice = np.array(plan.method.origins), bool(way[-1].any())
+    start = Course(conserved, plan.method, h, plan.q, plan.v)
     kept = course.Course(
-        np.append(seen.kept(start.momentum, start.center(0.0)), q[:3]),
-        conserved.mass * seen.vector(np.array(state.robot.gravity)),
+        np.concatenate((start.momentum, start.center(0.0), plan.q[:3])),
+        conserved.mass * np.array(state.robot.gravity),
         np.array([1.0 / conserved.mass]),
         np.zeros(course.SUMS),
     )
-    turning = np.zeros(state.robot.nv)
-    turning[plan.turning] = 1.0
-    squares = np.where(state.velocities(turning), (LARGEST_TURN / h) ** 2, LARGEST_SPEED**2)
-    sign = float(np.sign(plan.chart.scalar(plan.q))) if plan.chart else 0.0
-    u = plan.initial
-    return Packed(
+    squares = np.full(state.robot.nv, LARGEST_SPEED**2)
+    squares[plan.turning] = (LARGEST_TURN / h) ** 2
+    sign = np.sign(plan.chart.scalar(plan.q)) if plan.chart else 0.0
+    q, second = plan.q.copy(), plan.q.copy()
+    return (
         _mechanics(plant, tree),
-        method,
+        loop.Method(h, origins, way.ravel(), speed.ravel(), nodes, weights, h * moments, twice),
         _law(plan, plant),
         _channel(plan, plant),
         (kept, plan.project, not plant.isolated(driven=plan.law is not None)),
-        loop.Watch(squares, np.array([sign])),
-        forward.Point(q, state.velocities(plan.v), u.copy(), u.copy()),
-        loop.Stages(np.zeros(speed.shape[1] * size), np.zeros(size), q.copy(), q.copy(), u.copy()),
+        loop.Watch(state.velocities(squares), np.array([float(sign)])),
+        forward.Point(plan.q.copy(), state.velocities(plan.v), u.copy(), u.copy()),
+        loop.Stages(np.zeros(speed.shape[1] * size), np.zeros(size), q, second, u.copy()),
     )
 
 
@@ -126,13 +60,14 @@ def _mechanics(plant: Plant, tree: Tree) -> forward.Mechanics:
         tree,
         layout_of(tree, len(loads.input)),
         loads,
-        Seen(plant.state).vector(np.array(robot.gravity)),
+        np.array(robot.gravity),
         np.array([joint.idx_q for joint in robot.joints], dtype=np.intp),
         np.array([joint.unbounded for joint in robot.joints], dtype=bool),
         np.array((springs.stiffness != 0.0) | (springs.damping != 0.0), dtype=bool),
         np.array(springs.rest),
         np.where(fixed.any(axis=0), np.abs(fixed).argmax(axis=0), -1).astype(np.intp),
         np.array([held.columns.start for held in actuation.held], dtype=np.intp),
+        pin.SE3ToXYZQUAT(plant.state.origin),
     )
 
 
@@ -167,7 +102,7 @@ def _law(plan: Plan, plant: Plant) -> laws.Law:
 
 
 def _path(plan: Plan, plant: Plant) -> tracking.Path:
-    policy, state, seen = plan.policy, plant.state, Seen(plant.state)
+    policy, state = plan.policy, plant.state
     none, nowhere, size, nu = np.zeros(0), np.zeros(0, dtype=np.intp), state.nx // 2, plan.initial
     point = forward.Point(plan.q.copy(), np.zeros(size), nu.copy(), none)
     path = tracking.Path(
@@ -191,7 +126,7 @@ def _path(plan: Plan, plant: Plant) -> tracking.Path:
     pieces = schedule.K[:, None] if schedule.dt else schedule.quartics
     return path._replace(
         t=np.array(motion.t),
-        q=np.concatenate([seen.from_reference(each) for each in q]),
+        q=np.concatenate(q),
         u=np.concatenate(u),
         way=way,
         speed=speed,

@@ -82,16 +82,6 @@ class Plant:
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         return not (base or self.disturbance is not None or any(self.robot.gravity))
 
-    def held(self, u: Array) -> Callable[[float, Array, Array], Array]:
-        """Return f(t, q, v) for inputs that stay, with nothing in between where it can be.
-
-        What is held in reference axes must be zero.
-        """
-        if self._plain and self.disturbance is None:
-            model, data, tau = self._model, self._data, self._columns.dot(u)
-            return lambda _, q, v: _aba(model, data, q, v, tau)
-        return lambda t, q, v: self.stage(t, q, v, u)[0]
-
     def _in_base_axes(self, q: Array, u: Array) -> Array:
         """Return u (nu,) with what is held in reference axes in base axes, at any turn."""
         R = self.state.rotation(q)

@@ -98,18 +98,6 @@ def _advance(
     ask = channel.ask if channel is not None and channel.continuous else None
     pushed = not plant.isolated(driven=channel is not None)
 
-    if not ask and not pushed:
-        acting: Array | None = None
-        rate = plant.held(plan.initial)
-
-        def held(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-            nonlocal acting, rate
-            if u is not acting:
-                acting, rate = u, plant.held(u)
-            return take(rate, t, q, v)
-
-        return held
-
     stage, wrench, wrenches = plant.stage, conserved.wrench, course.wrenches
 
     def asked(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
