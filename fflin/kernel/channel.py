@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import namedtuple
 
 from fflin.kernel.lanes import chosen, inlined, load, store, whole
+from fflin.kernel.vectors import copy
 
 
 class Wheels(
@@ -43,9 +44,7 @@ def limit(channel, u):
 def send(channel, step, u):
     """Put the command of a sample on its way."""
     count = len(channel.low)
-    first = (step // channel.sample) % channel.slots * count
-    for index in range(count):
-        store(channel.pending, first + index, load(u, index))
+    copy(u, 0, channel.pending, (step // channel.sample) % channel.slots * count, count)
 
 
 @inlined
@@ -55,12 +54,10 @@ def arrive(channel, step, u):
     arrives = since >= 0 and since % channel.sample == 0
     if arrives:
         first = (since // channel.sample) % channel.slots * count
-        for index in range(count):
-            store(channel.held, index, load(channel.pending, first + index))
+        copy(channel.pending, first, channel.held, 0, count)
     if arrives or (since < 0 and step % channel.sample == 0):
         _begin_pulses(channel.pulses, step, channel.sample, channel.held)
-    for index in range(count):
-        store(u, index, load(channel.held, index))
+    copy(channel.held, 0, u, 0, count)
     pulses = channel.pulses
     for index in range(len(pulses.at)):
         level = chosen(float(step), load(pulses.end, index), load(pulses.level, index), 0.0)

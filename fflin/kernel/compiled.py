@@ -18,7 +18,7 @@ from typing import Any
 # ones do: sweeps are seldom alone.
 _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
 # Fewest steps of the loop for which its kernel is: loaded and kept on disk, kept, and neither.
-_BREAK_EVEN_LOOP, _BREAK_EVEN_LOOP_UNLOADED, _BREAK_EVEN_COMPILING = 100, 10_000, 20_000
+_BREAK_EVEN_LOOP, _BREAK_EVEN_LOOP_UNLOADED, _BREAK_EVEN_COMPILING = 100, 4000, 20_000
 
 # Files in which Linux tells a container's quota of computing time and its period [us], of version 2
 # and of version 1 of its control groups.

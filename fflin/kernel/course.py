@@ -24,14 +24,9 @@ SUMS = 18
 class Course(namedtuple("Course", "start weight per_mass sums")):
     """What is kept; each array of doubles may have a second axis of eight lanes.
 
-    Attributes
-    ----------
-    start : ndarray (12,)
-        Momentum and centre of mass at the start, and the point that both are seen from.
-    weight : ndarray (3,)
-    per_mass : ndarray (1,)
-    sums : ndarray (18,)
-        Impulse (6,) and way besides that of the initial velocity (3,), so far and of the step.
+    `start` (12,): momentum, centre of mass, and the point that both are seen from; weight (3,); and
+    `sums` (18,): impulse (6,) and way besides that of the initial velocity (3,), so far and of the
+    step.
     """
 
 
@@ -65,22 +60,16 @@ def end_step(course, h):
     per_mass = load(course.per_mass, 0)
     way = vec.times(vec.get3(course.sums, IMPULSE), h)
     vec.add3(course.sums, WAY, vec.times(vec.plus(way, vec.get3(course.sums, STEP_WAY)), per_mass))
-    for entry in range(6):
-        vec.add(course.sums, IMPULSE + entry, load(course.sums, STEP_IMPULSE + entry))
+    vec.add6(course.sums, IMPULSE, vec.get6(course.sums, STEP_IMPULSE))
 
 
 @inlined
-def momentum_of(course):
-    """Return the momentum, linear and angular."""
-    linear = vec.plus(vec.get3(course.start, 0), vec.get3(course.sums, IMPULSE))
-    return linear, vec.plus(vec.get3(course.start, 3), vec.get3(course.sums, IMPULSE + 3))
-
-
-@inlined
-def center_of(course, t):
-    """Return where the centre of mass is."""
+def kept_at(course, t):
+    """Return the momentum, linear and angular, and where the centre of mass is."""
+    momentum = vec.plus6(vec.get6(course.start, 0), vec.get6(course.sums, IMPULSE))
     flown = vec.times(vec.get3(course.start, 0), t * load(course.per_mass, 0))
-    return vec.plus(vec.plus(vec.get3(course.start, 6), vec.get3(course.sums, WAY)), flown)
+    way = vec.plus(vec.get3(course.start, 6), vec.get3(course.sums, WAY))
+    return momentum, vec.plus(way, flown)
 
 
 @inlined
@@ -93,9 +82,9 @@ def impose(work, robot, course, point, t):
     axes = axes_of(point.q)
     m, lever = load(work, tree.inertias), vec.get3(work, tree.inertias + 1)
     per_mass = 1.0 / m
-    place = vec.minus(center_of(course, t), vec.times(vec.product(axes, lever), per_mass))
+    (linear, angular), center = kept_at(course, t)
+    place = vec.minus(center, vec.times(vec.product(axes, lever), per_mass))
     vec.put3(point.q, 0, vec.plus(place, vec.get3(course.start, 9)))
-    linear, angular = momentum_of(course)
     angular = vec.across(axes, vec.minus(angular, vec.cross(place, linear)))
     linear = vec.across(axes, linear)
     # The base's rows of M nu: its block of a rigid body, and the first six entries of each row.

@@ -22,20 +22,11 @@ class Mechanics(
 ):
     """A robot as the loop reads it; each array of doubles may have a second axis of eight lanes.
 
-    Attributes
-    ----------
-    gravity : ndarray (3,)
-    index, circling, springy : ndarray (n,), (n,) of bool, (n,) of bool
-        Entry of q of each joint, whether it is the cosine of an angle, and whether the joint has a
-        spring or a damper.
-    rest : ndarray (n,)
-        Positions at which springs are at rest.
-    row : ndarray (nu,)
-        The coordinate that each input drives; -1 for one that is carried.
-    held : ndarray (k,)
-        First of three inputs each that are a vector on the base in reference axes.
-    origin : ndarray (7,)
-        Placement of the world's origin seen from the reference, in Pinocchio's order.
+    Gravity (3,); of each joint its entry of q (`index`), whether that is the cosine of an angle,
+    whether it has a spring or damper, and where the spring is at rest; the coordinate that each
+    input drives (`row`), -1 for one that is carried; the first of three inputs each that are a
+    vector on the base in reference axes (`held`); and the placement (7,) of the world's origin seen
+    from the reference.
     """
 
 
@@ -72,8 +63,7 @@ def seen(robot, q):
 @inlined
 def turn_inputs(robot, point):
     """Write the inputs in base axes."""
-    for index in range(len(robot.row)):
-        store(point.pushing, index, load(point.u, index))
+    vec.copy(point.u, 0, point.pushing, 0, len(robot.row))
     for index in range(len(robot.held)):
         at = robot.held[index]
         axes = columns_of(seen(robot, point.q))
@@ -104,8 +94,7 @@ def accelerate(work, robot, point, rates, to):
             vec.add(work, force + 6 + joint, -pull)
     factorise(work, tree)
     solve(work, tree, force)
-    for index in range(size):
-        store(rates, to + index, load(work, force + index))
+    vec.copy(work, force, rates, to, size)
     # What falls and what turns takes the base's origin along.
     fall = vec.across(axes_of(point.q), vec.get3(robot.gravity, 0))
     fall = vec.minus(fall, vec.cross(vec.get3(nu, 0), vec.get3(nu, 3)))

@@ -10,7 +10,7 @@ from fflin.kernel.forward import joint_position, seen
 from fflin.kernel.lanes import chosen, inlined, load, splat, store, whole
 from fflin.kernel.places import axes_of, columns_of
 from fflin.kernel.tracking import track
-from fflin.kernel.vectors import get3, plus, product, put3, times
+from fflin.kernel.vectors import copy, get3, plus, product, put3, times
 
 NOTHING, STATE, OUTPUT, TRACK = range(4)
 
@@ -18,20 +18,10 @@ NOTHING, STATE, OUTPUT, TRACK = range(4)
 class Law(namedtuple("Law", "kind turned near K offset A B C y0 measured x z next path")):
     """A policy; each array of doubles may have a second axis of eight lanes.
 
-    Attributes
-    ----------
-    kind : int
-        NOTHING, STATE (u = offset - K x), OUTPUT (u = offset + C z, z' = A z + B (y - y0), y
-        being states) or TRACK (u = u* - K e along `path`).
-    turned : ndarray (2,) of bool
-        Whether omega_b and v_b of the state stand in reference axes.
-    near : ndarray (n,)
-        Positions whose turn is taken of joints that go round.
-    K, offset : ndarray (nu nx,), (nu,)
-    A, B, C, y0, measured : ndarray
-        Of the filter, matrices row by row, and the states that are outputs.
-    x, z, next : ndarray (nx,), (nz,), (nz,)
-        Work space, and the filter's state.
+    By its kind NOTHING, STATE: u = offset - K x, OUTPUT: u = offset + C z and z' = A z + B (y - y0)
+    with y the states that are `measured`, or TRACK: u = u* - K e along `path`. `turned` says
+    whether omega_b and v_b of the state stand in reference axes, `near` (n,) which turn is taken
+    of joints that go round. x (nx,) and `next` (nz,) are work space, z (nz,) is the filter's state.
     """
 
 
@@ -55,8 +45,7 @@ def read_state(robot, law, point):
         if law.turned[part]:
             rate = product(axes, rate)
         put3(x, 6 + n + 3 * part, rate)
-    for joint in range(n):
-        store(x, 12 + n + joint, load(nu, 6 + joint))
+    copy(nu, 6, x, 12 + n, n)
 
 
 @inlined
@@ -94,5 +83,4 @@ def _filter(law, u):
             y = load(law.x, law.measured[index]) - load(law.y0, index)
             total = total + load(law.B, row * outputs + index) * y
         store(law.next, row, total)
-    for row in range(len(law.z)):
-        store(law.z, row, load(law.next, row))
+    copy(law.next, 0, law.z, 0, len(law.z))

@@ -5,39 +5,21 @@ from __future__ import annotations
 from collections import namedtuple
 
 from fflin.kernel.channel import arrive, limit, send, spare_wheels
-from fflin.kernel.course import (
-    add_wrench,
-    begin_step,
-    center_of,
-    end_step,
-    impose,
-    momentum_of,
-)
+from fflin.kernel.course import add_wrench, begin_step, end_step, impose, kept_at
 from fflin.kernel.forward import accelerate, configure, seen, turn_inputs
 from fflin.kernel.lanes import below, compiled, inlined, load, store
 from fflin.kernel.laws import NOTHING, command
 from fflin.kernel.places import displace
-from fflin.kernel.vectors import put3
+from fflin.kernel.vectors import copy, put3, put6
 
 
-class Method(namedtuple("Method", "h origin way speed nodes weights moments twice")):
-    """Steps of a method, by what its displacements and velocities are made of.
+class Method(namedtuple("Method", "h origin way speed nodes weights moments")):
+    """Steps of h [s], s stages each, by what its displacements and velocities are made of.
 
-    Attributes
-    ----------
-    h : float
-        Step [s].
-    origin : ndarray (s,) of int
-        After each stage: whether the way begins at the step's first place or at its second stage.
-    way : ndarray ((s + 1) (s + 1),)
-        Row by row, shares of v and the stages' accelerations in the displacement after each stage,
-        and in the second one after the last.
-    speed : ndarray (s (s + 1),)
-        In the velocity there.
-    nodes, weights, moments : ndarray (s,)
-        Of the stages: their times [s], and shares in sums along, with h and h^2.
-    twice : bool
-        Whether there is a second displacement.
+    Row by row: shares of v and the stages' accelerations in the displacement after each stage, and
+    the second one after the last (`way`), and in the velocity there (`speed`). A way begins at the
+    step's first place, or at its second stage's where `origin` says 1. `nodes` [s] are the stages'
+    times, `weights` and `moments` their shares in sums along, with h and h^2.
     """
 
 
@@ -66,23 +48,15 @@ def _combine(shares, row, rates, out):
 
 
 @inlined
-def _copy(source, target):
-    for index in range(len(target)):
-        store(target, index, load(source, index))
-
-
-@inlined
 def _record(rows, row, point, course, t):
     """Write a row: q, nu, u, and momentum and centre of mass as they are to be."""
     at = row * (len(point.q) + len(point.nu) + len(point.u) + 9)
     for values in (point.q, point.nu, point.u):
-        for index in range(len(values)):
-            store(rows, at + index, load(values, index))
+        copy(values, 0, rows, at, len(values))
         at += len(values)
-    linear, angular = momentum_of(course)
-    put3(rows, at, linear)
-    put3(rows, at + 3, angular)
-    put3(rows, at + 6, center_of(course, t))
+    momentum, center = kept_at(course, t)
+    put6(rows, at, momentum)
+    put3(rows, at + 6, center)
 
 
 @inlined
@@ -114,14 +88,14 @@ def _act(channel, law, robot, point, step, stage, t):
 @inlined
 def _move(robot, method, stages, point, stage):
     """Go from a stage, whose acceleration is there, to the next one, or to the end of the step."""
-    rates, along, last = stages.rates, stages.along, stage == len(method.origin) - 1
+    rates, along = stages.rates, stages.along
     if stage == 1:
-        _copy(point.q, stages.second)
+        copy(point.q, 0, stages.second, 0, len(point.q))
     _combine(method.way, stage, rates, along)
     _combine(method.speed, stage, rates, point.nu)
     begin = stages.first if method.origin[stage] == 0 else stages.second
     displace(robot.tree, begin, along, point.q)
-    if last and method.twice:
+    if stage == len(method.origin) - 1:
         _combine(method.way, stage + 1, rates, along)
         displace(robot.tree, point.q, along, point.q)
 
@@ -136,38 +110,29 @@ def advance(
 
     Parameters
     ----------
-    robot : Mechanics
-    method : Method
-    law : Law
-    channel : Channel
+    robot, method, law, channel, watch, point, stages
+        As `simulation.packing` makes them.
     course : tuple of Course, bool, bool
         And whether it is imposed, and whether anything pushes from outside.
-    watch : Watch
-    point : Point
-    stages : Stages
     clock : ndarray (1,) of int
-        How many steps are done.
-    last : int
-        How many are to be done.
+        How many steps are done; `last` are to be done.
     every : int
         Steps from row to row; 0 where none is recorded.
     rows : ndarray (rows * width,) or (rows * width, 8)
         Gets q, nu, u, and the momentum (6,) and centre of mass (3,) that are kept, row by row.
-    work : ndarray
-        Work space of `Layout.size`.
+    work : ndarray (Layout.size,) or (Layout.size, 8)
     """
     kept, project, pushed = course
     h, row = method.h, 0
     configure(work, robot, point.q)
     for step in range(clock[0], last):
         begin_step(kept)
-        _copy(point.q, stages.first)
-        for index in range(len(point.nu)):
-            store(stages.rates, index, load(point.nu, index))
+        copy(point.q, 0, stages.first, 0, len(point.q))
+        copy(point.nu, 0, stages.rates, 0, len(point.nu))
         for stage in range(len(method.origin)):
             _act(channel, law, robot, point, step, stage, step * h + method.nodes[stage])
             if stage == 0:
-                _copy(point.u, stages.u)
+                copy(point.u, 0, stages.u, 0, len(point.u))
                 if every > 0 and step % every == 0:
                     _record(rows, row, point, kept, step * h)
                     row += 1

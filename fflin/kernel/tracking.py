@@ -8,7 +8,7 @@ import numpy as np
 
 from fflin.kernel.lanes import angle, chosen, inlined, load, splat, store
 from fflin.kernel.places import attitude, axes_of, displace, quaternion_times
-from fflin.kernel.vectors import across, get3, minus, put3, times
+from fflin.kernel.vectors import across, copy, get3, minus, put3, times
 
 _NEAR = 1e-9  # a time this near to a knot, relative to the interval, is the knot's
 
@@ -16,30 +16,12 @@ _NEAR = 1e-9  # a time this near to a knot, relative to the interval, is the kno
 class Path(namedtuple("Path", "t q u way speed hold ends held last starts K order along e point")):
     """A trajectory and its gains, piece by piece.
 
-    Attributes
-    ----------
-    t : ndarray (N,)
-        Times of the knots [s].
-    q, u : ndarray (N nq,), (N nu,)
-        At the knots, and where the run goes on after the end.
-    way, speed : ndarray (4 (N - 1) (6 + n),)
-        Cubics in the share of an interval of the displacement from its knot, and of nu; of nu
-        what it is after the end, too.
-    hold, ends : bool
-        Whether u stays until the next knot, and whether the run goes on after the end.
-    held : ndarray (k,)
-        First of three inputs each that stand in the world's axes.
-    last : float
-        Time [s] of the last gain since the first.
-    starts, K : ndarray (M,), (M order nu nx,)
-        Where the pieces of K begin, and their coefficients in the time since.
-    order : int
-    along : ndarray (6 + n,)
-        Work space.
-    e : ndarray (nx,)
-        The error.
-    point : Point
-        What is followed.
+    At the knots t (N,) [s] q and u, row by row, and once more where the run `ends` later, at rest.
+    Between them `way` is the cubic (4, 6 + n) in the share of the interval of the displacement from
+    its knot, and `speed` that of nu; u is linear or on `hold`, and the three inputs from each of
+    `held` on stand in the world's axes. K has `order` coefficients in the time since each of
+    `starts`, and stays after `last` [s]. `along` (6 + n,), the error e (nx,) and the `point` that
+    is followed are work space.
     """
 
 
@@ -64,8 +46,7 @@ def _follow(robot, path, t):
     s = 0.0 if s < _NEAR else min(s, 1.0)
     if after:
         k, s = last + 2, 0.0
-    for index in range(len(point.q)):
-        point.q[index] = path.q[k * len(point.q) + index]
+    copy(path.q, k * len(point.q), point.q, 0, len(point.q))
     count = len(point.u)
     for index in range(count):
         value = path.u[k * count + index]
@@ -73,8 +54,7 @@ def _follow(robot, path, t):
             value += s * (path.u[(k + 1) * count + index] - value)
         point.u[index] = value
     if after:
-        for index in range(len(point.nu)):
-            point.nu[index] = path.speed[4 * (last + 1) * len(point.nu) + index]
+        copy(path.speed, 4 * (last + 1) * len(point.nu), point.nu, 0, len(point.nu))
     else:
         _cubic(path.way, k, s, path.along)
         _cubic(path.speed, k, s, point.nu)

@@ -23,6 +23,13 @@ def put3(work, at, a):
 
 
 @inlined
+def copy(source, first, target, to, count):
+    """Copy entries."""
+    for index in range(count):
+        store(target, to + index, load(source, first + index))
+
+
+@inlined
 def add(work, at, value):
     """Add to an entry."""
     store(work, at, load(work, at) + value)

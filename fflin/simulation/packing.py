@@ -11,6 +11,8 @@ from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array
 from fflin.control.output_feedback import OutputFeedback, measured_states
 from fflin.control.policies import StateFeedback
+from fflin.control.pulses import Pulses
+from fflin.control.saturation import Wheels
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.kernel import channel, course, forward, laws, loop, tracking
 from fflin.kernel.accelerations import layout_of, loads_of
@@ -28,7 +30,7 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> tuple[
     nodes, weights, moments = (
         np.array(each) * h for each in (plan.method.nodes, plan.method.weights, plan.method.moments)
     )
-    origins, twice = np.array(plan.method.origins), bool(way[-1].any())
+    origins = np.array(plan.method.origins)
     start = Course(conserved, plan.method, h, plan.q, plan.v)
     kept = course.Course(
         np.concatenate((start.momentum, start.center(0.0), plan.q[:3])),
@@ -42,7 +44,7 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> tuple[
     q, second = plan.q.copy(), plan.q.copy()
     return (
         _mechanics(plant, tree),
-        loop.Method(h, origins, way.ravel(), speed.ravel(), nodes, weights, h * moments, twice),
+        loop.Method(h, origins, way.ravel(), speed.ravel(), nodes, weights, h * moments),
         _law(plan, plant),
         _channel(plan, plant),
         (kept, plan.project, not plant.isolated(driven=plan.law is not None)),
@@ -142,27 +144,23 @@ def _path(plan: Plan, plant: Plant) -> tracking.Path:
 
 def _channel(plan: Plan, plant: Plant) -> channel.Channel:
     limits, times, names = plan.limits, plan.times, list(plant.state.names)
-    w, pulses = limits.wheels, limits.pulses and limits.pulses()
-    none, nowhere = np.zeros(0), np.zeros(0, dtype=np.intp)
-    wheels = channel.Wheels(nowhere, nowhere, none, none, none, none, none)
-    if w is not None:
-        first = plant.state.groups.omega_b.start
-        rows = [names.index(f"qdot_m.{name}") - first for name in w.names]
-        wheels = channel.Wheels(
-            np.array(w.at, dtype=np.intp),
-            np.array(rows, dtype=np.intp),
-            *(np.array(each, dtype=float) for each in (*w.torques, *w.limits, w.stiffness)),
+    bounds, none = np.zeros((2, 0)), np.zeros(0)
+    w = limits.wheels or Wheels([], [], bounds, bounds, none, lambda *_: none)
+    first = plant.state.groups.omega_b.start
+    rows = [names.index(f"qdot_m.{name}") - first for name in w.names]
+    wheels = channel.Wheels(
+        *(np.array(each, dtype=np.intp) for each in (w.at, rows)),
+        *(np.array(each, dtype=float) for each in (*w.torques, *w.limits, w.stiffness)),
+    )
+    fired = limits.pulses() if limits.pulses else Pulses([], limits.high, times.sample, times.dt)
+    figures, nothing = (fired.most, fired.least, fired.quantum), (0.0 * fired.most,) * 3
+    pulses = channel.Pulses._make(
+        (
+            *(np.array(fired.places, dtype=np.intp), np.array(fired.on_off, dtype=bool)),
+            *(np.array(each, dtype=float) for each in (*figures, *nothing)),
+            fired.time,
         )
-    fired = channel.Pulses(nowhere, none.astype(bool), none, none, none, none, none, none, 1.0)
-    if pulses is not None:
-        most, least, quantum = (
-            np.array(each, dtype=float) for each in (pulses.most, pulses.least, pulses.quantum)
-        )
-        at, on_off = np.array(pulses.places, dtype=np.intp), np.array(pulses.on_off, dtype=bool)
-        left, level, end = np.zeros((3, len(at)))
-        fired = channel.Pulses(
-            at, on_off, most, least, quantum, left, level, end, float(pulses.time)
-        )
+    )
     held: Array = np.minimum(np.maximum(plan.initial, limits.low), limits.high)
     slots = times.delay // times.sample + 1 if times.sample else 1
     return channel.Channel(
@@ -174,5 +172,5 @@ def _channel(plan: Plan, plant: Plant) -> channel.Channel:
         times.sample,
         times.delay,
         wheels,
-        fired,
+        pulses,
     )
