@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import pickle
 import warnings
 from collections.abc import Mapping
 from functools import cached_property, partial
@@ -15,6 +13,7 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinError, FflinWarning
 from fflin.base.validation import Array
+from fflin.batch.dispatch import ChunkResult
 from fflin.dynamics.inertia import Inertia
 from fflin.kernel.compiled import pays
 from fflin.linear.linearization import Linearizer
@@ -22,22 +21,14 @@ from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from fflin.batch.equations import BatchEquations
-    from fflin.dynamics.state import Frame
 
 
 class Points(NamedTuple):
-    """Points of one chunk, checked; v and u (rows, ..) or None for rest and no input."""
+    """Points of one chunk, checked; v and u0 (rows, ..) or None for rest and no input."""
 
     q: Array
     v: Array | None
-    u: Array | None
-
-
-class ChunkResult(NamedTuple):
-    """The result of a chunk: its arrays by name, and the warnings on the way."""
-
-    arrays: dict[str, Array]
-    notes: list[str]
+    u0: Array | None
 
 
 # Python has one set of warning filters for the whole process, so that threads take turns.
@@ -45,31 +36,10 @@ _TURN = Lock()
 
 
 class ChunkJob:
-    """Linearises chunks; is sent to every worker once.
+    """Linearises chunks of `count` points, `at_rest` all, as `Linearizer` does."""
 
-    Parameters
-    ----------
-    robot : Robot
-    frame, reference, moving : optional
-        As `Linearizer` takes them.
-    at_rest : bool
-        Whether all points have neither velocity nor input.
-    count : int
-        Points of all chunks.
-    """
-
-    def __init__(
-        self,
-        robot: Robot,
-        *,
-        frame: Frame | None,
-        reference: pin.SE3 | None,
-        moving: bool,
-        at_rest: bool,
-        count: int,
-    ) -> None:
-        options: Any = {"frame": frame, "reference": reference, "moving": moving}
-        self._again = partial(type(self), robot, **options, at_rest=at_rest, count=count)
+    def __init__(self, robot: Robot, *, at_rest: bool, count: int, **options: Any) -> None:
+        self._again = partial(type(self), robot, at_rest=at_rest, count=count, **options)
         self._count = count
         self.linearizer = Linearizer(robot, **options)
         prepared = self.linearizer.prepared
@@ -98,21 +68,7 @@ class ChunkJob:
     def run(
         self, points: Points, start: int, out: Mapping[str, Array] | None = None
     ) -> ChunkResult:
-        """Linearise about the points of a chunk; threads may share a job.
-
-        Parameters
-        ----------
-        points : Points
-        start : int
-            Number of its first point, for messages.
-        out : mapping, optional
-            Arrays to write to; new ones by default.
-
-        Raises
-        ------
-        FflinError
-            If there is no model about one of them; the message names it.
-        """
+        """Linearise about the points of a chunk; see `Job`."""
         count = len(points.q)
         if out is None:
             out = {key: np.empty((count, *shape)) for key, shape in self.shapes.items()}
@@ -169,34 +125,3 @@ class ChunkJob:
     def _inertia(self) -> tuple[Inertia, pin.Data]:
         data = self.linearizer.robot.create_data()
         return Inertia(self.linearizer.prepared.map, data), data
-
-
-class Parcel(NamedTuple):
-    """A job as it is sent: under a key, and its content only where a worker may not have it."""
-
-    key: str
-    content: bytes | None
-
-
-def pack(job: ChunkJob) -> Parcel:
-    """Pickle a job under the hash of its content."""
-    content = pickle.dumps(job)
-    return Parcel(hashlib.sha256(content).hexdigest(), content)
-
-
-# The jobs that this worker has received; the oldest is dropped first.
-_JOBS: dict[str, ChunkJob] = {}
-_KEPT = 4
-
-
-def work(parcel: Parcel, points: Points, start: int) -> ChunkResult | None:
-    """Do a chunk in a worker, or return None where the worker does not have the job."""
-    job = _JOBS.get(parcel.key)
-    if job is None:
-        if parcel.content is None:
-            return None
-        job = pickle.loads(parcel.content)
-        while len(_JOBS) >= _KEPT:
-            _JOBS.pop(next(iter(_JOBS)), None)
-        _JOBS[parcel.key] = job
-    return job.run(points, start)

@@ -4,40 +4,27 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import fields
 from hashlib import sha256
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.validation import Array
 from fflin.base.version import __version__
+from fflin.batch.batch_record import asked_of, texts_of
 from fflin.batch.chunks import ChunkJob, Points
 from fflin.batch.configurations import Configurations, GivenConfigurations, fingerprint
-from fflin.batch.files import header
-from fflin.batch.linear_batch import LinearBatch
-from fflin.batch.robot_functions import AT_ROOT
+from fflin.batch.linear_batch import AT_ROOT, LinearBatch
 from fflin.batch.rows import checked_inputs, checked_velocities, column
 from fflin.robot.frames import ROOT
-
-# Fields of a linear model that a batch has as arrays, or not at all.
-_OF_MODELS = (
-    *("C", "D", "dt", "_inertia", "_certify", "_ignorable", "_limits"),
-    *("weights", "_require_unchanged"),
-)
 
 # Attributes of a robot that, with its model and its mappings, tell it from others.
 _OF_THE_ROBOT = (
     *("name", "urdf_sha256", "locked", "joints", "followers"),
     *("inputs", "outputs", "gravity"),
 )
-
-
-class Span(NamedTuple):
-    """The points of a chunk, start up to but not including stop."""
-
-    start: int
-    stop: int
 
 
 class SweepTask:
@@ -50,10 +37,10 @@ class SweepTask:
         self.v = None if v is None else checked_velocities(self.robot, v, self.count)
         self.u = None if u is None else checked_inputs(names, u, self.count)
 
-    def points(self, span: Span) -> Points:
-        """Return the points of a span."""
-        v, u = (None if rows is None else rows[slice(*span)] for rows in (self.v, self.u))
-        return Points(self.configurations.rows(*span), v, u)
+    def points(self, start: int, stop: int) -> Points:
+        """Return some of the points."""
+        v, u = (None if rows is None else rows[start:stop] for rows in (self.v, self.u))
+        return Points(self.configurations.rows(start, stop), v, u)
 
     def given(self) -> dict[str, Array]:
         """Return the arrays of points that differ from point to point and are there already."""
@@ -87,20 +74,20 @@ class SweepTask:
             for key, value in self.constants(arrays).items()
         }
         common = self.job.linearizer.prepared.common
+        held = {item.name for item in fields(LinearBatch)} - {"C", "D"}
         absent: dict[str, Any] = dict.fromkeys(("_x0", "_y0", "_reference", "_drift"))
         return LinearBatch(
             **absent | rows | dict(arrays),
-            **{key: common[key] for key in common if key not in _OF_MODELS},
-            _ignorable=None,
+            **{key: common[key] for key in common.keys() & held},
             columns=tuple(map(column, self.robot.joints)),
-            _system=self.robot,
+            _asked=asked_of(common),
         )
 
     def texts(self, constants: Iterable[str]) -> dict[str, str]:
         """Return what a file of the batch has beside its arrays."""
         one = {key: np.empty((1, *shape)) for key, shape in self.job.shapes.items()}
-        example = self.batch(one | {"q": self.points(Span(0, 1)).q})
-        return {"header": header(example, self.count), "constant": json.dumps(list(constants))}
+        example = self.batch(one | {"q": self.points(0, 1).q})
+        return {**texts_of(example, self.count), "constant": json.dumps(list(constants))}
 
     @property
     def request(self) -> str:
