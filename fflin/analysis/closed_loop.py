@@ -44,19 +44,11 @@ _MOST_EVALUATIONS = 60_000
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A robot, its linear model, and the feedback ``u = u0 - K (z - z0)`` on the model's states.
-
-    Attributes
-    ----------
-    robot : Robot
-    lin : LinearModel
-        Whole or reduced; sampled if its input is held.
-    K : ndarray (nu, nz)
-    """
+    """A robot, its linear model, and the feedback ``u = u0 - K (z - z0)`` on the model's states."""
 
     robot: Robot
-    lin: LinearModel
-    K: Array
+    lin: LinearModel  # whole or reduced; sampled if its input is held
+    K: Array  # (nu, nz)
 
     @cached_property
     def state(self) -> StateMap:

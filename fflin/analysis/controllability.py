@@ -28,6 +28,7 @@ from fflin.analysis.names import (
 from fflin.analysis.pbh import split_by_poles
 from fflin.analysis.ranks import FixedPoles, Margin, Noisy, echelon, image, null_space, unit_columns
 from fflin.analysis.second_order import Hidden, SecondOrder, hidden
+from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import folded
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
@@ -39,7 +40,7 @@ _LOOPS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Controllability:
+class Controllability(FrozenArrays):
     """What the inputs of a linear model can move; prints in words.
 
     Attributes
@@ -82,10 +83,6 @@ class Controllability:
     margin: Margin
     notes: tuple[str, ...]
     robot: str
-
-    def __post_init__(self) -> None:
-        for array in (self.rows, self.basis, self.fixed_poles):
-            array.setflags(write=False)
 
     def __str__(self) -> str:
         nx = len(self.basis)

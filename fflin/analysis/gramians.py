@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fflin.base.errors import InputError
+from fflin.base.frozen import FrozenArrays
 from fflin.base.validation import Array, number
 from fflin.linear.model import LinearModel
 
@@ -16,7 +17,7 @@ _DECAY = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
-class Gramians:
+class Gramians(FrozenArrays):
     """Gramians of a linear model.
 
     Attributes
@@ -32,10 +33,6 @@ class Gramians:
     controllability: Array
     observability: Array
     duration: float
-
-    def __post_init__(self) -> None:
-        for array in (self.controllability, self.observability):
-            array.setflags(write=False)
 
 
 def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:

@@ -12,6 +12,7 @@ import numpy as np
 
 from fflin.analysis.eigenpairs import natural_modes
 from fflin.base.errors import InputError
+from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import counted, grid, width
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Mode:
+class Mode(FrozenArrays):
     """One mode: a conjugate pair of poles, or a real pole.
 
     Attributes
@@ -40,9 +41,6 @@ class Mode:
     shape: NDArray[np.complexfloating[Any]]
     unstable: bool
     margin: float
-
-    def __post_init__(self) -> None:
-        self.shape.setflags(write=False)
 
     @property
     def oscillates(self) -> bool:

@@ -72,22 +72,12 @@ def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
 
 
 class Split(NamedTuple):
-    """The state space of a model, split into what its inputs reach and the rest.
+    """The state space of a model, split into what its inputs reach and the rest."""
 
-    Attributes
-    ----------
-    reached, rest : ndarray (nx, d), (nx, nx - d)
-        Bases; of the dual pair the rest is what no output shows.
-    rows : ndarray (nx - d, nx)
-        ``rows @ x`` is what no input acts on.
-    fixed : FixedPoles
-        Of the rest.
-    """
-
-    reached: Array
-    rest: Array
-    rows: Array
-    fixed: FixedPoles
+    reached: Array  # (nx, d), a basis
+    rest: Array  # (nx, nx - d), a basis; of the dual pair of what no output shows
+    rows: Array  # (nx - d, nx) with rows @ x what no input acts on
+    fixed: FixedPoles  # of the rest
 
 
 def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False) -> Split:
@@ -96,19 +86,8 @@ def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = 
     The left vectors with ``w [A - s E, B] = 0`` are found at every eigenvalue s as singular
     vectors, and split off by an orthogonal transformation, until there are none: so that the
     whole of a defective eigenvalue goes. A staircase would carry the rounding of a weak step into
-    the next.
-
-    Parameters
-    ----------
-    X : ndarray (nx, nx)
-        Slopes: A, or (A - E)/dt of a sampled model.
-    drive : ndarray (nx, k)
-        B, or C^T of the dual pair.
-    M : ndarray (nx/2, nx/2)
-        Inertia.
-    dt : float
-    dual : bool
-        Whether to split by what outputs show.
+    the next. X (nx, nx) is A, or (A - E)/dt of a sampled model, `drive` (nx, k) is B, or, to split
+    by what outputs show, C^T of the `dual` pair.
     """
     pair = _scaled(X, M, dt)
     A, to = (pair.A.T, pair.to_x.T) if dual else (pair.A, pair.from_x)

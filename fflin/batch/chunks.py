@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping
 from functools import cached_property, partial
 from threading import Lock
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +14,7 @@ import pinocchio as pin
 from fflin.base.errors import FflinError, FflinWarning
 from fflin.base.validation import Array
 from fflin.batch.dispatch import ChunkResult
+from fflin.batch.rows import Points
 from fflin.dynamics.inertia import Inertia
 from fflin.kernel.compiled import pays
 from fflin.linear.linearization import Linearizer
@@ -21,14 +22,6 @@ from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from fflin.batch.equations import BatchEquations
-
-
-class Points(NamedTuple):
-    """Points of one chunk, checked; v and u0 (rows, ..) or None for rest and no input."""
-
-    q: Array
-    v: Array | None
-    u0: Array | None
 
 
 # Python has one set of warning filters for the whole process, so that threads take turns.
@@ -77,7 +70,7 @@ class ChunkJob:
             one = self.run(Points(points.q[:1], None, None), start)
             out["B_lower"][:] = one.arrays["B_lower"]
             return ChunkResult(dict(out), one.notes)
-        left = self.compiled.write(*points, out) if self.compiled else np.arange(count)
+        left = self.compiled.write(points, out) if self.compiled else np.arange(count)
         if not len(left):
             return ChunkResult(dict(out), [])
         with _TURN, warnings.catch_warnings(record=True) as caught:
@@ -93,8 +86,7 @@ class ChunkJob:
         return ChunkResult(dict(out), [str(note.message) for note in caught])
 
     def _write(self, row: int, points: Points, out: Mapping[str, Array]) -> None:
-        q, v, u = (None if rows is None else rows[row] for rows in points)
-        lin = self.linearizer(q, v, u)
+        lin = self.linearizer(*points.each(lambda rows: rows[row]))
         for key, array in out.items():
             lower = key == "B_lower"
             array[row] = lin.B[len(lin.B) // 2 :] if lower else getattr(lin, key.removeprefix("_"))

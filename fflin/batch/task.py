@@ -5,19 +5,19 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
-from hashlib import sha256
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.record import content_digest
 from fflin.base.validation import Array
 from fflin.base.version import __version__
 from fflin.batch.batch_record import asked_of, texts_of
-from fflin.batch.chunks import ChunkJob, Points
-from fflin.batch.configurations import Configurations, GivenConfigurations, fingerprint
+from fflin.batch.chunks import ChunkJob
+from fflin.batch.configurations import Configurations, GivenConfigurations, content
 from fflin.batch.linear_batch import AT_ROOT, LinearBatch
-from fflin.batch.rows import checked_inputs, checked_velocities, column
+from fflin.batch.rows import Points, checked_inputs, checked_velocities, column
 from fflin.robot.frames import ROOT
 
 # Attributes of a robot that, with its model and its mappings, tell it from others.
@@ -93,21 +93,19 @@ class SweepTask:
     def request(self) -> str:
         """Hash of all that the result depends on."""
         robot, prepared = self.robot, self.job.linearizer.prepared
-        digest = sha256(
-            repr(
-                [getattr(robot, key) for key in _OF_THE_ROBOT]
-                + [dict(getattr(robot, key)) for key in ("stiffness", "damping", "rest")]
-                + [prepared.map.frame, prepared.moving, prepared.own_reference]
-                + [self.job.only_inertia, __version__, pin.__version__]
-                + [self.count, fingerprint(self.configurations)]
-            ).encode()
+        inertias = [inertia.toDynamicParameters() for inertia in robot.model.inertias]
+        placements = [placement.homogeneous for placement in robot.model.jointPlacements]
+        said = [getattr(robot, key) for key in _OF_THE_ROBOT]
+        said += [dict(getattr(robot, key)) for key in ("stiffness", "damping", "rest")]
+        said += [prepared.map.frame, prepared.moving, prepared.own_reference]
+        said += [self.job.only_inertia, __version__, pin.__version__, self.count]
+        rows = {"v": self.v, "u": self.u}
+        return content_digest(
+            {
+                "robot": repr(said),
+                "model": np.concatenate([np.ravel(each) for each in (*inertias, *placements)]),
+                "reference": prepared.reference,
+                **{key: "none" if value is None else value for key, value in rows.items()},
+                **{f"of q: {key}": value for key, value in content(self.configurations).items()},
+            }
         )
-        for inertia, placement in zip(
-            robot.model.inertias, robot.model.jointPlacements, strict=True
-        ):
-            digest.update(inertia.toDynamicParameters().tobytes())
-            digest.update(placement.homogeneous.tobytes())
-        digest.update(prepared.reference.tobytes())
-        for rows in (self.v, self.u):
-            digest.update(b"none" if rows is None else np.ascontiguousarray(rows).data)
-        return digest.hexdigest()
