@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -114,12 +114,9 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
             f"the point is no fixed point: |f0| is {np.abs(lin.f0).max():.3g} and changes what "
             "the reduction leaves out; linearise at rest"
         )
-    values = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
-    M = held.rates.T @ lin.M @ held.rates
-    values |= part_of(lin, np.eye(len(T))[z], T, M) | {"C": lin.C @ T}
     stays = picked(lin.state_names, whole.state_names)
     reduced = ReducedModel(
-        **values,
+        **part_of(lin, np.eye(len(T))[z], T, held.rates.T @ lin.M @ held.rates),
         T=stays.T @ T,
         S=stays[z],
         momenta=held.momenta @ stays,

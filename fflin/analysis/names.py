@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from fflin.analysis.mechanics import ConservedMomenta
@@ -15,6 +17,8 @@ _CONSERVED = {
     "v_b": ("linear momentum", "base position"),
 }
 _OTHER = ("momentum of", "position of")
+
+_AXIS = re.compile(r"(?<!\S)[xyz](?!\S)")
 
 
 def momentum_names(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
@@ -38,20 +42,12 @@ def momentum_names(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
 
 def grouped(names: tuple[str, ...]) -> list[str]:
     """Join names that differ in their axis alone: "angular momentum x, y, z" is one."""
-    groups: dict[tuple[str, str], list[str]] = {}
+    groups: dict[str, list[str]] = {}
     for name in names:
-        words = name.split(" ")
-        axes = [i for i, word in enumerate(words) if word in ("x", "y", "z")]
-        if len(axes) == 1:
-            i = axes[0]
-            key = (" ".join(words[:i]), " ".join(words[i + 1 :]))
-            groups.setdefault(key, []).append(words[i])
-        else:
-            groups[name, ""] = []
-    return [
-        " ".join(part for part in (head, "/".join(axes), tail) if part)
-        for (head, tail), axes in groups.items()
-    ]
+        axes = _AXIS.findall(name)
+        key = _AXIS.sub("\0", name) if len(axes) == 1 else name
+        groups.setdefault(key, []).extend(axes[: len(axes) == 1])
+    return [key.replace("\0", "/".join(axes)) for key, axes in groups.items()]
 
 
 _RATES = {"q_b": "omega_b", "r_b": "v_b", "q_m": "qdot_m"}
