@@ -37,9 +37,9 @@ def run_chunks(
     size = store.chunk
     spans = [Span(at, min(at + size, store.count)) for at in range(0, store.count, size)]
     left = [span for span in spans if not store.finished(*span)]
-    count = (len(spans) - len(left)) * size
+    count = store.count - sum(stop - start for start, stop in left)
     if progress and count:
-        progress(min(count, store.count), store.count)
+        progress(count, store.count)
     failed: list[Done] = []
     notes: list[str] = []
     for done in (
@@ -54,7 +54,7 @@ def run_chunks(
             notes += done.result.notes
         count += done.span.stop - done.span.start
         if progress:
-            progress(min(count, store.count), store.count)
+            progress(count, store.count)
     if notes:
         more = f" (and {len(notes) - 1} more such)" if len(notes) > 1 else ""
         warnings.warn(notes[0] + more, FflinWarning, stacklevel=3)
