@@ -132,6 +132,8 @@ def generalized_inertia(lin: LinearModel) -> Array:
 
     .. math:: M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}
 
+    After Umetani and Yoshida, see `momentum_reduction`.
+
     Parameters
     ----------
     lin : LinearModel
@@ -146,10 +148,6 @@ def generalized_inertia(lin: LinearModel) -> Array:
     ------
     InputError
         If the base is not among the states.
-
-    References
-    ----------
-    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
     """
     lin = checked(lin)
     joints = sum(name.startswith("q_m.") for name in lin.state_names)
@@ -164,6 +162,8 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
     r"""Return the generalized Jacobian: a frame's velocity per joint rate at zero momentum (9.3).
 
     .. math:: J^* = J_m + J_b G, \qquad G = -M_{bb}^{-1} M_{bm}
+
+    After Umetani and Yoshida, see `momentum_reduction`.
 
     Parameters
     ----------
@@ -185,10 +185,6 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
         If there is no such frame.
     InputError
         If `q` is no configuration of the robot.
-
-    References
-    ----------
-    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
     """
     state = StateMap(robot)
     q = robot.neutral() if q is None else robot.checked_configuration(q)

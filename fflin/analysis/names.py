@@ -74,10 +74,14 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
     order = [i for i in np.argsort(-np.abs(weights) * sizes) if weights[i]]
     largest = abs(weights[order[0]]) * sizes[order[0]]
     shown = [i for i in order if abs(weights[i]) * sizes[i] > 1e-6 * largest]
-    terms = [_term(float(weights[i]), names[i], first=i == shown[0]) for i in shown[:most]]
+    terms: list[str] = []
+    for i in shown[:most]:
+        value = f"{abs(weights[i]):.3g}"
+        sign = ("-" if weights[i] < 0.0 else "+") + " " * bool(terms)
+        terms.append(sign + (names[i] if value == "1" else f"{value} {names[i]}"))
     if len(shown) > most:
         terms.append(f"+ {len(shown) - most} more")
-    return " ".join(terms)
+    return " ".join(terms).removeprefix("+")
 
 
 def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[str, ...]:
@@ -107,9 +111,3 @@ def shape(lin: LinearModel, at: Array) -> str:
     largest = at[int(np.abs(at * size).argmax())]
     names = tuple(name.partition(".")[2] or name for name in lin.state_names[len(lin.M) :])
     return combination(np.real(at / largest), names, size)
-
-
-def _term(weight: float, name: str, *, first: bool) -> str:
-    sign = ("-" if weight < 0.0 else "") if first else ("- " if weight < 0.0 else "+ ")
-    size = f"{abs(weight):.3g}"
-    return sign + (name if size == "1" else f"{size} {name}")

@@ -26,11 +26,7 @@ _DEAD = 1e4 * EPS
 
 
 class _Scaled(NamedTuple):
-    """A pair in coordinates of energy: ``x = to_x @ xi``, time in units of `unit` seconds.
-
-    Velocities are L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy, positions
-    likewise over the time unit. A is of size about 1.
-    """
+    """A pair in coordinates of energy: ``x = to_x @ xi``, time in units of `unit` seconds."""
 
     A: Array
     to_x: Array
@@ -40,19 +36,19 @@ class _Scaled(NamedTuple):
 
 
 def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
-    """Scale slopes to units of energy, and of time so that A is of size 1.
+    """Scale slopes to units of energy, and of time so that A is of size about 1.
 
-    The tolerance is twenty times the rounding of M^-1, or that of the exponential which the
-    slopes of a sampled model are a difference of.
+    Velocities are L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy, positions
+    likewise over the time unit. The tolerance is twenty times the rounding of M^-1, or that of the
+    exponential which the slopes of a sampled model are a difference of.
     """
     nv = len(M)
     p, v = slice(0, nv), slice(nv, None)
     L = np.linalg.cholesky(M)
     N = rates_of_positions(X)
-    to_velocity = np.linalg.inv(L.T)
-    to_position = N @ to_velocity
-    to_x = np.block([[to_position, np.zeros((nv, nv))], [np.zeros((nv, nv)), to_velocity]])
-    back = np.block([[L.T @ np.linalg.inv(N), np.zeros((nv, nv))], [np.zeros((nv, nv)), L.T]])
+    to_velocity, zero = np.linalg.inv(L.T), np.zeros((nv, nv))
+    to_x = np.block([[N @ to_velocity, zero], [zero, to_velocity]])
+    back = np.block([[L.T @ np.linalg.inv(N), zero], [zero, L.T]])
     A = back @ X @ to_x
     turning, fall, drag = (float(np.linalg.norm(A[i, j], 2)) for i, j in ((p, p), (v, p), (v, v)))
     rate = max(turning, drag, np.sqrt(fall))

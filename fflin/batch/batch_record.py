@@ -48,7 +48,15 @@ def read_batch(path: Path, robot: Robot | None, *, verify: bool) -> dict[str, An
         fields = {**_fields(arrays, record, constant), "verified": verified}
         ignorable = record["_ignorable"]
     if robot is None:
-        return fields | {"_asked": _unasked(fields["robot"], ignorable)}
+        return fields | {
+            "_asked": {
+                "_certify": partial(_refuse, "certificate", fields["robot"]),
+                "_inertia": partial(_refuse, "inertia M", fields["robot"]),
+                "_ignorable": partial(given, ignorable),
+                "_limits": dict,
+                "weights": {},
+            }
+        }
     joints = [name.removeprefix("q_m.") for name in fields["state_names"] if name[:4] == "q_m."]
     made_of = fields["urdf_sha256"], fields["locked"], tuple(joints)
     if (robot.urdf_sha256, robot.locked, robot.joint_names) != made_of:
@@ -62,17 +70,6 @@ def read_batch(path: Path, robot: Robot | None, *, verify: bool) -> dict[str, An
 def asked_of(common: Mapping[str, Any]) -> dict[str, Any]:
     """Return what models ask their robot for, of what is the same about all points."""
     return {key: common[key] for key in _OF_ROBOT}
-
-
-def _unasked(name: str, ignorable: Any) -> dict[str, Any]:
-    """Return the same for a file whose robot is not there."""
-    return {
-        "_certify": partial(_refuse, "certificate", name),
-        "_inertia": partial(_refuse, "inertia M", name),
-        "_ignorable": partial(given, ignorable),
-        "_limits": dict,
-        "weights": {},
-    }
 
 
 def _refuse(what: str, name: str, _: LinearModel) -> NoReturn:

@@ -93,12 +93,11 @@ class ChunkJob:
 
     def _write_at_rest(self, q: Array, B_lower: Array) -> None:
         (inertia, data), actuation = self._inertia, self.linearizer.prepared.actuation
-        if actuation.default:
-            inertia.invert(q, B_lower)
-            return
         nv = len(B_lower)
-        inverse = np.empty((nv, nv))
+        inverse = B_lower if actuation.default else np.empty((nv, nv))
         inertia.invert(q, inverse)
+        if actuation.default:
+            return
         # The columns do not depend on the base's position, and would lose digits to it.
         still = q.copy()
         still[:3] = 0.0

@@ -87,12 +87,12 @@ class RandomConfigurations:
     def rows(self, start: int, stop: int) -> Array:
         """Return the configurations (stop - start, nq)."""
         low, high = np.array(list(self.ranges.values())).reshape(-1, 2).T
-        blocks = []
-        for block in range(start // _DRAWN, -(-stop // _DRAWN)):
-            drawn = np.random.default_rng([self.seed, block]).uniform(low, high, (_DRAWN, len(low)))
-            first = block * _DRAWN
-            blocks.append(drawn[max(start - first, 0) : stop - first])
-        drawn = np.concatenate(blocks) if blocks else np.empty((0, len(low)))
+        first = start // _DRAWN
+        blocks = [np.empty((0, len(low)))] + [
+            np.random.default_rng([self.seed, block]).uniform(low, high, (_DRAWN, len(low)))
+            for block in range(first, -(-stop // _DRAWN))
+        ]
+        drawn = np.concatenate(blocks)[start - first * _DRAWN : stop - first * _DRAWN]
         values = dict(zip(self.ranges, drawn.T, strict=True))
         return _placed(self.robot, self.start, stop - start, values)
 

@@ -139,10 +139,15 @@ class Dispatch:
         hung = False
         while not (done := wait(self._running, _GLANCE if pool else None, FIRST_COMPLETED).done):
             assert pool is not None
-            if hung:
-                _break(pool)
-            # A process of it was killed.
             processes = list((pool._processes or {}).values())
+            if hung:
+                # It waits for the rest of a result whose worker was killed as it sent it, as long
+                # as anybody could still write to the pipe that all workers and this process share.
+                # Where nobody can, it finds itself broken, and its futures with it.
+                for process in processes:
+                    process.kill()
+                channel: Any = pool._result_queue
+                channel._writer.close()
             hung = any(process.exitcode not in (None, 0) for process in processes)
         return done
 
@@ -204,15 +209,3 @@ def _count(executor: Executor) -> int:
     if client is not None and hasattr(client, "nthreads"):
         return max(1, sum(client.nthreads().values()))
     return _UNKNOWN_WORKERS
-
-
-def _break(pool: ProcessPoolExecutor) -> None:
-    """End a pool that waits for the rest of a result whose worker was killed as it sent it.
-
-    It waits as long as anybody could still write to the pipe that all workers and this process
-    share. Where nobody can, it finds itself broken, and its futures with it.
-    """
-    for process in list((pool._processes or {}).values()):
-        process.kill()
-    channel: Any = pool._result_queue
-    channel._writer.close()
