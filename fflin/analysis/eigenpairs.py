@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from fflin.analysis.mechanics import floating_inertia
 from fflin.analysis.ranks import EPS
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
@@ -73,9 +74,7 @@ def _free_free(A: Array, M: Array, inertia: Array) -> NaturalModes | None:
     felt = np.flatnonzero(by_s.any(axis=0))
     if not felt.size:
         return NaturalModes([], nv, 2 * nv)
-    free = np.setdiff1d(np.arange(nv), felt)
-    across = unit[np.ix_(free, felt)]
-    M_star = unit[np.ix_(felt, felt)] - across.T @ np.linalg.solve(unit[np.ix_(free, free)], across)
+    M_star = floating_inertia(unit, felt, np.setdiff1d(np.arange(nv), felt))
     K = -M_star @ by_s[np.ix_(felt, felt)]
     squares, vectors = eigh((K + K.T) / 2.0, (M_star + M_star.T) / 2.0)
     squares, vectors = _polished(by_s[np.ix_(felt, felt)], squares, vectors)

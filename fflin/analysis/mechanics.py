@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +42,15 @@ def state_sizes(lin: LinearModel) -> Array:
 def slopes(lin: LinearModel) -> Array:
     """Return A, or (A - E)/dt of a sampled model, which has the same invariant subspaces."""
     return (lin.A - np.eye(len(lin.A))) / lin.dt if lin.dt else lin.A
+
+
+def floating_inertia(M: Array, kept: Any, others: Any) -> Array:
+    """Return what coordinates feel while the others float: the Schur complement of M."""
+    across = M[np.ix_(others, kept)]
+    felt: Array = M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(
+        M[np.ix_(others, others)], across
+    )
+    return felt
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pinocchio as pin
 
-from fflin.analysis.mechanics import checked, conserved
+from fflin.analysis.mechanics import checked, conserved, floating_inertia
 from fflin.analysis.names import undecided
 from fflin.analysis.ranks import Margin
 from fflin.analysis.wheels import certified, leaving, part_of, picked, without
@@ -153,8 +153,7 @@ def generalized_inertia(lin: LinearModel) -> Array:
     joints = sum(name.startswith("q_m.") for name in lin.state_names)
     if len(lin.A) != 12 + 2 * joints:
         raise InputError("the base is not among the states; take the model before its reduction")
-    M = lin.M
-    inertia: Array = M[6:, 6:] + M[6:, :6] @ _following(M)
+    inertia = floating_inertia(lin.M, range(6, 6 + joints), range(6))
     return (inertia + inertia.T) / 2.0
 
 
@@ -193,11 +192,5 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
     full = pin.computeFrameJacobian(model, data, q, index, axes)
     J = state.columns(np.vstack((full[LINEAR], full[ANGULAR])))
     M = state.project(pin.crba(model, data, q).T)
-    result: Array = J[:, 6:] + J[:, :6] @ _following(M)
+    result: Array = J[:, 6:] - J[:, :6] @ np.linalg.solve(M[:6, :6], M[:6, 6:])
     return result
-
-
-def _following(M: Array) -> Array:
-    """Return G (6, n), what the free base does when the joints move."""
-    G: Array = -np.linalg.solve(M[:6, :6], M[:6, 6:])
-    return G

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fflin.analysis.mechanics import second_order, slopes
+from fflin.analysis.mechanics import floating_inertia, second_order, slopes
 from fflin.analysis.ranks import Noisy, echelon, image, null_space
 from fflin.base.errors import InputError, StabilizabilityError, listed
 from fflin.base.frozen import frozen
@@ -120,11 +120,9 @@ def rigid_forces(body: LinearModel) -> Noisy:
 
 def without(lin: LinearModel, left: Indices) -> LinearModel:
     """Return a model without coordinates (k,) and their rates, exact whatever these do (9.4)."""
-    nv, M = len(lin.M), lin.M
-    kept = np.setdiff1d(np.arange(nv), left)
-    across = M[np.ix_(left, kept)]
-    rest = M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(M[np.ix_(left, left)], across)
-    names = [lin.state_names[i] for i in (*kept, *(kept + nv))]
+    kept = np.setdiff1d(np.arange(len(lin.M)), left)
+    names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
+    rest = floating_inertia(lin.M, kept, left)
     return selected(lin, names, rest, partial(without, left=left))
 
 
