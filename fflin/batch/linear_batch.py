@@ -101,10 +101,8 @@ class LinearBatch:
     verified: bool = True
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, np.ndarray) and value.flags.writeable:
-                object.__setattr__(self, item.name, frozen(value.view()))
+        for name, value in self._arrays().items():
+            object.__setattr__(self, name, frozen(value.view()))
 
     def __len__(self) -> int:
         return len(self.q)
