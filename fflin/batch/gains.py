@@ -86,8 +86,8 @@ class GainBatch(Design):
     def gain(self, joints: Array) -> Array:
         """Return K (nu, nx) at joint positions (n,) by linear interpolation.
 
-        Beyond the grid it is that at its edge. Errors are those of `grid`, and an `InputError` where
-        the positions are not n finite numbers.
+        Beyond the grid it is that at its edge. Errors are those of `grid`; the positions must be n
+        finite numbers.
         """
         return self._between(vector("joints", joints, len(self.joint_names), "the joint positions"))
 
