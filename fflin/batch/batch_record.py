@@ -46,7 +46,7 @@ def read_batch(path: Path, robot: Robot | None, *, verify: bool) -> dict[str, An
         arrays, constant, texts, verified = read_rows(path, verify=verify)
         record = json.loads(texts["header"])
         fields = {**_fields(arrays, record, constant), "verified": verified}
-        ignorable = record["_ignorable"]
+        ignorable = tuple(record["_ignorable"])
     if robot is None:
         return fields | {
             "_asked": {
