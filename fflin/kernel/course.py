@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections import namedtuple
 
 from fflin.kernel import vectors as vec
-from fflin.kernel.forward import push
 from fflin.kernel.lanes import inlined, load, store
 from fflin.kernel.places import axes_of
 from fflin.kernel.rnea import spatial_inertia_times, stored_momentum
@@ -39,9 +38,9 @@ def begin_step(course):
 
 @inlined
 def add_wrench(work, robot, course, point, weight, moment):
-    """Add to the sums of a step what pushes at a stage, which counts by its weight and moment."""
+    """Add to the sums of a step what pushed at a stage, which counts by its weight and moment."""
     axes = axes_of(point.q)
-    moments, force = push(work, robot, point)
+    moments, force = vec.get6(point.wrench, 0)
     place = vec.minus(vec.get3(point.q, 0), vec.get3(course.start, 9))
     lever = vec.product(axes, vec.get3(work, robot.tree.inertias + 1))
     force, falls = vec.product(axes, force), vec.get3(course.weight, 0)

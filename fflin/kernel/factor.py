@@ -8,7 +8,7 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, section 6.5.
 from __future__ import annotations
 
 from fflin.kernel.crba import inwards, outwards
-from fflin.kernel.lanes import compiled, inlined, load, scatter, splat, store, transpose
+from fflin.kernel.lanes import compiled, inlined, load, splat, store, transpose
 from fflin.kernel.tree import LANES
 
 
@@ -95,7 +95,10 @@ def multiply(work, tree, couplings, first):
             store(work, square + (j * size + i), total)
             if i == j:
                 coupling = coupling + total * load(work, tree.diagonal + i)
-    scatter(couplings, first, 1, coupling)
+    # The diagonal is not needed any more.
+    store(work, tree.diagonal, coupling)
+    for lane in range(LANES):
+        couplings[first + lane] = work[tree.diagonal, lane]
 
 
 @inlined
@@ -115,7 +118,8 @@ def unpack(work, start, entries, out, first, offset):
     for entry in range(0, whole, LANES):
         transpose(work, start + entry, out, to + entry, stride)
     for entry in range(whole, entries):
-        scatter(out, to + entry, stride, load(work, start + entry))
+        for lane in range(LANES):
+            out[first + lane, offset + entry] = work[start + entry, lane]
 
 
 @compiled

@@ -13,8 +13,7 @@ from fflin.kernel.crba import inwards, outwards
 from fflin.kernel.factor import factorise, solve
 from fflin.kernel.lanes import angle, inlined, load, store
 from fflin.kernel.places import attitude, axes_of, columns_of, quaternion_times
-from fflin.kernel.rnea import at_parent, carried_wrench, collect, load_bodies, move_bodies
-from fflin.kernel.tree import PLACE
+from fflin.kernel.rnea import collect, load_bodies, move_bodies, write_columns
 
 
 class Mechanics(
@@ -30,10 +29,11 @@ class Mechanics(
     """
 
 
-class Point(namedtuple("Point", "q nu u pushing")):
+class Point(namedtuple("Point", "q nu u pushing wrench")):
     """Where a robot is, q (nq,) and nu (6 + n,) in base axes, and the inputs (nu,) there.
 
-    `u` is as it is commanded, `pushing` in base axes.
+    `u` is as it is commanded, `pushing` in base axes; `wrench` (6,) is what the inputs of the last
+    acceleration are at the base's origin, moment and force.
     """
 
 
@@ -77,15 +77,23 @@ def accelerate(work, robot, point, rates, to):
     Its M is overwritten by its factor.
     """
     tree, layout, loads, nu = robot.tree, robot.layout, robot.loads, point.nu
-    move_bodies(work, tree, layout, nu)
-    load_bodies(work, tree, layout, loads, point.pushing)
-    collect(work, tree, layout)
-    force, size = layout.bias, len(tree.row)
+    force, size, count = layout.c, len(tree.row), len(loads.body)
     for index in range(size):
-        store(work, force + index, -load(work, force + index))
+        store(work, force + index, 0.0)
     for index in range(len(robot.row)):
         if robot.row[index] >= 0:
             vec.add(work, force + robot.row[index], load(point.pushing, index))
+    write_columns(work, tree, layout, loads)
+    for index in range(count):
+        u = load(point.pushing, loads.input[index])
+        for row in range(size):
+            vec.add(work, force + row, load(work, layout.columns + row * count + index) * u)
+    vec.copy(work, force, point.wrench, 0, 6)
+    move_bodies(work, tree, layout, nu)
+    load_bodies(work, tree, layout, loads)
+    collect(work, tree, layout)
+    for index in range(size):
+        vec.add(work, force + index, -load(work, layout.bias + index))
     for joint in range(len(robot.index)):
         if robot.springy[joint]:
             stretch = joint_position(robot, point.q, joint) - load(robot.rest, joint)
@@ -99,22 +107,3 @@ def accelerate(work, robot, point, rates, to):
     fall = vec.across(axes_of(point.q), vec.get3(robot.gravity, 0))
     fall = vec.minus(fall, vec.cross(vec.get3(nu, 0), vec.get3(nu, 3)))
     vec.put3(rates, to + 3, vec.plus(vec.get3(rates, to + 3), fall))
-
-
-@inlined
-def push(work, robot, point):
-    """Return the wrench on the robot at its base's origin (moment, force) of all its inputs."""
-    tree, loads = robot.tree, robot.loads
-    for index in range(6):
-        store(work, robot.layout.bias + index, 0.0)
-    for index in range(len(robot.row)):
-        if 0 <= robot.row[index] < 6:
-            vec.add(work, robot.layout.bias + robot.row[index], load(point.pushing, index))
-    total = vec.get6(work, robot.layout.bias)
-    for index in range(len(loads.body)):
-        body, wrench = loads.body[index], carried_wrench(work, tree, loads, index)
-        while body > 0:
-            wrench = at_parent(work, tree.places + body * PLACE, wrench)
-            body = tree.parent[body]
-        total = vec.plus6(total, vec.times6(wrench, load(point.pushing, loads.input[index])))
-    return total

@@ -240,22 +240,6 @@ def angle(typing: Any, sine: Any, cosine: Any) -> Any:
 
 
 @intrinsic
-def scatter(typing: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
-    """Write eight doubles to a contiguous array, `stride` apart, from an index on."""
-
-    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        values, first, step, eight = arguments
-        for lane in range(LANES):
-            at = builder.add(first, builder.mul(step, ir.Constant(step.type, lane)))
-            place = _flat_place(context, builder, array, values, at)
-            builder.store(builder.extract_element(eight, _INT32(lane)), place)
-        return context.get_dummy_value()
-
-    index_type = numba.types.intp
-    return numba.types.void(array, index_type, index_type, lanes), generate
-
-
-@intrinsic
 def transpose(typing: Any, source: Any, index: Any, target: Any, start: Any, stride: Any) -> Any:
     """Write eight vectors that stand one after the other lane by lane.
 

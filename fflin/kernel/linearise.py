@@ -18,6 +18,7 @@ from fflin.kernel.rnea import (
     collect,
     collect_momenta,
     load_bodies,
+    load_carried,
     load_momenta,
     move_bodies,
     write_columns,
@@ -92,7 +93,8 @@ def linearise(tree, layout, loads, points, out, lanes, work):
         pack(u, first, u_of)
         outwards(work, tree, q_of)
         move_bodies(work, tree, layout, nu_of)
-        load_bodies(work, tree, layout, loads, u_of)
+        load_bodies(work, tree, layout, loads)
+        load_carried(work, tree, layout, loads, u_of)
         load_momenta(work, tree, layout, loads)
         write_columns(work, tree, layout, loads)
         inwards(work, tree)

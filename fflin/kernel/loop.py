@@ -136,10 +136,10 @@ def advance(
                 if every > 0 and step % every == 0:
                     _record(rows, row, point, kept, step * h)
                     row += 1
+            accelerate(work, robot, point, stages.rates, (1 + stage) * len(point.nu))
             if pushed:
                 weight, moment = method.weights[stage], method.moments[stage]
                 add_wrench(work, robot, kept, point, weight, moment)
-            accelerate(work, robot, point, stages.rates, (1 + stage) * len(point.nu))
             _move(robot, method, stages, point, stage)
             configure(work, robot, point.q)
         if pushed:

@@ -84,8 +84,8 @@ def move_bodies(work, tree, layout, nu):
 
 
 @inlined
-def load_bodies(work, tree, layout, loads, u):
-    """Write the forces on the bodies, each alone, with its stored momentum and carried inputs."""
+def load_bodies(work, tree, layout, loads):
+    """Write the forces on the bodies, each alone, with its stored momentum."""
     for body in range(len(tree.parent)):
         at = layout.load + body * LOAD + FORCE
         moving = layout.motion + body * MOTION
@@ -101,6 +101,11 @@ def load_bodies(work, tree, layout, loads, u):
             vec.get3(work, layout.motion + body * MOTION), stored_momentum(work, tree, loads, index)
         )
         vec.add3(work, layout.load + body * LOAD + FORCE, turning)
+
+
+@inlined
+def load_carried(work, tree, layout, loads, u):
+    """Add the forces of the carried inputs to those on the bodies."""
     for index in range(len(loads.body)):
         pushed = vec.minus6(_NONE, carried_wrench(work, tree, loads, index))
         at = layout.load + loads.body[index] * LOAD + FORCE

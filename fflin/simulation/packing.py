@@ -49,7 +49,7 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> tuple[
         _channel(plan, plant),
         (kept, plan.project, not plant.isolated(driven=plan.law is not None)),
         loop.Watch(state.velocities(squares), np.array([float(sign)])),
-        forward.Point(plan.q.copy(), state.velocities(plan.v), u.copy(), u.copy()),
+        forward.Point(plan.q.copy(), state.velocities(plan.v), u.copy(), u.copy(), np.zeros(6)),
         loop.Stages(np.zeros(speed.shape[1] * size), np.zeros(size), q, second, u.copy()),
     )
 
@@ -106,7 +106,7 @@ def _law(plan: Plan, plant: Plant) -> laws.Law:
 def _path(plan: Plan, plant: Plant) -> tracking.Path:
     policy, state = plan.policy, plant.state
     none, nowhere, size, nu = np.zeros(0), np.zeros(0, dtype=np.intp), state.nx // 2, plan.initial
-    point = forward.Point(plan.q.copy(), np.zeros(size), nu.copy(), none)
+    point = forward.Point(plan.q.copy(), np.zeros(size), nu.copy(), none, none)
     path = tracking.Path(
         *(none, none, none, none, none, False, False, nowhere, 0.0, none, none, 1),
         *(np.zeros(size), np.zeros(state.nx), point),
