@@ -44,25 +44,12 @@ def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str
 
 
 def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
-    """Return where the names are that a key stands for.
+    """Return where the names are, of that kind, which a key stands for.
 
-    Parameters
-    ----------
-    kind : str
-        What to call them in an error.
-    key : str
-        A name such as ``tau_m.hinge_1``, a group such as ``tau_m``, or either the name or the
-        entry alone with ``*``, ``?`` for any letters, any one: ``tau_m.hinge_*``, ``hinge_*``,
-        ``*.x``. An entry may stand for itself too, ``hinge_1``.
-    names : sequence of str
-        In their order.
-
-    Raises
-    ------
-    UnknownNameError
-        If it stands for nothing.
-    InputError
-        If an entry's name or pattern is found in several groups.
+    It is a name such as ``tau_m.hinge_1``, a group such as ``tau_m``, or either the name or the
+    entry alone with ``*``, ``?`` for any letters, any one: ``tau_m.hinge_*``, ``hinge_*``, ``*.x``.
+    An entry may stand for itself too, ``hinge_1``. What stands for nothing is an
+    `UnknownNameError`, an entry of several groups an `InputError`.
     """
     if key in names:
         return [names.index(key)]

@@ -40,20 +40,8 @@ _LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
 class TomlFile:
     """What a TOML file holds, in tables and keys whose lines are known.
 
-    A place in it is written as keys and, in an array of tables, indices: ``input``, 3, ``axis``.
-
-    Attributes
-    ----------
-    path : Path
-    record : dict
-        As tomllib reads it.
-
-    Raises
-    ------
-    FileError
-        If it is not a regular file that can be read, or too large.
-    InputError
-        If it is not TOML; with file and line.
+    Its `record` is as tomllib reads it. A place in it is written as keys and, in an array of
+    tables, indices: ``input``, 3, ``axis``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -124,12 +112,10 @@ def _lines_of(text: str) -> dict[str, int]:
             table = name
         else:
             name = f"{table}.{name}" if table else name
-        lines.setdefault(name, number)
         # `a.b = 1` has a line of `a` too.
-        head = name.rpartition(".")[0]
-        while head and head not in lines:
-            lines[head] = number
-            head = head.rpartition(".")[0]
+        while name and name not in lines:
+            lines[name] = number
+            name = name.rpartition(".")[0]
     return lines
 
 
