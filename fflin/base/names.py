@@ -1,4 +1,4 @@
-"""What a name stands for: an entry GROUP.ENTRY, a group of them, or a pattern."""
+"""Names GROUP.ENTRY of states and inputs; groups, entries and patterns that stand for them."""
 
 from __future__ import annotations
 
@@ -27,6 +27,16 @@ def input_keys(of: Any) -> tuple[str, ...]:
     return tuple(
         name if group_of(name) in _GROUPS else f"{_OF_UNIT.get(unit, 'input')}.{name}"
         for name, unit in zip(of.input_names, of.input_units, strict=True)
+    )
+
+
+def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the 12 + 2n states: of the configuration, then of their rates."""
+    return (
+        *(f"{group}.{axis}" for group in ("q_b", "r_b") for axis in "xyz"),
+        *(f"q_m.{name}" for name in joints),
+        *(f"{group}.{axis}" for group in ("omega_b", "v_b") for axis in "xyz"),
+        *(f"qdot_m.{name}" for name in joints),
     )
 
 
@@ -88,6 +98,13 @@ def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[in
     for key in sorted(values, key=lambda key: 1 if _is_pattern(key) else 2 * (key not in groups)):
         found |= dict.fromkeys(matching(kind, key, names), values[key])
     return found
+
+
+def rates_by_name(joints: Sequence[str], values: Mapping[str, float]) -> dict[str, float]:
+    """Return {state: rate} of {joint, state, group or pattern: rate}."""
+    names = state_keys(joints)[6 + len(joints) :]
+    full = {f"qdot_m.{key}" if key in joints else key: value for key, value in values.items()}
+    return {names[index]: value for index, value in by_name("velocity", full, names).items()}
 
 
 def chosen(kind: str, keys: Sequence[str], names: Sequence[str]) -> list[int]:

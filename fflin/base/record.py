@@ -125,12 +125,9 @@ def content_digest(entries: Mapping[str, Any]) -> str:
             data = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
             blocks = [data[at : at + _BLOCK] for at in range(0, len(data), _BLOCK)]
             # Hashing lets other threads run.
-            digest.update(b"".join((pool.map if len(blocks) > 1 else map)(_sha256, blocks)))
+            run = pool.map if len(blocks) > 1 else map
+            digest.update(b"".join(run(lambda block: hashlib.sha256(block).digest(), blocks)))
     return digest.hexdigest()
-
-
-def _sha256(data: Any) -> bytes:
-    return hashlib.sha256(data).digest()
 
 
 def _to_npz(record: Mapping[str, Any], sealed: bool) -> bytes:

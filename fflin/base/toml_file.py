@@ -61,7 +61,9 @@ class TomlFile:
             raise InputError(f"{path}: is nested too deeply; expected tables of values") from None
         except ValueError as error:
             raise InputError(_explain(path, text, str(error))) from None
-        self._lines = _lines_of(_TEXTS.sub(_blank, text))
+        # Keys may be quoted: what stands on one line is left, and is no line of its own.
+        blank = _TEXTS.sub(lambda found: "\n" * found[0].count("\n") or found[0], text)
+        self._lines = _lines_of(blank)
 
     def line(self, *place: str | int) -> int:
         """Return the line of a place, or that of the table that holds it."""
@@ -127,8 +129,3 @@ def _explain(path: Path, text: str, problem: str) -> str:
         place = f"{path}:{text.rstrip().count(chr(10)) + 1}" if found else str(path)
         return f"{place}: not TOML: {what}; mend it"
     return f"{path}:{line}: not TOML: {what} at column {column}; mend it there"
-
-
-def _blank(found: re.Match[str]) -> str:
-    # Keys may be quoted: what stands on one line is left, and is no line of its own.
-    return found[0] if "\n" not in found[0] else "\n" * found[0].count("\n")

@@ -57,15 +57,11 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
             unequal.append(link.name)
         if link.mass == 0.0 and any(link.inertia):
             weightless.append(link.name)
-    notes = []
-    if negligible:
-        notes.append(
-            f"{origin}: the inertia of {named('link', negligible)} has a negative principal "
-            "moment, of no account beside the links it is fixed to"
-        )
-    if unequal:
+    lost = f"the inertia of {named('link', negligible)} has a negative principal moment, of no "
+    notes = (
+        (negligible, f"{lost}account beside the links it is fixed to"),
         # One principal moment is more than the sum of the others.
-        notes.append(f"{origin}: inertia of no rigid body: {enumerated(unequal)}")
-    if weightless:
-        notes.append(f"{origin}: an inertia and no mass: {named('link', weightless)}")
-    return notes
+        (unequal, f"inertia of no rigid body: {enumerated(unequal)}"),
+        (weightless, f"an inertia and no mass: {named('link', weightless)}"),
+    )
+    return [f"{origin}: {text}" for names, text in notes if names]

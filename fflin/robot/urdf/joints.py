@@ -95,10 +95,10 @@ def read_joint(element: Element) -> JointElement:
 
 def _axis(element: Element, of: str, kind: str) -> tuple[float, ...]:
     found = element.find("axis", of)
+    axis: tuple[float, ...] = (1.0, 0.0, 0.0)
     # Exporters write a zero axis into fixed joints; it has no meaning there.
     if kind not in _AXIAL:
-        return (1.0, 0.0, 0.0)
-    axis: tuple[float, ...] = (1.0, 0.0, 0.0)
+        return axis
     if found is not None:
         # Exporters write an rpy of zeros here, which turns nothing.
         turned = any(decimal(entry) != 0.0 for entry in found.attributes.get("rpy", "").split())
@@ -148,18 +148,18 @@ def _dynamics(element: Element, of: str, kind: str) -> tuple[float, float]:
     found = element.find("dynamics", of)
     if found is None or FREEDOM[kind] != 1:
         return 0.0, 0.0
-    values = []
     found.allow_only("damping", "friction", of=of)
-    for name in ("damping", "friction"):
-        if not found.attributes.get(name, "0").strip():
-            found.note(f"{name} of {of} is empty; taken as 0")
-            values.append(0.0)
-            continue
-        value = bounded_number(found, name, of, 0.0)
-        if value < 0.0:
-            raise found.error(f"{name} of {of} is {value:g}; it cannot be negative")
-        values.append(value)
-    return values[0], values[1]
+    return _resistance(found, "damping", of), _resistance(found, "friction", of)
+
+
+def _resistance(found: Element, name: str, of: str) -> float:
+    if not found.attributes.get(name, "0").strip():
+        found.note(f"{name} of {of} is empty; taken as 0")
+        return 0.0
+    value = bounded_number(found, name, of, 0.0)
+    if value < 0.0:
+        raise found.error(f"{name} of {of} is {value:g}; it cannot be negative")
+    return value
 
 
 def _mimic(element: Element, of: str) -> Mimic | None:

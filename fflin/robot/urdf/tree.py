@@ -65,6 +65,12 @@ def _check_root(root: Element) -> None:
                 "a <robot> inside <robot>; keep one <robot> with all links and joints"
             )
         if child.tag in ("link", "joint"):
+            for inner in child.children:
+                if inner.tag in ("link", "joint"):
+                    raise inner.error(
+                        f"<{inner.tag}> inside a <{child.tag}>, where URDF ignores it; put it "
+                        "directly into <robot>"
+                    )
             continue
         for inner in child.iterate():
             tags = {part.tag for part in inner.children}
@@ -75,14 +81,6 @@ def _check_root(root: Element) -> None:
                     f"<{inner.tag}> {quoted(inner.attributes.get('name', ''))} stands inside "
                     f"<{child.tag}>, where URDF ignores it; put it directly into <robot>"
                 )
-    for element in root.children:
-        if element.tag in ("link", "joint"):
-            for inner in element.children:
-                if inner.tag in ("link", "joint"):
-                    raise inner.error(
-                        f"<{inner.tag}> inside a <{element.tag}>, where URDF ignores it; put it "
-                        "directly into <robot>"
-                    )
 
 
 def _by_name(read: Callable[[Element], Part], elements: list[Element]) -> dict[str, Part]:

@@ -198,7 +198,7 @@ class _Builder:
         self._count = 0
         self.parser = expat.ParserCreate()
         self.parser.StartElementHandler = self._start
-        self.parser.EndElementHandler = self._end
+        self.parser.EndElementHandler = lambda _: self._open.pop()
         # A document type may be named; one that is declared elsewhere is not read.
         self.parser.EntityDeclHandler = self._refuse_entities
         self.parser.NotStandaloneHandler = self._meet_unread_declarations
@@ -238,9 +238,6 @@ class _Builder:
             )
         self._open[-1].children.append(element)
         self._open.append(element)
-
-    def _end(self, _: str) -> None:
-        self._open.pop()
 
     def _meet_unread_declarations(self) -> int:
         self._unread = True
