@@ -78,7 +78,7 @@ from fflin.control.kalman import Compensator as Compensator
 
 # Policies
 from fflin.control.policies import StateFeedback as StateFeedback
-from fflin.control.policies import TrajectoryFeedback as TrajectoryFeedback
+from fflin.control.tracking import TrajectoryFeedback as TrajectoryFeedback
 from fflin.control.policies import Allocation as Allocation
 from fflin.control.output_feedback import OutputFeedback as OutputFeedback
 from fflin.batch.gains import ScheduledFeedback as ScheduledFeedback
