@@ -267,7 +267,10 @@ def _locked(
 
 
 def _listed(lock: Any) -> list[str]:
-    names: list[Any] = list(lock) if isinstance(lock, Iterable) else [None]
+    try:
+        names = list(lock)
+    except TypeError:
+        names = [None]
     if not all(isinstance(name, str) for name in names):
         raise InputError(
             f"lock is a {type(lock).__name__}, expected {{joint: value}} or names of joints"
