@@ -21,20 +21,13 @@ _integrate = pin.integrate
 
 
 class Integrator:
-    """Steps of one size of one model.
+    """Steps of one size of one model."""
 
-    Attributes
-    ----------
-    weights : tuple of float
-        Of the stages, in what is summed along: v of the end is v + h sum(weights a).
-    moments : tuple of float
-        Of the stages, in the sum of a sum: a free place of the end is r + h v + h^2 sum(moments a).
-    reach : float
-        Largest pole times step with which it is stable on the negative real axis.
-    """
-
+    # Of the stages, in what is summed along: v of the end is v + h sum(weights a),
     weights: ClassVar[tuple[float, ...]]
+    # and in the sum of a sum: a free place of the end is r + h v + h^2 sum(moments a).
     moments: ClassVar[tuple[float, ...]]
+    # Largest pole times step with which it is stable on the negative real axis.
     reach: ClassVar[float]
 
     def __init__(self, model: pin.Model, dt: float) -> None:

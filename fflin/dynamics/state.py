@@ -73,6 +73,8 @@ class StateMap:
         With v = S nu, where joints mimic others; None where v is nu in another order.
     unbounded : ndarray of int
         Which of the n joints turn without end.
+    origin_quaternion : ndarray (4,)
+        Attitude of `origin`.
 
     Raises
     ------
@@ -124,8 +126,8 @@ class StateMap:
         self._reference = oMref
         # Composed as quaternions: their entries survive to the last digit near a turn of pi.
         offset = pin.SE3ToXYZQUAT(oMref.actInv(robot.model.jointPlacements[ROOT]))
-        self._position, self._quaternion = offset[:3], offset[3:]
-        self._rotation = rotation_matrix(self._quaternion)
+        self._position, self.origin_quaternion = offset[:3], offset[3:]
+        self._rotation = rotation_matrix(self.origin_quaternion)
         self._aligned = bool((self._rotation == np.eye(3)).all())
         root = robot.model.jointPlacements[ROOT].rotation
         self._gravity, self._falls = root.T @ np.array(robot.gravity), any(robot.gravity)
@@ -136,29 +138,19 @@ class StateMap:
         return pin.SE3(self._reference)
 
     @property
-    def origin_quaternion(self) -> Array:
-        """Attitude (4,) of `origin`."""
-        return self._quaternion
-
-    @property
     def origin(self) -> pin.SE3:
         """Where the base is, seen from the reference, at q[:7] = 0, 0, 0, 0, 0, 0, 1."""
-        return pin.XYZQUATToSE3(np.concatenate((self._position, self._quaternion)))
+        return pin.XYZQUATToSE3(np.concatenate((self._position, self.origin_quaternion)))
 
     def chart(self, q: Array) -> Chart:
-        """Return the attitude chart at a configuration.
-
-        Parameters
-        ----------
-        q : ndarray (nq,)
-            A valid configuration.
+        """Return the attitude chart at a valid configuration (nq,).
 
         Raises
         ------
         ChartError
             If the base is turned by pi from the reference.
         """
-        quaternion = quaternion_product(self._quaternion, q[3:7])
+        quaternion = quaternion_product(self.origin_quaternion, q[3:7])
         if quaternion[3] < 0.0:
             quaternion = -quaternion
         q0 = float(quaternion[3])
@@ -180,7 +172,7 @@ class StateMap:
 
     def scalar(self, q: Array) -> float:
         """Return q0 at a valid configuration, with the sign of the quaternion in q."""
-        return float(quaternion_product(self._quaternion, q[3:7])[3])
+        return float(quaternion_product(self.origin_quaternion, q[3:7])[3])
 
     def to_state(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
         """Convert a Pinocchio configuration and velocity to a state.
@@ -263,7 +255,7 @@ class StateMap:
         chart = Chart(relative[:, :3], relative[:, 3:], rotation_matrices(relative))
         q = np.empty((len(x), self.robot.nq))
         q[:, :3] = (x[:, g.r_b] - self._position) @ self._rotation
-        turned = relative @ product_matrix(conjugate(self._quaternion)).T
+        turned = relative @ product_matrix(conjugate(self.origin_quaternion)).T
         q[:, 3:7] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
         angles = x[:, g.q_m]
         q[:, self._idx_q] = angles

@@ -51,18 +51,11 @@ def state_history(
 
 
 def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:
-    r"""Return f(q, v) = offset - K x(q, v), x being the state of valid q and v.
+    """Return f(q, v) = offset - K x(q, v) (m,), x being the state of valid q and v.
 
     The attitude is linear in the quaternion, the place in the base's, and velocities in reference
     axes in R v: one product with all these gives f. That takes a fifth of the time of the state.
-
-    Parameters
-    ----------
-    state : StateMap
-    K : ndarray (m, nx)
-    offset : ndarray (m,)
-    near : ndarray (nx,)
-        A state; the angle of each continuous joint is taken on the turn nearest to it.
+    The angle of each continuous joint is taken on the turn nearest to the state `near` (nx,).
     """
     robot, g = state.robot, state.groups
     idx_q = np.array([joint.idx_q for joint in robot.joints], dtype=np.intp)
