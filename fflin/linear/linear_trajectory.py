@@ -80,11 +80,15 @@ class LinearTrajectory(Trajectory):
 
     def matrices(self, t: float) -> tuple[Array, Array]:
         """Return A (nx, nx) and B (nx, nu) at a time, linear between the knots or held."""
+        A, B = self.between(t, self.A, self.B)
+        return A, B
+
+    def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
+        """Return what arrays of the knots are at a time, linear between the knots or held."""
         k, share = placed(self.t, self._within(t))
         if self.dt or not share:
-            return self.A[k], self.B[k]
-        A, B = ((1.0 - share) * each[k] + share * each[k + 1] for each in (self.A, self.B))
-        return A, B
+            return tuple(each[k] for each in arrays)
+        return tuple(each[k] + share * (each[k + 1] - each[k]) for each in arrays)
 
     def check(self) -> Check:
         """Check every knot as `fflin.check` does: the worst of each figure."""
