@@ -50,6 +50,7 @@ _NAMES = {
         "control.tvlqr tvlqr",
         "control.gain_schedule GainSchedule",
         "control.kalman kalman Estimator lqg Compensator",
+        "control.tvkalman tvkalman FilterSchedule",
     ),
     "Policies": (
         "control.policies StateFeedback TrajectoryFeedback Allocation",
@@ -135,6 +136,7 @@ if TYPE_CHECKING:
     from fflin.control.plots import plot_loops, plot_poles
     from fflin.control.policies import Allocation, StateFeedback, TrajectoryFeedback
     from fflin.control.sampled_cost import sampled_cost
+    from fflin.control.tvkalman import FilterSchedule, tvkalman
     from fflin.control.tvlqr import tvlqr
     from fflin.control.weights import bryson
     from fflin.dynamics.points import configuration, effort, velocity

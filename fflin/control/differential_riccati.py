@@ -88,9 +88,7 @@ def step_back(early: Coefficients, late: Coefficients, P: Array, h: float) -> Ar
     return P
 
 
-def solve_back(
-    at: Callable[[float], Coefficients], knots: Array, P: Array
-) -> tuple[Array, Array]:
+def solve_back(at: Callable[[float], Coefficients], knots: Array, P: Array) -> tuple[Array, Array]:
     """Return times and P there, from its value at the last of the knots back to the first.
 
     Raises
@@ -159,7 +157,15 @@ class Passed:
     """
 
     def __init__(
-        self, t: Array, P: Array, K: Array, A: Array, B: Array, Q: Array, R: Array, dt: float,
+        self,
+        t: Array,
+        P: Array,
+        K: Array,
+        A: Array,
+        B: Array,
+        Q: Array,
+        R: Array,
+        dt: float,
         sign: float,
     ) -> None:
         from scipy.interpolate import CubicHermiteSpline

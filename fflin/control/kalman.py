@@ -11,7 +11,7 @@ from fflin.analysis.wheels import picked, regulated_part, seen_through
 from fflin.base.errors import DetectabilityError, InputError, MissingPackageError, listed
 from fflin.base.names import input_keys
 from fflin.base.record import Design
-from fflin.base.validation import Array
+from fflin.base.validation import Array, dimension
 from fflin.control.gain import Gain
 from fflin.control.lqr import require_fixed_point
 from fflin.control.weights import Weight, columns, weight
@@ -19,6 +19,8 @@ from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
+
+    from fflin.linear.linear_trajectory import LinearTrajectory
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -208,11 +210,13 @@ def kalman(
     from fflin.control.riccati import solve
 
     require_fixed_point(lin)
-    W, V = _disturbance(lin, W, G), weight("V", V, lin.output_names, definite=True)
+    noise, through = disturbance(lin, W, G)
+    V = weight("V", V, lin.output_names, definite=True)
     whole, noises, lin = lin, V, regulated_part(lin, wheel_speeds)
     S = picked(lin.state_names, whole.state_names)
     seen = seen_through(whole, S)
-    W, V = S @ W @ S.T, seen @ V @ seen.T
+    W, V = S @ through @ noise @ through.T @ S.T, seen @ V @ seen.T
+    W = 0.5 * (W + W.T)
     require_detectable(lin)
     require_disturbed(lin, W)
     C = np.ascontiguousarray(lin.C)
@@ -298,13 +302,19 @@ _FROM_MODEL = (
 )
 
 
-def _disturbance(lin: LinearModel, W: Weight, G: ArrayLike | None) -> Array:
+def disturbance(
+    of: LinearModel | LinearTrajectory, W: Weight, G: ArrayLike | None
+) -> tuple[Array, Array]:
+    """Return W (nw, nw) and the columns (.., nx, nw) that it acts through."""
+    nx = len(of.state_names)
     if G is None:
-        return weight("W", W, lin.state_names)
-    through = columns("G", G, len(lin.A))
-    count = through.shape[1]
-    same = np.array_equal(through, lin.B)
-    names = input_keys(lin) if same else [f"w_{i + 1}" for i in range(count)]
-    spread = through @ weight("W", W, names) @ through.T
-    half: Array = 0.5 * (spread + spread.T)
-    return half
+        return weight("W", W, of.state_names), np.eye(nx)
+    if dimension("G", G) == np.ndim(of.A) == 3:
+        through = np.array([columns("G", each, nx) for each in np.asarray(G)])
+        if len(through) != len(of.A):
+            raise InputError(f"G has {len(through)} matrices, expected {len(of.A)}, one a knot")
+    else:
+        through = columns("G", G, nx)
+    same = np.array_equal(through, of.B)
+    names = input_keys(of) if same else [f"w_{i + 1}" for i in range(through.shape[-1])]
+    return weight("W", W, names), through

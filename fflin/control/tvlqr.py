@@ -18,8 +18,6 @@ from fflin.control.differential_riccati import (
 )
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.weights import Weight, weight
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
 
 if TYPE_CHECKING:
     from fflin.linear.linear_trajectory import LinearTrajectory
@@ -107,7 +105,7 @@ def tvlqr(
 
         *given, _, rule = rule_weights(end, weights, hold=dt)
     Q = weight("Q", given[0], names)
-    R = weight("R", given[1], input_keys(Actuation(StateMap(traj.robot))), definite=True)
+    R = weight("R", given[1], input_keys(traj), definite=True)
     Qf = _cost_from(end, Q, R, sample) if steady else weight("Qf", Qf, names)
     fields: dict[str, Any] = {key: getattr(traj, key) for key in ("q", "v", "u", "hold", "frame")}
     fields |= {"state_names": names, "input_names": traj.input_names, "robot": traj.robot.name}
@@ -195,7 +193,7 @@ def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) ->
     maps, gains, costs, worst = [], [], [P], 0.0
     for steps, whole in reversed(list(transitions(traj, dt))):
         total, way = np.zeros_like(W), np.eye(nx + nu)
-        for F, h, step in steps:
+        for F, h, step, _ in steps:
             total += way.T @ held_cost(F, W, h) @ way
             way[:nx] = step @ way
         K, P, missed = sample_back(total, whole, P)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
 from fflin.linear.flow import placed
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
@@ -60,6 +61,11 @@ class LinearTrajectory(Trajectory):
         super().__post_init__()
         if self.state_names != self._state.names:
             raise InputError(f"it is no model of '{self.robot.name}' as it is given")
+
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """Of the nu inputs."""
+        return Actuation(self._state).units
 
     def __len__(self) -> int:
         return len(self.A)
