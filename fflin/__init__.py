@@ -54,7 +54,7 @@ _NAMES = {
     ),
     "Policies": (
         "control.policies StateFeedback TrajectoryFeedback Allocation",
-        "control.output_feedback OutputFeedback",
+        "control.output_feedback OutputFeedback TrajectoryOutputFeedback",
         "batch.gains ScheduledFeedback",
     ),
     "Simulation": (
@@ -132,7 +132,7 @@ if TYPE_CHECKING:
     from fflin.control.gain_schedule import GainSchedule
     from fflin.control.kalman import Compensator, Estimator, kalman, lqg
     from fflin.control.lqr import lqr
-    from fflin.control.output_feedback import OutputFeedback
+    from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
     from fflin.control.plots import plot_loops, plot_poles
     from fflin.control.policies import Allocation, StateFeedback, TrajectoryFeedback
     from fflin.control.sampled_cost import sampled_cost

@@ -98,7 +98,8 @@ def solve_back(at: Callable[[float], Coefficients], knots: Array, P: Array) -> t
     """
 
     def back(a: float, b: float, P: Array) -> Array:
-        return step_back(*(at(a + c * (b - a)) for c in GAUSS), P, b - a)
+        early, late = (at(a + c * (b - a)) for c in GAUSS)
+        return step_back(early, late, P, b - a)
 
     times, values = [float(knots[-1])], [P]
     for a in knots[-2::-1].tolist():

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, vector
 from fflin.control.kalman import Compensator
+from fflin.control.policies import TrajectoryFeedback
+from fflin.control.tvkalman import FilterSchedule
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.outputs import Measuring, Sensing
 from fflin.dynamics.state import StateMap
-from fflin.linear.fit import require_fit, require_same
+from fflin.linear.fit import Signals, require_fit, require_same
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
 
@@ -79,32 +82,132 @@ class OutputFeedback:
         lin, by = self.lin, self.compensator
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
         require_fit(lin, robot, state)
-        full = robot.outputs == (FullState(),)
-        sensed = state if full else Sensing(state, robot.outputs)
-        own, there = (lin.output_names, lin.output_units), (sensed.names, sensed.units)
-        require_same(f"the model is one of '{lin.robot}'", robot, "output", own, there)
-        measure = Measuring(state, lin.q)
-        aba = Aba(state) if any(output.FEELS_ACCELERATION for output in robot.outputs) else None
-        near = state.read(lin.q, lin.v)
-        z: Array = np.zeros(len(by.A))
-        asked = -np.inf
+        own = (lin.output_names, lin.output_units)
+        require_same(f"the model is one of '{lin.robot}'", robot, "output", own, _sensed(state))
+        there = Measuring(state, lin.q), state.read(lin.q, lin.v)
+        stays = _Sample(by.A, by.B, by.C, by.u0, by.y0, *there)
+        return _Loop(state, lin.dt, len(by.A), self.noise, lambda _: stays)
 
-        def policy(t: float, q: Array, v: Array) -> Array:
-            nonlocal z, asked
-            if asked >= 0.0 and abs(t - asked - lin.dt) > 1e-6 * lin.dt:
-                raise InputError(
-                    f"the compensator is asked {t - asked:g} s after its last sample, expected "
-                    f"{lin.dt:g} s; leave `sample` out"
-                )
-            asked = t
-            u: Array = by.u0 + by.C @ z
-            a: Array = np.zeros(robot.nv)
-            if aba is not None:
-                a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
-            y = measure(state.read(q, v, near=near), q, v, a)
-            if self.noise is not None:
-                y = y + vector("noise(t)", self.noise(t), len(y), "one value for each output")
-            z = by.A @ z + by.B @ (y - by.y0)
-            return u
 
-        return policy
+@dataclass(frozen=True, eq=False)
+class TrajectoryOutputFeedback(TrajectoryFeedback):
+    r"""The feedback ``u = u*(t) - K(t) eh`` of the error from a trajectory as it is estimated.
+
+    At each sample u acts, then y is measured and the estimate eh of the filter brought up to the
+    next sample, as in `OutputFeedback`. Positions and attitudes are measured relative to where the
+    trajectory has the base. What `bind` returns has the estimate (nx,) of the sample to come as
+    ``estimate``.
+
+    Parameters
+    ----------
+    trajectory : LinearTrajectory
+    schedule : GainSchedule
+        Of `tvlqr` with a sampling time.
+    filter : FilterSchedule
+        Of `tvkalman` with the same.
+    noise : callable, optional
+        noise(t) -> (ny,), added to y.
+
+    Raises
+    ------
+    InputError
+        If the two are not sampled alike or of different trajectories.
+    """
+
+    filter: FilterSchedule
+    noise: Callable[[float], ArrayLike] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.filter, FilterSchedule):
+            raise InputError(
+                f"filter is a {type(self.filter).__name__}, expected a FilterSchedule, as "
+                "fflin.tvkalman returns it"
+            )
+        gains, seen = self.schedule, self.filter
+        if not (gains.dt and gains.dt == seen.dt and np.array_equal(gains.A, seen.A)):
+            raise InputError(
+                f"the gains are sampled at dt = {gains.dt:g} s, the filter at {seen.dt:g} s, "
+                "expected the same sample= and the same trajectory of both"
+            )
+
+    def bind(self, robot: Robot) -> Policy:
+        """Return policy(t, q, v) -> u for a robot, with an estimate of its own.
+
+        Raises
+        ------
+        InputError
+            If the robot has not the trajectory's states, inputs and outputs.
+        """
+        super().bind(robot)  # refuses another robot
+        along, gains, seen = self.trajectory, self.schedule, self.filter
+        made = f"the trajectory is one of '{along.robot.name}'"
+        home = StateMap(robot, frame="local")
+        own = _sensed(StateMap(along.robot, frame="local"))
+        require_same(made, robot, "output", own, _sensed(home))
+        first, last = float(along.t[0]), float(along.t[-1])
+
+        def at(t: float) -> _Sample:
+            t = min(max(t, first), last)
+            k = seen._passed.index(t)
+            here = min(k, len(seen.A) - 1)
+            A, B, K, L = seen.A[here], seen.B[here], gains.K[k], seen.L[k]
+            q, v, _ = along.point(t)
+            # Held, an input that changes does most like its mean.
+            u = along.point(min(t + 0.5 * seen.dt, last) if along.hold == "linear" else t)[2]
+            place = home.origin * pin.XYZQUATToSE3(q[:7])
+            state = StateMap(robot, reference=place, frame="local")
+            A = A - B @ K - L @ (seen.C[k] - seen.D[k] @ K)
+            return _Sample(A, L, -K, u, seen.y[k], Measuring(state, q), state.read(q, v))
+
+        return _Loop(home, seen.dt, len(seen.state_names), self.noise, at)
+
+
+class _Sample(NamedTuple):
+    """A sample of a compensator: u = u0 + C z, then z = A z + B (y - y0), y measured near x."""
+
+    A: Array
+    B: Array
+    C: Array
+    u0: Array
+    y0: Array
+    measure: Measuring
+    near: Array
+
+
+class _Loop:
+    """A policy that remembers: the compensator of each sample on what the robot measures."""
+
+    def __init__(
+        self, state: StateMap, dt: float, size: int, noise: Any, at: Callable[[float], _Sample]
+    ) -> None:
+        self.estimate: Array = np.zeros(size)
+        self._dt, self._noise, self._at, self._asked = dt, noise, at, -np.inf
+        self._still: Array = np.zeros(state.robot.nv)
+        felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
+        self._aba = Aba(state) if felt else None
+
+    def __call__(self, t: float, q: Array, v: Array) -> Array:
+        apart = t - self._asked
+        if self._asked >= 0.0 and abs(apart - self._dt) > 1e-6 * self._dt:
+            raise InputError(
+                f"the compensator is asked {apart:g} s after its last sample, expected "
+                f"{self._dt:g} s; leave `sample` out"
+            )
+        self._asked = t
+        by = self._at(t)
+        u: Array = by.u0 + by.C @ self.estimate
+        state, a = by.measure.state, self._still
+        if aba := self._aba:
+            a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
+        y = by.measure(state.read(q, v, near=by.near), q, v, a)
+        if self._noise is not None:
+            y = y + vector("noise(t)", self._noise(t), len(y), "one value for each output")
+        self.estimate = by.A @ self.estimate + by.B @ (y - by.y0)
+        return u
+
+
+def _sensed(state: StateMap) -> Signals:
+    outputs = state.robot.outputs
+    sensed = state if outputs == (FullState(),) else Sensing(state, outputs)
+    return sensed.names, sensed.units

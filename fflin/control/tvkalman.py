@@ -172,7 +172,7 @@ def tvkalman(
     fields: dict[str, Any] = {key: getattr(traj, key) for key in names}
     fields |= {"robot": traj.robot.name, "V": V, "dt": dt}
     P = _steady(traj, at, V, sample, P0) if isinstance(P0, str) else None
-    P = weight("P0", P0, traj.state_names) if P is None else P  # type: ignore[arg-type]
+    P = weight("P0", P0, traj.state_names) if P is None else P
     try:
         # A P that overflows is refused, so that NumPy need not warn of it.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -184,10 +184,10 @@ def tvkalman(
     t, P = -times[::-1], found[::-1]
     own = (traj.A, traj.B, traj.C, traj.D, traj.y)
     rows = zip(*(traj.between(float(x), *own) for x in t), strict=True)
-    values = dict(zip("ABCDy", map(np.array, rows), strict=True))
-    values["W"] = np.array([at(float(x)).Q for x in t])
-    L = np.linalg.solve(V, values["C"] @ P).transpose(0, 2, 1)
-    made = FilterSchedule(t=t, L=L, P=P, residual=np.inf, **values, **fields)
+    fields |= dict(zip("ABCDy", map(np.array, rows), strict=True))
+    L = np.linalg.solve(V, fields["C"] @ P).transpose(0, 2, 1)
+    fields |= {"t": t, "L": L, "P": P, "W": np.array([at(float(x)).Q for x in t])}
+    made = FilterSchedule(residual=np.inf, **fields)
     return replace(made, residual=made._passed.residual(at))
 
 

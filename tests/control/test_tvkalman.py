@@ -221,7 +221,7 @@ def test_what_is_wrong_is_told(moving):
     }.items():
         with pytest.raises(fflin.FflinError, match=words):
             fflin.tvkalman(*arguments)
-    robot, traj = resting("cubesat", 1.0, [fflin.Gyroscope("base")])
+    _, traj = resting("cubesat", 1.0, [fflin.Gyroscope("base")])
     with pytest.raises(fflin.DetectabilityError, match=r"at the start: .*q_b\.x.*; give P0"):
         fflin.tvkalman(traj, 1, 1)
     # Over a finite time it needs not be seen.
