@@ -53,7 +53,8 @@ _NAMES = {
         "control.tvkalman tvkalman FilterSchedule",
     ),
     "Policies": (
-        "control.policies StateFeedback TrajectoryFeedback Allocation",
+        "control.policies StateFeedback Allocation",
+        "control.tracking TrajectoryFeedback",
         "control.output_feedback OutputFeedback TrajectoryOutputFeedback",
         "batch.gains ScheduledFeedback",
     ),
@@ -134,8 +135,9 @@ if TYPE_CHECKING:
     from fflin.control.lqr import lqr
     from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
     from fflin.control.plots import plot_loops, plot_poles
-    from fflin.control.policies import Allocation, StateFeedback, TrajectoryFeedback
+    from fflin.control.policies import Allocation, StateFeedback
     from fflin.control.sampled_cost import sampled_cost
+    from fflin.control.tracking import TrajectoryFeedback
     from fflin.control.tvkalman import FilterSchedule, tvkalman
     from fflin.control.tvlqr import tvlqr
     from fflin.control.weights import bryson

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, vector
 from fflin.control.kalman import Compensator
-from fflin.control.policies import TrajectoryFeedback
+from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvkalman import FilterSchedule
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.outputs import Measuring, Sensing
@@ -85,8 +86,8 @@ class OutputFeedback:
         own = (lin.output_names, lin.output_units)
         require_same(f"the model is one of '{lin.robot}'", robot, "output", own, _sensed(state))
         there = Measuring(state, lin.q), state.read(lin.q, lin.v)
-        stays = _Sample(by.A, by.B, by.C, by.u0, by.y0, *there)
-        return _Loop(state, lin.dt, len(by.A), self.noise, lambda _: stays)
+        stays = _Sample(by.A, by.B, by.C, by.u0, by.y0, lin.C, lin.D)
+        return _Loop(state, lin.dt, self.noise, _Law(len(by.A), lambda _: stays), lambda _: there)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,52 +141,109 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
             If the robot has not the trajectory's states, inputs and outputs.
         """
         super().bind(robot)  # refuses another robot
-        along, gains, seen = self.trajectory, self.schedule, self.filter
-        made = f"the trajectory is one of '{along.robot.name}'"
-        home = StateMap(robot, frame="local")
-        own = _sensed(StateMap(along.robot, frame="local"))
+        origin, home = self.trajectory.robot, StateMap(robot, frame="local")
+        own = _sensed(StateMap(origin, frame="local"))
+        made = f"the trajectory is one of '{origin.name}'"
         require_same(made, robot, "output", own, _sensed(home))
-        first, last = float(along.t[0]), float(along.t[-1])
 
-        def at(t: float) -> _Sample:
-            t = min(max(t, first), last)
-            k = seen._passed.index(t)
-            here = min(k, len(seen.A) - 1)
-            A, B, K, L = seen.A[here], seen.B[here], gains.K[k], seen.L[k]
-            q, v, _ = along.point(t)
-            # Held, an input that changes does most like its mean.
-            u = along.point(min(t + 0.5 * seen.dt, last) if along.hold == "linear" else t)[2]
+        def there(t: float) -> tuple[Measuring, Array]:
+            q, v, _ = self.reference(t)
             place = home.origin * pin.XYZQUATToSE3(q[:7])
             state = StateMap(robot, reference=place, frame="local")
-            A = A - B @ K - L @ (seen.C[k] - seen.D[k] @ K)
-            return _Sample(A, L, -K, u, seen.y[k], Measuring(state, q), state.read(q, v))
+            return Measuring(state, q), state.read(q, v)
 
-        return _Loop(home, seen.dt, len(seen.state_names), self.noise, at)
+        return _Loop(home, self.filter.dt, self.noise, _Law(self._size, self._sample), there)
+
+    def law(self) -> Callable[[float, Array], Array]:
+        """Return law(t, e) -> u at the samples, on what the linear models measure."""
+        law = _Law(self._size, self._sample)
+        return lambda t, e: law(t, lambda by, u: by.y0 + by.seen @ e + by.through @ (u - by.u0))
+
+    @property
+    def _size(self) -> int:
+        return len(self.filter.state_names)
+
+    @cached_property
+    def _rest(self) -> LinearModel:
+        """The model after the end."""
+        return self.end.discretize(self.filter.dt)
+
+    def _sample(self, t: float) -> _Sample:
+        gains, seen, dt = self.schedule, self.filter, self.filter.dt
+        k, ended = seen._passed.index(float(seen.t[0]) + t), t > self.duration + 1e-6 * dt
+        K, L = gains.K[k], seen.L[k]
+        # Held, an input that changes does most like its mean.
+        linear = self.trajectory.hold == "linear"
+        u, y, C, D = self.reference(t + 0.5 * dt * linear)[2], seen.y[k], seen.C[k], seen.D[k]
+        jump: Array = np.zeros(self._size)
+        if k < len(seen.A):
+            A, B = seen.A[k], seen.B[k]
+        else:
+            lin = self._rest
+            A, B = lin.A, lin.B
+            if ended:
+                u, y, C, D = lin.u0, lin.y0, lin.C, lin.D
+            else:
+                u = self.reference(self.duration)[2]
+                # From the next sample on the error is counted from rest.
+                stop = self.reference(self.duration)[1] - lin.v
+                jump[-len(jump) // 2 :] = StateMap(self.trajectory.robot).velocities(stop)
+                jump = A @ jump + B @ (u - lin.u0)
+        return _Sample(A - B @ K - L @ (C - D @ K), L, -K, u, y, C, D, jump)
 
 
 class _Sample(NamedTuple):
-    """A sample of a compensator: u = u0 + C z, then z = A z + B (y - y0), y measured near x."""
+    """A sample of a compensator: u = u0 + C z, then z = A z + B (y - y0) + jump.
+
+    By the linear model y - y0 = seen e + through (u - u0).
+    """
 
     A: Array
     B: Array
     C: Array
     u0: Array
     y0: Array
-    measure: Measuring
-    near: Array
+    seen: Array
+    through: Array
+    jump: Array | float = 0.0
+
+
+class _Law:
+    """What a compensator does from sample to sample; its estimate begins at zero."""
+
+    def __init__(self, size: int, at: Callable[[float], _Sample]) -> None:
+        self.estimate: Array = np.zeros(size)
+        self._at = at
+
+    def __call__(self, t: float, measure: Callable[[_Sample, Array], Array]) -> Array:
+        by = self._at(t)
+        u: Array = by.u0 + by.C @ self.estimate
+        innovation = measure(by, u) - by.y0
+        self.estimate = by.A @ self.estimate + by.B @ innovation + by.jump
+        return u
 
 
 class _Loop:
-    """A policy that remembers: the compensator of each sample on what the robot measures."""
+    """The policy of a law on what the robot measures, relative to where it is to be."""
 
     def __init__(
-        self, state: StateMap, dt: float, size: int, noise: Any, at: Callable[[float], _Sample]
+        self,
+        state: StateMap,
+        dt: float,
+        noise: Any,
+        law: _Law,
+        there: Callable[[float], tuple[Measuring, Array]],
     ) -> None:
-        self.estimate: Array = np.zeros(size)
-        self._dt, self._noise, self._at, self._asked = dt, noise, at, -np.inf
+        self._dt, self._noise, self._law, self._there = dt, noise, law, there
+        self._asked = -np.inf
         self._still: Array = np.zeros(state.robot.nv)
         felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
         self._aba = Aba(state) if felt else None
+
+    @property
+    def estimate(self) -> Array:
+        """Of the state of the compensator at the sample to come."""
+        return self._law.estimate
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         apart = t - self._asked
@@ -195,16 +253,18 @@ class _Loop:
                 f"{self._dt:g} s; leave `sample` out"
             )
         self._asked = t
-        by = self._at(t)
-        u: Array = by.u0 + by.C @ self.estimate
-        state, a = by.measure.state, self._still
-        if aba := self._aba:
-            a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
-        y = by.measure(state.read(q, v, near=by.near), q, v, a)
-        if self._noise is not None:
-            y = y + vector("noise(t)", self._noise(t), len(y), "one value for each output")
-        self.estimate = by.A @ self.estimate + by.B @ (y - by.y0)
-        return u
+
+        def measured(_: _Sample, u: Array) -> Array:
+            measure, near = self._there(t)
+            state, a = measure.state, self._still
+            if aba := self._aba:
+                a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
+            y = measure(state.read(q, v, near=near), q, v, a)
+            if self._noise is None:
+                return y
+            return y + vector("noise(t)", self._noise(t), len(y), "one value for each output")
+
+        return self._law(t, measured)
 
 
 def _sensed(state: StateMap) -> Signals:

@@ -22,6 +22,7 @@ from fflin.control.weights import Weight, weight
 if TYPE_CHECKING:
     from fflin.linear.linear_trajectory import LinearTrajectory
     from fflin.linear.model import LinearModel
+    from fflin.linear.trajectory import Trajectory
 
 _TOO_FAST = "P changes too fast; give smaller weights or a larger R"
 
@@ -144,23 +145,28 @@ def require_continuous(traj: LinearTrajectory) -> None:
 
 
 def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
-    """Return the model at the end, or the start (0), if steady, else at rest in that place."""
+    """Return the model at the last knot, or the first (0), if steady, else at rest there."""
+    lin = traj[end]
+    if lin.is_equilibrium():
+        return lin
+    try:
+        return resting_end(traj, end)
+    except EquilibriumError as error:
+        where, given = ("end", "Q, R and Qf") if end else ("start", "P0")
+        raise EquilibriumError(f"at the {where}: {error}; give {given}") from None
+
+
+def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
+    """Return the model at rest in the last configuration, in base axes; rotors spin on there."""
     from fflin.linear.equilibrium import equilibrium
     from fflin.linear.ignorable import rotor_names
     from fflin.linear.linearization import Linearizer
 
-    lin, robot = traj[end], traj.robot
-    if lin.is_equilibrium():
-        return lin
+    robot, q, v = traj.robot, traj.q[end], np.zeros(traj.robot.nv)
     rotors = rotor_names(robot)
     spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
-    v = np.zeros(robot.nv)
-    v[spinning] = lin.v[spinning]
-    try:
-        return Linearizer(robot, moving=True)(lin.q, v, equilibrium(robot, lin.q, v=v).u)
-    except EquilibriumError as error:
-        where, given = ("end", "Q, R and Qf") if end else ("start", "P0")
-        raise EquilibriumError(f"at the {where}: {error}; give {given}") from None
+    v[spinning] = traj.v[end, spinning]
+    return Linearizer(robot, moving=True)(q, v, equilibrium(robot, q, v=v).u)
 
 
 def _cost_from(lin: Any, Q: Array, R: Array, sample: float | None) -> Array:

@@ -1,7 +1,5 @@
 """Loops along a trajectory, closed over what is measured."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
