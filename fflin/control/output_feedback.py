@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, vector
+from fflin.control.differential_riccati import sample_back
 from fflin.control.kalman import Compensator
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvkalman import FilterSchedule
@@ -168,28 +170,38 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
         """The model after the end."""
         return self.end.discretize(self.filter.dt)
 
+    @cached_property
+    def _later(self) -> list[tuple[Array, Array]]:
+        """L and P of the samples from the end on, as far as they are known."""
+        return [(np.zeros(0), self.filter.P[-1])]
+
     def _sample(self, t: float) -> _Sample:
         gains, seen, dt = self.schedule, self.filter, self.filter.dt
-        k, ended = seen._passed.index(float(seen.t[0]) + t), t > self.duration + 1e-6 * dt
-        K, L = gains.K[k], seen.L[k]
-        # Held, an input that changes does most like its mean.
-        linear = self.trajectory.hold == "linear"
-        u, y, C, D = self.reference(t + 0.5 * dt * linear)[2], seen.y[k], seen.C[k], seen.D[k]
-        jump: Array = np.zeros(self._size)
+        k = round(t / dt)
         if k < len(seen.A):
-            A, B = seen.A[k], seen.B[k]
+            A, B, K, L, C, D = (x[k] for x in (seen.A, seen.B, gains.K, seen.L, seen.C, seen.D))
+            # Held, an input that changes does most like its mean.
+            u = self.reference(t + 0.5 * dt * (self.trajectory.hold == "linear"))[2]
+            return _Sample(A - B @ K - L @ (C - D @ K), L, -K, u, seen.y[k], C, D)
+        lin, K, (_, v, u), late = (
+            self._rest,
+            gains.K[-1],
+            self.reference(self.duration),
+            k - len(seen.A),
+        )
+        jump, C, D, y = np.zeros(self._size), seen.C[-1], seen.D[-1], seen.y[-1]
+        if late:
+            u, C, D, y = lin.u0, lin.C, lin.D, lin.y0
         else:
-            lin = self._rest
-            A, B = lin.A, lin.B
-            if ended:
-                u, y, C, D = lin.u0, lin.y0, lin.C, lin.D
-            else:
-                u = self.reference(self.duration)[2]
-                # From the next sample on the error is counted from rest.
-                stop = self.reference(self.duration)[1] - lin.v
-                jump[-len(jump) // 2 :] = StateMap(self.trajectory.robot).velocities(stop)
-                jump = A @ jump + B @ (u - lin.u0)
-        return _Sample(A - B @ K - L @ (C - D @ K), L, -K, u, y, C, D, jump)
+            # From the next sample on the error is counted from rest.
+            jump[len(jump) // 2 :] = StateMap(self.trajectory.robot).velocities(v - lin.v)
+            jump = lin.A @ jump + lin.B @ (u - lin.u0)
+        while len(self._later) <= late + 1:
+            weights = block_diag(seen.W[-1], seen.V)
+            L, P, _ = sample_back(weights, np.hstack((lin.A.T, C.T)), self._later[-1][1])
+            self._later.append((L.T, P))
+        L = self._later[late + 1][0]
+        return _Sample(lin.A - lin.B @ K - L @ (C - D @ K), L, -K, u, y, C, D, jump)
 
 
 class _Sample(NamedTuple):

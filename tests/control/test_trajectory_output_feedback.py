@@ -1,5 +1,7 @@
 """Loops along a trajectory, closed over what is measured."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -30,7 +32,7 @@ def flown(robot, knots=16, strength=1.0):
 def pair(robot, traj, V=1e-4, W=1e-3, P0=1e-4):
     along = fflin.linearize_trajectory(robot, traj, strict=True)
     R = along[0].M.diagonal() ** -2.0
-    gains = fflin.tvlqr(along, 1.0, R, 1.0, sample=SAMPLE)
+    gains = fflin.tvlqr(along, 1.0, R, sample=SAMPLE)
     return along, gains, fflin.tvkalman(along, W, V, P0=P0, sample=SAMPLE)
 
 
@@ -124,3 +126,66 @@ def test_the_errors_of_the_estimate_are_as_large_as_the_filter_says():
     low, high = chi2.ppf((1e-3, 1.0 - 1e-3), runs * nx)
     assert low < found.min() and found.max() < high
     assert found.mean() == pytest.approx(runs * nx, rel=0.05)
+
+
+def test_it_goes_on_at_rest_where_the_trajectory_ends(loop):
+    robot, along, gains, seen = loop
+    policy = fflin.TrajectoryOutputFeedback(along, gains, seen)
+    flown = fflin.simulate(robot, policy, dt=STEP)
+    # On its trajectory, at the knots nothing but rounding.
+    assert np.abs(flown.error[::8]).max() < 1e-12
+    apart = []
+    for size in (1e-3, 5e-4):
+        q0, v0 = start(robot, along, size * np.cos(np.arange(len(seen.state_names))))
+        flown = fflin.simulate(robot, policy, q0=q0, v0=v0, dt=STEP)
+        assert flown.t[-1] == pytest.approx(1.6)
+        apart.append(np.abs(flown.x - flown.prediction)[::8].max() / size)
+    # Matrices that are linear between knots leave this of it.
+    assert max(apart) < 0.02
+    # From the motion at the end, which is none of rest, to rest.
+    on = fflin.simulate(robot, policy, dt=STEP, duration=40.0)
+    # From the motion at the end, which is none of rest, to rest.
+    assert np.abs(on.v[128]).max() > 0.3
+    assert np.abs(on.error[-1]).max() < 1e-3
+    off = on.error - (on.prediction - on.target)
+    assert np.abs(off[137:161]).max() < 0.15 * np.abs(on.error[137:161]).max()
+
+
+def test_held_inputs_follow_linear_ones_by_their_mean():
+    robot = fflin.load("planar_detumble", outputs=OUTPUTS)
+    t = np.linspace(0.0, 2.0, 11)
+    u = np.outer(np.sin(2.0 * t), [1.0, 0.0, 2.0, 5.0, 5.0, 0.0, 0.1, 0.1, 0.1])
+    flown = fflin.simulate(
+        *(robot, lambda time, q, v: [np.interp(time, t, x) for x in u.T]),
+        **{"duration": 2.0, "dt": 0.005, "frame": "local", "every": 40},
+    )
+    traj = fflin.Trajectory(robot, t, flown.q, flown.v, u)
+    along, gains, seen = pair(robot, traj)
+    run = fflin.simulate(robot, fflin.TrajectoryOutputFeedback(along, gains, seen), dt=STEP)
+    # By their value at the sample it is off by half a sample, of first order.
+    late = fflin.simulate(robot, fflin.TrajectoryFeedback(along, gains), dt=STEP)
+    at = round(SAMPLE / STEP)
+    assert np.abs(run.error[::at]).max() < 0.5 * np.abs(late.error[::at]).max()
+
+
+def test_what_does_not_fit_is_refused(loop):
+    robot, along, gains, seen = loop
+    make = fflin.TrajectoryOutputFeedback
+    with pytest.raises(fflin.InputError, match="filter is a ndarray, expected a FilterSchedule"):
+        make(along, gains, np.eye(3))
+    whole = fflin.tvkalman(along, 1.0, 1.0, P0=1.0)
+    with pytest.raises(fflin.InputError, match=r"sampled at dt = 0\.1 s, the filter at 0 s, exp"):
+        make(along, gains, whole)
+    continuous = fflin.tvlqr(along, 1.0, 1.0, 1.0)
+    with pytest.raises(fflin.InputError, match=r"sampled at dt = 0 s, the filter at 0 s"):
+        make(along, continuous, whole)
+    with pytest.raises(fflin.InputError, match="the same trajectory"):
+        make(along, gains, replace(seen, A=2.0 * seen.A))
+    policy = make(along, gains, seen)
+    with pytest.raises(fflin.InputError, match="outputs"):
+        fflin.simulate(robot.replace(outputs=[fflin.BasePose()]), policy, dt=STEP)
+    with pytest.raises(fflin.InputError, match=r"asked 0\.2 s after its last sample"):
+        fflin.simulate(robot, policy, dt=STEP, sample=0.2)
+    short = make(along, gains, seen, lambda t: np.zeros(3))
+    with pytest.raises(fflin.InputError, match="one value for each output"):
+        fflin.simulate(robot, short, dt=STEP)
