@@ -150,8 +150,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
 
         def there(t: float) -> tuple[Measuring, Array]:
             q, v, _ = self.reference(t)
-            place = home.origin * pin.XYZQUATToSE3(q[:7])
-            state = StateMap(robot, reference=place, frame="local")
+            state = home.about(home.origin * pin.XYZQUATToSE3(q[:7]))
             return Measuring(state, q), state.read(q, v)
 
         return _Loop(home, self.filter.dt, self.noise, _Law(self._size, self._sample), there)
