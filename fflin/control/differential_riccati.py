@@ -158,21 +158,13 @@ class Passed:
     """
 
     def __init__(
-        self,
-        t: Array,
-        P: Array,
-        K: Array,
-        A: Array,
-        B: Array,
-        Q: Array,
-        R: Array,
-        dt: float,
-        sign: float,
+        self, t: Array, P: Array, K: Array, model: tuple[Array, ...], dt: float, sign: float
     ) -> None:
         from scipy.interpolate import CubicHermiteSpline
 
+        A, B, Q, R = model
         self.first, self.last = float(t[0]), float(t[-1])
-        self._P, self._K, self._dt, self._sign = P, K, dt, sign
+        self._P, self.K, self._dt, self._sign = P, K, dt, sign
         if dt:
             # A little early, since clocks are rounded.
             self._starts = [self.first, *(t[1:] - 1e-9 * dt).tolist()]
@@ -188,27 +180,23 @@ class Passed:
         quartics = np.zeros((5, *slope.shape))
         quartics[:4] += reach[:-1] @ powers
         quartics[1:] += slope @ powers
-        self._quartics = np.ascontiguousarray(quartics.transpose(1, 0, 2, 3))
-        self._quartics = self._quartics.reshape(len(slope), 5, -1)
-
-    def index(self, t: float) -> int:
-        """Return which piece a time is in."""
-        return bisect_right(self._starts, t) - 1
+        self._quartics = quartics.transpose(1, 0, 2, 3).reshape(len(slope), 5, -1)
 
     def gain(self, t: float) -> Array:
         """Return R^-1 B' P (nu, nx), of B and P at a time within the knots."""
         k = bisect_right(self._starts, t) - 1
         if self._dt:
-            return self._K[k]
+            return self.K[k]
         x = t - self._starts[k]
         square = x * x
         powers = np.array((1.0, x, square, square * x, square * square))
-        K: Array = powers.dot(self._quartics[k]).reshape(self._K.shape[1:])
+        K: Array = powers.dot(self._quartics[k]).reshape(self.K.shape[1:])
         return K
 
     def cost(self, t: float) -> Array:
         """Return P (nx, nx) at a time within the knots."""
-        P: Array = self._P[self.index(t)] if self._dt else self._cubics(t)
+        k = bisect_right(self._starts, t) - 1
+        P: Array = self._P[k] if self._dt else self._cubics(t)
         return P
 
     def residual(self, at: Callable[[float], Coefficients]) -> float:

@@ -26,14 +26,17 @@ def _nothing() -> Array:
 class Schedule(Design):
     """What `Passed` has of a trajectory's knots or samples."""
 
+    WIDTH: ClassVar = "nu"
+
     t: Array
 
     def __repr__(self) -> str:
         of: Any = self
-        time, (nx, *_), wide = (f"dt={of.dt:g} s, " if of.dt else ""), of.P.shape[1:], self._wide
+        time, wide = f"dt={of.dt:g} s, " if of.dt else "", self._passed.K.shape[1]
         return (
             f"{type(self).__name__}('{of.robot}', {len(self.t)} knots, {self.t[0]:g} to "
-            f"{self.t[-1]:g} s, {time}nx={nx}, {wide}, residual={of.residual:.1e})"
+            f"{self.t[-1]:g} s, {time}nx={of.P.shape[1]}, {self.WIDTH}={wide}, "
+            f"residual={of.residual:.1e})"
         )
 
     def __call__(self, t: float) -> Array:
@@ -58,10 +61,6 @@ class Schedule(Design):
 
     @cached_property
     def _passed(self) -> Passed:
-        raise NotImplementedError
-
-    @property
-    def _wide(self) -> str:
         raise NotImplementedError
 
 
@@ -147,8 +146,5 @@ class GainSchedule(Schedule):
 
     @cached_property
     def _passed(self) -> Passed:
-        return Passed(self.t, self.P, self.K, self.A, self.B, self.Q, self.R, self.dt, -1.0)
-
-    @property
-    def _wide(self) -> str:
-        return f"nu={self.K.shape[1]}"
+        model = (self.A, self.B, self.Q, self.R)
+        return Passed(self.t, self.P, self.K, model, self.dt, -1.0)

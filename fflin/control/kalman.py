@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from fflin.analysis.wheels import picked, regulated_part, seen_through
-from fflin.base.errors import DetectabilityError, InputError, MissingPackageError, listed
+from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array, dimension
 from fflin.control.gain import Gain
 from fflin.control.lqr import require_fixed_point
 from fflin.control.weights import Weight, columns, weight
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -137,19 +137,7 @@ class Compensator(Design):
         MissingPackageError
             If python-control is not installed.
         """
-        try:
-            import control
-        except ImportError:
-            raise MissingPackageError(
-                "to_control needs python-control; install it with: pip install 'fflin[control]'"
-            ) from None
-        D = np.zeros((len(self.C), self.B.shape[1]))
-        return control.ss(
-            *(self.A, self.B, self.C, D, self.dt),
-            states=[name.replace(".", "_") for name in self.state_names],
-            inputs=[name.replace(".", "_") for name in self.input_names],
-            outputs=[name.replace(".", "_") for name in self.output_names],
-        )
+        return state_space(self, np.zeros((len(self.C), self.B.shape[1])))
 
 
 def kalman(

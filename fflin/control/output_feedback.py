@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, vector
-from fflin.control.differential_riccati import sample_back
-from fflin.control.kalman import Compensator
+from fflin.control.kalman import Compensator, kalman
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvkalman import FilterSchedule
 from fflin.dynamics.aba import Aba
@@ -158,53 +156,40 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
     def law(self) -> Callable[[float, Array], Array]:
         """Return law(t, e) -> u at the samples, on what the linear models measure."""
         law = _Law(self._size, self._sample)
-        return lambda t, e: law(t, lambda by, u: by.y0 + by.seen @ e + by.through @ (u - by.u0))
+        return lambda t, e: law(
+            t, lambda by, u: by.y0 + by.seen @ (e + by.jump) + by.through @ (u - by.u0)
+        )
 
     @property
     def _size(self) -> int:
         return len(self.filter.state_names)
 
     @cached_property
-    def _rest(self) -> LinearModel:
-        """The model after the end."""
-        return self.end.discretize(self.filter.dt)
-
-    @cached_property
-    def _later(self) -> list[tuple[Array, Array]]:
-        """L and P of the samples from the end on, as far as they are known."""
-        return [(np.zeros(0), self.filter.P[-1])]
+    def _rest(self) -> tuple[LinearModel, Array]:
+        """The model after the end, and the gain of its steady filter."""
+        lin, seen = self.end.discretize(self.filter.dt), self.filter
+        return lin, kalman(lin, seen.W[-1], seen.V).L
 
     def _sample(self, t: float) -> _Sample:
         gains, seen, dt = self.schedule, self.filter, self.filter.dt
-        k = round(t / dt)
+        k, jump = round(t / dt), np.zeros(self._size)
         if k < len(seen.A):
             A, B, K, L, C, D = (x[k] for x in (seen.A, seen.B, gains.K, seen.L, seen.C, seen.D))
             # Held, an input that changes does most like its mean.
             u = self.reference(t + 0.5 * dt * (self.trajectory.hold == "linear"))[2]
-            return _Sample(A - B @ K - L @ (C - D @ K), L, -K, u, seen.y[k], C, D)
-        lin, K, (_, v, u), late = (
-            self._rest,
-            gains.K[-1],
-            self.reference(self.duration),
-            k - len(seen.A),
-        )
-        jump, C, D, y = np.zeros(self._size), seen.C[-1], seen.D[-1], seen.y[-1]
-        if late:
-            u, C, D, y = lin.u0, lin.C, lin.D, lin.y0
+            y = seen.y[k]
         else:
-            # From the next sample on the error is counted from rest.
-            jump[len(jump) // 2 :] = StateMap(self.trajectory.robot).velocities(v - lin.v)
-            jump = lin.A @ jump + lin.B @ (u - lin.u0)
-        while len(self._later) <= late + 1:
-            weights = block_diag(seen.W[-1], seen.V)
-            L, P, _ = sample_back(weights, np.hstack((lin.A.T, C.T)), self._later[-1][1])
-            self._later.append((L.T, P))
-        L = self._later[late + 1][0]
-        return _Sample(lin.A - lin.B @ K - L @ (C - D @ K), L, -K, u, y, C, D, jump)
+            (lin, L), K = self._rest, gains.K[-1]
+            A, B, C, D, u, y = lin.A, lin.B, lin.C, lin.D, lin.u0, lin.y0
+            if k == len(seen.A):
+                # From here on the error is counted from rest.
+                stop = self.reference(self.duration)[1] - lin.v
+                jump[len(jump) // 2 :] = StateMap(self.trajectory.robot).velocities(stop)
+        return _Sample(A - B @ K - L @ (C - D @ K), L, -K, u, y, C, D, jump)
 
 
 class _Sample(NamedTuple):
-    """A sample of a compensator: u = u0 + C z, then z = A z + B (y - y0) + jump.
+    """A sample of a compensator: u = u0 + C z, then z = A z + B (y - y0), z having jumped before.
 
     By the linear model y - y0 = seen e + through (u - u0).
     """
@@ -228,28 +213,20 @@ class _Law:
 
     def __call__(self, t: float, measure: Callable[[_Sample, Array], Array]) -> Array:
         by = self._at(t)
-        u: Array = by.u0 + by.C @ self.estimate
-        innovation = measure(by, u) - by.y0
-        self.estimate = by.A @ self.estimate + by.B @ innovation + by.jump
+        z = self.estimate + by.jump
+        u: Array = by.u0 + by.C @ z
+        self.estimate = by.A @ z + by.B @ (measure(by, u) - by.y0)
         return u
 
 
 class _Loop:
     """The policy of a law on what the robot measures, relative to where it is to be."""
 
-    def __init__(
-        self,
-        state: StateMap,
-        dt: float,
-        noise: Any,
-        law: _Law,
-        there: Callable[[float], tuple[Measuring, Array]],
-    ) -> None:
+    def __init__(self, state: StateMap, dt: float, noise: Any, law: _Law, there: Any) -> None:
         self._dt, self._noise, self._law, self._there = dt, noise, law, there
-        self._asked = -np.inf
         self._still: Array = np.zeros(state.robot.nv)
         felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
-        self._aba = Aba(state) if felt else None
+        self._aba, self._asked = Aba(state) if felt else None, -np.inf
 
     @property
     def estimate(self) -> Array:
@@ -270,10 +247,10 @@ class _Loop:
             state, a = measure.state, self._still
             if aba := self._aba:
                 a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
-            y = measure(state.read(q, v, near=near), q, v, a)
-            if self._noise is None:
-                return y
-            return y + vector("noise(t)", self._noise(t), len(y), "one value for each output")
+            y: Array = measure(state.read(q, v, near=near), q, v, a)
+            if self._noise is not None:
+                y = y + vector("noise(t)", self._noise(t), len(y), "one value for each output")
+            return y
 
         return self._law(t, measured)
 

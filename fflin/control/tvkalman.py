@@ -67,6 +67,7 @@ class FilterSchedule(Schedule):
     """
 
     VECTORS: ClassVar = ("t",)
+    WIDTH: ClassVar = "ny"
 
     L: Array
     P: Array
@@ -95,11 +96,7 @@ class FilterSchedule(Schedule):
     @cached_property
     def _passed(self) -> Passed:
         A, C, L = (each.transpose(0, 2, 1) for each in (self.A, self.C, self.L))
-        return Passed(self.t, self.P, L, A, C, self.W, self.V, self.dt, 1.0)
-
-    @property
-    def _wide(self) -> str:
-        return f"ny={self.L.shape[2]}"
+        return Passed(self.t, self.P, L, (A, C, self.W, self.V), self.dt, 1.0)
 
 
 def tvkalman(
@@ -171,8 +168,12 @@ def tvkalman(
     names: Any = ("state_names", "input_names", "output_names", "verified")
     fields: dict[str, Any] = {key: getattr(traj, key) for key in names}
     fields |= {"robot": traj.robot.name, "V": V, "dt": dt}
-    P = _steady(traj, at, V, sample, P0) if isinstance(P0, str) else None
-    P = weight("P0", P0, traj.state_names) if P is None else P
+    if isinstance(P0, str):
+        if P0 != "steady":
+            raise InputError(f"P0 is {P0!r}, expected 'steady' or a covariance")
+        P = _steady(traj, at(float(traj.t[0])).Q, V, dt)
+    else:
+        P = weight("P0", P0, traj.state_names)
     try:
         # A P that overflows is refused, so that NumPy need not warn of it.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -191,18 +192,10 @@ def tvkalman(
     return replace(made, residual=made._passed.residual(at))
 
 
-def _steady(
-    traj: LinearTrajectory,
-    at: Callable[[float], Coefficients],
-    V: Array,
-    sample: float | None,
-    P0: str,
-) -> Array:
-    if P0 != "steady":
-        raise InputError(f"P0 is {P0!r}, expected 'steady' or a covariance")
-    lin, W = steady_end(traj, 0), at(float(traj.t[0])).Q
-    if sample is not None:
-        lin, W = lin.discretize(sample), held_cost(lin.A.T, W, sample)
+def _steady(traj: LinearTrajectory, W: Array, V: Array, dt: float) -> Array:
+    lin = steady_end(traj, 0)
+    if dt:
+        lin, W = lin.discretize(dt), held_cost(lin.A.T, W, dt)
     try:
         return kalman(lin, W, V).P
     except (DetectabilityError, InputError) as error:

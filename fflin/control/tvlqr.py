@@ -127,7 +127,7 @@ def tvlqr(
         raise InputError(_TOO_FAST) from None
     A, B = map(np.array, zip(*(traj.between(float(x), traj.A, traj.B) for x in t), strict=True))
     K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
-    residual = Passed(t, P, K, A, B, Q, R, 0.0, -1.0).residual(at)
+    residual = Passed(t, P, K, (A, B, Q, R), 0.0, -1.0).residual(at)
     return GainSchedule(t=t, K=K, P=P, A=A, B=B, residual=residual, **fields)
 
 

@@ -161,12 +161,10 @@ def compare(
     column_scale = np.where(np.arange(state.nx)[:, None] < state.nx - nv, 1.0, input_mobility)
     difference_B = np.abs(lin.B - B) / row_scale / column_scale
     groups, inputs = state.groups._asdict(), actuation.groups
-    of_states = _Parts.of(groups, state.nx)
-    errors = of_states.blocks(difference_A, of_states)
-    errors_B = of_states.blocks(difference_B, _Parts.of(inputs, len(input_mobility)))
+    errors, errors_B = _blocks(difference_A, groups, groups), _blocks(difference_B, groups, inputs)
     if errors.any():
         terms = _cancelling_terms(state, lin, mobility, input_mobility)
-        sizes = np.maximum(of_states.blocks(scaled_A, of_states), terms)
+        sizes = np.maximum(_blocks(scaled_A, groups, groups), terms)
         errors /= np.where(sizes > 0.0, sizes, 1.0)
     every = ("A", groups, errors.tolist()), ("B", inputs, errors_B.tolist())
     return [
@@ -177,27 +175,11 @@ def compare(
     ]
 
 
-class _Parts(NamedTuple):
-    """Groups of rows or columns: their indices one after the other, and where each begins."""
-
-    indices: Any
-    starts: Any
-
-    @classmethod
-    def of(cls, groups: dict[str, Any], size: int) -> _Parts:
-        # An entry beyond the last for each, zero, so that none is empty.
-        rows = np.arange(size + 1)
-        taken = [np.concatenate((rows[:-1][each], rows[-1:])) for each in groups.values()]
-        starts = np.cumsum([0, *map(len, taken)])[:-1]
-        return cls(np.concatenate([rows[:0], *taken]), starts)
-
-    def blocks(self, matrix: Array, columns: _Parts) -> Array:
-        """Return the largest entry of each block of a matrix without negative ones."""
-        padded = np.zeros((len(matrix) + 1, matrix.shape[1] + 1))
-        padded[:-1, :-1] = matrix
-        found = np.maximum.reduceat(padded[self.indices], self.starts)[:, columns.indices]
-        largest: Array = np.maximum.reduceat(found, columns.starts, axis=1)
-        return largest
+def _blocks(matrix: Array, rows: dict[str, Any], columns: dict[str, Any]) -> Array:
+    """Return the largest entry of each block, none being negative; zero of an empty one."""
+    largest = np.array([matrix[each].max(axis=0, initial=0.0) for each in rows.values()])
+    found = [largest[:, each].max(axis=1, initial=0.0) for each in columns.values()]
+    return np.array(found).reshape(len(columns), len(rows)).T
 
 
 def mobilities(M: Array, B: Array) -> tuple[Array, Array]:
