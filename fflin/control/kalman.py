@@ -204,7 +204,7 @@ def kalman(
     S = picked(lin.state_names, whole.state_names)
     seen = seen_through(whole, S)
     W, V = S @ through @ noise @ through.T @ S.T, seen @ V @ seen.T
-    W = 0.5 * (W + W.T)
+    W = 0.5 * W + 0.5 * W.T
     require_detectable(lin)
     require_disturbed(lin, W)
     C = np.ascontiguousarray(lin.C)
