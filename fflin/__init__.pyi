@@ -71,6 +71,8 @@ from fflin.control.acceleration_lqr import acceleration_lqr as acceleration_lqr
 from fflin.control.sampled_cost import sampled_cost as sampled_cost
 from fflin.control.tvlqr import tvlqr as tvlqr
 from fflin.control.gain_schedule import GainSchedule as GainSchedule
+from fflin.control.tvkalman import tvkalman as tvkalman
+from fflin.control.tvkalman import FilterSchedule as FilterSchedule
 from fflin.control.kalman import kalman as kalman
 from fflin.control.kalman import Estimator as Estimator
 from fflin.control.kalman import lqg as lqg
@@ -81,6 +83,7 @@ from fflin.control.policies import StateFeedback as StateFeedback
 from fflin.control.tracking import TrajectoryFeedback as TrajectoryFeedback
 from fflin.control.policies import Allocation as Allocation
 from fflin.control.output_feedback import OutputFeedback as OutputFeedback
+from fflin.control.output_feedback import TrajectoryOutputFeedback as TrajectoryOutputFeedback
 from fflin.batch.gains import ScheduledFeedback as ScheduledFeedback
 
 # Simulation

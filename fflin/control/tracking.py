@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
     from fflin.robot.robot import Robot
 
+# A clock of many steps is rounded.
+_AT_THE_END = 1.0 + 1e-12
+
 # Returns q, v and u in the policy's axes at a time of the run.
 Reference: TypeAlias = Callable[[float], tuple[Array, Array, Array]]
 
@@ -83,7 +86,7 @@ class TrajectoryFeedback:
 
     def reference(self, t: float) -> tuple[Array, Array, Array]:
         """Return q, v, and u in base axes that are followed at a time of the run."""
-        if t > self.duration:
+        if t > self.duration * _AT_THE_END:
             return self.end.q, self.end.v, self.end.u0
         return self.trajectory.flow.at(float(self.trajectory.t[0]) + max(t, 0.0))
 
@@ -91,6 +94,10 @@ class TrajectoryFeedback:
         """Return K (nu, nx) at a time of the run."""
         knots = self.schedule.t
         return self.schedule.gain(float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0])))
+
+    def law(self) -> Callable[[float, Array], Array]:
+        """Return law(t, e) -> u of the error at a time of the run."""
+        return lambda t, e: self.reference(t)[2] - self.gain(t) @ e
 
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.

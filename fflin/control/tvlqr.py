@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,22 +9,22 @@ import numpy as np
 from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
 from fflin.base.names import input_keys
 from fflin.base.validation import Array, number
-from fflin.control.differential_riccati import Coefficients, step_back
+from fflin.control.differential_riccati import (
+    Coefficients,
+    Passed,
+    sample_back,
+    solve_back,
+    spread,
+)
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.weights import Weight, weight
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
-from fflin.linear.sampling import GAUSS
 
 if TYPE_CHECKING:
     from fflin.linear.linear_trajectory import LinearTrajectory
     from fflin.linear.model import LinearModel
     from fflin.linear.trajectory import Trajectory
 
-# Between two knots P is a cubic; knots are added until it is this accurate, relative to P.
-_ACCURACY = 1e-7
-_KNOTS_LIMIT = 100_000
-_TOO_FAST = "P changes too fast at {}; give smaller weights or a larger R"
+_TOO_FAST = "P changes too fast; give smaller weights or a larger R"
 
 
 def tvlqr(
@@ -93,15 +91,7 @@ def tvlqr(
     E. Celledoni, A. Marthinsen and B. Owren, Commutator-free Lie group methods, Future Generation
     Computer Systems 19(3), 2003.
     """
-    from fflin.linear.linear_trajectory import LinearTrajectory
-
-    if not isinstance(traj, LinearTrajectory):
-        raise InputError(
-            f"traj is a {type(traj).__name__}, expected a LinearTrajectory; "
-            "fflin.linearize_trajectory makes one"
-        )
-    if traj.dt:
-        raise InputError("traj is sampled; give the continuous one, and sample=")
+    require_continuous(traj)
     names, dt = traj.state_names, 0.0 if sample is None else number("sample", sample)
     steady = isinstance(Qf, str)
     if steady and Qf != "steady":
@@ -116,47 +106,66 @@ def tvlqr(
 
         *given, _, rule = rule_weights(end, weights, hold=dt)
     Q = weight("Q", given[0], names)
-    R = weight("R", given[1], input_keys(Actuation(StateMap(traj.robot))), definite=True)
+    R = weight("R", given[1], input_keys(traj), definite=True)
     Qf = _cost_from(end, Q, R, sample) if steady else weight("Qf", Qf, names)
     fields: dict[str, Any] = {key: getattr(traj, key) for key in ("q", "v", "u", "hold", "frame")}
     fields |= {"state_names": names, "input_names": traj.input_names, "robot": traj.robot.name}
     fields |= {"Q": Q, "R": R, "Qf": Qf, "weights": rule, "knots": traj.t}
     fields |= {"verified": traj.verified, "dt": dt}
-    if sample is not None:
-        return GainSchedule(**fields, **_sampled(traj, dt, Q, R, Qf))
+
+    def at(t: float) -> Coefficients:
+        A, B = traj.between(t, traj.A, traj.B)
+        return Coefficients(A, spread(B, R), Q)
+
     try:
-        # A P that overflows is refused below, so that NumPy need not warn of it.
+        # A P that overflows is refused, so that NumPy need not warn of it.
         with np.errstate(over="ignore", invalid="ignore"):
-            t, P = _solve(traj, Q, R, Qf)
+            if sample is not None:
+                return GainSchedule(**fields, **_sampled(traj, dt, Q, R, Qf))
+            t, P = solve_back(at, traj.t, Qf)
     except np.linalg.LinAlgError:
-        raise InputError(_TOO_FAST.format("some time")) from None
-    A, B = map(np.array, zip(*(traj.matrices(float(x)) for x in t), strict=True))
+        raise InputError(_TOO_FAST) from None
+    A, B = map(np.array, zip(*(traj.between(float(x), traj.A, traj.B) for x in t), strict=True))
     K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
-    schedule = GainSchedule(t=t, K=K, P=P, A=A, B=B, residual=math.inf, **fields)
-    return replace(schedule, residual=_residual(schedule))
+    residual = Passed(t, P, K, (A, B, Q, R), 0.0, -1.0).residual(at)
+    return GainSchedule(t=t, K=K, P=P, A=A, B=B, residual=residual, **fields)
 
 
-def steady_end(traj: LinearTrajectory) -> LinearModel:
-    """Return the model at the end where that is steady, else at rest in the last configuration."""
-    lin = traj[-1]
+def require_continuous(traj: LinearTrajectory) -> None:
+    """Raise `InputError` where something is no LinearTrajectory in continuous time."""
+    from fflin.linear.linear_trajectory import LinearTrajectory
+
+    if not isinstance(traj, LinearTrajectory):
+        raise InputError(
+            f"traj is a {type(traj).__name__}, expected a LinearTrajectory; "
+            "fflin.linearize_trajectory makes one"
+        )
+    if traj.dt:
+        raise InputError("traj is sampled; give the continuous one, and sample=")
+
+
+def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
+    """Return the model at the last knot, or the first (0), if steady, else at rest there."""
+    lin = traj[end]
     if lin.is_equilibrium():
         return lin
     try:
-        return resting_end(traj)
+        return resting_end(traj, end)
     except EquilibriumError as error:
-        raise EquilibriumError(f"at the end: {error}; give Q, R and Qf") from None
+        where, given = ("end", "Q, R and Qf") if end else ("start", "P0")
+        raise EquilibriumError(f"at the {where}: {error}; give {given}") from None
 
 
-def resting_end(traj: Trajectory) -> LinearModel:
+def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
     """Return the model at rest in the last configuration, in base axes; rotors spin on there."""
     from fflin.linear.equilibrium import equilibrium
     from fflin.linear.ignorable import rotor_names
     from fflin.linear.linearization import Linearizer
 
-    robot, q, v = traj.robot, traj.q[-1], np.zeros(traj.robot.nv)
+    robot, q, v = traj.robot, traj.q[end], np.zeros(traj.robot.nv)
     rotors = rotor_names(robot)
     spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
-    v[spinning] = traj.v[-1, spinning]
+    v[spinning] = traj.v[end, spinning]
     return Linearizer(robot, moving=True)(q, v, equilibrium(robot, q, v=v).u)
 
 
@@ -190,20 +199,11 @@ def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) ->
     maps, gains, costs, worst = [], [], [P], 0.0
     for steps, whole in reversed(list(transitions(traj, dt))):
         total, way = np.zeros_like(W), np.eye(nx + nu)
-        for F, h, step in steps:
+        for F, h, step, _ in steps:
             total += way.T @ held_cost(F, W, h) @ way
             way[:nx] = step @ way
-        total += whole.T @ P @ whole
-        K = np.linalg.solve(total[nx:, nx:], total[nx:, :nx])
-        # A sum of squares, which stays positive.
-        law = np.vstack((np.eye(nx), -K))
-        P = law.T @ total @ law
-        P = 0.5 * (P + P.T)
-        terms = P, total[:nx, :nx], total[:nx, nx:] @ K
-        size = sum(float(np.linalg.norm(each)) for each in terms)
-        worst = max(worst, float(np.linalg.norm(terms[0] - terms[1] + terms[2])) / (size or 1.0))
-        if not np.isfinite(P).all():
-            raise InputError(_TOO_FAST.format("some time"))
+        K, P, missed = sample_back(total, whole, P)
+        worst = max(worst, missed)
         maps.append(whole)
         gains.append(K)
         costs.append(P)
@@ -212,59 +212,3 @@ def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) ->
     gains = [*gains[::-1], gains[0]]
     found = {"t": traj.samples(dt), "K": np.array(gains), "P": np.array(costs[::-1])}
     return found | {"A": held[:, :, :nx], "B": held[:, :, nx:], "residual": worst}
-
-
-def _solve(traj: LinearTrajectory, Q: Array, R: Array, Qf: Array) -> tuple[Array, Array]:
-    def at(t: float) -> Coefficients:
-        A, B = traj.matrices(t)
-        return Coefficients(A, _spread(B, R), Q)
-
-    def back(a: float, b: float, P: Array) -> Array:
-        nodes = np.array([_spread(traj.matrices(a + c * (b - a))[1], R) for c in GAUSS])
-        return step_back(at(a), at(b), nodes, P, b - a)
-
-    times, values = [float(traj.t[-1])], [Qf]
-    for a in traj.t[-2::-1].tolist():
-        # Intervals left to do, the latest last; with P at the start from one step, where known.
-        pending: list[tuple[float, float, Array | None]] = [(a, times[-1], None)]
-        while pending:
-            start, end, single = pending.pop()
-            P = values[-1]
-            single = back(start, end, P) if single is None else single
-            middle = 0.5 * (start + end)
-            half = back(middle, end, P)
-            double = back(start, middle, half)
-            h = end - start
-            # The cubic with these values and slopes, midway.
-            bend = at(start).rate(double) - at(end).rate(P)
-            between = 0.5 * (double + P) + 0.125 * h * bend
-            if max(_apart(single, double), _apart(between, half)) <= _ACCURACY:
-                times += [middle, start]
-                values += [half, double]
-            elif len(times) > _KNOTS_LIMIT or h < 1e-12 * abs(traj.t[-1] - traj.t[0]):
-                raise InputError(_TOO_FAST.format(f"t = {end:g} s"))
-            else:
-                pending += [(start, middle, None), (middle, end, half)]
-    return np.array(times[::-1]), np.array(values[::-1])
-
-
-def _spread(B: Array, R: Array) -> Array:
-    S = B @ np.linalg.solve(R, B.T)
-    half: Array = 0.5 * (S + S.T)
-    return half
-
-
-def _apart(first: Array, second: Array) -> float:
-    return float(np.linalg.norm(first - second)) / max(float(np.linalg.norm(second)), 1e-300)
-
-
-def _residual(schedule: GainSchedule) -> float:
-    worst = 0.0
-    for i, t in enumerate(0.5 * (schedule.t[1:] + schedule.t[:-1])):
-        P, rate = schedule._cubics(t), schedule._cubics(t, 1)
-        A, B = (0.5 * (each[i] + each[i + 1]) for each in (schedule.A, schedule.B))
-        drift, spent = P @ A, P @ _spread(B, schedule.R) @ P
-        terms = np.array((rate, drift, drift.T, -spent, schedule.Q))
-        size = float(np.linalg.norm(terms, axis=(1, 2)).sum())
-        worst = max(worst, float(np.linalg.norm(terms.sum(axis=0))) / max(size, 1e-300))
-    return worst

@@ -1,5 +1,6 @@
 """The state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, frames and chart."""
 
+from copy import copy
 from itertools import compress
 from typing import Literal, get_args
 
@@ -121,16 +122,24 @@ class StateMap:
         self.unbounded = np.flatnonzero([joint.unbounded for joint in joints])
         self._cos = self._idx_q[self.unbounded]
         self._sin = self._cos + 1
-        # The free-flyer joint may itself stand somewhere in the world.
-        oMref = pin.SE3.Identity() if reference is None else placement("reference", reference)
+        root = robot.model.jointPlacements[ROOT].rotation
+        self._gravity, self._falls = root.T @ np.array(robot.gravity), any(robot.gravity)
+        self._refer(pin.SE3.Identity() if reference is None else placement("reference", reference))
+
+    def about(self, reference: pin.SE3) -> "StateMap":
+        """Return the map relative to another placement, with the same frame."""
+        other = copy(self)
+        other._refer(reference)
+        return other
+
+    def _refer(self, oMref: pin.SE3) -> None:
         self._reference = oMref
-        # Composed as quaternions: their entries survive to the last digit near a turn of pi.
-        offset = pin.SE3ToXYZQUAT(oMref.actInv(robot.model.jointPlacements[ROOT]))
+        # The free-flyer joint may itself stand somewhere in the world. Composed as quaternions:
+        # their entries survive to the last digit near a turn of pi.
+        offset = pin.SE3ToXYZQUAT(oMref.actInv(self.robot.model.jointPlacements[ROOT]))
         self._position, self.origin_quaternion = offset[:3], offset[3:]
         self._rotation = rotation_matrix(self.origin_quaternion)
         self._aligned = bool((self._rotation == np.eye(3)).all())
-        root = robot.model.jointPlacements[ROOT].rotation
-        self._gravity, self._falls = root.T @ np.array(robot.gravity), any(robot.gravity)
 
     @property
     def reference(self) -> pin.SE3:

@@ -40,13 +40,14 @@ def state_history(
     quaternion *= np.where(quaternion[:, 3:] < 0.0, -1.0, 1.0)
     chart = Chart(quaternion[:, :3], quaternion[:, 3:], rotation_matrices(quaternion))
     q_m = state.joint_positions(q)
-    before = np.zeros(len(q_m[0])) if near is None else near[state.groups.q_m]
+    before = np.zeros(q_m.shape[1]) if near is None else near[state.groups.q_m]
     rates = state.velocities(v)
-    for k in state.unbounded:
-        q_m[:, k] = np.unwrap([before[k], *q_m[:, k]])[1:]
+    if (k := state.unbounded).size:
+        q_m[:, k] = np.unwrap(np.vstack((before, q_m))[:, k], axis=0)[1:]
         if t is not None:
-            turned = 0.5 * np.diff(t) * (rates[1:, 6 + k] + rates[:-1, 6 + k])
-            q_m[1:, k] += _TURN * np.round((turned - np.diff(q_m[:, k])) / _TURN).cumsum()
+            turned = 0.5 * np.diff(t)[:, None] * (rates[1:, 6 + k] + rates[:-1, 6 + k])
+            turns = np.round((turned - np.diff(q_m[:, k], axis=0)) / _TURN)
+            q_m[1:, k] += _TURN * turns.cumsum(axis=0)
     return state.compose(chart, state.positions(q), q_m, rates)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
 from fflin.linear.flow import placed
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
@@ -61,6 +62,11 @@ class LinearTrajectory(Trajectory):
         if self.state_names != self._state.names:
             raise InputError(f"it is no model of '{self.robot.name}' as it is given")
 
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """Of the nu inputs."""
+        return Actuation(self._state).units
+
     def __len__(self) -> int:
         return len(self.A)
 
@@ -80,11 +86,15 @@ class LinearTrajectory(Trajectory):
 
     def matrices(self, t: float) -> tuple[Array, Array]:
         """Return A (nx, nx) and B (nx, nu) at a time, linear between the knots or held."""
+        A, B = self.between(t, self.A, self.B)
+        return A, B
+
+    def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
+        """Return what arrays of the knots are at a time, linear between the knots or held."""
         k, share = placed(self.t, self._within(t))
         if self.dt or not share:
-            return self.A[k], self.B[k]
-        A, B = ((1.0 - share) * each[k] + share * each[k + 1] for each in (self.A, self.B))
-        return A, B
+            return tuple(each[k] for each in arrays)
+        return tuple(each[k] + share * (each[k + 1] - each[k]) for each in arrays)
 
     def check(self) -> Check:
         """Check every knot as `fflin.check` does: the worst of each figure."""

@@ -16,8 +16,9 @@ from fflin.linear.trajectory import Trajectory
 # Steps are halved until the transition of a sample is this accurate.
 _ACCURACY, _MOST_PARTS = 1e-8, 64
 
-# F = [[A, B], [0, 0]] (nx + nu, nx + nu), for how long [s], and what it does (nx, nx + nu).
-Steps = list[tuple[Array, float, Array]]
+# F = [[A, B], [0, 0]] (nx + nu, nx + nu), for how long [s], what it does (nx, nx + nu), and the
+# times of what is HEAVY and LIGHT in it.
+Steps = list[tuple[Array, float, Array, tuple[float, float]]]
 
 
 def transitions(along: Trajectory, dt: float) -> Iterator[tuple[Steps, Array]]:
@@ -38,11 +39,11 @@ def transitions(along: Trajectory, dt: float) -> Iterator[tuple[Steps, Array]]:
         steps, whole = [], np.eye(nx + nu)
         for start, end in pairwise(cuts):
             for a, b in pairwise(np.linspace(start, end, parts + 1).tolist()):
-                early, late = (at(a + c * (b - a)) for c in GAUSS)
-                for first, second in ((early, late), (late, early)):
-                    F, h = HEAVY * first + LIGHT * second, 0.5 * (b - a)
+                early, late = ((t, at(t)) for t in (a + c * (b - a) for c in GAUSS))
+                for (first, heavy), (second, light) in ((early, late), (late, early)):
+                    F, h = HEAVY * heavy + LIGHT * light, 0.5 * (b - a)
                     step = np.column_stack(held_exponential(F[:nx, :nx], F[:nx, nx:], h))
-                    steps.append((F, h, step))
+                    steps.append((F, h, step, (first, second)))
                     whole[:nx] = step @ whole
         return steps, whole[:nx]
 

@@ -143,6 +143,11 @@ def sound(folder):
         "Trajectory": dict(zip("tqvu", (t, *rows), strict=True))
         | {"robot": robot, "hold": None, "frame": "local"},
         "TrajectoryFeedback": {"trajectory": along, "schedule": schedule},
+        "TrajectoryOutputFeedback": {
+            **{"trajectory": along, "filter": fflin.tvkalman(along, 1.0, 1.0, None, 1.0, 0.01)},
+            **{"schedule": fflin.tvlqr(along, 1.0, 1.0, 1.0, 0.01), "noise": None},
+        },
+        "tvkalman": {"traj": along, "W": 1.0, "V": 1.0, "G": along.B, "P0": 1.0, "sample": None},
         "tvlqr": {"traj": along, "Qf": 1.0, "sample": None, "weights": None} | weights,
         "validity": {
             **{"robot": robot, "lin": lin, "gain": None, "attitude": 5.0, "position": 0.1},
