@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
 from fflin.base.validation import Array
-from fflin.linear.sampling import GAUSS, HEAVY, LIGHT
+from fflin.linear.sampling import HEAVY, LIGHT
 
 
 class Coefficients(NamedTuple):
@@ -68,26 +68,18 @@ def _passage(coefficients: Coefficients, h: float) -> _Passage:
     return passage
 
 
-def step_back(start: Coefficients, end: Coefficients, S: Array, P: Array, h: float) -> Array:
+def step_back(early: Coefficients, late: Coefficients, P: Array, h: float) -> Array:
     """Return P at the start of an interval of its value at the end, of order four.
 
     Parameters
     ----------
-    start, end : Coefficients
-        A and Q are linear in between.
-    S : ndarray (2, nx, nx)
-        B R^-1 B' at the two Gauss nodes.
+    early, late : Coefficients
+        At the two Gauss nodes.
     P : ndarray (nx, nx)
     h : float
     """
-    if np.array_equal(start.A, end.A) and np.array_equal(start.S, end.S):
-        return _passage(end, h).back(P)
-    early, late = (
-        Coefficients(*((1.0 - c) * a + c * b for a, b in zip(start, end, strict=True)))._replace(
-            S=at_node
-        )
-        for c, at_node in zip(GAUSS, S, strict=True)
-    )
+    if np.array_equal(early.A, late.A) and np.array_equal(early.S, late.S):
+        return _passage(late, h).back(P)
     for first, second in ((late, early), (early, late)):
         mixed = Coefficients(*(HEAVY * a + LIGHT * b for a, b in zip(first, second, strict=True)))
         P = _passage(mixed, 0.5 * h).back(P)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -132,7 +133,7 @@ def tvlqr(
     A, B = map(np.array, zip(*(traj.matrices(float(x)) for x in t), strict=True))
     K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
     schedule = GainSchedule(t=t, K=K, P=P, A=A, B=B, residual=math.inf, **fields)
-    return replace(schedule, residual=_residual(schedule))
+    return replace(schedule, residual=_residual(schedule, traj))
 
 
 def steady_end(traj: LinearTrajectory) -> LinearModel:
@@ -209,13 +210,14 @@ def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) ->
 
 
 def _solve(traj: LinearTrajectory, Q: Array, R: Array, Qf: Array) -> tuple[Array, Array]:
+    @cache
     def at(t: float) -> Coefficients:
         A, B = traj.matrices(t)
         return Coefficients(A, _spread(B, R), Q)
 
     def back(a: float, b: float, P: Array) -> Array:
-        nodes = np.array([_spread(traj.matrices(a + c * (b - a))[1], R) for c in GAUSS])
-        return step_back(at(a), at(b), nodes, P, b - a)
+        early, late = (at(a + c * (b - a)) for c in GAUSS)
+        return step_back(early, late, P, b - a)
 
     times, values = [float(traj.t[-1])], [Qf]
     for a in traj.t[-2::-1].tolist():
@@ -252,11 +254,11 @@ def _apart(first: Array, second: Array) -> float:
     return float(np.linalg.norm(first - second)) / max(float(np.linalg.norm(second)), 1e-300)
 
 
-def _residual(schedule: GainSchedule) -> float:
+def _residual(schedule: GainSchedule, traj: LinearTrajectory) -> float:
     worst = 0.0
-    for i, t in enumerate(0.5 * (schedule.t[1:] + schedule.t[:-1])):
+    for t in 0.5 * (schedule.t[1:] + schedule.t[:-1]):
         P, rate = schedule._cubics(t), schedule._cubics(t, 1)
-        A, B = (0.5 * (each[i] + each[i + 1]) for each in (schedule.A, schedule.B))
+        A, B = traj.matrices(float(t))
         drift, spent = P @ A, P @ _spread(B, schedule.R) @ P
         terms = np.array((rate, drift, drift.T, -spent, schedule.Q))
         size = float(np.linalg.norm(terms, axis=(1, 2)).sum())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,12 +80,18 @@ class LinearTrajectory(Trajectory):
         return replace(lin, **own, y0=self.y[k], verified=self.verified)
 
     def matrices(self, t: float) -> tuple[Array, Array]:
-        """Return A (nx, nx) and B (nx, nu) at a time, linear between the knots or held."""
-        k, share = placed(self.t, self._within(t))
-        if self.dt or not share:
+        """Return A (nx, nx) and B (nx, nu) at a time; between the knots those of `point`."""
+        t = self._within(t)
+        k, share = placed(self.t, t)
+        if self.dt or share in (0.0, 1.0):
+            k += int(share) if not self.dt else 0
             return self.A[k], self.B[k]
-        A, B = ((1.0 - share) * each[k] + share * each[k + 1] for each in (self.A, self.B))
-        return A, B
+        lin = self._linearizer(*self.flow.at(t))
+        return lin.A, lin.B
+
+    @cached_property
+    def _linearizer(self) -> Linearizer:
+        return Linearizer(self.robot, moving=True)
 
     def check(self) -> Check:
         """Check every knot as `fflin.check` does: the worst of each figure."""
