@@ -52,7 +52,8 @@ _NAMES = {
         "control.kalman kalman Estimator lqg Compensator",
     ),
     "Policies": (
-        "control.policies StateFeedback TrajectoryFeedback Allocation",
+        "control.policies StateFeedback Allocation",
+        "control.tracking TrajectoryFeedback",
         "control.output_feedback OutputFeedback",
         "batch.gains ScheduledFeedback",
     ),
@@ -133,8 +134,9 @@ if TYPE_CHECKING:
     from fflin.control.lqr import lqr
     from fflin.control.output_feedback import OutputFeedback
     from fflin.control.plots import plot_loops, plot_poles
-    from fflin.control.policies import Allocation, StateFeedback, TrajectoryFeedback
+    from fflin.control.policies import Allocation, StateFeedback
     from fflin.control.sampled_cost import sampled_cost
+    from fflin.control.tracking import TrajectoryFeedback
     from fflin.control.tvlqr import tvlqr
     from fflin.control.weights import bryson
     from fflin.dynamics.points import configuration, effort, velocity

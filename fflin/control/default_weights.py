@@ -380,7 +380,7 @@ def _slowed(lin: LinearModel, Q: Array, cost: Array, size: Array, limit: _Limit)
     else:
         high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
         where = "at the displacements of the default weights"
-        warn_beyond(lin, where, asked, -high, high)
+        warn_beyond(lin.robot, where, lin.input_names, lin.input_units, asked[None], -high, high)
     return limit._replace(what=f"{limit.what}{_NOT_ENOUGH}")
 
 

@@ -1,10 +1,10 @@
-"""What decides on the inputs: feedback of the state about a point or along a trajectory."""
+"""What decides on the inputs: feedback of the state about a point, and allocation."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import pinocchio as pin
@@ -15,16 +15,12 @@ from fflin.base.validation import Array, as_double
 from fflin.control.bounded import nearest
 from fflin.control.channel import Law
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
-from fflin.dynamics.state_rows import moving_error, readout
-from fflin.linear.fit import require_fit, require_same, require_turns
+from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state_rows import readout
+from fflin.linear.fit import require_fit, require_turns
 from fflin.linear.model import LinearModel
 from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from fflin.control.gain_schedule import GainSchedule
-    from fflin.linear.linear_trajectory import LinearTrajectory
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
@@ -102,57 +98,6 @@ class StateFeedback:
 
 
 @dataclass(frozen=True, eq=False)
-class TrajectoryFeedback:
-    """The feedback ``u = u*(t) - K(t) e`` of the error from a trajectory.
-
-    The error is that of `linearize_trajectory`; K is held at its last value after the end, and
-    the trajectory's last point then is the target.
-
-    Parameters
-    ----------
-    trajectory : LinearTrajectory
-    schedule : GainSchedule
-        As `tvlqr` returns it.
-    """
-
-    trajectory: LinearTrajectory
-    schedule: GainSchedule
-
-    def __post_init__(self) -> None:
-        if not hasattr(self.trajectory, "point") or not callable(
-            getattr(self.schedule, "gain", None)
-        ):
-            raise InputError(
-                "TrajectoryFeedback takes a LinearTrajectory and a GainSchedule, as "
-                "fflin.linearize_trajectory and fflin.tvlqr return them"
-            )
-
-    def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot.
-
-        Raises
-        ------
-        InputError
-            If the robot has not the trajectory's states and inputs; its masses may be others.
-        """
-        along = self.trajectory
-        state, own = StateMap(robot, frame="local"), StateMap(along.robot, frame="local")
-        made = f"the trajectory is one of '{along.robot.name}'"
-        for kind, pair in (("input", map(Actuation, (own, state))), ("state", (own, state))):
-            require_same(made, robot, kind, *((each.names, each.units) for each in pair))
-        require_turns(made, along.robot.nq, robot)
-        end = float(along.t[-1])
-
-        def policy(t: float, q: Array, v: Array) -> Array:
-            t = min(max(t, float(along.t[0])), end)
-            q_star, v_star, u_star = along.point(t)
-            u: Array = u_star - self.schedule.gain(t).dot(moving_error(state, q_star, v_star, q, v))
-            return u
-
-        return policy
-
-
-@dataclass(frozen=True, eq=False)
 class Allocation:
     """Thrusts, none negative or beyond its limit, that come nearest to what a policy asks for.
 
@@ -190,10 +135,9 @@ class Allocation:
                 f"the design's joints are not those of '{robot.name}'; allocate for the same robot"
             )
         require_turns(f"the design is '{self.design.name}'", self.design.nq, robot)
-        lin = self.lin
+        frame, reference = axes_of(self)
         asked, given = (
-            StateMap(each, reference=lin.reference, frame=lin.frame) if lin else StateMap(each)
-            for each in (self.design, robot)
+            StateMap(each, reference=reference, frame=frame) for each in (self.design, robot)
         )
         asking, giving = Actuation(asked), Actuation(given)
         free = np.full(len(asking.names), np.inf)
@@ -215,6 +159,15 @@ class Allocation:
             return nearest(A, b, least, most)
 
         return policy
+
+
+def axes_of(policy: Any) -> tuple[Frame, pin.SE3 | None]:
+    """Return the frame and reference that a policy's state and inputs are in."""
+    lin, _ = feedback_of(policy)
+    if lin is not None:
+        return lin.frame, lin.reference
+    decides = policy.policy if isinstance(policy, Allocation) else policy
+    return getattr(decides, "frame", "hybrid"), None
 
 
 def bound(policy: Any, robot: Robot) -> Policy:

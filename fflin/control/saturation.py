@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -14,7 +14,6 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, listed
 from fflin.base.validation import Array
 from fflin.control.pulses import Pulses
-from fflin.linear.model import LinearModel
 from fflin.robot.fields import Range
 from fflin.robot.inputs import Thruster, named_inputs
 from fflin.robot.robot import Robot
@@ -90,19 +89,25 @@ def saturation(
     return Saturation(low, high, wheels, pulses)
 
 
-def warn_beyond(lin: LinearModel, where: str, asked: Array, low: Array, high: Array) -> None:
-    """Warn of inputs that are asked (nu,) for more than their limits."""
-    limits = np.where(asked > 0.0, high, low)
+def warn_beyond(
+    robot: str,
+    where: str,
+    names: Sequence[str],
+    units: Sequence[str],
+    asked: Array,
+    low: Array,
+    high: Array,
+) -> None:
+    """Warn of inputs that are asked, in any of the rows (N, nu), for more than their limits."""
+    bounds = np.where(asked > 0.0, high, low)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.nan_to_num(np.abs(asked / bounds), posinf=np.inf)
+    worst = share.argmax(axis=0)
     beyond = [
-        f"{name} is asked for {u:.3g} {unit}, limit {limit:g}"
-        for name, unit, u, limit in zip(
-            lin.input_names, lin.input_units, asked, limits, strict=True
-        )
-        if abs(u) > (1.0 + 1e-6) * abs(limit)
+        f"{name} is asked for {asked[row, k]:.3g} {unit}, limit {bounds[row, k]:g}"
+        for k, (name, unit, row) in enumerate(zip(names, units, worst, strict=True))
+        if share[row, k] > 1.0 + 1e-6
     ]
     if beyond:
-        warnings.warn(
-            f"the limits do not hold '{lin.robot}' {where}: {listed(beyond)}",
-            FflinWarning,
-            stacklevel=3,
-        )
+        said = f"the limits do not hold '{robot}' {where}: {listed(beyond)}"
+        warnings.warn(said, FflinWarning, stacklevel=3)

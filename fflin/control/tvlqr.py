@@ -22,6 +22,7 @@ from fflin.linear.sampling import GAUSS
 if TYPE_CHECKING:
     from fflin.linear.linear_trajectory import LinearTrajectory
     from fflin.linear.model import LinearModel
+    from fflin.linear.trajectory import Trajectory
 
 # Between two knots P is a cubic; knots are added until it is this accurate, relative to P.
 _ACCURACY = 1e-7
@@ -138,21 +139,26 @@ def tvlqr(
 
 def steady_end(traj: LinearTrajectory) -> LinearModel:
     """Return the model at the end where that is steady, else at rest in the last configuration."""
+    lin = traj[-1]
+    if lin.is_equilibrium():
+        return lin
+    try:
+        return resting_end(traj)
+    except EquilibriumError as error:
+        raise EquilibriumError(f"at the end: {error}; give Q, R and Qf") from None
+
+
+def resting_end(traj: Trajectory) -> LinearModel:
+    """Return the model at rest in the last configuration, in base axes; rotors spin on there."""
     from fflin.linear.equilibrium import equilibrium
     from fflin.linear.ignorable import rotor_names
     from fflin.linear.linearization import Linearizer
 
-    lin, robot = traj[-1], traj.robot
-    if lin.is_equilibrium():
-        return lin
+    robot, q, v = traj.robot, traj.q[-1], np.zeros(traj.robot.nv)
     rotors = rotor_names(robot)
     spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
-    v = np.zeros(robot.nv)
-    v[spinning] = lin.v[spinning]
-    try:
-        return Linearizer(robot, moving=True)(lin.q, v, equilibrium(robot, lin.q, v=v).u)
-    except EquilibriumError as error:
-        raise EquilibriumError(f"at the end: {error}; give Q, R and Qf") from None
+    v[spinning] = traj.v[-1, spinning]
+    return Linearizer(robot, moving=True)(q, v, equilibrium(robot, q, v=v).u)
 
 
 def _cost_from(lin: Any, Q: Array, R: Array, sample: float | None) -> Array:

@@ -24,7 +24,7 @@ Frame = Literal["hybrid", "local", "world"]
 
 # Which base velocities (omega_b, v_b), and wrenches (tau_b, F_b) with them, stand in the axes
 # of the reference instead of the base's.
-_IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
+IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
     "hybrid": (False, True),
     "local": (False, False),
     "world": (True, True),
@@ -98,7 +98,7 @@ class StateMap:
         n = robot.n
         self.robot = robot
         self.frame: Frame = frame
-        self.axes = _IN_REFERENCE_AXES[frame]
+        self.axes = IN_REFERENCE_AXES[frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
         self.nx = 12 + 2 * n
         self.groups = groups_of(n)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeAlias
+from itertools import compress
+from typing import Any, TypeAlias
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from fflin.base.rotation import (
     conjugate,
@@ -17,7 +19,7 @@ from fflin.base.rotation import (
 )
 from fflin.base.validation import Array
 from fflin.dynamics.chart import Chart
-from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.dynamics.state import ANGULAR, IN_REFERENCE_AXES, LINEAR, StateMap
 
 Readout: TypeAlias = Callable[[Array, Array], Array]
 
@@ -110,6 +112,47 @@ def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:
         return result
 
     return f
+
+
+def moving_errors(frame: str, x: Array, target: Array) -> Array:
+    """Return the errors (N, nx) of states from those of a moving reference, in its axes (9.5)."""
+    e, (turn, R), (turn_target, R_target) = x - target, _turned(x), _turned(target)
+    # The vector part of target^-1 x, on the side that is nearer.
+    q_b, q_target, scalar = x[:, :3], target[:, :3], (turn * turn_target)
+    scalar = scalar + (q_b * q_target).sum(axis=1, keepdims=True)
+    e[:, :3] = turn_target * q_b - turn * q_target - np.cross(q_target, q_b)
+    e[:, :3] *= np.where(scalar < 0.0, -1.0, 1.0)
+    e[:, 3:6] = (e[:, None, 3:6] @ R_target)[:, 0]
+    for rows in _in_reference(frame, x.shape[1]):
+        e[:, rows] = (x[:, None, rows] @ R - target[:, None, rows] @ R_target)[:, 0]
+    return e
+
+
+def moved_by(frame: str, target: Array, e: Array) -> Array:
+    """Return the states (N, nx) whose `moving_errors` are e; not finite where |q_b| is above 1."""
+    x, (turn_target, R_target), (turn, R) = target + e, _turned(target), _turned(e)
+    q_e, q_target = e[:, :3], target[:, :3]
+    x[:, :3] = turn_target * q_e + turn * q_target + np.cross(q_target, q_e)
+    scalar = turn * turn_target - (q_e * q_target).sum(axis=1, keepdims=True)
+    x[:, :3] *= np.where(scalar < 0.0, -1.0, 1.0)
+    x[:, 3:6] = target[:, 3:6] + (R_target @ e[:, 3:6, None])[..., 0]
+    R = R_target @ R
+    for rows in _in_reference(frame, x.shape[1]):
+        own = (target[:, None, rows] @ R_target)[:, 0] + e[:, rows]
+        x[:, rows] = (R @ own[..., None])[..., 0]
+    return x
+
+
+def _turned(x: Array) -> tuple[Array, Array]:
+    """Return the scalar part (N, 1) of the attitude of states, not negative, and the rotation."""
+    scalar = np.sqrt(1.0 - (x[:, :3] ** 2).sum(axis=1, keepdims=True))
+    return scalar, rotation_matrices(np.hstack((x[:, :3], scalar)))
+
+
+def _in_reference(frame: str, nx: int) -> list[NDArray[np.integer[Any]]]:
+    """Return where states have velocities of the base in reference axes."""
+    velocities = np.arange(nx)[nx // 2 :]
+    return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]
 
 
 def moving_error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Array) -> Array:

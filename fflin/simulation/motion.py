@@ -18,6 +18,7 @@ from fflin.base.names import chosen, input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, check_ending, write_whole
+from fflin.dynamics.state_rows import moving_errors
 from fflin.simulation.passed import Limited, Passed, Saturated, passed, saturated
 
 FORMATS = (*record.FORMATS, ".csv")
@@ -44,8 +45,9 @@ class Motion(Design):
         The state in the chart of `reference` and `frame`; continuous joints go on counting turns.
     u : ndarray (N, nu)
         What acted from t on, in the frame's axes; the last row repeats what acted to the end.
-    target : ndarray (nx,)
-        The state that is steered to, or one a row, (N, nx); empty where none is known.
+    target : ndarray (nx,) or (N, nx)
+        The state that is steered to, of a motion that is followed the one at each time; empty
+        where none is known.
     prediction : ndarray (N, nx)
         The state as the linear model has it under the same law; no rows where there is none.
     energy : ndarray (N,)
@@ -156,8 +158,18 @@ class Motion(Design):
 
     @property
     def error(self) -> Array | None:
-        """The states less the target (N, nx); None where there is no target."""
+        """The states less the target (N, nx); None where there is no target.
+
+        Of a target that moves, in its own axes, as `linearize_trajectory` has it.
+        """
+        if self.tracked:
+            return moving_errors(self.frame, self.x, self.target)
         return self.x - self.target if self.target.size else None
+
+    @property
+    def tracked(self) -> bool:
+        """Whether the target moves, one a row."""
+        return self.target.ndim == 2 and self.target.size > 0
 
     @property
     def attitude_error(self) -> Array | None:

@@ -14,6 +14,7 @@ from fflin.base.validation import Array, vector
 from fflin.control.channel import Channel, Law
 from fflin.control.policies import bound
 from fflin.control.saturation import Saturation
+from fflin.control.tracking import Reference, TrajectoryFeedback
 from fflin.dynamics import points
 from fflin.dynamics.integrators import Integrator, integrator
 from fflin.dynamics.state import StateMap
@@ -59,9 +60,10 @@ class Plan:
     progress: bool | None  # whether a bar is shown; None shows it where the run takes long
     near: Array | None  # the state (nx,) from which continuous joints count turns
     target: Array | None  # the state (nx,) that is steered to, where one is known
+    reference: Reference | None  # the motion that is followed, where there is one
     steered: tuple[str, ...]  # the states that are known to be fed back
     notes: tuple[str, ...]  # what is to be said of the run
-    predictor: Predictor | None  # of the linear motion under the same law
+    predictor: Predictor | TrajectoryFeedback | None  # of the linear motion under the same law
 
     def channel(self) -> Channel | None:
         """Return the way of the law's commands to the inputs, with nothing on it yet."""
@@ -70,13 +72,18 @@ class Plan:
         return Channel(self.law, self.initial, self.limits, self.times.sample, self.times.delay)
 
 
-def start_of(state: StateMap, x0: Any, q0: Any, v0: Any) -> tuple[Array, Array]:
+def start_of(
+    state: StateMap, x0: Any, q0: Any, v0: Any, reference: Reference | None
+) -> tuple[Array, Array]:
     """Return the initial configuration and velocity (nq,), (nv,)."""
     robot = state.robot
     if x0 is not None:
         if q0 is not None or v0 is not None:
             raise InputError("x0 is given with q0 or v0; give either")
         q, v = state.to_pinocchio(x0)
+    elif reference and q0 is v0 is None:
+        q, v, _ = reference(0.0)
+        q, v = q.copy(), v.copy()
     elif robot.start and q0 is None and v0 is None:
         q, v = points.start_of(robot)
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -11,18 +12,18 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.control.channel import Channel
 from fflin.control.output_feedback import OutputFeedback
-from fflin.control.policies import Allocation, TrajectoryFeedback
+from fflin.control.policies import Allocation
+from fflin.control.tracking import TrajectoryFeedback
+from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import moved_by, moving_errors
 from fflin.linear.model import LinearModel
 from fflin.simulation.plan import LinearLaw, Plan, Predictor
 from fflin.simulation.plant import Plant
 
-_WHY_NOT = {
-    Allocation: "an Allocation has thrusters that cannot pull, so that it is not linear",
-    TrajectoryFeedback: "a TrajectoryFeedback is linear along a trajectory, not about one point",
-}
+_WHY_NOT = {Allocation: "an Allocation has thrusters that cannot pull, so that it is not linear"}
 
 
-def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | None:
+def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryFeedback | None:
     """Return what predicts a run: the policy's own model, or the one that is given.
 
     Raises
@@ -34,6 +35,13 @@ def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | None:
         linear = bool(linear)
     if linear is False:
         return None
+    if isinstance(policy, TrajectoryFeedback):
+        if linear is None or linear is True:
+            return policy
+        raise InputError(
+            "a TrajectoryFeedback is linear along a trajectory, not about one point; leave linear "
+            "out"
+        )
     own: Any = getattr(policy, "lin", None)
     if not (linear is None or linear is True):
         own = _checked(plant, policy, linear)
@@ -105,7 +113,7 @@ def _law(policy: Any, lin: LinearModel) -> Callable[[], LinearLaw] | None:
     return lambda: feedback
 
 
-def predict(plan: Plan, x: Array, steps: int) -> Array:
+def predict(plan: Plan, x: Array, steps: int, target: Array) -> Array:
     """Return the states (N, nx) of the linear model in closed loop; no rows where it has none.
 
     Parameters
@@ -116,12 +124,19 @@ def predict(plan: Plan, x: Array, steps: int) -> Array:
         The states of the nonlinear robot, where the first row begins.
     steps : int
         That are taken; the last one has a row in any case.
+    target : ndarray (N, nx)
+        The states of the trajectory that is followed, where one is.
     """
     if plan.predictor is None:
         return x[:0]
     # A prediction that overflows is none.
     with np.errstate(over="ignore", invalid="ignore"):
-        found = _states(plan.predictor, plan, x[0], steps)[: len(x)]
+        if isinstance(plan.predictor, TrajectoryFeedback):
+            # The frame of a trajectory's errors.
+            e = _errors(plan.predictor, plan, moving_errors("local", x[:1], target[:1])[0], steps)
+            found = moved_by("local", target, e[: len(x)]) if len(e) >= len(x) else x[:0]
+        else:
+            found = _states(plan.predictor, plan, x[0], steps)[: len(x)]
     return found if len(found) == len(x) and np.isfinite(found).all() else x[:0]
 
 
@@ -164,3 +179,49 @@ def _states(predictor: Predictor, plan: Plan, x: Array, steps: int) -> Array:
             stages.append(lin.A @ at + lin.B @ (channel.ask(at) - u0) + lin.f0)
         e = e + dt / 6.0 * (stages[0] + 2.0 * (stages[1] + stages[2]) + stages[3])
     return np.array([*rows, e]) + x0
+
+
+def _errors(policy: TrajectoryFeedback, plan: Plan, e: Array, steps: int) -> Array:
+    """Return the errors from a trajectory that the linear models along it have, see `predict`."""
+    dt, _, every, sample, delay, *_ = plan.times
+    models, limits = policy.models, plan.limits
+    start = float(models.t[0])
+
+    def at(t: float) -> tuple[Array, Array, Array]:
+        """Return A, B and the inputs of the trajectory at a time of the run."""
+        if t > policy.duration:
+            return policy.end.A, policy.end.B, policy.end.u0
+        return (*models.matrices(start + t), policy.reference(t)[2])
+
+    def law(t: float, e: Array) -> Array:
+        return policy.reference(t)[2] - policy.gain(t) @ e
+
+    if limits.wheels:
+        names = limits.wheels.names
+        of = [models.state_names.index(f"qdot_m.{name}") for name in names]
+        of_v = [models.robot.joint(name).idx_v for name in names]
+
+        def speeds(t: float, e: Array) -> Array:
+            return policy.reference(t)[1][of_v] + e[of]
+
+        limits = limits._replace(wheels=limits.wheels._replace(speeds=speeds))
+    channel = Channel(law, plan.initial, limits, sample, delay)
+    rows, after, ended = [], at(0.0), False
+    for step in range(steps):
+        t = step * dt
+        u = channel.begin(step, t, e)
+        if step % every == 0:
+            rows.append(e)
+        if not ended and t > policy.duration - 1e-6 * dt:
+            # From here on the error is counted from rest.
+            ended, after = True, at(math.inf)
+            stop = policy.reference(policy.duration)[1] - policy.end.v
+            e = e + np.concatenate((np.zeros(len(e) // 2), StateMap(models.robot).velocities(stop)))
+        before, half, after = after, at(t + 0.5 * dt), at(t + dt)
+        stages: list[Array] = []
+        for share, (A, B, u_star) in ((0.0, before), (0.5, half), (0.5, half), (1.0, after)):
+            to = e + share * dt * stages[-1] if stages else e
+            acting = channel.ask(t + share * dt, to) if channel.continuous and stages else u
+            stages.append(A @ to + B @ (acting - u_star))
+        e = e + dt / 6.0 * (stages[0] + 2.0 * (stages[1] + stages[2]) + stages[3])
+    return np.array([*rows, e])

@@ -129,7 +129,9 @@ def verdict(motion: Any, kinds: list[Course]) -> str:
     places = [kind for kind in kinds if kind.title in _PLACES]
     judged = [kind for kind in places if kind.steered] or [k for k in kinds if k.steered]
     moved = [kind for kind in judged if kind.size.max() > _THERE]
-    if failed := [kind.last for kind in moved if kind.late]:
+    if motion.tracked:
+        said = f"beside its trajectory at the end: {_and([kind.last for kind in judged])}"
+    elif failed := [kind.last for kind in moved if kind.late]:
         said = f"not settled: {_and(failed)} at the end"
     elif moved:
         when = motion.t[max(kind.settled for kind in moved)]

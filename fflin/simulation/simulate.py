@@ -11,8 +11,9 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, truth
 from fflin.control.plants import notes_of
-from fflin.control.policies import fed_back
+from fflin.control.policies import axes_of, feedback_of
 from fflin.control.saturation import saturation, warn_beyond
+from fflin.control.tracking import followed, reference_of, steered_by, tracking_of
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import state_history
 from fflin.linear.model import LinearModel
@@ -36,6 +37,7 @@ from fflin.simulation.times import times_of
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from fflin.control.gain_schedule import GainSchedule
     from fflin.control.policies import Policy, StateFeedback
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
@@ -45,12 +47,12 @@ if TYPE_CHECKING:
 
 def simulate(
     robot: Robot,
-    policy: Policy | StateFeedback | Any = None,
+    policy: Policy | StateFeedback | GainSchedule | Any = None,
     *,
     x0: ArrayLike | None = None,
     q0: ArrayLike | None = None,
     v0: ArrayLike | None = None,
-    duration: float,
+    duration: float | None = None,
     dt: float | None = None,
     method: str = "cf4",
     project: bool = True,
@@ -80,15 +82,17 @@ def simulate(
     robot : Robot
     policy : callable, optional
         policy(t, q, v) -> u (nu,) over the robot's inputs, such as
-        ``StateFeedback(lin, gain.K)``; none acts by default.
+        ``StateFeedback(lin, gain.K)``; of a `GainSchedule` the feedback along its trajectory. None
+        acts by default.
     x0 : array_like (nx,), optional
         Initial state in the chart of the policy's model, or of `frame` and `reference`.
     q0 : array_like (nq,), optional
     v0 : array_like (nv,), optional
         Initial configuration and velocity in Pinocchio's order, instead of `x0`; neutral and at
-        rest by default, or the robot's `start` where nothing of these is given.
-    duration : float
-        [s]
+        rest by default, or where nothing of these is given the start of the trajectory that is
+        followed, or the robot's `start`.
+    duration : float, optional
+        [s]; by default that of the trajectory that is followed.
     dt : float, optional
         Step [s]; by default 0.01, or less where the loop's fastest pole or the samples ask for it.
         Where the input is neither sampled nor late, it is made to divide the duration.
@@ -115,15 +119,16 @@ def simulate(
     callback : callable, optional
         callback(t, q, v, u), called at every recorded row.
     linear : LinearModel or bool, optional
-        Predicts the motion under the same law, of a StateFeedback, an OutputFeedback without its
-        noise, or none; by default the policy's own model, False for none. Sampled, it does so
-        where every row is at a sample.
+        Predicts the motion under the same law, of a StateFeedback, a feedback along a trajectory,
+        an OutputFeedback without its noise, or none; by default the policy's own model, False for
+        none. Sampled, it does so where every row is at a sample.
     target : LinearModel or array_like (nx,), optional
         State, or model whose point it is, that errors are counted from; by default the point of
-        the policy's own model, and none under a policy without one.
+        the policy's own model, or along a trajectory the state that it has at each time, and none
+        under a policy without one.
     frame : {"hybrid", "local", "world"}, optional
     reference : pin.SE3, optional
-        Chart of x and axes of u; the policy's model's by default, else hybrid and the identity.
+        Chart of x and axes of u; the policy's by default, else hybrid and the identity.
     every : int, optional
         Steps from one recorded row to the next; by default 1, or where that would be more than
         100,000 rows, as many as leave 10,000, which the motion's `notes` say.
@@ -154,32 +159,52 @@ def simulate(
     ----------
     E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
     """
-    own: Any = getattr(policy, "lin", None)
-    lin = own if isinstance(own, LinearModel) else None
-    if lin is not None:
-        if frame is not None or reference is not None:
-            raise InputError("frame and reference are those of the policy's model; leave out")
-        frame, reference = lin.frame, lin.reference
-    state = StateMap(robot, reference=reference, frame="hybrid" if frame is None else frame)
+    policy = followed(policy, robot)
+    lin, _ = feedback_of(policy)
+    follows, along = reference_of(policy), tracking_of(policy)
+    own_frame, own_reference = axes_of(policy)
+    if lin is not None and (frame is not None or reference is not None):
+        raise InputError("frame and reference are those of the policy's model; leave out")
+    if along and frame not in (None, own_frame):
+        raise InputError(
+            f"frame is {frame!r}, expected '{own_frame}' along a trajectory, whose inputs are in "
+            "base axes; leave it out"
+        )
+    state = StateMap(
+        robot,
+        reference=own_reference if reference is None else reference,
+        frame=own_frame if frame is None else frame,
+    )
     plant = Plant(state, disturbance)
     foresees = predictor(plant, policy, linear)
-    q, v = start_of(state, x0, q0, v0)
+    q, v = start_of(state, x0, q0, v0, follows)
     times = times_of(policy, duration, dt, every, sample, delay)
     times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=dt is None)
     acting, known = chosen_limits(robot, limits)
     within = saturation(robot, acting, q, times.dt, times.sample)
     law = law_of(policy, plant, within, times)
-    # The model's inputs are others where they are allocated to the robot's.
-    same = lin is not None and lin.input_names == plant.actuation.names
-    if lin is not None and same:
-        warn_beyond(lin, "at its target", lin.u0, within.low, within.high)
+    signals, cut = (plant.actuation.names, plant.actuation.units), (within.low, within.high)
+    follows = follows if target is None else None
     goal = target_of(state, lin if target is None else target)
+    initial = np.zeros(len(within.low))
+    # The model's inputs are others where they are allocated to the robot's.
+    if lin is not None and lin.input_names == plant.actuation.names:
+        initial = np.asarray(lin.u0)
+        warn_beyond(robot.name, "at its target", *signals, lin.u0[None], *cut)
+    elif along is policy is not None:
+        initial = along.reference(0.0)[2]
+        warn_beyond(robot.name, "on its trajectory", *signals, along.trajectory.u_base, *cut)
+    near = goal
+    if x0 is not None:
+        near = np.asarray(x0, dtype=float)
+    elif follows:
+        near = state.read(*follows(0.0)[:2])
     plan = Plan(
         q=q,
         v=v,
         times=times,
         law=law,
-        initial=lin.u0 if lin is not None and same else np.zeros(len(within.low)),
+        initial=initial,
         limits=within,
         known=known,
         method=method_of(method, times),
@@ -189,9 +214,10 @@ def simulate(
         events=events_of(events, callback),
         callback=callback,
         progress=progress,
-        near=goal if x0 is None else np.asarray(x0, dtype=float),
+        near=near,
         target=goal,
-        steered=fed_back(policy),
+        reference=follows,
+        steered=steered_by(policy),
         notes=(*notes_of(policy, robot), *times.notes),
         predictor=foresees,
     )
@@ -210,6 +236,10 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
     conserved = Conserved(robot, plan.q)
     run = go(plan, plant, conserved)
     x = state_history(state, run.q, run.v, plan.near, run.t)
+    target = np.zeros(0) if plan.target is None else plan.target
+    if plan.reference is not None:
+        q, v, _ = map(np.array, zip(*map(plan.reference, run.t.tolist()), strict=True))
+        target = state_history(state, q, v, plan.near, run.t)
     history = conserved.histories(run.q, run.v)
     return Motion(
         t=run.t,
@@ -217,8 +247,8 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         v=run.v,
         x=x,
         u=run.u,
-        target=np.zeros(0) if plan.target is None else plan.target,
-        prediction=predict(plan, x, run.steps),
+        target=target,
+        prediction=predict(plan, x, run.steps, target),
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
         momentum_drift=conserved.momentum_drift(history, run.momentum),

@@ -10,6 +10,7 @@ import numpy as np
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import number, whole
 from fflin.control.policies import feedback_of
+from fflin.control.tracking import TrajectoryFeedback, largest_rate, tracking_of
 
 LARGEST_TURN = 1.0  # within one step [rad], beyond which no integrator follows
 _STEP = 0.01  # [s]
@@ -75,24 +76,27 @@ class Times(NamedTuple):
 
     @property
     def _moving(self) -> str:
-        return f": {self.mode} moves most there"
+        return f": {self.mode} moves most there" if self.mode else ""
 
 
 def times_of(
     policy: Any,
-    duration: float,
+    duration: float | None,
     dt: float | None,
     every: int | None,
     sample: float | None,
     delay: float,
 ) -> Times:
     """Return the times of a simulation, whose arguments are those of `simulate`."""
+    follows = tracking_of(policy)
     if sample is not None:
         sample = _positive("sample", sample)
     else:
-        sample = getattr(getattr(policy, "lin", None), "dt", None) or None
-    fastest, mode = (0.0, "") if sample else _fastest_pole(policy)
-    duration, delay = _positive("duration", duration), number("delay", delay)
+        made = follows.schedule if follows else getattr(policy, "lin", None)
+        sample = getattr(made, "dt", None) or None
+    fastest, mode = (0.0, "") if sample else _fastest_pole(policy, follows)
+    duration = _positive("duration", _duration(duration, follows))
+    delay = number("delay", delay)
     if not 0.0 <= delay <= _LONGEST:
         raise InputError(f"delay is {delay:g} s, expected 0 to {_LONGEST:g} s")
     if every is not None:
@@ -122,6 +126,12 @@ def times_of(
     return Times(dt, steps, every, samples, late, fastest, mode, thinned)
 
 
+def _duration(given: float | None, follows: TrajectoryFeedback | None) -> float:
+    if given is None and follows is None:
+        raise InputError("duration is missing; give it [s]")
+    return follows.duration if given is None and follows else given  # type: ignore[return-value]
+
+
 def _thinning(steps: int, sample: int) -> int:
     """Return the steps from row to row, for rows that are few and fall on samples, if there are."""
     least = -(-steps // _FEW_ROWS)
@@ -130,12 +140,14 @@ def _thinning(steps: int, sample: int) -> int:
     return next(part for part in range(least, sample + 1) if sample % part == 0)
 
 
-def _fastest_pole(policy: Any) -> tuple[float, str]:
+def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> tuple[float, str]:
     """Return the largest magnitude [1/s] of the poles of a continuous loop, and what moves there.
 
     The state is named that takes the largest part in the mode, by the products of its left and
     right vectors, which have no unit; only where the pole asks for a step below the usual one.
     """
+    if follows is not None:
+        return largest_rate(follows.schedule), ""
     lin, K = feedback_of(policy)
     if lin is None or K is None or lin.dt:
         return 0.0, ""

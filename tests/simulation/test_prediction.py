@@ -5,7 +5,7 @@ import pytest
 
 import fflin
 from tests.support.measured import FELT, POSITIONS, designed, foreseen
-from tests.support.motions import displaced, motion, regulated
+from tests.support.motions import displaced, regulated
 from tests.support.weights import unit_weights
 
 
@@ -64,14 +64,9 @@ def test_a_model_about_another_point_foresees_with_the_policys_law():
 def test_where_nothing_can_be_foreseen_the_reason_is_said():
     robot, lin, gain = regulated("planar_detumble")
     feedback = fflin.StateFeedback(lin, gain.K)
-    t, q, v, u = motion(robot)
-    along = fflin.linearize_trajectory(robot, t, q, v, u)
     batch = fflin.sweep(robot, fflin.grid(robot, {"joint_1": [0.0, 1.0]}))
     policies = {
         "an Allocation has thrusters that cannot pull": fflin.Allocation(feedback, robot),
-        "a TrajectoryFeedback is linear along a trajectory": fflin.TrajectoryFeedback(
-            along, fflin.tvlqr(along, 1.0, 1.0, 1.0)
-        ),
         "a ScheduledFeedback is not known to be linear": fflin.ScheduledFeedback(
             lin, fflin.lqr_batch(batch, 1.0, 1.0)
         ),

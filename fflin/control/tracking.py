@@ -1,0 +1,160 @@
+"""Feedback along a trajectory, and the reference that it follows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from fflin.base.errors import EquilibriumError, InputError
+from fflin.base.validation import Array
+from fflin.control.gain_schedule import GainSchedule
+from fflin.control.policies import Allocation, fed_back
+from fflin.control.tvlqr import resting_end
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import moving_error
+from fflin.linear.fit import require_same, require_turns
+from fflin.linear.linear_trajectory import LinearTrajectory, along
+from fflin.linear.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from fflin.control.policies import Policy
+    from fflin.linear.model import LinearModel
+    from fflin.robot.robot import Robot
+
+# Returns q, v and u in the policy's axes at a time of the run.
+Reference: TypeAlias = Callable[[float], tuple[Array, Array, Array]]
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryFeedback:
+    """The feedback ``u = u*(t) - K(t) e`` of the error from a trajectory.
+
+    The error is that of `linearize_trajectory`, u on the base is in base axes, and t is the time
+    since the first knot. After the end the last configuration at rest is the target, with what
+    holds the robot there and the last K.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    schedule : GainSchedule
+        As `tvlqr` returns it.
+    """
+
+    trajectory: Trajectory
+    schedule: GainSchedule
+
+    frame = "local"
+
+    def __post_init__(self) -> None:
+        if not (
+            isinstance(self.trajectory, Trajectory) and isinstance(self.schedule, GainSchedule)
+        ):
+            raise InputError(
+                "TrajectoryFeedback takes a LinearTrajectory and a GainSchedule, as "
+                "fflin.linearize_trajectory and fflin.tvlqr return them"
+            )
+
+    @property
+    def duration(self) -> float:
+        """Time [s] from the first knot to the last."""
+        return float(self.trajectory.t[-1] - self.trajectory.t[0])
+
+    @cached_property
+    def models(self) -> LinearTrajectory:
+        """The linear models along the trajectory."""
+        motion = self.trajectory
+        return motion if isinstance(motion, LinearTrajectory) else along(motion)
+
+    @cached_property
+    def end(self) -> LinearModel:
+        """The model at rest in the last configuration; InputError where nothing holds it."""
+        try:
+            return resting_end(self.trajectory)
+        except EquilibriumError as error:
+            raise InputError(
+                f"after the trajectory's {self.duration:g} s nothing holds the robot: {error}; "
+                "give no longer duration"
+            ) from None
+
+    def reference(self, t: float) -> tuple[Array, Array, Array]:
+        """Return q, v, and u in base axes that are followed at a time of the run."""
+        if t > self.duration:
+            return self.end.q, self.end.v, self.end.u0
+        return self.trajectory.flow.at(float(self.trajectory.t[0]) + max(t, 0.0))
+
+    def gain(self, t: float) -> Array:
+        """Return K (nu, nx) at a time of the run."""
+        knots = self.schedule.t
+        return self.schedule.gain(float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0])))
+
+    def bind(self, robot: Robot) -> Policy:
+        """Return policy(t, q, v) -> u for a robot.
+
+        Raises
+        ------
+        InputError
+            If the robot has not the trajectory's states and inputs; its masses may be others.
+        """
+        origin = self.trajectory.robot
+        state, own = StateMap(robot, frame="local"), StateMap(origin, frame="local")
+        made = f"the trajectory is one of '{origin.name}'"
+        for kind, pair in (("input", map(Actuation, (own, state))), ("state", (own, state))):
+            require_same(made, robot, kind, *((each.names, each.units) for each in pair))
+        require_turns(made, origin.nq, robot)
+
+        def policy(t: float, q: Array, v: Array) -> Array:
+            q_star, v_star, u_star = self.reference(t)
+            u: Array = u_star - self.gain(t).dot(moving_error(state, q_star, v_star, q, v))
+            return u
+
+        return policy
+
+
+def followed(policy: Any, robot: Robot) -> Any:
+    """Return a policy, for a schedule the feedback along its trajectory."""
+    if isinstance(policy, Allocation):
+        return replace(policy, policy=followed(policy.policy, policy.design))
+    if isinstance(policy, GainSchedule):
+        return TrajectoryFeedback(policy.trajectory(robot), policy)
+    return policy
+
+
+def reference_of(policy: Any) -> Reference | None:
+    """Return what a policy follows, where it follows a motion."""
+    decides = policy.policy if isinstance(policy, Allocation) else policy
+    found = getattr(decides, "reference", None)
+    return found if callable(found) else None
+
+
+def tracking_of(policy: Any) -> TrajectoryFeedback | None:
+    """Return the feedback along a trajectory that a policy is or allocates."""
+    decides = policy.policy if isinstance(policy, Allocation) else policy
+    return decides if isinstance(decides, TrajectoryFeedback) else None
+
+
+def steered_by(policy: Any) -> tuple[str, ...]:
+    """Return the names of the states that a policy feeds back, as far as that is known."""
+    if (follows := tracking_of(policy)) is None:
+        return fed_back(policy)
+    used, names = np.abs(follows.schedule.K).max(axis=(0, 1)), follows.schedule.state_names
+    return tuple(name for name, size in zip(names, used, strict=True) if size)
+
+
+def largest_rate(schedule: GainSchedule) -> float:
+    """Return the magnitude [1/s] that the loop's poles pass for a twentieth of the time alone.
+
+    A large weight at the end makes K large for a moment, which is over before it does harm; the
+    inputs of samples do not follow at all, 0.
+    """
+    if schedule.dt:
+        return 0.0
+    rates = np.abs(np.linalg.eigvals(schedule.A - schedule.B @ schedule.K)).max(axis=1)
+    held, rates = np.diff(schedule.t), np.maximum(rates[1:], rates[:-1])
+    order = rates.argsort()
+    passed = np.searchsorted(held[order].cumsum(), 0.95 * held.sum())
+    return float(rates[order][min(int(passed), len(rates) - 1)])

@@ -1,0 +1,224 @@
+"""Runs along a trajectory: what they follow, how far they are from it, what is foreseen."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from fflin.dynamics.state_rows import moved_by, moving_error, moving_errors
+
+
+def swung(robot, duration=4.0, *, size=0.1, spin=0.0, sample=None):
+    """A motion under joint torques that swing, and come to nothing at the end."""
+    nu = len(fflin.linearize(robot).u0)
+
+    def policy(t, q, v):
+        return size * np.sin(2.0 * np.pi * t / duration) * np.cos(np.arange(nu))
+
+    v0 = np.zeros(robot.nv)
+    v0[3:6] = spin
+    return fflin.simulate(
+        robot, policy, v0=v0, duration=duration, dt=0.01, frame="local", sample=sample
+    )
+
+
+def beside(robot, traj, size, seed=3):
+    step = size * np.random.default_rng(seed).standard_normal(robot.nv)
+    return pin.integrate(robot.model, traj.q[0], step), traj.v[0] + 0.3 * step
+
+
+@pytest.fixture(scope="module")
+def case():
+    robot = fflin.load("ets_vii")
+    traj = swung(robot, spin=0.05).trajectory()
+    return robot, fflin.tvlqr(fflin.linearize_trajectory(robot, traj)), traj
+
+
+@pytest.mark.parametrize("frame", ["local", "hybrid", "world"])
+def test_the_errors_of_rows_are_those_of_points_and_lead_back(frame):
+    robot, rng = fflin.load("servicer_7dof"), np.random.default_rng(5)
+    state = fflin.StateMap(robot, frame=frame)
+    turns = 0.5 * rng.standard_normal((20, robot.nv))
+    q = [pin.integrate(robot.model, robot.neutral(), turn) for turn in turns]
+    v = rng.standard_normal((20, robot.nv))
+    x = np.array([state.to_state(*each) for each in zip(q, v, strict=True)])
+    e = moving_errors(frame, x[1:], x[:-1])
+    for k, row in enumerate(e):
+        here = moving_error(state, q[k], v[k], q[k + 1], v[k + 1])
+        here[6 : 6 + robot.n] = x[k + 1, 6 : 6 + robot.n] - x[k, 6 : 6 + robot.n]
+        np.testing.assert_allclose(row, here, atol=1e-13)
+    np.testing.assert_allclose(moved_by(frame, x[:-1], e), x[1:], atol=1e-13)
+
+
+def test_a_schedule_runs_as_the_feedback_along_its_trajectory(case):
+    robot, schedule, traj = case
+    q0, v0 = beside(robot, traj, 0.02)
+    run = fflin.simulate(robot, schedule, q0=q0, v0=v0)
+    assert run.t[-1] == traj.t[-1]
+    assert run.frame == "local"
+    assert run.tracked
+    policy = fflin.TrajectoryFeedback(traj, schedule)
+    np.testing.assert_array_equal(fflin.simulate(robot, policy, q0=q0, v0=v0).x, run.x)
+    # Target and error are those of the time, as the feedback has them.
+    state = fflin.StateMap(robot, frame="local")
+    for k in (0, 137, 400):
+        q, v, u = traj.point(run.t[k])
+        np.testing.assert_allclose(run.target[k], state.to_state(q, v), atol=1e-13)
+        e = moving_error(state, q, v, run.q[k], run.v[k])
+        np.testing.assert_allclose(run.error[k], e, atol=1e-13)
+        if k < 400:
+            np.testing.assert_allclose(run.u[k], u - schedule.gain(run.t[k]) @ e, atol=1e-12)
+    apart = [
+        pin.log3(pin.XYZQUATToSE3(r[:7]).rotation.T @ pin.XYZQUATToSE3(q[:7]).rotation)
+        for r, q in ((traj.point(t)[0], q) for t, q in zip(run.t, run.q, strict=True))
+    ]
+    np.testing.assert_allclose(
+        run.attitude_error, np.degrees(np.linalg.norm(apart, axis=1)), atol=1e-9
+    )
+    assert str(run).startswith("beside its trajectory at the end: attitude")
+
+
+def test_without_a_start_it_begins_on_its_trajectory(case):
+    robot, schedule, traj = case
+    run = fflin.simulate(robot, schedule)
+    np.testing.assert_array_equal(run.q[0], traj.q[0])
+    np.testing.assert_array_equal(run.v[0], traj.v[0])
+    assert np.abs(run.error).max() < 1e-5
+
+
+def test_what_is_foreseen_along_a_trajectory_is_off_by_the_square_of_the_error(case):
+    robot, schedule, traj = case
+    off = []
+    for size in (2e-2, 1e-2, 5e-3):
+        q0, v0 = beside(robot, traj, size)
+        run = fflin.simulate(robot, schedule, q0=q0, v0=v0, linear=True)
+        assert run.linear is not None
+        np.testing.assert_allclose(run.linear[0], run.x[0], atol=1e-14)
+        off.append(np.abs(run.linear - run.x).max())
+    np.testing.assert_allclose(np.log2([off[0] / off[1], off[1] / off[2]]), 2.0, atol=0.25)
+
+
+@pytest.mark.parametrize("options", [{"sample": 0.2}, {"limits": 0.12}, {"delay": 0.05}])
+def test_what_is_foreseen_is_sampled_late_and_limited_as_the_run_is(case, options):
+    robot, schedule, traj = case
+    q0, v0 = beside(robot, traj, 1e-3)
+    run = fflin.simulate(robot, schedule, q0=q0, v0=v0, **options)
+    plain = fflin.simulate(robot, schedule, q0=q0, v0=v0)
+    apart = np.abs(run.linear - run.x).max()
+    assert apart < 1e-4
+    assert apart < 0.05 * np.abs(plain.x - run.x).max()
+
+
+def test_after_the_end_the_last_configuration_is_held_at_rest():
+    robot = fflin.load("planar_detumble")
+    traj = swung(robot, size=0.3, spin=0.02).trajectory()
+    assert np.abs(traj.v[-1]).max() > 1e-2
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj))
+    run = fflin.simulate(robot, schedule, duration=120.0, dt=0.02)
+    after = run.t > traj.t[-1] + 1e-9
+    held = fflin.StateMap(robot, frame="local").to_state(traj.q[-1], np.zeros(robot.nv))
+    np.testing.assert_allclose(run.target[after], np.tile(held, (after.sum(), 1)), atol=1e-14)
+    assert np.abs(run.error[-1]).max() < 1e-4
+    assert np.abs(run.linear[-1] - run.x[-1]).max() < 1e-4
+
+
+def test_a_sampled_schedule_is_asked_at_its_samples():
+    robot = fflin.load("ets_vii")
+    traj = swung(robot, sample=0.2).trajectory()
+    assert traj.hold == "previous"
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj), sample=0.2)
+    q0, v0 = beside(robot, traj, 0.01)
+    run = fflin.simulate(robot, schedule, q0=q0, v0=v0, dt=0.02)
+    held = run.u[:-1].reshape(-1, 10, run.u.shape[1])
+    np.testing.assert_array_equal(held, np.repeat(held[:, :1], 10, axis=1))
+    state = fflin.StateMap(robot, frame="local")
+    q, v, u = traj.point(run.t[50])
+    e = moving_error(state, q, v, run.q[50], run.v[50])
+    np.testing.assert_allclose(run.u[50], u - schedule.gain(run.t[50]) @ e, atol=1e-12)
+
+
+def test_a_clock_that_does_not_begin_at_zero_is_counted_from_the_first_knot(case):
+    robot, schedule, traj = case
+    late = fflin.Trajectory(robot, traj.t + 100.0, traj.q, traj.v, traj.u, hold=traj.hold)
+    moved = fflin.tvlqr(fflin.linearize_trajectory(robot, late))
+    q0, v0 = beside(robot, traj, 0.02)
+    runs = [fflin.simulate(robot, each, q0=q0, v0=v0, linear=False) for each in (schedule, moved)]
+    np.testing.assert_allclose(runs[1].x, runs[0].x, atol=1e-9)
+
+
+def test_thrusters_take_what_a_schedule_asks_of_the_base():
+    design = fflin.load("cubesat", inputs=[fflin.BaseTorque(), fflin.BaseForce()])
+    traj = swung(design, size=1e-4, spin=0.02).trajectory()
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(design, traj))
+    places = [(x, y, z) for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.15, 0.15)]
+    thrusters = [
+        fflin.Thruster("base", place, -np.sign(place[axis]) * np.eye(3)[axis])
+        for place in places
+        for axis in range(3)
+    ]
+    robot = design.replace(inputs=thrusters)
+    q0, v0 = beside(design, traj, 1e-3)
+    alone = fflin.simulate(design, schedule, q0=q0, v0=v0)
+    run = fflin.simulate(robot, fflin.Allocation(schedule, design), q0=q0, v0=v0)
+    assert run.linear is None
+    np.testing.assert_allclose(run.x, alone.x, atol=1e-8)
+    np.testing.assert_allclose(run.target, alone.target, atol=1e-14)
+
+
+def test_limits_that_the_trajectory_itself_breaks_are_told(case):
+    robot, schedule, _ = case
+    with pytest.warns(fflin.FflinWarning, match=r"on its trajectory: .* is asked for 0\.\d+ N"):
+        fflin.simulate(robot, schedule, duration=0.1, limits=0.05)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"frame": "hybrid"}, "frame is 'hybrid', expected 'local' along a trajectory"),
+        ({"linear": "lin"}, "linear along a trajectory, not about one point"),
+    ],
+)
+def test_what_does_not_go_along_a_trajectory_is_refused(case, options, said):
+    robot, schedule, _ = case
+    if "linear" in options:
+        options = {"linear": fflin.linearize(robot)}
+    with pytest.raises(fflin.InputError, match=said):
+        fflin.simulate(robot, schedule, **options)
+
+
+def test_a_run_without_an_end_is_refused():
+    robot = fflin.load("cubesat")
+    with pytest.raises(fflin.InputError, match="duration is missing"):
+        fflin.simulate(robot)
+
+
+def test_a_schedule_of_another_robot_is_refused(case):
+    _, schedule, _ = case
+    with pytest.raises(fflin.InputError):
+        fflin.simulate(fflin.load("servicer_7dof"), schedule)
+
+
+def test_where_nothing_holds_the_robot_a_run_ends_with_its_trajectory():
+    robot = fflin.load(
+        "planar_detumble", gravity=(0.0, 0.0, -9.81), inputs=[fflin.JointTorque("joint_1")]
+    )
+    t = np.linspace(0.0, 0.4, 9)
+    fall = fflin.simulate(robot, duration=0.4, dt=0.01, every=5, frame="local")
+    along = fflin.linearize_trajectory(robot, fall.trajectory())
+    schedule = fflin.tvlqr(along, 1.0, 1.0, 1.0)
+    assert len(t) == len(fall.t)
+    assert np.abs(fflin.simulate(robot, schedule).error).max() < 1e-6
+    with pytest.raises(fflin.InputError, match=r"after the trajectory's 0\.4 s nothing holds"):
+        fflin.simulate(robot, schedule, duration=1.0)
+
+
+def test_a_motion_that_is_followed_comes_back_from_its_file(case, tmp_path):
+    robot, schedule, traj = case
+    q0, v0 = beside(robot, traj, 0.02)
+    run = fflin.simulate(robot, schedule, q0=q0, v0=v0, duration=0.5)
+    for name in ("a.npz", "a.mat", "a.json"):
+        run.save(tmp_path / name)
+        back = fflin.Motion.load(tmp_path / name)
+        np.testing.assert_array_equal(back.target, run.target)
+        np.testing.assert_array_equal(back.error, run.error)
+        assert back.tracked
