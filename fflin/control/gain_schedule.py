@@ -38,7 +38,7 @@ class GainSchedule(Design):
         The cost from t on is e' P(t) e.
     A : ndarray (M, nx, nx)
     B : ndarray (M, nx, nu)
-        The model at the knots, linear in between; or M - 1 that take a sample to the next.
+        The model at the knots; or M - 1 that take a sample to the next.
     Q, R, Qf : ndarray
         Weights of the continuous cost.
     residual : float
@@ -126,8 +126,9 @@ class GainSchedule(Design):
             return self.K[k]
         x = t - self._starts[k]
         square = x * x
-        powers = np.array((1.0, x, square, square * x, square * square))
-        K: Array = powers.dot(self._quartics[k]).reshape(self.K.shape[1:])
+        fourth = square * square
+        powers = np.array((1.0, x, square, square * x, fourth, fourth * x, fourth * square))
+        K: Array = powers.dot(self._pieces[k]).reshape(self.K.shape[1:])
         return K
 
     def cost_to_go(self, t: float) -> Array:
@@ -164,12 +165,12 @@ class GainSchedule(Design):
         )
 
     @cached_property
-    def _quartics(self) -> Array:
-        """Coefficients (M - 1, 5, nu nx) of K in the time since the knot."""
-        reach = np.linalg.solve(self.R, self.B.transpose(0, 2, 1))
-        slope = np.diff(reach, axis=0) / np.diff(self.t)[:, None, None]
-        P = self._cubics.c[::-1]
-        K = np.zeros((5, *slope.shape))
-        K[:4] += reach[:-1] @ P
-        K[1:] += slope @ P
-        return np.ascontiguousarray(K.transpose(1, 0, 2, 3)).reshape(len(slope), 5, -1)
+    def _pieces(self) -> Array:
+        """Coefficients (M - 1, 7, nu nx) of K in the time since the knot, B being a spline."""
+        from scipy.interpolate import CubicSpline
+
+        P, B = self._cubics.c[::-1], CubicSpline(self.t, self.B).c[::-1]
+        K = np.zeros((7, *B[0].transpose(0, 2, 1).shape))
+        for power, reach in enumerate(np.linalg.solve(self.R, B.transpose(0, 1, 3, 2))):
+            K[power : power + 4] += reach @ P
+        return np.ascontiguousarray(K.transpose(1, 0, 2, 3)).reshape(len(P[0]), 7, -1)

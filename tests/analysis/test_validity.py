@@ -2,12 +2,15 @@
 
 import contextlib
 import os
+import re
+import runpy
 import signal
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -20,6 +23,8 @@ from fflin.analysis.validity import _LEVELS, _clopper_pearson, _crossing, _slope
 from fflin.batch.workers import OwnWorkers
 from tests.support.commands import refused, run
 from tests.support.weights import unit_weights
+
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 def held(robot, dt=0.0, reduce=False):
@@ -328,3 +333,11 @@ def test_command_compares_frames():
     code, out, _ = run(*options, "--frames", "local", "hybrid")
     assert code == 0 and out.count("of 2 runs settled, every one up to") == 2
     assert "choose from 'hybrid', 'local', 'world'" in refused(*options, "--frames", "base")
+
+
+def test_the_table_of_frames_is_what_its_command_makes():
+    frames = runpy.run_path(str(DOCS / "frames.py"))
+    table = (DOCS / "conventions.md").read_text(encoding="utf-8")
+    design = "acceleration_lqr(lin, 1, 1, 1)"
+    found = frames["settled"](fflin.load("servicer_7dof"), design, 150.0)
+    assert re.search(rf"`{re.escape(design)}`, servicer_7dof \|.* {found} \|$", table, re.MULTILINE)

@@ -299,7 +299,7 @@ def test_asking_for_a_gain_solves_nothing(moving, monkeypatch):
     schedule.gain(0.0)
     monkeypatch.setattr(np.linalg, "solve", None)
     for t, K in zip(asked, expected, strict=True):
-        assert schedule.gain(t) == pytest.approx(K, rel=1e-9, abs=1e-12 * np.abs(K).max())
+        assert schedule.gain(t) == pytest.approx(K, rel=0.0, abs=1e-7 * np.abs(K).max())
     for odd in (None, "x", np.nan, -1.0, 1j):
         with pytest.raises(fflin.InputError, match="t is"):
             schedule.gain(odd)
