@@ -82,8 +82,9 @@ def run() -> Table:
         "Along a trajectory",
         f"planar_detumble over {KNOTS} knots of a motion of {DURATION:g} s: its linear models with "
         "fflin's check of the motion, the regulator along it, and the closed loop from 1 deg, 3 "
-        "deg in the joints and 3 deg/s beside it: time of fflin, Drake's as a multiple. Errors are relative to the largest gain, or of the "
-        "last state, against a tight reference.",
+        "deg in the joints and 3 deg/s beside it: time of fflin, Drake's as a multiple. Errors are "
+        "relative to the largest gain or the largest entry of the last state, against a tight "
+        "reference.",
         ("", "fflin [ms]", "error", "Drake", "error of Drake"),
         tuple(cells),
         tuple(notes),

@@ -189,7 +189,7 @@ def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) ->
     W = np.zeros((nx + nu, nx + nu))
     W[:nx, :nx], W[nx:, nx:] = Q, R
     maps, gains, costs, worst = [], [], [P], 0.0
-    for steps, whole in reversed(list(transitions(traj, dt))):
+    for steps, whole in reversed(list(transitions(traj, traj.matrices, dt))):
         total, way = np.zeros_like(W), np.eye(nx + nu)
         for F, h, step in steps:
             total += way.T @ held_cost(F, W, h) @ way

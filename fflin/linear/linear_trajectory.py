@@ -67,14 +67,13 @@ class LinearTrajectory(Trajectory):
 
     def __getitem__(self, index: int) -> LinearModel:
         """Return the linear model at a knot."""
-        return self._model(Linearizer(self.robot, moving=True), range(len(self))[index])
+        return self._model(range(len(self))[index])
 
     def __iter__(self) -> Iterator[LinearModel]:
-        linearizer = Linearizer(self.robot, moving=True)
-        return (self._model(linearizer, k) for k in range(len(self)))
+        return map(self._model, range(len(self)))
 
-    def _model(self, linearizer: Linearizer, k: int) -> LinearModel:
-        lin = linearizer(self.q[k], self.v[k], self.u_base[k])
+    def _model(self, k: int) -> LinearModel:
+        lin = self._linearizer(self.q[k], self.v[k], self.u_base[k])
         own = {name: getattr(self, name)[k] for name in "ABCD"}
         lin = lin.discretize(self.dt) if self.dt else lin
         return replace(lin, **own, y0=self.y[k], verified=self.verified)
@@ -118,7 +117,7 @@ class LinearTrajectory(Trajectory):
         """
         if self.dt:
             raise InputError(f"the model is sampled already, at dt = {self.dt:g} s")
-        found = np.array([transition for _, transition in transitions(self, dt)])
+        found = np.array([transition for _, transition in transitions(self, self.matrices, dt)])
         nx, models = len(self.state_names), along(self.resampled(dt))
         return replace(models, A=found[:, :nx, :nx], B=found[:, :nx, nx:], dt=float(dt))
 
