@@ -83,7 +83,7 @@ class TrajectoryFeedback:
 
     def reference(self, t: float) -> tuple[Array, Array, Array]:
         """Return q, v, and u in base axes that are followed at a time of the run."""
-        if t > self.duration:
+        if t > self.duration * (1.0 + 1e-9):  # beyond what rounding makes of the last step
             return self.end.q, self.end.v, self.end.u0
         return self.trajectory.flow.at(float(self.trajectory.t[0]) + max(t, 0.0))
 

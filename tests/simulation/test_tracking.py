@@ -240,3 +240,13 @@ def test_a_loop_of_ten_seconds_comes_back_to_a_hundredth_of_a_degree():
         assert run.attitude_error[-1] < degrees
         largest = np.abs(run.u).max()
         assert largest == 20.0 if limit else largest > 60.0
+
+
+def test_the_last_step_ends_on_the_trajectory_whatever_its_time_is_rounded_to():
+    robot = fflin.load("planar_detumble")
+    traj = swung(robot, 1.0, size=0.3, spin=0.02).trajectory()
+    policy = fflin.TrajectoryFeedback(traj, fflin.tvlqr(fflin.linearize_trajectory(robot, traj)))
+    late = np.nextafter(policy.duration, np.inf)
+    for t in (policy.duration, late):
+        np.testing.assert_array_equal(policy.reference(t)[1], traj.point(traj.t[-1])[1])
+    assert not policy.reference(policy.duration + 1e-6)[1].any()
