@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -145,6 +145,7 @@ def steered_by(policy: Any) -> tuple[str, ...]:
     return tuple(name for name, size in zip(names, used, strict=True) if size)
 
 
+@lru_cache(maxsize=2)  # half of a short run's time
 def largest_rate(schedule: GainSchedule) -> float:
     """Return the magnitude [1/s] that the loop's poles pass for a twentieth of the time alone.
 
