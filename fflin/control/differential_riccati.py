@@ -153,14 +153,14 @@ def sample_back(weights: Array, whole: Array, P: Array) -> tuple[Array, Array, f
 class Passed:
     """P (M, nx, nx) and R^-1 B' P (M, nu, nx) over time, as a schedule is asked for them.
 
-    Between knots P is a cubic and B linear; of samples dt [s] apart what is asked for is that of
+    Between knots P is a cubic and B a spline; of samples dt [s] apart what is asked for is that of
     the last one. `sign` is -1 of a P that goes backwards from the end, 1 of one that goes forward.
     """
 
     def __init__(
         self, t: Array, P: Array, K: Array, model: tuple[Array, ...], dt: float, sign: float
     ) -> None:
-        from scipy.interpolate import CubicHermiteSpline
+        from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
         A, B, Q, R = model
         self.first, self.last = float(t[0]), float(t[-1])
@@ -174,13 +174,11 @@ class Passed:
         drift, spent = P @ A, K.transpose(across) @ R @ K
         rate = sign * (drift + drift.transpose(across) + Q - spent)
         self._cubics = CubicHermiteSpline(t, P, rate, extrapolate=False)
-        reach = np.linalg.solve(R, B.transpose(across))
-        slope = np.diff(reach, axis=0) / np.diff(t)[:, None, None]
-        powers = self._cubics.c[::-1]
-        quartics = np.zeros((5, *slope.shape))
-        quartics[:4] += reach[:-1] @ powers
-        quartics[1:] += slope @ powers
-        self._quartics = quartics.transpose(1, 0, 2, 3).reshape(len(slope), 5, -1)
+        powers, of_B = self._cubics.c[::-1], CubicSpline(t, B).c[::-1]
+        pieces = np.zeros((7, *of_B[0].transpose(across).shape))
+        for power, reach in enumerate(np.linalg.solve(R, of_B.transpose(0, 1, 3, 2))):
+            pieces[power : power + 4] += reach @ powers
+        self._pieces = pieces.transpose(1, 0, 2, 3).reshape(len(t) - 1, 7, -1)
 
     def gain(self, t: float) -> Array:
         """Return R^-1 B' P (nu, nx), of B and P at a time within the knots."""
@@ -189,8 +187,9 @@ class Passed:
             return self.K[k]
         x = t - self._starts[k]
         square = x * x
-        powers = np.array((1.0, x, square, square * x, square * square))
-        K: Array = powers.dot(self._quartics[k]).reshape(self.K.shape[1:])
+        fourth = square * square
+        powers = np.array((1.0, x, square, square * x, fourth, fourth * x, fourth * square))
+        K: Array = powers.dot(self._pieces[k]).reshape(self.K.shape[1:])
         return K
 
     def cost(self, t: float) -> Array:

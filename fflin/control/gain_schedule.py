@@ -78,7 +78,7 @@ class GainSchedule(Schedule):
         The cost from t on is e' P(t) e.
     A : ndarray (M, nx, nx)
     B : ndarray (M, nx, nu)
-        The model at the knots, linear in between; or M - 1 that take a sample to the next.
+        The model at the knots; or M - 1 that take a sample to the next.
     Q, R, Qf : ndarray
         Weights of the continuous cost.
     residual : float

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
 # A clock of many steps is rounded.
-_AT_THE_END = 1.0 + 1e-12
+_AT_THE_END = 1.0 + 1e-9
 
 # Returns q, v and u in the policy's axes at a time of the run.
 Reference: TypeAlias = Callable[[float], tuple[Array, Array, Array]]
@@ -152,6 +152,7 @@ def steered_by(policy: Any) -> tuple[str, ...]:
     return tuple(name for name, size in zip(names, used, strict=True) if size)
 
 
+@lru_cache(maxsize=2)  # half of a short run's time
 def largest_rate(schedule: GainSchedule) -> float:
     """Return the magnitude [1/s] that the loop's poles pass for a twentieth of the time alone.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -160,8 +160,9 @@ def tvkalman(
     noise, columns = disturbance(traj, W, G)
     through = np.broadcast_to(columns, (len(traj.t), *columns.shape[-2:]))
 
+    @cache
     def at(t: float) -> Coefficients:
-        A, C, by = traj.between(t, traj.A, traj.C, through)
+        (A, _), (C, by) = traj.matrices(t), traj.between(t, traj.C, through)
         intensity = by @ noise @ by.T
         return Coefficients(A.T, spread(C.T, V), 0.5 * (intensity + intensity.T))
 
@@ -183,8 +184,8 @@ def tvkalman(
     except np.linalg.LinAlgError:
         raise InputError("P changes too fast; give a smaller W or a larger V") from None
     t, P = -times[::-1], found[::-1]
-    own = (traj.A, traj.B, traj.C, traj.D, traj.y)
-    rows = zip(*(traj.between(float(x), *own) for x in t), strict=True)
+    own, clock = (traj.C, traj.D, traj.y), t.tolist()
+    rows = zip(*((*traj.matrices(x), *traj.between(x, *own)) for x in clock), strict=True)
     fields |= dict(zip("ABCDy", map(np.array, rows), strict=True))
     L = np.linalg.solve(V, fields["C"] @ P).transpose(0, 2, 1)
     fields |= {"t": t, "L": L, "P": P, "W": np.array([at(float(x)).Q for x in t])}
@@ -209,7 +210,7 @@ def _sampled(
     at_samples = along(traj.resampled(dt))
     nx, ny = len(P), len(V)
     maps, gains, found, disturbed, worst = [], [], [P], [], 0.0
-    for C, (steps, whole) in zip(at_samples.C, transitions(traj, dt), strict=False):
+    for C, (steps, whole) in zip(at_samples.C, transitions(traj, traj.matrices, dt), strict=False):
         weights = np.zeros((nx + ny, nx + ny))
         W, weights[nx:, nx:] = weights[:nx, :nx], V
         for F, h, step, (first, second) in steps:

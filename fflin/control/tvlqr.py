@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -113,8 +114,9 @@ def tvlqr(
     fields |= {"Q": Q, "R": R, "Qf": Qf, "weights": rule, "knots": traj.t}
     fields |= {"verified": traj.verified, "dt": dt}
 
+    @cache
     def at(t: float) -> Coefficients:
-        A, B = traj.between(t, traj.A, traj.B)
+        A, B = traj.matrices(t)
         return Coefficients(A, spread(B, R), Q)
 
     try:
@@ -125,7 +127,7 @@ def tvlqr(
             t, P = solve_back(at, traj.t, Qf)
     except np.linalg.LinAlgError:
         raise InputError(_TOO_FAST) from None
-    A, B = map(np.array, zip(*(traj.between(float(x), traj.A, traj.B) for x in t), strict=True))
+    A, B = map(np.array, zip(*(traj.matrices(float(x)) for x in t), strict=True))
     K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
     residual = Passed(t, P, K, (A, B, Q, R), 0.0, -1.0).residual(at)
     return GainSchedule(t=t, K=K, P=P, A=A, B=B, residual=residual, **fields)
@@ -197,7 +199,7 @@ def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) ->
     W = np.zeros((nx + nu, nx + nu))
     W[:nx, :nx], W[nx:, nx:] = Q, R
     maps, gains, costs, worst = [], [], [P], 0.0
-    for steps, whole in reversed(list(transitions(traj, dt))):
+    for steps, whole in reversed(list(transitions(traj, traj.matrices, dt))):
         total, way = np.zeros_like(W), np.eye(nx + nu)
         for F, h, step, _ in steps:
             total += way.T @ held_cost(F, W, h) @ way

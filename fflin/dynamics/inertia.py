@@ -110,7 +110,7 @@ class Inertia:
             f"M of '{name}': {coordinate_names(self._state.robot)[worst]} moves an inertia of "
             f"{inertias[worst]:.1e} only, where mass and place of its links would allow "
             f"{allowed[worst]:.1e}, and B is as large as {1.0 / inertias[worst]:.1e}; give the "
-            "links their inertia, or lock it",
+            "links their inertia, see whether joints are placed in metres, or lock it",
             FflinWarning,
             stacklevel=6,
         )

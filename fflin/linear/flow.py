@@ -157,7 +157,7 @@ def placed(t: Array, time: float) -> tuple[int, float]:
     A knot belongs to the interval that begins there, as do times that only rounding keeps from it.
     """
     last = len(t) - 2
-    k = max(0, min(int(np.searchsorted(t, time, side="right")) - 1, last))
+    k = max(0, min(int(t.searchsorted(time, "right")) - 1, last))
     share = float((time - t[k]) / (t[k + 1] - t[k]))
     if share > 1.0 - _NEAR and k < last:
         return k + 1, 0.0

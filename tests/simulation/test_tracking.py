@@ -5,6 +5,8 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from benchmarks.cases.trajectory import beside as beside_knots
+from benchmarks.cases.trajectory import flown
 from fflin.dynamics.state_rows import moved_by, moving_error, moving_errors
 
 
@@ -222,3 +224,29 @@ def test_a_motion_that_is_followed_comes_back_from_its_file(case, tmp_path):
         np.testing.assert_array_equal(back.target, run.target)
         np.testing.assert_array_equal(back.error, run.error)
         assert back.tracked
+
+
+def test_a_loop_of_ten_seconds_comes_back_to_a_hundredth_of_a_degree():
+    """Under the default weights for 1.5 rad/s, and inputs that are limited to a third of theirs."""
+    traj = flown()
+    robot, along = traj.robot, fflin.linearize_trajectory(traj.robot, traj)
+    slow = fflin.tvlqr(along)
+    schedule = fflin.tvlqr(along, slow.Q, slow.R * (0.2 / 1.5) ** 4)
+    policy = fflin.TrajectoryFeedback(along, schedule)
+    q0, v0 = beside_knots(traj)
+    for limit, degrees in ((None, 0.01), (20.0, 0.1)):
+        run = fflin.simulate(robot, policy, q0=q0, v0=v0, duration=10.0, limits=limit, linear=False)
+        assert run.attitude_error[0] == pytest.approx(1.0)
+        assert run.attitude_error[-1] < degrees
+        largest = np.abs(run.u).max()
+        assert largest == 20.0 if limit else largest > 60.0
+
+
+def test_the_last_step_ends_on_the_trajectory_whatever_its_time_is_rounded_to():
+    robot = fflin.load("planar_detumble")
+    traj = swung(robot, 1.0, size=0.3, spin=0.02).trajectory()
+    policy = fflin.TrajectoryFeedback(traj, fflin.tvlqr(fflin.linearize_trajectory(robot, traj)))
+    late = np.nextafter(policy.duration, np.inf)
+    for t in (policy.duration, late):
+        np.testing.assert_array_equal(policy.reference(t)[1], traj.point(traj.t[-1])[1])
+    assert not policy.reference(policy.duration + 1e-6)[1].any()

@@ -152,6 +152,7 @@ def sound(folder):
         "validity": {
             **{"robot": robot, "lin": lin, "gain": None, "attitude": 5.0, "position": 0.1},
             **{"joint": 0.1, "samples": 1, "seed": 0, "confidence": 0.9, "executor": None},
+            "frames": (),
         },
         "velocity": {"robot": robot, "values": {}},
         "visualize": {
