@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -14,7 +14,6 @@ import pinocchio as pin
 
 from fflin.base import record
 from fflin.base.errors import InputError
-from fflin.base.names import chosen, input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, check_ending, write_whole
@@ -24,8 +23,6 @@ from fflin.simulation.passed import Limited, Passed, Saturated, passed, saturate
 FORMATS = (*record.FORMATS, ".csv")
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from fflin.linear.trajectory import Trajectory
     from fflin.robot.robot import Robot
 
@@ -252,6 +249,8 @@ class Motion(Design):
 
     def plot(self, path: str | Path | None = None, **options: Any) -> Any:
         """Draw the motion, see `plot_motion`; into a file where a path is given."""
+        from fflin.simulation.motion_plot import plot_motion
+
         return plot_motion(self, path, **options)
 
 
@@ -262,59 +261,3 @@ def require_motion(motion: Any) -> Motion:
             f"motion is a {type(motion).__name__}, expected a Motion, as fflin.simulate returns it"
         )
     return motion
-
-
-def plot_motion(
-    motion: Motion, path: str | Path | None = None, *, show: Sequence[str] | None = None
-) -> Figure:
-    """Draw the errors, inputs and momentum drift of a motion, linear beside nonlinear.
-
-    Parameters
-    ----------
-    motion : Motion
-        With a prediction, each group of states shows the nonlinear robot in full lines and the
-        linear model dashed, and below it their difference.
-    path : str or Path, optional
-        .png, .pdf or .svg to save to.
-    show : sequence of str, optional
-        What is drawn of states and inputs: names, groups or patterns such as ``q_m``, ``thrust``,
-        ``*.hinge_*``; all by default.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    MissingPackageError
-        If matplotlib is not installed.
-    FileError
-        If the ending is another or the file cannot be written.
-    UnknownNameError
-        If there is nothing of a name in `show`.
-    """
-    from fflin.simulation.plots import Signals, draw
-
-    motion = require_motion(motion)
-    limits = dict(zip(motion.limit_names, motion.limits, strict=True))
-    inertias = motion.wheel_inertias.tolist()
-    title = f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"
-    if motion.linear is not None:
-        title += "; full: nonlinear, dashed: linear"
-    names = (*motion.state_names, *input_keys(motion))
-    show = [show] if isinstance(show, str) else show
-    if not (show is None or isinstance(show, Sequence)):
-        raise InputError(f"show is {show!r}, expected a list of names, groups or patterns")
-    shown = range(len(names)) if show is None else chosen("state or input", show, names)
-    nx = len(motion.state_names)
-    states, inputs = [i for i in shown if i < nx], [i - nx for i in shown if i >= nx]
-    return draw(
-        motion.t,
-        Signals(motion.x, motion.state_names, motion.state_units, limits).only(states),
-        Signals(motion.u, motion.input_names, motion.input_units, limits).only(inputs),
-        dict.fromkeys(motion.wheels, 0.0) | dict(zip(motion.wheels, inertias, strict=False)),
-        None if motion.linear is None else motion.linear[:, states],
-        {"momentum": motion.momentum_drift, "centre of mass [m]": motion.com_drift},
-        title=f"{title}\n{motion.stopped}" if motion.stopped else title,
-        path=path,
-    )
