@@ -71,7 +71,7 @@ _NAMES = {
     "Figures": (
         "analysis.plots plot_matrices plot_check plot_modes plot_validity",
         "control.plots plot_poles plot_loops",
-        "simulation.motion_plot plot_motion",
+        "simulation.motion plot_motion",
     ),
     "Errors": (
         "base.errors FflinError InputError UnknownNameError FileError",
@@ -165,8 +165,7 @@ if TYPE_CHECKING:
         RelativePose,
     )
     from fflin.robot.robot import Robot
-    from fflin.simulation.motion import Motion
-    from fflin.simulation.motion_plot import plot_motion
+    from fflin.simulation.motion import Motion, plot_motion
     from fflin.simulation.simulate import simulate
     from fflin.view.visualize import visualize
 

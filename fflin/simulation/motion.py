@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -23,6 +23,8 @@ from fflin.simulation.passed import Limited, Passed, Saturated, passed, saturate
 FORMATS = (*record.FORMATS, ".csv")
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from fflin.linear.trajectory import Trajectory
     from fflin.robot.robot import Robot
 
@@ -249,8 +251,6 @@ class Motion(Design):
 
     def plot(self, path: str | Path | None = None, **options: Any) -> Any:
         """Draw the motion, see `plot_motion`; into a file where a path is given."""
-        from fflin.simulation.motion_plot import plot_motion
-
         return plot_motion(self, path, **options)
 
 
@@ -261,3 +261,39 @@ def require_motion(motion: Any) -> Motion:
             f"motion is a {type(motion).__name__}, expected a Motion, as fflin.simulate returns it"
         )
     return motion
+
+
+def plot_motion(
+    motion: Motion, path: str | Path | None = None, *, show: Sequence[str] | None = None
+) -> Figure:
+    """Draw the errors, inputs and momentum drift of a motion, linear beside nonlinear.
+
+    Parameters
+    ----------
+    motion : Motion
+        With a prediction, each group of states shows the nonlinear robot in full lines and the
+        linear model dashed, and below it their difference. Along a trajectory it shows the robot
+        over the pale reference, and below it the error, that of the linear model dashed; a dotted
+        line is where the reference comes to rest.
+    path : str or Path, optional
+        .png, .pdf or .svg to save to.
+    show : sequence of str, optional
+        What is drawn of states and inputs: names, groups or patterns such as ``q_m``, ``thrust``,
+        ``*.hinge_*``; all by default.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    MissingPackageError
+        If matplotlib is not installed.
+    FileError
+        If the ending is another or the file cannot be written.
+    UnknownNameError
+        If there is nothing of a name in `show`.
+    """
+    from fflin.simulation.motion_plot import draw_motion
+
+    return draw_motion(require_motion(motion), path, show)

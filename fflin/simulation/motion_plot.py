@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.names import chosen, input_keys
-from fflin.base.validation import Array
 from fflin.dynamics.state_rows import moving_errors
-from fflin.simulation.motion import Motion, require_motion
 from fflin.simulation.plots import Signals, draw
 
 if TYPE_CHECKING:
@@ -22,38 +20,8 @@ if TYPE_CHECKING:
 _STILL = 1e-12
 
 
-def plot_motion(
-    motion: Motion, path: str | Path | None = None, *, show: Sequence[str] | None = None
-) -> Figure:
-    """Draw the errors, inputs and momentum drift of a motion, linear beside nonlinear.
-
-    Parameters
-    ----------
-    motion : Motion
-        With a prediction, each group of states shows the nonlinear robot in full lines and the
-        linear model dashed, and below it their difference. Along a trajectory it shows the robot
-        over the pale reference, and below it the error, that of the linear model dashed; a dotted
-        line is where the reference comes to rest.
-    path : str or Path, optional
-        .png, .pdf or .svg to save to.
-    show : sequence of str, optional
-        What is drawn of states and inputs: names, groups or patterns such as ``q_m``, ``thrust``,
-        ``*.hinge_*``; all by default.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    MissingPackageError
-        If matplotlib is not installed.
-    FileError
-        If the ending is another or the file cannot be written.
-    UnknownNameError
-        If there is nothing of a name in `show`.
-    """
-    motion = require_motion(motion)
+def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None) -> Figure:
+    """Draw a motion, see `plot_motion`."""
     limits = dict(zip(motion.limit_names, motion.limits, strict=True))
     inertias = motion.wheel_inertias.tolist()
     title = f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"
@@ -86,28 +54,24 @@ def plot_motion(
     )
 
 
-def _apart(motion: Motion) -> tuple[str, Signals] | None:
+def _apart(motion: Any) -> tuple[str, Signals] | None:
     """Return the errors from a reference, of attitude in degrees, or from the linear model."""
     names, units, linear = motion.state_names, motion.state_units, motion.linear
     if not motion.tracked:
         if linear is None:
             return None
         return "difference", Signals(motion.x - linear, names, units, {})
-    flown, foreseen = (
-        None if x is None else _in_degrees(moving_errors(motion.frame, x, motion.target))
-        for x in (motion.x, linear)
-    )
-    return "error", Signals(flown, names, ("deg",) * 3 + units[3:], {}, foreseen)
+    found = []
+    for x in (motion.x,) if linear is None else (motion.x, linear):
+        e = moving_errors(motion.frame, x, motion.target)
+        sines = np.minimum(1.0, np.linalg.norm(e[:, :3], axis=1, keepdims=True))
+        e[:, :3] *= np.degrees(2.0 / np.sinc(np.arcsin(sines) / np.pi))
+        found.append(e)
+    flown, *foreseen = found
+    return "error", Signals(flown, names, ("deg",) * 3 + units[3:], {}, *foreseen)
 
 
-def _in_degrees(e: Array) -> Array:
-    """Return errors whose attitude is the rotation vector [deg]."""
-    half = np.linalg.norm(e[:, :3], axis=1, keepdims=True)
-    e[:, :3] *= np.degrees(2.0 / np.sinc(np.arcsin(np.minimum(half, 1.0)) / np.pi))
-    return e
-
-
-def resting_from(motion: Motion) -> float | None:
+def resting_from(motion: Any) -> float | None:
     """Return the time [s] from which a target that moved stands still; None where none does."""
     places = motion.target[:, : motion.x.shape[1] // 2] if motion.tracked else motion.x[:1]
     moved = np.flatnonzero(np.abs(np.diff(places, axis=0)).max(axis=1, initial=0.0) > _STILL)

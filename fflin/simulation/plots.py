@@ -48,11 +48,13 @@ class Signals(NamedTuple):
     def only(self, indices: Sequence[int]) -> Signals:
         """Return some of the columns."""
         names, units = ([of[i] for i in indices] for of in (self.names, self.units))
-        values, linear, reference = (
-            None if of is None else of[:, indices]
-            for of in (self.values, self.linear, self.reference)
-        )
-        return Signals(values, names, units, self.limits, linear, reference)
+        beside = (None if x is None else x[:, indices] for x in (self.linear, self.reference))
+        return Signals(self.values[:, indices], names, units, self.limits, *beside)
+
+    def times(self, factors: Array, unit: str, limits: Mapping[str, Array]) -> Signals:
+        """Return them times (k,), in that unit and with limits of it."""
+        beside = (None if x is None else factors * x for x in (self.linear, self.reference))
+        return Signals(factors * self.values, self.names, [unit] * len(factors), limits, *beside)
 
     def unit(self, indices: Sequence[int]) -> str:
         """Return the units of some columns in brackets."""
@@ -158,28 +160,15 @@ def _panels(states: Signals, inputs: Signals, wheels: Mapping[str, float]) -> di
         if J.all():
             names = [states.names[i] for i in speeds]
             limits = {x: J[k] * states.limits[x] for k, x in enumerate(names) if x in states.limits}
-            turning = states.only(speeds)
-            momenta = turning._replace(
-                values=J * turning.values,
-                units=["N m s"] * len(J),
-                limits=limits,
-                reference=None if turning.reference is None else J * turning.reference,
-            )
+            momenta = states.only(speeds).times(J, "N m s", limits)
             found["wheel momenta"] = _Panel(momenta, list(range(len(J))))
     return found
 
 
 def _histories(axes: Axes, t: Array, states: Signals, group: str, indices: list[int]) -> None:
     for color, i in zip(cycle(len(indices)), indices, strict=True):
-        lines = (
-            (states.reference, {"color": color, **_PALE}),
-            (states.values, {"color": color, "label": _short(states.names[i])}),
-            (states.linear, {"color": color, "ls": "--", "lw": 1.0}),
-        )
-        for values, look in lines:
-            if values is not None:
-                times, shown = _broken(t, values, indices) if group == "q_b" else (t, values)
-                axes.plot(times, shown[:, i], **look)
+        gaps = indices if group == "q_b" else []
+        _curve(axes, t, states, i, gaps, color=color, label=_short(states.names[i]))
     _limits(axes, states, indices)
     axes.set(title=_GROUPS[group], ylabel=states.unit(indices))
     if group not in _OF_JOINTS:
@@ -187,7 +176,18 @@ def _histories(axes: Axes, t: Array, states: Signals, group: str, indices: list[
     axes.margins(x=0.0)
 
 
-def _broken(t: Array, x: Array, indices: list[int]) -> tuple[Array, Array]:
+def _curve(
+    axes: Axes, t: Array, of: Signals, i: int, gaps: Sequence[int] = (), **look: Any
+) -> None:
+    """Draw a column over its pale reference and below that of the linear model, dashed."""
+    dashed = {"ls": "--", "lw": 1.0}
+    for x, own in ((of.reference, _PALE), (of.values, look), (of.linear, dashed)):
+        if x is not None:
+            times, shown = _broken(t, x, gaps) if gaps else (t, x)
+            axes.plot(times, shown[:, i], **{"color": look["color"]} | own)
+
+
+def _broken(t: Array, x: Array, indices: Sequence[int]) -> tuple[Array, Array]:
     """Return times and states with a gap where the attitude goes through a turn of 180 degrees."""
     q_b = x[:, indices]
     # The vector part of a unit quaternion whose sign has changed.
@@ -197,9 +197,7 @@ def _broken(t: Array, x: Array, indices: list[int]) -> tuple[Array, Array]:
 
 def _apart(axes: Axes, t: Array, title: str, signals: Signals, indices: list[int]) -> None:
     for color, i in zip(cycle(len(indices)), indices, strict=True):
-        axes.plot(t, signals.values[:, i], color=color, lw=1.0)
-        if signals.linear is not None:
-            axes.plot(t, signals.linear[:, i], "--", color=color, lw=1.0)
+        _curve(axes, t, signals, i, color=color, lw=1.0)
     axes.set(xlabel="t [s]", ylabel=f"{title}\n{signals.unit(indices)}".strip())
     axes.margins(x=0.0)
     axes.ticklabel_format(axis="y", scilimits=(-2, 3))
@@ -210,10 +208,8 @@ def _inputs(axes: Axes, t: Array, panel: _Panel, title: str, colors: Mapping[str
     signals, indices = panel
     for color, i in zip(cycle(len(indices)), indices, strict=True):
         short = _short(signals.names[i])
-        if signals.reference is not None:
-            axes.plot(t, signals.reference[:, i], color=colors.get(short, color), **_PALE)
-        axes.plot(
-            *(t, signals.values[:, i]),
+        _curve(
+            *(axes, t, signals, i),
             color=colors.get(short, color),
             drawstyle="default" if title in _SMOOTH else "steps-post",
             label=short if title.startswith("wheel") else signals.names[i],

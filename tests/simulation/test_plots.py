@@ -70,7 +70,8 @@ def test_a_reference_lies_pale_under_what_follows_it(along):
     figure = motion.plot()
     found = panels(figure)
     titles = ("attitude q_b", "position r_b", "joints q_m", "angular velocity omega_b")
-    for title, start in zip((*titles, "velocity v_b", "joint rates"), (0, 3, 6, 9, 12, 15)):
+    titles = (*titles, "velocity v_b", "joint rates")
+    for title, start in zip(titles, range(0, 18, 3), strict=True):
         curves = [each for each in found[title].get_lines() if len(each.get_xdata()) > 2]
         assert len(curves) == 6
         for k, (pale, flown) in enumerate(zip(curves[::2], curves[1::2], strict=True)):
