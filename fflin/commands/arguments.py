@@ -138,7 +138,7 @@ def add_reference(command: argparse.ArgumentParser) -> None:
     )
 
 
-def add_pose(command: argparse.ArgumentParser) -> None:
+def add_pose(command: Container) -> None:
     """Add what says where the robot is and how it moves."""
     add_values(command, "--joint", "put a joint at VALUE [rad|m]; the others are at neutral")
     _add_vector(command, "--rpy", "RPY", "base attitude: roll, pitch, yaw [deg] about fixed axes")
@@ -151,7 +151,7 @@ def add_pose(command: argparse.ArgumentParser) -> None:
     )
 
 
-def add_inputs_there(command: argparse.ArgumentParser) -> None:
+def add_inputs_there(command: Container) -> None:
     """Add what says the inputs at the point."""
     add_values(
         command, "--effort", "an input at the point, by its name in u, such as tau_m.joint_1"
@@ -164,7 +164,7 @@ def add_inputs_there(command: argparse.ArgumentParser) -> None:
     )
 
 
-def add_system(command: argparse.ArgumentParser) -> None:
+def add_system(command: Container) -> None:
     """Add what acts on the robot, what is watched of it, and in which axes."""
     for name, unit in (("stiffness", "N m/rad|N/m"), ("damping", "N m s/rad|N s/m")):
         add_values(
@@ -214,7 +214,7 @@ def add_system(command: argparse.ArgumentParser) -> None:
     )
 
 
-def add_output_file(command: argparse.ArgumentParser, what: str) -> None:
+def add_output_file(command: Container, what: str) -> None:
     """Add -o FILE; `what` says which endings there are."""
     command.add_argument(
         "-o", "--output-file", metavar="FILE", dest="output_file", type=file_name, help=what

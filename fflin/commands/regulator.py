@@ -15,6 +15,7 @@ from fflin.base.errors import (
 from fflin.commands import DONE
 from fflin.commands.arguments import (
     Commands,
+    Container,
     add_output_file,
     add_point,
     add_values,
@@ -44,7 +45,7 @@ def add_commands(commands: Commands) -> None:
     add_figure(lqr, "draw the loop of each input with its margins, and the poles,")
 
 
-def add_weights(command: argparse.ArgumentParser) -> None:
+def add_weights(command: Container) -> None:
     """Add what is regulated and at which cost: --q, --r, --bryson, --dt, --reduce and so on."""
     command.add_argument(
         "--weights",

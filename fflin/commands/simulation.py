@@ -6,7 +6,7 @@ import argparse
 import warnings
 from typing import TYPE_CHECKING, Any
 
-from fflin.base.errors import FflinWarning, InputError, listed
+from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import chosen, input_keys
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
@@ -22,17 +22,22 @@ from fflin.commands.arguments import (
     file_name,
     number,
 )
-from fflin.commands.points import configuration_of, inputs_at, load_robot, once, placed, velocity_of
-from fflin.commands.regulator import add_weights, gain_of, regulated_part
+from fflin.commands.loops import about_point, along, refuse_law, require_held, start_of
+from fflin.commands.points import load_robot, once
+from fflin.commands.regulator import add_weights
+from fflin.commands.tracking import add_trajectory
 from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
 
 if TYPE_CHECKING:
-    from fflin.base.validation import Array
     from fflin.control.policies import StateFeedback
-    from fflin.linear.model import LinearModel
     from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion
 
+
+_GROUPS = (
+    *("where it starts", "where it is to be", "what regulates it", "the run", "the robot"),
+    "what is kept and shown of it",
+)
 
 # The options that name a file to write.
 _OUTPUTS = ("output_file", "plot", "html", "png", "gif")
@@ -44,54 +49,58 @@ def add_commands(commands: Commands) -> None:
         commands,
         "simulate",
         _simulate,
-        "let a regulator bring the nonlinear robot from where it is put to the target",
+        "let a regulator bring the nonlinear robot from where it is put to the target, or "
+        "along a trajectory",
         "fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png",
     )
     add_robot(simulate)
-    add_pose(simulate)
-    add_system(simulate)
+    start, goal, law, run, system, shown = map(simulate.add_argument_group, _GROUPS)
+    add_system(system)
+    add_pose(start)
     add_values(
-        simulate,
+        start,
+        "--offset",
+        "how far from the trajectory's start it starts, in the base's axes there: a state, group "
+        "or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw [deg]",
+    )
+    add_values(
+        goal,
         "--target-joint",
         "where a joint is to go [rad|m]; the others go to neutral, the base to the world's origin",
     )
     add_values(
-        simulate,
+        goal,
         "--target-velocity",
         "a velocity of the target, such as the speed of a wheel that is to be held; it starts with "
         "it where --velocity does not say otherwise",
     )
-    add_inputs_there(simulate)
-    add_weights(simulate)
-    simulate.add_argument(
+    add_inputs_there(goal)
+    add_trajectory(goal)
+    add_weights(law)
+    law.add_argument(
+        "--schedule",
+        metavar="FILE",
+        type=file_name,
+        help="follow the trajectory with these gains, as tvlqr saves them; without it they are "
+        "designed",
+    )
+    law.add_argument(
+        "--gain",
+        metavar="FILE",
+        type=file_name,
+        help="regulate with this gain, as lqr saves it, about the point it was designed for",
+    )
+    law.add_argument(
         "--allocate",
         action=argparse.BooleanOptionalAction,
         help="whether to design with torque and force on the base, and let the thrusters, none of "
         "which pulls, give what comes nearest; by default where they push every way; else a "
         "thrust below zero is cut",
     )
-    simulate.add_argument(
+    law.add_argument(
         "--free", action="store_true", help="let it move without a regulator or any input"
     )
-    simulate.add_argument(
-        "--duration",
-        metavar="T",
-        type=number,
-        help="time [s]; by default what the linear loop takes to settle, from 60 to 600",
-    )
-    simulate.add_argument(
-        "--step", metavar="H", type=number, help="step of the integration [s]; chosen by default"
-    )
-    simulate.add_argument(
-        "--every",
-        metavar="N",
-        type=count_of,
-        help="steps from one recorded row to the next; chosen where there are many",
-    )
-    simulate.add_argument(
-        "--method", default="cf4", help="cf4 (default), rkmk4 or semi_implicit_euler"
-    )
-    simulate.add_argument(
+    law.add_argument(
         "--limits",
         choices=("urdf", "none"),
         default="urdf",
@@ -99,32 +108,49 @@ def add_commands(commands: Commands) -> None:
         "wheels (urdf, default), or only what --limit says (none)",
     )
     add_values(
-        simulate,
+        law,
         "--limit",
         "largest magnitude of an input, a group of them such as tau_m, or a pattern; goes first",
     )
-    simulate.add_argument(
+    law.add_argument(
         "--delay",
         metavar="T",
         type=number,
         default=0.0,
         help="time from a sample to its effect [s]",
     )
-    simulate.add_argument(
+    run.add_argument(
+        "--duration",
+        metavar="T",
+        type=number,
+        help="time [s]; by default that of the trajectory, or from 60 to 600, what the linear loop "
+        "takes to settle",
+    )
+    run.add_argument(
+        "--step", metavar="H", type=number, help="step of the integration [s]; chosen by default"
+    )
+    run.add_argument(
+        "--every",
+        metavar="N",
+        type=count_of,
+        help="steps from one recorded row to the next; chosen where there are many",
+    )
+    run.add_argument("--method", default="cf4", help="cf4 (default), rkmk4 or semi_implicit_euler")
+    shown.add_argument(
         "--plot",
         metavar="FILE",
         type=file_name,
         help="draw linear beside nonlinear into FILE: .png, .pdf or .svg",
     )
     add_values(
-        simulate,
+        shown,
         "--show",
         "what --plot draws: a state or input, a group or a pattern, such as q_m, '*.hinge_*'",
         metavar="NAME",
         read=str,
     )
-    add_output_file(simulate, "save the motion to FILE: .npz, .mat, .json or .csv")
-    add_pictures(simulate)
+    add_output_file(shown, "save the motion to FILE: .npz, .mat, .json or .csv")
+    add_pictures(shown)
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
@@ -179,71 +205,39 @@ def _leave_earlier(arguments: argparse.Namespace) -> list[str]:
 
 def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     """Return the motion that the arguments ask for."""
-    from fflin.control.bounded import thrusters_push_every_way
     from fflin.simulation.settling import SHORTEST, time_to_settle
     from fflin.simulation.simulate import simulate
 
     given = once("--limit", arguments.limit)
     options: dict[str, Any] = {
-        "q0": configuration_of(robot, arguments, robot.start),
-        "v0": velocity_of(robot, arguments, "target_velocity", "velocity", start=robot.start),
         "dt": arguments.step,
         "every": arguments.every,
         "method": arguments.method,
         "limits": [arguments.limits, given] if arguments.limits == "urdf" else given or None,
         "delay": arguments.delay,
+        "duration": arguments.duration,
     }
+    if arguments.trajectory or arguments.schedule:
+        policy, start = along(robot, arguments)
+        return simulate(robot, policy, **options, **start)
+    if arguments.offset or arguments.hold:
+        raise InputError("--offset and --hold are of a --trajectory; give one, or leave them out")
+    q, v = start_of(robot, arguments)
+    options |= {"q0": q, "v0": v}
     if arguments.free:
-        if arguments.limit or arguments.delay:
-            raise InputError("--free has no input to limit or delay; leave one out")
-        weighed = any((arguments.weights, arguments.q, arguments.r, arguments.bryson, arguments.dt))
-        target = arguments.target_joint or arguments.target_velocity
-        if weighed or target or arguments.reduce or arguments.allocate:
-            raise InputError(
-                "--free has no regulator to give weights, a target or thrusters; leave one out"
-            )
-        duration = SHORTEST if arguments.duration is None else arguments.duration
-        return simulate(robot, frame=arguments.frame, duration=duration, **options)
-    from fflin.control.policies import Allocation, StateFeedback
-
-    allocate = thrusters_push_every_way(robot) if arguments.allocate is None else arguments.allocate
-    design = _without_thrusters(robot) if allocate else robot
-    lin = _about_target(design, arguments)
-    gain = gain_of(lin, arguments)
-    if not (arguments.reduce or allocate):
-        options["linear"] = lin  # at every row, where the sampled model has the samples alone
-    if gain.dt:
-        lin = lin.discretize(gain.dt)
-    policy = StateFeedback(lin, gain.K)
-    _require_held(robot, policy, options["q0"])
-    options["duration"] = arguments.duration
+        refuse_law(arguments)
+        options["duration"] = SHORTEST if arguments.duration is None else arguments.duration
+        return simulate(robot, frame=arguments.frame, **options)
+    policy, feedback, lin = about_point(robot, arguments)
+    require_held(robot, feedback, q)
     if arguments.duration is None:
-        options["duration"] = time_to_settle(robot, policy, options["q0"], options["v0"])
-    if allocate:
-        return simulate(robot, Allocation(policy, design), **options)
-    motion = simulate(robot, policy, **options)
-    _warn_of_cut_thrust(robot, motion, policy)
+        options["duration"] = time_to_settle(robot, feedback, q, v)
+    if policy is not feedback:
+        return simulate(robot, policy, **options)
+    # At every row, where a sampled model has the samples alone.
+    motion = simulate(robot, policy, **options, linear=lin)
+    _warn_of_cut_thrust(robot, motion, feedback)
     return motion
-
-
-def _require_held(robot: Robot, policy: StateFeedback, q: Array) -> None:
-    """Warn of what starts beside the target and is not fed back; refuse a start of nothing else."""
-    from fflin.control.policies import fed_back
-    from fflin.dynamics.state import StateMap
-
-    lin = policy.lin
-    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    start, target = (state.read(at, lin.v, near=state.read(lin.q, lin.v)) for at in (q, lin.q))
-    beside = [name for name, x in zip(state.names, abs(start - target), strict=True) if x > 1e-9]
-    loose = [name for name in beside if name not in fed_back(policy)]
-    if loose and loose == beside:
-        raise InputError(
-            f"what starts beside the target is not regulated: {listed(loose)}; no input would act: "
-            "give inputs that move it, or another start"
-        )
-    if loose:
-        text = f"{listed(loose)} starts beside the target and is not regulated"
-        warnings.warn(text, FflinWarning, stacklevel=2)
 
 
 def _warn_of_cut_thrust(robot: Robot, motion: Motion, policy: StateFeedback) -> None:
@@ -265,25 +259,3 @@ def _warn_of_cut_thrust(robot: Robot, motion: Motion, policy: StateFeedback) -> 
             FflinWarning,
             stacklevel=2,
         )
-
-
-def _without_thrusters(robot: Robot) -> Robot:
-    from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
-
-    others = tuple(each for each in robot.inputs if not isinstance(each, Thruster))
-    if len(others) == len(robot.inputs):
-        raise InputError(f"--allocate: '{robot.name}' has no thrusters; give --inputs with some")
-    missing = [
-        kind for kind in (BaseTorque, BaseForce) if not any(isinstance(x, kind) for x in others)
-    ]
-    base = tuple(kind() for kind in missing)
-    return robot.replace(inputs=(*base, *others))
-
-
-def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
-    from fflin.linear.linearization import linearize
-
-    q = placed(robot, "--target-joint", arguments.target_joint)
-    v = velocity_of(robot, arguments, "target_velocity")
-    u = inputs_at(robot, q, v, arguments)
-    return regulated_part(linearize(robot, q, v, u, frame=arguments.frame), arguments)

@@ -9,6 +9,7 @@ from fflin.base.errors import InputError
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
+    Container,
     add_output_file,
     add_robot,
     add_system,
@@ -20,7 +21,9 @@ from fflin.commands.points import load_robot, once
 from fflin.commands.regulator import add_weights
 
 if TYPE_CHECKING:
+    from fflin.control.gain_schedule import GainSchedule
     from fflin.linear.linear_trajectory import LinearTrajectory
+    from fflin.robot.robot import Robot
 
 
 def add_commands(commands: Commands) -> None:
@@ -40,7 +43,7 @@ def add_commands(commands: Commands) -> None:
     add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json")
 
 
-def add_trajectory(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
+def add_trajectory(parser: Container, *, required: bool = False) -> None:
     """Add --trajectory and --hold; then --frame is by default what the file says."""
     parser.add_argument(
         "--trajectory",
@@ -59,7 +62,7 @@ def add_trajectory(parser: argparse.ArgumentParser, *, required: bool = False) -
     parser.set_defaults(frame=None)
 
 
-def models_along(arguments: argparse.Namespace) -> LinearTrajectory:
+def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> LinearTrajectory:
     """Return the linear models along the trajectory that is given."""
     from fflin.linear.linear_trajectory import linearize_trajectory
     from fflin.linear.trajectory import Trajectory
@@ -71,7 +74,10 @@ def models_along(arguments: argparse.Namespace) -> LinearTrajectory:
         getattr(arguments, "position", None) or ()
     ):
         raise InputError("--rpy and --position say a point and --trajectory a motion; give either")
-    robot, options = load_robot(arguments), {"hold": arguments.hold, "frame": arguments.frame}
+    robot, options = (
+        robot or load_robot(arguments),
+        {"hold": arguments.hold, "frame": arguments.frame},
+    )
     return linearize_trajectory(robot, Trajectory.load(arguments.trajectory, robot, **options))
 
 
@@ -93,20 +99,27 @@ def check_along(arguments: argparse.Namespace) -> int:
 
 
 def _tvlqr(arguments: argparse.Namespace) -> int:
-    from fflin.control.default_weights import rule_weights
-    from fflin.control.tvlqr import steady_end, tvlqr
-
     if arguments.reduce:
         raise InputError("--reduce: over a finite time the inputs hold what they can; leave it out")
     along = models_along(arguments)
+    _say(schedule_of(along, arguments, once("--qf", arguments.qf) or "steady"), arguments)
+    return DONE
+
+
+def schedule_of(
+    along: LinearTrajectory, arguments: argparse.Namespace, Qf: Any = "steady"
+) -> GainSchedule:
+    """Return the regulator along a trajectory that the weights say."""
+    from fflin.control.default_weights import rule_weights
+    from fflin.control.tvlqr import steady_end, tvlqr
+
     options: dict[str, Any] = {"sample": arguments.dt, "weights": arguments.weights}
     given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
     if any(given.values()):
         end, hold = steady_end(along), arguments.dt or 0.0
         Q, R, _, rule = rule_weights(end, arguments.weights, given, hold=hold)
         options |= {"Q": Q, "R": R, "weights": None, "rule": rule}
-    _say(tvlqr(along, Qf=once("--qf", arguments.qf) or "steady", **options), arguments)
-    return DONE
+    return tvlqr(along, Qf=Qf, **options)
 
 
 def _say(made: Any, arguments: argparse.Namespace) -> None:

@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, add_pose, add_robot, command, file_name, number
+from fflin.commands.arguments import (
+    Commands,
+    Container,
+    add_pose,
+    add_robot,
+    command,
+    file_name,
+    number,
+)
 from fflin.commands.points import configuration_of, load_robot
 
 if TYPE_CHECKING:
@@ -38,7 +46,7 @@ def add_commands(commands: Commands) -> None:
     )
 
 
-def add_pictures(command: argparse.ArgumentParser) -> None:
+def add_pictures(command: Container) -> None:
     """Add the options of a command that makes a motion: files to show it in, and how."""
     command.add_argument(
         "--html",
@@ -67,7 +75,7 @@ def add_pictures(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_scene(command: argparse.ArgumentParser) -> None:
+def _add_scene(command: Container) -> None:
     command.add_argument(
         "--scene",
         choices=("space", "lab"),

@@ -92,10 +92,20 @@ class GainSchedule(Design):
 
     def trajectory(self, robot: Robot) -> Trajectory:
         """Return the trajectory that it keeps a robot on."""
+        from fflin.dynamics.actuation import Actuation
+        from fflin.dynamics.state import StateMap
+        from fflin.linear.fit import require_same
         from fflin.linear.trajectory import Trajectory
 
         if not self.knots.size:
             raise InputError("the file has no trajectory; load it with fflin.Trajectory.load")
+        state, made = StateMap(robot), f"the gains are those of '{self.robot}'"
+        inputs = Actuation(state).names, self.input_names
+        for kind, there, own in (
+            ("state", state.names, self.state_names),
+            ("input", *inputs),
+        ):
+            require_same(made, robot, kind, (own, own), (there, there))
         values: dict[str, Any] = {name: getattr(self, name) for name in ("q", "v", "u")}
         return Trajectory(robot, self.knots, **values, hold=self.hold, frame=self.frame)
 

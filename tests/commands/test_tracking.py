@@ -3,6 +3,7 @@
 import csv
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from scipy.io import savemat
 
@@ -77,3 +78,119 @@ def test_what_is_no_motion_is_said_and_what_is_no_trajectory_refused(flown):
     )
     assert "cannot be read" in refused("tvlqr", "planar_detumble", "--trajectory", "nosuch.csv")
     assert "expected a part of" in refused("tvlqr", *given, "--frame", "world", "--dt", "0.3")
+
+
+def chain(folder, *options, file="flown.csv"):
+    given = ("--trajectory", folder / file, *(("--frame", "world") * (file == "flown.csv")))
+    return run("simulate", "planar_detumble", *given, *options, cwd=folder)
+
+
+OFFSET = ("--offset", "yaw=1", "--offset", "q_m=0.05", "--offset", "omega_b.z=0.05")
+
+
+def test_a_trajectory_is_followed_from_beside_it_to_files(flown):
+    folder, robot, motion = flown
+    code, out, err = chain(
+        folder,
+        *OFFSET,
+        "--bryson",
+        "q_b=0.02",
+        "--bryson",
+        "q_m=0.05",
+        "--limit",
+        "tau_m=0.5",
+        "--html",
+        "a.html",
+        "--plot",
+        "a.png",
+        "-o",
+        "a.npz",
+    )
+    assert (code, err) == (0, "")
+    assert out.startswith("beside its trajectory at the end: attitude")
+    assert all((folder / name).stat().st_size > 10_000 for name in ("a.html", "a.png", "a.npz"))
+    run_ = fflin.Motion.load(folder / "a.npz")
+    assert run_.tracked
+    assert run_.t[-1] == 2.0
+    # As the schedule in its file does, and as Python does.
+    weights = ("--bryson", "q_b=0.02", "--bryson", "q_m=0.05", "-o", "gains.npz")
+    given = ("--trajectory", folder / "flown.csv", "--frame", "world")
+    assert run("tvlqr", "planar_detumble", *given, *weights, cwd=folder)[0] == 0
+    code, _, err = chain(
+        folder, *OFFSET, "--schedule", "gains.npz", "--limit", "tau_m=0.5", "-o", "b.npz"
+    )
+    assert (code, err) == (0, "")
+    np.testing.assert_array_equal(fflin.Motion.load(folder / "b.npz").x, run_.x)
+    alone = ("--schedule", "gains.npz", *OFFSET, "--limit", "tau_m=0.5", "-o", "c.npz")
+    assert run("simulate", "planar_detumble", *alone, cwd=folder)[0] == 0
+    np.testing.assert_allclose(fflin.Motion.load(folder / "c.npz").x, run_.x, atol=1e-12)
+    # The start is where it was asked to be.
+    state = fflin.StateMap(robot, reference=pin.XYZQUATToSE3(motion.q[0, :7]), frame="local")
+    there, here = (state.to_state(each.q[0], each.v[0]) for each in (motion, run_))
+    e = np.zeros(18)
+    e[2], e[6:9], e[11] = np.sin(np.radians(0.5)), 0.05, 0.05
+    np.testing.assert_allclose(here - there, e, atol=1e-12)
+
+
+def test_a_sampled_trajectory_of_a_mat_file_is_followed_past_its_end(flown):
+    folder = flown[0]
+    code, _, err = chain(
+        folder, "--dt", 0.1, "--offset", "yaw=1", "--duration", 60, "-o", "d.npz", file="flown.mat"
+    )
+    assert (code, err) == (0, "")
+    motion = fflin.Motion.load(folder / "d.npz")
+    assert motion.t[-1] == 60.0
+    held = motion.u[:-1].reshape(-1, 10, 9)
+    np.testing.assert_array_equal(held, np.repeat(held[:, :1], 10, axis=1))
+    assert motion.attitude_error[-1] < 0.05 < motion.attitude_error.max()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--free",), "--free: a trajectory says where the robot is to be"),
+        (("--target-joint", "joint_1=1"), "--target-joint: a trajectory says"),
+        (("--rpy", 1, 0, 0), "--rpy: it starts on the trajectory, or beside it by --offset"),
+        (("--offset", "yaw=1", "--offset", "q_b.x=0.1"), "q_b and an angle; give either"),
+        (("--offset", "q_b=0.8"), r"|q_b| is 1.39, expected less than 1"),
+        (("--offset", "jaw=1"), "no state named 'jaw'; did you mean yaw?"),
+        (("--schedule", "other.npz"), "other.npz has the gains of another motion than"),
+        (("--schedule", "other.npz", "--q", "q_b=1"), "--q: --schedule has its weights"),
+        (("--allocate",), "has no thrusters"),
+    ],
+)
+def test_what_a_trajectory_already_says_is_refused(flown, options, said):
+    folder, robot, motion = flown
+    if not (folder / "other.npz").exists():
+        along = fflin.linearize_trajectory(robot, motion.resampled(0.5))
+        fflin.tvlqr(along).save(folder / "other.npz")
+    given = ("--trajectory", folder / "flown.mat")
+    assert said in refused("simulate", "planar_detumble", *given, *options, cwd=folder)
+
+
+def test_gains_of_another_robot_are_refused(flown):
+    folder, robot, motion = flown
+    fflin.tvlqr(fflin.linearize_trajectory(robot, motion)).save(folder / "own.npz")
+    said = refused("simulate", "ets_vii", "--schedule", "own.npz", cwd=folder)
+    assert "the gains are those of 'planar_detumble', not of 'ets_vii'" in said
+    assert "--offset and --hold are of a --trajectory" in refused(
+        "simulate", "ets_vii", "--offset", "yaw=1"
+    )
+
+
+@pytest.mark.parametrize("options", [(), ("--dt", "0.1")])
+def test_a_gain_from_a_file_regulates_as_the_one_that_is_designed(tmp_path, options):
+    lqr = ("lqr", "ets_vii", "--joint", "joint_1=0.5", "--weights", "identity", *options)
+    assert run(*lqr, "-o", "gain.npz", cwd=tmp_path)[0] == 0
+    start = ("simulate", "ets_vii", "--rpy", 5, 0, 0, "--duration", 2, "-o")
+    designed = ("--target-joint", "joint_1=0.5", "--weights", "identity", *options)
+    assert run(*start, "a.npz", *designed, cwd=tmp_path)[0] == 0
+    code, _, err = run(*start, "b.npz", "--gain", "gain.npz", cwd=tmp_path)
+    assert (code, "gain" in err) == (0, False)
+    a, b = (fflin.Motion.load(tmp_path / name) for name in ("a.npz", "b.npz"))
+    np.testing.assert_allclose(b.x, a.x, atol=1e-9)
+    np.testing.assert_allclose(b.linear, a.linear, atol=1e-9)
+    said = refused(*start, "c.npz", "--gain", "gain.npz", "--q", "q_b=1", cwd=tmp_path)
+    assert "--q: --gain has its weights and its point" in said
+    other = refused("simulate", "canadarm2", "--gain", "gain.npz", cwd=tmp_path)
+    assert "gain.npz is a gain of 'ets_vii', not of 'canadarm2'" in other

@@ -1,0 +1,206 @@
+"""What closes the loop that the command simulate shows, from files or by design."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fflin.base.errors import FflinWarning, InputError, listed
+from fflin.base.names import by_name
+from fflin.commands.points import configuration_of, inputs_at, once, placed, velocity_of
+from fflin.commands.regulator import gain_of, regulated_part
+from fflin.commands.tracking import models_along, schedule_of
+
+if TYPE_CHECKING:
+    from fflin.base.validation import Array
+    from fflin.control.policies import StateFeedback
+    from fflin.control.tracking import TrajectoryFeedback
+    from fflin.linear.model import LinearModel
+    from fflin.robot.robot import Robot
+
+_WEIGHTS = ("weights", "q", "r", "bryson", "dt")
+_TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce")
+_ANGLES = ("roll", "pitch", "yaw")
+
+
+def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
+    """Refuse options that say nothing beside others."""
+    if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name)]:
+        raise InputError(f"{', '.join(given)}: {why}; leave it out")
+
+
+def refuse_law(arguments: argparse.Namespace) -> None:
+    """Refuse what says how a regulator is, where there is none."""
+    _refuse(arguments, ("limit", "delay"), "--free has no input to limit or delay")
+    names = (*_WEIGHTS, *_TARGETS[:2], "reduce", "allocate", "gain")
+    _refuse(arguments, names, "--free has no regulator to give weights, a target or thrusters")
+
+
+def start_of(robot: Robot, arguments: argparse.Namespace) -> tuple[Array, Array | None]:
+    """Return q (nq,) and v (nv,) that the arguments or the robot say."""
+    q = configuration_of(robot, arguments, robot.start)
+    names = ("target_velocity", "velocity")
+    return q, velocity_of(robot, arguments, *names, start=robot.start)
+
+
+def about_point(
+    robot: Robot, arguments: argparse.Namespace
+) -> tuple[Any, StateFeedback, LinearModel | None]:
+    """Return the policy, the feedback in it, and the model that foresees it at every row."""
+    from fflin.control.bounded import thrusters_push_every_way
+    from fflin.control.policies import Allocation, StateFeedback
+
+    allocate = thrusters_push_every_way(robot) if arguments.allocate is None else arguments.allocate
+    if arguments.gain:
+        from fflin.control.gain import Gain
+
+        _refuse(arguments, (*_WEIGHTS, *_TARGETS), "--gain has its weights and its point")
+        gain = Gain.load(arguments.gain)
+        # Made for the motors and thrusters themselves, a gain needs nobody to share out a wrench.
+        if arguments.allocate is None:
+            allocate = allocate and "tau_b.x" in gain.input_names
+        design = _without_thrusters(robot) if allocate else robot
+        lin = _about_gain(design, gain, arguments.gain)
+    else:
+        design = _without_thrusters(robot) if allocate else robot
+        lin = _about_target(design, arguments)
+        gain = gain_of(lin, arguments)
+    feedback = StateFeedback(lin.discretize(gain.dt) if gain.dt else lin, gain.K)
+    if allocate:
+        return Allocation(feedback, design), feedback, None
+    return feedback, feedback, None if arguments.reduce else lin
+
+
+def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
+    """Return the feedback along a trajectory, and the start beside it."""
+    from fflin.control.gain_schedule import GainSchedule
+    from fflin.control.policies import Allocation
+    from fflin.control.tracking import TrajectoryFeedback
+    from fflin.linear.trajectory import Trajectory
+
+    _refuse(arguments, ("free", "gain", *_TARGETS), "a trajectory says where the robot is to be")
+    poses = ("joint", "rpy", "position", "velocity")
+    _refuse(arguments, poses, "it starts on the trajectory, or beside it by --offset")
+    design = _without_thrusters(robot) if arguments.allocate else robot
+    if arguments.schedule is None:
+        models = models_along(arguments, design)
+        policy = TrajectoryFeedback(models, schedule_of(models, arguments))
+    else:
+        _refuse(arguments, _WEIGHTS, "--schedule has its weights and its time between samples")
+        schedule = GainSchedule.load(arguments.schedule)
+        if arguments.trajectory is None:
+            _refuse(arguments, ("hold",), "--schedule has its trajectory")
+            motion = schedule.trajectory(design)
+        else:
+            options = {"hold": arguments.hold, "frame": arguments.frame}
+            motion = Trajectory.load(arguments.trajectory, design, **options)
+            _require_own(schedule, motion, arguments)
+        policy = TrajectoryFeedback(motion, schedule)
+    start = _beside(design, policy, once("--offset", arguments.offset))
+    return (Allocation(policy, design) if arguments.allocate else policy), start
+
+
+def _require_own(schedule: Any, motion: Any, arguments: argparse.Namespace) -> None:
+    """Refuse gains that are of another motion."""
+    knots = (schedule.knots, motion.t), (schedule.q, motion.q), (schedule.v, motion.v)
+    size = max(1.0, *(float(np.abs(each).max()) for _, each in knots))
+    if any(
+        own.shape != there.shape or np.abs(own - there).max() > 1e-6 * size for own, there in knots
+    ):
+        raise InputError(
+            f"{arguments.schedule} has the gains of another motion than {arguments.trajectory}; "
+            "design them for this one (fflin tvlqr), or leave --trajectory out"
+        )
+
+
+def _beside(robot: Robot, policy: TrajectoryFeedback, given: dict[str, float]) -> dict[str, Any]:
+    """Return the start that is beside that of a trajectory by what --offset says."""
+    import pinocchio as pin
+
+    from fflin.dynamics.state import StateMap
+    from fflin.dynamics.state_rows import moved_by
+
+    if not given:
+        return {}
+    state = StateMap(robot, frame="local")
+    q, v, _ = policy.reference(0.0)
+    values = by_name("state", given, (*state.names, *_ANGLES))
+    e, angles = np.zeros((1, state.nx)), [values.pop(state.nx + k, None) for k in range(3)]
+    e[0, list(values)] = list(values.values())
+    if angles != [None] * 3:
+        if e[0, :3].any():
+            raise InputError("--offset has q_b and an angle; give either")
+        R = pin.rpy.rpyToMatrix(*(math.radians(angle or 0.0) for angle in angles))
+        e[0, :3] = pin.Quaternion(R).coeffs()[:3] * np.sign(pin.Quaternion(R).coeffs()[3] or 1.0)
+    if not np.linalg.norm(e[0, :3]) < 1.0:
+        raise InputError(f"--offset: |q_b| is {np.linalg.norm(e[0, :3]):.3g}, expected less than 1")
+    # From a chart about the trajectory's start, where the base may be turned by any angle.
+    chart = StateMap(robot, reference=pin.XYZQUATToSE3(q[:7]), frame="local")
+    x = moved_by("local", chart.to_state(q, v)[None], e)[0]
+    q, v = chart.to_pinocchio(x)
+    return {"q0": q, "v0": v}
+
+
+def _about_gain(robot: Robot, gain: Any, path: Path) -> LinearModel:
+    """Return the model about the point of a gain, with the base at the world's origin there."""
+    from fflin.dynamics.state import StateMap
+    from fflin.linear.fit import require_same
+    from fflin.linear.linearization import linearize
+
+    state = StateMap(robot, frame=gain.frame)
+    own = (gain.state_names, gain.state_units)
+    require_same(
+        f"{path} is a gain of '{gain.robot}'", robot, "state", own, (state.names, state.units)
+    )
+    q, v = state.to_pinocchio(gain.x0)
+    lin = linearize(robot, q, v, frame=gain.frame)
+    inputs = (gain.input_names, gain.input_units), (lin.input_names, lin.input_units)
+    require_same(f"{path} is a gain of '{gain.robot}'", robot, "input", *inputs)
+    return linearize(robot, q, v, gain.u0, frame=gain.frame)
+
+
+def require_held(robot: Robot, policy: StateFeedback, q: Array) -> None:
+    """Warn of what starts beside the target and is not fed back; refuse a start of nothing else."""
+    from fflin.control.policies import fed_back
+    from fflin.dynamics.state import StateMap
+
+    lin = policy.lin
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    start, target = (state.read(at, lin.v, near=state.read(lin.q, lin.v)) for at in (q, lin.q))
+    beside = [name for name, x in zip(state.names, abs(start - target), strict=True) if x > 1e-9]
+    loose = [name for name in beside if name not in fed_back(policy)]
+    if loose and loose == beside:
+        raise InputError(
+            f"what starts beside the target is not regulated: {listed(loose)}; no input would act: "
+            "give inputs that move it, or another start"
+        )
+    if loose:
+        text = f"{listed(loose)} starts beside the target and is not regulated"
+        warnings.warn(text, FflinWarning, stacklevel=2)
+
+
+def _without_thrusters(robot: Robot) -> Robot:
+    from fflin.robot.inputs import BaseForce, BaseTorque, Thruster
+
+    others = tuple(each for each in robot.inputs if not isinstance(each, Thruster))
+    if len(others) == len(robot.inputs):
+        raise InputError(f"--allocate: '{robot.name}' has no thrusters; give --inputs with some")
+    missing = [
+        kind for kind in (BaseTorque, BaseForce) if not any(isinstance(x, kind) for x in others)
+    ]
+    base = tuple(kind() for kind in missing)
+    return robot.replace(inputs=(*base, *others))
+
+
+def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
+    from fflin.linear.linearization import linearize
+
+    q = placed(robot, "--target-joint", arguments.target_joint)
+    v = velocity_of(robot, arguments, "target_velocity")
+    u = inputs_at(robot, q, v, arguments)
+    return regulated_part(linearize(robot, q, v, u, frame=arguments.frame), arguments)
