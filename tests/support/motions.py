@@ -65,6 +65,12 @@ def settling(robot, duration, *, reference=HOME, predicted=False):
     )
 
 
+def led(motion, rows=250):
+    """The motion as one that follows what it does itself so many rows later."""
+    ahead = np.minimum(np.arange(len(motion.t)) + rows, len(motion.t) - 1)
+    return replace(motion, target=motion.x[ahead])
+
+
 def motion(robot, start=None, duration=0.4, knots=81):
     """A motion of the robot under inputs that change slowly, to 1e-10."""
     q0, v0, u0 = random_point(robot, np.random.default_rng(1))
