@@ -93,7 +93,7 @@ def motion_page(
         "speed": speed,
         "follow": follow,
         "points": rounded(shown_points, info["size"]),
-        "target": "reference" if len(goal) > 1 else "target" * len(goal),
+        "target": len(goal) > 0,
         "linear": motion.linear is not None,
     }
     return build_page(info, window.commands()), drawing.notes

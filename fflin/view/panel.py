@@ -52,7 +52,7 @@ _CHARTS: tuple[dict[tuple[str, str], str], ...] = (
 
 
 class _Line(NamedTuple):
-    """Values (N,) of a name, limits (2,), infinite where open, and a reference (N,) or none (0,)."""
+    """Values (N,) of a name, its limits (2,), infinite where open, and a reference (N,) or (0,)."""
 
     name: str
     values: Array

@@ -24,7 +24,8 @@ function legendOf(info) {
     ...info.arrows.map(({ kind, colour }) => entry(`${kind} on the base`, colour, "wrench", kind)),
   ];
   const rest = info.rest === null ? "" : `, at rest from ${Number(info.rest.toPrecision(4))} s`;
-  if (info.target) entries.push({ ...entry(info.target + rest, GHOST, "target"), dashed: info.followed.length });
+  const dashed = info.followed.length > 0;
+  if (info.target) entries.push({ ...entry(dashed ? `reference${rest}` : "target", GHOST, "target"), dashed });
   if (info.linear) entries.push(entry("linear model", "#ff7fc8", "linear"));
   // In the panel thrusters are named in their plot; a strip of pictures has none.
   return [...entries, ...info.plumes.map(({ name, colour }) => ({ label: name, colour, strip: true }))];
