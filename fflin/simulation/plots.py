@@ -114,6 +114,7 @@ def draw(
             _histories(axes, t, states, group, indices)
             if place == 0 and states.reference is not None:
                 axes.plot([], [], color="#888888", **_PALE, label="reference")
+            if group not in _OF_JOINTS:
                 axes.legend(handlelength=1.2)
             if apart is not None:
                 below_it = figure.add_subplot(grid[2 * row + 1, column], sharex=axes)
@@ -171,8 +172,6 @@ def _histories(axes: Axes, t: Array, states: Signals, group: str, indices: list[
         _curve(axes, t, states, i, gaps, color=color, label=_short(states.names[i]))
     _limits(axes, states, indices)
     axes.set(title=_GROUPS[group], ylabel=states.unit(indices))
-    if group not in _OF_JOINTS:
-        axes.legend(handlelength=1.2)
     axes.margins(x=0.0)
 
 

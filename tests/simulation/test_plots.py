@@ -81,6 +81,10 @@ def test_a_reference_lies_pale_under_what_follows_it(along):
             assert pale.get_linewidth() > 2.0 * flown.get_linewidth()
     texts = [text.get_text() for axes in figure.axes for text in legend_texts(axes)]
     assert texts.count("reference") == 1
+    figure = motion.plot(show=["q_m", "tau_m"])
+    (named,) = figure.legends
+    assert [text.get_text() for text in named.get_texts()][-2:] == ["reference", "limit"]
+    assert not any(legend_texts(axes) for axes in figure.axes[:-1])
 
 
 def legend_texts(axes):
