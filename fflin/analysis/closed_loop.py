@@ -44,19 +44,11 @@ _MOST_EVALUATIONS = 60_000
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A robot, its linear model, and the feedback ``u = u0 - K (z - z0)`` on the model's states.
-
-    Attributes
-    ----------
-    robot : Robot
-    lin : LinearModel
-        Whole or reduced; sampled if its input is held.
-    K : ndarray (nu, nz)
-    """
+    """A robot, its linear model, and the feedback ``u = u0 - K (z - z0)`` on the model's states."""
 
     robot: Robot
-    lin: LinearModel
-    K: Array
+    lin: LinearModel  # whole or reduced; sampled if its input is held
+    K: Array  # (nu, nz)
 
     @cached_property
     def state(self) -> StateMap:
@@ -104,11 +96,7 @@ class Loop:
     def displaced(
         self, rng: np.random.Generator, attitude: float, position: float, joint: float
     ) -> Array:
-        """Return a state (nx,) at the point's velocity, displaced in a random direction.
-
-        The base is turned by `attitude` [deg] and moved by `position` [m], the joint that is
-        displaced most by `joint` [rad|m]; what is not among the model's states stays.
-        """
+        """Return a state (nx,) displaced by [deg], [m] and [rad|m], the model's states alone."""
         state, lin = self.state, self.lin
         g = state.groups
         x = state.to_state(lin.q, lin.v)
@@ -126,10 +114,7 @@ class Loop:
         return x
 
     def prediction_error(self, x: Array) -> float:
-        """Return the largest error of the linear loop from a state on, relative to its deviation.
-
-        NaN where the nonlinear loop ends before it settles.
-        """
+        """Return the linear loop's largest relative error; NaN where the other ends unsettled."""
         times = self._times(_FORESIGHT / self.decay)
         _, motion = self.run(x, times, _PRECISION)
         foreseen = self.linear(motion[0], times)[: len(motion)]
@@ -149,15 +134,10 @@ class Loop:
         return np.linspace(0.0, horizon, _STEPS + 1)
 
     def run(self, x: Array, times: Array, precision: float) -> tuple[str, Array]:
-        """Follow the nonlinear loop from a state.
+        """Return how the nonlinear loop ends, and the deviations (<= len(times), nz) on the way.
 
-        Returns
-        -------
-        outcome : str
-            "settled", "slow" where it was on its way at the last time, "chart" where the base
-            came near a turn of 180 degrees, or "diverged".
-        motion : ndarray (<= len(times), nz)
-            Deviations of the model's states, at the times that were reached.
+        It ends "settled", "slow" where it was on its way at the last time, "chart" where the base
+        came near a turn of 180 degrees, or "diverged".
         """
         follow = self._sampled if self.lin.dt else self._continuous
         motion = [x[self.watched] - self.lin.x0]

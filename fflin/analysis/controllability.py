@@ -28,6 +28,7 @@ from fflin.analysis.names import (
 from fflin.analysis.pbh import split_by_poles
 from fflin.analysis.ranks import FixedPoles, Margin, Noisy, echelon, image, null_space, unit_columns
 from fflin.analysis.second_order import Hidden, SecondOrder, hidden
+from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import folded
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
@@ -39,7 +40,7 @@ _LOOPS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Controllability:
+class Controllability(FrozenArrays):
     """What the inputs of a linear model can move; prints in words.
 
     Attributes
@@ -82,10 +83,6 @@ class Controllability:
     margin: Margin
     notes: tuple[str, ...]
     robot: str
-
-    def __post_init__(self) -> None:
-        for array in (self.rows, self.basis, self.fixed_poles):
-            array.setflags(write=False)
 
     def __str__(self) -> str:
         nx = len(self.basis)
@@ -148,7 +145,7 @@ def controllability(lin: LinearModel) -> Controllability:
     """
     lin = checked(lin)
     held = conserved(lin)
-    part = _split_kept(lin, held)
+    part = _by_second_order(lin, held) or _by_poles(lin, held)
     fixed, size = part.fixed, state_sizes(lin)
     others: Array = np.zeros((len(part.rows), len(lin.A)))
     others[:, held.selected] = part.rows
@@ -186,10 +183,7 @@ class _Part(NamedTuple):
     fixed: FixedPoles
 
 
-def _split_kept(lin: LinearModel, held: ConservedMomenta) -> _Part:
-    part = _by_second_order(lin, held)
-    if part is not None:
-        return part
+def _by_poles(lin: LinearModel, held: ConservedMomenta) -> _Part:
     z, R = held.selected, held.rates
     found = split_by_poles(slopes(lin)[z] @ held.T, lin.B[z], R.T @ lin.M @ R, lin.dt)
     rows, names = _labels(lin, found.rows, held)
@@ -213,7 +207,10 @@ def _by_second_order(lin: LinearModel, held: ConservedMomenta) -> _Part | None:
     s, v = np.split(found.motions, 2)
     pushed = np.hstack((s.T @ system.D.values + v.T @ system.M, s.T @ system.M))
     size = np.tile(system.size, 2)
-    reached = _across(pushed / size) / size[:, None]
+    # An orthonormal basis of what is orthogonal to those rows.
+    across = pushed / size
+    across = np.linalg.qr((across / np.linalg.norm(across, axis=1, keepdims=True)).T, "complete")[0]
+    reached = across[:, len(pushed) :] / size[:, None]
     to_s = np.linalg.inv((rates_of_positions(slopes(source)) @ R)[held.kept])
     reached[:r] = np.linalg.solve(to_s, reached[:r])
     if system.D.values.any():
@@ -223,13 +220,6 @@ def _by_second_order(lin: LinearModel, held: ConservedMomenta) -> _Part | None:
         rows, names = _vibration_rows(found, system, to_s, lin, held)
         method = "modes"
     return _Part(reached, rows, names, method, found.fixed.seen(R))
-
-
-def _across(rows: Array) -> Array:
-    """Return an orthonormal basis of what is orthogonal to independent rows (k, n)."""
-    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    basis: Array = np.linalg.qr(rows.T, mode="complete")[0][:, len(rows) :]
-    return basis
 
 
 def _labels(lin: LinearModel, rows: Array, held: ConservedMomenta) -> tuple[Array, tuple[str, ...]]:

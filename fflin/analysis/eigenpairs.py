@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from fflin.analysis.mechanics import floating_inertia
 from fflin.analysis.ranks import EPS
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
@@ -23,20 +24,9 @@ _NO_STIFFNESS = 1e-13
 
 
 class NaturalModes(NamedTuple):
-    """Eigenpairs of A.
+    """Eigenpairs of A; the figures are those of `Modes`."""
 
-    Attributes
-    ----------
-    triples : list of (complex, ndarray (nx,), float)
-        Poles but zero, one of each pair, their shapes, and the real parts as multiples of rounding.
-    rigid_body : int
-        Independent displacements that nothing opposes.
-    zeros : int
-        Eigenvalues at zero.
-    residual : float
-        As in `Modes`.
-    """
-
+    # Poles but zero, one of each pair, their shapes, and the real parts as multiples of rounding.
     triples: list[tuple[complex, Any, float]]
     rigid_body: int
     zeros: int
@@ -84,9 +74,7 @@ def _free_free(A: Array, M: Array, inertia: Array) -> NaturalModes | None:
     felt = np.flatnonzero(by_s.any(axis=0))
     if not felt.size:
         return NaturalModes([], nv, 2 * nv)
-    free = np.setdiff1d(np.arange(nv), felt)
-    across = unit[np.ix_(free, felt)]
-    M_star = unit[np.ix_(felt, felt)] - across.T @ np.linalg.solve(unit[np.ix_(free, free)], across)
+    M_star = floating_inertia(unit, felt, np.setdiff1d(np.arange(nv), felt))
     K = -M_star @ by_s[np.ix_(felt, felt)]
     squares, vectors = eigh((K + K.T) / 2.0, (M_star + M_star.T) / 2.0)
     squares, vectors = _polished(by_s[np.ix_(felt, felt)], squares, vectors)
@@ -118,10 +106,7 @@ def _polished(by_s: Array, squares: Array, vectors: Array) -> tuple[Array, Array
 
 
 def _scales(A: Array, inertia: Array) -> tuple[Array, float]:
-    """Return weights of the states and a rate, over which the entries of A are of size 1.
-
-    Velocities are weighed by sqrt(M_ii), and positions by the rate as well.
-    """
+    """Return weights of the states and a rate, over which the entries of A are of size 1."""
     nv = len(inertia)
     rates = np.abs(np.tile(inertia, 2)[:, None] * A / np.tile(inertia, 2))
     turning = max(float(rates[nv:, nv:].max()), float(rates[:nv, :nv].max()))
@@ -152,18 +137,9 @@ def nonzero_eigenpairs(
     :math:`V_0, V_1` a basis of the null space and of its complement, A is replaced by
     :math:`V_1^T A V_1`, which has the other eigenvalues, until nothing is left to split off.
 
-    Parameters
-    ----------
-    A : ndarray (n, n)
-        Scaled so that its entries are comparable, the largest about 1.
-    tolerance : float
-        Singular values below n times this are taken for zero.
-
-    Returns
-    -------
-    pairs : list of (eigenvalue, eigenvector (n,), error)
-        `error` bounds what rounding does to the eigenvalue: by its condition number.
-    nullity : int
+    A is scaled so that its entries are comparable, the largest about 1; singular values below n
+    times the tolerance are taken for zero. A pair is an eigenvalue, its eigenvector (n,), and a
+    bound on what rounding does to the eigenvalue, by its condition number.
     """
     from scipy.linalg import eig
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fflin.base.errors import InputError
+from fflin.base.frozen import FrozenArrays
 from fflin.base.validation import Array, number
 from fflin.linear.model import LinearModel
 
@@ -16,7 +17,7 @@ _DECAY = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
-class Gramians:
+class Gramians(FrozenArrays):
     """Gramians of a linear model.
 
     Attributes
@@ -32,10 +33,6 @@ class Gramians:
     controllability: Array
     observability: Array
     duration: float
-
-    def __post_init__(self) -> None:
-        for array in (self.controllability, self.observability):
-            array.setflags(write=False)
 
 
 def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
@@ -77,18 +74,14 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     pairs = ((lin.A, lin.B), (lin.A.T, lin.C.T))
     if duration is None:
         _require_decay(lin)
-        found = [_endless(A, B @ B.T, lin.dt) for A, B in pairs]
-        reach, show = (0.5 * (W + W.T) for W in found)
-        return Gramians(reach, show, np.inf)
-    duration = number("duration", duration)
-    if duration <= 0.0:
+    elif (duration := number("duration", duration)) <= 0.0:
         raise InputError(f"duration is {duration:g} s, expected a positive horizon")
     with np.errstate(over="ignore", invalid="ignore"):
-        found = [_finite(A, B @ B.T, lin.dt, duration) for A, B in pairs]
+        found = [_gramian(A, B @ B.T, lin.dt, duration) for A, B in pairs]
     if not all(np.isfinite(W).all() for W in found):
         raise InputError(f"duration is {duration:g} s, over which the model overflows")
     reach, show = (0.5 * (W + W.T) for W in found)
-    return Gramians(reach, show, duration)
+    return Gramians(reach, show, np.inf if duration is None else duration)
 
 
 def _require_decay(lin: LinearModel) -> None:
@@ -103,20 +96,18 @@ def _require_decay(lin: LinearModel) -> None:
         )
 
 
-def _endless(A: Array, Q: Array, dt: float) -> Array:
-    from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
+def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:
+    if duration is None:
+        from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
-    W: Array = solve_discrete_lyapunov(A, Q) if dt else solve_continuous_lyapunov(A, -Q)
-    return W
-
-
-def _finite(A: Array, Q: Array, dt: float, duration: float) -> Array:
-    if dt:
-        steps = round(duration / dt)
-        if not steps or abs(steps * dt - duration) > 1e-9 * duration:
-            raise InputError(f"duration is {duration:g} s, expected a multiple of dt = {dt:g} s")
-        return _summed(A, Q, steps)
-    return held_cost(A.T, Q, duration)
+        W: Array = solve_discrete_lyapunov(A, Q) if dt else solve_continuous_lyapunov(A, -Q)
+        return W
+    if not dt:
+        return held_cost(A.T, Q, duration)
+    steps = round(duration / dt)
+    if not steps or abs(steps * dt - duration) > 1e-9 * duration:
+        raise InputError(f"duration is {duration:g} s, expected a multiple of dt = {dt:g} s")
+    return _summed(A, Q, steps)
 
 
 def _summed(A: Array, Q: Array, steps: int) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -43,31 +44,27 @@ def slopes(lin: LinearModel) -> Array:
     return (lin.A - np.eye(len(lin.A))) / lin.dt if lin.dt else lin.A
 
 
+def floating_inertia(M: Array, kept: Any, others: Any) -> Array:
+    """Return what coordinates feel while the others float: the Schur complement of M."""
+    across = M[np.ix_(others, kept)]
+    felt: Array = M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(
+        M[np.ix_(others, others)], across
+    )
+    return felt
+
+
 @dataclass(frozen=True)
 class ConservedMomenta:
-    """The momenta that no input, spring or damper changes, and what follows from them.
+    """The momenta that no input, spring or damper changes, and what follows from them."""
 
-    Attributes
-    ----------
-    weights : ndarray (k, nv)
-        W with ``W M nu`` conserved, in echelon form: a row that is a unit vector is the
-        momentum of that coordinate.
-    momenta, coordinates : ndarray (k, nx)
-        L1 and L2 with ``L1 A = 0``, ``L2 A = L1``, ``L B = 0`` (sampled: of (A - E)/dt).
-    kept : ndarray (r,) of int
-        Coordinates that, with their rates, say the rest where L1 x = L2 x = 0.
-    T : ndarray (nx, 2 r)
-        The states with L1 x = L2 x = 0 of those coordinates and rates.
-    margin : Margin
-        Of the decision on r.
-    """
-
+    # W (k, nv) with W M nu conserved, in echelon form: a unit vector is one coordinate's momentum.
     weights: Array
+    # L1, L2 (k, nx) with L1 A = 0, L2 A = L1, L B = 0 (sampled: of (A - E)/dt).
     momenta: Array
     coordinates: Array
-    kept: Array
-    T: Array
-    margin: Margin
+    kept: Array  # (r,), coordinates that, with their rates, say the rest where L1 x = L2 x = 0
+    T: Array  # (nx, 2 r), the states with L1 x = L2 x = 0 of those coordinates and rates
+    margin: Margin  # of the decision on r
 
     @property
     def selected(self) -> Array:

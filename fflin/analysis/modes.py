@@ -12,6 +12,7 @@ import numpy as np
 
 from fflin.analysis.eigenpairs import natural_modes
 from fflin.base.errors import InputError
+from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import counted, grid, width
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Mode:
+class Mode(FrozenArrays):
     """One mode: a conjugate pair of poles, or a real pole.
 
     Attributes
@@ -40,9 +41,6 @@ class Mode:
     shape: NDArray[np.complexfloating[Any]]
     unstable: bool
     margin: float
-
-    def __post_init__(self) -> None:
-        self.shape.setflags(write=False)
 
     @property
     def oscillates(self) -> bool:
@@ -181,13 +179,9 @@ def modes(lin: LinearModel) -> Modes:
     if nx != 2 * nv:
         raise InputError(f"the model has {nx} states, expected {nv} positions and their velocities")
     found = natural_modes(lin)
+    triples = sorted(found.triples, key=lambda triple: (abs(triple[0]), triple[0].real))
     return Modes(
-        tuple(
-            Mode(pole, _normalised(shape), margin > 1.0, margin)
-            for pole, shape, margin in sorted(
-                found.triples, key=lambda triple: (abs(triple[0]), triple[0].real)
-            )
-        ),
+        tuple(Mode(pole, _normalised(x), margin > 1.0, margin) for pole, x, margin in triples),
         found.rigid_body,
         found.zeros,
         found.residual,
@@ -217,11 +211,12 @@ def modes_report(found: Modes) -> str:
     head += f", {counted(others, 'real pole')}" if others else ""
     if not found.equilibrium:
         head += "; not an equilibrium, where eigenvalues are those of a frozen model"
-    parts = [textwrap.fill(head, width())]
+    said = [head]
     if found.unstable:
         poles = ", ".join(f"{mode.pole:.5g}" for mode in found.unstable)
-        parts.append(textwrap.fill(f"unstable: poles with a positive real part {poles}", width()))
-    parts += [textwrap.fill(f"note: {note}", width()) for note in found.notes]
+        said.append(f"unstable: poles with a positive real part {poles}")
+    said += [f"note: {note}" for note in found.notes]
+    parts = [textwrap.fill(each, width()) for each in said]
     rows = [["rad/s", "damping", "time [s]", "", "what moves"]]
     rows += [
         [

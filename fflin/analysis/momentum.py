@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.analysis.mechanics import checked, conserved
+from fflin.analysis.mechanics import checked, conserved, floating_inertia
 from fflin.analysis.names import undecided
 from fflin.analysis.ranks import Margin
 from fflin.analysis.wheels import certified, leaving, part_of, picked, without
@@ -114,12 +114,9 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
             f"the point is no fixed point: |f0| is {np.abs(lin.f0).max():.3g} and changes what "
             "the reduction leaves out; linearise at rest"
         )
-    values = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
-    M = held.rates.T @ lin.M @ held.rates
-    values |= part_of(lin, np.eye(len(T))[z], T, M) | {"C": lin.C @ T}
     stays = picked(lin.state_names, whole.state_names)
     reduced = ReducedModel(
-        **values,
+        **part_of(lin, np.eye(len(T))[z], T, held.rates.T @ lin.M @ held.rates),
         T=stays.T @ T,
         S=stays[z],
         momenta=held.momenta @ stays,
@@ -135,6 +132,8 @@ def generalized_inertia(lin: LinearModel) -> Array:
 
     .. math:: M^* = M_{mm} - M_{mb} M_{bb}^{-1} M_{bm}
 
+    After Umetani and Yoshida, see `momentum_reduction`.
+
     Parameters
     ----------
     lin : LinearModel
@@ -149,17 +148,12 @@ def generalized_inertia(lin: LinearModel) -> Array:
     ------
     InputError
         If the base is not among the states.
-
-    References
-    ----------
-    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
     """
     lin = checked(lin)
     joints = sum(name.startswith("q_m.") for name in lin.state_names)
     if len(lin.A) != 12 + 2 * joints:
         raise InputError("the base is not among the states; take the model before its reduction")
-    M = lin.M
-    inertia: Array = M[6:, 6:] + M[6:, :6] @ _following(M)
+    inertia = floating_inertia(lin.M, range(6, 6 + joints), range(6))
     return (inertia + inertia.T) / 2.0
 
 
@@ -167,6 +161,8 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
     r"""Return the generalized Jacobian: a frame's velocity per joint rate at zero momentum (9.3).
 
     .. math:: J^* = J_m + J_b G, \qquad G = -M_{bb}^{-1} M_{bm}
+
+    After Umetani and Yoshida, see `momentum_reduction`.
 
     Parameters
     ----------
@@ -188,10 +184,6 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
         If there is no such frame.
     InputError
         If `q` is no configuration of the robot.
-
-    References
-    ----------
-    Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
     """
     state = StateMap(robot)
     q = robot.neutral() if q is None else robot.checked_configuration(q)
@@ -200,11 +192,5 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
     full = pin.computeFrameJacobian(model, data, q, index, axes)
     J = state.columns(np.vstack((full[LINEAR], full[ANGULAR])))
     M = state.project(pin.crba(model, data, q).T)
-    result: Array = J[:, 6:] + J[:, :6] @ _following(M)
+    result: Array = J[:, 6:] - J[:, :6] @ np.linalg.solve(M[:6, :6], M[:6, 6:])
     return result
-
-
-def _following(M: Array) -> Array:
-    """Return G (6, n), what the free base does when the joints move."""
-    G: Array = -np.linalg.solve(M[:6, :6], M[:6, 6:])
-    return G

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from fflin.analysis.mechanics import ConservedMomenta
@@ -15,6 +17,8 @@ _CONSERVED = {
     "v_b": ("linear momentum", "base position"),
 }
 _OTHER = ("momentum of", "position of")
+
+_AXIS = re.compile(r"(?<!\S)[xyz](?!\S)")
 
 
 def momentum_names(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
@@ -38,20 +42,12 @@ def momentum_names(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
 
 def grouped(names: tuple[str, ...]) -> list[str]:
     """Join names that differ in their axis alone: "angular momentum x, y, z" is one."""
-    groups: dict[tuple[str, str], list[str]] = {}
+    groups: dict[str, list[str]] = {}
     for name in names:
-        words = name.split(" ")
-        axes = [i for i, word in enumerate(words) if word in ("x", "y", "z")]
-        if len(axes) == 1:
-            i = axes[0]
-            key = (" ".join(words[:i]), " ".join(words[i + 1 :]))
-            groups.setdefault(key, []).append(words[i])
-        else:
-            groups[name, ""] = []
-    return [
-        " ".join(part for part in (head, "/".join(axes), tail) if part)
-        for (head, tail), axes in groups.items()
-    ]
+        axes = _AXIS.findall(name)
+        key = _AXIS.sub("\0", name) if len(axes) == 1 else name
+        groups.setdefault(key, []).extend(axes[: len(axes) == 1])
+    return [key.replace("\0", "/".join(axes)) for key, axes in groups.items()]
 
 
 _RATES = {"q_b": "omega_b", "r_b": "v_b", "q_m": "qdot_m"}
@@ -78,10 +74,14 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
     order = [i for i in np.argsort(-np.abs(weights) * sizes) if weights[i]]
     largest = abs(weights[order[0]]) * sizes[order[0]]
     shown = [i for i in order if abs(weights[i]) * sizes[i] > 1e-6 * largest]
-    terms = [_term(float(weights[i]), names[i], first=i == shown[0]) for i in shown[:most]]
+    terms: list[str] = []
+    for i in shown[:most]:
+        value = f"{abs(weights[i]):.3g}"
+        sign = ("-" if weights[i] < 0.0 else "+") + " " * bool(terms)
+        terms.append(sign + (names[i] if value == "1" else f"{value} {names[i]}"))
     if len(shown) > most:
         terms.append(f"+ {len(shown) - most} more")
-    return " ".join(terms)
+    return " ".join(terms).removeprefix("+")
 
 
 def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[str, ...]:
@@ -111,9 +111,3 @@ def shape(lin: LinearModel, at: Array) -> str:
     largest = at[int(np.abs(at * size).argmax())]
     names = tuple(name.partition(".")[2] or name for name in lin.state_names[len(lin.M) :])
     return combination(np.real(at / largest), names, size)
-
-
-def _term(weight: float, name: str, *, first: bool) -> str:
-    sign = ("-" if weight < 0.0 else "") if first else ("- " if weight < 0.0 else "+ ")
-    size = f"{abs(weight):.3g}"
-    return sign + (name if size == "1" else f"{size} {name}")

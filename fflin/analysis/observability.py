@@ -19,13 +19,14 @@ from fflin.analysis.names import combination, undecided, unsettled, with_rates
 from fflin.analysis.pbh import split_by_poles
 from fflin.analysis.ranks import EPS, FixedPoles, Margin, Noisy, echelon, without_rounding
 from fflin.analysis.second_order import hidden
+from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import folded
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 
 
 @dataclass(frozen=True, eq=False)
-class Observability:
+class Observability(FrozenArrays):
     """What the outputs of a linear model show; prints in words.
 
     Attributes
@@ -60,10 +61,6 @@ class Observability:
     margin: Margin
     notes: tuple[str, ...]
     robot: str
-
-    def __post_init__(self) -> None:
-        for array in (self.basis, self.rows, self.fixed_poles):
-            array.setflags(write=False)
 
     def __str__(self) -> str:
         lines = [

@@ -26,11 +26,7 @@ _DEAD = 1e4 * EPS
 
 
 class _Scaled(NamedTuple):
-    """A pair in coordinates of energy: ``x = to_x @ xi``, time in units of `unit` seconds.
-
-    Velocities are L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy, positions
-    likewise over the time unit. A is of size about 1.
-    """
+    """A pair in coordinates of energy: ``x = to_x @ xi``, time in units of `unit` seconds."""
 
     A: Array
     to_x: Array
@@ -40,19 +36,19 @@ class _Scaled(NamedTuple):
 
 
 def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
-    """Scale slopes to units of energy, and of time so that A is of size 1.
+    """Scale slopes to units of energy, and of time so that A is of size about 1.
 
-    The tolerance is twenty times the rounding of M^-1, or that of the exponential which the
-    slopes of a sampled model are a difference of.
+    Velocities are L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy, positions
+    likewise over the time unit. The tolerance is twenty times the rounding of M^-1, or that of the
+    exponential which the slopes of a sampled model are a difference of.
     """
     nv = len(M)
     p, v = slice(0, nv), slice(nv, None)
     L = np.linalg.cholesky(M)
     N = rates_of_positions(X)
-    to_velocity = np.linalg.inv(L.T)
-    to_position = N @ to_velocity
-    to_x = np.block([[to_position, np.zeros((nv, nv))], [np.zeros((nv, nv)), to_velocity]])
-    back = np.block([[L.T @ np.linalg.inv(N), np.zeros((nv, nv))], [np.zeros((nv, nv)), L.T]])
+    to_velocity, zero = np.linalg.inv(L.T), np.zeros((nv, nv))
+    to_x = np.block([[N @ to_velocity, zero], [zero, to_velocity]])
+    back = np.block([[L.T @ np.linalg.inv(N), zero], [zero, L.T]])
     A = back @ X @ to_x
     turning, fall, drag = (float(np.linalg.norm(A[i, j], 2)) for i, j in ((p, p), (v, p), (v, v)))
     rate = max(turning, drag, np.sqrt(fall))
@@ -72,22 +68,12 @@ def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
 
 
 class Split(NamedTuple):
-    """The state space of a model, split into what its inputs reach and the rest.
+    """The state space of a model, split into what its inputs reach and the rest."""
 
-    Attributes
-    ----------
-    reached, rest : ndarray (nx, d), (nx, nx - d)
-        Bases; of the dual pair the rest is what no output shows.
-    rows : ndarray (nx - d, nx)
-        ``rows @ x`` is what no input acts on.
-    fixed : FixedPoles
-        Of the rest.
-    """
-
-    reached: Array
-    rest: Array
-    rows: Array
-    fixed: FixedPoles
+    reached: Array  # (nx, d), a basis
+    rest: Array  # (nx, nx - d), a basis; of the dual pair of what no output shows
+    rows: Array  # (nx - d, nx) with rows @ x what no input acts on
+    fixed: FixedPoles  # of the rest
 
 
 def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False) -> Split:
@@ -96,19 +82,8 @@ def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = 
     The left vectors with ``w [A - s E, B] = 0`` are found at every eigenvalue s as singular
     vectors, and split off by an orthogonal transformation, until there are none: so that the
     whole of a defective eigenvalue goes. A staircase would carry the rounding of a weak step into
-    the next.
-
-    Parameters
-    ----------
-    X : ndarray (nx, nx)
-        Slopes: A, or (A - E)/dt of a sampled model.
-    drive : ndarray (nx, k)
-        B, or C^T of the dual pair.
-    M : ndarray (nx/2, nx/2)
-        Inertia.
-    dt : float
-    dual : bool
-        Whether to split by what outputs show.
+    the next. X (nx, nx) is A, or (A - E)/dt of a sampled model, `drive` (nx, k) is B, or, to split
+    by what outputs show, C^T of the `dual` pair.
     """
     pair = _scaled(X, M, dt)
     A, to = (pair.A.T, pair.to_x.T) if dual else (pair.A, pair.from_x)

@@ -24,20 +24,11 @@ _FLOOR, _ROUNDING = 1e3 * EPS, 0.3
 
 
 class Decision(NamedTuple):
-    """Whether a singular value counts: where its ratio to the tolerance is above 1.
-
-    Attributes
-    ----------
-    ratio : float
-    at : ndarray or None
-        Its direction; None where there was nothing to decide.
-    states : int
-        How many states hang on it: two on a pair of poles, or a momentum and what it drives.
-    """
+    """Whether a singular value counts: where its ratio to the tolerance is above 1."""
 
     ratio: float
-    at: Any = None
-    states: int = 1
+    at: Any = None  # its direction; None where there was nothing to decide
+    states: int = 1  # that hang on it: two on a pair of poles, or a momentum and what it drives
 
 
 class Margin(NamedTuple):
@@ -84,16 +75,11 @@ class Margin(NamedTuple):
 
     @property
     def doubts(self) -> tuple[tuple[float, Any, int], ...]:
-        """The decisions within rounding: their ratios, directions, and by how much they differ.
-
-        The last is negative where less would count.
-        """
-        found = []
-        if self.kept < CLEAR:
-            found.append((self.kept, self.counted.at, -self.counted.states))
-        if self.dropped > LOST:
-            found.append((self.dropped, self.left_out.at, self.left_out.states))
-        return tuple(found)
+        """The decisions within rounding: ratios, directions, and how many states more they are."""
+        counted, left_out = self
+        near = [(counted.ratio, counted.at, -counted.states)] * (self.kept < CLEAR)
+        near += [left_out] * (self.dropped > LOST)
+        return tuple(near)
 
 
 def decided(ratio: float, direction: Any, states: int = 1) -> Margin:
@@ -103,22 +89,12 @@ def decided(ratio: float, direction: Any, states: int = 1) -> Margin:
 
 
 class FixedPoles(NamedTuple):
-    """The poles of what inputs do not reach, or outputs do not show.
+    """The poles of what inputs do not reach, or outputs do not show."""
 
-    Attributes
-    ----------
-    poles : ndarray (k,)
-        [1/s], or of the sampled model.
-    decays : bool
-        Whether all of them do, beyond rounding.
-    margin, settling : Margin
-        Of what is reached or shown, and of whether the slowest of these poles decays.
-    """
-
-    poles: Any = np.zeros(0)
-    decays: bool = True
-    margin: Margin = Margin()
-    settling: Margin = Margin()
+    poles: Any = np.zeros(0)  # (k,) [1/s], or of the sampled model
+    decays: bool = True  # whether all of them do, beyond rounding
+    margin: Margin = Margin()  # of what is reached or shown
+    settling: Margin = Margin()  # of whether the slowest of these poles decays
 
     def seen(self, change: Array) -> FixedPoles:
         """Return it with the directions of its margins in other coordinates."""
@@ -228,22 +204,9 @@ def unit_columns(matrix: Array) -> Array:
 
 
 def echelon(columns: Array, weights: Array, preferred: Array | None = None) -> tuple[Array, Array]:
-    """Return a basis (m, r) of the same columns whose rows at r pivots are the identity.
+    """Return a basis of independent columns (m, r), the identity at r pivots, and these.
 
-    Parameters
-    ----------
-    columns : ndarray (m, r)
-        Of full column rank.
-    weights : ndarray (m,)
-        Makes rows of different units comparable.
-    preferred : ndarray (m,) of bool, optional
-        Rows to look for pivots in first.
-
-    Returns
-    -------
-    basis : ndarray (m, r)
-    pivots : ndarray (r,) of int
-        Ascending.
+    `weights` (m,) make rows comparable; pivots are looked for in `preferred` rows first.
     """
     from scipy.linalg import qr
 

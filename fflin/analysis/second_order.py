@@ -38,19 +38,12 @@ _SUSPICIOUS, _NEAR, _REFINEMENTS = 1e-3, 0.1, 8
 
 @dataclass(frozen=True)
 class SecondOrder:
-    """The forces of a model, in coordinates s whose rates are the velocities.
-
-    Attributes
-    ----------
-    M : ndarray (nv, nv)
-    K, D : Noisy (nv, nv)
-    S : Noisy (nv, nu)
-    """
+    """The forces of a model, in coordinates s whose rates are the velocities."""
 
     M: Array
     K: Noisy
     D: Noisy
-    S: Noisy
+    S: Noisy  # (nv, nu)
 
     @cached_property
     def size(self) -> Array:
@@ -109,19 +102,10 @@ class SecondOrder:
 
 
 class Hidden(NamedTuple):
-    """What a reading of positions and velocities misses of the free motion.
+    """What a reading of positions and velocities misses of the free motion."""
 
-    Attributes
-    ----------
-    motions : ndarray (2 nv, k)
-        Basis of the unobservable subspace, (s, ds/dt).
-    shapes : tuple of (complex, ndarray (nv, m))
-        Of the continuous poles that are not zero, one of each pair.
-    fixed : FixedPoles
-    """
-
-    motions: Array
-    shapes: tuple[tuple[complex, Any], ...]
+    motions: Array  # (2 nv, k), basis of the unobservable subspace, (s, ds/dt)
+    shapes: tuple[tuple[complex, Any], ...]  # (nv, m), of each continuous pole or pair but zero
     fixed: FixedPoles
 
 
@@ -137,11 +121,8 @@ def hidden(system: SecondOrder, position: Noisy, velocity: Noisy, dt: float) -> 
     What hides from the inputs are the left vectors, which by symmetry are found with
     :math:`C_s = S^T, C_v = 0`.
 
-    Returns
-    -------
-    Hidden or None
-        None where K or D are of another kind, where sampling every `dt` takes two poles for one,
-        and where a pole is defective, so that eigenvectors do not tell what belongs to it.
+    It is None where K or D are of another kind, where sampling every `dt` takes two poles for one,
+    and where a pole is defective, so that eigenvectors do not tell what belongs to it.
     """
     if not system.symmetric or (dt and _aliased(system.poles[0], dt)):
         return None

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.analysis.controllability import controllability
+from fflin.analysis.controllability import Controllability, controllability
 from fflin.analysis.mechanics import conserved
 from fflin.analysis.names import grouped, with_rates
-from fflin.analysis.observability import observability
+from fflin.analysis.observability import Observability, observability
 from fflin.analysis.ranks import Margin, judged
 from fflin.analysis.wheels import damped_wheels
 from fflin.base.errors import (
@@ -31,57 +31,56 @@ if TYPE_CHECKING:
 # zero: repeated eigenvalues are computed with such errors.
 _RANK = 1e-7
 
-_UNSEEN = "which do not settle by themselves; add outputs"
-
 
 def require_stabilizable(lin: LinearModel) -> None:
     """Raise `StabilizabilityError` that names what no input can hold."""
     if len(lin.A) < 2 * len(lin.M):  # with speeds of wheels without their angles
         missed = f"the inputs cannot hold {{}}{damped_wheels(lin) or '; add inputs'}"
-        reached = lin.A, lin.B, "held by the inputs", missed, StabilizabilityError
-        return _warn_of_doubts(_checked_reach(lin, *reached))
+        _check_reach(lin, lin.A, lin.B, "held by the inputs", missed, StabilizabilityError)
+        return
     found = controllability(lin)
     if not found.stabilizable:
         weights = conserved(lin).weights
         words = _forces_missing(lin, weights) if len(weights) else None
         words = words or f"{', '.join(grouped(found.uncontrollable))}; add inputs"
-        error = StabilizabilityError(f"the inputs cannot hold {words}{_doubts(found.notes)}")
-        error.margin = found.margin
-        raise error
-    _warn_of_doubts(found.notes)
+        raise _error(StabilizabilityError, f"the inputs cannot hold {words}", found)
+    _warn_of(found.notes)
 
 
 def require_detectable(lin: LinearModel) -> None:
     """Raise `DetectabilityError` that names what no output shows and what does not settle."""
+    missed = "the outputs do not show {}, which do not settle by themselves; add outputs"
     if len(lin.A) < 2 * len(lin.M):
-        missed = f"the outputs do not show {{}}, {_UNSEEN}"
-        shown = lin.A.T, lin.C.T, "shown by the outputs", missed, DetectabilityError
-        return _warn_of_doubts(_checked_reach(lin, *shown))
+        _check_reach(lin, lin.A.T, lin.C.T, "shown by the outputs", missed, DetectabilityError)
+        return
     found = observability(lin)
     if not found.detectable:
-        error = DetectabilityError(
-            f"the outputs do not show {with_rates(found.unobservable)}, {_UNSEEN}"
-            f"{_doubts(found.notes)}"
-        )
-        error.margin = found.margin
-        raise error
-    _warn_of_doubts(found.notes)
+        raise _error(DetectabilityError, missed.format(with_rates(found.unobservable)), found)
+    _warn_of(found.notes)
+
+
+def _error(
+    kind: type[FflinError], words: str, found: Controllability | Observability
+) -> FflinError:
+    error: Any = kind(words + _doubts(found.notes))
+    error.margin = found.margin
+    return error
 
 
 def _doubts(notes: tuple[str, ...]) -> str:
     return "".join(f"; {note}" for note in notes if note.startswith("undecided"))
 
 
-def _warn_of_doubts(notes: tuple[str, ...]) -> None:
+def _warn_of(notes: tuple[str, ...], stacklevel: int = 4) -> None:
     for note in notes:
         if note.startswith("undecided"):
-            warnings.warn(note, FflinWarning, stacklevel=4)
+            warnings.warn(note, FflinWarning, stacklevel=stacklevel)
 
 
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
     """Raise `InputError` that names the modes on the boundary of stability that Q leaves out."""
     missed = "Q does not weigh {}, which do not settle by themselves; weigh them"
-    _warn_of_doubts(_checked_reach(lin, A.T, _root(Q), "weighed by Q", missed))
+    _check_reach(lin, A.T, _root(Q), "weighed by Q", missed)
 
 
 def require_disturbed(lin: LinearModel, W: Array) -> None:
@@ -90,7 +89,7 @@ def require_disturbed(lin: LinearModel, W: Array) -> None:
         "W does not disturb {}, which do not settle by themselves: a steady filter would not "
         "correct them; give them an intensity"
     )
-    _warn_of_doubts(_checked_reach(lin, lin.A, _root(W), "disturbed by W", missed))
+    _check_reach(lin, lin.A, _root(W), "disturbed by W", missed)
 
 
 def _root(W: Array) -> Array:
@@ -106,15 +105,15 @@ def _root(W: Array) -> Array:
     return root
 
 
-def _checked_reach(
+def _check_reach(
     lin: LinearModel,
     A: Array,
     B: Array,
     what: str,
     complaint: str,
     error: type[FflinError] = InputError,
-) -> tuple[str, ...]:
-    """Return what is undecided; raise an error where B misses a mode on the boundary.
+) -> None:
+    """Raise an error where B misses a mode on the boundary, or warn of what is undecided.
 
     A growing mode may be missed by a weight or a disturbance, whose error is an `InputError`.
     """
@@ -143,7 +142,7 @@ def _checked_reach(
     if missed:
         words = _dominant(np.array(missed), lin.state_names)
         raise error(f"{complaint.format(words)}{_doubts(doubts)}")
-    return doubts
+    _warn_of(doubts, 5)
 
 
 def _left_null(matrix: Array) -> tuple[Array, Margin]:

@@ -10,9 +10,10 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fflin.analysis.mechanics import second_order, slopes
+from fflin.analysis.mechanics import floating_inertia, second_order, slopes
 from fflin.analysis.ranks import Noisy, echelon, image, null_space
 from fflin.base.errors import InputError, StabilizabilityError, listed
+from fflin.base.frozen import frozen
 from fflin.base.names import input_keys
 from fflin.base.validation import Array
 from fflin.linear.files import given
@@ -119,21 +120,17 @@ def rigid_forces(body: LinearModel) -> Noisy:
 
 def without(lin: LinearModel, left: Indices) -> LinearModel:
     """Return a model without coordinates (k,) and their rates, exact whatever these do (9.4)."""
-    nv, M = len(lin.M), lin.M
-    kept = np.setdiff1d(np.arange(nv), left)
-    across = M[np.ix_(left, kept)]
-    rest = M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(M[np.ix_(left, left)], across)
-    names = [lin.state_names[i] for i in (*kept, *(kept + nv))]
+    kept = np.setdiff1d(np.arange(len(lin.M)), left)
+    names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
+    rest = floating_inertia(lin.M, kept, left)
     return selected(lin, names, rest, partial(without, left=left))
 
 
 def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
     """Return the model of some states, of the inertia M, and of the outputs that see no others."""
     S = picked(names, lin.state_names)
-    seen = seen_through(lin, S)
-    values = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
-    values |= part_of(lin, S, S.T, M)
-    values |= {"C": seen @ lin.C @ S.T, "D": seen @ lin.D, "y0": seen @ lin.y0}
+    seen, values = seen_through(lin, S), part_of(lin, S, S.T, M)
+    values |= {"C": seen @ values["C"], "D": seen @ lin.D, "y0": seen @ lin.y0}
     for key in ("output_names", "output_units"):
         values[key] = tuple(getattr(lin, key)[i] for i in seen.argmax(axis=1))
     return certified(LinearModel(**values), lin, make)
@@ -152,18 +149,19 @@ def seen_through(lin: LinearModel, S: Array) -> Array:
 
 def part_of(lin: LinearModel, S: Array, T: Array, M: Array) -> dict[str, Any]:
     """Return the fields of a model of the states z = S x of the inertia M, the others T z."""
-    M.setflags(write=False)
     names = tuple(lin.state_names[i] for i in S.argmax(axis=1))
-    return {
+    whole = {item.name: getattr(lin, item.name) for item in fields(LinearModel)}
+    return whole | {
         "A": S @ lin.A @ T,
         "B": S @ lin.B,
+        "C": lin.C @ T,
         "f0": S @ lin.f0,
         "x0": S @ lin.x0,
         "state_names": names,
         "state_units": tuple(lin.state_units[i] for i in S.argmax(axis=1)),
         "_ignorable": partial(given, tuple(name for name in names if name in lin.ignorable)),
         "_drift": None if lin.drift is None else S @ lin.drift,
-        "_inertia": partial(given, M),
+        "_inertia": partial(given, frozen(M)),
     }
 
 

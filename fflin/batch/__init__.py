@@ -1,7 +1,8 @@
 """Many points at once: points, workers, files, gains between points.
 
-A sweep's `configurations` and `task` are cut into `chunks`, which `dispatch` gives to threads or
-workers; the `store` keeps what they come to, and a `linear_batch` is read from it.
+`run` takes any rows through any job: chunk by chunk, on threads or by `dispatch` on workers, into a
+`store` that goes on after a crash. A sweep is such a run: of `configurations` (and what is the same
+about them, a `task`) through the job of `chunks`; a `linear_batch` is read from the store.
 
 Imports `base`, `robot`, `dynamics`, `kernel`, `linear` and `control`.
 """

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
-import pickle
 import warnings
 from collections.abc import Mapping
 from functools import cached_property, partial
 from threading import Lock
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import FflinError, FflinWarning
 from fflin.base.validation import Array
+from fflin.batch.dispatch import ChunkResult
+from fflin.batch.rows import Points
 from fflin.dynamics.inertia import Inertia
 from fflin.kernel.compiled import pays
 from fflin.linear.linearization import Linearizer
@@ -22,22 +22,6 @@ from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
     from fflin.batch.equations import BatchEquations
-    from fflin.dynamics.state import Frame
-
-
-class Points(NamedTuple):
-    """Points of one chunk, checked; v and u (rows, ..) or None for rest and no input."""
-
-    q: Array
-    v: Array | None
-    u: Array | None
-
-
-class ChunkResult(NamedTuple):
-    """The result of a chunk: its arrays by name, and the warnings on the way."""
-
-    arrays: dict[str, Array]
-    notes: list[str]
 
 
 # Python has one set of warning filters for the whole process, so that threads take turns.
@@ -45,31 +29,10 @@ _TURN = Lock()
 
 
 class ChunkJob:
-    """Linearises chunks; is sent to every worker once.
+    """Linearises chunks of `count` points, `at_rest` all, as `Linearizer` does."""
 
-    Parameters
-    ----------
-    robot : Robot
-    frame, reference, moving : optional
-        As `Linearizer` takes them.
-    at_rest : bool
-        Whether all points have neither velocity nor input.
-    count : int
-        Points of all chunks.
-    """
-
-    def __init__(
-        self,
-        robot: Robot,
-        *,
-        frame: Frame | None,
-        reference: pin.SE3 | None,
-        moving: bool,
-        at_rest: bool,
-        count: int,
-    ) -> None:
-        options: Any = {"frame": frame, "reference": reference, "moving": moving}
-        self._again = partial(type(self), robot, **options, at_rest=at_rest, count=count)
+    def __init__(self, robot: Robot, *, at_rest: bool, count: int, **options: Any) -> None:
+        self._again = partial(type(self), robot, at_rest=at_rest, count=count, **options)
         self._count = count
         self.linearizer = Linearizer(robot, **options)
         prepared = self.linearizer.prepared
@@ -98,21 +61,7 @@ class ChunkJob:
     def run(
         self, points: Points, start: int, out: Mapping[str, Array] | None = None
     ) -> ChunkResult:
-        """Linearise about the points of a chunk; threads may share a job.
-
-        Parameters
-        ----------
-        points : Points
-        start : int
-            Number of its first point, for messages.
-        out : mapping, optional
-            Arrays to write to; new ones by default.
-
-        Raises
-        ------
-        FflinError
-            If there is no model about one of them; the message names it.
-        """
+        """Linearise about the points of a chunk; see `Job`."""
         count = len(points.q)
         if out is None:
             out = {key: np.empty((count, *shape)) for key, shape in self.shapes.items()}
@@ -121,7 +70,7 @@ class ChunkJob:
             one = self.run(Points(points.q[:1], None, None), start)
             out["B_lower"][:] = one.arrays["B_lower"]
             return ChunkResult(dict(out), one.notes)
-        left = self.compiled.write(*points, out) if self.compiled else np.arange(count)
+        left = self.compiled.write(points, out) if self.compiled else np.arange(count)
         if not len(left):
             return ChunkResult(dict(out), [])
         with _TURN, warnings.catch_warnings(record=True) as caught:
@@ -137,20 +86,18 @@ class ChunkJob:
         return ChunkResult(dict(out), [str(note.message) for note in caught])
 
     def _write(self, row: int, points: Points, out: Mapping[str, Array]) -> None:
-        q, v, u = (None if rows is None else rows[row] for rows in points)
-        lin = self.linearizer(q, v, u)
+        lin = self.linearizer(*points.each(lambda rows: rows[row]))
         for key, array in out.items():
             lower = key == "B_lower"
             array[row] = lin.B[len(lin.B) // 2 :] if lower else getattr(lin, key.removeprefix("_"))
 
     def _write_at_rest(self, q: Array, B_lower: Array) -> None:
         (inertia, data), actuation = self._inertia, self.linearizer.prepared.actuation
-        if actuation.default:
-            inertia.invert(q, B_lower)
-            return
         nv = len(B_lower)
-        inverse = np.empty((nv, nv))
+        inverse = B_lower if actuation.default else np.empty((nv, nv))
         inertia.invert(q, inverse)
+        if actuation.default:
+            return
         # The columns do not depend on the base's position, and would lose digits to it.
         still = q.copy()
         still[:3] = 0.0
@@ -169,34 +116,3 @@ class ChunkJob:
     def _inertia(self) -> tuple[Inertia, pin.Data]:
         data = self.linearizer.robot.create_data()
         return Inertia(self.linearizer.prepared.map, data), data
-
-
-class Parcel(NamedTuple):
-    """A job as it is sent: under a key, and its content only where a worker may not have it."""
-
-    key: str
-    content: bytes | None
-
-
-def pack(job: ChunkJob) -> Parcel:
-    """Pickle a job under the hash of its content."""
-    content = pickle.dumps(job)
-    return Parcel(hashlib.sha256(content).hexdigest(), content)
-
-
-# The jobs that this worker has received; the oldest is dropped first.
-_JOBS: dict[str, ChunkJob] = {}
-_KEPT = 4
-
-
-def work(parcel: Parcel, points: Points, start: int) -> ChunkResult | None:
-    """Do a chunk in a worker, or return None where the worker does not have the job."""
-    job = _JOBS.get(parcel.key)
-    if job is None:
-        if parcel.content is None:
-            return None
-        job = pickle.loads(parcel.content)
-        while len(_JOBS) >= _KEPT:
-            _JOBS.pop(next(iter(_JOBS)), None)
-        _JOBS[parcel.key] = job
-    return job.run(points, start)

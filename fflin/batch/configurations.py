@@ -6,7 +6,6 @@ import math
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from hashlib import sha256
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -88,25 +87,19 @@ class RandomConfigurations:
     def rows(self, start: int, stop: int) -> Array:
         """Return the configurations (stop - start, nq)."""
         low, high = np.array(list(self.ranges.values())).reshape(-1, 2).T
-        blocks = []
-        for block in range(start // _DRAWN, -(-stop // _DRAWN)):
-            drawn = np.random.default_rng([self.seed, block]).uniform(low, high, (_DRAWN, len(low)))
-            first = block * _DRAWN
-            blocks.append(drawn[max(start - first, 0) : stop - first])
-        drawn = np.concatenate(blocks) if blocks else np.empty((0, len(low)))
+        first = start // _DRAWN
+        blocks = [np.empty((0, len(low)))] + [
+            np.random.default_rng([self.seed, block]).uniform(low, high, (_DRAWN, len(low)))
+            for block in range(first, -(-stop // _DRAWN))
+        ]
+        drawn = np.concatenate(blocks)[start - first * _DRAWN : stop - first * _DRAWN]
         values = dict(zip(self.ranges, drawn.T, strict=True))
         return _placed(self.robot, self.start, stop - start, values)
 
 
 @dataclass(frozen=True, eq=False)
 class GivenConfigurations:
-    """An array of configurations.
-
-    Attributes
-    ----------
-    q : ndarray (N, nq)
-        Valid ones.
-    """
+    """An array of valid configurations (N, nq)."""
 
     q: Array
 
@@ -224,13 +217,7 @@ def random_configurations(
 
 
 def as_configurations(robot: Robot, q: Any) -> Configurations:
-    """Return the points that `sweep` is given as rows of this robot.
-
-    Raises
-    ------
-    InputError
-        If they are none, or of another robot.
-    """
+    """Return the points that `sweep` is given as rows of this robot."""
     if not isinstance(robot, Robot):
         raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
     if isinstance(q, GivenConfigurations):  # checked already
@@ -245,36 +232,27 @@ def as_configurations(robot: Robot, q: Any) -> Configurations:
     return replace(q, robot=robot)
 
 
-def fingerprint(configurations: Configurations) -> str:
-    """Return a hash of what all rows are made of."""
-    digest = sha256(type(configurations).__name__.encode())
-    for item in fields(configurations):
-        value = getattr(configurations, item.name)
-        if item.name != "robot":
-            parts = value.items() if isinstance(value, Mapping) else [(item.name, value)]
-            for name, numbers in parts:
-                digest.update(f" {name} {np.shape(numbers)} ".encode())
-                digest.update(np.ascontiguousarray(numbers).data)
-    return digest.hexdigest()
+def content(configurations: Configurations) -> dict[str, Any]:
+    """Return what all rows are made of, by names in their order."""
+    values = {item.name: getattr(configurations, item.name) for item in fields(configurations)}
+    of_joints = values.pop("axes", None) or values.pop("ranges", {})
+    values.pop("robot", None)
+    named = {f"{at} {name}": value for at, (name, value) in enumerate(of_joints.items())}
+    return {"of": type(configurations).__name__, **values, **named}
 
 
 def _range(robot: Robot, joint: Joint, given: Any) -> tuple[float, float]:
     if given is not None:
+        what = f"range of '{joint.name}'"
         try:
             low, high = given
         except (TypeError, ValueError):
-            raise InputError(
-                f"range of '{joint.name}' is {given!r}, expected (low, high)"
-            ) from None
-        low, high = number(f"range of '{joint.name}'", low), number("its end", high)
+            raise InputError(f"{what} is {given!r}, expected (low, high)") from None
+        low, high = number(what, low), number("its end", high)
         if not low <= high:
-            raise InputError(
-                f"range of '{joint.name}' is {low:g} to {high:g}, expected low to high"
-            )
+            raise InputError(f"{what} is {low:g} to {high:g}, expected low to high")
         if math.isinf(high - low):
-            raise InputError(
-                f"range of '{joint.name}' is {low:g} to {high:g}, wider than all numbers; narrow it"
-            )
+            raise InputError(f"{what} is {low:g} to {high:g}, wider than all numbers; narrow it")
         return low, high
     if joint.unbounded:
         return _TURN

@@ -1,9 +1,11 @@
-"""Chunks of a sweep in this process, or on the workers of an executor, of which some may die."""
+"""Chunks of rows on the workers of an executor, of which some may die."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import hashlib
+import pickle
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -11,15 +13,12 @@ from concurrent.futures import (
     Executor,
     Future,
     ProcessPoolExecutor,
-    ThreadPoolExecutor,
     wait,
 )
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from fflin.base.errors import FflinError
 from fflin.base.validation import Array
-from fflin.batch.chunks import ChunkResult, Parcel, pack, work
-from fflin.batch.task import Span, SweepTask
 from fflin.batch.workers import NoWorkers, WorkerDied
 
 # A chunk whose worker dies is given to another, up to this many times.
@@ -34,6 +33,36 @@ _GLANCE = 1.0
 # Assumed of an executor that does not tell how many workers it has.
 _UNKNOWN_WORKERS = 16
 
+Rows = Callable[[int, int], Any]
+
+
+class Span(NamedTuple):
+    """The rows of a chunk, start up to but not including stop."""
+
+    start: int
+    stop: int
+
+
+class ChunkResult(NamedTuple):
+    """The result of a chunk: its arrays by name, and the warnings on the way."""
+
+    arrays: dict[str, Array]
+    notes: list[str]
+
+
+class Job(Protocol):
+    """What is done to rows; it is pickled, and sent to every worker once."""
+
+    @property
+    def shapes(self) -> Mapping[str, tuple[int, ...]]:
+        """Shape of each array that it makes, for one row."""
+
+    def run(self, rows: Any, start: int, out: Mapping[str, Array] | None = None, /) -> ChunkResult:
+        """Do the rows from number `start` on, into arrays `out` or new ones.
+
+        Threads may share a job. A `FflinError` is why there is no result.
+        """
+
 
 class Done(NamedTuple):
     """A chunk that came to an end: its result, or why there is none."""
@@ -43,111 +72,48 @@ class Done(NamedTuple):
     reason: str
 
 
-def run_here(
-    task: SweepTask,
-    spans: Sequence[Span],
-    place: Callable[[int, int], Mapping[str, Array] | None],
-    threads: int,
-) -> Iterator[Done]:
-    """Do chunks in this process, several at a time where the kernel does them.
-
-    Parameters
-    ----------
-    task : SweepTask
-    spans : sequence of Span
-    place : callable
-        Returns the arrays that a chunk is written to, or None for new ones.
-    threads : int
-
-    Yields
-    ------
-    Done
-        Each span once.
-    """
-
-    def run(span: Span) -> Done:
-        rows = place(*span)
-        out = None if rows is None else {key: rows[key] for key in task.job.shapes}
-        try:
-            return Done(span, task.job.run(task.points(span), span.start, out), "")
-        except FflinError as error:
-            return Done(span, None, str(error))
-
-    if threads == 1 or len(spans) == 1 or not task.job.compiled:
-        yield from map(run, spans)
-        return
-    pool, begun = ThreadPoolExecutor(threads), deque[Future[Done]]()
-    try:
-        for span in spans:
-            begun.append(pool.submit(run, span))
-            # Results that nobody has taken yet would fill the memory.
-            if len(begun) > threads:
-                yield begun.popleft().result()
-        while begun:
-            yield begun.popleft().result()
-    finally:
-        # Without waiting, so that Ctrl-C ends a compilation too.
-        pool.shutdown(wait=False, cancel_futures=True)
-
-
-def dispatch(task: SweepTask, spans: Sequence[Span], workers: Executor) -> Iterator[Done]:
-    """Do chunks on workers and yield them as they are finished.
-
-    The job is sent with the first chunks only, and again to a worker that says it has none.
-
-    Parameters
-    ----------
-    task : SweepTask
-    spans : sequence of Span
-    workers : Executor
-
-    Yields
-    ------
-    Done
-        Each span once.
-    """
-    state = _Dispatch(task, spans, workers)
-    try:
-        while state.waiting or state.running:
-            state.begin()
-            yield from state.finished()
-            if state.broken is not None:
-                yield from state.lost()
-    finally:
-        for future in state.running:
-            future.cancel()
-
-
-class _Dispatch:
+class Dispatch:
     """The chunks that wait and those that run, how often each was begun, and the workers."""
 
-    def __init__(self, task: SweepTask, spans: Sequence[Span], workers: Executor) -> None:
-        self.waiting = list(reversed(spans))
-        self.running: dict[Future[ChunkResult | None], Span] = {}
-        self.broken: BaseException | None = None
-        self._attempts: dict[Span, int] = {}
-        self._task, self._parcel, self._workers = task, pack(task.job), workers
-        self._ahead = _QUEUED * _count(workers)
+    def __init__(self, job: Job, rows: Rows, spans: list[Span], workers: Executor) -> None:
+        content = pickle.dumps(job)
+        self._parcel = Parcel(hashlib.sha256(content).hexdigest(), content)
+        self._rows, self._workers, self._ahead = rows, workers, _QUEUED * _count(workers)
+        self._waiting = spans[::-1]
+        self._running: dict[Future[ChunkResult | None], Span] = {}
+        self._attempts: Counter[Span] = Counter()
+        self._broken: BaseException | None = None
         self._known = False
 
-    def begin(self) -> None:
-        """Submit as many chunks as the workers can take."""
-        while self.waiting and len(self.running) < self._ahead and self.broken is None:
-            self._submit(self.waiting.pop(), None if self._known else self._parcel.content)
+    def __iter__(self) -> Iterator[Done]:
+        try:
+            while self._waiting or self._running:
+                while self._waiting and len(self._running) < self._ahead and not self._broken:
+                    self._submit(self._waiting.pop(), None if self._known else self._parcel.content)
+                if self._running:
+                    yield from self._finished()
+                if self._broken:
+                    yield from self._given_up(self._broken)
+        finally:
+            for future in self._running:
+                future.cancel()
 
-    def finished(self) -> Iterator[Done]:
+    def _submit(self, span: Span, content: bytes | None) -> None:
+        """Begin a chunk, or put it back where the executor is dead."""
+        arguments = self._parcel._replace(content=content), self._rows(*span), span.start
+        try:
+            future = self._workers.submit(work, *arguments)
+        except Exception as error:  # broken, shut down, or of its own
+            self._waiting.append(span)
+            self._broken = error
+        else:
+            self._attempts[span] += 1
+            self._running[future] = span
+
+    def _finished(self) -> Iterator[Done]:
         """Wait for a chunk and yield what is finished."""
-        if not self.running:
-            return
-        pool = self._workers if isinstance(self._workers, ProcessPoolExecutor) else None
-        hung = False
-        while not (done := wait(self.running, _GLANCE if pool else None, FIRST_COMPLETED).done):
-            assert pool is not None
-            if hung:
-                _break(pool)
-            hung = _lost_a_worker(pool)
-        for future in done:
-            span = self.running.pop(future)
+        for future in self._wait():
+            span = self._running.pop(future)
             try:
                 chunk = future.result()
             except FflinError as error:
@@ -155,8 +121,8 @@ class _Dispatch:
             except WorkerDied as error:
                 yield from self._lost(span, str(error))
             except (BrokenExecutor, CancelledError) as error:
-                self.broken = self.broken or error
-                self.waiting.append(span)
+                self._broken = self._broken or error
+                self._waiting.append(span)
             except Exception as error:
                 # Executors have errors of their own, such as of a scheduler that lost a worker.
                 yield from self._lost(span, f"{type(error).__name__}: {error}")
@@ -168,40 +134,69 @@ class _Dispatch:
                     self._known = True
                     yield Done(span, chunk, "")
 
-    def lost(self) -> Iterator[Done]:
+    def _wait(self) -> set[Future[ChunkResult | None]]:
+        pool = self._workers if isinstance(self._workers, ProcessPoolExecutor) else None
+        hung = False
+        while not (done := wait(self._running, _GLANCE if pool else None, FIRST_COMPLETED).done):
+            assert pool is not None
+            processes = list((pool._processes or {}).values())
+            if hung:
+                # It waits for the rest of a result whose worker was killed as it sent it, as long
+                # as anybody could still write to the pipe that all workers and this process share.
+                # Where nobody can, it finds itself broken, and its futures with it.
+                for process in processes:
+                    process.kill()
+                channel: Any = pool._result_queue
+                channel._writer.close()
+            hung = any(process.exitcode not in (None, 0) for process in processes)
+        return done
+
+    def _lost(self, span: Span, reason: str) -> Iterator[Done]:
+        """Put a chunk back whose worker died, or give it up."""
+        if self._attempts[span] < _ATTEMPTS:
+            self._waiting.append(span)
+        else:
+            yield Done(span, None, reason)
+
+    def _given_up(self, error: BaseException) -> Iterator[Done]:
         """Yield the chunks that an executor took with it when it died."""
-        error, self.broken = self.broken, None
-        running, self.running = self.running, {}
         reason = f"the executor died: {type(error).__name__}: {error}".rstrip(": ")
         if isinstance(error, NoWorkers):
             reason = str(error)
+        running, self._running = self._running, {}
+        waiting, self._waiting = self._waiting, []
         for future, span in running.items():
             # Some were finished before it died.
             good = future.done() and not future.cancelled() and future.exception() is None
             chunk = future.result() if good else None
             yield Done(span, chunk, "" if chunk is not None else reason)
-        waiting, self.waiting = self.waiting, []
         for span in reversed(waiting):
             yield Done(span, None, reason)
 
-    def _submit(self, span: Span, content: bytes | None) -> None:
-        """Begin a chunk, or put it back where the executor is dead."""
-        arguments = Parcel(self._parcel.key, content), self._task.points(span), span.start
-        try:
-            future = self._workers.submit(work, *arguments)
-        except Exception as error:  # broken, shut down, or of its own
-            self.waiting.append(span)
-            self.broken = error
-        else:
-            self._attempts[span] = self._attempts.get(span, 0) + 1
-            self.running[future] = span
 
-    def _lost(self, span: Span, reason: str) -> Iterator[Done]:
-        """Put a chunk back whose worker died, or give it up."""
-        if self._attempts[span] < _ATTEMPTS:
-            self.waiting.append(span)
-        else:
-            yield Done(span, None, reason)
+class Parcel(NamedTuple):
+    """A job as it is sent: under a key, and its content only where a worker may not have it."""
+
+    key: str
+    content: bytes | None
+
+
+# The jobs that this worker has received; the oldest is dropped first.
+_JOBS: dict[str, Job] = {}
+_KEPT = 4
+
+
+def work(parcel: Parcel, rows: Any, start: int) -> ChunkResult | None:
+    """Do a chunk in a worker, or return None where the worker does not have the job."""
+    job = _JOBS.get(parcel.key)
+    if job is None:
+        if parcel.content is None:
+            return None
+        job = pickle.loads(parcel.content)
+        while len(_JOBS) >= _KEPT:
+            _JOBS.pop(next(iter(_JOBS)), None)
+        _JOBS[parcel.key] = job
+    return job.run(rows, start)
 
 
 def _count(executor: Executor) -> int:
@@ -214,21 +209,3 @@ def _count(executor: Executor) -> int:
     if client is not None and hasattr(client, "nthreads"):
         return max(1, sum(client.nthreads().values()))
     return _UNKNOWN_WORKERS
-
-
-def _lost_a_worker(pool: ProcessPoolExecutor) -> bool:
-    """Whether a process of a pool was killed."""
-    processes = list((pool._processes or {}).values())
-    return any(process.exitcode not in (None, 0) for process in processes)
-
-
-def _break(pool: ProcessPoolExecutor) -> None:
-    """End a pool that waits for the rest of a result whose worker was killed as it sent it.
-
-    It waits as long as anybody could still write to the pipe that all workers and this process
-    share. Where nobody can, it finds itself broken, and its futures with it.
-    """
-    for process in list((pool._processes or {}).values()):
-        process.kill()
-    channel: Any = pool._result_queue
-    channel._writer.close()

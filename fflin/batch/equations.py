@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from operator import itemgetter
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from fflin.base.rotation import product_matrix, rotation_matrices
 from fflin.base.validation import Array
+from fflin.batch.rows import Points
 from fflin.dynamics.chart import SMALLEST_Q0, Chart, Standing
 from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.rnea import Rates
@@ -29,15 +31,7 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 
 class BatchEquations(ABC):
-    """What differs from point to point of a robot's linear models, about many points.
-
-    Parameters
-    ----------
-    prepared : Prepared
-        Without outputs but the state; see `batch_equations`.
-    tree : Tree
-        Of the same robot.
-    """
+    """What differs from point to point of a robot's linear models, about many points."""
 
     BLOCK: ClassVar[int]  # points that are done at a time
 
@@ -45,31 +39,17 @@ class BatchEquations(ABC):
         self._prepared, self._tree = prepared, tree
         self._least_coupling = 0.999 * (6 + prepared.robot.n)
 
-    def write(
-        self, q: Array, v: Array | None, u: Array | None, out: Mapping[str, Array]
-    ) -> RowNumbers:
+    def write(self, points: Points, out: Mapping[str, Array]) -> RowNumbers:
         """Write what differs from point to point, and return the rows that are left.
 
         Left are those that the linearizer refuses or warns of: where M is singular or nearly so,
-        the chart ends, or numbers are beyond all sense.
-
-        Parameters
-        ----------
-        q, v, u : ndarray (N, nq), (N, nv), (N, nu)
-            Valid points; None for rest and no input.
-        out : mapping
-            B_lower and, but at rest, A, f0, _x0 and with a moving reference _drift, each with N
-            rows.
+        the chart ends, or numbers are beyond all sense. `out` has B_lower and, but at rest, A, f0,
+        _x0 and with a moving reference _drift, each with as many rows.
         """
-        count = len(q)
+        count = len(points.q)
         if count < LANES:
-            filled = (
-                _filled(q),
-                None if v is None else _filled(v),
-                None if u is None else _filled(u),
-            )
             more = {key: np.empty((LANES, *array.shape[1:])) for key, array in out.items()}
-            left = self.write(*filled, more)
+            left = self.write(points.each(_filled), more)
             for key, array in out.items():
                 array[:] = more[key][:count]
             return left[left < count]
@@ -78,15 +58,13 @@ class BatchEquations(ABC):
             # The last block begins early enough to fill the lanes; some points are done twice.
             rows = slice(min(start, count - LANES), start + self.BLOCK)
             place = {key: array[rows] for key, array in out.items()}
-            point = q[rows], None if v is None else v[rows], None if u is None else u[rows]
+            point = points.each(itemgetter(rows))
             with np.errstate(all="ignore"):
-                good[rows] = self._write_block(*point, place)
+                good[rows] = self._write_block(point, place)
         return np.flatnonzero(~good)
 
     @abstractmethod
-    def _write_block(
-        self, q: Array, v: Array | None, u: Array | None, out: Mapping[str, Array]
-    ) -> Mask:
+    def _write_block(self, points: Points, out: Mapping[str, Array]) -> Mask:
         """Do the points of a block and return which of them are good."""
 
     def _regular(self, q: Array, couplings: Array) -> Mask:
@@ -101,10 +79,9 @@ class RestEquations(BatchEquations):
 
     BLOCK = 2**16
 
-    def _write_block(
-        self, q: Array, v: Array | None, u: Array | None, out: Mapping[str, Array]
-    ) -> Mask:
-        B, actuation, nv = out["B_lower"], self._prepared.actuation, self._prepared.map.nx // 2
+    def _write_block(self, points: Points, out: Mapping[str, Array]) -> Mask:
+        q, B, actuation = points.q, out["B_lower"], self._prepared.actuation
+        nv = B.shape[1]
         inverse = B if actuation.default else np.empty((len(q), nv, nv))
         couplings = inverse_inertias(self._tree, q, inverse)
         if not actuation.default:
@@ -122,10 +99,9 @@ class PointEquations(BatchEquations):
         self._accelerations = BatchAccelerations(prepared.map, prepared.actuation, tree)
         self._root = prepared.robot.model.jointPlacements[ROOT].rotation
 
-    def _write_block(
-        self, q: Array, v: Array | None, u: Array | None, out: Mapping[str, Array]
-    ) -> Mask:
+    def _write_block(self, points: Points, out: Mapping[str, Array]) -> Mask:
         prepared, state, actuation = self._prepared, self._prepared.map, self._prepared.actuation
+        q, v, u = points
         count, nv, groups = len(q), state.nx // 2, state.groups
         nu: Array = np.zeros((count, nv)) if v is None else state.velocities(v)
         if u is None:
@@ -186,12 +162,8 @@ def _filled(rows: Array) -> Array:
 def batch_equations(prepared: Prepared, *, only_inertia: bool) -> BatchEquations | None:
     """Return the equations of a robot, or None where the kernel does not know them.
 
-    Parameters
-    ----------
-    prepared : Prepared
-        The kernel differentiates no outputs, and knows joints that are screws about fixed axes.
-    only_inertia : bool
-        Whether all but B is known beforehand.
+    It differentiates no outputs, and knows joints that are screws about fixed axes. Where
+    `only_inertia`, all but B is known beforehand.
     """
     tree = batch_tree(prepared.robot)
     if tree is None or prepared.sensing is not None:

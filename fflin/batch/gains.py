@@ -86,12 +86,8 @@ class GainBatch(Design):
     def gain(self, joints: Array) -> Array:
         """Return K (nu, nx) at joint positions (n,) by linear interpolation.
 
-        Beyond the grid it is that at its edge.
-
-        Raises
-        ------
-        InputError
-            If the points are not on a grid, or the positions are not n finite numbers.
+        Beyond the grid it is that at its edge. Errors are those of `grid`; the positions must be n
+        finite numbers.
         """
         return self._between(vector("joints", joints, len(self.joint_names), "the joint positions"))
 
@@ -235,13 +231,7 @@ class ScheduledFeedback:
         _ = self.gains.grid
 
     def bind(self, robot: Robot) -> Any:
-        """Return policy(t, q, v) -> u for a robot.
-
-        Raises
-        ------
-        InputError
-            If the robot has not the model's states and inputs; its masses may be others.
-        """
+        """Return policy(t, q, v) -> u for a robot; errors are those of `StateFeedback.bind`."""
         lin, gains = self.lin, self.gains
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
         require_fit(lin, robot, state)

@@ -10,17 +10,21 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from fflin.base.errors import InputError, unknown
+from fflin.base.frozen import frozen
 from fflin.base.record import NOT_VERIFIED
 from fflin.base.validation import Array, number
 from fflin.base.writing import as_path
-from fflin.batch.files import header, is_constant, read_batch, write_batch
-from fflin.batch.robot_functions import functions_of, own_reference
+from fflin.batch.batch_record import read_batch, texts_of
+from fflin.batch.files import is_constant, write_rows
 from fflin.batch.rows import Column, away, positions, values
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
+
+# Position and quaternion of a free-flyer joint that stands at the robot's root.
+AT_ROOT = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 # Two joint values are the same where they differ by no more than this [rad|m].
 _SAME = 1e-9
@@ -92,18 +96,13 @@ class LinearBatch:
     _reference: Array | None
     _root: Array
     _drift: Array | None
-    # As a file has it; None where it is found on the robot.
-    _ignorable: tuple[str, ...] | None
-    _system: Robot | None
+    # What models ask their robot for, by the names of their fields.
+    _asked: Mapping[str, Any]
     verified: bool = True
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, np.ndarray) and value.flags.writeable:
-                value = value.view()
-                value.setflags(write=False)
-                object.__setattr__(self, item.name, value)
+        for name, value in self._arrays().items():
+            object.__setattr__(self, name, frozen(value.view()))
 
     def __len__(self) -> int:
         return len(self.q)
@@ -150,8 +149,7 @@ class LinearBatch:
         count, nv, nu = self.B_lower.shape
         B = np.zeros((count, 2 * nv, nu))
         B[:, nv:] = self.B_lower
-        B.setflags(write=False)
-        return B
+        return frozen(B)
 
     @property
     def x0(self) -> Array:
@@ -233,8 +231,8 @@ class LinearBatch:
         """
         if not len(self):
             raise InputError("the batch has no points; there is nothing to save")
-        text = header(self, len(self))
-        write_batch(as_path(path), self._arrays(), text, sealed=self.verified)
+        texts = texts_of(self, len(self))
+        write_rows(as_path(path), self._arrays(), texts, sealed=self.verified)
 
     @staticmethod
     def load(path: str | Path, robot: Robot | None = None, *, verify: bool = True) -> LinearBatch:
@@ -258,11 +256,7 @@ class LinearBatch:
         MissingPackageError
             If h5py is needed and not installed.
         """
-        batch = LinearBatch(**read_batch(as_path(path), verify=verify), _system=robot)
-        made_of = batch.urdf_sha256, batch.locked, batch.joint_names
-        if robot is not None and (robot.urdf_sha256, robot.locked, robot.joint_names) != made_of:
-            raise InputError(f"'{robot.name}' is not the robot that the batch is of")
-        return batch
+        return LinearBatch(**read_batch(as_path(path), robot, verify=verify))
 
     def _arrays(self) -> dict[str, Array]:
         """Return the arrays that are held, all with N rows, by the fields' names."""
@@ -274,23 +268,20 @@ class LinearBatch:
         # A row of a file is read here, so that no model keeps the file open.
         rows = {key: np.asarray(array[index]) for key, array in self._arrays().items()}
         lower, root = rows.pop("B_lower"), rows.pop("_root")
-        B = np.concatenate((np.zeros_like(lower), lower))
-        B.setflags(write=False)
+        B = frozen(np.concatenate((np.zeros_like(lower), lower)))
         x0 = rows.pop("_x0", None)
         if x0 is None:
             x0 = self._states_at_rest(rows["q"][None])[0]
         made = {"B": B, "x0": x0, "y0": rows.pop("_y0", x0), "dt": 0.0}
         if "_reference" not in rows:
-            made["_reference"] = own_reference(root, rows["q"][:7])
-        asked = functions_of(self._system, self.robot, self._ignorable)
-        return LinearModel.from_fields({**common, **rows, **made, **asked})
+            made["_reference"] = _in_world(root, rows["q"][:7])
+        return LinearModel.from_fields({**common, **rows, **made, **self._asked})
 
     def _states_at_rest(self, q: Array) -> Array:
         q_m = positions(q, self.columns)
         x0 = np.zeros((len(q), len(self.state_names)))
         x0[:, 6 : 6 + q_m.shape[1]] = q_m
-        x0.setflags(write=False)
-        return x0
+        return frozen(x0)
 
     def _named(self, joints: Mapping[str, Any]) -> dict[int, Any]:
         if not isinstance(joints, Mapping) or not joints:
@@ -299,3 +290,12 @@ class LinearBatch:
             if name not in self.joint_names:
                 raise unknown("joint", name, self.joint_names)
         return {self.joint_names.index(name): value for name, value in joints.items()}
+
+
+def _in_world(root: Array, base: Array) -> Array:
+    """Return the placement (7,) in the world of a base that is placed (7,) in the root's frame."""
+    import pinocchio as pin
+
+    if (root == AT_ROOT).all():
+        return base
+    return frozen(pin.SE3ToXYZQUAT(pin.XYZQUATToSE3(root) * pin.XYZQUATToSE3(base)))

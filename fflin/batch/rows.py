@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -17,6 +17,19 @@ Column: TypeAlias = tuple[int, int]
 
 # Rows that are checked at once, which bounds the memory of what is computed on the way.
 _BLOCK = 2048
+
+
+class Points(NamedTuple):
+    """Valid configurations, velocities and inputs; v and u0 are None for rest and no input."""
+
+    q: Array
+    v: Array | None
+    u0: Array | None
+
+    def each(self, change: Callable[[Array], Array]) -> Points:
+        """Return them with the same done to each."""
+        v, u0 = (None if rows is None else change(rows) for rows in self[1:])
+        return Points(change(self.q), v, u0)
 
 
 def column(joint: Joint) -> Column:
@@ -53,13 +66,7 @@ def follow_rows(robot: Robot, q: Array) -> None:
 
 
 def checked_configurations(robot: Robot, q: Any) -> Array:
-    """Return a copy of configurations (N, nq), each as `Robot.checked_configuration` has it.
-
-    Raises
-    ------
-    InputError
-        If the shape is wrong or a row is no configuration; the message names it.
-    """
+    """Return a copy of configurations (N, nq), each as `Robot.checked_configuration` has it."""
     rows = _rows("q", q, robot.nq, "a configuration in Pinocchio's order each")
     for start in range(0, len(rows), _BLOCK):
         block = rows[start : start + _BLOCK]
@@ -86,13 +93,7 @@ def checked_configurations(robot: Robot, q: Any) -> Array:
 
 
 def checked_velocities(robot: Robot, v: Any, count: int) -> Array:
-    """Return velocities (N, nv) of an array (N, nv), or (nv,) for all; read-only.
-
-    Raises
-    ------
-    InputError
-        If the shape is wrong or a row is no velocity; the message names it.
-    """
+    """Return velocities (N, nv) of an array (N, nv), or (nv,) for all; read-only."""
     if dimension("v", v) == 1:
         return np.broadcast_to(robot.checked_velocity(v).copy(), (count, robot.nv))
     rows = _rows("v", v, robot.nv, "a velocity in Pinocchio's order each", count)
@@ -104,13 +105,7 @@ def checked_velocities(robot: Robot, v: Any, count: int) -> Array:
 
 
 def checked_inputs(names: tuple[str, ...], u: Any, count: int) -> Array:
-    """Return inputs (N, nu) of an array (N, nu), or (nu,) for all; read-only.
-
-    Raises
-    ------
-    InputError
-        If the shape is wrong or an entry is not finite.
-    """
+    """Return inputs (N, nu) of an array (N, nu), or (nu,) for all; read-only."""
     nu = len(names)
     if dimension("u", u) == 1:
         return np.broadcast_to(vector("u", u, nu, "the robot's inputs").copy(), (count, nu))

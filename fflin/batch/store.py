@@ -15,33 +15,24 @@ from fflin.base.errors import FileError, InputError
 from fflin.base.record import SEAL
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, check_place, install, reason, reserve
-from fflin.batch.files import CHECKED, CHUNK_SEALS, batch_seal, check_format, chunk_seal, hdf5
+from fflin.batch.files import CHECKED, CHUNK_SEALS, check_format, chunk_seal, hdf5, whole_seal
 
 # Allowance for what a file has besides its rows: names, constant arrays, digests [bytes].
 _OVERHEAD = 2**16
 
 
 class MemoryStore:
-    """Arrays in memory.
+    """Arrays of `count` rows in memory, of these shapes each."""
 
-    Parameters
-    ----------
-    count, chunk : int
-        Points, and points in a chunk.
-    shapes : mapping
-        Shape of each array for one point.
-    """
+    part = None  # there is no file
 
     def __init__(self, count: int, chunk: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        self.names, self.chunk = tuple(shapes), chunk
+        self.count, self.chunk, self.names = count, chunk, tuple(shapes)
         self.arrays = {key: np.empty((count, *shape)) for key, shape in shapes.items()}
 
     def finished(self, start: int, stop: int) -> bool:
         """Whether a chunk is there from before: none is."""
         return False
-
-    def close(self) -> None:
-        """Do nothing: memory needs no closing."""
 
     def place(self, start: int, stop: int) -> dict[str, Array]:
         """Return where the rows of a chunk are, to be written."""
@@ -53,42 +44,22 @@ class MemoryStore:
             if not np.may_share_memory(rows, arrays[key]):
                 rows[:] = arrays[key]
 
+    def close(self) -> None:
+        """Do nothing: memory needs no closing."""
+
+    discard = close
+
 
 class FileStore:
-    """Arrays in an HDF5 file, NAME.part until it is whole.
+    """Arrays of `count` rows in an HDF5 file, NAME.part until it is whole.
 
     Their place in the file is fixed and reserved from the start, so that a crash in the middle of
     a chunk harms no other, and the disk does not fill up under it; a chunk counts as finished once
-    its hash stands beside it.
+    its hash stands beside it. A file that is there goes on, in chunks of its own size (`resumed`),
+    if `request`, a hash of all that the result depends on, is the same.
 
-    Parameters
-    ----------
-    path : Path
-        Of the file as it will be called; one that is not .h5 is made of the unfinished file.
-    request : str
-        Hash of all that the result depends on.
-    count, chunk : int
-        Points, and points in a chunk.
-    shapes : mapping
-        Shape of each array for one point.
-    constants : mapping
-        Arrays that are the same at all points.
-    texts : mapping
-        Attributes of the file.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Of the arrays.
-    resumed : bool
-        Whether a file of the same request was there.
-    chunk : int
-        Points in a chunk; of a file that was there its own.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be written, or is one of another request.
+    A path that is not .h5 is for the caller to make of the unfinished file. Beside the rows stand
+    `constants`, arrays that are the same for all of them, and `texts`, as attributes.
     """
 
     def __init__(
@@ -102,7 +73,7 @@ class FileStore:
         texts: Mapping[str, str],
     ) -> None:
         self.path, self.part = path, part_of(path)
-        self.chunk, self.names = chunk, tuple(shapes)
+        self.count, self.chunk, self.names = count, chunk, tuple(shapes)
         self._constants, self._texts = constants, texts
         self.resumed = self.part.exists()
         try:
@@ -117,18 +88,18 @@ class FileStore:
             if self.resumed:
                 self._go_on(request)
             else:
-                self._begin(request, count, shapes)
+                self._begin(request, shapes)
         except BaseException:
             (self.close if self.resumed else self.discard)()
             raise
 
-    def _begin(self, request: str, count: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    def _begin(self, request: str, shapes: Mapping[str, tuple[int, ...]]) -> None:
         with self._writable():
             for key, shape in shapes.items():
-                _reserve(self._file, key, (count, *shape))
+                _reserve(self._file, key, (self.count, *shape))
             for key, value in self._constants.items():
                 self._file.create_dataset(key, data=value)
-            self._file[CHUNK_SEALS] = np.zeros((-(-count // self.chunk), 32), np.uint8)
+            self._file[CHUNK_SEALS] = np.zeros((-(-self.count // self.chunk), 32), np.uint8)
             self._file[SEAL] = np.zeros(32, np.uint8)
             self._file.attrs.update({**self._texts, "chunk": self.chunk, "request": request})
             self._file.flush()
@@ -194,7 +165,7 @@ class FileStore:
         """Add the hash of all and, where the target is HDF5 too, take its place."""
         with self._writable():
             seals = self._file[CHUNK_SEALS][:]
-            self._file[SEAL][:] = batch_seal(self._texts, self.chunk, seals, self._constants)
+            self._file[SEAL][:] = whole_seal(self._texts, self.chunk, seals, self._constants)
             self._file.close()
             if self.path.suffix == ".h5":
                 install(self.part, self.path)
@@ -236,24 +207,7 @@ def part_of(path: Path) -> Path:
 
 
 def check_room(count: int, size: int, path: Path | None) -> None:
-    """Raise where so many points with a result of so many bytes do not fit.
-
-    Parameters
-    ----------
-    count : int
-        Points.
-    size : int
-        Of the result [bytes].
-    path : Path or None
-        File that is to be written; None keeps the result in memory.
-
-    Raises
-    ------
-    FileError
-        If the disk has not so much free.
-    InputError
-        If the machine has not so much memory.
-    """
+    """Raise where so many points with a result of so many bytes fit neither file nor memory."""
     said = f"{count:,} points are {readable(size)}"
     if path is None:
         if size > (memory := _memory()):

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import logging
 import math
-import warnings
-from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinWarning, FileError, InputError, SweepError, listed
+from fflin.base.errors import FileError, InputError
 from fflin.base.record import NoRoomError
 from fflin.base.validation import whole
 from fflin.batch.chunks import ChunkJob
 from fflin.batch.configurations import Configurations, as_configurations
-from fflin.batch.dispatch import Done, dispatch, run_here
 from fflin.batch.linear_batch import LinearBatch
+from fflin.batch.run import Progress, failure, run_chunks
 from fflin.batch.store import FileStore, MemoryStore, check_room, output_path
-from fflin.batch.task import Span, SweepTask
+from fflin.batch.task import SweepTask
 from fflin.batch.workers import OwnWorkers
 from fflin.kernel.compiled import available_cores
 from fflin.robot.robot import Robot
@@ -42,8 +40,6 @@ _LEAST_CHUNK, _LARGEST_CHUNK = 16, 2**16
 _SHARES = 32
 
 _log = logging.getLogger("fflin")
-
-Progress = Callable[[int, int], object]
 
 
 def sweep(
@@ -130,38 +126,25 @@ def sweep(
         raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
     path = None if out is None else output_path(out)
     points = as_configurations(robot, q)
-    job = ChunkJob(
-        robot,
-        frame=frame,
-        reference=reference,
-        moving=moving,
-        at_rest=v is None and u is None,
-        count=len(points),
-    )
+    options: Any = {"frame": frame, "reference": reference, "moving": moving}
+    job = ChunkJob(robot, at_rest=v is None and u is None, count=len(points), **options)
     check_room(len(points), len(points) * _row_bytes(job), path)
     task = SweepTask(job, points, v, u)
     parallel = executor is not None or workers is not None
     threads = threads or available_cores()
     shares = (_SHARES, 1) if parallel else (4 * threads, threads)
     store = _store(task, path, chunk or _chunk_size(task, *shares))
-    size = store.chunk
-    spans = [Span(at, min(at + size, task.count)) for at in range(0, task.count, size)]
-    own = OwnWorkers(int(workers)) if workers else None
-    others = own or executor
-    try:
-        left = [span for span in spans if not store.finished(*span)]
-        if others is None:
-            done = run_here(task, left, store.place, threads)
-        else:
-            done = dispatch(task, left, others)
-        failed = _collect(task, done, store, (len(spans) - len(left)) * size, progress)
+    with closing(store), OwnWorkers(int(workers)) if workers else nullcontext(executor) as others:
+        if others is None and not job.compiled:
+            threads = 1
+        failed = run_chunks(
+            job, task.points, store, executor=others, threads=threads, progress=progress
+        )
         if failed:
-            raise _failure(task, store, failed, len(spans))
+            raise failure(
+                failed, store, "configurations", lambda kept: _in_memory(task, store)[kept]
+            )
         return _finish(task, store, path)
-    finally:
-        store.close()
-        if own is not None:
-            own.shutdown()
 
 
 def planned_bytes(
@@ -173,10 +156,8 @@ def planned_bytes(
     reference: pin.SE3 | None = None,
 ) -> int:
     """Return how large the result of a sweep over so many points is [bytes]."""
-    job = ChunkJob(
-        robot, frame=frame, reference=reference, moving=False, at_rest=at_rest, count=count
-    )
-    return count * _row_bytes(job)
+    options: Any = {"frame": frame, "reference": reference, "moving": False}
+    return count * _row_bytes(ChunkJob(robot, at_rest=at_rest, count=count, **options))
 
 
 def _row_bytes(job: ChunkJob) -> int:
@@ -206,63 +187,9 @@ def _store(task: SweepTask, path: Path | None, size: int) -> FileStore | MemoryS
     return store
 
 
-def _collect(
-    task: SweepTask,
-    done: Iterable[Done],
-    store: FileStore | MemoryStore,
-    count: int,
-    progress: Progress | None,
-) -> list[Done]:
-    """Keep what is finished and return what failed."""
-    failed: list[Done] = []
-    notes: list[str] = []
-    if progress and count:
-        progress(min(count, task.count), task.count)
-    for span, result, reason in done:
-        if result is None:
-            failed.append(Done(span, None, reason))
-        else:
-            points = task.points(span)
-            rows: dict[str, Any] = {"q": points.q, "v": points.v, "u0": points.u}
-            arrays = {key: rows[key] if key in rows else result.arrays[key] for key in store.names}
-            store.write(*span, arrays)
-            notes += result.notes
-        count += span.stop - span.start
-        if progress:
-            progress(min(count, task.count), task.count)
-    if notes:
-        more = f" (and {len(notes) - 1} more such)" if len(notes) > 1 else ""
-        warnings.warn(notes[0] + more, FflinWarning, stacklevel=3)
-    return sorted(failed)
-
-
-def _failure(
-    task: SweepTask, store: FileStore | MemoryStore, failed: list[Done], chunks: int
-) -> SweepError:
-    spans = listed(f"{start} to {stop - 1}" for (start, stop), *_ in failed)
-    verb = "has" if len(failed) == 1 else "have"
-    said = (
-        f"{len(failed)} of {chunks} chunks {verb} no result, configurations {spans}: "
-        f"{failed[0].reason}"
-    )
-    batch = None
-    if len(failed) == chunks:
-        if isinstance(store, FileStore):
-            store.discard()
-    elif isinstance(store, FileStore):
-        said += f"; the others are in {store.part}, and the same call goes on from them"
-    else:
-        kept = np.ones(task.count, dtype=bool)
-        for (start, stop), *_ in failed:
-            kept[start:stop] = False
-        batch = task.batch(task.given() | store.arrays)[kept]
-        said += "; the others are in the `batch` of this error"
-    return SweepError(said, tuple((*span, reason) for span, _, reason in failed), batch)
-
-
 def _finish(task: SweepTask, store: FileStore | MemoryStore, path: Path | None) -> LinearBatch:
     if isinstance(store, MemoryStore):
-        batch = task.batch(task.given() | store.arrays)
+        batch = _in_memory(task, store)
         if path is not None:
             batch.save(path)
         return batch
@@ -279,6 +206,11 @@ def _finish(task: SweepTask, store: FileStore | MemoryStore, path: Path | None) 
         ) from None
     store.part.unlink()
     return batch
+
+
+def _in_memory(task: SweepTask, store: FileStore | MemoryStore) -> LinearBatch:
+    assert isinstance(store, MemoryStore)
+    return task.batch(task.given() | store.arrays)
 
 
 def _written(path: Path, task: SweepTask) -> LinearBatch:

@@ -4,40 +4,27 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from hashlib import sha256
-from typing import Any, NamedTuple
+from dataclasses import fields
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.record import content_digest
 from fflin.base.validation import Array
 from fflin.base.version import __version__
-from fflin.batch.chunks import ChunkJob, Points
-from fflin.batch.configurations import Configurations, GivenConfigurations, fingerprint
-from fflin.batch.files import header
-from fflin.batch.linear_batch import LinearBatch
-from fflin.batch.robot_functions import AT_ROOT
-from fflin.batch.rows import checked_inputs, checked_velocities, column
+from fflin.batch.batch_record import asked_of, texts_of
+from fflin.batch.chunks import ChunkJob
+from fflin.batch.configurations import Configurations, GivenConfigurations, content
+from fflin.batch.linear_batch import AT_ROOT, LinearBatch
+from fflin.batch.rows import Points, checked_inputs, checked_velocities, column
 from fflin.robot.frames import ROOT
-
-# Fields of a linear model that a batch has as arrays, or not at all.
-_OF_MODELS = (
-    *("C", "D", "dt", "_inertia", "_certify", "_ignorable", "_limits"),
-    *("weights", "_require_unchanged"),
-)
 
 # Attributes of a robot that, with its model and its mappings, tell it from others.
 _OF_THE_ROBOT = (
     *("name", "urdf_sha256", "locked", "joints", "followers"),
     *("inputs", "outputs", "gravity"),
 )
-
-
-class Span(NamedTuple):
-    """The points of a chunk, start up to but not including stop."""
-
-    start: int
-    stop: int
 
 
 class SweepTask:
@@ -50,10 +37,10 @@ class SweepTask:
         self.v = None if v is None else checked_velocities(self.robot, v, self.count)
         self.u = None if u is None else checked_inputs(names, u, self.count)
 
-    def points(self, span: Span) -> Points:
-        """Return the points of a span."""
-        v, u = (None if rows is None else rows[slice(*span)] for rows in (self.v, self.u))
-        return Points(self.configurations.rows(*span), v, u)
+    def points(self, start: int, stop: int) -> Points:
+        """Return some of the points."""
+        v, u = (None if rows is None else rows[start:stop] for rows in (self.v, self.u))
+        return Points(self.configurations.rows(start, stop), v, u)
 
     def given(self) -> dict[str, Array]:
         """Return the arrays of points that differ from point to point and are there already."""
@@ -87,40 +74,38 @@ class SweepTask:
             for key, value in self.constants(arrays).items()
         }
         common = self.job.linearizer.prepared.common
+        held = {item.name for item in fields(LinearBatch)} - {"C", "D"}
         absent: dict[str, Any] = dict.fromkeys(("_x0", "_y0", "_reference", "_drift"))
         return LinearBatch(
             **absent | rows | dict(arrays),
-            **{key: common[key] for key in common if key not in _OF_MODELS},
-            _ignorable=None,
+            **{key: common[key] for key in common.keys() & held},
             columns=tuple(map(column, self.robot.joints)),
-            _system=self.robot,
+            _asked=asked_of(common),
         )
 
     def texts(self, constants: Iterable[str]) -> dict[str, str]:
         """Return what a file of the batch has beside its arrays."""
         one = {key: np.empty((1, *shape)) for key, shape in self.job.shapes.items()}
-        example = self.batch(one | {"q": self.points(Span(0, 1)).q})
-        return {"header": header(example, self.count), "constant": json.dumps(list(constants))}
+        example = self.batch(one | {"q": self.points(0, 1).q})
+        return {**texts_of(example, self.count), "constant": json.dumps(list(constants))}
 
     @property
     def request(self) -> str:
         """Hash of all that the result depends on."""
         robot, prepared = self.robot, self.job.linearizer.prepared
-        digest = sha256(
-            repr(
-                [getattr(robot, key) for key in _OF_THE_ROBOT]
-                + [dict(getattr(robot, key)) for key in ("stiffness", "damping", "rest")]
-                + [prepared.map.frame, prepared.moving, prepared.own_reference]
-                + [self.job.only_inertia, __version__, pin.__version__]
-                + [self.count, fingerprint(self.configurations)]
-            ).encode()
+        inertias = [inertia.toDynamicParameters() for inertia in robot.model.inertias]
+        placements = [placement.homogeneous for placement in robot.model.jointPlacements]
+        said = [getattr(robot, key) for key in _OF_THE_ROBOT]
+        said += [dict(getattr(robot, key)) for key in ("stiffness", "damping", "rest")]
+        said += [prepared.map.frame, prepared.moving, prepared.own_reference]
+        said += [self.job.only_inertia, __version__, pin.__version__, self.count]
+        rows = {"v": self.v, "u": self.u}
+        return content_digest(
+            {
+                "robot": repr(said),
+                "model": np.concatenate([np.ravel(each) for each in (*inertias, *placements)]),
+                "reference": prepared.reference,
+                **{key: "none" if value is None else value for key, value in rows.items()},
+                **{f"of q: {key}": value for key, value in content(self.configurations).items()},
+            }
         )
-        for inertia, placement in zip(
-            robot.model.inertias, robot.model.jointPlacements, strict=True
-        ):
-            digest.update(inertia.toDynamicParameters().tobytes())
-            digest.update(placement.homogeneous.tobytes())
-        digest.update(prepared.reference.tobytes())
-        for rows in (self.v, self.u):
-            digest.update(b"none" if rows is None else np.ascontiguousarray(rows).data)
-        return digest.hexdigest()

@@ -33,17 +33,8 @@ class OwnWorkers(Executor):
 
     Those of `concurrent.futures.ProcessPoolExecutor` share one pipe for their results: where one
     is killed in the middle of a large result, all wait for the rest of it for ever. They also
-    outlive a caller that is killed; these end with it.
-
-    Parameters
-    ----------
-    count : int
-        Processes, at most one for each core.
-
-    Warns
-    -----
-    FflinWarning
-        Where there are fewer cores.
+    outlive a caller that is killed; these end with it. Of more than there are cores it warns, and
+    takes one for each.
     """
 
     def __init__(self, count: int) -> None:
@@ -61,10 +52,7 @@ class OwnWorkers(Executor):
         self._processes: dict[Any, Connection] = {}
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Have a process call a function; see `concurrent.futures.Executor.submit`.
-
-        The future raises `WorkerDied` where the process dies of it.
-        """
+        """Have a process call a function; `WorkerDied` is raised where it dies of it."""
         return self._threads.submit(self._do, (fn, args, kwargs))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:

@@ -49,7 +49,7 @@ def content(thing):
     held = {}
     for field in fields(thing):
         value = getattr(thing, field.name)
-        if field.name in ("verified", "_robot", "_system") or callable(value):
+        if field.name in ("verified", "_robot", "_asked") or callable(value):
             continue
         held[field.name] = (
             (value.shape, np.ascontiguousarray(value).tobytes())
@@ -59,6 +59,8 @@ def content(thing):
     if isinstance(thing, fflin.LinearModel):
         held |= {"M": thing.M.tobytes(), "certificate": thing.certificate}
         held["ignorable"] = thing.ignorable
+    if isinstance(thing, fflin.LinearBatch):
+        held["ignorable"] = thing[0].ignorable
     for name in ("_ignorable", "_require_unchanged"):
         held.pop(name, None)
     return held

@@ -55,7 +55,7 @@ class Counting:
 
 
 def test_the_robot_is_sent_to_each_worker_once(robot, monkeypatch):
-    monkeypatch.setattr(batch_chunks, "_JOBS", {})
+    monkeypatch.setattr(dispatching, "_JOBS", {})
     executor = Counting()
     q, _, _ = points(robot, 60)
     batch = fflin.sweep(robot, q, executor=executor, chunk=2)
@@ -67,7 +67,7 @@ def test_the_robot_is_sent_to_each_worker_once(robot, monkeypatch):
     class Forgetful(Counting):
         def submit(self, function, parcel, *arguments):
             if next(lost):
-                batch_chunks._JOBS.clear()
+                dispatching._JOBS.clear()
             return super().submit(function, parcel, *arguments)
 
     forgetful = Forgetful()

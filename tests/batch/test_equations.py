@@ -8,6 +8,7 @@ import pytest
 
 import fflin
 from fflin.batch.equations import batch_equations
+from fflin.batch.rows import Points
 from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
 
 pytest.importorskip("numba")
@@ -44,7 +45,7 @@ def agreement(robot, count=11, **options):
         shapes["_drift"] = (nx,)
     out = {key: np.full((count, *shape), np.nan) for key, shape in shapes.items()}
     equations = batch_equations(linearizer.prepared, only_inertia=False)
-    assert not len(equations.write(q, v, u, out))
+    assert not len(equations.write(Points(q, v, u), out))
     worst = 0.0
     for row in range(count):
         lin = linearizer(q[row], v[row], u[row])
@@ -149,7 +150,7 @@ def test_angles_beyond_the_kernels_sines_are_left(robots):
     out = {"A": (nx, nx), "B_lower": (nv, u.shape[1]), "f0": (nx,), "_x0": (nx,)}
     arrays = {key: np.zeros((20, *shape)) for key, shape in out.items()}
     equations = batch_equations(fflin.Linearizer(robot).prepared, only_inertia=False)
-    assert equations.write(q, v, u, arrays).tolist() == [3]
+    assert equations.write(Points(q, v, u), arrays).tolist() == [3]
 
 
 def test_outputs_are_left_to_the_linearizer(robots):

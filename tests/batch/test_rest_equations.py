@@ -6,6 +6,7 @@ import pytest
 
 import fflin
 from fflin.batch.equations import batch_equations
+from fflin.batch.rows import Points
 from fflin.dynamics.inertia import Inertia
 from fflin.linear.certificate import inertia_matrix
 from tests.support.robots import BUNDLED, random_tree
@@ -30,7 +31,7 @@ def agreement(robot, q):
     kernel, loop = np.empty((2, len(q), size, size))
     prepared = fflin.Linearizer(robot).prepared
     equations = batch_equations(prepared, only_inertia=True)
-    assert not len(equations.write(q, None, None, {"B_lower": kernel}))
+    assert not len(equations.write(Points(q, None, None), {"B_lower": kernel}))
     inertia = Inertia(prepared.map, robot.create_data())
     for point, inverse in zip(q, loop, strict=True):
         inertia.invert(point, inverse)

@@ -1,0 +1,98 @@
+"""Any rows through any job: drawn by a seed, on threads or workers, into a file that goes on."""
+
+from contextlib import closing, nullcontext
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.batch.dispatch import ChunkResult
+from fflin.batch.files import read_rows
+from fflin.batch.run import failure, run_chunks
+from fflin.batch.store import FileStore, MemoryStore
+from fflin.batch.workers import OwnWorkers
+
+COUNT, CHUNK = 50, 8
+STORED = {"seed": (), "walk": (3,)}
+
+
+class Seeds(NamedTuple):
+    seed: np.ndarray
+
+
+class Walks:
+    """Random walks; that of one seed has no end."""
+
+    shapes = {"walk": (3,)}  # noqa: RUF012
+
+    def __init__(self, endless=-1):
+        self.endless = endless
+
+    def run(self, rows, start, out=None):
+        out = {"walk": np.empty((len(rows.seed), 3))} if out is None else out
+        for at, seed in enumerate(rows.seed.astype(int)):
+            if seed == self.endless:
+                raise fflin.FflinError(f"walk {start + at} has no end")
+            out["walk"][at] = np.random.default_rng(seed).normal(size=(9, 3)).sum(axis=0)
+        return ChunkResult(dict(out), ["tired"] * (start == 0))
+
+
+def seeds(start, stop):
+    return Seeds(np.arange(start, stop, dtype=float))
+
+
+@pytest.fixture(scope="module")
+def expected():
+    store = MemoryStore(COUNT, COUNT, STORED)
+    with pytest.warns(fflin.FflinWarning, match="tired"):
+        assert not run_chunks(Walks(), seeds, store)
+    return store.arrays
+
+
+@pytest.mark.filterwarnings("ignore:tired")
+@pytest.mark.parametrize("threads, workers", [(1, 0), (3, 0), (1, 2)])
+def test_a_file_goes_on_where_a_run_ended_and_is_the_same_on_any_workers(
+    threads, workers, expected, tmp_path
+):
+    pytest.importorskip("h5py")
+    path, told = tmp_path / "walks.h5", []
+
+    def run(job):
+        texts = {"kind": "walks", "constant": '["pace"]'}
+        pace = {"pace": np.array([1.5])}
+        with (
+            closing(FileStore(path, "request", COUNT, CHUNK, STORED, pace, texts)) as store,
+            OwnWorkers(workers) if workers else nullcontext() as executor,
+        ):
+            failed = run_chunks(
+                job,
+                seeds,
+                store,
+                executor=executor,
+                threads=threads,
+                progress=lambda done, _: told.append(done),
+            )
+            if failed:
+                raise failure(failed, store, "walks", list)
+            store.complete()
+
+    with pytest.raises(fflin.SweepError, match=r"1 of 7 chunks .* walks 16 to 23: walk 20 has no"):
+        run(Walks(endless=20))
+    told.clear()
+    run(Walks())
+    assert told == [42, 50]
+    arrays, constant, texts, verified = read_rows(path, verify=True)
+    assert verified and constant == ["pace"] and texts["kind"] == "walks"
+    assert np.array_equal(arrays["pace"], [1.5])
+    for key, value in expected.items():
+        assert np.array_equal(arrays[key], value)
+
+
+def test_in_memory_the_error_has_what_is_made_of_the_rest():
+    store = MemoryStore(COUNT, CHUNK, STORED)
+    with pytest.warns(fflin.FflinWarning, match="tired"):
+        failed = run_chunks(Walks(endless=20), seeds, store)
+    error = failure(failed, store, "walks", lambda kept: store.arrays["seed"][kept])
+    assert error.failed == ((16, 24, "walk 20 has no end"),)
+    assert np.array_equal(error.batch, np.r_[0:16, 24:50])
