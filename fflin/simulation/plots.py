@@ -111,11 +111,7 @@ def draw(
         for place, (group, indices) in enumerate(groups.items()):
             row, column = divmod(place, across)
             axes = figure.add_subplot(grid[row * (1 + both), column])
-            _histories(axes, t, states, group, indices)
-            if place == 0 and states.reference is not None:
-                axes.plot([], [], color="#888888", **_PALE, label="reference")
-            if group not in _OF_JOINTS:
-                axes.legend(handlelength=1.2)
+            _histories(axes, t, states, group, indices, keyed=place == 0)
             if apart is not None:
                 below_it = figure.add_subplot(grid[2 * row + 1, column], sharex=axes)
                 _apart(below_it, t, *apart, indices)
@@ -166,12 +162,18 @@ def _panels(states: Signals, inputs: Signals, wheels: Mapping[str, float]) -> di
     return found
 
 
-def _histories(axes: Axes, t: Array, states: Signals, group: str, indices: list[int]) -> None:
+def _histories(
+    axes: Axes, t: Array, states: Signals, group: str, indices: list[int], *, keyed: bool
+) -> None:
     for color, i in zip(cycle(len(indices)), indices, strict=True):
         gaps = indices if group == "q_b" else []
         _curve(axes, t, states, i, gaps, color=color, label=_short(states.names[i]))
     _limits(axes, states, indices)
     axes.set(title=_GROUPS[group], ylabel=states.unit(indices))
+    if keyed and states.reference is not None:
+        axes.plot([], [], color="#888888", **_PALE, label="reference")
+    if group not in _OF_JOINTS:
+        axes.legend(handlelength=1.2)
     axes.margins(x=0.0)
 
 
