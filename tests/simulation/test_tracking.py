@@ -8,25 +8,7 @@ import fflin
 from benchmarks.cases.trajectory import beside as beside_knots
 from benchmarks.cases.trajectory import flown
 from fflin.dynamics.state_rows import moved_by, moving_error, moving_errors
-
-
-def swung(robot, duration=4.0, *, size=0.1, spin=0.0, sample=None):
-    """A motion under joint torques that swing, and come to nothing at the end."""
-    nu = len(fflin.linearize(robot).u0)
-
-    def policy(t, q, v):
-        return size * np.sin(2.0 * np.pi * t / duration) * np.cos(np.arange(nu))
-
-    v0 = np.zeros(robot.nv)
-    v0[3:6] = spin
-    return fflin.simulate(
-        robot, policy, v0=v0, duration=duration, dt=0.01, frame="local", sample=sample
-    )
-
-
-def beside(robot, traj, size, seed=3):
-    step = size * np.random.default_rng(seed).standard_normal(robot.nv)
-    return pin.integrate(robot.model, traj.q[0], step), traj.v[0] + 0.3 * step
+from tests.support.motions import beside, swung
 
 
 @pytest.fixture(scope="module")
