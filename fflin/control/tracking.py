@@ -13,7 +13,7 @@ from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.validation import Array
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.policies import Allocation, fed_back
-from fflin.control.tvlqr import resting_end
+from fflin.control.tvlqr import resting_end, steady_regulator
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moving_error
@@ -39,7 +39,7 @@ class TrajectoryFeedback:
 
     The error is that of `linearize_trajectory`, u on the base is in base axes, and t is the time
     since the first knot. After the end the last configuration at rest is the target, with what
-    holds the robot there and the last K.
+    holds the robot there and the regulator of the same weights about it.
 
     Parameters
     ----------
@@ -90,9 +90,17 @@ class TrajectoryFeedback:
             return self.end.q, self.end.v, self.end.u0
         return self.trajectory.flow.at(float(self.trajectory.t[0]) + max(t, 0.0))
 
+    @cached_property
+    def end_gain(self) -> Array:
+        """K (nu, nx) of the regulator of the same weights about `end`."""
+        by = self.schedule
+        return steady_regulator(self.end, by.Q, by.R, by.dt)[1]
+
     def gain(self, t: float) -> Array:
         """Return K (nu, nx) at a time of the run."""
         knots = self.schedule.t
+        if t > self.duration * _AT_THE_END:
+            return self.end_gain
         return self.schedule.gain(float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0])))
 
     def law(self) -> Callable[[float, Array], Array]:

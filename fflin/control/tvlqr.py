@@ -21,6 +21,7 @@ from fflin.control.gain_schedule import GainSchedule
 from fflin.control.weights import Weight, weight
 
 if TYPE_CHECKING:
+    from fflin.control.gain import Gain
     from fflin.linear.linear_trajectory import LinearTrajectory
     from fflin.linear.model import LinearModel
     from fflin.linear.trajectory import Trajectory
@@ -68,7 +69,8 @@ def tvlqr(
     sample : float, optional
         Sampling time [s], of which the duration is a multiple.
     weights : {"urdf", "identity"}, optional
-        Instead of Q and R: the rule of `lqr`, about that same point.
+        Instead of Q and R: the rule of `lqr`, about that same point, from a tenth of its
+        displacements, and fast enough to bring errors to nothing within the trajectory.
     rule : str
         What made Q and R, in words.
 
@@ -103,12 +105,13 @@ def tvlqr(
     end: Any = steady_end(traj) if steady or by_rule else None
     given: list[Any] = [Q, R]
     if by_rule:
-        from fflin.control.default_weights import rule_weights
+        from fflin.control.default_weights import pace_along, rule_weights
 
-        *given, _, rule = rule_weights(end, weights, hold=dt)
+        pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
+        *given, _, rule = rule_weights(end, weights, pace=pace)
     Q = weight("Q", given[0], names)
     R = weight("R", given[1], input_keys(traj), definite=True)
-    Qf = _cost_from(end, Q, R, sample) if steady else weight("Qf", Qf, names)
+    Qf = steady_regulator(end, Q, R, sample)[0] if steady else weight("Qf", Qf, names)
     fields: dict[str, Any] = {key: getattr(traj, key) for key in ("q", "v", "u", "hold", "frame")}
     fields |= {"state_names": names, "input_names": traj.input_names, "robot": traj.robot.name}
     fields |= {"Q": Q, "R": R, "Qf": Qf, "weights": rule, "knots": traj.t}
@@ -171,23 +174,26 @@ def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
     return Linearizer(robot, moving=True)(q, v, equilibrium(robot, q, v=v).u)
 
 
-def _cost_from(lin: Any, Q: Array, R: Array, sample: float | None) -> Array:
-    """Return the cost P (nx, nx) of a regulator about a steady point."""
+def steady_regulator(
+    lin: LinearModel, Q: Array, R: Array, sample: float | None
+) -> tuple[Array, Array]:
+    """Return the cost P (nx, nx) and K (nu, nx) of a regulator about a steady point."""
     from fflin.analysis.momentum import momentum_reduction
     from fflin.control.lqr import lqr
     from fflin.control.sampled_cost import sampled_cost
 
-    def cost(lin: LinearModel, Q: Array) -> Array:
-        if sample is None:
-            return lqr(lin, Q, R).P
-        return lqr(lin.discretize(sample), *sampled_cost(lin, sample, Q, R)).P
+    def regulator(lin: LinearModel, Q: Array) -> Gain:
+        if not sample:
+            return lqr(lin, Q, R)
+        return lqr(lin.discretize(sample), *sampled_cost(lin, sample, Q, R))
 
     try:
-        return cost(lin, Q)
+        gain = regulator(lin, Q)
+        return gain.P, gain.K
     except StabilizabilityError:
         part = momentum_reduction(lin)
-        P: Array = part.S.T @ cost(part, part.T.T @ Q @ part.T) @ part.S
-        return P
+        gain = regulator(part, part.T.T @ Q @ part.T)
+        return part.S.T @ gain.P @ part.S, gain.K @ part.S
 
 
 def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) -> dict[str, Any]:

@@ -268,8 +268,13 @@ def test_weights_are_those_of_lqr(tumbling):
     with pytest.raises(fflin.UnknownNameError, match="q_x"):
         fflin.tvlqr(traj, {"q_x": 1.0}, 1.0)
     end = fflin.linearize(traj.robot, traj.q[-1], moving=True)
-    assert "come back at" in fflin.tvlqr(traj).weights
-    assert fflin.tvlqr(traj).Q == pytest.approx(fflin.lqr(end).Q)
+    # Their rule, of a loop that fits into the trajectory, from a tenth of the displacements.
+    pace = min(max(15.0 / (traj.t[-1] - traj.t[0]), 0.2), 1.5)
+    along, about = fflin.tvlqr(traj), fflin.lqr(end)
+    assert "the base from 3 deg" in along.weights
+    assert f"come back at {pace:.3g} rad/s" in along.weights
+    assert np.diag(along.Q) == pytest.approx(np.diag(about.Q), rel=0.05)
+    assert np.diag(along.R) * pace**4 == pytest.approx(np.diag(about.R) * 0.2**4, rel=0.05)
     slow, quick = (fflin.tvlqr(traj, sample=dt).R.max() for dt in (1.0, 0.25))
     assert slow > 10.0 * quick
     assert (fflin.tvlqr(traj, weights="identity").R == np.eye(9)).all()

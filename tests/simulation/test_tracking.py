@@ -209,19 +209,36 @@ def test_a_motion_that_is_followed_comes_back_from_its_file(case, tmp_path):
 
 
 def test_a_loop_of_ten_seconds_comes_back_to_a_hundredth_of_a_degree():
-    """Under the default weights for 1.5 rad/s, and inputs that are limited to a third of theirs."""
+    """Under the default weights, and inputs that are limited to a third of what they ask for."""
     traj = flown()
     robot, along = traj.robot, fflin.linearize_trajectory(traj.robot, traj)
-    slow = fflin.tvlqr(along)
-    schedule = fflin.tvlqr(along, slow.Q, slow.R * (0.2 / 1.5) ** 4)
-    policy = fflin.TrajectoryFeedback(along, schedule)
+    schedule = fflin.tvlqr(along)
+    assert "the base from 3 deg" in schedule.weights
     q0, v0 = beside_knots(traj)
     for limit, degrees in ((None, 0.01), (20.0, 0.1)):
-        run = fflin.simulate(robot, policy, q0=q0, v0=v0, duration=10.0, limits=limit, linear=False)
+        run = fflin.simulate(robot, schedule, q0=q0, v0=v0, limits=limit, linear=False)
         assert run.attitude_error[0] == pytest.approx(1.0)
         assert run.attitude_error[-1] < degrees
         largest = np.abs(run.u).max()
         assert largest == 20.0 if limit else largest > 60.0
+
+
+@pytest.mark.parametrize("sample", [None, 0.1])
+def test_after_the_end_the_regulator_about_rest_acts_whatever_the_weight_at_the_end(sample):
+    robot = fflin.load("planar_detumble")
+    traj = swung(robot, size=0.3).trajectory()
+    along = fflin.linearize_trajectory(robot, traj)
+    heavy = fflin.tvlqr(along, 10.0, 0.05, 1e4, sample=sample)
+    steady = fflin.tvlqr(along, 10.0, 0.05, "steady", sample=sample)
+    ends = [
+        fflin.TrajectoryFeedback(along, each).gain(traj.t[-1] + 1.0) for each in (heavy, steady)
+    ]
+    np.testing.assert_array_equal(*ends)
+    if sample is None:
+        np.testing.assert_allclose(ends[1], steady.K[-1], rtol=0.05, atol=1e-2)
+    run = fflin.simulate(robot, heavy, duration=30.0)
+    assert not run.stopped
+    assert np.abs(run.error[-1]).max() < 1e-3
 
 
 def test_the_last_step_ends_on_the_trajectory_whatever_its_time_is_rounded_to():
