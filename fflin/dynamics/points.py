@@ -1,6 +1,7 @@
 """Configurations, velocities and inputs of a point by name."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -61,6 +62,21 @@ def start_of(robot: Robot) -> tuple[Array, Array]:
     base = pin.SE3(rotation, np.array(start.get("position", np.zeros(3))))
     q = configuration(robot, start.get("joints"), base)
     return q, velocity(robot, start.get("velocity", {}))
+
+
+def point_of(
+    state: StateMap, x0: Any, q0: Any, v0: Any, default: Callable[[], tuple[Array, Array]]
+) -> tuple[Array, Array]:
+    """Return the configuration (nq,) and velocity (nv,) that a caller gives, as x or as q and v."""
+    robot = state.robot
+    if x0 is not None:
+        if q0 is not None or v0 is not None:
+            raise InputError("x0 is given with q0 or v0; give either")
+        return state.to_pinocchio(x0)
+    if q0 is None and v0 is None:
+        return default()
+    q = robot.neutral() if q0 is None else robot.checked_configuration(q0).copy()
+    return q, np.zeros(robot.nv) if v0 is None else robot.checked_velocity(v0).copy()
 
 
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:

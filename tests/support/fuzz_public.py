@@ -98,6 +98,10 @@ def sound(folder):
         "momentum_reduction": {"lin": fflin.linearize(robot.replace(inputs=robot.inputs[2:]))},
         "observability": {"lin": lin},
         "OutputFeedback": {"lin": lin, "compensator": fflin.lqg(gain, filtered), "noise": None},
+        "plan": {
+            **{"robot": robot, "goal": (q, None), "duration": 1.0, "q0": q, "v0": v, "x0": None},
+            **{"knots": 3, "hold": "previous", "limits": None, "R": 1.0, "free": ()},
+        },
         "plot_check": {"check": fflin.check(robot, lin), "path": None},
         "plot_loops": {"gain": gain, "path": None},
         "plot_matrices": {"lin": lin, "path": None},
