@@ -324,3 +324,18 @@ def test_eight_lanes_are_eight_runs(robots, monkeypatch):
         np.testing.assert_allclose(u, motion.u[:200:10], rtol=1e-11, atol=1e-11)
         np.testing.assert_allclose(parts[6].q[:, lane], motion.q[-1], rtol=0, atol=1e-12)
     assert np.ptp(parts[6].q[:7], axis=1).min() > 1e-4
+
+
+def test_a_command_that_is_no_number_is_told(robots):
+    robot = robots["cubesat"]
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, np.full(lin.B.shape[::-1], 1e308))
+    x0 = displaced(lin, offset=100.0)
+    options = {"x0": x0, "sample": 0.01, "duration": 0.1, "linear": False}
+    said = []
+    for engine in compiled.ENGINES:
+        with np.errstate(over="ignore"), pytest.raises(fflin.InputError) as caught:
+            fflin.simulate(robot, policy, **options, engine=engine)
+        said.append(str(caught.value))
+    assert said[0] == said[1]
+    assert "inf for" in said[0]
