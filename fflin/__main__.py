@@ -1,5 +1,6 @@
 """Run the command line, as ``fflin`` and as ``python -m fflin``."""
 
+import gc
 import signal
 import sys
 
@@ -17,6 +18,7 @@ def main() -> int:
         leave(reason)
     # All is done and said.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.freeze()  # what ends with the process need not be searched for circles
     return code
 
 
