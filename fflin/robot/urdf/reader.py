@@ -64,7 +64,9 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     """Do what `read_urdf` does with the bytes of a file; `path` names it in errors."""
     root = parse(document, str(path))
     notes: list[str] = []
-    first = first_xacro(root)
+    # The marks of xacro, and of what may stand for them.
+    plain = document.replace(b"\0", b"")  # UTF-16 too
+    first = first_xacro(root) if any(x in plain for x in (b"xacro:", b"$", b"&#")) else None
     if path.suffix == ".xacro" or first:
         expanded, notes = expand(path, document, first)
         root = parse(expanded, f"{path} as expanded by xacro")
