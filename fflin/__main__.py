@@ -10,6 +10,7 @@ from fflin.commands.interruption import leave, listen
 def main() -> int:
     """Run the command line on the arguments of this process, and return its exit code."""
     listen()
+    gc.set_threshold(50_000)  # most of what a command makes, it keeps to its end
     try:
         from fflin.commands import cli
 

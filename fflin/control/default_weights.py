@@ -323,12 +323,15 @@ def _radius_of_gyration(M: Array) -> float:
 
 
 def _largest(K: Array, size: Array, names: tuple[str, ...]) -> Array:
-    """Return the largest K d of all displacements d: the base's in any direction, joints' signs."""
+    """Return the largest K d of all displacements d: the base's in any direction, joints' signs.
+
+    K is (..., k, nx), or (..., k, m) without its velocities.
+    """
     groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
-    scaled = K[:, : len(size)] * size
-    total: Array = np.abs(scaled[:, (groups != "q_b") & (groups != "r_b")]).sum(axis=1)
+    scaled = K[..., : len(size)] * size
+    total: Array = np.abs(scaled[..., (groups != "q_b") & (groups != "r_b")]).sum(axis=-1)
     for group in ("q_b", "r_b"):
-        total += np.linalg.norm(scaled[:, groups == group], axis=1)
+        total += np.linalg.norm(scaled[..., groups == group], axis=-1)
     return total
 
 
@@ -351,16 +354,16 @@ def _fastest(
     """
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
-    speeds = np.zeros(len(T))
-    if any(name.startswith("qdot_m.") for name in lin.limits):
-        for time in np.geomspace(0.1 / rates[-1] ** (1 if (mass == 1.0).all() else 2), 3.0, 60):
-            x = rates * time / math.sqrt(2.0)
-            moving = math.sqrt(2.0) * rates * np.exp(-x) * np.sin(x)
-            if (mass < 1.0).any():
-                fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
-                moving = (rates**2 * (slow - fast) / root).real
-            now = _largest(T @ (moving[:, None] * to_modes), size, lin.state_names)
-            speeds = np.maximum(speeds, now)
+    if not any(name.startswith("qdot_m.") for name in lin.limits):
+        return np.zeros(len(T))
+    first = 0.1 / rates[-1] ** (1 if (mass == 1.0).all() else 2)
+    time = np.geomspace(first, 3.0, 60)[:, None]
+    x = rates * time / math.sqrt(2.0)
+    moving = math.sqrt(2.0) * rates * np.exp(-x) * np.sin(x)
+    if (mass < 1.0).any():
+        fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
+        moving = (rates**2 * (slow - fast) / root).real
+    speeds: Array = _largest(T @ (moving[..., None] * to_modes), size, lin.state_names).max(axis=0)
     return speeds
 
 

@@ -25,6 +25,8 @@ _STEPS = 25
 _ROUNDED = 1e-12
 _NEAR = 1e-3
 
+_APART = 1e-5
+
 
 class Solution(NamedTuple):
     """P and K, the poles of A - B K, the relative residual, and what found them."""
@@ -177,6 +179,17 @@ def half_size(
 
 
 def _half_size(equation: Riccati) -> Solution | None:
+    found = None
+    # Modes that coincide, as of critical damping, have no inverse: Newton starts beside them.
+    for apart in (0.0, _APART):
+        found = _from_modes(equation, apart) or found
+        if found is not None and found.residual <= _SOUND:
+            break
+    return found
+
+
+def _from_modes(equation: Riccati, apart: float) -> Solution | None:
+    """Solve from the modes of a loop whose weights on velocities are larger by that part."""
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         source = _bilinear(equation) if equation.discrete else equation
         if source is None:
@@ -186,6 +199,9 @@ def _half_size(equation: Riccati) -> Solution | None:
             # In terms of u + R^-1 N' x the cost has no cross term.
             A = A - source.B @ dtrtrs(source.R_factor, cross, lower=1, trans=1)[0]
             Q = Q - cross.T @ cross
+        scale = np.ones(len(A))
+        scale[len(A) // 2 :] += apart
+        Q = scale[:, None] * Q * scale
         loop = second_order_loop(A, source.B, Q, source.R_factor)
         if loop is None:
             return None
