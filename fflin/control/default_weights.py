@@ -233,10 +233,13 @@ def default_weights(
 
 def _damping(lin: LinearModel) -> Array:
     """Return B (m, m) of viscous dampers, 0 where there are none."""
+    m = len(lin.M)
+    if lin.dt or not lin.A[m:, m:].any():  # samples show springs as damping too
+        return np.zeros_like(lin.M)
     D = second_order(lin).D.values
     rates, modes = eigh(0.5 * (D + D.T), lin.M)
-    # What motion brings to one, it takes from another; and samples show springs as damping too.
-    damped: Any = not lin.dt and rates.sum() > 1e-9 * np.abs(rates).sum()
+    # What motion brings to one, it takes from another.
+    damped: Any = rates.sum() > 1e-9 * np.abs(rates).sum()
     forces = lin.M @ modes
     return (forces * rates.clip(0.0)) @ forces.T * damped
 
