@@ -90,24 +90,8 @@ def rule_weights(
     """Return Q, R and N of a model by a rule, and the rule in words.
 
     The cost of a sampled model is the continuous one under the hold, where it is known what it
-    was sampled from.
-
-    Parameters
-    ----------
-    lin : LinearModel
-    name : {"urdf", "identity"} or None
-        "urdf" is `default_weights`, "identity" 1 on every state and input; by default what the
-        robot has in its `weights`, and "urdf" where it has none.
-    given : mapping
-        Parts "q", "r", "bryson" of those that have their own, as `Robot.replace` takes them.
-    wheel_speeds : bool, optional
-        As in `lqr`.
-    pace : Pace
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such rule, state or input.
+    was sampled from. The rule is by default what the robot has in its `weights`, and "urdf" where
+    it has none; `given` has parts "q", "r", "bryson" of weights, as `Robot.replace` takes them.
     """
     source = lin.generator or lin
     layers = [(given, False)] if given else []
@@ -326,10 +310,7 @@ def _radius_of_gyration(M: Array) -> float:
 
 
 def _largest(K: Array, size: Array, names: tuple[str, ...]) -> Array:
-    """Return the largest K d of all displacements d: the base's in any direction, joints' signs.
-
-    K is (..., k, nx), or (..., k, m) without its velocities.
-    """
+    """Return the largest K d of all displacements d: the base's in any direction, joints' signs."""
     groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
     scaled = K[..., : len(size)] * size
     total: Array = np.abs(scaled[..., (groups != "q_b") & (groups != "r_b")]).sum(axis=-1)

@@ -125,28 +125,7 @@ def solve(
     A fully actuated second-order system is solved by its own half-size method, any other and
     where that falls short by SciPy's. Newton's method (Kleinman) refines either, step by step as
     long as it lowers the residual, which is measured in the variables given.
-
-    Parameters
-    ----------
-    A : ndarray (nx, nx)
-    B : ndarray (nx, nu)
-    Q : ndarray (nx, nx)
-        Symmetric.
-    R : ndarray (nu, nu)
-        Symmetric positive definite.
-    N : ndarray (nx, nu), optional
-    dt : float
-        Sampling time; 0 for continuous time.
-
-    Returns
-    -------
-    Solution
-        The method is "structured" or "general".
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If there is no stabilising solution, or none is found.
+    A `numpy.linalg.LinAlgError` says that there is no stabilising solution, or none is found.
 
     References
     ----------
@@ -178,18 +157,9 @@ def half_size(
     return solution if solution is not None and solution.residual <= _SOUND else None
 
 
-def _half_size(equation: Riccati) -> Solution | None:
+def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
+    """Solve from the modes of a loop whose weights on velocities are larger by a part."""
     found = None
-    # Modes that coincide, as of critical damping, have no inverse: Newton starts beside them.
-    for apart in (0.0, _APART):
-        found = _from_modes(equation, apart) or found
-        if found is not None and found.residual <= _SOUND:
-            break
-    return found
-
-
-def _from_modes(equation: Riccati, apart: float) -> Solution | None:
-    """Solve from the modes of a loop whose weights on velocities are larger by that part."""
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         source = _bilinear(equation) if equation.discrete else equation
         if source is None:
@@ -207,8 +177,11 @@ def _from_modes(equation: Riccati, apart: float) -> Solution | None:
             return None
         P = loop.modes.lyapunov_modal(loop.cost)
         modes = None if equation.discrete else loop.modes
-        return _finished(equation, *_refined(equation, P, modes), "structured")
-    return None
+        found = _finished(equation, *_refined(equation, P, modes), "structured")
+    if apart or (found is not None and found.residual <= _SOUND):
+        return found
+    # Modes that coincide, as of critical damping, have no inverse: Newton starts beside them.
+    return _half_size(equation, _APART) or found
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:

@@ -30,8 +30,6 @@ _LARGEST_SHARE = 1e9
 
 STROKE = 1.0  # [m] that a sliding joint is taken to be out at most, for those moments
 
-_ITERATIONS = 20  # to tell in words what is ill-conditioned
-
 # From this size on LAPACK is quicker than a sparse factor.
 _DENSE_SIZE = 64
 
@@ -124,12 +122,12 @@ class Inertia:
         lost = not self.least_coupling < coupling < _LARGEST_COUPLING  # or NaN
         if lost:
             mode = np.linalg.eigh(M / scale / scale[:, None])[1][:, 0]
-        else:  # the same by the inverse, at a tenth of the price
+        else:  # the same by powers of the inverse, at a tenth of the price
             stretched = inverse * scale * scale[:, None]
             mode = stretched[int(stretched.diagonal().argmax())]
-            for _ in range(_ITERATIONS):
-                mode = stretched @ (mode / np.linalg.norm(mode))
-            mode /= np.linalg.norm(mode)
+            for _ in range(20):
+                mode = stretched @ mode
+                mode /= np.linalg.norm(mode)
         names = coordinate_names(self._state.robot)
         involved = listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
         if lost:
