@@ -25,7 +25,7 @@ _ENTITY = re.compile(rb"&(?!(amp|lt|gt|quot|apos);|#)")
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
-@lru_cache(1000)  # a file has a few of them many times
+@lru_cache(128)  # a file has a few of them many times
 def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str | None:
     """Return what of the known is nearest to a name, None where nothing is near."""
     import difflib
