@@ -132,6 +132,16 @@ def test_a_trajectory_is_followed_from_beside_it_to_files(flown):
     np.testing.assert_allclose(here - there, e, atol=1e-12)
 
 
+def test_an_offset_may_be_more_than_half_a_turn(flown):
+    folder, _, motion = flown
+    assert chain(folder, "--offset", "yaw=200", "--duration", 0.01, "-o", "turned.npz")[0] == 0
+    q = fflin.Motion.load(folder / "turned.npz").q[0], motion.q[0]
+    here, there = (pin.XYZQUATToSE3(each[:7]).rotation for each in q)
+    np.testing.assert_allclose(
+        there.T @ here, pin.rpy.rpyToMatrix(0, 0, np.radians(200)), atol=1e-9
+    )
+
+
 def test_a_sampled_trajectory_of_a_mat_file_is_followed_past_its_end(flown):
     folder = flown[0]
     code, _, err = chain(

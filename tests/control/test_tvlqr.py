@@ -238,6 +238,20 @@ def test_a_steady_end_goes_on_as_the_regulator_does(tumbling):
         fflin.tvlqr(hung, Q, R[6:])
 
 
+def test_at_a_steady_end_wheels_spin_on():
+    wheel = fflin.ReactionWheel((0, 0, 1), inertia=1e-4)
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(), fflin.BaseForce(), wheel])
+    v0 = fflin.velocity(robot, {"omega_b.x": 0.1, "omega_b.y": 0.05, "wheel_1": 500.0})
+    run = fflin.simulate(robot, v0=v0, duration=1.0, dt=0.01, every=5, frame="local")
+    traj = fflin.linearize_trajectory(robot, run.trajectory())
+    schedule = fflin.tvlqr(traj, 1.0, 1.0)
+    rest = np.r_[np.zeros(6), traj.v[-1, 6]]
+    lin = fflin.linearize(robot, traj.q[-1], rest, moving=True)
+    assert schedule.P[-1] == pytest.approx(fflin.lqr(lin, 1.0, 1.0).P)
+    after = fflin.TrajectoryFeedback(traj, schedule).reference(2.0)
+    assert after[1] == pytest.approx(rest)
+
+
 @pytest.mark.filterwarnings("ignore:t, q, v, u are no motion")
 def test_a_steady_end_leaves_out_what_inputs_cannot_hold(tumbling):
     robot, traj = tumbling
@@ -275,6 +289,8 @@ def test_weights_are_those_of_lqr(tumbling):
     assert f"come back at {pace:.3g} rad/s" in along.weights
     assert np.diag(along.Q) == pytest.approx(np.diag(about.Q), rel=0.05)
     assert np.diag(along.R) * pace**4 == pytest.approx(np.diag(about.R) * 0.2**4, rel=0.05)
+    long = resting("ets_vii", 100.0)[1]
+    assert "come back at 0.2 rad/s" in fflin.tvlqr(long).weights  # as at a point, no slower
     slow, quick = (fflin.tvlqr(traj, sample=dt).R.max() for dt in (1.0, 0.25))
     assert slow > 10.0 * quick
     assert (fflin.tvlqr(traj, weights="identity").R == np.eye(9)).all()

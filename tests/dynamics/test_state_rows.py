@@ -48,6 +48,17 @@ def test_rows_of_a_motion_are_its_states(name, frame):
         np.testing.assert_allclose(row, near, atol=1e-13)
 
 
+def test_rates_tell_the_turns_between_rows():
+    robot = fflin.load("planar_detumble")
+    state, t = fflin.StateMap(robot), np.linspace(0.0, 2.0, 5)
+    rates = np.outer(1.0 + t, (40.0, -60.0, 0.5))
+    angles = np.outer(t + 0.5 * t**2, (40.0, -60.0, 0.5))
+    q = [fflin.configuration(robot, dict(zip(robot.joint_names, a, strict=True))) for a in angles]
+    v = np.hstack((np.zeros((5, 6)), rates))
+    found = state_history(state, np.array(q), v, t=t)[:, state.groups.q_m]
+    np.testing.assert_allclose(found, angles, atol=1e-12)
+
+
 def test_cf4_is_the_published_scheme():
     # q2 = I(q, h/2 k1), q3 = I(q, h/2 k2), q4 = I(q2, h (k3 - k1/2)), then two exponentials.
     robot = fflin.load("servicer_7dof")

@@ -190,9 +190,32 @@ def test_a_fast_wheel_turns_between_knots():
     robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(), wheel])
     v0 = fflin.velocity(robot, {"wheel_1": 500.0})
     run = fflin.simulate(robot, v0=v0, duration=0.2, dt=0.001, every=20)
-    at = run.trajectory().point(0.03)[0]
-    exact = fflin.simulate(robot, v0=v0, duration=0.03, dt=0.001).q[-1]
+    # Not midway, where two turns more are one: the same angle.
+    at = run.trajectory().point(0.025)[0]
+    exact = fflin.simulate(robot, v0=v0, duration=0.025, dt=0.001).q[-1]
     assert np.abs(pin.difference(robot.model, at, exact)).max() < 1e-9
+
+
+def test_points_between_knots_are_of_order_four():
+    robot = fflin.load("astrobee_arm")
+    t, q, v, u = motion(robot)
+    assert np.abs(v[:, 3:6]).max() > 0.1  # the base rotates
+
+    def missed(every):
+        along = fflin.Trajectory(robot, *(each[::every] for each in (t, q, v, u)))
+        midway = range(every // 2, len(t), every)
+        apart = [pin.difference(robot.model, along.point(t[k])[0], q[k]) for k in midway]
+        return np.abs(apart).max(axis=0)
+
+    assert np.log2(missed(16) / missed(8)) == pytest.approx(np.full(robot.nv, 4.0), abs=0.5)
+
+
+def test_a_bad_interval_is_told_at_both_its_knots(loop):
+    _, run = loop
+    along = run(sample=0.1, every=10).trajectory()
+    u = along.u.copy()
+    u[7, 2] += 10.0 * np.abs(u).max()
+    assert np.flatnonzero(replace(along, u=u).residual > 1e-6).tolist() == [7, 8]
 
 
 @pytest.mark.parametrize("ending", ["npz", "mat", "json", "csv"])

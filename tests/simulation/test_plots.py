@@ -3,12 +3,14 @@
 import math
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import fflin
 from fflin.dynamics.state_rows import moved_by
+from fflin.simulation.motion_plot import resting_from
 from tests.support.motions import tracked
 from tests.support.weights import unit_weights
 
@@ -187,6 +189,13 @@ def limited():
 
     v0 = fflin.velocity(robot, {"spin": 290.0, "joint_1": 0.04})
     return fflin.simulate(robot, policy, v0=v0, duration=0.02, dt=1e-3, limits="urdf")
+
+
+@pytest.mark.parametrize(("target", "since"), [((0, 1, 2, 3, 3), 0.75), ((0, 1, 2, 3, 4), None)])
+def test_a_target_rests_from_where_two_rows_of_it_are_one(target, since):
+    rows = np.outer(target, (1.0, 0.0))
+    motion = SimpleNamespace(t=np.linspace(0.0, 1.0, 5), x=rows, target=rows, tracked=True)
+    assert resting_from(motion) == since
 
 
 def panels(figure):

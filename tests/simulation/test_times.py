@@ -1,9 +1,12 @@
 """How many rows a run records by itself, and what is said of a pole that makes it slow."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import fflin
+from fflin.control.tracking import largest_rate
 from fflin.simulation import times
 from fflin.simulation.report import motion_report
 from tests.support.commands import run
@@ -76,6 +79,22 @@ def test_the_pole_that_makes_a_run_slow_is_named():
     # A loop without such a pole is not analysed further.
     calm = times.times_of(fflin.StateFeedback(lin, fflin.lqr(lin).K), 1.0, None, None, None, 0.0)
     assert calm.mode == "" and calm.fastest > 0.0
+
+
+@pytest.mark.parametrize(
+    ("t", "rates", "found"),
+    [
+        ((0.0, 10.0, 100.0), (50.0, 2.0, 2.0), 50.0),
+        ((0.0, 90.0, 100.0), (2.0, 2.0, 50.0), 50.0),
+        ((0.0, 4.0, 100.0), (50.0, 2.0, 2.0), 2.0),
+        ((0.0, 96.0, 100.0), (2.0, 2.0, 50.0), 2.0),
+    ],
+)
+def test_what_a_loop_passes_for_a_twentieth_of_the_time_makes_no_run_slow(t, rates, found):
+    A = np.array([[[0.0, rate], [-rate, 0.0]] for rate in rates])
+    zero = np.zeros_like(A)
+    schedule = SimpleNamespace(t=np.array(t), A=A, B=zero, K=zero, dt=0.0)
+    assert largest_rate.__wrapped__(schedule) == pytest.approx(found)
 
 
 def test_hours_that_nobody_asked_for_are_refused():

@@ -23,6 +23,7 @@ def test_the_errors_of_rows_are_those_of_points_and_lead_back(frame):
     robot, rng = fflin.load("servicer_7dof"), np.random.default_rng(5)
     state = fflin.StateMap(robot, frame=frame)
     turns = 0.5 * rng.standard_normal((20, robot.nv))
+    turns[:, 3:6] *= 4.0  # across half turns
     q = [pin.integrate(robot.model, robot.neutral(), turn) for turn in turns]
     v = rng.standard_normal((20, robot.nv))
     x = np.array([state.to_state(*each) for each in zip(q, v, strict=True)])
@@ -102,6 +103,8 @@ def test_after_the_end_the_last_configuration_is_held_at_rest():
     after = run.t > traj.t[-1] + 1e-9
     held = fflin.StateMap(robot, frame="local").to_state(traj.q[-1], np.zeros(robot.nv))
     np.testing.assert_allclose(run.target[after], np.tile(held, (after.sum(), 1)), atol=1e-14)
+    # The error jumps to that from rest, in the prediction as in the run.
+    assert np.abs(run.linear - run.x).max() < 0.1 * np.abs(traj.v[-1]).max()
     assert np.abs(run.error[-1]).max() < 1e-4
     assert np.abs(run.linear[-1] - run.x[-1]).max() < 1e-4
 
@@ -119,6 +122,15 @@ def test_a_sampled_schedule_is_asked_at_its_samples():
     q, v, u = traj.point(run.t[50])
     e = moving_error(state, q, v, run.q[50], run.v[50])
     np.testing.assert_allclose(run.u[50], u - schedule.gain(run.t[50]) @ e, atol=1e-12)
+
+
+@pytest.mark.parametrize("sample", [None, 0.2])
+def test_what_a_trajectory_holds_is_foreseen_to_end_at_its_knots(sample):
+    robot = fflin.load("ets_vii")
+    traj = swung(robot, sample=0.2).trajectory()
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj), sample=sample)
+    run = fflin.simulate(robot, schedule, dt=0.02)
+    assert np.abs(run.linear - run.x).max() < 1e-6
 
 
 def test_a_clock_that_does_not_begin_at_zero_is_counted_from_the_first_knot(case):
