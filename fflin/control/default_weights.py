@@ -32,8 +32,9 @@ BANDWIDTH, _HELD = 0.2, 0.3
 TURN, WAY, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 
 # Along a trajectory errors are a tenth of these, and are to be gone within it: so many time
-# constants are to fit in, of a loop that is no slower than at a point, nor faster than this.
-_BESIDE, _CONSTANTS, _FASTEST = 0.1, 15.0, 1.5
+# constants are to fit in, of a loop that is no slower than at a point, nor faster than this. Under
+# a hold it may use more of it, since the regulator of the samples themselves is exact.
+_BESIDE, _CONSTANTS, _FASTEST, _HELD_ALONG = 0.1, 15.0, 1.5, 1.0
 
 # So many times the loops of springs and gravity are slowed.
 _TRIALS = 8
@@ -62,6 +63,7 @@ class Pace(NamedTuple):
     bandwidth: float = BANDWIDTH  # [rad/s]
     share: float = 1.0
     hold: float = 0.0  # [s] that the inputs of a continuous model will be held for
+    held: float = _HELD  # what the fastest of the loop may do within a hold [rad]
 
 
 AT_A_POINT = Pace()
@@ -69,7 +71,7 @@ AT_A_POINT = Pace()
 
 def pace_along(duration: float, hold: float) -> Pace:
     """Return the pace of a loop along a trajectory of that duration [s]."""
-    return Pace(min(max(_CONSTANTS / duration, BANDWIDTH), _FASTEST), _BESIDE, hold)
+    return Pace(min(max(_CONSTANTS / duration, BANDWIDTH), _FASTEST), _BESIDE, hold, _HELD_ALONG)
 
 
 class _Limit(NamedTuple):
@@ -183,7 +185,7 @@ def default_weights(
         Whole or reduced; of a sampled one, weights for the sum over its samples.
     pace : Pace
         Along a trajectory that of `pace_along`: the displacements are a tenth of those above, and
-        w is 15 over its duration, within 0.2 and 1.5 rad/s.
+        w is 15 over its duration, within 0.2 and 1.5 rad/s, or what the hold leaves.
     momenta : mapping, optional
         {qdot_m.WHEEL: most momentum [N m s] that it can take up} of wheels that are not states.
 
@@ -269,7 +271,7 @@ def _of_inertia(
         *_of_efforts(lin, _largest(gain, size, lin.state_names)),
     ]
     if pace.hold or lin.dt:
-        fastest = _HELD / ((pace.hold or lin.dt) * rates[-1])
+        fastest = pace.held / ((pace.hold or lin.dt) * rates[-1])
         limits.append(_Limit(float(fastest), "the time of the hold"))
     limit = min(limits)
     if A[m:].any() or A[:m, :m].any():

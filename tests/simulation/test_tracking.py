@@ -316,16 +316,15 @@ def test_inputs_that_jump_at_knots_are_followed_to_the_integrators_order(engine)
     assert errors[0] > 8.0 * errors[1]
 
 
-def test_a_sample_of_inputs_that_change_has_their_mean():
+def test_a_sample_of_inputs_that_change_has_their_mean(monkeypatch):
     robot = fflin.load("planar_detumble")
     traj = swung(robot, 2.0, size=0.5).trajectory()
-    along = fflin.linearize_trajectory(robot, traj)
-    errors = []
-    for sample in (0.2, 0.1):
-        run = fflin.simulate(robot, fflin.tvlqr(along, sample=sample), dt=0.01)
-        errors.append(np.abs(run.error[-1]).max())
-        np.testing.assert_allclose(run.u[0], traj.point(0.5 * sample)[2], atol=1e-12)
-    assert errors[0] > 3.0 * errors[1]
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj), sample=0.1)
+    run = fflin.simulate(robot, schedule, dt=0.01)
+    np.testing.assert_allclose(run.u[0], traj.point(0.05)[2], atol=1e-12)
+    monkeypatch.setattr(fflin.TrajectoryFeedback, "ahead", 0.0)
+    late = fflin.simulate(robot, schedule, dt=0.01)
+    assert np.abs(run.error[::10]).max() < 0.2 * np.abs(late.error[::10]).max()
 
 
 @pytest.mark.parametrize("first", [0.0, 0.3])
@@ -341,3 +340,15 @@ def test_a_run_of_just_the_trajectorys_length_needs_no_rest(first):
         run = fflin.simulate(robot, schedule, dt=dt)
         assert run.linear is not None
         assert np.abs(run.error).max() < 1e-4
+
+
+@pytest.mark.parametrize(("sample", "degrees"), [(0.05, 0.01), (0.1, 0.02), (0.2, 0.1)])
+def test_default_gains_of_samples_bring_errors_to_nothing_within_a_trajectory(sample, degrees):
+    robot = fflin.load("planar_detumble")
+    traj = swung(robot, 6.0, size=0.5).trajectory().resampled(0.1)
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj), sample=sample)
+    offset = np.r_[0.0, 0.0, 0.0, 0.0, np.radians(1.0), 0.0, np.full(3, np.radians(3.0))]
+    q0 = pin.integrate(robot.model, traj.q[0], offset)
+    run = fflin.simulate(robot, schedule, q0=q0, v0=traj.v[0], linear=False)
+    assert run.attitude_error[0] == pytest.approx(1.0)
+    assert run.attitude_error[-1] < degrees
