@@ -20,7 +20,7 @@ CALLED = {"policy", "disturbance", "callback", "progress"}
 
 # Weights, some of which need seconds; where they are designed with, the quick lqr answers for all.
 SLOW, WEIGHTS = (
-    {"tvlqr", "lqr_batch", "ScheduledFeedback"},
+    {"tvlqr", "tvkalman", "lqr_batch", "ScheduledFeedback"},
     {"scalar", "zero", "tiny", "huge", "many"},
 )
 
@@ -40,6 +40,7 @@ def results(name):
 
 RESULTS = {
     *("Certificate", "Check", "Compensator", "Controllability", "Equilibrium", "Estimator"),
+    "FilterSchedule",
     *("Gain", "GainSchedule", "Gramians", "Grid", "LinearModel", "LinearTrajectory", "Mode"),
     *("Modes", "Motion", "Observability", "RandomConfigurations", "ReducedModel", "Robot"),
     "Validity",

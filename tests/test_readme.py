@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from shutil import which
 
+import numpy as np
 import pytest
 
 import fflin
@@ -102,6 +103,36 @@ def test_commands_run(tmp_path):
             check=False,
         )
         assert done.returncode == 0, done.stderr
+
+
+def test_the_chain_of_the_tutorial_runs(tmp_path):
+    """Its file, code and commands in their order; the flown motion ends near to the plan."""
+    text = (ROOT / "docs" / "tracking.md").read_text(encoding="utf-8")
+    (toml,) = code_blocks("toml", text)
+    (tmp_path / "detumble.toml").write_text(toml)
+    for language, block in re.findall(r"```(sh|python)\n(.*?)```", text, re.DOTALL):
+        if language == "python":
+            commands = [["-c", "import fflin; robot = fflin.load('detumble.toml')\n" + block]]
+        else:
+            commands = [["-m", *shlex.split(line)] for line in block.splitlines()]
+        for command in commands:
+            done = subprocess.run(
+                [sys.executable, *command],
+                cwd=tmp_path,
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            assert done.returncode == 0, done.stderr
+    motion = fflin.Motion.load(tmp_path / "flown.npz")
+    assert motion.attitude_error[0] == pytest.approx(1.0, abs=1e-9)
+    assert motion.attitude_error[-1] < 0.1
+    assert (np.abs(motion.u) <= np.repeat([12.0, 7.0, 6.0], 3) + 1e-9).all()
+    slew = fflin.Trajectory.load(
+        tmp_path / "slew.npz", fflin.load("servicer_7dof", lock=["panel_*"])
+    )
+    # The last knot is the goal, met to 1e-6, over a step's way of some 0.1.
+    assert (np.abs(slew.v[:, 6:]) <= 0.4 + 1e-6).all() and slew.residual.max() < 1e-5
 
 
 def test_two_commands_set_up_from_nothing():

@@ -10,6 +10,7 @@ ORDER = (
     "batch_at_points",
     "lqr",
     "simulation_step",
+    "trajectory",
     "start_up",
     "memory",
 )

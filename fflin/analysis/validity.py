@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -16,6 +16,7 @@ from fflin.analysis.displacement import checked_displacement, joint_unit, scaled
 from fflin.base.errors import FflinError, InputError
 from fflin.base.tables import folded
 from fflin.base.validation import Array, number, whole
+from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -68,6 +69,10 @@ class Validity:
     confidence : float
     joint_unit : str
         "rad" or "m" where all joints are of one kind, else "rad|m".
+    frame : str
+        In whose axes rates and inputs of the base are fed back.
+    frames : dict
+        {frame: Validity} of the others that were asked for.
     """
 
     levels: Array
@@ -84,6 +89,8 @@ class Validity:
     largest: dict[str, float]
     joint_unit: str
     robot: str
+    frame: str
+    frames: dict[str, Validity] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for array in (self.levels, self.prediction_error, self.sampled):
@@ -118,6 +125,12 @@ class Validity:
             f"between {100.0 * low:.1f} and {100.0 * high:.1f} % do ({sure} confidence)"
             + (f"; {failures}" if failures else ""),
         ]
+        for each in (self, *self.frames.values()) if self.frames else ():
+            upto = shown(each.holds, self.joint_unit)
+            lines.append(
+                f"fed back in frame {each.frame}: {each.settled} of {count} runs settled, "
+                + (f"every one up to {upto}" if each.inside else "not even the smallest")
+            )
         return folded(lines)
 
 
@@ -139,6 +152,7 @@ def validity(
     samples: int = 100,
     seed: int = 0,
     confidence: float = 0.95,
+    frames: Iterable[Frame] = (),
     executor: Executor | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Validity:
@@ -167,6 +181,9 @@ def validity(
         The same seed gives the same result whatever the executor.
     confidence : float
         Of the intervals.
+    frames : sequence of {"hybrid", "local", "world"}
+        In whose axes the same linear loop is to be tried too, from the same displacements; the
+        base of the point must not be turned against the reference.
     executor : concurrent.futures.Executor, optional
         Runs them in parallel, such as a ProcessPoolExecutor.
     progress : callable, optional
@@ -195,6 +212,9 @@ def validity(
     confidence = number("confidence", confidence)
     if not 0.0 < confidence < 1.0:
         raise InputError(f"confidence is {confidence:g}, expected a share between 0 and 1")
+    if isinstance(frames, str) or not isinstance(frames, Iterable):
+        raise InputError(f"frames is {frames!r}, expected several, such as ('hybrid', 'local')")
+    loops = {loop.lin.frame: loop} | {each: _in_frame(loop, each) for each in frames}
     # Each run has its own random stream, so that results do not depend on the order.
     streams = np.random.SeedSequence(seed).spawn(samples + _DIRECTIONS)
     levels = (np.arange(samples) + 0.5) / samples
@@ -204,17 +224,39 @@ def validity(
         )
     if progress is not None and not callable(progress):
         raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
-    runs: list[Callable[[], Any]] = [
-        *(partial(_foreseen, loop, largest, stream) for stream in streams[:_DIRECTIONS]),
-        *map(partial(partial, _outcome, loop, largest), levels, streams[_DIRECTIONS:]),
-    ]
+    runs: list[Callable[[], Any]] = []
+    for each in loops.values():
+        runs += (partial(_foreseen, each, largest, stream) for stream in streams[:_DIRECTIONS])
+        runs += map(partial(partial, _outcome, each, largest), levels, streams[_DIRECTIONS:])
     found: list[Any] = [None] * len(runs)
     for done, (index, result) in enumerate(_each(runs, executor), 1):
         found[index] = result
         if progress:
             progress(done, len(runs))
+    one = len(streams)
+    own, *others = (
+        _judged(each, largest, levels, found[k * one : (k + 1) * one], confidence)
+        for k, each in enumerate(loops.values())
+    )
+    return replace(own, frames={each.frame: each for each in others})
+
+
+def _in_frame(loop: Loop, frame: Frame) -> Loop:
+    """Return the same linear loop, fed back in other axes."""
+    state = StateMap(loop.robot, reference=loop.lin.reference, frame=frame)
+    if not np.allclose(state.to_state(loop.lin.q, loop.lin.v)[:3], 0.0, atol=1e-9):
+        raise InputError(
+            "the base of the point is turned against the reference, where frames have different "
+            "models; compare them on a model made without a reference"
+        )
+    return replace(loop, lin=replace(loop.lin, frame=state.frame))
+
+
+def _judged(
+    loop: Loop, largest: dict[str, float], levels: Array, found: list[Any], confidence: float
+) -> Validity:
     worst = np.array(found[:_DIRECTIONS]).max(axis=0)
-    outcomes = tuple(found[_DIRECTIONS:])
+    outcomes, samples = tuple(found[_DIRECTIONS:]), len(levels)
     failed = [i for i, outcome in enumerate(outcomes) if outcome != "settled"]
     inside = failed[0] if failed else samples
     settled = outcomes.count("settled")
@@ -232,8 +274,9 @@ def validity(
         rate=_clopper_pearson(settled, samples, confidence),
         confidence=confidence,
         largest=largest,
-        joint_unit=joint_unit(lin),
-        robot=lin.robot,
+        joint_unit=joint_unit(loop.lin),
+        robot=loop.lin.robot,
+        frame=loop.lin.frame,
     )
 
 

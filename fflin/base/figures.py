@@ -70,20 +70,15 @@ def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float)
     getattr(axes, f"set_{axis}lim")(min(low, -0.5 * least), max(high, 0.5 * least))
 
 
-class styled:
-    """The style, for as long as a figure is drawn, and the class of figures without a window."""
+@contextmanager
+def styled() -> Iterator[Any]:
+    """Give the class of figures without a window, and the style for as long as one is drawn."""
+    require_matplotlib()
+    import matplotlib
+    from matplotlib.figure import Figure
 
-    def __enter__(self) -> Any:
-        require_matplotlib()
-        import matplotlib
-        from matplotlib.figure import Figure
-
-        self._context = matplotlib.rc_context(_STYLE)
-        self._context.__enter__()
-        return Figure
-
-    def __exit__(self, *problem: object) -> None:
-        self._context.__exit__(None, None, None)
+    with matplotlib.rc_context(_STYLE):
+        yield Figure
 
 
 @contextmanager

@@ -35,11 +35,6 @@ def read_mat(content: bytes) -> dict[str, Any]:
     """Return the variables of a file: arrays, texts, lists of cells, and structs as dicts.
 
     Variables of other kinds, such as functions and sparse matrices, are left out.
-
-    Raises
-    ------
-    ValueError
-        If it is no such file or a damaged one.
     """
     if content[124:128] not in (b"\0\1IM", b"\1\0MI"):
         hint = ", but of version 7.3; write it with save -v7" * (content[126:128] == b"IM")

@@ -1,4 +1,4 @@
-"""What a name stands for: an entry GROUP.ENTRY, a group of them, or a pattern."""
+"""Names GROUP.ENTRY of states and inputs; groups, entries and patterns that stand for them."""
 
 from __future__ import annotations
 
@@ -30,6 +30,16 @@ def input_keys(of: Any) -> tuple[str, ...]:
     )
 
 
+def state_keys(joints: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the 12 + 2n states: of the configuration, then of their rates."""
+    return (
+        *(f"{group}.{axis}" for group in ("q_b", "r_b") for axis in "xyz"),
+        *(f"q_m.{name}" for name in joints),
+        *(f"{group}.{axis}" for group in ("omega_b", "v_b") for axis in "xyz"),
+        *(f"qdot_m.{name}" for name in joints),
+    )
+
+
 def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str, str]]:
     """Return (first, last, group, units) of names of one group, or of one unit."""
     found: list[tuple[int, int, str, list[str]]] = []
@@ -44,25 +54,12 @@ def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str
 
 
 def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
-    """Return where the names are that a key stands for.
+    """Return where the names are, of that kind, which a key stands for.
 
-    Parameters
-    ----------
-    kind : str
-        What to call them in an error.
-    key : str
-        A name such as ``tau_m.hinge_1``, a group such as ``tau_m``, or either the name or the
-        entry alone with ``*``, ``?`` for any letters, any one: ``tau_m.hinge_*``, ``hinge_*``,
-        ``*.x``. An entry may stand for itself too, ``hinge_1``.
-    names : sequence of str
-        In their order.
-
-    Raises
-    ------
-    UnknownNameError
-        If it stands for nothing.
-    InputError
-        If an entry's name or pattern is found in several groups.
+    It is a name such as ``tau_m.hinge_1``, a group such as ``tau_m``, or either the name or the
+    entry alone with ``*``, ``?`` for any letters, any one: ``tau_m.hinge_*``, ``hinge_*``, ``*.x``.
+    An entry may stand for itself too, ``hinge_1``. What stands for nothing is an
+    `UnknownNameError`, an entry of several groups an `InputError`.
     """
     if key in names:
         return [names.index(key)]
@@ -101,6 +98,13 @@ def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[in
     for key in sorted(values, key=lambda key: 1 if _is_pattern(key) else 2 * (key not in groups)):
         found |= dict.fromkeys(matching(kind, key, names), values[key])
     return found
+
+
+def rates_by_name(joints: Sequence[str], values: Mapping[str, float]) -> dict[str, float]:
+    """Return {state: rate} of {joint, state, group or pattern: rate}."""
+    names = state_keys(joints)[6 + len(joints) :]
+    full = {f"qdot_m.{key}" if key in joints else key: value for key, value in values.items()}
+    return {names[index]: value for index, value in by_name("velocity", full, names).items()}
 
 
 def chosen(kind: str, keys: Sequence[str], names: Sequence[str]) -> list[int]:

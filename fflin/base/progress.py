@@ -28,11 +28,10 @@ class Progress:
         left = (now - self._start) * (1.0 - share) / share
         bar = "#" * round(30 * share)
         self._drawn = True
-        print(f"\r[{bar:<30}] {share:4.0%}, {left:.0f} s left ", end="", file=sys.stderr)
-        sys.stderr.flush()
+        said = f"\r[{bar:<30}] {share:4.0%}, {left:.0f} s left "
+        print(said, end="", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """Take the bar away."""
         if self._drawn:
-            print("\r\x1b[2K", end="", file=sys.stderr)
-            sys.stderr.flush()
+            print("\r\x1b[2K", end="", file=sys.stderr, flush=True)

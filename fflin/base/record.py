@@ -49,15 +49,7 @@ class NoRoomError(FileError):
 
 
 def write_record(path: Path, record: Mapping[str, Any], *, sealed: bool) -> None:
-    """Write a record, in the format that the ending says; with its digest where `sealed`.
-
-    Raises
-    ------
-    FileError
-        If the ending is no known one or the file cannot be written.
-    InputError
-        If a figure is not finite.
-    """
+    """Write a record, in the format that the ending says; with its digest where `sealed`."""
     check_ending(path, FORMATS)
     require_finite(record)
     encode = {".npz": _to_npz, ".mat": _to_mat, ".json": _to_json}[path.suffix]
@@ -65,16 +57,9 @@ def write_record(path: Path, record: Mapping[str, Any], *, sealed: bool) -> None
 
 
 def read_record(path: Path) -> tuple[Record, bool]:
-    """Return the record in a file, and whether it is verified.
+    """Return the record in a file, and whether it is verified; to be called within `reading`.
 
     Arrays may have other shapes of the same order: .mat knows no vectors, .json no empty matrices.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read.
-    ValueError or another
-        If it is not one of records, or is damaged; `reading` tells it.
     """
     check_ending(path, FORMATS)
     decode = {".npz": _from_npz, ".mat": _from_mat, ".json": _from_json}[path.suffix]
@@ -140,12 +125,9 @@ def content_digest(entries: Mapping[str, Any]) -> str:
             data = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
             blocks = [data[at : at + _BLOCK] for at in range(0, len(data), _BLOCK)]
             # Hashing lets other threads run.
-            digest.update(b"".join((pool.map if len(blocks) > 1 else map)(_sha256, blocks)))
+            run = pool.map if len(blocks) > 1 else map
+            digest.update(b"".join(run(lambda block: hashlib.sha256(block).digest(), blocks)))
     return digest.hexdigest()
-
-
-def _sha256(data: Any) -> bytes:
-    return hashlib.sha256(data).digest()
 
 
 def _to_npz(record: Mapping[str, Any], sealed: bool) -> bytes:

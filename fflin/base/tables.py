@@ -39,15 +39,7 @@ def _on_terminal() -> bool:
 
 
 def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
-    """Align cells in columns.
-
-    Parameters
-    ----------
-    rows : sequence of sequence of str
-        Of equal length; a cell "." is dimmed.
-    align : str
-        "l" or "r" for each column; those beyond its end are aligned to the right.
-    """
+    """Align cells in columns, "l" or "r" each, "r" beyond the end of `align`; dim a cell "."."""
     sizes = [max(map(len, column)) for column in zip(*rows, strict=True)]
     align = align.ljust(len(sizes), "r")
     lines = []

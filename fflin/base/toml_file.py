@@ -40,20 +40,8 @@ _LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
 class TomlFile:
     """What a TOML file holds, in tables and keys whose lines are known.
 
-    A place in it is written as keys and, in an array of tables, indices: ``input``, 3, ``axis``.
-
-    Attributes
-    ----------
-    path : Path
-    record : dict
-        As tomllib reads it.
-
-    Raises
-    ------
-    FileError
-        If it is not a regular file that can be read, or too large.
-    InputError
-        If it is not TOML; with file and line.
+    Its `record` is as tomllib reads it. A place in it is written as keys and, in an array of
+    tables, indices: ``input``, 3, ``axis``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -73,7 +61,9 @@ class TomlFile:
             raise InputError(f"{path}: is nested too deeply; expected tables of values") from None
         except ValueError as error:
             raise InputError(_explain(path, text, str(error))) from None
-        self._lines = _lines_of(_TEXTS.sub(_blank, text))
+        # Keys may be quoted: what stands on one line is left, and is no line of its own.
+        blank = _TEXTS.sub(lambda found: "\n" * found[0].count("\n") or found[0], text)
+        self._lines = _lines_of(blank)
 
     def line(self, *place: str | int) -> int:
         """Return the line of a place, or that of the table that holds it."""
@@ -124,12 +114,10 @@ def _lines_of(text: str) -> dict[str, int]:
             table = name
         else:
             name = f"{table}.{name}" if table else name
-        lines.setdefault(name, number)
         # `a.b = 1` has a line of `a` too.
-        head = name.rpartition(".")[0]
-        while head and head not in lines:
-            lines[head] = number
-            head = head.rpartition(".")[0]
+        while name and name not in lines:
+            lines[name] = number
+            name = name.rpartition(".")[0]
     return lines
 
 
@@ -141,8 +129,3 @@ def _explain(path: Path, text: str, problem: str) -> str:
         place = f"{path}:{text.rstrip().count(chr(10)) + 1}" if found else str(path)
         return f"{place}: not TOML: {what}; mend it"
     return f"{path}:{line}: not TOML: {what} at column {column}; mend it there"
-
-
-def _blank(found: re.Match[str]) -> str:
-    # Keys may be quoted: what stands on one line is left, and is no line of its own.
-    return found[0] if "\n" not in found[0] else "\n" * found[0].count("\n")

@@ -27,28 +27,9 @@ DOUBLE = np.dtype(np.float64)
 
 
 def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
-    """Return a float vector of the given size.
+    """Return a vector (size,) of finite native floats: the caller's own array where it is one.
 
-    Parameters
-    ----------
-    name : str
-        What to call it in an error.
-    value : array_like
-        What the caller gave; never modified.
-    size : int
-        Expected number of entries.
-    of_what : str
-        What the entries stand for, in an error.
-
-    Returns
-    -------
-    ndarray (size,)
-        The caller's own array where it already is a native float vector.
-
-    Raises
-    ------
-    InputError
-        If the shape is another, an entry is masked, complex or not finite.
+    An error says its name and `of_what` its entries are.
     """
     if type(value) is np.ndarray and value.dtype is DOUBLE:
         array: Array = value
@@ -107,6 +88,12 @@ def by_name(name: str, value: Any, of_what: str) -> Mapping[str, Any]:
     return value
 
 
+def numbers(name: str, value: Any, of_what: str, each: str) -> dict[str, float]:
+    """Return {name: finite float} of a mapping by names; an error calls one of them `each`."""
+    values = by_name(name, value, of_what).items()
+    return {key: number(f"{each} '{key}'", entry) for key, entry in values}
+
+
 def dimension(name: str, value: Any) -> int:
     """Return how many indices an array has, or raise `InputError` where it is none."""
     try:
@@ -116,10 +103,7 @@ def dimension(name: str, value: Any) -> int:
 
 
 def placement(name: str, value: Any) -> pin.SE3:
-    """Return a copy of a rigid placement, or raise `InputError`.
-
-    Its rotation is renormalised where it is one within 1e-6.
-    """
+    """Return a copy of a rigid placement, its rotation normalised where it is one within 1e-6."""
     import pinocchio as pin
 
     if not isinstance(value, pin.SE3):

@@ -72,13 +72,7 @@ def remember(*paths: str | Path) -> None:
 
 
 def write_whole(contents: Mapping[Path, bytes]) -> None:
-    """Write files so that each is whole or, where anything fails, as it was before.
-
-    Raises
-    ------
-    FileError
-        If a file cannot be written.
-    """
+    """Write files so that each is whole or, where anything fails, as it was before."""
     with replacing(*contents) as files:
         for file, content in zip(files, contents.values(), strict=True):
             file.write_bytes(content)

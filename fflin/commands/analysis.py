@@ -59,6 +59,13 @@ def add_commands(commands: Commands) -> None:
     ):
         help = f"{what}; {default:g} by default"
         validity.add_argument(f"--{name}", metavar=metavar, type=read, default=default, help=help)
+    validity.add_argument(
+        "--frames",
+        nargs="+",
+        choices=("hybrid", "local", "world"),
+        default=(),
+        help="feed rates and inputs of the base back in the axes of these frames too",
+    )
     add_figure(validity, "draw it")
 
 
@@ -148,6 +155,7 @@ def _validity(arguments: argparse.Namespace) -> int:
                 joint=arguments.spread,
                 samples=arguments.samples,
                 seed=arguments.seed,
+                frames=arguments.frames,
                 executor=executor,
                 progress=bar.update,
             )

@@ -8,8 +8,6 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.names import by_name
 from fflin.commands.points import configuration_of, inputs_at, once, placed, velocity_of
@@ -107,6 +105,8 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
 
 def _require_own(schedule: Any, motion: Any, arguments: argparse.Namespace) -> None:
     """Refuse gains that are of another motion."""
+    import numpy as np
+
     knots = (schedule.knots, motion.t), (schedule.q, motion.q), (schedule.v, motion.v)
     size = max(1.0, *(float(np.abs(each).max()) for _, each in knots))
     if any(
@@ -120,6 +120,7 @@ def _require_own(schedule: Any, motion: Any, arguments: argparse.Namespace) -> N
 
 def _beside(robot: Robot, policy: TrajectoryFeedback, given: dict[str, float]) -> dict[str, Any]:
     """Return the start that is beside that of a trajectory by what --offset says."""
+    import numpy as np
     import pinocchio as pin
 
     from fflin.dynamics.state import StateMap

@@ -148,8 +148,8 @@ def velocity_of(
 
     A start goes before all but --velocity.
     """
+    from fflin.base.names import rates_by_name
     from fflin.dynamics.points import velocity
-    from fflin.robot.signals import rates_by_name
 
     values: dict[str, float] = {}
     for option in options or ("velocity",):

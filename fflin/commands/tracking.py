@@ -110,14 +110,14 @@ def schedule_of(
     along: LinearTrajectory, arguments: argparse.Namespace, Qf: Any = "steady"
 ) -> GainSchedule:
     """Return the regulator along a trajectory that the weights say."""
-    from fflin.control.default_weights import rule_weights
+    from fflin.control.default_weights import pace_along, rule_weights
     from fflin.control.tvlqr import steady_end, tvlqr
 
     options: dict[str, Any] = {"sample": arguments.dt, "weights": arguments.weights}
     given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}
     if any(given.values()):
-        end, hold = steady_end(along), arguments.dt or 0.0
-        Q, R, _, rule = rule_weights(end, arguments.weights, given, hold=hold)
+        pace = pace_along(float(along.t[-1] - along.t[0]), arguments.dt or 0.0)
+        Q, R, _, rule = rule_weights(steady_end(along), arguments.weights, given, pace=pace)
         options |= {"Q": Q, "R": R, "weights": None, "rule": rule}
     return tvlqr(along, Qf=Qf, **options)
 

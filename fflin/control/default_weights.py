@@ -31,6 +31,10 @@ BANDWIDTH, _HELD = 0.2, 0.3
 # gyration, and a joint's [rad], [m], or this share of its travel.
 TURN, WAY, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 
+# Along a trajectory errors are a tenth of these, and are to be gone within it: so many time
+# constants are to fit in, of a loop that is no slower than at a point, nor faster than this.
+_BESIDE, _CONSTANTS, _FASTEST = 0.1, 15.0, 1.5
+
 # So many times the loops of springs and gravity are slowed.
 _TRIALS = 8
 
@@ -52,6 +56,22 @@ class Weights(NamedTuple):
     bandwidth: float
 
 
+class Pace(NamedTuple):
+    """How fast a loop comes back that no limit slows, from which share of the displacements."""
+
+    bandwidth: float = BANDWIDTH  # [rad/s]
+    share: float = 1.0
+    hold: float = 0.0  # [s] that the inputs of a continuous model will be held for
+
+
+AT_A_POINT = Pace()
+
+
+def pace_along(duration: float, hold: float) -> Pace:
+    """Return the pace of a loop along a trajectory of that duration [s]."""
+    return Pace(min(max(_CONSTANTS / duration, BANDWIDTH), _FASTEST), _BESIDE, hold)
+
+
 class _Limit(NamedTuple):
     """The largest bandwidth that a limit leaves, and what limits it."""
 
@@ -65,7 +85,7 @@ def rule_weights(
     given: Mapping[str, Any] | None = None,
     *,
     wheel_speeds: bool | None = None,
-    hold: float = 0.0,
+    pace: Pace = AT_A_POINT,
 ) -> tuple[Array, Array, Array | None, str]:
     """Return Q, R and N of a model by a rule, and the rule in words.
 
@@ -82,8 +102,7 @@ def rule_weights(
         Parts "q", "r", "bryson" of those that have their own, as `Robot.replace` takes them.
     wheel_speeds : bool, optional
         As in `lqr`.
-    hold : float
-        Time [s] that the inputs of a continuous model will be held for.
+    pace : Pace
 
     Raises
     ------
@@ -96,7 +115,7 @@ def rule_weights(
         layers.insert(0, (lin.weights, True))
         name = lin.weights.get("rule")
     if name is None or name == "urdf":
-        Q, R, rule = _of_regulated(source, lin.dt or hold, wheel_speeds)
+        Q, R, rule = _of_regulated(source, pace._replace(hold=lin.dt or pace.hold), wheel_speeds)
     elif name == "identity":
         nx, nu = lin.B.shape
         Q, R, rule = np.eye(nx), np.eye(nu), "identity: 1 on every state and every input"
@@ -116,12 +135,12 @@ def rule_weights(
 
 
 def _of_regulated(
-    lin: LinearModel, hold: float, wheel_speeds: bool | None
+    lin: LinearModel, pace: Pace, wheel_speeds: bool | None
 ) -> tuple[Array, Array, str]:
     """Return Q (nx, nx), R and the rule of what is regulated of a model that may have wheels."""
     part = regulated_part(lin, wheel_speeds)
     if part is lin:
-        return default_weights(lin, hold)[:3]
+        return default_weights(lin, pace)[:3]
     wheels, _ = ignorable_wheels(lin)
     body = regulated_part(without(lin, wheels))
     at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
@@ -129,7 +148,7 @@ def _of_regulated(
     most = np.array([lin.limits[name] for name in names])
     # A wheel that is at its limit already is counted as one at rest, and told.
     room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
-    Q, R, rule, bandwidth = default_weights(body, hold, dict(zip(names, room, strict=True)))
+    Q, R, rule, bandwidth = default_weights(body, pace, dict(zip(names, room, strict=True)))
     if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
         rule += f"; the point alone asks {listed(beyond)} for more than the URDF allows"
     S = picked(body.state_names, lin.state_names)
@@ -145,7 +164,7 @@ def _of_regulated(
 
 
 def default_weights(
-    lin: LinearModel, hold: float = 0.0, momenta: Mapping[str, float] | None = None
+    lin: LinearModel, pace: Pace = AT_A_POINT, momenta: Mapping[str, float] | None = None
 ) -> Weights:
     r"""Return weights with which a displaced robot comes back within the URDF's limits.
 
@@ -178,8 +197,9 @@ def default_weights(
     ----------
     lin : LinearModel
         Whole or reduced; of a sampled one, weights for the sum over its samples.
-    hold : float
-        Time [s] that the inputs will be held for.
+    pace : Pace
+        Along a trajectory that of `pace_along`: the displacements are a tenth of those above, and
+        w is 15 over its duration, within 0.2 and 1.5 rad/s.
     momenta : mapping, optional
         {qdot_m.WHEEL: most momentum [N m s] that it can take up} of wheels that are not states.
 
@@ -202,9 +222,9 @@ def default_weights(
             f"the model of '{lin.robot}' has not the coordinates and their rates as states, which "
             "the default weights are made for; give Q and R"
         )
-    damping, w = _damping(lin), BANDWIDTH
+    damping, w = _damping(lin), pace.bandwidth
     for _ in range(_PASSES if damping.any() else 1):
-        found = _of_inertia(lin, lin.M + damping / w, np.linalg.inv(N), hold, momenta or {})
+        found = _of_inertia(lin, lin.M + damping / w, np.linalg.inv(N), pace, momenta or {})
         w, before = found.bandwidth, w
         if _NOT_ENOUGH in found.rule or w > 0.97 * before:
             break
@@ -222,10 +242,10 @@ def _damping(lin: LinearModel) -> Array:
 
 
 def _of_inertia(
-    lin: LinearModel, M: Array, inverse: Array, hold: float, momenta: Mapping[str, float]
+    lin: LinearModel, M: Array, inverse: Array, pace: Pace, momenta: Mapping[str, float]
 ) -> Weights:
     """Return the weights of an inertia M (m, m) that damping adds to; N^-1 is `inverse`."""
-    h, m, size = lin.dt or 1.0, len(M), _displacements(lin)
+    h, m, size = lin.dt or 1.0, len(M), _displacements(lin, pace.share)
     A = lin.A - np.eye(len(lin.A)) if lin.dt else lin.A
     theta = np.abs(inverse) @ size
     D = np.abs(M) @ theta / theta
@@ -257,35 +277,37 @@ def _of_inertia(
     motors = [lin.input_names.index(name.removeprefix("qdot_m.")) for name in momenta]
     taken = np.vstack((T, added[motors]))
     limits = [
-        _Limit(BANDWIDTH, ""),
+        _Limit(pace.bandwidth, ""),
         *_of_speeds(room, _fastest(taken, rates, to_modes, size, lin, mass)),
         *_of_efforts(lin, _largest(gain, size, lin.state_names)),
     ]
-    if hold or lin.dt:
-        fastest = _HELD / ((hold or lin.dt) * rates[-1])
+    if pace.hold or lin.dt:
+        fastest = _HELD / ((pace.hold or lin.dt) * rates[-1])
         limits.append(_Limit(float(fastest), "the time of the hold"))
     limit = min(limits)
     if A[m:].any() or A[:m, :m].any():
         limit = _slowed(lin, Q, cost, size, limit)
     R = np.diag(h * cost / limit.bandwidth**4)
-    rule = _rule(lin, size, limit) + ("; damping is counted in" if (lin.M != M).any() else "")
+    rule = _rule(lin, size, limit, pace.share * TURN) + (
+        "; damping is counted in" if (lin.M != M).any() else ""
+    )
     return Weights(h * Q, R, rule, limit.bandwidth)
 
 
-def _displacements(lin: LinearModel) -> Array:
-    """Return what each coordinate (m,) is displaced by."""
+def _displacements(lin: LinearModel, share: float) -> Array:
+    """Return what each coordinate (m,) is displaced by, a share of what it may be."""
     m = len(lin.M)
     names, units = lin.state_names[:m], lin.state_units[:m]
     radius = _radius_of_gyration(lin.M) if names[:6] == _BASE else 1.0
     size = np.empty(m)
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         if name.startswith("q_b."):
-            size[i] = math.sin(math.radians(TURN / 2.0))
+            size[i] = math.sin(math.radians(share * TURN / 2.0))
         elif name.startswith("r_b."):
-            size[i] = WAY * radius
+            size[i] = share * WAY * radius
         else:
             most = LENGTH if unit == "m" else ANGLE
-            size[i] = min(most, TRAVEL * lin.limits.get(name, math.inf))
+            size[i] = share * min(most, TRAVEL * lin.limits.get(name, math.inf))
     return size
 
 
@@ -384,9 +406,9 @@ def _slowed(lin: LinearModel, Q: Array, cost: Array, size: Array, limit: _Limit)
     return limit._replace(what=f"{limit.what}{_NOT_ENOUGH}")
 
 
-def _rule(lin: LinearModel, size: Array, limit: _Limit) -> str:
+def _rule(lin: LinearModel, size: Array, limit: _Limit, turn: float) -> str:
     groups = [name.partition(".")[0] for name in lin.state_names[: len(size)]]
-    base = [f"{TURN:g} deg"] * ("q_b" in groups)
+    base = [f"{turn:g} deg"] * ("q_b" in groups)
     if "r_b" in groups:
         base.append(f"{size[groups.index('r_b')]:.2g} m")
     joints: dict[str, float] = {}

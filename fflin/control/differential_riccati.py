@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
+from collections.abc import Callable
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +13,10 @@ from scipy.linalg import cho_factor, cho_solve, expm
 
 from fflin.base.validation import Array
 from fflin.linear.sampling import GAUSS, HEAVY, LIGHT
+
+# Between two knots P is a cubic; knots are added until it is this accurate, relative to P.
+_ACCURACY = 1e-7
+_KNOTS_LIMIT = 100_000
 
 
 class Coefficients(NamedTuple):
@@ -68,30 +75,153 @@ def _passage(coefficients: Coefficients, h: float) -> _Passage:
     return passage
 
 
-def step_back(start: Coefficients, end: Coefficients, S: Array, P: Array, h: float) -> Array:
-    """Return P at the start of an interval of its value at the end, of order four.
+def step_back(early: Coefficients, late: Coefficients, P: Array, h: float) -> Array:
+    """Return P (nx, nx) at the start of an interval of its value at the end, of order four.
 
-    Parameters
-    ----------
-    start, end : Coefficients
-        A and Q are linear in between.
-    S : ndarray (2, nx, nx)
-        B R^-1 B' at the two Gauss nodes.
-    P : ndarray (nx, nx)
-    h : float
+    The coefficients are those at the Gauss nodes; where they are the same, the step is exact.
     """
-    if np.array_equal(start.A, end.A) and np.array_equal(start.S, end.S):
-        return _passage(end, h).back(P)
-    early, late = (
-        Coefficients(*((1.0 - c) * a + c * b for a, b in zip(start, end, strict=True)))._replace(
-            S=at_node
-        )
-        for c, at_node in zip(GAUSS, S, strict=True)
-    )
+    if all(np.array_equal(*pair) for pair in zip(early, late, strict=True)):
+        return _passage(late, h).back(P)
     for first, second in ((late, early), (early, late)):
         mixed = Coefficients(*(HEAVY * a + LIGHT * b for a, b in zip(first, second, strict=True)))
         P = _passage(mixed, 0.5 * h).back(P)
     return P
+
+
+def solve_back(at: Callable[[float], Coefficients], knots: Array, P: Array) -> tuple[Array, Array]:
+    """Return times and P there, from its value at the last of the knots back to the first.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If P changes too fast.
+    """
+
+    def back(a: float, b: float, P: Array) -> Array:
+        early, late = (at(a + c * (b - a)) for c in GAUSS)
+        return step_back(early, late, P, b - a)
+
+    times, values = [float(knots[-1])], [P]
+    for a in knots[-2::-1].tolist():
+        # Intervals left to do, the latest last; with P at the start from one step, where known.
+        pending: list[tuple[float, float, Array | None]] = [(a, times[-1], None)]
+        while pending:
+            start, end, single = pending.pop()
+            P = values[-1]
+            single = back(start, end, P) if single is None else single
+            middle = 0.5 * (start + end)
+            half = back(middle, end, P)
+            double = back(start, middle, half)
+            h = end - start
+            # The cubic with these values and slopes, midway.
+            bend = at(start).rate(double) - at(end).rate(P)
+            between = 0.5 * (double + P) + 0.125 * h * bend
+            if max(_apart(single, double), _apart(between, half)) <= _ACCURACY:
+                times += [middle, start]
+                values += [half, double]
+            elif len(times) > _KNOTS_LIMIT or h < 1e-12 * abs(knots[-1] - knots[0]):
+                raise np.linalg.LinAlgError("P changes too fast")
+            else:
+                pending += [(start, middle, None), (middle, end, half)]
+    return np.array(times[::-1]), np.array(values[::-1])
+
+
+def sample_back(weights: Array, whole: Array, P: Array) -> tuple[Array, Array, float]:
+    """Return K, P a sample before, and the relative residual of the difference equation.
+
+    Parameters
+    ----------
+    weights : ndarray (nx + nu, nx + nu)
+        What a sample costs, of the error and the input at its start.
+    whole : ndarray (nx, nx + nu)
+        What takes these two to the next sample.
+    P : ndarray (nx, nx)
+        The cost from that on.
+    """
+    nx = len(P)
+    total = weights + whole.T @ P @ whole
+    K = np.linalg.solve(total[nx:, nx:], total[nx:, :nx])
+    # A sum of squares, which stays positive.
+    law = np.vstack((np.eye(nx), -K))
+    P = _symmetric(law.T @ total @ law)
+    if not np.isfinite(P).all():
+        raise np.linalg.LinAlgError("P changes too fast")
+    terms = np.array((P, -total[:nx, :nx], total[:nx, nx:] @ K))
+    return K, P, _imbalance(terms)
+
+
+class Passed:
+    """P (M, nx, nx) and R^-1 B' P (M, nu, nx) over time, as a schedule is asked for them.
+
+    Between knots P is a cubic and B a spline; of samples dt [s] apart what is asked for is that of
+    the last one. `sign` is -1 of a P that goes backwards from the end, 1 of one that goes forward.
+    """
+
+    def __init__(
+        self, t: Array, P: Array, K: Array, model: tuple[Array, ...], dt: float, sign: float
+    ) -> None:
+        from scipy.interpolate import CubicHermiteSpline, CubicSpline
+
+        A, B, Q, R = model
+        self.first, self.last = float(t[0]), float(t[-1])
+        self._P, self.K, self._dt, self._sign = P, K, dt, sign
+        if dt:
+            # A little early, since clocks are rounded.
+            self.starts = [self.first, *(t[1:] - 1e-9 * dt).tolist()]
+            return
+        self.starts = t[:-1].tolist()
+        across = (0, 2, 1)
+        drift, spent = P @ A, K.transpose(across) @ R @ K
+        rate = sign * (drift + drift.transpose(across) + Q - spent)
+        self._cubics = CubicHermiteSpline(t, P, rate, extrapolate=False)
+        powers, of_B = self._cubics.c[::-1], CubicSpline(t, B).c[::-1]
+        pieces = np.zeros((7, *of_B[0].transpose(across).shape))
+        for power, reach in enumerate(np.linalg.solve(R, of_B.transpose(0, 1, 3, 2))):
+            pieces[power : power + 4] += reach @ powers
+        self.pieces = pieces.transpose(1, 0, 2, 3).reshape(len(t) - 1, 7, -1)
+
+    def gain(self, t: float) -> Array:
+        """Return R^-1 B' P (nu, nx), of B and P at a time within the knots."""
+        k = bisect_right(self.starts, t) - 1
+        if self._dt:
+            return self.K[k]
+        x = t - self.starts[k]
+        square = x * x
+        fourth = square * square
+        powers = np.array((1.0, x, square, square * x, fourth, fourth * x, fourth * square))
+        K: Array = powers.dot(self.pieces[k]).reshape(self.K.shape[1:])
+        return K
+
+    def cost(self, t: float) -> Array:
+        """Return P (nx, nx) at a time within the knots."""
+        k = bisect_right(self.starts, t) - 1
+        P: Array = self._P[k] if self._dt else self._cubics(t)
+        return P
+
+    def residual(self, at: Callable[[float], Coefficients]) -> float:
+        """Return the largest relative residual of the differential equation midway."""
+        worst, ends = 0.0, [*self.starts, self.last]
+        for t in (0.5 * (a + b) for a, b in pairwise(ends)):
+            P, (A, S, Q) = self._cubics(t), at(t)
+            drift = P @ A
+            terms = np.array((drift, drift.T, -P @ S @ P, Q, -self._sign * self._cubics(t, 1)))
+            worst = max(worst, _imbalance(terms))
+        return worst
+
+
+def spread(B: Array, R: Array) -> Array:
+    """Return B R^-1 B'."""
+    return _symmetric(B @ np.linalg.solve(R, B.T))
+
+
+def _imbalance(terms: Array) -> float:
+    """Return the norm of a sum relative to the sum of the norms of its terms."""
+    size = float(np.linalg.norm(terms, axis=(1, 2)).sum())
+    return float(np.linalg.norm(terms.sum(axis=0))) / max(size, 1e-300)
+
+
+def _apart(first: Array, second: Array) -> float:
+    return float(np.linalg.norm(first - second)) / max(float(np.linalg.norm(second)), 1e-300)
 
 
 def _symmetric(matrix: Array) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -12,10 +11,9 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.validation import Array, number
+from fflin.control.differential_riccati import Passed
 
 if TYPE_CHECKING:
-    from scipy.interpolate import CubicHermiteSpline
-
     from fflin.linear.trajectory import Trajectory
     from fflin.robot.robot import Robot
 
@@ -25,7 +23,50 @@ def _nothing() -> Array:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class GainSchedule(Design):
+class Schedule(Design):
+    """What `Passed` has of a trajectory's knots or samples."""
+
+    WIDTH: ClassVar = "nu"
+
+    t: Array
+
+    def __repr__(self) -> str:
+        of: Any = self
+        time, wide = f"dt={of.dt:g} s, " if of.dt else "", self.passed.K.shape[1]
+        return (
+            f"{type(self).__name__}('{of.robot}', {len(self.t)} knots, {self.t[0]:g} to "
+            f"{self.t[-1]:g} s, {time}nx={of.P.shape[1]}, {self.WIDTH}={wide}, "
+            f"residual={of.residual:.1e})"
+        )
+
+    def __call__(self, t: float) -> Array:
+        """Return the gain at a time."""
+        return self.gain(t)
+
+    def gain(self, t: float) -> Array:
+        """Return the gain at a time; InputError where it is not within the knots.
+
+        Between the knots that of the model and P there; of samples that of the last one.
+        """
+        passed = self.passed
+        if type(t) is not float or not passed.first <= t <= passed.last:
+            t = self._within(t)
+        return passed.gain(t)
+
+    def _within(self, t: float) -> float:
+        t, passed = number("t", t), self.passed
+        if not passed.first <= t <= passed.last:
+            raise InputError(f"t is {t:g} s, expected {passed.first:g} to {passed.last:g} s")
+        return t
+
+    @cached_property
+    def passed(self) -> Passed:
+        """Gain and cost over time."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GainSchedule(Schedule):
     r"""A time-varying feedback ``u = u*(t) - K(t) e`` of the error e from a trajectory.
 
     Attributes
@@ -38,7 +79,7 @@ class GainSchedule(Design):
         The cost from t on is e' P(t) e.
     A : ndarray (M, nx, nx)
     B : ndarray (M, nx, nu)
-        The model at the knots, linear in between; or M - 1 that take a sample to the next.
+        The model at the knots; or M - 1 that take a sample to the next.
     Q, R, Qf : ndarray
         Weights of the continuous cost.
     residual : float
@@ -56,7 +97,6 @@ class GainSchedule(Design):
 
     VECTORS: ClassVar = ("t", "knots")
 
-    t: Array
     K: Array
     P: Array
     A: Array
@@ -76,14 +116,6 @@ class GainSchedule(Design):
     u: Array = field(default_factory=_nothing)
     hold: str = field(default_factory=str)
     frame: str = field(default_factory=str)
-
-    def __repr__(self) -> str:
-        time = f"dt={self.dt:g} s, " if self.dt else ""
-        return (
-            f"GainSchedule('{self.robot}', {len(self.t)} knots, {self.t[0]:g} to "
-            f"{self.t[-1]:g} s, {time}nx={self.P.shape[1]}, nu={self.K.shape[1]}, "
-            f"residual={self.residual:.1e})"
-        )
 
     def __str__(self) -> str:
         """Show the rule of its weights too."""
@@ -109,67 +141,12 @@ class GainSchedule(Design):
         values: dict[str, Any] = {name: getattr(self, name) for name in ("q", "v", "u")}
         return Trajectory(robot, self.knots, **values, hold=self.hold, frame=self.frame)
 
-    def __call__(self, t: float) -> Array:
-        """Return K (nu, nx) at a time."""
-        return self.gain(t)
-
-    def gain(self, t: float) -> Array:
-        """Return K (nu, nx) at a time; InputError where it is not within the knots.
-
-        Between the knots R^-1 B' P of B and P there; of samples that of the last one.
-        """
-        first, last = self._ends
-        if type(t) is not float or not first <= t <= last:
-            t = self._within(t)
-        k = bisect_right(self.starts, t) - 1
-        if self.dt:
-            return self.K[k]
-        x = t - self.starts[k]
-        square = x * x
-        powers = np.array((1.0, x, square, square * x, square * square))
-        K: Array = powers.dot(self.quartics[k]).reshape(self.K.shape[1:])
-        return K
-
     def cost_to_go(self, t: float) -> Array:
         """Return P (nx, nx) at a time: a cubic between the knots, or that of the last sample."""
-        t = self._within(t)
-        P: Array = self.P[bisect_right(self.starts, t) - 1] if self.dt else self._cubics(t)
-        return P
-
-    def _within(self, t: float) -> float:
-        t, (first, last) = number("t", t), self._ends
-        if not first <= t <= last:
-            raise InputError(f"t is {t:g} s, expected {first:g} to {last:g} s")
-        return t
+        return self.passed.cost(self._within(t))
 
     @cached_property
-    def _ends(self) -> tuple[float, float]:
-        return float(self.t[0]), float(self.t[-1])
-
-    @cached_property
-    def starts(self) -> list[float]:
-        """Where each piece begins; a sample a little early, since clocks are rounded."""
-        early = [self._ends[0], *(self.t[1:] - 1e-9 * self.dt).tolist()]
-        return early if self.dt else self.t[:-1].tolist()
-
-    @cached_property
-    def _cubics(self) -> CubicHermiteSpline:
-        """P over time."""
-        from scipy.interpolate import CubicHermiteSpline
-
-        drift, across = self.P @ self.A, (0, 2, 1)
-        spent = self.K.transpose(across) @ self.R @ self.K
-        return CubicHermiteSpline(
-            self.t, self.P, spent - drift - drift.transpose(across) - self.Q, extrapolate=False
-        )
-
-    @cached_property
-    def quartics(self) -> Array:
-        """Coefficients (M - 1, 5, nu nx) of K in the time since the knot."""
-        reach = np.linalg.solve(self.R, self.B.transpose(0, 2, 1))
-        slope = np.diff(reach, axis=0) / np.diff(self.t)[:, None, None]
-        P = self._cubics.c[::-1]
-        K = np.zeros((5, *slope.shape))
-        K[:4] += reach[:-1] @ P
-        K[1:] += slope @ P
-        return np.ascontiguousarray(K.transpose(1, 0, 2, 3)).reshape(len(slope), 5, -1)
+    def passed(self) -> Passed:
+        """Gain and cost over time."""
+        model = (self.A, self.B, self.Q, self.R)
+        return Passed(self.t, self.P, self.K, model, self.dt, -1.0)

@@ -8,17 +8,19 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from fflin.analysis.wheels import picked, regulated_part, seen_through
-from fflin.base.errors import DetectabilityError, InputError, MissingPackageError, listed
+from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.record import Design
-from fflin.base.validation import Array
+from fflin.base.validation import Array, dimension
 from fflin.control.gain import Gain
 from fflin.control.lqr import require_fixed_point
 from fflin.control.weights import Weight, columns, weight
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
+
+    from fflin.linear.linear_trajectory import LinearTrajectory
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -135,19 +137,7 @@ class Compensator(Design):
         MissingPackageError
             If python-control is not installed.
         """
-        try:
-            import control
-        except ImportError:
-            raise MissingPackageError(
-                "to_control needs python-control; install it with: pip install 'fflin[control]'"
-            ) from None
-        D = np.zeros((len(self.C), self.B.shape[1]))
-        return control.ss(
-            *(self.A, self.B, self.C, D, self.dt),
-            states=[name.replace(".", "_") for name in self.state_names],
-            inputs=[name.replace(".", "_") for name in self.input_names],
-            outputs=[name.replace(".", "_") for name in self.output_names],
-        )
+        return state_space(self, np.zeros((len(self.C), self.B.shape[1])))
 
 
 def kalman(
@@ -208,11 +198,13 @@ def kalman(
     from fflin.control.riccati import solve
 
     require_fixed_point(lin)
-    W, V = _disturbance(lin, W, G), weight("V", V, lin.output_names, definite=True)
+    noise, through = disturbance(lin, W, G)
+    V = weight("V", V, lin.output_names, definite=True)
     whole, noises, lin = lin, V, regulated_part(lin, wheel_speeds)
     S = picked(lin.state_names, whole.state_names)
     seen = seen_through(whole, S)
-    W, V = S @ W @ S.T, seen @ V @ seen.T
+    W, V = S @ through @ noise @ through.T @ S.T, seen @ V @ seen.T
+    W = 0.5 * W + 0.5 * W.T
     require_detectable(lin)
     require_disturbed(lin, W)
     C = np.ascontiguousarray(lin.C)
@@ -298,13 +290,19 @@ _FROM_MODEL = (
 )
 
 
-def _disturbance(lin: LinearModel, W: Weight, G: ArrayLike | None) -> Array:
+def disturbance(
+    of: LinearModel | LinearTrajectory, W: Weight, G: ArrayLike | None
+) -> tuple[Array, Array]:
+    """Return W (nw, nw) and the columns (.., nx, nw) that it acts through."""
+    nx = len(of.state_names)
     if G is None:
-        return weight("W", W, lin.state_names)
-    through = columns("G", G, len(lin.A))
-    count = through.shape[1]
-    same = np.array_equal(through, lin.B)
-    names = input_keys(lin) if same else [f"w_{i + 1}" for i in range(count)]
-    spread = through @ weight("W", W, names) @ through.T
-    half: Array = 0.5 * (spread + spread.T)
-    return half
+        return weight("W", W, of.state_names), np.eye(nx)
+    if dimension("G", G) == np.ndim(of.A) == 3:
+        through = np.array([columns("G", each, nx) for each in np.asarray(G)])
+        if len(through) != len(of.A):
+            raise InputError(f"G has {len(through)} matrices, expected {len(of.A)}, one a knot")
+    else:
+        through = columns("G", G, nx)
+    same = np.array_equal(through, of.B)
+    names = input_keys(of) if same else [f"w_{i + 1}" for i in range(through.shape[-1])]
+    return weight("W", W, names), through

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -13,7 +13,7 @@ from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.validation import Array
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.policies import Allocation, fed_back
-from fflin.control.tvlqr import resting_end
+from fflin.control.tvlqr import resting_end, steady_regulator
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moving_error
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
     from fflin.robot.robot import Robot
 
+# A clock of many steps is rounded.
+AT_THE_END = 1.0 + 1e-9
+
 # Returns q, v and u in the policy's axes at a time of the run.
 Reference: TypeAlias = Callable[[float], tuple[Array, Array, Array]]
 
@@ -36,7 +39,7 @@ class TrajectoryFeedback:
 
     The error is that of `linearize_trajectory`, u on the base is in base axes, and t is the time
     since the first knot. After the end the last configuration at rest is the target, with what
-    holds the robot there and the last K.
+    holds the robot there and the regulator of the same weights about it.
 
     Parameters
     ----------
@@ -83,14 +86,26 @@ class TrajectoryFeedback:
 
     def reference(self, t: float) -> tuple[Array, Array, Array]:
         """Return q, v, and u in base axes that are followed at a time of the run."""
-        if t > self.duration:
+        if t > self.duration * AT_THE_END:
             return self.end.q, self.end.v, self.end.u0
         return self.trajectory.flow.at(float(self.trajectory.t[0]) + max(t, 0.0))
+
+    @cached_property
+    def end_gain(self) -> Array:
+        """K (nu, nx) of the regulator of the same weights about `end`."""
+        by = self.schedule
+        return steady_regulator(self.end, by.Q, by.R, by.dt)[1]
 
     def gain(self, t: float) -> Array:
         """Return K (nu, nx) at a time of the run."""
         knots = self.schedule.t
+        if t > self.duration * AT_THE_END:
+            return self.end_gain
         return self.schedule.gain(float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0])))
+
+    def law(self) -> Callable[[float, Array], Array]:
+        """Return law(t, e) -> u of the error at a time of the run."""
+        return lambda t, e: self.reference(t)[2] - self.gain(t) @ e
 
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
@@ -145,6 +160,7 @@ def steered_by(policy: Any) -> tuple[str, ...]:
     return tuple(name for name, size in zip(names, used, strict=True) if size)
 
 
+@lru_cache(maxsize=2)  # half of a short run's time
 def largest_rate(schedule: GainSchedule) -> float:
     """Return the magnitude [1/s] that the loop's poles pass for a twentieth of the time alone.
 

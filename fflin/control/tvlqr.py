@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,22 +10,23 @@ import numpy as np
 from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
 from fflin.base.names import input_keys
 from fflin.base.validation import Array, number
-from fflin.control.differential_riccati import Coefficients, step_back
+from fflin.control.differential_riccati import (
+    Coefficients,
+    Passed,
+    sample_back,
+    solve_back,
+    spread,
+)
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.weights import Weight, weight
-from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
-from fflin.linear.sampling import GAUSS
 
 if TYPE_CHECKING:
+    from fflin.control.gain import Gain
     from fflin.linear.linear_trajectory import LinearTrajectory
     from fflin.linear.model import LinearModel
     from fflin.linear.trajectory import Trajectory
 
-# Between two knots P is a cubic; knots are added until it is this accurate, relative to P.
-_ACCURACY = 1e-7
-_KNOTS_LIMIT = 100_000
-_TOO_FAST = "P changes too fast at {}; give smaller weights or a larger R"
+_TOO_FAST = "P changes too fast; give smaller weights or a larger R"
 
 
 def tvlqr(
@@ -69,7 +69,8 @@ def tvlqr(
     sample : float, optional
         Sampling time [s], of which the duration is a multiple.
     weights : {"urdf", "identity"}, optional
-        Instead of Q and R: the rule of `lqr`, about that same point.
+        Instead of Q and R: the rule of `lqr`, about that same point, from a tenth of its
+        displacements, and fast enough to bring errors to nothing within the trajectory.
     rule : str
         What made Q and R, in words.
 
@@ -93,15 +94,7 @@ def tvlqr(
     E. Celledoni, A. Marthinsen and B. Owren, Commutator-free Lie group methods, Future Generation
     Computer Systems 19(3), 2003.
     """
-    from fflin.linear.linear_trajectory import LinearTrajectory
-
-    if not isinstance(traj, LinearTrajectory):
-        raise InputError(
-            f"traj is a {type(traj).__name__}, expected a LinearTrajectory; "
-            "fflin.linearize_trajectory makes one"
-        )
-    if traj.dt:
-        raise InputError("traj is sampled; give the continuous one, and sample=")
+    require_continuous(traj)
     names, dt = traj.state_names, 0.0 if sample is None else number("sample", sample)
     steady = isinstance(Qf, str)
     if steady and Qf != "steady":
@@ -112,71 +105,95 @@ def tvlqr(
     end: Any = steady_end(traj) if steady or by_rule else None
     given: list[Any] = [Q, R]
     if by_rule:
-        from fflin.control.default_weights import rule_weights
+        from fflin.control.default_weights import pace_along, rule_weights
 
-        *given, _, rule = rule_weights(end, weights, hold=dt)
+        pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
+        *given, _, rule = rule_weights(end, weights, pace=pace)
     Q = weight("Q", given[0], names)
-    R = weight("R", given[1], input_keys(Actuation(StateMap(traj.robot))), definite=True)
-    Qf = _cost_from(end, Q, R, sample) if steady else weight("Qf", Qf, names)
+    R = weight("R", given[1], input_keys(traj), definite=True)
+    Qf = steady_regulator(end, Q, R, sample)[0] if steady else weight("Qf", Qf, names)
     fields: dict[str, Any] = {key: getattr(traj, key) for key in ("q", "v", "u", "hold", "frame")}
     fields |= {"state_names": names, "input_names": traj.input_names, "robot": traj.robot.name}
     fields |= {"Q": Q, "R": R, "Qf": Qf, "weights": rule, "knots": traj.t}
     fields |= {"verified": traj.verified, "dt": dt}
-    if sample is not None:
-        return GainSchedule(**fields, **_sampled(traj, dt, Q, R, Qf))
+
+    @cache
+    def at(t: float) -> Coefficients:
+        A, B = traj.matrices(t)
+        return Coefficients(A, spread(B, R), Q)
+
     try:
-        # A P that overflows is refused below, so that NumPy need not warn of it.
+        # A P that overflows is refused, so that NumPy need not warn of it.
         with np.errstate(over="ignore", invalid="ignore"):
-            t, P = _solve(traj, Q, R, Qf)
+            if sample is not None:
+                return GainSchedule(**fields, **_sampled(traj, dt, Q, R, Qf))
+            t, P = solve_back(at, traj.t, Qf)
     except np.linalg.LinAlgError:
-        raise InputError(_TOO_FAST.format("some time")) from None
+        raise InputError(_TOO_FAST) from None
     A, B = map(np.array, zip(*(traj.matrices(float(x)) for x in t), strict=True))
     K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
-    schedule = GainSchedule(t=t, K=K, P=P, A=A, B=B, residual=math.inf, **fields)
-    return replace(schedule, residual=_residual(schedule))
+    residual = Passed(t, P, K, (A, B, Q, R), 0.0, -1.0).residual(at)
+    return GainSchedule(t=t, K=K, P=P, A=A, B=B, residual=residual, **fields)
 
 
-def steady_end(traj: LinearTrajectory) -> LinearModel:
-    """Return the model at the end where that is steady, else at rest in the last configuration."""
-    lin = traj[-1]
+def require_continuous(traj: LinearTrajectory) -> None:
+    """Raise `InputError` where something is no LinearTrajectory in continuous time."""
+    from fflin.linear.linear_trajectory import LinearTrajectory
+
+    if not isinstance(traj, LinearTrajectory):
+        raise InputError(
+            f"traj is a {type(traj).__name__}, expected a LinearTrajectory; "
+            "fflin.linearize_trajectory makes one"
+        )
+    if traj.dt:
+        raise InputError("traj is sampled; give the continuous one, and sample=")
+
+
+def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
+    """Return the model at the last knot, or the first (0), if steady, else at rest there."""
+    lin = traj[end]
     if lin.is_equilibrium():
         return lin
     try:
-        return resting_end(traj)
+        return resting_end(traj, end)
     except EquilibriumError as error:
-        raise EquilibriumError(f"at the end: {error}; give Q, R and Qf") from None
+        where, given = ("end", "Q, R and Qf") if end else ("start", "P0")
+        raise EquilibriumError(f"at the {where}: {error}; give {given}") from None
 
 
-def resting_end(traj: Trajectory) -> LinearModel:
+def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
     """Return the model at rest in the last configuration, in base axes; rotors spin on there."""
     from fflin.linear.equilibrium import equilibrium
     from fflin.linear.ignorable import rotor_names
     from fflin.linear.linearization import Linearizer
 
-    robot, q, v = traj.robot, traj.q[-1], np.zeros(traj.robot.nv)
+    robot, q, v = traj.robot, traj.q[end], np.zeros(traj.robot.nv)
     rotors = rotor_names(robot)
     spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
-    v[spinning] = traj.v[-1, spinning]
+    v[spinning] = traj.v[end, spinning]
     return Linearizer(robot, moving=True)(q, v, equilibrium(robot, q, v=v).u)
 
 
-def _cost_from(lin: Any, Q: Array, R: Array, sample: float | None) -> Array:
-    """Return the cost P (nx, nx) of a regulator about a steady point."""
+def steady_regulator(
+    lin: LinearModel, Q: Array, R: Array, sample: float | None
+) -> tuple[Array, Array]:
+    """Return the cost P (nx, nx) and K (nu, nx) of a regulator about a steady point."""
     from fflin.analysis.momentum import momentum_reduction
     from fflin.control.lqr import lqr
     from fflin.control.sampled_cost import sampled_cost
 
-    def cost(lin: LinearModel, Q: Array) -> Array:
-        if sample is None:
-            return lqr(lin, Q, R).P
-        return lqr(lin.discretize(sample), *sampled_cost(lin, sample, Q, R)).P
+    def regulator(lin: LinearModel, Q: Array) -> Gain:
+        if not sample:
+            return lqr(lin, Q, R)
+        return lqr(lin.discretize(sample), *sampled_cost(lin, sample, Q, R))
 
     try:
-        return cost(lin, Q)
+        gain = regulator(lin, Q)
+        return gain.P, gain.K
     except StabilizabilityError:
         part = momentum_reduction(lin)
-        P: Array = part.S.T @ cost(part, part.T.T @ Q @ part.T) @ part.S
-        return P
+        gain = regulator(part, part.T.T @ Q @ part.T)
+        return part.S.T @ gain.P @ part.S, gain.K @ part.S
 
 
 def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) -> dict[str, Any]:
@@ -188,22 +205,13 @@ def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) ->
     W = np.zeros((nx + nu, nx + nu))
     W[:nx, :nx], W[nx:, nx:] = Q, R
     maps, gains, costs, worst = [], [], [P], 0.0
-    for steps, whole in reversed(list(transitions(traj, dt))):
+    for steps, whole in reversed(list(transitions(traj, traj.matrices, dt))):
         total, way = np.zeros_like(W), np.eye(nx + nu)
-        for F, h, step in steps:
+        for F, h, step, _ in steps:
             total += way.T @ held_cost(F, W, h) @ way
             way[:nx] = step @ way
-        total += whole.T @ P @ whole
-        K = np.linalg.solve(total[nx:, nx:], total[nx:, :nx])
-        # A sum of squares, which stays positive.
-        law = np.vstack((np.eye(nx), -K))
-        P = law.T @ total @ law
-        P = 0.5 * (P + P.T)
-        terms = P, total[:nx, :nx], total[:nx, nx:] @ K
-        size = sum(float(np.linalg.norm(each)) for each in terms)
-        worst = max(worst, float(np.linalg.norm(terms[0] - terms[1] + terms[2])) / (size or 1.0))
-        if not np.isfinite(P).all():
-            raise InputError(_TOO_FAST.format("some time"))
+        K, P, missed = sample_back(total, whole, P)
+        worst = max(worst, missed)
         maps.append(whole)
         gains.append(K)
         costs.append(P)
@@ -212,59 +220,3 @@ def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) ->
     gains = [*gains[::-1], gains[0]]
     found = {"t": traj.samples(dt), "K": np.array(gains), "P": np.array(costs[::-1])}
     return found | {"A": held[:, :, :nx], "B": held[:, :, nx:], "residual": worst}
-
-
-def _solve(traj: LinearTrajectory, Q: Array, R: Array, Qf: Array) -> tuple[Array, Array]:
-    def at(t: float) -> Coefficients:
-        A, B = traj.matrices(t)
-        return Coefficients(A, _spread(B, R), Q)
-
-    def back(a: float, b: float, P: Array) -> Array:
-        nodes = np.array([_spread(traj.matrices(a + c * (b - a))[1], R) for c in GAUSS])
-        return step_back(at(a), at(b), nodes, P, b - a)
-
-    times, values = [float(traj.t[-1])], [Qf]
-    for a in traj.t[-2::-1].tolist():
-        # Intervals left to do, the latest last; with P at the start from one step, where known.
-        pending: list[tuple[float, float, Array | None]] = [(a, times[-1], None)]
-        while pending:
-            start, end, single = pending.pop()
-            P = values[-1]
-            single = back(start, end, P) if single is None else single
-            middle = 0.5 * (start + end)
-            half = back(middle, end, P)
-            double = back(start, middle, half)
-            h = end - start
-            # The cubic with these values and slopes, midway.
-            bend = at(start).rate(double) - at(end).rate(P)
-            between = 0.5 * (double + P) + 0.125 * h * bend
-            if max(_apart(single, double), _apart(between, half)) <= _ACCURACY:
-                times += [middle, start]
-                values += [half, double]
-            elif len(times) > _KNOTS_LIMIT or h < 1e-12 * abs(traj.t[-1] - traj.t[0]):
-                raise InputError(_TOO_FAST.format(f"t = {end:g} s"))
-            else:
-                pending += [(start, middle, None), (middle, end, half)]
-    return np.array(times[::-1]), np.array(values[::-1])
-
-
-def _spread(B: Array, R: Array) -> Array:
-    S = B @ np.linalg.solve(R, B.T)
-    half: Array = 0.5 * (S + S.T)
-    return half
-
-
-def _apart(first: Array, second: Array) -> float:
-    return float(np.linalg.norm(first - second)) / max(float(np.linalg.norm(second)), 1e-300)
-
-
-def _residual(schedule: GainSchedule) -> float:
-    worst = 0.0
-    for i, t in enumerate(0.5 * (schedule.t[1:] + schedule.t[:-1])):
-        P, rate = schedule._cubics(t), schedule._cubics(t, 1)
-        A, B = (0.5 * (each[i] + each[i + 1]) for each in (schedule.A, schedule.B))
-        drift, spent = P @ A, P @ _spread(B, schedule.R) @ P
-        terms = np.array((rate, drift, drift.T, -spent, schedule.Q))
-        size = float(np.linalg.norm(terms, axis=(1, 2)).sum())
-        worst = max(worst, float(np.linalg.norm(terms.sum(axis=0))) / max(size, 1e-300))
-    return worst

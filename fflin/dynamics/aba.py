@@ -14,17 +14,7 @@ from fflin.robot.frames import ROOT
 
 
 class Aba:
-    """The nonlinear dynamics of a robot with all that acts on it, in base axes.
-
-    Parameters
-    ----------
-    state : StateMap
-
-    Attributes
-    ----------
-    inverse : ndarray (6 + n, 6 + n)
-        M^-1 in base axes as ABA has it, of the last slopes.
-    """
+    """The nonlinear dynamics of a robot with all that acts on it, in base axes."""
 
     def __init__(self, state: StateMap) -> None:
         robot = state.robot
@@ -34,6 +24,7 @@ class Aba:
         self._weightless = robot.model
         self._model = robot.model.copy()
         self._model.gravity.linear = np.array(robot.gravity)
+        # M^-1 in base axes as ABA has it, of the last slopes.
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
         self._resists = any(values.any() for values in robot.springs)
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
@@ -84,18 +75,11 @@ class Aba:
         by_q[:, 6:] -= by_force[:, 6:] * stiffness
         by_v[:, 6:] -= by_force[:, 6:] * damping
         at_rest = np.zeros_like(v)
-        by_u = [
-            state.velocities(
-                self._accelerate(
-                    self._weightless,
-                    q,
-                    at_rest,
-                    self.actuation.torques(unit),
-                    self._wrenches(q, at_rest, unit),
-                )
-            )
-            for unit in np.eye(len(u))
-        ]
+        by_u = []
+        for unit in np.eye(len(u)):
+            forces, wrenches = self.actuation.torques(unit), self._wrenches(q, at_rest, unit)
+            rate = self._accelerate(self._weightless, q, at_rest, forces, wrenches)
+            by_u.append(state.velocities(rate))
         return by_q, by_v, np.column_stack(by_u)
 
     def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:

@@ -11,7 +11,7 @@ from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
-from fflin.robot.frames import ROOT, find_frame
+from fflin.robot.frames import find_frame
 from fflin.robot.inputs import (
     BaseForce,
     BaseTorque,
@@ -20,7 +20,6 @@ from fflin.robot.inputs import (
     WrenchInput,
     named_inputs,
 )
-from fflin.robot.robot import Robot
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 
@@ -33,20 +32,7 @@ class Held(NamedTuple):
 
 
 class Actuation:
-    """The inputs of a robot, prepared.
-
-    Attributes
-    ----------
-    names, units : tuple of str
-        Of the nu inputs.
-    groups : dict
-        {name: indices} of the inputs by kind: tau_b, F_b, tau_m, thrust, wheel, in order of
-        appearance.
-    default : bool
-        Whether they are tau_b, F_b and every joint's, so that the columns are the identity.
-    held : tuple of Held
-        What the frame holds in reference axes.
-    """
+    """The inputs of a robot, prepared."""
 
     def __init__(self, state: StateMap) -> None:
         robot, nv = state.robot, 6 + state.robot.n
@@ -57,7 +43,7 @@ class Actuation:
         columns: list[Array] = []
         held: list[Held] = []
         # Thrusters and wheels that are no joints, by the Pinocchio joint that carries them:
-        # (input, wrench in its frame).
+        # (input, wrench (6,) of a unit in its frame).
         carried: dict[int, list[tuple[int, Array]]] = {}
         identity = np.eye(nv)
         for item, own in named_inputs(robot.inputs):
@@ -78,7 +64,8 @@ class Actuation:
                 columns.append(identity[6 + robot.joint_names.index(own[0])])
             else:
                 assert isinstance(item, WrenchInput)
-                joint, wrench = _carried(robot, item)
+                joint, placement = find_frame(robot.model, item.frame)
+                wrench = np.array(placement.act(pin.Force(item.wrench)).vector)
                 carried.setdefault(joint, []).append((at, wrench))
                 columns.append(np.zeros(nv))
             units += [unit] * (len(names) - at)
@@ -86,57 +73,40 @@ class Actuation:
         twice = [name for index, name in enumerate(names) if name in names[:index]]
         if twice:
             raise InputError(f"two inputs are named '{twice[0]}'; give one of them another name")
-        self.names, self.units = tuple(names), tuple(units)
+        # As a model calls them too.
+        self.names = self.input_names = tuple(names)
+        self.units = self.input_units = tuple(units)
+        # {kind: indices}: tau_b, F_b, tau_m, thrust, wheel, in order of appearance.
         self.groups = {
             kind: np.flatnonzero([kind == other for other in kinds])
             for kind in dict.fromkeys(kinds)
         }
+        # What the frame holds in reference axes.
         self.held, self._held = tuple(held), tuple(vector.columns for vector in held)
-        self._fixed = np.column_stack(columns) if columns else np.zeros((nv, 0))
-        self.default = self._fixed.shape == (nv, nv) and bool((self._fixed == identity).all())
-        self._carried = [
+        # Generalised force (6 + n, nu) of the inputs that the configuration does not change.
+        self.fixed: Array = np.column_stack(columns) if columns else np.zeros((nv, 0))
+        # Whether they are tau_b, F_b and every joint's, so that the columns are the identity.
+        self.default = self.fixed.shape == (nv, nv) and bool((self.fixed == identity).all())
+        # By joint: the inputs that it carries, and their wrenches (6, ..) in its frame.
+        self.wrench_columns: list[tuple[int, NDArray[np.intp], Array]] = [
             (joint, np.array([at for at, _ in items]), np.column_stack([w for _, w in items]))
             for joint, items in carried.items()
         ]
+        self.carried = bool(carried)  # so that their columns depend on the configuration
         self._of_carried = [at for items in carried.values() for at, _ in items]
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        """As a model calls them."""
-        return self.names
-
-    @property
-    def input_units(self) -> tuple[str, ...]:
-        """As a model calls them."""
-        return self.units
-
-    @property
-    def fixed(self) -> Array:
-        """Generalised force (6 + n, nu) of the inputs that the configuration does not change."""
-        return self._fixed
-
-    @property
-    def wrench_columns(self) -> list[tuple[int, NDArray[np.intp], Array]]:
-        """By joint: the inputs that it carries, and their wrenches (6, ..) in its frame."""
-        return self._carried
-
-    @property
-    def carried(self) -> bool:
-        """Whether an input's column depends on the configuration."""
-        return bool(self._carried)
 
     def columns(self, data: pin.Data, q: Array) -> Array:
         """Return B_u (6 + n, nu), the generalised force in base axes of a unit of each input (6.1).
 
         Inputs that are held in reference axes are counted as if they were held in base axes.
         """
-        if not self._carried:
-            return self._fixed
-        columns = self._fixed.copy()
+        if not self.carried:
+            return self.fixed
+        columns = self.fixed.copy()
         pin.computeJointJacobians(self._model, data, q)
         forces = [
             pin.getJointJacobian(self._model, data, joint, _LOCAL).T.dot(wrenches)
-            for joint, _, wrenches in self._carried
+            for joint, _, wrenches in self.wrench_columns
         ]
         columns[:, self._of_carried] = self._state.forces(np.concatenate(forces, axis=1))
         return columns
@@ -164,21 +134,13 @@ class Actuation:
 
         It is constant there. Wheels that are joints, and stored momentum, have no part in it.
         """
-        if not self._carried:
+        if not self.carried:
             return None
         external = pin.StdVec_Force(self._model.njoints, pin.Force.Zero())
-        for joint, inputs, wrenches in self._carried:
+        for joint, inputs, wrenches in self.wrench_columns:
             external[joint] = pin.Force(wrenches.dot(u.take(inputs)))
         return external
 
     def torques(self, u: Array) -> Array:
         """Return the generalised forces (6 + n,) in base axes of all but those `wrenches`."""
-        return self._fixed @ u
-
-
-def _carried(robot: Robot, item: WrenchInput) -> tuple[int, Array]:
-    """Return the joint that carries an input and its wrench (6,) per unit in that joint's frame."""
-    joint, placement = ROOT, pin.SE3.Identity()
-    if item.frame is not None:
-        joint, placement = find_frame(robot.model, item.frame)
-    return joint, np.array(placement.act(pin.Force(item.wrench)).vector)
+        return self.fixed @ u

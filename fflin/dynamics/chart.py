@@ -17,20 +17,11 @@ class Chart:
     """The attitude chart at one base attitude, relative to the reference, or at many.
 
     Numbers of equations are those of docs/derivation.md.
-
-    Attributes
-    ----------
-    q_b : ndarray (.., 3)
-        Vector part of the quaternion of refMb.
-    q0 : float or ndarray (.., 1)
-        Its scalar part, positive.
-    R : ndarray (.., 3, 3)
-        refMb.rotation.
     """
 
-    q_b: Array
-    q0: float | Array
-    R: Array
+    q_b: Array  # vector part (.., 3) of the quaternion of refMb
+    q0: float | Array  # its scalar part (.., 1), positive
+    R: Array  # refMb.rotation (.., 3, 3)
 
     @cached_property
     def Q(self) -> Array:
@@ -88,13 +79,7 @@ class Chart:
 
 
 class Standing(Chart):
-    """That of a base that stands at the reference, or of many: R = Q = E and J = 2 E cost nothing.
-
-    Parameters
-    ----------
-    count : int, optional
-        Of many.
-    """
+    """That of a base at the reference, or of many: R = Q = E and J = 2 E cost nothing."""
 
     N = 0.5 * np.eye(3)
 
@@ -121,10 +106,7 @@ class Standing(Chart):
         self, parts: tuple[slice, ...], x: Array, *, out: Array | None = None
     ) -> Array:
         """Return x itself, or write it to `out`."""
-        if out is None:
-            return x
-        out[...] = x
-        return out
+        return _turned(self.R, (), x, out)
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:
         """Return x itself."""

@@ -47,21 +47,11 @@ class Inertia:
 
     By Pinocchio's articulated bodies where these are sure to lose no digit that matters, else by
     a Cholesky factor of CRBA's M. Scaling M by its diagonal before it is factored would gain
-    nothing, since the rounding of a Cholesky factorisation is invariant under it.
-
-    Parameters
-    ----------
-    state : StateMap
-        Order of the coordinates.
-    data : pin.Data
-        Work space, overwritten at each call.
-
-    Attributes
-    ----------
-    least_coupling, warning_coupling : float
-        Between these the sum of M_ii (M^-1)_ii lies where M^-1 is good.
+    nothing, since the rounding of a Cholesky factorisation is invariant under it. `data` is work
+    space, overwritten at each call.
     """
 
+    # Between this and `least_coupling` the sum of M_ii (M^-1)_ii lies where M^-1 is good.
     warning_coupling = _WARNING_COUPLING
 
     def __init__(self, state: StateMap, data: pin.Data) -> None:
@@ -85,12 +75,8 @@ class Inertia:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array.
 
         By articulated bodies only where `quick` is asked for: their rounding, small as it is,
-        takes from a slope M^-1 K the exactness of what M^-1 leaves alone.
-
-        Raises
-        ------
-        SingularInertiaError
-            If a joint moves no mass, named.
+        takes from a slope M^-1 K the exactness of what M^-1 leaves alone. Where a joint moves no
+        mass, a `SingularInertiaError` names it.
         """
         still = self._still
         still[7:] = q[7:]
@@ -124,7 +110,7 @@ class Inertia:
             f"M of '{name}': {coordinate_names(self._state.robot)[worst]} moves an inertia of "
             f"{inertias[worst]:.1e} only, where mass and place of its links would allow "
             f"{allowed[worst]:.1e}, and B is as large as {1.0 / inertias[worst]:.1e}; give the "
-            "links their inertia, or lock it",
+            "links their inertia, see whether joints are placed in metres, or lock it",
             FflinWarning,
             stacklevel=6,
         )
@@ -165,21 +151,12 @@ _BOUNDS: WeakKeyDictionary[Robot, Array | None] = WeakKeyDictionary()
 
 
 def inertia_bounds(model: pin.Model) -> Array | None:
-    """Bound what each coordinate moves: its mass, or its moment about the base's origin.
+    """Bound what each coordinate of a free flyer moves: its mass, or its moment.
 
-    A body's moment about an axis through that origin is at most its largest principal moment and
-    its mass times the square of the way to it, from joint to joint. M's diagonal is no larger.
-
-    Parameters
-    ----------
-    model : pin.Model
-        Its root joint is a free flyer.
-
-    Returns
-    -------
-    ndarray (nv,) or None
-        In Pinocchio's order, for sliding joints within `STROKE`; None where a joint neither turns
-        nor slides alone.
+    A body's moment about an axis through the base's origin is at most its largest principal moment
+    and its mass times the square of the way to it, from joint to joint. M's diagonal is no larger.
+    The bounds (nv,) are in Pinocchio's order, for sliding joints within `STROKE`; None where a
+    joint neither turns nor slides alone.
     """
     joints = model.joints.tolist()
     slides = [joint.shortname().startswith("JointModelP") for joint in joints]

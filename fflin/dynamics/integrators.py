@@ -21,27 +21,18 @@ _integrate = pin.integrate
 
 
 class Integrator:
-    """Steps of one size of one model.
+    """Steps of one size of one model."""
 
-    Attributes
-    ----------
-    nodes : tuple of float
-        Of the stages, in a step of length 1.
-    weights : tuple of float
-        Of the stages, in what is summed along: v of the end is v + h sum(weights a).
-    moments : tuple of float
-        Of the stages, in the sum of a sum: a free place of the end is r + h v + h^2 sum(moments a).
-    origins : tuple of int
-        After each stage: 0 where the way to the next begins at the step's first place, 1 where at
-        the second stage's. Empty where a step is no such combination.
-    reach : float
-        Largest pole times step with which it is stable on the negative real axis.
-    """
-
+    # Of the stages: their times in a step of length 1,
     nodes: ClassVar[tuple[float, ...]]
+    # shares in what is summed along: v of the end is v + h sum(weights a),
     weights: ClassVar[tuple[float, ...]]
+    # and in the sum of a sum: a free place of the end is r + h v + h^2 sum(moments a).
     moments: ClassVar[tuple[float, ...]]
+    # Largest pole times step with which it is stable on the negative real axis.
     reach: ClassVar[float]
+    # After each stage: 0 where the way to the next begins at the step's first place, 1 where at the
+    # second stage's. Empty where a step is no such combination.
     origins: ClassVar[tuple[int, ...]] = ()
 
     def __init__(self, model: pin.Model, dt: float) -> None:

@@ -23,14 +23,8 @@ class Groups(NamedTuple):
 
 def groups_of(n: int) -> Groups:
     """Return the groups of the state of a robot with n joints."""
-    return Groups(
-        slice(0, 3),
-        slice(3, 6),
-        slice(6, 6 + n),
-        slice(6 + n, 9 + n),
-        slice(9 + n, 12 + n),
-        slice(12 + n, 12 + 2 * n),
-    )
+    ends = (0, 3, 6, 6 + n, 9 + n, 12 + n, 12 + 2 * n)
+    return Groups(*map(slice, ends, ends[1:]))
 
 
 def states_of(robot: Robot) -> dict[str, str]:

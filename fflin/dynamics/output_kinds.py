@@ -10,39 +10,22 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 import pinocchio as pin
 
+import fflin.robot.outputs as kinds
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.state import PIN_ANGULAR, PIN_LINEAR
-from fflin.robot.outputs import (
-    Accelerometer,
-    CenterOfMass,
-    FramePose,
-    FrameVelocity,
-    Gyroscope,
-    Momentum,
-    Output,
-    RelativePose,
-)
+from fflin.robot.frames import Carried
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 
 
 class Sensed(NamedTuple):
-    """Outputs and their derivatives at a point.
-
-    Attributes
-    ----------
-    y : ndarray (ny,)
-        The outputs; zero where they are states.
-    by_q, by_v, by_a : ndarray (ny, nv)
-        Derivatives with respect to the tangent of q that pin.integrate moves along, v and a;
-        rows of states are zero. None for by_a where no output depends on a.
-    """
+    """Outputs and their derivatives (ny, nv) at a point, zero where they are states."""
 
     y: Array
-    by_q: Array
+    by_q: Array  # over the tangent of q that pin.integrate moves along
     by_v: Array
-    by_a: Array | None
+    by_a: Array | None  # None where no output depends on a
 
     def part(self, rows: slice) -> "Sensed":
         """Return views of the rows of one output."""
@@ -51,56 +34,32 @@ class Sensed(NamedTuple):
 
 
 class Point(NamedTuple):
-    """The robot with its base at the origin, and what was left out of it.
-
-    Attributes
-    ----------
-    q, v : ndarray (nq,), (nv,)
-        Configuration with the base at the world's origin in its axes, and velocity without the
-        linear one of the base.
-    R, r_b : ndarray (3, 3), (3,)
-        Rotation and position of the base relative to the reference.
-    v_b, g : ndarray (3,)
-        Velocity of the base's origin and gravity, in base axes.
-    stored : tuple of (int, ndarray (3,))
-        Momentum of wheels that are no joints: the joint that carries it, and it in its axes.
-    """
+    """The robot with its base at the origin, and what was left out of it."""
 
     model: pin.Model
     data: pin.Data
-    q: Array
-    v: Array
-    R: Array
+    q: Array  # (nq,) with the base at the world's origin in its axes
+    v: Array  # (nv,) without the linear one of the base
+    R: Array  # rotation (3, 3) and position (3,) of the base relative to the reference
     r_b: Array
-    v_b: Array
+    v_b: Array  # velocity of the base's origin and gravity (3,), in base axes
     g: Array
+    # Momentum (3,) of wheels that are no joints: the joint that carries it, and it in its axes.
     stored: tuple[tuple[int, Array], ...] = ()
 
-
-class Carried(NamedTuple):
-    """Where a frame is: the joint that carries it, and its placement on that joint."""
-
-    joint: int
-    placement: pin.SE3
+    def placement(self, frame: Carried) -> pin.SE3:
+        """Return where a frame is on the robot."""
+        return self.data.oMi[frame.joint] * frame.placement
 
 
 class World(NamedTuple):
-    """The robot where it is, after Pinocchio's forward kinematics of second order.
-
-    Attributes
-    ----------
-    reference : pin.SE3
-        What positions and axes are relative to.
-    gravity : ndarray (3,)
-    stored : tuple of (int, ndarray (3,))
-        As in `Point`.
-    """
+    """The robot where it is, after Pinocchio's forward kinematics of second order."""
 
     model: pin.Model
     data: pin.Data
-    reference: pin.SE3
+    reference: pin.SE3  # what positions and axes are relative to
     gravity: Array
-    stored: tuple[tuple[int, Array], ...]
+    stored: tuple[tuple[int, Array], ...]  # as in `Point`
 
     def placement(self, frame: Carried) -> pin.SE3:
         """Return where a frame is in the world."""
@@ -112,20 +71,20 @@ class World(NamedTuple):
 
 
 # Those of the whole robot call all of Pinocchio's that they need; those of frames expect its
-# computeForwardKinematicsDerivatives.
-Slopes: TypeAlias = Callable[[Point, Sequence[Carried], Sensed], None]
+# computeForwardKinematicsDerivatives: f(point, where to write them, *frames)
+Slopes: TypeAlias = Callable[..., None]
 
-# The last argument has the attitudes of the frames at the point of linearisation.
-Value: TypeAlias = Callable[[World, Sequence[Carried], Sequence[Array]], Array]
+# f(world, attitudes of the frames at the point of linearisation, *frames)
+Value: TypeAlias = Callable[..., Array]
 
 
-def _center_of_mass_slopes(at: Point, _: Sequence[Carried], to: Sensed) -> None:
+def _center_of_mass_slopes(at: Point, to: Sensed) -> None:
     jacobian = pin.jacobianCenterOfMass(at.model, at.data, at.q, False)
     to.y[:] = at.r_b + at.R.dot(at.data.com[0])
     to.by_q[:] = at.R.dot(jacobian)
 
 
-def _center_of_mass(world: World, *_: object) -> Array:
+def _center_of_mass(world: World, _: object) -> Array:
     return np.asarray(world.reference.actInv(_center(world)))
 
 
@@ -136,7 +95,7 @@ def _center(world: World) -> Array:
     return np.asarray(sum(moments) / sum(inertia.mass for inertia, _ in bodies))
 
 
-def _momentum_slopes(at: Point, _: Sequence[Carried], to: Sensed) -> None:
+def _momentum_slopes(at: Point, to: Sensed) -> None:
     # Its rate, which this differentiates too, is of no interest: any acceleration will do.
     by_q, _, _, by_v = pin.computeCentroidalDynamicsDerivatives(at.model, at.data, at.q, at.v, at.v)
     mass, still = pin.computeTotalMass(at.model), at.data.hg
@@ -153,7 +112,7 @@ def _momentum_slopes(at: Point, _: Sequence[Carried], to: Sensed) -> None:
         to.by_q[:3] -= R.dot(skew(stored)).dot(jacobian[PIN_ANGULAR])
 
 
-def _momentum(world: World, *_: object) -> Array:
+def _momentum(world: World, _: object) -> Array:
     model, data, turned = world.model, world.data, world.reference.rotation.T
     momenta = [data.oMi[i].act(model.inertias[i] * data.v[i]) for i in range(1, model.njoints)]
     linear = sum(h.linear for h in momenta)
@@ -163,26 +122,24 @@ def _momentum(world: World, *_: object) -> Array:
     return np.concatenate((turned @ angular, turned @ linear))
 
 
-def _frame_pose_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> None:
-    (frame,) = frames
-    placement = at.data.oMi[frame.joint] * frame.placement
+def _frame_pose_slopes(at: Point, to: Sensed, frame: Carried) -> None:
+    placement = at.placement(frame)
     _, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     to.y[:3] = at.r_b + at.R.dot(placement.translation)
     to.by_q[:3] = at.R.dot(placement.rotation).dot(jacobian[PIN_LINEAR])
     to.by_q[3:] = jacobian[PIN_ANGULAR]
 
 
-def _frame_pose(world: World, frames: Sequence[Carried], before: Sequence[Array]) -> Array:
-    placement = world.placement(frames[0])
+def _frame_pose(world: World, before: Sequence[Array], frame: Carried) -> Array:
+    placement = world.placement(frame)
     turned = pin.log3(before[0].T @ placement.rotation)
     return np.concatenate((world.reference.actInv(placement.translation), turned))
 
 
-def _frame_velocity_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> None:
-    (frame,) = frames
+def _frame_velocity_slopes(at: Point, to: Sensed, frame: Carried) -> None:
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     velocity = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL)
-    R = at.R.dot((at.data.oMi[frame.joint] * frame.placement).rotation)
+    R = at.R.dot(at.placement(frame).rotation)
     to.y[:3] = velocity.angular
     to.by_q[:3] = by_q[PIN_ANGULAR]
     to.by_v[:3] = jacobian[PIN_ANGULAR]
@@ -193,22 +150,16 @@ def _frame_velocity_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> 
     to.by_v[3:] = R.dot(jacobian[PIN_LINEAR])
 
 
-def _frame_velocity(world: World, frames: Sequence[Carried], _: Sequence[Array]) -> Array:
-    velocity = world.velocity(frames[0])
-    R = world.reference.rotation.T @ world.placement(frames[0]).rotation
+def _frame_velocity(world: World, _: object, frame: Carried) -> Array:
+    velocity = world.velocity(frame)
+    R = world.reference.rotation.T @ world.placement(frame).rotation
     return np.concatenate((velocity.angular, R @ velocity.linear))
 
 
-def _relative_pose_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> None:
-    (place, other), (jacobian, seeing) = zip(
-        *(
-            (
-                at.data.oMi[frame.joint] * frame.placement,
-                pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)[1],
-            )
-            for frame in frames
-        ),
-        strict=True,
+def _relative_pose_slopes(at: Point, to: Sensed, *frames: Carried) -> None:
+    place, other = map(at.placement, frames)
+    jacobian, seeing = (
+        pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)[1] for frame in frames
     )
     relative = other.actInv(place)
     R, p = relative.rotation, relative.translation
@@ -220,28 +171,26 @@ def _relative_pose_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> N
     to.by_q[:, :6] = 0.0  # the base carries both
 
 
-def _relative_pose(world: World, frames: Sequence[Carried], before: Sequence[Array]) -> Array:
-    place, other = (world.placement(frame) for frame in frames)
+def _relative_pose(world: World, before: Sequence[Array], *frames: Carried) -> Array:
+    place, other = map(world.placement, frames)
     turned = pin.log3((before[1].T @ before[0]).T @ other.rotation.T @ place.rotation)
     seen = other.rotation.T @ (place.translation - other.translation)
     return np.concatenate((seen, turned))
 
 
-def _gyroscope_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> None:
-    (frame,) = frames
+def _gyroscope_slopes(at: Point, to: Sensed, frame: Carried) -> None:
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     to.y[:] = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL).angular
     to.by_q[:] = by_q[PIN_ANGULAR]
     to.by_v[:] = jacobian[PIN_ANGULAR]
 
 
-def _gyroscope(world: World, frames: Sequence[Carried], _: Sequence[Array]) -> Array:
-    return np.asarray(world.velocity(frames[0]).angular)
+def _gyroscope(world: World, _: object, frame: Carried) -> Array:
+    return np.asarray(world.velocity(frame).angular)
 
 
-def _accelerometer_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> None:
+def _accelerometer_slopes(at: Point, to: Sensed, frame: Carried) -> None:
     # Pinocchio was given dv_b/dt + omega_b x v_b - g, in base axes, for the base's acceleration.
-    (frame,) = frames
     _, by_q, by_v, by_a = pin.getPointClassicAccelerationDerivatives(
         at.model, at.data, *frame, _LOCAL
     )
@@ -254,8 +203,7 @@ def _accelerometer_slopes(at: Point, frames: Sequence[Carried], to: Sensed) -> N
     to.by_v[:, PIN_ANGULAR] -= of_base.dot(skew(at.v_b))
 
 
-def _accelerometer(world: World, frames: Sequence[Carried], _: Sequence[Array]) -> Array:
-    (frame,) = frames
+def _accelerometer(world: World, _: object, frame: Carried) -> Array:
     velocity = world.velocity(frame)
     rate = frame.placement.actInv(world.data.a[frame.joint]).linear
     felt = rate + np.cross(velocity.angular, velocity.linear)
@@ -263,12 +211,12 @@ def _accelerometer(world: World, frames: Sequence[Carried], _: Sequence[Array]) 
 
 
 # What is not here is made of states.
-KINDS: dict[type[Output], tuple[Slopes, Value]] = {
-    CenterOfMass: (_center_of_mass_slopes, _center_of_mass),
-    Momentum: (_momentum_slopes, _momentum),
-    FramePose: (_frame_pose_slopes, _frame_pose),
-    FrameVelocity: (_frame_velocity_slopes, _frame_velocity),
-    RelativePose: (_relative_pose_slopes, _relative_pose),
-    Gyroscope: (_gyroscope_slopes, _gyroscope),
-    Accelerometer: (_accelerometer_slopes, _accelerometer),
+KINDS: dict[type[kinds.Output], tuple[Slopes, Value]] = {
+    kinds.CenterOfMass: (_center_of_mass_slopes, _center_of_mass),
+    kinds.Momentum: (_momentum_slopes, _momentum),
+    kinds.FramePose: (_frame_pose_slopes, _frame_pose),
+    kinds.FrameVelocity: (_frame_velocity_slopes, _frame_velocity),
+    kinds.RelativePose: (_relative_pose_slopes, _relative_pose),
+    kinds.Gyroscope: (_gyroscope_slopes, _gyroscope),
+    kinds.Accelerometer: (_accelerometer_slopes, _accelerometer),
 }

@@ -6,13 +6,13 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.names import joints_by_name
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.output_kinds import KINDS, Carried, Point, Sensed, Slopes, World
+from fflin.dynamics.output_kinds import KINDS, Point, Sensed, Slopes, World
 from fflin.dynamics.state import PIN_ANGULAR, PIN_LINEAR, StateMap
-from fflin.robot.frames import ROOT, find_frame
-from fflin.robot.outputs import BasePose, FullState, JointPositions, JointVelocities, Output
+from fflin.robot.frames import ROOT, Carried, find_frame
+from fflin.robot.joints import by_joint
+from fflin.robot.outputs import BasePose, FullState, JointOutput, JointPositions, Output
 
 # Rotation and position of the base relative to itself.
 _STANDING: tuple[Array, Array] = (np.eye(3), np.zeros(3))
@@ -27,49 +27,26 @@ class Sensing:
     put on afterwards, and an orbit costs no digits. Of the base's acceleration only
     :math:`\dot v_b + \omega_b \times v_b - g`, in base axes, is felt.
 
-    Parameters
-    ----------
-    state : StateMap
-    outputs : sequence of Output
-    own_reference : bool
-        Whether the reference is the base's own placement at each point, not that of `state`.
-
-    Attributes
-    ----------
-    names, units : tuple of str
-        Of the ny outputs.
-    states : list of (int, int)
-        (output, state) for each output that is a state.
-    needs_acceleration : bool
-        Whether an output depends on the acceleration, so that D is not zero.
-
-    Raises
-    ------
-    InputError
-        If something is no output, two outputs have one name, or a joint mimics another.
-    UnknownNameError
-        If there is no such frame or joint.
+    With `own_reference` the reference is the base's own placement at each point, not that of the
+    state. What is no output, or twice there, is an `InputError`.
     """
 
     def __init__(
-        self,
-        state: StateMap,
-        outputs: Sequence[Output],
-        *,
-        own_reference: bool = False,
+        self, state: StateMap, outputs: Sequence[Output], *, own_reference: bool = False
     ) -> None:
         robot = state.robot
         self._state, self._own_reference = state, own_reference
         # The free-flyer joint may itself stand somewhere in the world.
         self._home = pin.SE3ToXYZQUAT(robot.model.jointPlacements[ROOT].inverse())
 
+        # (output, state) for each output that is a state.
         self.states: list[tuple[int, int]] = []
-        self._kinds: list[tuple[slice, Slopes, tuple[Carried, ...]]] = []
+        self._kinds: list[tuple[slice, Slopes, list[Carried]]] = []
         signals: list[tuple[str, str]] = []
         for output in outputs:
             at = len(signals)
             if type(output) in KINDS:
-                frames = _carried(state, output)
+                frames = [find_frame(robot.model, name) for name in output.frames]
                 signals += output.signals
                 self._kinds.append((slice(at, len(signals)), KINDS[type(output)][0], frames))
             else:
@@ -83,26 +60,14 @@ class Sensing:
         twice = [name for index, name in enumerate(self.names) if name in self.names[:index]]
         if twice:
             raise InputError(f"output '{twice[0]}' is asked for twice; leave one of them out")
+        # Where one does, D is not zero.
         self.needs_acceleration = any(output.FEELS_ACCELERATION for output in outputs)
 
     def evaluate(self, data: pin.Data, q: Array, v: Array, a: Array) -> Sensed:
-        """Return the outputs and their derivatives at a point.
+        """Return the outputs and their derivatives at valid q (nq,) and v (nv,).
 
-        Parameters
-        ----------
-        data : pin.Data
-            Work space; what it held is lost.
-        q : ndarray (nq,)
-            A valid configuration.
-        v : ndarray (nv,)
-            Velocity: base linear and angular in base axes, then joints.
-        a : ndarray (nv,)
-            Its time derivative as pin.aba returns it, with gravity's part. Not looked at where
-            `needs_acceleration` is false.
-
-        Returns
-        -------
-        Sensed
+        What `data` held is lost. The acceleration a (nv,), as pin.aba returns it with gravity's
+        part, is not looked at where `needs_acceleration` is false.
         """
         ny, nv = len(self.names), len(v)
         by_a = np.zeros((ny, nv)) if self.needs_acceleration else None
@@ -115,7 +80,7 @@ class Sensing:
             if frames and not derived:
                 self._derive(at, v, a)
                 derived = True
-            slopes(at, frames, sensed.part(rows))
+            slopes(at, sensed.part(rows), *frames)
         return sensed
 
     def _derive(self, at: Point, v: Array, a: Array) -> None:
@@ -143,13 +108,8 @@ class Sensing:
 class Measuring:
     """The outputs y of the nonlinear robot, out of elementary kinematics in the world.
 
-    The route by which C and D are checked, and nothing of the one by which they are made.
-
-    Parameters
-    ----------
-    state : StateMap
-    q : ndarray (nq,)
-        The point, from which rotation vectors are counted.
+    The route by which C and D are checked, and nothing of the one by which they are made. Rotation
+    vectors are counted from the point q (nq,).
     """
 
     def __init__(self, state: StateMap, q: Array) -> None:
@@ -160,7 +120,7 @@ class Measuring:
             *(np.array(robot.gravity), robot.stored_momentum),
         )
         pin.forwardKinematics(robot.model, world.data, q)
-        frames = [_carried(state, output) for output in robot.outputs]
+        frames = [[find_frame(world.model, x) for x in output.frames] for output in robot.outputs]
         attitudes = [[np.array(world.placement(f).rotation) for f in group] for group in frames]
         self._outputs = tuple(zip(robot.outputs, frames, attitudes, strict=True))
 
@@ -170,7 +130,7 @@ class Measuring:
         pin.forwardKinematics(world.model, world.data, q, v, a)
         return np.concatenate(
             [
-                KINDS[type(output)][1](world, frames, attitudes)
+                KINDS[type(output)][1](world, attitudes, *frames)
                 if type(output) in KINDS
                 else x[state_indices(self.state, output)]
                 for output, frames, attitudes in self._outputs
@@ -185,7 +145,7 @@ def state_indices(state: StateMap, output: Output) -> list[int]:
         return list(range(state.nx))
     if isinstance(output, BasePose):
         return list(range(groups.q_b.start, groups.r_b.stop))
-    if not isinstance(output, JointPositions | JointVelocities):
+    if not isinstance(output, JointOutput):
         raise InputError(f"{output!r} is no output, as FramePose('tool') would be")
     group = groups.q_m if isinstance(output, JointPositions) else groups.qdot_m
     names = robot.joint_names
@@ -193,12 +153,5 @@ def state_indices(state: StateMap, output: Output) -> list[int]:
     return [
         group.start + names.index(name)
         for key in asked
-        for name in joints_by_name(
-            "joint", {str(key): 0}, names, lambda name: robot.joint(name).name
-        )
+        for name in by_joint({str(key): 0}, names, robot.joint)
     ]
-
-
-def _carried(state: StateMap, output: Output) -> tuple[Carried, ...]:
-    """Return where the frames of an output are; a link's before a joint's of the same name."""
-    return tuple(Carried(*find_frame(state.robot.model, name)) for name in output.frames)

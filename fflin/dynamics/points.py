@@ -1,26 +1,24 @@
 """Configurations, velocities and inputs of a point by name."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from fflin.base import names
 from fflin.base.errors import InputError
-from fflin.base.names import input_keys, joints_by_name
-from fflin.base.validation import Array, by_name, number, placement
+from fflin.base.names import by_name, input_keys, rates_by_name
+from fflin.base.validation import Array, numbers, placement
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT
 from fflin.robot.inputs import named_wheels
+from fflin.robot.joints import by_joint
 from fflin.robot.robot import Robot
-from fflin.robot.signals import rates_by_name
 
 
 def configuration(
-    robot: Robot,
-    joints: Mapping[str, float] | None = None,
-    base: pin.SE3 | None = None,
+    robot: Robot, joints: Mapping[str, float] | None = None, base: pin.SE3 | None = None
 ) -> Array:
     """Build a Pinocchio configuration.
 
@@ -50,12 +48,8 @@ def configuration(
     if base is not None:
         root = robot.model.jointPlacements[ROOT]
         q[:7] = pin.SE3ToXYZQUAT(root.actInv(placement("base", base)))
-    values = {
-        name: number(f"joint '{name}'", value)
-        for name, value in by_name("joints", {} if joints is None else joints, "joint").items()
-    }
-    found = joints_by_name("joint", values, robot.joint_names, lambda name: robot.joint(name).name)
-    for name, value in found.items():
+    values = numbers("joints", {} if joints is None else joints, "joint", "joint")
+    for name, value in by_joint(values, robot.joint_names, robot.joint).items():
         robot.joint(name).place(q, value)
     robot.follow(q)
     return robot.checked_configuration(q)
@@ -68,6 +62,21 @@ def start_of(robot: Robot) -> tuple[Array, Array]:
     base = pin.SE3(rotation, np.array(start.get("position", np.zeros(3))))
     q = configuration(robot, start.get("joints"), base)
     return q, velocity(robot, start.get("velocity", {}))
+
+
+def point_of(
+    state: StateMap, x0: Any, q0: Any, v0: Any, default: Callable[[], tuple[Array, Array]]
+) -> tuple[Array, Array]:
+    """Return the configuration (nq,) and velocity (nv,) that a caller gives, as x or as q and v."""
+    robot = state.robot
+    if x0 is not None:
+        if q0 is not None or v0 is not None:
+            raise InputError("x0 is given with q0 or v0; give either")
+        return state.to_pinocchio(x0)
+    if q0 is None and v0 is None:
+        return default()
+    q = robot.neutral() if q0 is None else robot.checked_configuration(q0).copy()
+    return q, np.zeros(robot.nv) if v0 is None else robot.checked_velocity(v0).copy()
 
 
 def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
@@ -92,10 +101,7 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
     InputError
         If a value is not a finite number.
     """
-    checked = {
-        name: number(f"velocity '{name}'", value)
-        for name, value in by_name("values", values, "velocity").items()
-    }
+    checked = numbers("values", values, "velocity", "velocity")
     state = StateMap(robot)
     for name, _ in named_wheels(robot.inputs):
         if name in checked and name not in robot.joint_names:
@@ -124,10 +130,7 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
     InputError
         If a value is not a finite number.
     """
-    checked = {
-        name: number(f"effort '{name}'", value)
-        for name, value in by_name("values", values, "input").items()
-    }
+    checked = numbers("values", values, "input", "effort")
     keys = input_keys(Actuation(StateMap(robot)))
-    found = names.by_name("input", checked, keys)
+    found = by_name("input", checked, keys)
     return np.array([found.get(index, 0.0) for index in range(len(keys))])

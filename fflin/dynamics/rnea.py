@@ -16,47 +16,24 @@ from fflin.dynamics.state import LINEAR, PIN_ANGULAR, StateMap
 
 
 class Rates(NamedTuple):
-    r"""The acceleration of the base origin and the joints, in base axes, and what it depends on.
+    """The acceleration of the base origin and the joints, in base axes, and what it depends on.
 
     Of many points each has a leading axis of them.
-
-    Attributes
-    ----------
-    c : ndarray (.., 6 + n)
-        Of (3.1): without gravity and :math:`\omega \times v_b`.
-    by_q_m : ndarray (.., 6 + n, n)
-        D_m of (3.3).
-    by_nu : ndarray (.., 6 + n, 6 + n)
-        D_nu of (3.3), zero over the base's linear velocity.
-    by_u : ndarray (.., 6 + n, nu)
-        D_u of (3.3), `u` held in base axes.
-    gravity : ndarray (3,) or (.., 3)
-        In base axes.
     """
 
-    c: Array
-    by_q_m: Array
-    by_nu: Array
-    by_u: Array
-    gravity: Array
+    c: Array  # (6 + n,) of (3.1): without gravity and omega x v_b
+    by_q_m: Array  # D_m (6 + n, n) of (3.3)
+    by_nu: Array  # D_nu (6 + n, 6 + n) of (3.3), zero over the base's linear velocity
+    by_u: Array  # D_u (6 + n, nu) of (3.3), u held in base axes
+    gravity: Array  # (3,) in base axes
 
 
 class Gyroscopic(NamedTuple):
-    r"""The torques :math:`-\omega \times h` of stored momentum, and their slopes.
+    r"""The torques :math:`-\omega \times h` of stored momentum, and their slopes."""
 
-    Attributes
-    ----------
-    wrenches : pin.StdVec_Force
-        On every joint, in its frame.
-    force : ndarray (nv,)
-        What they are as a generalised force.
-    by_q, by_v : ndarray (nv, nv)
-        Its slopes, that over q with the Jacobian held: RNEA's derivatives with the wrenches have
-        the rest.
-    """
-
-    wrenches: pin.StdVec_Force
-    force: Array
+    wrenches: pin.StdVec_Force  # on every joint, in its frame
+    force: Array  # what they are as a generalised force (nv,)
+    # Its slopes (nv, nv); over q with the Jacobian held, for RNEA's with the wrenches has the rest.
     by_q: Array
     by_v: Array
 
@@ -65,14 +42,8 @@ class Accelerations:
     r"""``M nudot + b = B u`` of a robot, solved and differentiated in base axes.
 
     The slopes of :math:`\dot\nu = M^{-1}(B u - b(q, \nu))` are those of RNEA at the acceleration,
-    :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`.
-
-    Parameters
-    ----------
-    state : StateMap
-    actuation : Actuation
-    data : pin.Data
-        Work space, overwritten at each call.
+    :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`. `data` is work space, overwritten
+    at each call.
     """
 
     def __init__(self, state: StateMap, actuation: Actuation, data: pin.Data) -> None:
@@ -90,16 +61,9 @@ class Accelerations:
         self._inertia.invert(q, out, quick=True)
 
     def rates(self, q: Array, v: Array, nu: Array, q_m: Array, u: Array) -> Rates:
-        """Return the accelerations and their slopes.
+        """Return the accelerations and their slopes at q (nq,), v (nv,) and u (nu,) in base axes.
 
-        Parameters
-        ----------
-        q, v : ndarray (nq,), (nv,)
-            The point, in Pinocchio's order.
-        nu, q_m : ndarray (6 + n,), (n,)
-            The same velocity in state order and base axes, and the joints' positions.
-        u : ndarray (nu,)
-            Over the inputs, in base axes.
+        With nu (6 + n,), the same velocity in state order and base axes, and the joints' q_m (n,).
         """
         model, data, state = self._model, self._data, self._state
         # Without the base's position and linear velocity: nothing here depends on them, and
@@ -163,12 +127,8 @@ class Accelerations:
         force, by_q, by_v = np.zeros(nv), np.zeros((nv, nv)), np.zeros((nv, nv))
         pin.computeForwardKinematicsDerivatives(model, data, q, v, np.zeros(nv))
         for joint, momentum in self._stored:
-            turned, jacobian = (
-                part[PIN_ANGULAR]
-                for part in pin.getJointVelocityDerivatives(
-                    model, data, joint, pin.ReferenceFrame.LOCAL
-                )
-            )
+            slopes = pin.getJointVelocityDerivatives(model, data, joint, pin.ReferenceFrame.LOCAL)
+            turned, jacobian = (part[PIN_ANGULAR] for part in slopes)
             torque = momentum @ data.v[joint].angular
             wrenches[joint] += pin.Force(np.zeros(3), torque)
             force += jacobian.T @ torque

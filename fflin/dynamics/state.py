@@ -1,5 +1,6 @@
 """The state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m): its order, frames and chart."""
 
+from copy import copy
 from itertools import compress
 from typing import Literal, get_args
 
@@ -73,6 +74,8 @@ class StateMap:
         With v = S nu, where joints mimic others; None where v is nu in another order.
     unbounded : ndarray of int
         Which of the n joints turn without end.
+    origin_quaternion : ndarray (4,)
+        Attitude of `origin`.
 
     Raises
     ------
@@ -119,16 +122,24 @@ class StateMap:
         self.unbounded = np.flatnonzero([joint.unbounded for joint in joints])
         self._cos = self._idx_q[self.unbounded]
         self._sin = self._cos + 1
-        # The free-flyer joint may itself stand somewhere in the world.
-        oMref = pin.SE3.Identity() if reference is None else placement("reference", reference)
-        self._reference = oMref
-        # Composed as quaternions: their entries survive to the last digit near a turn of pi.
-        offset = pin.SE3ToXYZQUAT(oMref.actInv(robot.model.jointPlacements[ROOT]))
-        self._position, self._quaternion = offset[:3], offset[3:]
-        self._rotation = rotation_matrix(self._quaternion)
-        self._aligned = bool((self._rotation == np.eye(3)).all())
         root = robot.model.jointPlacements[ROOT].rotation
         self._gravity, self._falls = root.T @ np.array(robot.gravity), any(robot.gravity)
+        self._refer(pin.SE3.Identity() if reference is None else placement("reference", reference))
+
+    def about(self, reference: pin.SE3) -> "StateMap":
+        """Return the map relative to another placement, with the same frame."""
+        other = copy(self)
+        other._refer(reference)
+        return other
+
+    def _refer(self, oMref: pin.SE3) -> None:
+        self._reference = oMref
+        # The free-flyer joint may itself stand somewhere in the world. Composed as quaternions:
+        # their entries survive to the last digit near a turn of pi.
+        offset = pin.SE3ToXYZQUAT(oMref.actInv(self.robot.model.jointPlacements[ROOT]))
+        self._position, self.origin_quaternion = offset[:3], offset[3:]
+        self._rotation = rotation_matrix(self.origin_quaternion)
+        self._aligned = bool((self._rotation == np.eye(3)).all())
 
     @property
     def reference(self) -> pin.SE3:
@@ -136,29 +147,19 @@ class StateMap:
         return pin.SE3(self._reference)
 
     @property
-    def origin_quaternion(self) -> Array:
-        """Attitude (4,) of `origin`."""
-        return self._quaternion
-
-    @property
     def origin(self) -> pin.SE3:
         """Where the base is, seen from the reference, at q[:7] = 0, 0, 0, 0, 0, 0, 1."""
-        return pin.XYZQUATToSE3(np.concatenate((self._position, self._quaternion)))
+        return pin.XYZQUATToSE3(np.concatenate((self._position, self.origin_quaternion)))
 
     def chart(self, q: Array) -> Chart:
-        """Return the attitude chart at a configuration.
-
-        Parameters
-        ----------
-        q : ndarray (nq,)
-            A valid configuration.
+        """Return the attitude chart at a valid configuration (nq,).
 
         Raises
         ------
         ChartError
             If the base is turned by pi from the reference.
         """
-        quaternion = quaternion_product(self._quaternion, q[3:7])
+        quaternion = quaternion_product(self.origin_quaternion, q[3:7])
         if quaternion[3] < 0.0:
             quaternion = -quaternion
         q0 = float(quaternion[3])
@@ -180,7 +181,7 @@ class StateMap:
 
     def scalar(self, q: Array) -> float:
         """Return q0 at a valid configuration, with the sign of the quaternion in q."""
-        return float(quaternion_product(self._quaternion, q[3:7])[3])
+        return float(quaternion_product(self.origin_quaternion, q[3:7])[3])
 
     def to_state(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
         """Convert a Pinocchio configuration and velocity to a state.
@@ -263,7 +264,7 @@ class StateMap:
         chart = Chart(relative[:, :3], relative[:, 3:], rotation_matrices(relative))
         q = np.empty((len(x), self.robot.nq))
         q[:, :3] = (x[:, g.r_b] - self._position) @ self._rotation
-        turned = relative @ product_matrix(conjugate(self._quaternion)).T
+        turned = relative @ product_matrix(conjugate(self.origin_quaternion)).T
         q[:, 3:7] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
         angles = x[:, g.q_m]
         q[:, self._idx_q] = angles

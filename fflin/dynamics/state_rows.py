@@ -40,29 +40,23 @@ def state_history(
     quaternion *= np.where(quaternion[:, 3:] < 0.0, -1.0, 1.0)
     chart = Chart(quaternion[:, :3], quaternion[:, 3:], rotation_matrices(quaternion))
     q_m = state.joint_positions(q)
-    before = np.zeros(len(q_m[0])) if near is None else near[state.groups.q_m]
+    before = np.zeros(q_m.shape[1]) if near is None else near[state.groups.q_m]
     rates = state.velocities(v)
-    for k in state.unbounded:
-        q_m[:, k] = np.unwrap([before[k], *q_m[:, k]])[1:]
+    if (k := state.unbounded).size:
+        q_m[:, k] = np.unwrap(np.vstack((before, q_m))[:, k], axis=0)[1:]
         if t is not None:
-            turned = 0.5 * np.diff(t) * (rates[1:, 6 + k] + rates[:-1, 6 + k])
-            q_m[1:, k] += _TURN * np.round((turned - np.diff(q_m[:, k])) / _TURN).cumsum()
+            turned = 0.5 * np.diff(t)[:, None] * (rates[1:, 6 + k] + rates[:-1, 6 + k])
+            turns = np.round((turned - np.diff(q_m[:, k], axis=0)) / _TURN)
+            q_m[1:, k] += _TURN * turns.cumsum(axis=0)
     return state.compose(chart, state.positions(q), q_m, rates)
 
 
 def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:
-    r"""Return f(q, v) = offset - K x(q, v), x being the state of valid q and v.
+    """Return f(q, v) = offset - K x(q, v) (m,), x being the state of valid q and v.
 
     The attitude is linear in the quaternion, the place in the base's, and velocities in reference
     axes in R v: one product with all these gives f. That takes a fifth of the time of the state.
-
-    Parameters
-    ----------
-    state : StateMap
-    K : ndarray (m, nx)
-    offset : ndarray (m,)
-    near : ndarray (nx,)
-        A state; the angle of each continuous joint is taken on the turn nearest to it.
+    The angle of each continuous joint is taken on the turn nearest to the state `near` (nx,).
     """
     robot, g = state.robot, state.groups
     idx_q = np.array([joint.idx_q for joint in robot.joints], dtype=np.intp)

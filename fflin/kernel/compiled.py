@@ -60,14 +60,13 @@ def numba_is_there() -> bool:
 
 def loop_pays(steps: int) -> bool:
     """Whether the compiled loop is there and beats the one in Python over so many steps."""
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    own = Path(__file__).parent
+    if steps < _BREAK_EVEN_LOOP or not numba_is_there():
+        return False
+    chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
     folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
     if not any(_kept(folder, "loop", "advance") for folder in folders):
-        return steps >= _BREAK_EVEN_COMPILING and numba_is_there()
-    if "numba" in sys.modules:
-        return steps >= _BREAK_EVEN_LOOP
-    return steps >= _BREAK_EVEN_LOOP_UNLOADED and numba_is_there()
+        return steps >= _BREAK_EVEN_COMPILING
+    return steps >= _BREAK_EVEN_LOOP_UNLOADED or "numba" in sys.modules
 
 
 def kernel(module: str, name: str, what: str = "the batch kernel") -> Any:

@@ -13,10 +13,13 @@ from fflin.kernel.vectors import across, copy, get3, minus, put3, times
 _NEAR = 1e-9  # a time this near to a knot, relative to the interval, is the knot's
 
 
-class Path(namedtuple("Path", "t q u way speed hold ends held last starts K order along e point")):
+class Path(
+    namedtuple("Path", "t q u way speed hold ends held over last starts K order along e point")
+):
     """A trajectory and its gains, piece by piece.
 
-    At the knots t (N,) [s] q and u, row by row, and once more where the run `ends` later, at rest.
+    At the knots t (N,) [s] q and u, row by row, and once more, with nu and K, where the run `ends`
+    later, which is when t > `over` [s].
     Between them `way` is the cubic (4, 6 + n) in the share of the interval of the displacement from
     its knot, and `speed` that of nu; u is linear or on `hold`, and the three inputs from each of
     `held` on stand in the world's axes. K has `order` coefficients in the time since each of
@@ -36,9 +39,9 @@ def _cubic(coefficients, k, s, out):
 
 @inlined
 def _follow(robot, path, t):
-    """Write what is followed at a time of the run, its inputs in base axes."""
+    """Write what is followed at a time of the run, u in base axes; return if it is over."""
     point, last, knots = path.point, len(path.t) - 2, path.t
-    time, after = knots[0] + max(t, 0.0), path.ends and t > knots[-1] - knots[0]
+    time, after = knots[0] + max(t, 0.0), path.ends and t > path.over
     k = max(0, min(np.searchsorted(knots, time, side="right") - 1, last))
     s = (time - knots[k]) / (knots[k + 1] - knots[k])
     if s > 1.0 - _NEAR and k < last:
@@ -62,6 +65,7 @@ def _follow(robot, path, t):
     for index in range(len(path.held)):
         at = path.held[index]
         put3(point.u, at, across(axes_of(point.q), get3(point.u, at)))
+    return after
 
 
 @inlined
@@ -88,12 +92,14 @@ def _error(robot, path, point):
 @inlined
 def track(robot, path, point, t):
     """Write the inputs u* - K e at a time of the run."""
-    _follow(robot, path, t)
+    after = _follow(robot, path, t)
     _error(robot, path, point)
     starts, count, width = path.starts, len(path.point.u), len(path.e)
     since = path.starts[0] + min(max(t, 0.0), path.last)
     k = max(0, np.searchsorted(starts, since, side="right") - 1)
-    since, first, size = since - starts[k], k * path.order * count * width, count * width
+    since = 0.0 if after else since - starts[k]
+    k = len(starts) if after else k
+    first, size = k * path.order * count * width, count * width
     for row in range(count):
         total = splat(point.u, path.point.u[row])
         for column in range(width):

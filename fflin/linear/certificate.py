@@ -1,5 +1,7 @@
 """A second route to A and B, by Pinocchio's ABA derivatives, and how far two routes differ."""
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,8 +44,9 @@ class Block(NamedTuple):
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
     """Compute the figures that prove a continuous-time model of this robot."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    A, B, _ = aba_route(state, lin.q, lin.v, lin.u0, moving=lin.moving)
-    blocks = compare(state, lin, lin.M, A, B)
+    aba = Aba(state)
+    A, B, _ = aba_route(state, aba, lin.q, lin.v, lin.u0, moving=lin.moving)
+    blocks = compare(state, aba.actuation, lin, lin.M, A, B)
     return Certificate(
         condition=scaled_condition(lin.M),
         inertia_residual=inertia_residual(lin.M, inverse_inertia(state, lin)),
@@ -67,7 +70,7 @@ def inertia_residual(M: Array, inverse: Array) -> float:
 
 
 def aba_route(
-    state: StateMap, q: Array, v: Array, u: Array, *, moving: bool = False
+    state: StateMap, aba: Aba, q: Array, v: Array, u: Array, *, moving: bool = False
 ) -> tuple[Array, Array, Array]:
     r"""Build A and B from the derivatives of ABA.
 
@@ -82,7 +85,6 @@ def aba_route(
     inverse : ndarray (6 + n, 6 + n)
         M^-1 in base axes as ABA has it, which tells how much its route is worth.
     """
-    aba = Aba(state)
     chart, g, nv = state.chart(q), state.groups, 6 + state.robot.n
     nu, u = state.velocities(v), aba.actuation.in_base_axes(chart, u)
     # Pinocchio differentiates in world axes at the world's origin, where a distant base costs
@@ -140,7 +142,9 @@ def _change_of_coordinates(
     return T, T_rate
 
 
-def compare(state: StateMap, lin: LinearModel, M: Array, A: Array, B: Array) -> list[Block]:
+def compare(
+    state: StateMap, actuation: Actuation, lin: LinearModel, M: Array, A: Array, B: Array
+) -> list[Block]:
     """Compare a model's A and B with those of another route, block by block.
 
     `M` is the robot's, for the scales.
@@ -156,22 +160,26 @@ def compare(state: StateMap, lin: LinearModel, M: Array, A: Array, B: Array) -> 
     difference_A, scaled_A = np.abs(lin.A - A) / row_scale, np.abs(lin.A) / row_scale
     column_scale = np.where(np.arange(state.nx)[:, None] < state.nx - nv, 1.0, input_mobility)
     difference_B = np.abs(lin.B - B) / row_scale / column_scale
-    inputs = Actuation(state).groups
-    of_point = speeds(state, lin.v), _largest(state.chart(lin.q).J)
+    groups, inputs = state.groups._asdict(), actuation.groups
+    errors, errors_B = _blocks(difference_A, groups, groups), _blocks(difference_B, groups, inputs)
+    if errors.any():
+        terms = _cancelling_terms(state, lin, mobility, input_mobility)
+        sizes = np.maximum(_blocks(scaled_A, groups, groups), terms)
+        errors /= np.where(sizes > 0.0, sizes, 1.0)
+    every = ("A", groups, errors.tolist()), ("B", inputs, errors_B.tolist())
+    return [
+        Block(matrix, row, column, error)
+        for i, row in enumerate(groups)
+        for matrix, columns, found in every
+        for column, error in zip(columns, found[i], strict=True)
+    ]
 
-    groups = state.groups._asdict()
-    blocks = []
-    for row, rows in groups.items():
-        for column, columns in groups.items():
-            error = _largest(difference_A[rows, columns])
-            if error:
-                scales = mobility, input_mobility, *of_point
-                cancelling = _cancelling_terms(state, lin, scales, row, column)
-                error /= max(_largest(scaled_A[rows, columns]), cancelling) or 1.0
-            blocks.append(Block("A", row, column, error))
-        for column, columns in inputs.items():
-            blocks.append(Block("B", row, column, _largest(difference_B[rows, columns])))
-    return blocks
+
+def _blocks(matrix: Array, rows: dict[str, Any], columns: dict[str, Any]) -> Array:
+    """Return the largest entry of each block, none being negative; zero of an empty one."""
+    largest = np.array([matrix[each].max(axis=0, initial=0.0) for each in rows.values()])
+    found = [largest[:, each].max(axis=1, initial=0.0) for each in columns.values()]
+    return np.array(found).reshape(len(columns), len(rows)).T
 
 
 def mobilities(M: Array, B: Array) -> tuple[Array, Array]:
@@ -183,33 +191,30 @@ def mobilities(M: Array, B: Array) -> tuple[Array, Array]:
 
 
 def _cancelling_terms(
-    state: StateMap, lin: LinearModel, scales: tuple[Any, ...], row: str, column: str
-) -> float:
-    """Size of the terms that may cancel in a block of A, in its scaled units.
+    state: StateMap, lin: LinearModel, mobility: Array, input_mobility: Array
+) -> Array:
+    """Size (6, 6) of the terms that may cancel in a block of A, in its scaled units.
 
     The base's own velocity has no influence but in its own axes, and counts for what its
     rounding can do to Pinocchio's derivatives only.
     """
-    mobility, input_mobility, (speed, rate, momentum), steepest = scales
-    steepness = steepest if column == "q_b" else 1.0
+    speed, rate, momentum = speeds(state, lin.v)
     # What the momentum of wheels does to a turning link, in the units of the rows.
     spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
     still = speed.copy()
     still[LINEAR] *= _ROUNDING_SHARE
-    moving = {"omega_b", "v_b", "qdot_m"}
-    if row not in moving:
-        return 0.0 if column in moving else _largest(speed[:6]) * steepness
-    if column in moving:
-        # A unit of this velocity under the motion, and, where it turns, of the base's speed.
-        nu = state.groups._asdict()[column]
-        turning = rate * _largest(1.0 / mobility[nu.start - state.nx : nu.stop - state.nx or None])
-        turning += spin * (column != "v_b")
-        return max(turning, _largest(still[LINEAR] / mobility[LINEAR]) * (column != "v_b"))
+    resting = still / mobility
     accelerations = np.abs(lin.f0[-len(mobility) :]) / mobility
     forces = np.abs(lin.u0) * input_mobility
-    return steepness * (
-        _largest(accelerations) + _largest(forces) + rate * (_largest(still / mobility) + spin)
-    )
+    size = _largest(accelerations) + _largest(forces) + rate * (_largest(resting) + spin)
+    # A unit of a velocity under the motion, and, where it turns, of the base's speed.
+    unit = 1.0 / mobility
+    turning = rate * np.array([_largest(unit[part]) for part in (ANGULAR, LINEAR, slice(6, None))])
+    turning[[0, 2]] = np.maximum(turning[[0, 2]] + spin, _largest(resting[LINEAR]))
+    terms: Array = np.zeros((6, 6))
+    terms[:3, :3], terms[3:, :3], terms[3:, 3:] = _largest(speed[:6]), size, turning
+    terms[:, 0] *= _largest(state.chart(lin.q).J)
+    return terms
 
 
 def speeds(state: StateMap, v: Array) -> tuple[Array, float, float]:
@@ -229,9 +234,9 @@ def _largest(x: Array) -> float:
     return float(np.abs(x).max(initial=0.0))
 
 
-def inertia_matrix(robot: Robot, lin: LinearModel) -> Array:
+def inertia_matrix(robot: Robot, lin: LinearModel, state: StateMap | None = None) -> Array:
     """Return M (6 + n, 6 + n) of a linear model, in state order and in the frame's axes."""
-    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    state = state or StateMap(robot, reference=lin.reference, frame=lin.frame)
     M = state.project(pin.crba(robot.model, robot.create_data(), lin.q).T)
     chart = state.chart(lin.q)
     M = state.to_frame(chart, state.to_frame(chart, M).T).T

@@ -10,7 +10,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.tables import grid, width
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.aba import Aba
 from fflin.dynamics.outputs import Measuring, Sensing
 from fflin.dynamics.state import StateMap
 from fflin.linear.certificate import (
@@ -141,31 +141,35 @@ def check(robot: Robot, lin: LinearModel) -> Check:
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; check the continuous one")
-    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-    actuation, made = Actuation(state), f"the model is one of '{lin.robot}'"
+    return _checked(Aba(StateMap(robot, frame=lin.frame)), lin)
+
+
+def _checked(aba: Aba, lin: LinearModel) -> Check:
+    robot, state, actuation = aba.state.robot, aba.state.about(lin.reference), aba.actuation
+    made = f"the model is one of '{lin.robot}'"
     states, inputs = (lin.state_names, lin.state_units), (lin.input_names, lin.input_units)
     require_same(made, robot, "state", states, (state.names, state.units))
     require_same(made, robot, "input", inputs, (actuation.names, actuation.units))
     q, v = robot.checked_configuration(lin.q), robot.checked_velocity(lin.v)
-    M = inertia_matrix(robot, lin)
+    M = inertia_matrix(robot, lin, state)
     condition = scaled_condition(M)
     route = min(max(_ROUTE_TOLERANCE, _ROUTE_ROUNDING * condition), _LOOSEST)
     difference = min(max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition), _LOOSEST)
-    model = (ErrorDynamics if lin.moving else Nonlinear)(state, lin)
-    A, B, inverse = aba_route(state, q, v, lin.u0, moving=lin.moving)
+    model = (ErrorDynamics if lin.moving else Nonlinear)(state, lin, aba)
+    A, B, inverse = aba_route(state, aba, q, v, lin.u0, moving=lin.moving)
     # Links far apart cost ABA digits that M keeps; what its inverse of M lacks, its route lacks.
     own_error = inertia_residual(_in_base_axes(state, M, q), inverse)
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
     rows = [
         Row("ABA derivatives", f"{b.matrix}[{b.row}, {b.column}]", b.error, by_aba)
-        for b in compare(state, lin, M, A, B)
+        for b in compare(state, actuation, lin, M, A, B)
     ]
     rows += [
         Row("differences", f"{b.matrix}[{b.row}, {b.column}]", b.error, difference)
-        for b in compare(state, lin, M, *_differences(model, lin, M))
+        for b in compare(state, actuation, lin, M, *_differences(model, lin, M))
     ]
     rows += _output_rows(model, lin, M, difference)
-    rows.append(Row("flow", "f", flow_error(robot, lin), difference))
+    rows.append(Row("flow", "f", flow_error(model, lin), difference))
     rows += [Row("point", name, error, route) for name, error in _point_errors(model, lin, M, q, v)]
     rows.append(Row("inertia", "M", _relative(lin.M, M, floor=0.0), route))
     inverse = inverse_inertia(state, lin)
@@ -179,8 +183,10 @@ def check(robot: Robot, lin: LinearModel) -> Check:
 def check_all(robot: Robot, models: Iterable[LinearModel], title: str) -> Check:
     """Check many models; of each figure the one that is nearest to its tolerance, or beyond it."""
     worst: dict[tuple[str, str], Row] = {}
+    aba: Aba | None = None
     for lin in models:
-        for row in check(robot, lin).rows:
+        aba = aba or Aba(StateMap(robot, frame=lin.frame))
+        for row in _checked(aba, lin).rows:
             before = worst.setdefault((row.test, row.block), row)
             if not row.error * before.tolerance <= before.error * row.tolerance:
                 worst[row.test, row.block] = row
@@ -219,10 +225,10 @@ def _differences(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, A
     step, push = difference_steps(model.state, lin, M)
     bends = np.arange(len(step)) < len(step) - len(M)
     bends[model.state.groups.r_b] = False
-    A = jacobian(lambda x: model.rates(x, np.tile(lin.u0, (len(x), 1))), lin.x0, step, bends)
-    straight = np.zeros(len(push), dtype=bool)
-    B = jacobian(lambda u: model.rates(np.tile(lin.x0, (len(u), 1)), u), lin.u0, push, straight)
-    return A, B
+    nx, point = len(step), np.concatenate((lin.x0, lin.u0))
+    steps, bends = np.concatenate((step, push)), np.concatenate((bends, push < 0.0))
+    slopes = jacobian(lambda rows: model.rates(rows[:, :nx], rows[:, nx:]), point, steps, bends)
+    return slopes[:, :nx], slopes[:, nx:]
 
 
 def _output_rows(model: Nonlinear, lin: LinearModel, M: Array, tolerance: float) -> list[Row]:

@@ -69,7 +69,7 @@ class Flow:
         groups = [[0, 1, 2], [3, 4, 5], *([each] for each in alone), *([others] if others else [])]
         speed, push = (
             np.abs(v).max(axis=0),
-            np.abs([self._rate(*each) for each in knots]).max(axis=0),
+            np.abs([self.rate(*each) for each in knots]).max(axis=0),
         )
         for group in groups:
             speed[group], push[group] = (x[group].max() or 1.0 for x in (speed, push))
@@ -84,10 +84,10 @@ class Flow:
         with np.errstate(all="ignore"):
             for k, h in enumerate(np.diff(t)):
                 steps = max(1, steps // 4)
-                end = self._end(k, steps, q[k], v[k])
+                end = self.end(k, steps, q[k], v[k])
                 while steps < _MOST_STEPS:
                     before, steps = end, 2 * steps
-                    end = self._end(k, steps, q[k], v[k])
+                    end = self.end(k, steps, q[k], v[k])
                     if (
                         size(
                             pin.difference(self._model, *(before[0], end[0])), end[1] - before[1], h
@@ -100,13 +100,13 @@ class Flow:
                 )
         return np.where(np.isfinite(found), found, np.inf)
 
-    def _end(self, k: int, steps: int, q: Array, v: Array) -> tuple[Array, Array]:
+    def end(self, k: int, steps: int, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and v at the end of an interval by steps of CF4 (11.1) from q and v on."""
         start, h = self._t[k], self._t[k + 1] - self._t[k]
         method = CommutatorFree4(self._model, h / steps)
         for step in range(steps):
             q, v = method.step(
-                lambda t, q, v: self._rate(q, v, self._input(k, (t - start) / h)),
+                lambda t, q, v: self.rate(q, v, self._input(k, (t - start) / h)),
                 start + step * method.dt,
                 q,
                 v,
@@ -131,17 +131,18 @@ class Flow:
     def _in_base_axes(self, q: Array, u: Array) -> Array:
         return self._aba.actuation.rows_in_base_axes(q[None], u[None])[0]
 
-    def _rate(self, q: Array, v: Array, u: Array) -> Array:
+    def rate(self, q: Array, v: Array, u: Array) -> Array:
+        """Return dv/dt (nv,) under inputs in the frame's axes."""
         return self._aba.acceleration(q, v, self._in_base_axes(q, u)).copy()
 
     @cached_property
     def cubics(self) -> tuple[Array, Array]:
         """Coefficients (N - 1, 4, nv) of the way in the tangent at the first knot, and of v."""
         q, v, h = self._q, self._v, np.diff(self._t)[:, None]
-        begin = np.array([self._rate(*each) for each in zip(q, v, self._u, strict=True)])
+        begin = np.array([self.rate(*each) for each in zip(q, v, self._u, strict=True)])
         end = begin[1:]
         if self._held:
-            end = np.array([self._rate(*each) for each in zip(q[1:], v[1:], self._u, strict=False)])
+            end = np.array([self.rate(*each) for each in zip(q[1:], v[1:], self._u, strict=False)])
         way = np.array([pin.difference(self._model, *pair) for pair in pairwise(q)])
         wheels = [joint.idx_v for joint in self._aba.state.robot.joints if joint.unbounded]
         # The knots have a fast wheel's angle only within a turn; its speed says how many turns.
@@ -163,7 +164,7 @@ def placed(t: Array, time: float) -> tuple[int, float]:
     A knot belongs to the interval that begins there, as do times that only rounding keeps from it.
     """
     last = len(t) - 2
-    k = max(0, min(int(np.searchsorted(t, time, side="right")) - 1, last))
+    k = max(0, min(int(t.searchsorted(time, "right")) - 1, last))
     share = float((time - t[k]) / (t[k + 1] - t[k]))
     if share > 1.0 - _NEAR and k < last:
         return k + 1, 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
 from fflin.linear.flow import placed
 from fflin.linear.linearization import Linearizer
 from fflin.linear.model import LinearModel
@@ -61,30 +63,47 @@ class LinearTrajectory(Trajectory):
         if self.state_names != self._state.names:
             raise InputError(f"it is no model of '{self.robot.name}' as it is given")
 
+    @property
+    def input_units(self) -> tuple[str, ...]:
+        """Of the nu inputs."""
+        return Actuation(self._state).units
+
     def __len__(self) -> int:
         return len(self.A)
 
     def __getitem__(self, index: int) -> LinearModel:
         """Return the linear model at a knot."""
-        return self._model(Linearizer(self.robot, moving=True), range(len(self))[index])
+        return self._model(range(len(self))[index])
 
     def __iter__(self) -> Iterator[LinearModel]:
-        linearizer = Linearizer(self.robot, moving=True)
-        return (self._model(linearizer, k) for k in range(len(self)))
+        return map(self._model, range(len(self)))
 
-    def _model(self, linearizer: Linearizer, k: int) -> LinearModel:
-        lin = linearizer(self.q[k], self.v[k], self.u_base[k])
+    def _model(self, k: int) -> LinearModel:
+        lin = self._linearizer(self.q[k], self.v[k], self.u_base[k])
         own = {name: getattr(self, name)[k] for name in "ABCD"}
         lin = lin.discretize(self.dt) if self.dt else lin
         return replace(lin, **own, y0=self.y[k], verified=self.verified)
 
+    @cached_property
+    def _linearizer(self) -> Linearizer:
+        return Linearizer(self.robot, moving=True)
+
     def matrices(self, t: float) -> tuple[Array, Array]:
-        """Return A (nx, nx) and B (nx, nu) at a time, linear between the knots or held."""
+        """Return A (nx, nx) and B (nx, nu) at a time; between the knots those of `point`."""
+        t = self._within(t)
+        k, share = placed(self.t, t)
+        if self.dt or share in (0.0, 1.0):
+            k += int(share) if not self.dt else 0
+            return self.A[k], self.B[k]
+        lin = self._linearizer(*self.flow.at(t))
+        return lin.A, lin.B
+
+    def between(self, t: float, *arrays: Array) -> tuple[Array, ...]:
+        """Return what arrays of the knots are at a time, linear between the knots or held."""
         k, share = placed(self.t, self._within(t))
         if self.dt or not share:
-            return self.A[k], self.B[k]
-        A, B = ((1.0 - share) * each[k] + share * each[k + 1] for each in (self.A, self.B))
-        return A, B
+            return tuple(each[k] for each in arrays)
+        return tuple(each[k] + share * (each[k + 1] - each[k]) for each in arrays)
 
     def check(self) -> Check:
         """Check every knot as `fflin.check` does: the worst of each figure."""
@@ -111,7 +130,7 @@ class LinearTrajectory(Trajectory):
         """
         if self.dt:
             raise InputError(f"the model is sampled already, at dt = {self.dt:g} s")
-        found = np.array([transition for _, transition in transitions(self, dt)])
+        found = np.array([transition for _, transition in transitions(self, self.matrices, dt)])
         nx, models = len(self.state_names), along(self.resampled(dt))
         return replace(models, A=found[:, :nx, :nx], B=found[:, :nx, nx:], dt=float(dt))
 

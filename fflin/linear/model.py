@@ -320,19 +320,7 @@ class LinearModel(FrozenArrays):
             If the robot's model was changed after it was made.
         """
         self.require_unchanged()
-        try:
-            import control
-        except ImportError:
-            raise MissingPackageError(
-                "to_control needs python-control; install it with: pip install 'fflin[control]'"
-            ) from None
-        # python-control reserves dots in signal names for its own system.signal syntax.
-        return control.ss(
-            *(self.A, self.B, self.C, self.D, self.dt),
-            states=[name.replace(".", "_") for name in self.state_names],
-            inputs=[name.replace(".", "_") for name in self.input_names],
-            outputs=[name.replace(".", "_") for name in self.output_names],
-        )
+        return state_space(self, self.D)
 
     def save(self, path: str | Path) -> None:
         """Write the model and its certificate, whole or not at all.
@@ -369,6 +357,22 @@ class LinearModel(FrozenArrays):
         values, certificate = read_model(as_path(path))
         lin = LinearModel(**values, _certify=partial(given, Certificate(**certificate)))
         return replace(lin, _certify=partial(same_certificate, lin, lin.fingerprint))
+
+
+def state_space(of: Any, D: Array) -> Any:
+    """Return a `control.StateSpace` of what has A, B, C, dt and names of signals."""
+    try:
+        import control
+    except ImportError:
+        raise MissingPackageError(
+            "to_control needs python-control; install it with: pip install 'fflin[control]'"
+        ) from None
+    # python-control reserves dots in signal names for its own system.signal syntax.
+    names = {
+        f"{kind}s": [name.replace(".", "_") for name in getattr(of, f"{kind}_names")]
+        for kind in ("state", "input", "output")
+    }
+    return control.ss(of.A, of.B, of.C, D, of.dt, **names)
 
 
 def _same_M(continuous: LinearModel, _: LinearModel) -> Array:

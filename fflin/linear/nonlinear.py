@@ -1,7 +1,7 @@
 """The nonlinear model in the chart, its slopes by differences, and the flow that it must follow."""
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,9 @@ from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.chart import Chart, times
 from fflin.dynamics.state import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR, StateMap
-from fflin.dynamics.state_rows import moving_error
+from fflin.dynamics.state_rows import moving_errors, state_history
 from fflin.linear.certificate import mobilities
 from fflin.linear.model import LinearModel
-from fflin.robot.robot import Robot
 
 # Where the base flies faster than this [m/s], the rounding of its speed would hide the rest.
 _FAST = 100.0
@@ -32,9 +31,9 @@ class Nonlinear:
     constant velocity: they are the same, v_b's rate but for the turning of the base's axes.
     """
 
-    def __init__(self, state: StateMap, lin: LinearModel) -> None:
+    def __init__(self, state: StateMap, lin: LinearModel, aba: Aba | None = None) -> None:
         self.state = state
-        self.aba = Aba(state)
+        self.aba = aba or Aba(state)
         observer = rotation_matrix(lin.q[3:7]) @ lin.v[PIN_LINEAR]
         self._observer = observer if np.linalg.norm(observer) > _FAST else np.zeros(3)
 
@@ -55,11 +54,11 @@ class Nonlinear:
         a[:, PIN_LINEAR] -= times(skew(v[:, PIN_ANGULAR]), observer)
         return chart, q, v, a
 
-    def passing(self, x: Array, motion: Sequence[Array], t: float) -> Array:
-        """Return the state a time t after x on a motion that has (q, v, a) there."""
-        q, v, a = motion
-        after = pin.integrate(self.state.robot.model, q, t * v)
-        return self.state.to_state(after, v + t * a, near=x)
+    def passing(self, x: Array, q: Array, v: Array, a: Array, t: Array) -> Array:
+        """Return the states (N, nx) a time t (N, 1) after rows of q, v and a, near the state x."""
+        model = self.state.robot.model
+        after = np.array([pin.integrate(model, *each) for each in zip(q, t * v, strict=True)])
+        return state_history(self.state, after, v + t * a, x)
 
     def __call__(self, x: Array, u: Array) -> Array:
         """Return dx/dt (nx,)."""
@@ -67,8 +66,10 @@ class Nonlinear:
 
     def rates(self, x: Array, u: Array) -> Array:
         """Return dx/dt (N, nx) of rows x (N, nx) and u (N, nu)."""
+        return self._rates(x, *self._accelerations(x, u))
+
+    def _rates(self, x: Array, chart: Chart, q: Array, v: Array, a: Array) -> Array:
         state = self.state
-        chart, _, v, a = self._accelerations(x, u)
         linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
         rate = state.velocities(a)
         if state.axes[1]:
@@ -87,24 +88,22 @@ class ErrorDynamics(Nonlinear):
     with r = R*^T (p - p*): rdot = R_e v - v* - w* x r.
     """
 
-    def __init__(self, state: StateMap, lin: LinearModel) -> None:
-        super().__init__(state, lin)
+    def __init__(self, state: StateMap, lin: LinearModel, aba: Aba | None = None) -> None:
+        super().__init__(state, lin, aba)
         self._q, self._v = lin.q.copy(), lin.v
         self._q[:3] = 0.0
         self._a = state.velocities(self.acceleration(lin.x0, lin.u0)[2])
 
-    def passing(self, x: Array, motion: Sequence[Array], t: float) -> Array:
-        """Return the error when reference and robot, at x, have both moved on for a time t."""
-        model, (q, v, a) = self.state.robot.model, motion
-        ahead = pin.integrate(model, self._q, t * self._v), self._v
-        error = moving_error(self.state, *ahead, pin.integrate(model, q, t * v), v + t * a)
-        error[-len(self._a) :] -= t * self._a
-        return error
+    def passing(self, x: Array, q: Array, v: Array, a: Array, t: Array) -> Array:
+        """Return the errors when reference and robot have both moved on for a time t."""
+        at, still = np.tile(self._q, (len(t), 1)), np.zeros_like(a)
+        ahead = super().passing(x, at, np.tile(self._v, (len(t), 1)), still, t)
+        errors = moving_errors("local", super().passing(x, q, v, a, t), ahead)
+        errors[:, -len(self._a) :] -= t * self._a
+        return errors
 
-    def rates(self, x: Array, u: Array) -> Array:
-        """Return the rates of the error (N, nx) of rows."""
+    def _rates(self, x: Array, chart: Chart, q: Array, v: Array, a: Array) -> Array:
         state = self.state
-        chart, _, v, a = self._accelerations(x, u)
         linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
         at_linear, at_angular = self._v[PIN_LINEAR], self._v[PIN_ANGULAR]
         turning = chart.q0 * (angular - at_angular)
@@ -145,34 +144,26 @@ def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array
     return step, push
 
 
-def _derivative(f: Callable[[float], Array], h: float) -> Array:
-    """Return df/dt at 0 by differences at t = -3 h ... 3 h."""
-    differences = [f(k * h) - f(-k * h) for k in range(1, 1 + len(_WEIGHTS))]
-    return np.tensordot(_WEIGHTS, differences, axes=1) / h
-
-
-def flow_error(robot: Robot, lin: LinearModel) -> float:
+def flow_error(model: Nonlinear, lin: LinearModel) -> float:
     """How far f is from the rate of the state along motions of the robot.
 
     The motions pass the point with its own velocity and with a unit of each base velocity added.
     They pass it at the origin, since a step would drown in the digits of a distant place.
     """
-    turned = pin.SE3(lin.reference.rotation, np.zeros(3))
-    state = StateMap(robot, reference=turned, frame=lin.frame)
-    model = (ErrorDynamics if lin.moving else Nonlinear)(state, lin)
+    model = copy(model)
+    model.state = state = model.state.about(pin.SE3(lin.reference.rotation, np.zeros(3)))
     x = np.tile(lin.x0, (7, 1))
     x[:, state.groups.r_b] = 0.0
-    x[1:, 6 + robot.n : 12 + robot.n] += np.eye(6)
+    x[1:, 6 + state.robot.n : 12 + state.robot.n] += np.eye(6)
     u = np.tile(lin.u0, (7, 1))
-    chart, *motions = model._accelerations(x, u)
-    worst = 0.0
-    for at, q0, expected, *motion in zip(
-        x, np.asarray(chart.q0), model.rates(x, u), *motions, strict=True
-    ):
-        v = motion[1]
-        h = 1e-2 * float(q0[0]) / (1.0 + float(np.abs(v[3:]).max()))
-        rate = _derivative(partial(model.passing, at, motion), h)
-        floor = 1.0 + float(np.abs(v).max())
-        scale = max(floor, float(np.abs(expected).max()))
-        worst = max(worst, float(np.abs(expected - rate).max()) / scale)
-    return worst
+    chart, q, v, a = model._accelerations(x, u)
+    expected = model._rates(x, chart, q, v, a)
+    # Differences at t = -3 h ... 3 h.
+    h = 1e-2 * chart.q0 / (1.0 + np.abs(v[:, 3:]).max(axis=1, keepdims=True))
+    ways = np.concatenate([k * h for k in (1, 2, 3, -1, -2, -3)])
+    q, v_there, a = (np.tile(each, (6, 1)) for each in (q, v, a))
+    after = model.passing(x[0], q, v_there, a, ways)
+    ahead, behind = after.reshape(2, 3, *x.shape)
+    rates = np.tensordot(_WEIGHTS, ahead - behind, axes=1) / h
+    floor, size = 1.0 + np.abs(v).max(axis=1), np.abs(expected).max(axis=1)
+    return float((np.abs(expected - rates).max(axis=1) / np.maximum(floor, size)).max())

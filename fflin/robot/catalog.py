@@ -13,27 +13,13 @@ _PRUNED = {"talos_legs": ("torso_1_joint",)}
 
 @dataclass(frozen=True)
 class RobotFile:
-    """Where a robot's description lies.
+    """Where a robot's description lies."""
 
-    Attributes
-    ----------
-    name : str
-        Name that `load` takes.
-    path : Path
-        The URDF.
-    origin : str
-        "fflin", "example-robot-data" or "file".
-    package_dirs : tuple of Path
-        Folders in which ``package://`` paths of meshes are looked up.
-    prune : tuple of str
-        Joints that are cut off with all that hangs on them.
-    """
-
-    name: str
-    path: Path
-    origin: str
-    package_dirs: tuple[Path, ...] = ()
-    prune: tuple[str, ...] = ()
+    name: str  # that `load` takes
+    path: Path  # of the URDF
+    origin: str  # "fflin", "example-robot-data" or "file"
+    package_dirs: tuple[Path, ...] = ()  # where ``package://`` paths of meshes are looked up
+    prune: tuple[str, ...] = ()  # joints that are cut off with all that hangs on them
 
 
 @cache
@@ -57,17 +43,11 @@ def _example_robot_data() -> dict[str, RobotFile]:
 
     found = {}
     for name, loader in ROBOTS.items():
-        if not loader.urdf_filename:
-            continue
-        inner = Path(loader.path, loader.urdf_subpath, loader.urdf_filename)
-        root = Path(getModelPath(str(inner))).resolve()
-        found[name] = RobotFile(
-            name,
-            root / inner,
-            "example-robot-data",
-            (root.parents[1], root.parent),
-            _PRUNED.get(name, ()),
-        )
+        if loader.urdf_filename:
+            inner = Path(loader.path, loader.urdf_subpath, loader.urdf_filename)
+            root = Path(getModelPath(str(inner))).resolve()
+            folders, prune = (root.parents[1], root.parent), _PRUNED.get(name, ())
+            found[name] = RobotFile(name, root / inner, "example-robot-data", folders, prune)
     return found
 
 
@@ -82,29 +62,10 @@ def list_robots() -> tuple[str, ...]:
 
 
 def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
-    """Find the description of a robot by its name or by the path of its URDF.
+    """Find the description of a robot by its name or by a path, relative to the folder.
 
-    A bundled name comes first, then a path that exists, then a name of example-robot-data.
-
-    Parameters
-    ----------
-    robot : str or Path
-        Name or path, of a URDF or of a robot file; ``servicer_7dof.toml`` is a bundled one.
-    folder : str or Path
-        What the path is relative to.
-
-    Returns
-    -------
-    RobotFile
-
-    Raises
-    ------
-    UnknownNameError
-        If it is neither a known name nor looks like a path.
-    FileError
-        If it looks like a path and nothing is there.
-    UrdfError
-        If the robot is known but has no URDF.
+    A bundled name comes first, then the path of a URDF or of a robot file that exists
+    (``servicer_7dof.toml`` is a bundled one), then a name of example-robot-data.
     """
     if not isinstance(robot, str | os.PathLike):
         raise InputError(f"robot is a {type(robot).__name__}, expected a name or a path")
@@ -129,24 +90,7 @@ def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
 
 
 def find_inputs(inputs: str | Path) -> Path:
-    """Find a file of inputs by its path, or the bundled one by its robot's name.
-
-    Parameters
-    ----------
-    inputs : str or Path
-        Name or path; a bundled name comes first.
-
-    Returns
-    -------
-    Path
-
-    Raises
-    ------
-    InputError
-        If it is no path.
-    UnknownNameError
-        If it is a bare name, neither of a bundled file nor of one that exists.
-    """
+    """Find a file of inputs by the name of the bundled one's robot, else by its path."""
     if not isinstance(inputs, str | os.PathLike) or "\0" in str(inputs):
         raise InputError(f"{inputs!r} is not the path of a file of inputs")
     if not str(inputs):

@@ -28,14 +28,9 @@ _SWING, _DAMPED = math.pi, 0.01
 
 
 def draft(robot: Robot, urdf: str) -> str:
-    """Return the text of a robot file.
+    """Return the text of a robot file of a robot that is as its URDF is, with nothing said of it.
 
-    Parameters
-    ----------
-    robot : Robot
-        As its URDF is, with nothing said of it.
-    urdf : str
-        What the file names the URDF by.
+    `urdf` is what the file names the URDF by.
     """
     model = robot.model
     idle = [joint for joint in robot.joints if model.effortLimit[joint.idx_v] == 0.0]
@@ -62,7 +57,7 @@ def draft(robot: Robot, urdf: str) -> str:
         urdf=_text(urdf),
         joint=_text(robot.joint_names[0] if robot.n else "joint_1"),
         passive=passive if names else "",
-        candidates="".join(map(_candidate, [robot] * model.nframes, range(model.nframes))),
+        candidates="".join(_candidate(robot, index) for index in range(model.nframes)),
         damping=_lines("", {name: f"{value:.6g}" for name, value in damping.items()}),
         stiffness=_lines("", {name: f"{size * _SWING**2:.6g}" for name, size in inertia.items()}),
         limits=_lines("# ", limits),
@@ -79,7 +74,9 @@ def _candidate(robot: Robot, index: int) -> str:
     kind = next((kind for kind, look in _LOOKS.items() if look.search(frame.name)), "")
     if not kind or frame.type != pin.FrameType.BODY or frame.parentJoint < ROOT:
         return ""
-    placement = pin.updateFramePlacement(model, _placed(robot), index)
+    data = robot.create_data()
+    pin.forwardKinematics(model, data, robot.neutral())
+    placement = pin.updateFramePlacement(model, data, index)
     axis, name, inertia = np.array([0.0, 0.0, 1.0]), frame.name, ""
     if kind == "reaction_wheel":
         name += "_rotor"  # which may be a joint's, whose name no frame has
@@ -99,12 +96,6 @@ def _candidate(robot: Robot, index: int) -> str:
         f'# [[input]]\n# type = "{kind}"\n# name = {_text(name)}\n# frame = {_text(frame.name)}\n'
         f"{position}# {key} = {_vector(axis)}\n{inertia}"
     )
-
-
-def _placed(robot: Robot) -> pin.Data:
-    data = robot.create_data()
-    pin.forwardKinematics(robot.model, data, robot.neutral())
-    return data
 
 
 def _vector(values: np.ndarray) -> str:

@@ -1,12 +1,12 @@
-"""What of a robot its user may set: inputs, passive joints, gravity; checked once."""
+"""What of a robot its user may set: inputs, passive joints, gravity, its start; checked once."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias
 
-from fflin.base.errors import InputError, ModelError, UnknownNameError, unknown
-from fflin.base.names import by_name, joints_by_name, matching
+from fflin.base.errors import InputError, ModelError, unknown
+from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
 from fflin.base.validation import dimension, number
 from fflin.robot.inputs import (
     KINDS,
@@ -19,43 +19,36 @@ from fflin.robot.inputs import (
     named_wheels,
     three_numbers,
 )
-from fflin.robot.joints import Joint
+from fflin.robot.joints import Find, by_joint
 from fflin.robot.outputs import Output
-from fflin.robot.signals import input_keys_of, state_keys
 
 # The least and the largest value; infinite where there is no limit.
 Range: TypeAlias = tuple[float, float]
 
 _OF_JOINTS = ("q_m", "qdot_m")
 
+# In the order in which a robot file gives them: names of inputs are known after the inputs.
 FIELDS = (
-    *("inputs", "outputs", "stiffness", "damping", "rest", "gravity", "limits"),
-    *("passive", "weights", "start"),
+    *("passive", "inputs", "outputs", "stiffness", "damping", "rest", "gravity"),
+    *("limits", "weights", "start"),
 )
+RULES = ("urdf", "identity")
+_START = ("joints", "rpy", "position", "velocity")
+_WEIGHTS = ("rule", "q", "r", "bryson")
 
 
-def validated_fields(
+def checked_fields(
     fields: Mapping[str, Any],
-    find: Callable[[str], Joint],
+    find: Find,
     joints: Sequence[str],
+    own: Sequence[str],
+    inputs: Sequence[Input],
     urdf_damping: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Return the fields as a robot holds them.
+    """Return fields, as `Robot.replace` takes them but for passive and inputs, as a robot has them.
 
-    Parameters
-    ----------
-    fields : mapping
-        As `Robot.replace` takes them, but for inputs and limits.
-    find : callable
-        Returns the joint of a name or raises.
-    joints : sequence of str
-        What one value for all stands for.
-    urdf_damping : mapping
-        What damping="urdf" stands for.
-
-    Returns
-    -------
-    dict
+    `own` are the joints that are no wheels, which one value for all stands for, and `urdf_damping`
+    is what damping="urdf" stands for.
     """
     checked: dict[str, Any] = {}
     for name, value in fields.items():
@@ -70,19 +63,25 @@ def validated_fields(
             checked[name] = _outputs(value)
         elif name == "gravity":
             checked[name] = three_numbers("gravity", value)
+        elif name == "limits":
+            checked[name] = given_limits(inputs, joints, value)
+        elif name == "weights":
+            checked[name] = _weights(value, joints, inputs)
+        elif name == "start":
+            checked[name] = _start(value, find, joints)
         elif name == "damping" and isinstance(value, str):
             if value != "urdf":
                 raise InputError(f"damping is '{value}', expected 'urdf', a number or a mapping")
             checked[name] = dict(urdf_damping)
         else:
-            checked[name] = _by_joint(name, value, find, joints)
+            checked[name] = _by_joint(name, value, find, own)
     return checked
 
 
-def validated_inputs(
-    value: Any, find: Callable[[str], Joint], joints: Sequence[str], passive: Sequence[str]
+def checked_inputs(
+    value: Any, find: Find, joints: Sequence[str], passive: Sequence[str]
 ) -> tuple[Input, ...]:
-    """Return the inputs as a robot holds them; `find` returns the joint of a name or raises."""
+    """Return the inputs as a robot holds them."""
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise InputError(f"inputs is a {type(value).__name__}, expected a sequence of inputs")
     if not value:
@@ -105,16 +104,23 @@ def validated_inputs(
     return tuple(value)
 
 
-def _spread(
-    item: Input, find: Callable[[str], Joint], joints: Sequence[str], passive: Sequence[str]
-) -> list[Input]:
+def _spread(item: Input, find: Find, joints: Sequence[str], passive: Sequence[str]) -> list[Input]:
     """Return a joint torque for each joint with a motor that its name, or pattern, stands for."""
     if not isinstance(item, JointTorque):
         return [item]
-    found = joints_by_name("joint", {str(item.joint): None}, joints, lambda name: find(name).name)
+    found = by_joint({str(item.joint): None}, joints, find)
     if item.joint in found and item.joint in passive:
         raise InputError(f"joint '{item.joint}' is passive and has a joint torque; leave one out")
     return [replace(item, joint=name) for name in found if name not in passive]
+
+
+def _input_keys(inputs: Sequence[Input]) -> tuple[str, ...]:
+    """Return the names of the inputs, as `fflin.base.names.input_keys` has those of a model."""
+    return tuple(
+        name if name.startswith(f"{item.GROUP}.") else f"{item.GROUP}.{name}"
+        for item, names in named_inputs(inputs)
+        for name in names
+    )
 
 
 def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> dict[str, Range]:
@@ -123,30 +129,22 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> 
     Which is the largest magnitude of all inputs, or {name, group or pattern of inputs or states:
     largest magnitude, or (least, largest)}. A thruster never pulls.
     """
-    keys = input_keys_of(inputs)
-    names: list[str] = []
-    floors: list[float] = []
-    for item, own in named_inputs(inputs):
-        names += own
-        floors += [-math.inf if item.PULLS else 0.0] * len(own)
+    keys, states, named = _input_keys(inputs), state_keys(joints), named_inputs(inputs)
+    names = [*(name for _, own in named for name in own), *states]
+    pushing = {name for item, own in named if not item.PULLS for name in own}
     if not isinstance(given, Mapping):
         given = dict.fromkeys(dict.fromkeys(item.GROUP for item in inputs), given)
     ranges = {str(key): _range(key, value) for key, value in given.items()}
-    of_states: dict[str, Range] = {}
-    for key in list(ranges):
-        try:
-            matching("input", key, keys)
-        except UnknownNameError:
-            of_states[key] = ranges.pop(key)
-    states = state_keys(joints)
-    names, floors = [*names, *states], floors + [-math.inf] * len(states)
+    of_inputs = {key: ranges[key] for key in ranges if stands_for_any(key, keys)}
+    of_states = {key: ranges[key] for key in ranges if key not in of_inputs}
     # The group of all joints leaves wheels out, whose speeds are of another size.
     wheels = {f"{group}.{name}" for group in _OF_JOINTS for name, _ in named_wheels(inputs)}
-    whole = {key: of_states.pop(key) for key in list(of_states) if key in _OF_JOINTS}
+    whole = {key: of_states.pop(key) for key in _OF_JOINTS if key in of_states}
     found = by_name("input or state", whole, (*keys, *states))
     found = {i: limits for i, limits in found.items() if names[i] not in wheels}
     found |= by_name("input or state", of_states, (*keys, *states))
-    found |= by_name("input", ranges, keys)
+    found |= by_name("input", of_inputs, keys)
+    floors = [0.0 if name in pushing else -math.inf for name in names]
     return {
         names[i]: (max(low, floors[i]), max(high, floors[i])) for i, (low, high) in found.items()
     }
@@ -161,9 +159,7 @@ def _outputs(value: Any) -> tuple[Output, ...]:
     return tuple(value)
 
 
-def _by_joint(
-    what: str, value: Any, find: Callable[[str], Joint], joints: Sequence[str]
-) -> dict[str, float]:
+def _by_joint(what: str, value: Any, find: Find, joints: Sequence[str]) -> dict[str, float]:
     if not isinstance(value, Mapping):
         if what == "rest":
             raise InputError(f"rest is {value!r}, expected a mapping {{joint: position}}")
@@ -172,7 +168,7 @@ def _by_joint(
     for name, entry in checked.items():
         if what != "rest" and entry < 0.0:
             raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")
-    return joints_by_name("joint", checked, joints, lambda name: find(name).name)
+    return by_joint(checked, joints, find)
 
 
 def _range(name: str, value: Any) -> Range:
@@ -186,3 +182,82 @@ def _range(name: str, value: Any) -> Range:
             f"limit of '{name}' is {value}, expected a magnitude of 0 or more, or (least, largest)"
         )
     return least, largest
+
+
+def _start(value: Any, find: Find, joints: Sequence[str]) -> dict[str, Any]:
+    """Return where a robot starts, with joints and rates by their full names."""
+    start = _parts("start", value, _START)
+    if "joints" in start:
+        values = _numbers("start of joint", "start joints", start["joints"])
+        start["joints"] = by_joint(values, joints, find)
+    for name in ("rpy", "position"):
+        if name in start:
+            start[name] = three_numbers(f"start {name}", start[name])
+    if "velocity" in start:
+        rates = _numbers("start velocity", "start velocity", start["velocity"])
+        start["velocity"] = rates_by_name(joints, rates)
+    return start
+
+
+def kept_start(start: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any]:
+    """Return of a start what is of these joints, of which some wheels are none."""
+    names = {*joints, *state_keys(joints)}
+    return {
+        part: {key: x for key, x in value.items() if key in names}
+        if isinstance(value, Mapping)
+        else value
+        for part, value in start.items()
+    }
+
+
+def _weights(value: Any, joints: Sequence[str], inputs: Sequence[Input]) -> dict[str, Any]:
+    """Return the weights of a robot's regulator, whose names are those of states and inputs."""
+    weights = _parts("weights", value, _WEIGHTS)
+    if str(weights.get("rule", RULES[0])) not in RULES:
+        raise unknown("rule of weights", weights["rule"], RULES)
+    states, keys = state_keys(joints), _input_keys(inputs)
+    parts = {
+        "q": ("state", states),
+        "r": ("input", keys),
+        "bryson": ("state or input", (*states, *keys)),
+    }
+    for part, (kind, names) in parts.items():
+        weights[part] = _numbers(f"{part} of", part, weights.get(part, {}))
+        for key, entry in weights[part].items():
+            matching(kind, key, names)
+            if entry < 0.0 or (part != "q" and not entry):
+                least = "0 or more" if part == "q" else "more than 0"
+                raise InputError(f"{part} of '{key}' is {entry:g}, expected {least}")
+    for key in weights["bryson"]:
+        if key in weights["q"] or key in weights["r"]:
+            raise InputError(f"'{key}' has a weight and a largest value; give either")
+    return {part: value for part, value in weights.items() if value}
+
+
+def checked_passive(
+    value: Any, find: Find, joints: Sequence[str], locked: Sequence[str]
+) -> tuple[str, ...]:
+    """Return the joints without a motor, in the order of the state."""
+    keys = [value] if isinstance(value, str) else value
+    if not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
+        raise InputError(f"passive is {value!r}, expected names of joints")
+    for key in keys:
+        if any(each.rpartition("=")[0] == key for each in locked):
+            raise InputError(f"joint '{key}' is locked and passive; leave one out")
+    found = by_joint(dict.fromkeys(keys), joints, find)
+    return tuple(name for name in joints if name in found)
+
+
+def _parts(what: str, value: Any, known: Sequence[str]) -> dict[str, Any]:
+    if not isinstance(value, Mapping):
+        raise InputError(f"{what} is {value!r}, expected a mapping of {', '.join(known)}")
+    for name in value:
+        if name not in known:
+            raise unknown(f"part of {what}", name, known)
+    return dict(value)
+
+
+def _numbers(what: str, part: str, value: Any) -> dict[str, float]:
+    if not isinstance(value, Mapping):
+        raise InputError(f"{part} is {value!r}, expected {{name: number}}")
+    return {name: number(f"{what} '{name}'", entry) for name, entry in value.items()}

@@ -1,5 +1,7 @@
 """Frames of a model by name."""
 
+from typing import NamedTuple
+
 import pinocchio as pin
 
 from fflin.base.errors import unknown
@@ -7,16 +9,18 @@ from fflin.base.errors import unknown
 ROOT = 1  # index of the free-flyer among Pinocchio's joints; 0 is the universe
 
 
+class Carried(NamedTuple):
+    """Where a frame is: the joint that carries it, and its placement on that joint."""
+
+    joint: int
+    placement: pin.SE3
+
+
 def frame_index(model: pin.Model, name: str) -> int:
-    """Return the index of a frame.
+    """Return the index of a frame of the robot; a link's comes before a joint's of that name.
 
-    Of frames that share the name, a link's comes first. Pinocchio's own look-up refuses a name
-    that a link and a joint share, and takes a link called universe for the world.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is none on the robot.
+    Pinocchio's own look-up refuses a name that a link and a joint share, and takes a link called
+    universe for the world.
     """
     frames = {i: f for i, f in enumerate(model.frames.tolist()) if f.parentJoint >= ROOT}
     # The comparison with an array would be one.
@@ -26,7 +30,9 @@ def frame_index(model: pin.Model, name: str) -> int:
     return next((i for i in found if frames[i].type == pin.FrameType.BODY), found[0])
 
 
-def find_frame(model: pin.Model, name: str) -> tuple[int, pin.SE3]:
-    """Return the joint that carries a frame, see `frame_index`, and its placement there."""
+def find_frame(model: pin.Model, name: str | None) -> Carried:
+    """Return where a frame is, see `frame_index`; the base's root frame where none is named."""
+    if name is None:
+        return Carried(ROOT, pin.SE3.Identity())
     frame = model.frames[frame_index(model, name)]
-    return frame.parentJoint, pin.SE3(frame.placement)
+    return Carried(frame.parentJoint, pin.SE3(frame.placement))

@@ -8,6 +8,7 @@ from typing import Any
 from fflin.base.errors import InputError, unknown
 from fflin.base.toml_file import TomlFile
 from fflin.robot.catalog import find_inputs
+from fflin.robot.fields import FIELDS
 from fflin.robot.inputs import KINDS, Input
 
 _TYPES = {kind.KEY: kind for kind in KINDS}
@@ -15,10 +16,7 @@ _VECTORS = ("position", "direction", "axis")
 _NUMBERS = ("inertia", "momentum", "max", "min", "max_speed", "least_impulse")
 
 # The keys of a robot file; one that has no `urdf` holds inputs alone.
-ROBOT_KEYS = (
-    *("urdf", "package_dirs", "gravity", "lock", "passive", "input", "outputs"),
-    *("stiffness", "damping", "rest", "limits", "weights", "start"),
-)
+ROBOT_KEYS = ("urdf", "package_dirs", "lock", "input", *(x for x in FIELDS if x != "inputs"))
 
 
 def load_inputs(path: str | Path) -> tuple[Input, ...]:
@@ -110,11 +108,7 @@ def read_inputs(document: TomlFile) -> tuple[Input, ...]:
     seen: dict[Input | str | None, int] = {}
     for index, table in enumerate(tables):
         item = _input(document, index, table)
-        what = (
-            getattr(item, "name", "")
-            if hasattr(item, "name")
-            else replace(item, min=None, max=None)
-        )
+        what = item.name if hasattr(item, "name") else replace(item, min=None, max=None)
         if what is not None and what in seen:
             shown = f"the name '{what}'" if isinstance(what, str) else what
             first = document.line("input", seen[what])

@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -17,28 +17,17 @@ Vector3: TypeAlias = Sequence[float]
 
 @dataclass(frozen=True)
 class Input:
-    """What every kind of input says of itself.
+    """What every kind of input says of itself."""
 
-    Attributes
-    ----------
-    KEY : str
-        Its type in a TOML file.
-    GROUP : str
-        What its inputs are called together, in weights and limits.
-    UNIT : str
-    max : float, optional
-        What it does not exceed, in its unit; one number, or three for torque and force on the base.
-    min : float, optional
-        The least that it gives; by default -max, of a thruster 0.
-    """
-
-    KEY: ClassVar[str]
-    GROUP: ClassVar[str]
+    KEY: ClassVar[str]  # its type in a TOML file
+    GROUP: ClassVar[str]  # what its inputs are called together, in weights and limits
     UNIT: ClassVar[str] = "N m"
     ENTRIES: ClassVar[str] = " "
     PULLS: ClassVar[bool] = True
 
+    # What it does not exceed, in its unit; one number, or three for torque and force on the base.
     max: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
+    # The least that it gives; by default -max, of a thruster 0.
     min: float | Vector3 | None = field(default=None, kw_only=True, repr=False)
 
     def __post_init__(self) -> None:
@@ -46,13 +35,15 @@ class Input:
             value, what = getattr(self, name), f"{self.KEY} {name}"
             if value is not None:
                 several = len(self.ENTRIES) > 1 and dimension(what, value)
-                limit = three_numbers(what, value) if several else number(what, value)
-                object.__setattr__(self, name, limit)
+                self._set(name, three_numbers(what, value) if several else number(what, value))
         for least, largest in self.ranges:
             if largest <= 0.0:
                 raise InputError(f"{self.KEY} max is {largest:g}, expected more than 0, or none")
             if least > largest:
                 raise InputError(f"{self.KEY} min is {least:g}, more than its max of {largest:g}")
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
@@ -65,7 +56,8 @@ class Input:
     @property
     def frames(self) -> tuple[str, ...]:
         """The frames of the model that it is fixed in."""
-        return ()
+        frame: str | None = getattr(self, "frame", None)
+        return () if frame is None else (frame,)
 
     def names(self, count: int) -> tuple[str, ...]:
         """Return the names of its entries in u, where it is the count-th of its kind."""
@@ -73,21 +65,10 @@ class Input:
 
 
 class WrenchInput(Input, ABC):
-    """An input that pushes or turns a link by a wrench that is constant in a frame.
+    """An input that pushes or turns a link by a wrench that is constant in a frame."""
 
-    Attributes
-    ----------
-    frame : str or None
-        Frame of the model, on the base or on any link; None is the base's root frame.
-    """
-
-    frame: str | None
+    frame: str | None  # of the model, on the base or on any link; None is the base's root frame
     name: str | None
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """The frames of the model that it is fixed in."""
-        return () if self.frame is None else (self.frame,)
 
     def names(self, count: int) -> tuple[str, ...]:
         """Return its name in u; thruster_1, wheel_1 and so on where it has none of its own."""
@@ -183,13 +164,10 @@ class Thruster(WrenchInput):
             raise InputError(f"thruster min is {self.min}, expected 0 or more: it never pulls")
         if truth("thruster on_off", self.on_off) and (self.max is None or self.min):
             raise InputError("thruster on_off is set: it needs a max, which it pushes with, no min")
-        if self.least_impulse is not None:
-            impulse = _positive("thruster least_impulse", self.least_impulse, "N s")
-            object.__setattr__(self, "least_impulse", impulse)
-        position = three_numbers("thruster position", self.position)
-        object.__setattr__(self, "position", position)
-        direction = _unit("thruster direction", self.direction, "where it pushes")
-        object.__setattr__(self, "direction", direction)
+        if (impulse := self.least_impulse) is not None:
+            self._set("least_impulse", _positive("thruster least_impulse", impulse, "N s"))
+        self._set("position", three_numbers("thruster position", self.position))
+        self._set("direction", _unit("thruster direction", self.direction, "where it pushes"))
 
     @property
     def wrench(self) -> Array:
@@ -242,11 +220,11 @@ class ReactionWheel(WrenchInput):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "axis", _unit("wheel axis", self.axis, "what it turns about"))
-        object.__setattr__(self, "momentum", number("wheel momentum", self.momentum))
+        self._set("axis", _unit("wheel axis", self.axis, "what it turns about"))
+        self._set("momentum", number("wheel momentum", self.momentum))
         if self.max_speed is not None:
             speed = _positive("wheel max_speed", self.max_speed, "rad/s")
-            object.__setattr__(self, "max_speed", speed)
+            self._set("max_speed", speed)
             if self.inertia is None:
                 raise InputError(
                     f"wheel max_speed is {speed:g} rad/s, but its speed is no state; give it an "
@@ -261,7 +239,7 @@ class ReactionWheel(WrenchInput):
                 "wheel momentum is given beside an inertia, with which its speed is a state; leave "
                 "one out, and give the speed as a velocity of the point"
             )
-        object.__setattr__(self, "inertia", inertia)
+        self._set("inertia", inertia)
 
     @property
     def wrench(self) -> Array:
@@ -317,8 +295,3 @@ def named_wheels(inputs: Sequence[Input]) -> list[tuple[str, ReactionWheel]]:
     """Return the wheels among inputs, each with its name: wheel_1, wheel_2, ... by default."""
     found = named_inputs(inputs)
     return [(names[0], item) for item, names in found if isinstance(item, ReactionWheel)]
-
-
-def default_inputs(joint_names: Sequence[str]) -> tuple[Input, ...]:
-    """Return one force for each degree of freedom: tau_b, F_b and every joint's."""
-    return (BaseTorque(), BaseForce(), *(JointTorque(name) for name in joint_names))

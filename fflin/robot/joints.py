@@ -1,35 +1,26 @@
 """Joints of one degree of freedom, independent or following another."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.names import joints_by_name
 from fflin.base.validation import NORM_TOLERANCE, Array
+
+T = TypeVar("T")
 
 
 class Joint(NamedTuple):
-    """One joint of one degree of freedom.
+    """One joint of one degree of freedom."""
 
-    Attributes
-    ----------
-    name : str
-        Its name in the model.
-    idx_q, idx_v : int
-        Where it begins in Pinocchio's q and v.
-    unbounded : bool
-        Stored as (cos, sin), two entries of q; one angle in the state.
-    prismatic : bool
-        A length in metres; otherwise an angle in radians.
-    """
-
-    name: str
-    idx_q: int
+    name: str  # in the model
+    idx_q: int  # where it begins in Pinocchio's q, and in v
     idx_v: int
-    unbounded: bool
-    prismatic: bool
+    unbounded: bool  # stored as (cos, sin), two entries of q; one angle in the state
+    prismatic: bool  # a length in metres; otherwise an angle in radians
 
     @property
     def unit(self) -> str:
@@ -71,6 +62,15 @@ class Follower(NamedTuple):
     def place(self, q: Array) -> None:
         """Put it where its leader in this configuration says."""
         self.joint.place(q, self.multiplier * self.leader.value(q) + self.offset)
+
+
+# Returns the joint of a name, or raises what is wrong with it.
+Find: TypeAlias = Callable[[str], Joint]
+
+
+def by_joint(values: Mapping[str, T], joints: Sequence[str], find: Find) -> dict[str, T]:
+    """Return {joint: value} of {joint or pattern: value}; the group ``q_m`` is all joints."""
+    return joints_by_name("joint", values, joints, lambda name: find(name).name)
 
 
 def followed(followers: Sequence[Follower], q: Array) -> Array:

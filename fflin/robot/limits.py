@@ -6,9 +6,9 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import InputError
+from fflin.base.names import state_keys
 from fflin.robot.fields import Range, given_limits
 from fflin.robot.inputs import JointTorque, ReactionWheel, named_inputs
-from fflin.robot.signals import state_keys
 
 if TYPE_CHECKING:
     from fflin.robot.joints import Joint

@@ -13,7 +13,7 @@ import pinocchio as pin
 from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
-from fflin.base.writing import remember
+from fflin.base.writing import as_path, remember
 from fflin.robot.catalog import RobotFile, find_robot
 from fflin.robot.frames import ROOT
 from fflin.robot.joints import Follower, Joint
@@ -126,13 +126,17 @@ def _load(
     # They are read when the robot is drawn, and no output may take their place before.
     meshes = (find_mesh(uri, found.path, folders) for uri in description.meshes)
     remember(*filter(None, meshes))
+    damping = {name: description.damping.get(name, 0.0) for name in loaded.joint_names}
+    # That of mimic joints counts with that of their leaders: the power is the same.
+    for joint, leader, multiplier, _ in loaded.followers:
+        damping[leader.name] += multiplier**2 * description.damping.get(joint.name, 0.0)
     loaded = replace(
         loaded,
         urdf=found.path,
         urdf_sha256=description.sha256,
         notes=description.notes,
         package_dirs=folders,
-        urdf_damping=_independent_damping(loaded, description.damping),
+        urdf_damping=damping,
     )
     return loaded, description.advice
 
@@ -179,8 +183,6 @@ def from_model(
 
 
 def _folders(package_dirs: Any) -> tuple[Path, ...]:
-    from fflin.base.writing import as_path
-
     if isinstance(package_dirs, str | os.PathLike) or not isinstance(package_dirs, Sequence):
         raise InputError(f"package_dirs is {package_dirs!r}, expected a list of folders")
     return tuple(as_path(folder) for folder in package_dirs)
@@ -195,32 +197,18 @@ def _robot(
         model, mimics, locked = _locked(model, locks, mimics)
     all_joints = [_joint(model, index) for index in range(ROOT + 1, model.njoints)]
     by_name = {joint.name: joint for joint in all_joints}
-    robot = Robot(
-        model,
-        name,
-        None,
-        "",
-        tuple(joint for joint in all_joints if joint.name not in mimics),
-        tuple(
-            Follower(by_name[joint], by_name[mimic.leader], mimic.multiplier, mimic.offset)
-            for joint, mimic in mimics.items()
-        ),
-        locked=locked,
+    joints = tuple(joint for joint in all_joints if joint.name not in mimics)
+    followers = tuple(
+        Follower(by_name[joint], by_name[mimic.leader], mimic.multiplier, mimic.offset)
+        for joint, mimic in mimics.items()
     )
+    robot = Robot(model, name, None, "", joints, followers, locked=locked)
     if not model.check(robot.create_data()):
         raise ModelError(
             f"'{name}': the joints are not in depth-first order, in which Pinocchio's CRBA is "
             "wrong; add the joints of one branch before those of the next"
         )
     return robot
-
-
-def _independent_damping(robot: Robot, damping: Mapping[str, float]) -> dict[str, float]:
-    """Count the damping of mimic joints with that of their leaders: the power is the same."""
-    result = {name: damping.get(name, 0.0) for name in robot.joint_names}
-    for joint, leader, multiplier, _ in robot.followers:
-        result[leader.name] += multiplier**2 * damping.get(joint.name, 0.0)
-    return result
 
 
 def _check_root(model: pin.Model, name: str) -> None:
@@ -257,18 +245,14 @@ def _locked(
         keys = [lock] if isinstance(lock, str) else _listed(lock)
         asked = {key: lock[key] if isinstance(lock, Mapping) else None for key in keys}
         given |= joints_by_name("joint to lock", asked, movable, movable_one)
-    names, q = list(given), pin.neutral(model)
-    values = {
-        name: None if given.get(name) is None else number(f"lock '{name}'", given[name])
-        for name in names
-    }
+    values = {n: None if x is None else number(f"lock '{n}'", x) for n, x in given.items()}
     for name, mimic in mimics.items():
         leader_value = values.get(mimic.leader, 0.0) or 0.0
         if mimic.leader in values or values.get(name, 0.0) is None:
             values.setdefault(name, None)
             if values[name] is None:
                 values[name] = mimic.multiplier * leader_value + mimic.offset
-    indices, locked = [], []
+    q, indices, locked = pin.neutral(model), [], []
     for name, value in values.items():
         index = model.getJointId(name)
         indices.append(index)

@@ -34,14 +34,6 @@ def idle_coordinates(robot: Robot) -> tuple[str, ...]:
     joints of their armature's share. It vanishes only if the velocity of every mass, every turn
     that has inertia and every rate that has an armature do: whether some :math:`\nu` makes them
     do so is a question of geometry, decided without the masses, whose rounding could hide it.
-
-    Parameters
-    ----------
-    robot : Robot
-
-    Returns
-    -------
-    tuple of str
     """
     if robot not in _FOUND:
         _FOUND[robot] = _idle(robot)
@@ -94,10 +86,7 @@ def massless_note(robot: Robot) -> str:
 
 
 def require_inertia(robot: Robot) -> None:
-    """Raise `SingularInertiaError` where M is singular at every configuration.
-
-    The rounding of its factors may hide it.
-    """
+    """Refuse an M that is singular at every configuration, which rounding of factors may hide."""
     if idle_coordinates(robot):
         raise SingularInertiaError(massless_note(robot))
 

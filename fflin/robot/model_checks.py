@@ -13,20 +13,7 @@ from fflin.robot.urdf.inertias import is_impossible
 
 
 def check_model(model: pin.Model, name: str) -> None:
-    """Refuse a model whose numbers no robot has.
-
-    Parameters
-    ----------
-    model : pin.Model
-    name : str
-        What errors call the robot.
-
-    Raises
-    ------
-    ModelError
-        Naming the joint: if it hangs on one that comes after it, its placement is none, the body
-        it carries is impossible, or its armature is negative or not finite.
-    """
+    """Refuse a model whose numbers no robot has, by the joint that has them."""
     # All parents first: making the Data of a model whose parents form a loop never ends.
     for faults in (_of_parent, _of_joint):
         for index in range(1, model.njoints):

@@ -4,7 +4,6 @@ Reference axes are those of the reference placement that the state is relative t
 measures, and its slopes, stand in `fflin.dynamics.output_kinds`.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
@@ -13,20 +12,13 @@ from fflin.base.errors import InputError, unknown
 
 @dataclass(frozen=True)
 class Output:
-    """What every kind of output says of itself.
+    """What every kind of output says of itself."""
 
-    Attributes
-    ----------
-    WORD : str
-        What it is called on a command line.
-    VECTORS : tuple of (str, str)
-        (name, unit) of each vector of three that it measures; empty where it is of states.
-    FEELS_ACCELERATION : bool
-        Whether it depends on the accelerations, and so on the inputs.
-    """
-
+    # What it is called on a command line.
     WORD: ClassVar[str]
+    # (name, unit) of each vector of three that it measures; empty where it is of states.
     VECTORS: ClassVar[tuple[tuple[str, str], ...]] = ()
+    # Whether it depends on the accelerations, and so on the inputs.
     FEELS_ACCELERATION: ClassVar[bool] = False
 
     @property
@@ -65,7 +57,20 @@ class BasePose(Output):
 
 
 @dataclass(frozen=True)
-class JointPositions(Output):
+class JointOutput(Output):
+    """An output of joints: all of them where none is named."""
+
+    joints: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        # A string is a sequence of names of one letter each.
+        if isinstance(self.joints, str):
+            given = repr(self.joints)
+            raise InputError(f"joints is {given}, expected a tuple of names, ({given},)")
+
+
+@dataclass(frozen=True)
+class JointPositions(JointOutput):
     """Angles [rad] or lengths [m] of joints, the states.
 
     Parameters
@@ -76,14 +81,10 @@ class JointPositions(Output):
     """
 
     WORD = "joints"
-    joints: tuple[str, ...] | None = None
-
-    def __post_init__(self) -> None:
-        _check_joints(self.joints)
 
 
 @dataclass(frozen=True)
-class JointVelocities(Output):
+class JointVelocities(JointOutput):
     """Rates [rad/s] or [m/s] of joints, the states.
 
     Parameters
@@ -94,10 +95,6 @@ class JointVelocities(Output):
     """
 
     WORD = "rates"
-    joints: tuple[str, ...] | None = None
-
-    def __post_init__(self) -> None:
-        _check_joints(self.joints)
 
 
 @dataclass(frozen=True)
@@ -218,45 +215,26 @@ KINDS: tuple[type[Output], ...] = (
 def parse_output(text: str) -> tuple[Output, ...]:
     """Read one output as it is written on a command line.
 
-    Parameters
-    ----------
-    text : str
-        ``state``, ``base``, ``joints``, ``rates``, ``com`` or ``momentum``; of some joints
-        ``joints:NAME``, ``rates:NAME``, where a name may be a pattern; or of a frame
-        ``pose:NAME``, ``velocity:NAME``, both as ``frame:NAME``, ``gyroscope:NAME``,
-        ``accelerometer:NAME``; or of two ``relative:NAME:TO``.
-
-    Returns
-    -------
-    tuple of Output
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such output.
-    InputError
-        If a frame is missing, or one is given where none belongs.
+    That is ``state``, ``base``, ``joints``, ``rates``, ``com`` or ``momentum``; of some joints
+    ``joints:NAME``, ``rates:NAME``, where a name may be a pattern; of a frame ``pose:NAME``,
+    ``velocity:NAME``, both as ``frame:NAME``, ``gyroscope:NAME``, ``accelerometer:NAME``; or of
+    two ``relative:NAME:TO``.
     """
     word, colon, rest = text.partition(":")
     kinds = {kind.WORD: (kind,) for kind in KINDS} | {"frame": (FramePose, FrameVelocity)}
     if word not in kinds:
         raise unknown("output", word, tuple(kinds))
-    wanted = [item.name for item in fields(kinds[word][0])]
-    if not issubclass(kinds[word][0], FrameOutput):
-        if rest and word in ("joints", "rates"):
-            return (JointPositions((rest,)) if word == "joints" else JointVelocities((rest,)),)
+    kind = kinds[word][0]
+    if rest and issubclass(kind, JointOutput):
+        return (kind((rest,)),)
+    if not issubclass(kind, FrameOutput):
         if colon:
             raise InputError(f"output '{text}' is of the whole robot; write {word}")
-        return (kinds[word][0](),)
+        return (kind(),)
+    wanted = [item.name for item in fields(kind)]
     names = rest.split(":", len(wanted) - 1)
     if len(names) != len(wanted) or not all(names):
         form = ":".join((word, "NAME", *(name.upper() for name in wanted[1:])))
         missing = "no frame" if len(wanted) == 1 else "fewer than two frames"
         raise InputError(f"output '{text}' is of {missing}; write {form}")
     return tuple(kind(*names) for kind in kinds[word])
-
-
-def _check_joints(joints: Sequence[str] | None) -> None:
-    # A string is a sequence of names of one letter each.
-    if isinstance(joints, str):
-        raise InputError(f"joints is {joints!r}, expected a tuple of names, ({joints!r},)")

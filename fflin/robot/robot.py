@@ -14,13 +14,12 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, vector
-from fflin.robot.fields import Range, given_limits, validated_fields, validated_inputs
+from fflin.robot.fields import Range, checked_fields, checked_inputs, checked_passive, kept_start
 from fflin.robot.frames import ROOT, find_frame
-from fflin.robot.inputs import Input, default_inputs, named_wheels
+from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import Follower, Joint, check_followers_rates, followed
 from fflin.robot.model_checks import change_in
 from fflin.robot.outputs import FullState, Output
-from fflin.robot.start import checked_passive, checked_start, checked_weights, kept_start
 from fflin.robot.wheels import stored_momentum, with_wheels
 
 _CONFIGURATION = "a configuration in Pinocchio's order"
@@ -119,7 +118,9 @@ class Robot:
         if self._as_made is None or self._as_made[0] is not self.model:
             object.__setattr__(self, "_as_made", (self.model, self.model.copy()))
         if not self.inputs:
-            object.__setattr__(self, "inputs", default_inputs(self.joint_names))
+            # One force for each degree of freedom.
+            default = (BaseTorque(), BaseForce(), *map(JointTorque, self.joint_names))
+            object.__setattr__(self, "inputs", default)
 
     def replace(self, **fields: Any) -> Robot:
         """Return the same robot with other inputs, passive joints or gravity.
@@ -176,18 +177,9 @@ class Robot:
             robot = robot._without_motors(fields.pop("passive"))
         if "inputs" in fields:
             robot = robot._with_inputs(fields.pop("inputs"))
-        joints = robot.joint_names
-        if "limits" in fields:
-            limits = given_limits(robot.inputs, joints, fields.pop("limits"))
-            robot = replace(robot, limits=limits)
-        if "weights" in fields:
-            weights = checked_weights(fields.pop("weights"), joints, robot.inputs)
-            robot = replace(robot, weights=weights)
-        if "start" in fields:
-            start = checked_start(fields.pop("start"), robot.joint, joints)
-            robot = replace(robot, start=start)
-        own = (robot._wheelless or robot).joint_names
-        robot = replace(robot, **validated_fields(fields, robot.joint, own, self.urdf_damping))
+        joints, own = robot.joint_names, robot._bare.joint_names
+        known = (robot.joint, joints, own, robot.inputs, self.urdf_damping)
+        robot = replace(robot, **checked_fields(fields, *known))
         for name in robot.used_frames:
             find_frame(robot.model, name)
         return robot
@@ -219,7 +211,7 @@ class Robot:
         """
         from fflin.robot.mass_properties import with_bodies
 
-        return self._of_model(with_bodies((self._wheelless or self).model, bodies))
+        return self._of_model(with_bodies(self._bare.model, bodies))
 
     def perturbed(
         self, *, mass: float = 0.1, com: float = 0.1, inertia: float = 0.1, seed: int = 0
@@ -244,8 +236,8 @@ class Robot:
         """
         from fflin.robot.mass_properties import perturbed
 
-        model = (self._wheelless or self).model
-        return self._of_model(perturbed(model, seed, mass=mass, com=com, inertia=inertia))
+        model = perturbed(self._bare.model, seed, mass=mass, com=com, inertia=inertia)
+        return self._of_model(model)
 
     @property
     def used_frames(self) -> tuple[str, ...]:
@@ -267,12 +259,8 @@ class Robot:
     @cached_property
     def springs(self) -> Springs:
         """Stiffness, damping and rest positions (n,) in state order."""
-        return Springs(
-            *(
-                np.array([values.get(name, 0.0) for name in self.joint_names])
-                for values in (self.stiffness, self.damping, self.rest)
-            )
-        )
+        given = (self.stiffness, self.damping, self.rest)
+        return Springs(*(np.array([x.get(name, 0.0) for name in self.joint_names]) for x in given))
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -358,7 +346,7 @@ class Robot:
             If the size is wrong, an entry is not finite, a part is not of unit length, or a mimic
             joint is not where its leader puts it.
         """
-        if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != self._shape:
+        if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != (self.nq,):
             q = vector("q", q, self.nq, _CONFIGURATION)
         entries = q.tolist()
         if not math.isfinite(sum(entries)):
@@ -397,9 +385,14 @@ class Robot:
         check_followers_rates(self.followers, v)
         return v
 
+    @property
+    def _bare(self) -> Robot:
+        """The robot without the wheels among its joints."""
+        return self._wheelless or self
+
     def _without_motors(self, passive: Any) -> Robot:
         """Return the robot without the torques of joints that have no motor."""
-        bare = self._wheelless or self
+        bare = self._bare
         joints = checked_passive(passive, bare.joint, bare.joint_names, self.locked)
         inputs = tuple(item for item in self.inputs if getattr(item, "joint", None) not in joints)
         if not inputs:
@@ -408,28 +401,24 @@ class Robot:
 
     def _with_inputs(self, inputs: Any) -> Robot:
         """Return the robot with other inputs, and with the wheels among them as joints."""
-        bare = self._wheelless or self
-        checked = validated_inputs(inputs, bare.joint, bare.joint_names, self.passive)
+        bare = self._bare
+        checked = checked_inputs(inputs, bare.joint, bare.joint_names, self.passive)
         wheels = [(name, wheel) for name, wheel in named_wheels(checked) if wheel.inertia]
         model, joints, followers = with_wheels(bare.model, bare.joints, bare.followers, wheels)
-        names = {joint.name for joint in joints}
-        stiffness, damping, rest = (
-            {name: x for name, x in values.items() if name in names}
-            for values in (self.stiffness, self.damping, self.rest)
-        )
-        robot = replace(
+        names = [joint.name for joint in joints]
+        of_joints: dict[str, Any] = {
+            field: {name: x for name, x in getattr(self, field).items() if name in names}
+            for field in ("stiffness", "damping", "rest")
+        }
+        return replace(
             self,
             model=model,
             joints=joints,
             followers=followers,
             inputs=checked,
-            stiffness=stiffness,
-            damping=damping,
-            rest=rest,
+            start=kept_start(self.start, names),
             _wheelless=bare if wheels else None,
-        )
-        return (
-            replace(robot, start=kept_start(self.start, robot.joint_names)) if self.start else robot
+            **of_joints,
         )
 
     def _of_model(self, model: pin.Model) -> Robot:
@@ -437,9 +426,8 @@ class Robot:
         from fflin.robot.mass_properties import identity
 
         self.require_unchanged()
-        bare = self._wheelless or self
-        told = identity(self.urdf_sha256, model, bare.model)
-        other = replace(bare, model=model, urdf_sha256=told)
+        told = identity(self.urdf_sha256, model, self._bare.model)
+        other = replace(self._bare, model=model, urdf_sha256=told)
         if self._wheelless is None:
             return other
         return replace(self, urdf_sha256=told, _wheelless=other)._with_inputs(self.inputs)
@@ -473,10 +461,6 @@ class Robot:
                 f"{size / 2**30:.1f} GiB (limit 1 GiB); lock joints that do not matter"
             )
         return self.model.createData()
-
-    @cached_property
-    def _shape(self) -> tuple[int]:
-        return (self.nq,)
 
     @cached_property
     def unbounded(self) -> dict[int, str]:

@@ -13,6 +13,7 @@ from fflin.base.errors import FflinError, InputError
 from fflin.base.names import stands_for_any
 from fflin.base.toml_file import TomlFile, flat
 from fflin.robot.catalog import find_robot
+from fflin.robot.fields import FIELDS
 from fflin.robot.input_files import check_keys, is_number, read_inputs
 from fflin.robot.outputs import parse_output
 
@@ -26,24 +27,9 @@ if TYPE_CHECKING:
 _OF_NAMES = ("urdf", "package_dirs", "lock", "passive", "outputs")
 _WORDS = (["damping"], ["weights", "rule"])
 
-# In the order in which they are given to the robot: names of inputs are known after the inputs.
-_FIELDS = (
-    *("passive", "inputs", "outputs", "stiffness", "damping", "rest", "gravity"),
-    *("limits", "weights", "start"),
-)
-
 
 class RobotToml:
-    """What a robot's TOML file says, checked as far as it can be without the robot.
-
-    Attributes
-    ----------
-    found : RobotFile
-        The URDF, under the name of the TOML file.
-    lock : mapping
-        {joint or pattern: value, or None at neutral}.
-    package_dirs : tuple of Path
-    """
+    """What a robot's TOML file says, checked as far as it can be without the robot."""
 
     def __init__(self, path: Path, name: str) -> None:
         self._document = document = TomlFile(path)
@@ -56,18 +42,20 @@ class RobotToml:
         given = {key: self._checked(key) for key in document.record if key != "input"}
         self._written = given | {"inputs": document.record.get("input")}
         lock, folders = given.pop("lock", {}), given.pop("package_dirs", [])
+        # {joint or pattern: value, or None at neutral}.
         self.lock: dict[str, float | None] = lock if isinstance(lock, dict) else dict.fromkeys(lock)
         self.package_dirs = tuple(path.parent / folder for folder in folders)
         with self.placed("urdf"):
+            # The URDF, under the name of the TOML file.
             self.found = replace(find_robot(given.pop("urdf"), path.parent), name=name)
-            if is_toml(self.found.path):
+            if self.found.path.suffix.lower() == ".toml":
                 raise InputError(f"urdf is {self.found.path}, expected a URDF or a robot's name")
         with self.placed("outputs"):
             if words := given.get("outputs"):
                 given["outputs"] = [output for word in words for output in parse_output(word)]
         if "input" in document.record:
             given["inputs"] = read_inputs(document)
-        self._fields = {key: given[key] for key in _FIELDS if key in given}
+        self._fields = {key: given[key] for key in FIELDS if key in given}
 
     def applied(self, robot: Robot) -> Robot:
         """Return the robot of the URDF with what the file says.
@@ -140,11 +128,6 @@ def _leaves(value: Any, *place: str) -> Iterator[tuple[Any, ...]]:
             yield from _leaves(inner, *place)
     else:
         yield (*place, value)
-
-
-def is_toml(path: Path) -> bool:
-    """Whether a robot's description is a robot file."""
-    return path.suffix.lower() == ".toml"
 
 
 def _places(value: Any, *place: str | int) -> Iterator[tuple[Any, ...]]:

@@ -48,24 +48,13 @@ def robot_info(robot: Robot) -> str:
     for joint in sorted(kinds, key=lambda joint: joint.idx_v):
         index = model.getJointId(joint.name)
         depth[index] = depth[model.parents[index]] + 1
-        limits = (
-            (".", ".")
-            if joint.unbounded
-            else (
-                _limit(model.lowerPositionLimit[joint.idx_q]),
-                _limit(model.upperPositionLimit[joint.idx_q]),
-            )
-        )
-        rows.append(
-            [
-                "  " * depth[index] + joint.name,
-                kinds[joint],
-                f"{model.inertias[index].mass:.6g}",
-                *limits,
-                _limit(model.effortLimit[joint.idx_v]),
-                _limit(model.velocityLimit[joint.idx_v]),
-            ]
-        )
+        travel = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+        limits = [
+            *((math.inf, math.inf) if joint.unbounded else travel),
+            *(model.effortLimit[joint.idx_v], model.velocityLimit[joint.idx_v]),
+        ]
+        mass = f"{model.inertias[index].mass:.6g}"
+        rows.append(["  " * depth[index] + joint.name, kinds[joint], mass, *map(_limit, limits)])
     frames = [frame.name for frame in model.frames.tolist() if frame.parentJoint >= ROOT]
     wrapped = textwrap.fill(
         ", ".join(dict.fromkeys(frames)), width(), initial_indent="  ", subsequent_indent="  "

@@ -34,11 +34,8 @@ class _Mounted(NamedTuple):
 
 def carrier(model: pin.Model, wheel: ReactionWheel) -> tuple[int, Array]:
     """Return the joint that carries a wheel, and its axis (3,) in that joint's frame."""
-    axis = np.array(wheel.axis)
-    if wheel.frame is None:
-        return ROOT, axis
     joint, placement = find_frame(model, wheel.frame)
-    return joint, placement.rotation @ axis
+    return joint, placement.rotation @ np.array(wheel.axis)
 
 
 def stored_momentum(model: pin.Model, inputs: Sequence[Input]) -> tuple[tuple[int, Array], ...]:
@@ -61,24 +58,8 @@ def with_wheels(
 ) -> tuple[pin.Model, tuple[Joint, ...], tuple[Follower, ...]]:
     """Return a model with one more joint for each wheel, its joints in order, and its followers.
 
-    A wheel comes after all joints below its carrier, so that joints stay in depth-first order,
-    without which CRBA would be wrong.
-
-    Parameters
-    ----------
-    model : pin.Model
-        Its bodies count the wheels. Not changed.
-    joints, followers : tuple
-        Of that model.
-    wheels : sequence of (str, ReactionWheel)
-        Names, and wheels with an inertia.
-
-    Raises
-    ------
-    UnknownNameError
-        If a wheel's frame does not exist.
-    InputError
-        If its carrier has less inertia than it, or its name is taken.
+    The bodies of the model, which is not changed, count the wheels. A wheel comes after all joints
+    below its carrier, so that joints stay in depth-first order, without which CRBA would be wrong.
     """
     if not wheels:
         return model, joints, followers
@@ -95,17 +76,13 @@ def with_wheels(
         bodies[joint] = _without(bodies[joint], mounted, of)
         carried.setdefault(joint, []).append(mounted)
     new = _rebuilt(model, bodies, carried)
-    new_joints = [joint.within(new) for joint in joints]
-    for name, _ in wheels:
-        new_joints.append(Joint(name, 0, 0, unbounded=True, prismatic=False).within(new))
-    return (
-        new,
-        tuple(sorted(new_joints, key=lambda joint: joint.idx_v)),
-        tuple(
-            follower._replace(joint=follower.joint.within(new), leader=follower.leader.within(new))
-            for follower in followers
-        ),
+    turning = (Joint(name, 0, 0, unbounded=True, prismatic=False) for name, _ in wheels)
+    new_joints = [joint.within(new) for joint in (*joints, *turning)]
+    new_followers = (
+        follower._replace(joint=follower.joint.within(new), leader=follower.leader.within(new))
+        for follower in followers
     )
+    return new, tuple(sorted(new_joints, key=lambda joint: joint.idx_v)), tuple(new_followers)
 
 
 def _without(body: pin.Inertia, wheel: _Mounted, of: str) -> pin.Inertia:
@@ -124,9 +101,7 @@ def _without(body: pin.Inertia, wheel: _Mounted, of: str) -> pin.Inertia:
 
 
 def _rebuilt(
-    model: pin.Model,
-    bodies: Sequence[pin.Inertia],
-    carried: dict[int, list[_Mounted]],
+    model: pin.Model, bodies: Sequence[pin.Inertia], carried: dict[int, list[_Mounted]]
 ) -> pin.Model:
     new = pin.Model()
     new.name = model.name
@@ -142,12 +117,8 @@ def _rebuilt(
             new.appendBodyToJoint(moved[item], bodies[item], pin.SE3.Identity())
             continue
         parent, (name, axis, inertia) = item
-        index = new.addJoint(
-            moved[parent],
-            pin.JointModelRUBZ(),
-            pin.SE3(_turned_to(axis), np.zeros(3)),
-            name,
-        )
+        placement = pin.SE3(_turned_to(axis), np.zeros(3))
+        index = new.addJoint(moved[parent], pin.JointModelRUBZ(), placement, name)
         spinning = pin.Inertia(0.0, np.zeros(3), inertia * np.outer(_Z, _Z))
         new.appendBodyToJoint(index, spinning, pin.SE3.Identity())
     _carry_over(model, new, moved)
@@ -181,10 +152,7 @@ def _depth_first(
 
 def _carry_over(model: pin.Model, new: pin.Model, moved: dict[int, int]) -> None:
     """Copy what a model keeps of its joints beside them."""
-    for names, begin, length in (
-        (_OF_VELOCITY, "idx_vs", "nvs"),
-        (_OF_POSITION, "idx_qs", "nqs"),
-    ):
+    for names, begin, length in (_OF_VELOCITY, "idx_vs", "nvs"), (_OF_POSITION, "idx_qs", "nqs"):
         sizes, old_at, new_at = getattr(model, length), getattr(model, begin), getattr(new, begin)
         for name in names:
             values, old = getattr(new, name).copy(), getattr(model, name)

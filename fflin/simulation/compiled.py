@@ -108,6 +108,8 @@ def _fly(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
         stopped = f"interrupted at t = {clock[0] * times.dt:g} s"
     finally:
         bar.close()
+    if not np.isfinite(stages.u).all():
+        return go(plan, plant, conserved)  # which says whose command was no number
     count, end = -(-int(clock[0]) // times.every), clock[0] * times.dt
     t = np.append(times.every * np.arange(count) * times.dt, end)
     momentum, center = np.split(kept.start[:9] + kept.sums[:9], [6])

@@ -14,7 +14,6 @@ import pinocchio as pin
 
 from fflin.base import record
 from fflin.base.errors import InputError
-from fflin.base.names import chosen, input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, check_ending, write_whole
@@ -276,7 +275,9 @@ def plot_motion(
     ----------
     motion : Motion
         With a prediction, each group of states shows the nonlinear robot in full lines and the
-        linear model dashed, and below it their difference.
+        linear model dashed, and below it their difference. Along a trajectory it shows the robot
+        over the pale reference, and below it the error, that of the linear model dashed; a dotted
+        line is where the reference comes to rest.
     path : str or Path, optional
         .png, .pdf or .svg to save to.
     show : sequence of str, optional
@@ -296,28 +297,6 @@ def plot_motion(
     UnknownNameError
         If there is nothing of a name in `show`.
     """
-    from fflin.simulation.plots import Signals, draw
+    from fflin.simulation.motion_plot import draw_motion
 
-    motion = require_motion(motion)
-    limits = dict(zip(motion.limit_names, motion.limits, strict=True))
-    inertias = motion.wheel_inertias.tolist()
-    title = f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"
-    if motion.linear is not None:
-        title += "; full: nonlinear, dashed: linear"
-    names = (*motion.state_names, *input_keys(motion))
-    show = [show] if isinstance(show, str) else show
-    if not (show is None or isinstance(show, Sequence)):
-        raise InputError(f"show is {show!r}, expected a list of names, groups or patterns")
-    shown = range(len(names)) if show is None else chosen("state or input", show, names)
-    nx = len(motion.state_names)
-    states, inputs = [i for i in shown if i < nx], [i - nx for i in shown if i >= nx]
-    return draw(
-        motion.t,
-        Signals(motion.x, motion.state_names, motion.state_units, limits).only(states),
-        Signals(motion.u, motion.input_names, motion.input_units, limits).only(inputs),
-        dict.fromkeys(motion.wheels, 0.0) | dict(zip(motion.wheels, inertias, strict=False)),
-        None if motion.linear is None else motion.linear[:, states],
-        {"momentum": motion.momentum_drift, "centre of mass [m]": motion.com_drift},
-        title=f"{title}\n{motion.stopped}" if motion.stopped else title,
-        path=path,
-    )
+    return draw_motion(require_motion(motion), path, show)

@@ -13,7 +13,7 @@ from fflin.control.output_feedback import OutputFeedback, measured_states
 from fflin.control.policies import StateFeedback
 from fflin.control.pulses import Pulses
 from fflin.control.saturation import Wheels
-from fflin.control.tracking import TrajectoryFeedback
+from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.kernel import channel, course, forward, laws, loop, tracking
 from fflin.kernel.accelerations import layout_of, loads_of
 from fflin.kernel.tree import Tree
@@ -109,7 +109,7 @@ def _path(plan: Plan, plant: Plant) -> tracking.Path:
     none, nowhere, size, nu = np.zeros(0), np.zeros(0, dtype=np.intp), state.nx // 2, plan.initial
     point = forward.Point(plan.q.copy(), np.zeros(size), nu.copy(), none, none)
     path = tracking.Path(
-        *(none, none, none, none, none, False, False, nowhere, 0.0, none, none, 1),
+        *(none, none, none, none, none, False, False, nowhere, 0.0, 0.0, none, none, 1),
         *(np.zeros(size), np.zeros(state.nx), point),
     )
     if not isinstance(policy, TrajectoryFeedback):
@@ -117,16 +117,22 @@ def _path(plan: Plan, plant: Plant) -> tracking.Path:
     motion, schedule = policy.trajectory, policy.schedule
     way, speed = (state.velocities(each).ravel() for each in motion.flow.cubics)
     q, u = list(motion.q), list(motion.u)
-    steps, dt = plan.times.steps, plan.times.dt
-    ends = max(steps * dt, (steps - 1) * dt + dt) > policy.duration
+    over = policy.duration * AT_THE_END
+    ends = plan.times.steps * plan.times.dt > over
     held = np.array([each.columns.start for each in motion.flow.held], dtype=np.intp)
+    nx, gains = state.nx, schedule.passed
+    pieces = (schedule.K if schedule.dt else gains.pieces).reshape(
+        len(gains.starts), -1, len(nu) * nx
+    )
     if ends:
+        last = np.zeros_like(pieces[:1])
+        last[0, 0] = policy.end_gain.ravel()
+        pieces = np.concatenate((pieces, last))
         q.append(policy.end.q)
         u.append(policy.end.u0.copy())
         speed = np.append(speed, state.velocities(policy.end.v))
         for at in held:
             u[-1][at : at + 3] = rotation_matrix(q[-1][3:7]) @ u[-1][at : at + 3]
-    pieces = schedule.K[:, None] if schedule.dt else schedule.quartics
     return path._replace(
         t=np.array(motion.t),
         q=np.concatenate(q),
@@ -136,8 +142,9 @@ def _path(plan: Plan, plant: Plant) -> tracking.Path:
         hold=motion.hold == "previous",
         ends=bool(ends),
         held=held,
-        last=float(schedule.t[-1] - schedule.t[0]),
-        starts=np.array(schedule.starts),
+        over=over,
+        last=gains.last - gains.first,
+        starts=np.array(gains.starts),
         K=np.array(pieces).ravel(),
         order=pieces.shape[1],
     )
@@ -154,7 +161,7 @@ def _channel(plan: Plan, plant: Plant) -> channel.Channel:
         *(np.array(each, dtype=float) for each in (*w.torques, *w.limits, w.stiffness)),
     )
     fired = limits.pulses() if limits.pulses else Pulses([], limits.high, times.sample, times.dt)
-    figures, nothing = (fired.most, fired.least, fired.quantum), (0.0 * fired.most,) * 3
+    figures, nothing = (fired.most, fired.least, fired.quantum), (np.zeros(len(fired.places)),) * 3
     pulses = channel.Pulses._make(
         (
             *(np.array(fired.places, dtype=np.intp), np.array(fired.on_off, dtype=bool)),

@@ -77,19 +77,14 @@ def start_of(
     state: StateMap, x0: Any, q0: Any, v0: Any, reference: Reference | None
 ) -> tuple[Array, Array]:
     """Return the initial configuration and velocity (nq,), (nv,)."""
-    robot = state.robot
-    if x0 is not None:
-        if q0 is not None or v0 is not None:
-            raise InputError("x0 is given with q0 or v0; give either")
-        q, v = state.to_pinocchio(x0)
-    elif reference and q0 is v0 is None:
-        q, v, _ = reference(0.0)
-        q, v = q.copy(), v.copy()
-    elif robot.start and q0 is None and v0 is None:
-        q, v = points.start_of(robot)
-    else:
-        q = robot.neutral() if q0 is None else robot.checked_configuration(q0).copy()
-        v = np.zeros(robot.nv) if v0 is None else robot.checked_velocity(v0).copy()
+
+    def default() -> tuple[Array, Array]:
+        if reference:
+            q, v, _ = reference(0.0)
+            return q.copy(), v.copy()
+        return points.start_of(state.robot)
+
+    q, v = points.point_of(state, x0, q0, v0, default)
     if not np.abs(v).max() < LARGEST_SPEED:
         raise InputError(
             f"the initial velocity has an entry of {np.abs(v).max():.3g}, expected less than "

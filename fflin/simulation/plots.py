@@ -21,6 +21,7 @@ _OF_JOINTS = ("q_m", "qdot_m")
 _SMOOTH = ("wheel speeds", "wheel momenta")
 _MOST_IN_A_PANEL = 6
 _NEAR = 1.0 / 3.0  # share of a limit that a curve comes to where it is drawn
+_PALE: dict[str, Any] = {"lw": 3.6, "alpha": 0.3}  # of a reference, below what follows it
 _GROUPS = {
     "q_b": "attitude q_b",
     "r_b": "position r_b",
@@ -32,17 +33,28 @@ _GROUPS = {
 
 
 class Signals(NamedTuple):
-    """Histories (N, k), with names GROUP.NAME and units, and limits (2,) by name."""
+    """Histories (N, k), with names GROUP.NAME and units, and limits (2,) by name.
+
+    Beside them those of the linear model, and the reference that they follow.
+    """
 
     values: Array
     names: Sequence[str]
     units: Sequence[str]
     limits: Mapping[str, Array]
+    linear: Array | None = None
+    reference: Array | None = None
 
     def only(self, indices: Sequence[int]) -> Signals:
         """Return some of the columns."""
         names, units = ([of[i] for i in indices] for of in (self.names, self.units))
-        return Signals(self.values[:, indices], names, units, self.limits)
+        beside = (None if x is None else x[:, indices] for x in (self.linear, self.reference))
+        return Signals(self.values[:, indices], names, units, self.limits, *beside)
+
+    def times(self, factors: Array, unit: str, limits: Mapping[str, Array]) -> Signals:
+        """Return them times (k,), in that unit and with limits of it."""
+        beside = (None if x is None else factors * x for x in (self.linear, self.reference))
+        return Signals(factors * self.values, self.names, [unit] * len(factors), limits, *beside)
 
     def unit(self, indices: Sequence[int]) -> str:
         """Return the units of some columns in brackets."""
@@ -62,16 +74,18 @@ def draw(
     states: Signals,
     inputs: Signals,
     wheels: Mapping[str, float],
-    linear: Array | None,
+    apart: tuple[str, Signals] | None,
     drifts: Mapping[str, Array],
     *,
     title: str,
+    rest: float | None = None,
     path: str | Path | None = None,
 ) -> Figure:
     """Draw states, those of the linear model dashed, inputs and {label: drift} over time.
 
     `wheels` is {name: inertia} of the joints that are wheels; their momenta are drawn where the
-    inertia is known.
+    inertia is known. What they are `apart` from is drawn below the states, with its title. A thin
+    line marks the time at which a reference comes to `rest`.
     """
     target = target_of(path)
     groups: dict[str, list[int]] = {}
@@ -84,7 +98,7 @@ def draw(
     # With the drift, in as few rows of up to four as there can be.
     rows = math.ceil((len(panels) + 1) / 4)
     with styled() as figure_class:
-        both = linear is not None
+        both = apart is not None
         heights = [3.0, 1.2][: 1 + both] * math.ceil(len(groups) / across) or [0.01]
         size = (11.0, 0.3 + 3.0 * rows + 0.9 * sum(heights))
         figure = figure_class(figsize=size, layout="constrained")
@@ -97,10 +111,10 @@ def draw(
         for place, (group, indices) in enumerate(groups.items()):
             row, column = divmod(place, across)
             axes = figure.add_subplot(grid[row * (1 + both), column])
-            _histories(axes, t, states, linear, group, indices)
-            if linear is not None:
-                apart = figure.add_subplot(grid[2 * row + 1, column], sharex=axes)
-                _difference(apart, t, states, linear, indices)
+            _histories(axes, t, states, group, indices, keyed=place == 0)
+            if apart is not None:
+                below_it = figure.add_subplot(grid[2 * row + 1, column], sharex=axes)
+                _apart(below_it, t, *apart, indices)
                 axes.tick_params(labelbottom=False)
             else:
                 axes.set_xlabel("t [s]")
@@ -117,6 +131,8 @@ def draw(
             # Joints are many, have long names, and are the same in three panels.
             limit = {"limit": lines.pop("limit")} if "limit" in lines else {}
             _below(figure, lines | limit, "joints", "left" if figure.legends else "center")
+        for axes in figure.axes if rest is not None else ():
+            axes.axvline(rest, lw=0.8, ls=":", color="#555555", label="_rest")
         _drifts(figure.add_subplot(next(places)), t, drifts)
         figure.suptitle(title, fontsize=11)
         return saved(figure, target)
@@ -141,27 +157,38 @@ def _panels(states: Signals, inputs: Signals, wheels: Mapping[str, float]) -> di
         if J.all():
             names = [states.names[i] for i in speeds]
             limits = {x: J[k] * states.limits[x] for k, x in enumerate(names) if x in states.limits}
-            momenta = Signals(J * states.values[:, speeds], names, ["N m s"] * len(J), limits)
+            momenta = states.only(speeds).times(J, "N m s", limits)
             found["wheel momenta"] = _Panel(momenta, list(range(len(J))))
     return found
 
 
 def _histories(
-    axes: Axes, t: Array, states: Signals, linear: Array | None, group: str, indices: list[int]
+    axes: Axes, t: Array, states: Signals, group: str, indices: list[int], *, keyed: bool
 ) -> None:
-    times, shown = _broken(t, states.values, indices) if group == "q_b" else (t, states.values)
     for color, i in zip(cycle(len(indices)), indices, strict=True):
-        axes.plot(times, shown[:, i], color=color, label=_short(states.names[i]))
-        if linear is not None:
-            axes.plot(t, linear[:, i], "--", color=color, lw=1.0)
+        gaps = indices if group == "q_b" else []
+        _curve(axes, t, states, i, gaps, color=color, label=_short(states.names[i]))
     _limits(axes, states, indices)
     axes.set(title=_GROUPS[group], ylabel=states.unit(indices))
+    if keyed and states.reference is not None:
+        axes.plot([], [], color="#888888", **_PALE, label="reference")
     if group not in _OF_JOINTS:
         axes.legend(handlelength=1.2)
     axes.margins(x=0.0)
 
 
-def _broken(t: Array, x: Array, indices: list[int]) -> tuple[Array, Array]:
+def _curve(
+    axes: Axes, t: Array, of: Signals, i: int, gaps: Sequence[int] = (), **look: Any
+) -> None:
+    """Draw a column over its pale reference and below that of the linear model, dashed."""
+    dashed = {"ls": "--", "lw": 1.0}
+    for x, own in ((of.reference, _PALE), (of.values, look), (of.linear, dashed)):
+        if x is not None:
+            times, shown = _broken(t, x, gaps) if gaps else (t, x)
+            axes.plot(times, shown[:, i], **{"color": look["color"]} | own)
+
+
+def _broken(t: Array, x: Array, indices: Sequence[int]) -> tuple[Array, Array]:
     """Return times and states with a gap where the attitude goes through a turn of 180 degrees."""
     q_b = x[:, indices]
     # The vector part of a unit quaternion whose sign has changed.
@@ -169,10 +196,10 @@ def _broken(t: Array, x: Array, indices: list[int]) -> tuple[Array, Array]:
     return np.insert(t, jumps, t[jumps]), np.insert(x, jumps, np.nan, axis=0)
 
 
-def _difference(axes: Axes, t: Array, states: Signals, linear: Array, indices: list[int]) -> None:
+def _apart(axes: Axes, t: Array, title: str, signals: Signals, indices: list[int]) -> None:
     for color, i in zip(cycle(len(indices)), indices, strict=True):
-        axes.plot(t, states.values[:, i] - linear[:, i], color=color, lw=1.0)
-    axes.set(xlabel="t [s]", ylabel=f"difference\n{states.unit(indices)}".strip())
+        _curve(axes, t, signals, i, color=color, lw=1.0)
+    axes.set(xlabel="t [s]", ylabel=f"{title}\n{signals.unit(indices)}".strip())
     axes.margins(x=0.0)
     axes.ticklabel_format(axis="y", scilimits=(-2, 3))
 
@@ -182,8 +209,8 @@ def _inputs(axes: Axes, t: Array, panel: _Panel, title: str, colors: Mapping[str
     signals, indices = panel
     for color, i in zip(cycle(len(indices)), indices, strict=True):
         short = _short(signals.names[i])
-        axes.plot(
-            *(t, signals.values[:, i]),
+        _curve(
+            *(axes, t, signals, i),
             color=colors.get(short, color),
             drawstyle="default" if title in _SMOOTH else "steps-post",
             label=short if title.startswith("wheel") else signals.names[i],

@@ -203,9 +203,6 @@ def _errors(policy: TrajectoryFeedback, plan: Plan, e: Array, steps: int) -> Arr
             return policy.end.A, policy.end.B, policy.end.u0
         return (*models.matrices(start + t), policy.reference(t)[2])
 
-    def law(t: float, e: Array) -> Array:
-        return policy.reference(t)[2] - policy.gain(t) @ e
-
     if limits.wheels:
         names = limits.wheels.names
         of = [models.state_names.index(f"qdot_m.{name}") for name in names]
@@ -215,7 +212,7 @@ def _errors(policy: TrajectoryFeedback, plan: Plan, e: Array, steps: int) -> Arr
             return policy.reference(t)[1][of_v] + e[of]
 
         limits = limits._replace(wheels=limits.wheels._replace(speeds=speeds))
-    channel = Channel(law, plan.initial, limits, sample, delay)
+    channel = Channel(policy.law(), plan.initial, limits, sample, delay)
     rows, after, ended = [], at(0.0), False
     for step in range(steps):
         t = step * dt
@@ -228,8 +225,10 @@ def _errors(policy: TrajectoryFeedback, plan: Plan, e: Array, steps: int) -> Arr
             stop = policy.reference(policy.duration)[1] - policy.end.v
             e = e + np.concatenate((np.zeros(len(e) // 2), StateMap(models.robot).velocities(stop)))
         before, half, after = after, at(t + 0.5 * dt), at(t + dt)
+        # What the trajectory holds ends with the step, whatever acts from the next knot on.
+        last = (*after[:2], policy.reference(t + (1.0 - 1e-6) * dt)[2])
         stages: list[Array] = []
-        for share, (A, B, u_star) in ((0.0, before), (0.5, half), (0.5, half), (1.0, after)):
+        for share, (A, B, u_star) in ((0.0, before), (0.5, half), (0.5, half), (1.0, last)):
             to = e + share * dt * stages[-1] if stages else e
             acting = channel.ask(t + share * dt, to) if channel.continuous and stages else u
             stages.append(A @ to + B @ (acting - u_star))

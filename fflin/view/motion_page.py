@@ -86,7 +86,7 @@ def motion_page(
     if follow:
         shown_points = frame_points(drawing, film, info["size"], follow=True)
     info |= panel(robot, motion, shown, goal)
-    info |= marks(robot, film, tool, info["size"])
+    info |= marks(robot, film, tool, info["size"], goals)
     info |= {
         "mode": "motion",
         "t": packed(t),
@@ -188,11 +188,19 @@ def triads(robot: Robot, tool: str | None, size: float) -> list[dict[str, Any]]:
     ]
 
 
-def marks(robot: Robot, film: Playback, tool: str | None, size: float) -> dict[str, Any]:
-    """Return trails, arrows of the base's wrench and plumes."""
-    trails = [("centre of mass", COM_COLOR, film.com)]
+def marks(
+    robot: Robot, film: Playback, tool: str | None, size: float, goals: Array
+) -> dict[str, Any]:
+    """Return trails, those of goals (N, njoints - 1, 7) that move too, wrenches and plumes."""
+    trails, followed = [("centre of mass", COM_COLOR, film.com)], {}
+    if len(goals) > 1:
+        trails, followed = [("base", COM_COLOR, film.poses[:, 0, :3])], {"base": goals[:, 0, :3]}
     if tool:
         trails.insert(0, ("tool", TOOL_COLOR, film.tool))
+        if followed:
+            joint, at = find_frame(robot.model, tool)
+            ends = [pin.XYZQUATToSE3(each).act(at.translation) for each in goals[:, joint - ROOT]]
+            followed["tool"] = np.array(ends)
     arrows = [("force", FORCE_COLOR, film.force), ("torque", TORQUE_COLOR, film.torque)]
     paths = body_paths(robot)
     most = float(np.abs(film.thrust).max(initial=0.0))
@@ -200,6 +208,10 @@ def marks(robot: Robot, film: Playback, tool: str | None, size: float) -> dict[s
         "trails": [
             {"name": name, "colour": color, "points": packed(points), "radius": 0.0055 * size}
             for name, color, points in trails
+        ],
+        "followed": [
+            {"name": name, "points": packed(points), "radius": 0.004 * size}
+            for name, points in followed.items()
         ],
         "arrows": [
             {

@@ -12,6 +12,7 @@ from fflin.base.names import input_keys
 from fflin.base.validation import Array
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
+from fflin.simulation.motion_plot import resting_from
 from fflin.view.page import packed
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ _NOTHING = 1e-14
 _UNSEEN = 1e-6
 
 _OPEN = np.full(2, np.inf)
+_NONE = np.zeros(0)
 
 # Titles of states and inputs of a group and a unit; in a family a name has one colour.
 _CHARTS: tuple[dict[tuple[str, str], str], ...] = (
@@ -50,11 +52,17 @@ _CHARTS: tuple[dict[tuple[str, str], str], ...] = (
 
 
 class _Line(NamedTuple):
-    """What a chart shows of one name: its values (N,), and limits (2,), infinite where open."""
+    """Values (N,) of a name, its limits (2,), infinite where open, and a reference (N,) or (0,)."""
 
     name: str
     values: Array
     limits: Array
+    reference: Array = _NONE
+
+    @property
+    def size(self) -> float:
+        """The largest of its values."""
+        return float(np.abs((*self.values, *self.reference)).max())
 
 
 def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]]:
@@ -100,16 +108,17 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
     readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]
     plots = [
         _plot(title, unit, [_Line("", values, _OPEN)])
-        for title, unit, values in readouts[:2]
+        for title, unit, values in readouts[: 4 if len(target) > 1 else 2]
         if values.any()
     ]
     readouts.append(("momentum drift", "", motion.momentum_drift[shown]))
     if len(motion.com_drift):  # a file may not tell
         readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
-    lines = _lines(robot, motion, shown)
+    reference = motion.target[shown] if len(target) > 1 else np.zeros((0, motion.x.shape[1]))
+    lines = _lines(robot, motion, shown, reference)
     for family, charts in enumerate(_CHARTS):
         for key, title in charts.items():
-            sizes = [np.abs(line.values).max() for line in lines.get(key, [])]
+            sizes = [line.size for line in lines.get(key, [])]
             seen = [x > _UNSEEN * max(sizes) for x in sizes]
             plot = _plot(title, key[1], list(compress(lines.get(key, []), seen)), family)
             # Of rates their limits alone are of interest.
@@ -121,27 +130,34 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
             for label, unit, values in readouts
         ],
         "plots": plots,
+        "rest": resting_from(motion) if len(target) > 1 else None,
         "passed": [[str(each), each.time] for each in motion.passed],
     }
 
 
-def _lines(robot: Robot, motion: Motion, shown: Array) -> dict[tuple[str, str], list[_Line]]:
+def _lines(
+    robot: Robot, motion: Motion, shown: Array, reference: Array
+) -> dict[tuple[str, str], list[_Line]]:
     """Return the lines of states and inputs that are not zero all along, by group and unit."""
     limits = dict(zip(motion.limit_names, motion.limits, strict=True))
     found: dict[tuple[str, str], list[_Line]] = {}
-    for name, key, unit, column in (
-        *zip(motion.state_names, motion.state_names, motion.state_units, motion.x.T, strict=True),
-        *zip(motion.input_names, input_keys(motion), motion.input_units, motion.u.T, strict=True),
+    names, inputs = motion.state_names, motion.input_names
+    for name, key, unit, column, followed in (
+        *zip(names, names, motion.state_units, motion.x.T, reference.T, strict=True),
+        *zip(
+            *(inputs, input_keys(motion), motion.input_units, motion.u.T, [_NONE] * len(inputs)),
+            strict=True,
+        ),
     ):
         group, _, entry = key.partition(".")
-        line = _Line(entry, column[shown], limits.get(name, _OPEN))
-        if np.abs(line.values).max() < _NOTHING:
+        line = _Line(entry, column[shown], limits.get(name, _OPEN), followed)
+        if line.size < _NOTHING:
             continue
         if group in ("q_m", "qdot_m") and entry in robot.wheels:
             if group == "q_m":
                 continue
             group, inertia = "speed", robot.wheels[entry]
-            momentum = _Line(entry, inertia * line.values, inertia * line.limits)
+            momentum = _Line(entry, *(inertia * each for each in line[1:]))
             found.setdefault(("momentum", "N m s"), []).append(momentum)
         found.setdefault((group, unit), []).append(line)
     return found
@@ -157,6 +173,7 @@ def _plot(title: str, unit: str, lines: list[_Line], family: int = -1) -> dict[s
             {
                 "label": line.name,
                 "values": packed(line.values),
+                "reference": packed(line.reference),
                 "limits": [
                     level
                     for level in line.limits[np.isfinite(line.limits)].tolist()

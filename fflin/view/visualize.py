@@ -57,8 +57,11 @@ def visualize(
     The page has the robot in its colours, triads at base and tool, the trails of the tool and of
     the centre of mass, arrows of force and torque on the base and plumes of thrusters as long as
     u(t), a translucent robot at the target and, where the motion has a linear prediction, another
-    that follows it; a slider, and a panel with errors and inputs over time. Every body is a node
-    ``meshcat/robot/JOINT`` of meshcat's scene whose pose is that of the joint's frame.
+    that follows it; a slider, and a panel with errors and inputs over time. Along a trajectory the
+    reference moves beside the robot, with its paths of base and tool in dashes beside those that
+    were flown, and pale under the joints' curves; a dotted line is where it comes to rest. Every
+    body is a node ``meshcat/robot/JOINT`` of meshcat's scene whose pose is that of the joint's
+    frame.
 
     Parameters
     ----------
@@ -272,8 +275,9 @@ def _pictures(
 
     start, end = float(motion.t[0]), float(motion.t[-1])
     if times is None:
-        # What settles moves most at first.
-        times = [start + share * (end - start) for share in (0.0, 0.08, 0.25, 1.0)]
+        # What settles moves most at first, what follows a trajectory all the time.
+        shares = (0.0, 0.35, 0.7, 1.0) if motion.tracked else (0.0, 0.08, 0.25, 1.0)
+        times = [start + share * (end - start) for share in shares]
     times = check_times(times, start, end)
     contents = {}
     with tempfile.TemporaryDirectory(prefix="fflin-") as folder:

@@ -2,14 +2,18 @@
 
 import contextlib
 import os
+import re
+import runpy
 import signal
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
+from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from scipy.stats import binomtest
 
@@ -19,6 +23,8 @@ from fflin.analysis.validity import _LEVELS, _clopper_pearson, _crossing, _slope
 from fflin.batch.workers import OwnWorkers
 from tests.support.commands import refused, run
 from tests.support.weights import unit_weights
+
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 def held(robot, dt=0.0, reduce=False):
@@ -59,8 +65,6 @@ def test_trust_ends_where_the_error_reaches_a_tenth():
 
 def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
     """A run against an integration of (q, v) by Pinocchio, which knows nothing of the chart."""
-    import pinocchio as pin
-
     robot = robots["ets_vii"]
     lin, gain = held(robot)
     loop = Loop(robot, lin, gain.K)
@@ -91,8 +95,6 @@ def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
 
 
 def test_displacements_are_as_large_as_they_say(robots):
-    import pinocchio as pin
-
     robot = robots["ets_vii"]
     lin, gain = held(robot)
     loop = Loop(robot, lin, gain.K)
@@ -298,3 +300,44 @@ def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
     assert process.returncode == 130
     # The bar is taken away before the line.
     assert said.endswith(b"\r\x1b[2Kfflin: stopped\r\n")
+
+
+def test_frames_are_compared_in_the_same_linear_loop():
+    """What is fed back in base axes is that of `Loop` in that frame, run by run."""
+    robot = fflin.load("ur5")
+    lin = fflin.linearize(robot, fflin.configuration(robot, {"elbow_joint": 1.2}))
+    gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
+    options = {"attitude": 60.0, "position": 0.0, "joint": 0.0, "samples": 6, "seed": 2}
+    found = fflin.validity(robot, lin, gain, frames=("local", "world"), **options)
+    assert list(found.frames) == ["local", "world"] and found.frame == "hybrid"
+    for frame, other in found.frames.items():
+        there = fflin.linearize(robot, lin.q, frame=frame)
+        alone = fflin.validity(robot, there, gain, **options)
+        assert other.outcomes == alone.outcomes and other.frame == frame
+        assert other.prediction_error == pytest.approx(alone.prediction_error, rel=1e-4)
+    # A gain that is as uneven as the inertia bears no turn of the axes that it is given in.
+    assert found.settled == 6 > found.frames["world"].settled
+    assert f"in frame world: {found.frames['world'].settled} of 6 runs" in str(found)
+
+    base = pin.SE3(pin.exp3(np.array([0.3, 0.0, 0.0])), np.zeros(3))
+    q = fflin.configuration(robot, {}, base)
+    turned = fflin.linearize(robot, q, reference=pin.SE3.Identity())
+    with pytest.raises(fflin.InputError, match="turned against the reference"):
+        fflin.validity(robot, turned, gain, frames=["local"], **options)
+    with pytest.raises(fflin.InputError, match="frames is 'local', expected several"):
+        fflin.validity(robot, lin, gain, frames="local", **options)
+
+
+def test_command_compares_frames():
+    options = ("validity", "cubesat", "--samples", "2")
+    code, out, _ = run(*options, "--frames", "local", "hybrid")
+    assert code == 0 and out.count("of 2 runs settled, every one up to") == 2
+    assert "choose from 'hybrid', 'local', 'world'" in refused(*options, "--frames", "base")
+
+
+def test_the_table_of_frames_is_what_its_command_makes():
+    frames = runpy.run_path(str(DOCS / "frames.py"))
+    table = (DOCS / "conventions.md").read_text(encoding="utf-8")
+    design = "acceleration_lqr(lin, 1, 1, 1)"
+    found = frames["settled"](fflin.load("servicer_7dof"), design, 150.0)
+    assert re.search(rf"`{re.escape(design)}`, servicer_7dof \|.* {found} \|$", table, re.MULTILINE)

@@ -2,6 +2,7 @@
 
 import itertools
 import warnings
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from fflin.simulation import compiled
+from fflin.simulation import compiled, packing
 from tests.support.measured import POSITIONS, designed
 from tests.support.motions import HOME, displaced
 from tests.support.motions import motion as trajectory
@@ -17,6 +18,9 @@ from tests.support.robots import BUNDLED, FRAMES, LINKS, MIMIC, free_body, rando
 from tests.support.weights import unit_weights
 
 pytest.importorskip("numba")
+
+from fflin.kernel import tracking
+from fflin.kernel.loop import advance
 
 WHEEL = fflin.ReactionWheel((0, 0, 1), name="spin", inertia=0.02, max_speed=300.0, max=0.5)
 STORING = fflin.ReactionWheel((1, 2, 2), name="storing", momentum=3.0)
@@ -263,3 +267,75 @@ def test_the_quicker_loop_is_taken_and_the_motion_says_which(robots, monkeypatch
         assert fflin.Motion.load(tmp_path / "motion.npz").engine == engine
     monkeypatch.setattr(compiled, "_LARGEST_FACTOR", 0)
     assert fflin.simulate(robot, duration=0.1, dt=0.01).engine == "python"
+
+
+# What is the same for all lanes.
+SHARED = {"turns", "slides", "factor", "axes", "armature", "share", "weights", "moments", "nodes"}
+
+
+def in_lanes(runs):
+    """The parts of eight runs side by side."""
+    first = runs[0]
+    if isinstance(first, np.ndarray):
+        return np.column_stack(runs).copy() if first.dtype == float else first
+    if isinstance(first, tracking.Path):
+        return first._replace(e=in_lanes([each.e for each in runs]))
+    if not isinstance(first, tuple):
+        return first
+    names = getattr(first, "_fields", range(len(first)))
+    parts = [
+        own[0] if name in SHARED else in_lanes(own)
+        for name, own in zip(names, zip(*runs, strict=True), strict=True)
+    ]
+    return type(first)(*parts) if hasattr(first, "_fields") else tuple(parts)
+
+
+def test_eight_lanes_are_eight_runs(robots, monkeypatch):
+    """Each with a start, masses and gains of its own."""
+    jet = fflin.Thruster("link_2", (0.2, 0.1, 0.0), (1.0, 0.5, 0.2), "jet")
+    inputs = [*robots["ets_vii"].inputs, jet, STORING]
+    runs, motions, given = [], [], packing.packed
+
+    def packed(*arguments):
+        runs.append(given(*arguments))
+        return deepcopy(runs[-1])
+
+    monkeypatch.setattr(packing, "packed", packed)
+    for share in np.linspace(0.8, 1.2, 8):
+        model = robots["ets_vii"].model.copy()
+        for joint in range(1, model.njoints):
+            model.inertias[joint] = pin.Inertia.FromDynamicParameters(
+                share * model.inertias[joint].toDynamicParameters()
+            )
+        robot = fflin.from_model(model, inputs=inputs, stiffness={"joint_1": 10.0 * share})
+        lin = fflin.linearize(robot)
+        policy = fflin.StateFeedback(lin, share * fflin.lqr(lin).K)
+        options = {"x0": share * displaced(lin), "dt": 0.01, "linear": False}
+        motions.append(fflin.simulate(robot, policy, duration=2.0, **options, engine="compiled"))
+    parts = in_lanes(runs)
+    clock, width = np.zeros(1, dtype=np.intp), robot.nq + 6 + robot.n + len(lin.u0) + 9
+    rows, work = np.empty((21 * width, 8)), np.empty((parts[0].layout.size, 8))
+    advance(*parts, clock, 150, 10, rows, work)
+    advance(*parts, clock, 200, 10, rows[15 * width :], work)
+    for lane, motion in enumerate(motions):
+        found = rows[: 20 * width, lane].reshape(20, width)
+        np.testing.assert_allclose(found[:, : robot.nq], motion.q[:200:10], rtol=0, atol=1e-12)
+        u = found[:, robot.nq + 6 + robot.n : -9]
+        np.testing.assert_allclose(u, motion.u[:200:10], rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(parts[6].q[:, lane], motion.q[-1], rtol=0, atol=1e-12)
+    assert np.ptp(parts[6].q[:7], axis=1).min() > 1e-4
+
+
+def test_a_command_that_is_no_number_is_told(robots):
+    robot = robots["cubesat"]
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, np.full(lin.B.shape[::-1], 1e308))
+    x0 = displaced(lin, offset=100.0)
+    options = {"x0": x0, "sample": 0.01, "duration": 0.1, "linear": False}
+    said = []
+    for engine in compiled.ENGINES:
+        with np.errstate(over="ignore"), pytest.raises(fflin.InputError) as caught:
+            fflin.simulate(robot, policy, **options, engine=engine)
+        said.append(str(caught.value))
+    assert said[0] == said[1]
+    assert "gave nan for tau_b.x" in said[0]

@@ -2,11 +2,14 @@
 
 import math
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import fflin
+from fflin.dynamics.state_rows import moved_by
+from tests.support.motions import tracked
 from tests.support.weights import unit_weights
 
 pytest.importorskip("matplotlib")
@@ -21,6 +24,12 @@ def loop():
     x0[2] = math.sin(math.radians(10.0))
     policy = fflin.StateFeedback(lin, gain.K)
     return lin, gain, fflin.simulate(robot, policy, x0=x0, duration=3.0, every=10)
+
+
+ROWS = (
+    *("t", "q", "v", "x", "u", "target", "prediction"),
+    *("energy", "momentum", "momentum_drift", "com_drift"),
+)
 
 
 def lines(axes):
@@ -48,6 +57,75 @@ def test_motion_shows_linear_beside_nonlinear_and_their_difference(loop):
         name for name in motion.input_names if name.startswith("tau_m")
     }
     assert "momentum drift, relative" in axes
+
+
+@pytest.fixture(scope="module")
+def along():
+    """A run along a trajectory, and beyond its end for as long again."""
+    return tracked(fflin.load("planar_detumble"), 2.0, run=4.0, limits=0.3)
+
+
+def test_a_reference_lies_pale_under_what_follows_it(along):
+    _, motion = along
+    figure = motion.plot()
+    found = panels(figure)
+    titles = ("attitude q_b", "position r_b", "joints q_m", "angular velocity omega_b")
+    titles = (*titles, "velocity v_b", "joint rates")
+    for title, start in zip(titles, range(0, 18, 3), strict=True):
+        curves = [each for each in found[title].get_lines() if len(each.get_xdata()) > 2]
+        assert len(curves) == 6
+        for k, (pale, flown) in enumerate(zip(curves[::2], curves[1::2], strict=True)):
+            np.testing.assert_array_equal(pale.get_ydata(), motion.target[:, start + k])
+            np.testing.assert_array_equal(flown.get_ydata(), motion.x[:, start + k])
+            assert pale.get_color() == flown.get_color() and pale.get_alpha() < 0.5
+            assert pale.get_linewidth() > 2.0 * flown.get_linewidth()
+    texts = [text.get_text() for axes in figure.axes for text in legend_texts(axes)]
+    assert texts.count("reference") == 1
+    figure = motion.plot(show=["q_m", "tau_m"])
+    (named,) = figure.legends
+    assert [text.get_text() for text in named.get_texts()][-2:] == ["reference", "limit"]
+    assert not any(legend_texts(axes) for axes in figure.axes[:-1])
+
+
+def legend_texts(axes):
+    return axes.get_legend().get_texts() if axes.get_legend() else []
+
+
+def test_below_it_stands_the_error_and_that_which_is_foreseen(along):
+    _, motion = along
+    figure = motion.plot()
+    strips = [each for each in figure.axes if each.get_ylabel().startswith("error")]
+    units = ["[deg]", "[m]", "[rad]", "[rad/s]", "[m/s]", "[rad/s]"]
+    assert [each.get_ylabel() for each in strips] == [f"error\n{unit}" for unit in units]
+    flown, foreseen = (
+        np.array([each.get_ydata() for axes in strips for each in axes.get_lines()[at:6:2]]).T
+        for at in (0, 1)
+    )
+    np.testing.assert_allclose(flown[:, 3:], motion.error[:, 3:], atol=1e-15)
+    turned = motion.error[:, :3] / np.linalg.norm(motion.error[:, :3], axis=1, keepdims=True)
+    np.testing.assert_allclose(flown[:, :3], motion.attitude_error[:, None] * turned, atol=1e-6)
+    assert all(each.get_linestyle() == "--" for axes in strips for each in axes.get_lines()[1:6:2])
+    angles = np.radians(np.linalg.norm(foreseen[:, :3], axis=1, keepdims=True))
+    foreseen[:, :3] = np.radians(foreseen[:, :3]) * np.sin(angles / 2.0) / angles
+    back = moved_by(motion.frame, motion.target, foreseen)
+    np.testing.assert_allclose(back, motion.linear, atol=1e-12)
+
+
+def rests(figure):
+    """The times at which lines mark that a reference rests, of each panel that has one."""
+    marks = [[x for x in axes.get_lines() if x.get_label() == "_rest"] for axes in figure.axes]
+    return [line.get_xdata()[0] for (line,) in filter(None, marks)]
+
+
+def test_a_line_marks_where_the_reference_comes_to_rest(along):
+    traj, motion = along
+    figure = motion.plot()
+    assert rests(figure) == [traj.t[-1]] * (len(figure.axes) - 1)
+    assert figure.get_suptitle().endswith("dashed: linear; reference at rest from 2 s")
+    within = motion.t <= traj.t[-1]
+    rows = {name: getattr(motion, name)[within] for name in ROWS}
+    figure = replace(motion, **rows).plot()
+    assert not rests(figure) and "rest" not in figure.get_suptitle()
 
 
 def test_motion_without_a_prediction_has_no_differences():

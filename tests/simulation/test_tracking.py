@@ -5,26 +5,10 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from benchmarks.cases.trajectory import beside as beside_knots
+from benchmarks.cases.trajectory import flown
 from fflin.dynamics.state_rows import moved_by, moving_error, moving_errors
-
-
-def swung(robot, duration=4.0, *, size=0.1, spin=0.0, sample=None):
-    """A motion under joint torques that swing, and come to nothing at the end."""
-    nu = len(fflin.linearize(robot).u0)
-
-    def policy(t, q, v):
-        return size * np.sin(2.0 * np.pi * t / duration) * np.cos(np.arange(nu))
-
-    v0 = np.zeros(robot.nv)
-    v0[3:6] = spin
-    return fflin.simulate(
-        robot, policy, v0=v0, duration=duration, dt=0.01, frame="local", sample=sample
-    )
-
-
-def beside(robot, traj, size, seed=3):
-    step = size * np.random.default_rng(seed).standard_normal(robot.nv)
-    return pin.integrate(robot.model, traj.q[0], step), traj.v[0] + 0.3 * step
+from tests.support.motions import beside, swung
 
 
 @pytest.fixture(scope="module")
@@ -222,3 +206,46 @@ def test_a_motion_that_is_followed_comes_back_from_its_file(case, tmp_path):
         np.testing.assert_array_equal(back.target, run.target)
         np.testing.assert_array_equal(back.error, run.error)
         assert back.tracked
+
+
+def test_a_loop_of_ten_seconds_comes_back_to_a_hundredth_of_a_degree():
+    """Under the default weights, and inputs that are limited to a third of what they ask for."""
+    traj = flown()
+    robot, along = traj.robot, fflin.linearize_trajectory(traj.robot, traj)
+    schedule = fflin.tvlqr(along)
+    assert "the base from 3 deg" in schedule.weights
+    q0, v0 = beside_knots(traj)
+    for limit, degrees in ((None, 0.01), (20.0, 0.1)):
+        run = fflin.simulate(robot, schedule, q0=q0, v0=v0, limits=limit, linear=False)
+        assert run.attitude_error[0] == pytest.approx(1.0)
+        assert run.attitude_error[-1] < degrees
+        largest = np.abs(run.u).max()
+        assert largest == 20.0 if limit else largest > 60.0
+
+
+@pytest.mark.parametrize("sample", [None, 0.1])
+def test_after_the_end_the_regulator_about_rest_acts_whatever_the_weight_at_the_end(sample):
+    robot = fflin.load("planar_detumble")
+    traj = swung(robot, size=0.3).trajectory()
+    along = fflin.linearize_trajectory(robot, traj)
+    heavy = fflin.tvlqr(along, 10.0, 0.05, 1e4, sample=sample)
+    steady = fflin.tvlqr(along, 10.0, 0.05, "steady", sample=sample)
+    ends = [
+        fflin.TrajectoryFeedback(along, each).gain(traj.t[-1] + 1.0) for each in (heavy, steady)
+    ]
+    np.testing.assert_array_equal(*ends)
+    if sample is None:
+        np.testing.assert_allclose(ends[1], steady.K[-1], rtol=0.05, atol=1e-2)
+    run = fflin.simulate(robot, heavy, duration=30.0)
+    assert not run.stopped
+    assert np.abs(run.error[-1]).max() < 1e-3
+
+
+def test_the_last_step_ends_on_the_trajectory_whatever_its_time_is_rounded_to():
+    robot = fflin.load("planar_detumble")
+    traj = swung(robot, 1.0, size=0.3, spin=0.02).trajectory()
+    policy = fflin.TrajectoryFeedback(traj, fflin.tvlqr(fflin.linearize_trajectory(robot, traj)))
+    late = np.nextafter(policy.duration, np.inf)
+    for t in (policy.duration, late):
+        np.testing.assert_array_equal(policy.reference(t)[1], traj.point(traj.t[-1])[1])
+    assert not policy.reference(policy.duration + 1e-6)[1].any()

@@ -98,6 +98,10 @@ def sound(folder):
         "momentum_reduction": {"lin": fflin.linearize(robot.replace(inputs=robot.inputs[2:]))},
         "observability": {"lin": lin},
         "OutputFeedback": {"lin": lin, "compensator": fflin.lqg(gain, filtered), "noise": None},
+        "plan": {
+            **{"robot": robot, "goal": (q, None), "duration": 1.0, "q0": q, "v0": v, "x0": None},
+            **{"knots": 3, "hold": "previous", "limits": None, "R": 1.0, "free": ()},
+        },
         "plot_check": {"check": fflin.check(robot, lin), "path": None},
         "plot_loops": {"gain": gain, "path": None},
         "plot_matrices": {"lin": lin, "path": None},
@@ -143,10 +147,16 @@ def sound(folder):
         "Trajectory": dict(zip("tqvu", (t, *rows), strict=True))
         | {"robot": robot, "hold": None, "frame": "local"},
         "TrajectoryFeedback": {"trajectory": along, "schedule": schedule},
+        "TrajectoryOutputFeedback": {
+            **{"trajectory": along, "filter": fflin.tvkalman(along, 1.0, 1.0, None, 1.0, 0.01)},
+            **{"schedule": fflin.tvlqr(along, 1.0, 1.0, 1.0, 0.01), "noise": None},
+        },
+        "tvkalman": {"traj": along, "W": 1.0, "V": 1.0, "G": along.B, "P0": 1.0, "sample": None},
         "tvlqr": {"traj": along, "Qf": 1.0, "sample": None, "weights": None} | weights,
         "validity": {
             **{"robot": robot, "lin": lin, "gain": None, "attitude": 5.0, "position": 0.1},
             **{"joint": 0.1, "samples": 1, "seed": 0, "confidence": 0.9, "executor": None},
+            "frames": (),
         },
         "velocity": {"robot": robot, "values": {}},
         "visualize": {

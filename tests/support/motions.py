@@ -65,6 +65,12 @@ def settling(robot, duration, *, reference=HOME, predicted=False):
     )
 
 
+def led(motion, rows=250):
+    """The motion as one that follows what it does itself so many rows later."""
+    ahead = np.minimum(np.arange(len(motion.t)) + rows, len(motion.t) - 1)
+    return replace(motion, target=motion.x[ahead])
+
+
 def motion(robot, start=None, duration=0.4, knots=81):
     """A motion of the robot under inputs that change slowly, to 1e-10."""
     q0, v0, u0 = random_point(robot, np.random.default_rng(1))
@@ -120,3 +126,31 @@ def strong_thrusters():
     """The thrusters of the cubesat, each as strong as it is asked to be."""
     inputs = fflin.load_inputs("cubesat")
     return [replace(x, max=None) for x in inputs if isinstance(x, fflin.Thruster)]
+
+
+def swung(robot, duration=4.0, *, size=0.1, spin=0.0, sample=None):
+    """A motion under joint torques that swing, and come to nothing at the end."""
+    nu = len(fflin.linearize(robot).u0)
+
+    def policy(t, q, v):
+        return size * np.sin(2.0 * np.pi * t / duration) * np.cos(np.arange(nu))
+
+    v0 = np.zeros(robot.nv)
+    v0[3:6] = spin
+    return fflin.simulate(
+        robot, policy, v0=v0, duration=duration, dt=0.01, frame="local", sample=sample
+    )
+
+
+def beside(robot, traj, size, seed=3):
+    """A start beside that of a trajectory, by some of the size in every direction."""
+    step = size * np.random.default_rng(seed).standard_normal(robot.nv)
+    return pin.integrate(robot.model, traj.q[0], step), traj.v[0] + 0.3 * step
+
+
+def tracked(robot, duration=4.0, *, run=None, off=0.02, size=0.1, **options):
+    """A trajectory and a run of the feedback along it that begins beside it."""
+    traj = swung(robot, duration, size=size, spin=0.05).trajectory().resampled(0.05)
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj))
+    q0, v0 = beside(robot, traj, off)
+    return traj, fflin.simulate(robot, schedule, q0=q0, v0=v0, duration=run, **options)

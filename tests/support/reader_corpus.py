@@ -146,7 +146,12 @@ refuse("com of two entries", arm(child=inertial(origin='<origin xyz="0 0"/>')), 
 refuse("rpy beyond anything", arm(inside=f'{AXIS}<origin rpy="1e40 0 0"/>'), "beyond anything")
 refuse("xyz of 1e29", arm(inside=f'{AXIS}<origin xyz="0 -1e29 0"/>'), ":4:", "'hinge'", "1e+07 m")
 refuse("xyz of 1e8", arm(inside=f'{AXIS}<origin xyz="1e8 0 0"/>'), ":4:", "'hinge'", "1e+08 m")
-warn("xyz of 1e7", arm(inside=f'{AXIS}<origin xyz="1e7 0 0"/>'), "moves an inertia of 1.0e+00 only")
+warn(
+    "xyz of 1e7",
+    arm(inside=f'{AXIS}<origin xyz="1e7 0 0"/>'),
+    "moves an inertia of 1.0e+00 only",
+    "see whether joints are placed in metres",
+)
 refuse(
     "mimic offset of 1e29",
     arm(

@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 import fflin
+from tests.support.motions import led
 from tests.support.patience import PATIENCE, wait_until
 
 needs_chromium = pytest.mark.skipif(not shutil.which("chromium"), reason="no chromium")
@@ -35,6 +36,15 @@ def test_pictures(robots, motion, tmp_path):
         assert image.n_frames == 6 and image.size == (640, 400)
     with pytest.raises(fflin.InputError, match="times are"):
         fflin.visualize(robot, motion, png=strip, times=[9.0])
+
+
+def test_along_a_trajectory_pictures_are_taken_all_the_way(robots, motion, tmp_path, monkeypatch):
+    taken = []
+    monkeypatch.setattr("fflin.view.capture.find_chromium", lambda: "")
+    monkeypatch.setattr("fflin.view.capture.take_png", lambda _, at, size: taken.append(at) or b"")
+    for each in (motion, led(motion)):
+        fflin.visualize(robots["planar_detumble"], each, png=tmp_path / "m.png")
+    np.testing.assert_allclose(taken, np.array([[0, 0.08, 0.25, 1.0], [0, 0.35, 0.7, 1.0]]) * 4.0)
 
 
 def test_without_chromium_one_line_says_how(robots, motion, tmp_path, monkeypatch):

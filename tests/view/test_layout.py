@@ -9,7 +9,7 @@ import pytest
 
 import fflin
 from tests.support.browser import Watched, chromium
-from tests.support.motions import settling
+from tests.support.motions import led, settling
 
 SIZES = [(800, 600), (1400, 900)]
 
@@ -29,6 +29,7 @@ ROBOTS = {
     "servicer_7dof": lambda: with_inputs("servicer_7dof"),
     "canadarm2": lambda: fflin.load("canadarm2"),
     "talos": lambda: fflin.load("talos"),
+    "along": lambda: with_inputs("servicer_7dof"),
 }
 
 
@@ -41,13 +42,14 @@ def watched(request, browser, tmp_path_factory):
         warnings.simplefilter("ignore")
         robot = ROBOTS[request.param]()
         motion = settling(robot, 20.0, predicted=True)
+    motion = led(motion) if request.param == "along" else motion
     wheels = [motion.state_names.index(f"qdot_m.{name}") for name in robot.wheels]
     x = motion.x.copy()
     x[:, wheels] = np.sin(motion.t)[:, None] * 100.0
     path = tmp_path_factory.mktemp("layout") / "motion.html"
     fflin.visualize(robot, replace(motion, x=x), html=path)
     watched = Watched(browser, path.as_uri() + "#pause", size=SIZES[0])
-    watched.name = request.param
+    watched.name, watched.led = request.param, motion.tracked
     watched.do("fflin.seek(7)")
     yield watched
     assert not watched.errors
@@ -135,9 +137,10 @@ def test_every_curve_can_be_told(watched):
                 assert colour == keys.get(label, "#8a93a5")
             widest = max(plot["lines"], key=lambda line: np.ptp(line[2]))
             assert widest[0] in keys
-    texts = watched.page.locator(".keys span").all_text_contents()
+    assert watched.page.locator(".pale span").all_text_contents() == ["reference"] * watched.led
+    texts = watched.page.locator(".keys:not(.pale) span").all_text_contents()
     assert texts == [name for kin in families.values() for name, _ in kin[0]["keys"] or []]
-    swatches = watched.do("""[...document.querySelectorAll('.keys span')].map((each) =>
+    swatches = watched.do("""[...document.querySelectorAll('.keys:not(.pale) span')].map((each) =>
         each.style.getPropertyValue('--swatch'))""")
     assert swatches == [c for kin in families.values() for _, c in kin[0]["keys"] or []]
     # The line that lies highest at the last moment, by pointing above it.
@@ -185,7 +188,10 @@ def test_frames_of_a_strip_have_their_time_and_the_first_a_legend(watched, size)
         texts = watched.page.locator("#legend label").all_text_contents()
         named = watched.do("""fflin.plots.filter(({ title }) => title === 'thrusters')
             .flatMap(({ keys }) => keys.map(([name]) => name))""")
-        assert texts[-2 - len(named) :] == ["target", "linear model", *named]
+        assert texts[-2 - len(named) :] == [
+            "reference, at rest from 17.5 s" if watched.led else "target",
+            *("linear model", *named),
+        ]
         for hidden in ("#panel", "#bar", "header"):
             assert not len(boxes(watched, hidden))
         watched.do("fflin.plain(true, false)")
@@ -222,7 +228,7 @@ def test_what_was_passed_leads_to_its_time(browser, tmp_path):
     watched.page.close()
 
 
-def rows_of(watched, at, colour, low, high):
+def rows_of(watched, at, colour, low, high, least=120):
     """Return {value: columns} where a plot has a colour, of values from its axis."""
     pixels, width, height = watched.do(f"""(() => {{
         const canvas = document.querySelectorAll('.plot canvas')[{at}];
@@ -231,7 +237,7 @@ def rows_of(watched, at, colour, low, high):
     }})()""")
     image = np.array(pixels, dtype=int).reshape(height, width, 4)[:, : width - 46]
     wanted = [int(part, 16) for part in re.findall("..", colour[1:])]
-    near = (np.abs(image[..., :3] - wanted).max(axis=2) < 40) & (image[..., 3] > 120)
+    near = (np.abs(image[..., :3] - wanted).max(axis=2) < 40) & (image[..., 3] > least)
     values = high - (np.arange(height) + 0.5 - 1.0) / (height - 2) * (high - low)
     return near, values, (high - low) / (height - 2)
 
@@ -265,6 +271,45 @@ def test_curves_and_limits_are_drawn_where_the_data_have_them(browser, tmp_path)
         seen = values[near[:, column] & (np.abs(values) < 8.0)]
         assert np.abs(seen - expected).min() < 2.0 * step
     assert not near[np.argmin(np.abs(values - 8.5))].any()
+    watched.page.close()
+
+
+def test_a_reference_is_pale_under_its_curve_and_a_line_is_where_it_rests(browser, tmp_path):
+    robot = fflin.load("ets_vii")
+    motion = settling(robot, 20.0)
+    at = motion.state_names.index("q_m.joint_1")
+    x = motion.x.copy()
+    x[:, 6 : 6 + robot.n] = 0.0
+    x[:, at] = 1.0 + 0.5 * np.sin(motion.t)
+    target = x.copy()
+    target[:, at] = -2.0 + 0.5 * np.cos(np.minimum(motion.t, 15.0))
+    target[motion.t > 14.995, :6] = target[-1, :6]
+    path = tmp_path / "m.html"
+    fflin.visualize(robot, replace(motion, x=x, target=target), html=path)
+    watched = Watched(browser, path.as_uri() + "#pause", size=(1400, 900))
+    watched.drawn()
+    titles = watched.do("fflin.plots.map(({ title }) => title)")
+    assert titles[:3] == ["attitude error", "position error", "largest joint error"]
+    plot = titles.index("joints")
+    (colour,) = watched.do(f"fflin.plots[{plot}].lines.map(({{ colour }}) => colour)")
+    low, high = (each + 0.06 * 4.0 * s for each, s in ((-2.5, -1), (1.5, 1)))
+    near, values, _ = rows_of(watched, plot, colour, low, high, least=60)
+    full, _, _ = rows_of(watched, plot, colour, low, high)
+    times = np.linspace(0.0, 20.0, near.shape[1] + 1)
+    for column in range(10, near.shape[1] - 10, 12):
+        t = times[column]
+        pale = values[near[:, column] & (values < -1.0)]
+        assert np.abs(pale + 2.0 - 0.5 * np.cos(min(t, 15.0))).max() < 0.2
+        assert not full[values < -1.0, column].any()
+        assert full[values > 0.3, column].any()
+    assert near[values < -1.0].sum() > 1.5 * near[values > 0.3].sum()  # it is the wider
+    assert watched.do(
+        "JSON.parse(document.getElementById('data').textContent).rest"
+    ) == pytest.approx(15.0)
+    line, _, _ = rows_of(watched, plot, "#93a1ba", low, high, least=60)
+    free = line[np.abs(values + 0.7) < 0.5]  # between the curves
+    found = np.flatnonzero(free.mean(axis=0) > 0.2)
+    assert len(found) and np.abs(times[found] - 15.0).max() < 0.2
     watched.page.close()
 
 

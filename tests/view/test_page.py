@@ -11,8 +11,9 @@ import pytest
 
 import fflin
 from fflin.robot.robot import ROOT
+from fflin.view.playback import default_tool
 from tests.support.browser import Watched, chromium
-from tests.support.motions import HOME, settling
+from tests.support.motions import HOME, led, settling
 
 # Positions travel as 32-bit floats, of metres.
 EXACT = 1e-5
@@ -457,16 +458,22 @@ def test_without_a_target_there_is_no_ghost(robots, browser, tmp_path):
     watched.page.close()
 
 
-def test_a_target_that_moves_is_shown_where_it_is(robots, browser, tmp_path):
+@pytest.fixture(scope="module")
+def led_page(robots, browser, tmp_path_factory):
+    """A motion that follows another, and its page."""
     robot = robots["planar_detumble"]
-    motion = settling(robot, duration=4.0)
-    state = fflin.StateMap(robot, reference=motion.reference, frame=motion.frame)
-    # Steered along its own way, half a second ahead of where it is.
-    ahead = np.minimum(np.arange(len(motion.t)) + 250, len(motion.t) - 1)
-    motion = replace(motion, target=motion.x[ahead])
-    path = tmp_path / "along.html"
+    motion = led(settling(robot, duration=4.0))
+    path = tmp_path_factory.mktemp("led") / "along.html"
     fflin.visualize(robot, motion, html=path)
     watched = Watched(browser, path.as_uri() + "#pause")
+    yield robot, motion, watched, page_data(path)
+    assert not watched.errors
+    watched.page.close()
+
+
+def test_a_reference_moves_and_is_shown_where_it_is(led_page):
+    robot, motion, watched, _ = led_page
+    state = fflin.StateMap(robot, reference=motion.reference, frame=motion.frame)
     for t in (0.0, 1.7, 4.0):
         watched.do(f"fflin.seek({t})")
         index = np.argmin(np.abs(motion.t - t))
@@ -476,5 +483,63 @@ def test_a_target_that_moves_is_shown_where_it_is(robots, browser, tmp_path):
         angle = np.degrees(np.linalg.norm(pin.log3(to.actInv(base).rotation)))
         value = watched.page.locator(".readouts b").first.text_content()
         assert float(value.split()[0]) == pytest.approx(angle, rel=3e-2, abs=1e-3)
-    assert not watched.errors
-    watched.page.close()
+
+
+def middle_of(watched, *path, mesh):
+    """Return the points (N, 3) that a tube runs along, and the share of it that is drawn."""
+    points, share = watched.do(f"""(() => {{
+        const trail = viewer.scene_tree.find(['meshcat', ...{list(path)!r}]).object.children[0];
+        const {{ attributes, index }} = trail.children[{mesh}].geometry, points = [];
+        for (let k = 0; k < attributes.position.count; k += 7) {{
+            const sum = new MeshCat.THREE.Vector3(), p = new MeshCat.THREE.Vector3();
+            for (let j = k; j < k + 6; j++) sum.add(p.fromBufferAttribute(attributes.position, j));
+            points.push(sum.divideScalar(6).toArray());
+        }}
+        return [points, index.count / 36 / (points.length - 1)];
+    }})()""")
+    return np.array(points), share
+
+
+def test_the_paths_of_the_reference_are_dashed_beside_those_flown(led_page):
+    robot, motion, watched, _ = led_page
+    state = fflin.StateMap(robot, reference=motion.reference, frame=motion.frame)
+    data, tool = robot.model.createData(), robot.model.getFrameId(default_tool(robot))
+
+    def course(q):
+        ends = []
+        for each in q:
+            pin.framesForwardKinematics(robot.model, data, each)
+            ends.append(data.oMf[tool].translation.copy())
+        return {"base": q[:, :3], "tool": np.array(ends)}
+
+    followed = course(np.array([state.to_pinocchio(x)[0] for x in motion.target]))
+    flown = course(motion.q)
+    for k, name in enumerate(("base", "tool")):
+        reference, share = middle_of(watched, "target", f"path {k}", mesh=0)
+        assert 0.2 < share < 0.9  # gaps between
+        own, whole = middle_of(watched, "trails", name, mesh=1)
+        assert whole == 1.0
+        for points, expected in ((reference, followed[name]), (own, flown[name])):
+            away = np.linalg.norm(points[:, None] - expected, axis=2)
+            assert away.min(axis=1).max() < 4e-3
+            assert away[0, 0] < EXACT < 4e-3 < np.linalg.norm(reference[0] - own[0])
+            assert away[-1, -1] < 4e-3
+    # They are named, and the reference's go with its ghost.
+    named = watched.page.locator("#legend label").all_text_contents()
+    assert named[:2] == ["path of the tool", "path of the base"]
+    box = watched.page.get_by_label("reference, at rest from 3.5 s")
+    shown = "viewer.scene_tree.find(['meshcat', 'target']).object.visible"
+    for check, expected in ((box.uncheck, False), (box.check, True)):
+        check(force=True)
+        assert watched.do(shown) is expected
+    assert watched.page.locator("#legend i.dashed").count() == 1
+
+
+def test_a_reference_adds_little_to_the_page(led_page):
+    _, motion, _, shown = led_page
+    rows = len(shown["t"]) * 3 / 16
+    assert rows < 130 < len(motion.t)
+    added = sum(len(each["points"]) for each in shown["followed"])
+    added += sum(len(line["reference"]) for plot in shown["plots"] for line in plot["lines"])
+    # Two paths of three single floats and three joints, in base64.
+    assert added <= 16 / 3 * rows * (2 * 3 + 3) + 40

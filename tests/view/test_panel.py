@@ -10,7 +10,7 @@ import pytest
 import fflin
 from fflin.view.motion_page import subtitle
 from fflin.view.panel import errors, panel
-from tests.support.motions import settling
+from tests.support.motions import led, settling
 from tests.support.robots import random_pose
 
 
@@ -210,3 +210,34 @@ def test_what_was_passed_is_told_with_its_time(robots):
     motion = limited(replace(motion, u=u), {name: (-2.0, 2.0)})
     ((text, time),) = panel(robot, motion, every(motion), motion.q[:1])["passed"]
     assert time == motion.t[700] and text == f"{name} 3 N m at 0.35 s, limit 2"
+
+
+def test_what_is_followed_goes_with_joints_and_wheels():
+    wheel = fflin.ReactionWheel((0, 0, 1), name="w", inertia=1e-3)
+    robot = fflin.load("planar_detumble")
+    robot = robot.replace(inputs=[*robot.inputs, wheel])
+    motion = settling(robot, 1.0)
+    x = motion.x.copy()
+    x[:, motion.state_names.index("qdot_m.w")] = np.sin(motion.t)
+    motion = led(replace(motion, x=x))
+    rows = every(motion)
+    goal = np.tile(robot.neutral(), (len(rows), 1))
+    shown = panel(robot, motion, rows, goal)
+    followed = {
+        plot["title"]: {line["label"]: floats(line["reference"]) for line in plot["lines"]}
+        for plot in shown["plots"]
+    }
+    for joint in robot.joint_names[:3]:
+        expected = motion.target[rows, motion.state_names.index(f"q_m.{joint}")]
+        np.testing.assert_allclose(followed["joints"][joint], expected, rtol=1e-6)
+    speed = motion.target[rows, motion.state_names.index("qdot_m.w")]
+    np.testing.assert_allclose(followed["wheel speed"]["w"], speed, rtol=1e-6)
+    np.testing.assert_allclose(followed["wheel momentum"]["w"], 1e-3 * speed, rtol=1e-6)
+    assert not any(each.size for each in followed["joint torques"].values())
+    assert shown["rest"] == motion.t[-251]
+    titles = [plot["title"] for plot in shown["plots"]]
+    assert titles[:3] == ["attitude error", "position error", "largest joint error"]
+    # Of a target that stands still nothing is said to be followed.
+    shown = panel(robot, motion, rows, robot.neutral()[None])
+    assert shown["rest"] is None
+    assert not any(line["reference"] for plot in shown["plots"] for line in plot["lines"])

@@ -33,29 +33,11 @@ def is_impossible(mass: float, moments: Sequence[float]) -> bool:
 
 
 def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[str]:
-    """Judge the inertia of every link as it stands in the file.
+    """Warn of what is odd about the inertia of a link as it stands in the file, `origin`.
 
     The principal moments of a body are positive, and none is more than the sum of the others.
-    A link that breaks the first is refused, unless the rigid body of which it is a part, all
-    links that fixed joints weld together, outweighs it by far.
-
-    Parameters
-    ----------
-    links : iterable of Link
-    model : pin.Model
-        Built from them, with the bodies welded.
-    origin : str
-        What the notes call the file.
-
-    Returns
-    -------
-    list of str
-        Warnings.
-
-    Raises
-    ------
-    UrdfError
-        If an inertia is impossible and matters.
+    A link that breaks the first is refused, unless the rigid body of which it is a part in the
+    model, all links that fixed joints weld together, outweighs it by far.
     """
     unequal, weightless, negligible = [], [], []
     for link in links:
@@ -63,7 +45,9 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
             continue
         least, middle, largest = link.principal_inertias().tolist()
         if is_impossible(link.mass, (least, middle, largest)):
-            if abs(least) > _LOST_IN_BODY * _least_moment_of_body(link, model):
+            joint = model.frames[model.getFrameId(link.name, pin.FrameType.BODY)].parentJoint
+            of_body = np.linalg.eigvalsh(model.inertias[joint].inertia)[0]
+            if abs(least) > _LOST_IN_BODY * of_body:
                 raise link.element.error(
                     f"the inertia of link {quoted(link.name)} has principal moments {least:.3g}, "
                     f"{middle:.3g}, {largest:.3g} kg m^2; none can be negative: correct ixx ... izz"
@@ -73,20 +57,11 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
             unequal.append(link.name)
         if link.mass == 0.0 and any(link.inertia):
             weightless.append(link.name)
-    notes = []
-    if negligible:
-        notes.append(
-            f"{origin}: the inertia of {named('link', negligible)} has a negative principal "
-            "moment, of no account beside the links it is fixed to"
-        )
-    if unequal:
+    lost = f"the inertia of {named('link', negligible)} has a negative principal moment, of no "
+    notes = (
+        (negligible, f"{lost}account beside the links it is fixed to"),
         # One principal moment is more than the sum of the others.
-        notes.append(f"{origin}: inertia of no rigid body: {enumerated(unequal)}")
-    if weightless:
-        notes.append(f"{origin}: an inertia and no mass: {named('link', weightless)}")
-    return notes
-
-
-def _least_moment_of_body(link: Link, model: pin.Model) -> float:
-    joint = model.frames[model.getFrameId(link.name, pin.FrameType.BODY)].parentJoint
-    return float(np.linalg.eigvalsh(model.inertias[joint].inertia)[0])
+        (unequal, f"inertia of no rigid body: {enumerated(unequal)}"),
+        (weightless, f"an inertia and no mass: {named('link', weightless)}"),
+    )
+    return [f"{origin}: {text}" for names, text in notes if names]

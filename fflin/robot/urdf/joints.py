@@ -11,14 +11,7 @@ from fflin.robot.urdf.links import Pose, bounded_number, read_pose, refuse_near_
 from fflin.robot.urdf.xml import Element, decimal, quoted
 
 # Degrees of freedom of the types of joint.
-FREEDOM = {
-    "fixed": 0,
-    "revolute": 1,
-    "continuous": 1,
-    "prismatic": 1,
-    "planar": 3,
-    "floating": 6,
-}
+FREEDOM = dict(fixed=0, revolute=1, continuous=1, prismatic=1, planar=3, floating=6)
 _AXIAL = ("revolute", "continuous", "prismatic", "planar")
 
 # What a joint without a limit is limited to.
@@ -30,57 +23,28 @@ _SHORTEST_AXIS, _LONGEST_AXIS = 1e-6, 1e6
 
 @dataclass(frozen=True)
 class Mimic:
-    """A joint that moves with another: value = multiplier * leader's value + offset.
-
-    Attributes
-    ----------
-    leader : str
-        The joint that it follows.
-    multiplier : float
-        [rad/rad, m/rad, ...]
-    offset : float
-        [rad|m]
-    """
+    """A joint that moves with another: value = multiplier * leader's value + offset."""
 
     leader: str
-    multiplier: float
-    offset: float
+    multiplier: float  # [rad/rad, m/rad, ...]
+    offset: float  # [rad|m]
 
 
 @dataclass(frozen=True)
 class JointElement:
-    """One joint as the file describes it.
-
-    Attributes
-    ----------
-    name, type : str
-    parent, child : str
-        Names of the links.
-    element : Element
-        Where it stands in the file.
-    origin : Pose
-        Of the child's frame in the parent's.
-    axis : tuple of float
-        In the child's frame; Pinocchio scales it to unit length.
-    limits : dict
-        Those of lower, upper, effort and velocity that the file gives; None without <limit>.
-    damping, friction : float
-        [N m s/rad | N s/m], [N m | N].
-    mimic : Mimic or None
-        As written: the leader may itself be a mimic.
-    """
+    """One joint between two links, and the element that describes it."""
 
     name: str
     type: str
     parent: str
     child: str
     element: Element
-    origin: Pose
-    axis: tuple[float, ...]
-    limits: dict[str, float] | None
-    damping: float
-    friction: float
-    mimic: Mimic | None
+    origin: Pose  # of the child's frame in the parent's
+    axis: tuple[float, ...]  # in the child's frame; Pinocchio scales it to unit length
+    limits: dict[str, float] | None  # lower, upper, effort, velocity as given; None without <limit>
+    damping: float  # [N m s/rad | N s/m]
+    friction: float  # [N m | N]
+    mimic: Mimic | None  # as written: the leader may itself be a mimic
 
     @property
     def freedom(self) -> int:
@@ -131,10 +95,10 @@ def read_joint(element: Element) -> JointElement:
 
 def _axis(element: Element, of: str, kind: str) -> tuple[float, ...]:
     found = element.find("axis", of)
+    axis: tuple[float, ...] = (1.0, 0.0, 0.0)
     # Exporters write a zero axis into fixed joints; it has no meaning there.
     if kind not in _AXIAL:
-        return (1.0, 0.0, 0.0)
-    axis: tuple[float, ...] = (1.0, 0.0, 0.0)
+        return axis
     if found is not None:
         # Exporters write an rpy of zeros here, which turns nothing.
         turned = any(decimal(entry) != 0.0 for entry in found.attributes.get("rpy", "").split())
@@ -184,18 +148,18 @@ def _dynamics(element: Element, of: str, kind: str) -> tuple[float, float]:
     found = element.find("dynamics", of)
     if found is None or FREEDOM[kind] != 1:
         return 0.0, 0.0
-    values = []
     found.allow_only("damping", "friction", of=of)
-    for name in ("damping", "friction"):
-        if not found.attributes.get(name, "0").strip():
-            found.note(f"{name} of {of} is empty; taken as 0")
-            values.append(0.0)
-            continue
-        value = bounded_number(found, name, of, 0.0)
-        if value < 0.0:
-            raise found.error(f"{name} of {of} is {value:g}; it cannot be negative")
-        values.append(value)
-    return values[0], values[1]
+    return _resistance(found, "damping", of), _resistance(found, "friction", of)
+
+
+def _resistance(found: Element, name: str, of: str) -> float:
+    if not found.attributes.get(name, "0").strip():
+        found.note(f"{name} of {of} is empty; taken as 0")
+        return 0.0
+    value = bounded_number(found, name, of, 0.0)
+    if value < 0.0:
+        raise found.error(f"{name} of {of} is {value:g}; it cannot be negative")
+    return value
 
 
 def _mimic(element: Element, of: str) -> Mimic | None:

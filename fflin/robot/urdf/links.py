@@ -20,47 +20,28 @@ _FARTHEST = 1e7  # [m]
 _QUATERNION_SLACK = 1e-3
 
 
+# The entries of an inertia as URDF orders them.
+INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
 @dataclass(frozen=True)
 class Pose:
-    """Where a frame lies in another, as the file writes it.
+    """Where a frame lies in another, as the file writes it."""
 
-    Attributes
-    ----------
-    xyz : tuple of float
-        [m].
-    rpy : tuple of float
-        Roll, pitch, yaw about fixed axes [rad].
-    quaternion : tuple of float or None
-        x y z w of unit length; in the place of `rpy`.
-    """
-
-    xyz: tuple[float, ...] = (0.0, 0.0, 0.0)
-    rpy: tuple[float, ...] = (0.0, 0.0, 0.0)
-    quaternion: tuple[float, ...] | None = None
+    xyz: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m]
+    rpy: tuple[float, ...] = (0.0, 0.0, 0.0)  # roll, pitch, yaw about fixed axes [rad]
+    quaternion: tuple[float, ...] | None = None  # x y z w of unit length, in place of rpy
 
 
 @dataclass(frozen=True)
 class Link:
-    """One link.
-
-    Attributes
-    ----------
-    name : str
-    element : Element
-        Where it stands in the file.
-    mass : float or None
-        [kg]; None where the link has no <inertial>.
-    com : Pose
-        Centre of mass, and axes of the inertia.
-    inertia : tuple of float
-        ixx ixy ixz iyy iyz izz [kg m^2] about the centre of mass.
-    """
+    """One link, and the element that describes it."""
 
     name: str
     element: Element
-    mass: float | None = None
-    com: Pose = Pose()
-    inertia: tuple[float, ...] = (0.0,) * 6
+    mass: float | None = None  # [kg]; None where the link has no <inertial>
+    com: Pose = Pose()  # centre of mass, and axes of the inertia
+    inertia: tuple[float, ...] = (0.0,) * 6  # INERTIA [kg m^2] about the centre of mass
 
     def principal_inertias(self) -> Array:
         """Return the eigenvalues (3,) of the inertia, ascending [kg m^2]."""
@@ -86,9 +67,8 @@ def read_link(element: Element) -> Link:
     if mass < 0.0:
         raise mass_element.error(f"mass of {of} is {mass:g} kg; it cannot be negative")
     inertia = inertial.require("inertia", f"<inertial> of {of}")
-    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    inertia.allow_only(*names, of=of)
-    moments = tuple(bounded_number(inertia, entry, of) for entry in names)
+    inertia.allow_only(*INERTIA, of=of)
+    moments = tuple(bounded_number(inertia, entry, of) for entry in INERTIA)
     return Link(name, element, mass, read_pose(inertial, of), moments)
 
 

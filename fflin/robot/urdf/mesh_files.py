@@ -11,14 +11,8 @@ from urllib.parse import unquote
 def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
     """Return the file of a mesh, None where it is not there.
 
-    Parameters
-    ----------
-    uri : str
-        package://NAME/PATH, file:///PATH, an absolute path or one relative to the URDF.
-    urdf : Path
-        The robot's file. A package is also looked for in the folders that this one lies in.
-    package_dirs : sequence of Path
-        Folders that hold packages.
+    The uri is package://NAME/PATH, file:///PATH, an absolute path or one relative to the URDF. A
+    package is looked for in `package_dirs`, and in the folders that the URDF lies in.
     """
     scheme, separator, rest = uri.partition("://")
     candidates: Iterable[Path]

@@ -9,25 +9,10 @@ from fflin.robot.urdf.xml import enumerated, quoted
 
 
 def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
-    """Resolve chains of mimics.
+    """Return {follower: Mimic of an independent joint} of all joints by name, in their order.
 
     A joint that follows a follower follows the latter's leader: with q1 = m1 q2 + o1 and
-    q2 = m2 q3 + o2, q1 = m1 m2 q3 + m1 o2 + o1.
-
-    Parameters
-    ----------
-    joints : dict
-        All joints of the robot by name. A <mimic> in a fixed joint is passed over.
-
-    Returns
-    -------
-    dict
-        {name of the follower: Mimic of an independent joint}, in the order of `joints`.
-
-    Raises
-    ------
-    UrdfError
-        If a leader does not exist, is not of one degree of freedom, or follows its follower.
+    q2 = m2 q3 + o2, q1 = m1 m2 q3 + m1 o2 + o1. A <mimic> in a fixed joint is passed over.
     """
     written = {name: joint.mimic for name, joint in joints.items() if joint.mimic and joint.freedom}
     resolved: dict[str, Mimic] = {}
@@ -63,17 +48,6 @@ def counted_leaders(joints: dict[str, JointElement], mimics: dict[str, Mimic]) -
 
     A turn of the leader more leaves a follower where it is only if that is continuous too and
     makes a whole number of turns itself.
-
-    Parameters
-    ----------
-    joints : dict
-        All joints of the robot by name.
-    mimics : dict
-        Of `resolve_mimics`.
-
-    Returns
-    -------
-    set of str
     """
     return {
         mimic.leader

@@ -41,60 +41,23 @@ class Advice(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """A robot as its file describes it.
+    """A robot as its file describes it."""
 
-    Attributes
-    ----------
-    model : pin.Model
-        Free-flyer root joint, zero gravity; mimic joints move freely in it.
-    sha256 : str
-        Hash of the file as it was read; files that a xacro includes are not part of it.
-    mimics : dict
-        {joint: Mimic} of the joints that follow another, resolved to independent leaders.
-    damping, friction : dict
-        {joint: value} where not zero, [N m s/rad | N s/m] and [N m | N].
-    meshes : tuple of str
-        Mesh files that it names, as it names them; they are not read.
-    notes : tuple of str
-        Warnings, one line each.
-    advice : tuple of Advice
-        Warnings of those joints that the robot's fields leave as they are.
-    """
-
-    model: pin.Model
-    sha256: str
-    mimics: dict[str, Mimic]
-    damping: dict[str, float]
-    friction: dict[str, float]
-    meshes: tuple[str, ...]
-    notes: tuple[str, ...]
-    advice: tuple[Advice, ...] = ()
+    model: pin.Model  # free-flyer root joint, zero gravity; mimic joints move freely in it
+    sha256: str  # of the file as it was read, without files that a xacro includes
+    mimics: dict[str, Mimic]  # of the joints that follow another, with independent leaders
+    damping: dict[str, float]  # {joint: value} where not zero [N m s/rad | N s/m]
+    friction: dict[str, float]  # the same [N m | N]
+    meshes: tuple[str, ...]  # mesh files as it names them; they are not read
+    notes: tuple[str, ...]  # warnings, one line each
+    advice: tuple[Advice, ...] = ()  # those that hold where the robot's fields say no more
 
 
 def read_urdf(path: Path, prune: Sequence[str] = ()) -> Description:
     """Read a URDF, or a xacro, as a robot that floats free.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    prune : sequence of str
-        Joints to cut off with all that hangs on them.
-
-    Returns
-    -------
-    Description
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read.
-    UrdfError
-        If it does not describe a robot; the message gives file, line and what to mend.
-    MissingPackageError
-        If it is a xacro and xacrodoc is not installed.
-    UnknownNameError
-        If there is no such joint to prune.
+    Joints in `prune` are cut off with all that hangs on them. What is no robot is a `UrdfError`
+    that gives file, line and what to mend; a xacro without xacrodoc is a `MissingPackageError`.
     """
     return describe(read_document(path), path, prune)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from typing import TypeVar
 
 from fflin.base.errors import unknown
 from fflin.robot.urdf.joints import JointElement, read_joint
@@ -16,64 +17,31 @@ _DEPTH_LIMIT = 1_000
 # Pinocchio's time grows with the square of their number; these take some seconds.
 _LINK_LIMIT = 10_000
 
+Part = TypeVar("Part", Link, JointElement)
+
 
 @dataclass(frozen=True)
 class Urdf:
-    """What a URDF describes, checked: the joints connect the links into one tree.
+    """What a URDF describes, checked: the joints connect the links into one tree."""
 
-    Attributes
-    ----------
-    name : str
-        Empty where the file gives none.
-    links : dict
-        By name, in the order of the file.
-    joints : dict
-        By name, in the order of the file.
-    depth : int
-        Number of links on the longest way from the root.
-    """
-
-    name: str
-    links: dict[str, Link]
+    name: str  # empty where the file gives none
+    links: dict[str, Link]  # by name, in the order of the file
     joints: dict[str, JointElement]
-    depth: int
+    depth: int  # number of links on the longest way from the root
 
 
 def read_description(root: Element, prune: Collection[str] = ()) -> Urdf:
     """Check the elements of a URDF and return what they describe.
 
-    Parameters
-    ----------
-    root : Element
-    prune : collection of str
-        Joints to cut off with all that hangs on them.
-
-    Returns
-    -------
-    Urdf
-
-    Raises
-    ------
-    UrdfError
-        If anything in it is wrong; the message gives file, line, element and what to mend.
-    UnknownNameError
-        If there is no such joint to prune.
+    Joints in `prune` are cut off with all that hangs on them.
     """
     _check_root(root)
-    links: dict[str, Link] = {}
-    for element in root.find_all("link"):
-        link = read_link(element)
-        _check_new("link", element, link.name, links.get(link.name))
-        links[link.name] = link
+    links = _by_name(read_link, root.find_all("link"))
     if len(links) > _LINK_LIMIT:
         raise root.error(f"<robot> has {len(links)} links; at most {_LINK_LIMIT} are read")
     if not links:
         raise root.error("<robot> has no <link>; add one")
-    joints: dict[str, JointElement] = {}
-    for element in root.find_all("joint"):
-        joint = read_joint(element)
-        _check_new("joint", element, joint.name, joints.get(joint.name))
-        joints[joint.name] = joint
+    joints = _by_name(read_joint, root.find_all("joint"))
     depths = _check_tree(root, links, joints)
     if prune:
         dropped = _hanging_on(prune, joints)
@@ -97,6 +65,12 @@ def _check_root(root: Element) -> None:
                 "a <robot> inside <robot>; keep one <robot> with all links and joints"
             )
         if child.tag in ("link", "joint"):
+            for inner in child.children:
+                if inner.tag in ("link", "joint"):
+                    raise inner.error(
+                        f"<{inner.tag}> inside a <{child.tag}>, where URDF ignores it; put it "
+                        "directly into <robot>"
+                    )
             continue
         for inner in child.iterate():
             tags = {part.tag for part in inner.children}
@@ -107,22 +81,19 @@ def _check_root(root: Element) -> None:
                     f"<{inner.tag}> {quoted(inner.attributes.get('name', ''))} stands inside "
                     f"<{child.tag}>, where URDF ignores it; put it directly into <robot>"
                 )
-    for element in root.children:
-        if element.tag in ("link", "joint"):
-            for inner in element.children:
-                if inner.tag in ("link", "joint"):
-                    raise inner.error(
-                        f"<{inner.tag}> inside a <{element.tag}>, where URDF ignores it; put it "
-                        "directly into <robot>"
-                    )
 
 
-def _check_new(kind: str, element: Element, name: str, earlier: Link | JointElement | None) -> None:
-    if earlier is not None:
-        raise element.error(
-            f"a second {kind} named {quoted(name)}, after that of line {earlier.element.line}; "
-            "rename one of them"
-        )
+def _by_name(read: Callable[[Element], Part], elements: list[Element]) -> dict[str, Part]:
+    parts: dict[str, Part] = {}
+    for element in elements:
+        part = read(element)
+        earlier = parts.setdefault(part.name, part)
+        if earlier is not part:
+            raise element.error(
+                f"a second {element.tag} named {quoted(part.name)}, after that of line "
+                f"{earlier.element.line}; rename one of them"
+            )
+    return parts
 
 
 def _check_tree(

@@ -2,35 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
+from html import escape
 
 from fflin.robot.urdf.joints import UNLIMITED, JointElement
-from fflin.robot.urdf.links import Link, Pose
+from fflin.robot.urdf.links import INERTIA, Link, Pose
 from fflin.robot.urdf.tree import Urdf
 
 
 def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:
-    """Write a description without visuals, collisions and extensions.
+    """Write a description without visuals, collisions and extensions, its numbers to the last bit.
 
-    Parameters
-    ----------
-    urdf : Urdf
-    counted : collection of str
-        Continuous joints whose whole turns count: written as revolute joints without bounds,
-        for Pinocchio stores a continuous one as (cos, sin).
-
-    Returns
-    -------
-    str
-        Every number is the double that was read.
+    Continuous joints whose whole turns count, `counted`, become revolute ones without bounds, for
+    Pinocchio stores a continuous one as (cos, sin).
     """
     # urdfdom reads quat_xyzw from version 1.1 on; 1.2 would require limits.
     lines = [f'<robot name={_quoted(urdf.name)} version="1.1">']
     for link in urdf.links.values():
         lines.extend(_link(link))
     for joint in urdf.joints.values():
-        lines.extend(_joint(_counting(joint) if joint.name in counted else joint))
+        lines.extend(_joint(joint, joint.name in counted))
     lines.append("</robot>")
     return "\n".join(lines)
 
@@ -38,22 +30,15 @@ def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:
 def _link(link: Link) -> Iterator[str]:
     yield f"<link name={_quoted(link.name)}>"
     if link.mass is not None:
-        entries = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-        inertia = " ".join(
-            f'{name}="{value!r}"' for name, value in zip(entries, link.inertia, strict=True)
-        )
         yield f'<inertial>{_origin(link.com)}<mass value="{link.mass!r}"/>'
-        yield f"<inertia {inertia}/></inertial>"
+        yield f"<inertia {_entries(dict(zip(INERTIA, link.inertia, strict=True)))}/></inertial>"
     yield "</link>"
 
 
-def _counting(joint: JointElement) -> JointElement:
-    """Return a continuous joint as a revolute one without bounds."""
+def _joint(joint: JointElement, counted: bool) -> Iterator[str]:
     unbounded = {"lower": -UNLIMITED, "upper": UNLIMITED}
-    return replace(joint, type="revolute", limits=(joint.limits or {}) | unbounded)
-
-
-def _joint(joint: JointElement) -> Iterator[str]:
+    if counted:
+        joint = replace(joint, type="revolute", limits=(joint.limits or {}) | unbounded)
     yield f'<joint name={_quoted(joint.name)} type="{joint.type}">'
     yield f"<parent link={_quoted(joint.parent)}/><child link={_quoted(joint.child)}/>"
     yield _origin(joint.origin)
@@ -62,25 +47,20 @@ def _joint(joint: JointElement) -> Iterator[str]:
         if joint.damping or joint.friction:
             yield f'<dynamics damping="{joint.damping!r}" friction="{joint.friction!r}"/>'
     if joint.type in ("revolute", "prismatic") or joint.limits:
-        yield _limit(joint)
+        limits = unbounded if joint.limits is None else joint.limits
+        yield f"<limit {_entries({'effort': UNLIMITED, 'velocity': UNLIMITED} | limits)}/>"
     yield "</joint>"
 
 
-def _limit(joint: JointElement) -> str:
-    limits = {"effort": UNLIMITED, "velocity": UNLIMITED}
-    if joint.limits is None:
-        limits |= {"lower": -UNLIMITED, "upper": UNLIMITED}
-    limits |= joint.limits or {}
-    entries = " ".join(f'{name}="{value!r}"' for name, value in limits.items())
-    return f"<limit {entries}/>"
-
-
 def _origin(pose: Pose) -> str:
+    attitude = f'rpy="{_numbers(pose.rpy)}"'
     if pose.quaternion is not None:
         attitude = f'quat_xyzw="{_numbers(pose.quaternion)}"'
-    else:
-        attitude = f'rpy="{_numbers(pose.rpy)}"'
     return f'<origin xyz="{_numbers(pose.xyz)}" {attitude}/>'
+
+
+def _entries(values: Mapping[str, float]) -> str:
+    return " ".join(f'{name}="{value!r}"' for name, value in values.items())
 
 
 def _numbers(values: tuple[float, ...]) -> str:
@@ -89,8 +69,4 @@ def _numbers(values: tuple[float, ...]) -> str:
 
 def _quoted(text: str) -> str:
     """Write an attribute's value. The standard library's writer loads its network client."""
-    for character, entity in (("&", "&amp;"), ("<", "&lt;"), (">", "&gt;"), ('"', "&quot;")):
-        text = text.replace(character, entity)
-    for character in "\t\n\r":
-        text = text.replace(character, f"&#{ord(character)};")
-    return f'"{text}"'
+    return f'"{escape(text).translate({9: "&#9;", 10: "&#10;", 13: "&#13;"})}"'

@@ -24,12 +24,10 @@ LIMIT = 60.0
 _PR_SET_PDEATHSIG = 1
 
 # What lies below these does not reach the model, so a "${" there is no reason to expand.
-_IGNORED = frozenset(
-    {
-        *("visual", "collision", "material", "gazebo", "transmission", "ros2_control"),
-        *("sensor", "plugin", "safety_controller", "calibration"),
-    }
-)
+_IGNORED = {
+    *("visual", "collision", "material", "gazebo", "transmission", "ros2_control"),
+    *("sensor", "plugin", "safety_controller", "calibration"),
+}
 
 
 def first_xacro(root: Element) -> Element | None:
@@ -46,30 +44,10 @@ def first_xacro(root: Element) -> Element | None:
 
 
 def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, list[str]]:
-    """Expand a xacro document, in a process of its own that may take `LIMIT`.
+    """Return a xacro document as plain URDF, and the lines that xacro had to say.
 
-    Parameters
-    ----------
-    path : Path
-        Where it lies; files that it includes are looked up from there.
-    document : bytes
-        What the file holds.
-    first : Element or None
-        Of `first_xacro`, for errors.
-
-    Returns
-    -------
-    document : bytes
-        Plain URDF.
-    notes : list of str
-        What xacro had to say, one entry a line.
-
-    Raises
-    ------
-    MissingPackageError
-        If xacrodoc is not installed.
-    UrdfError
-        If xacro cannot expand it, or takes too long.
+    It is expanded in a process of its own that may take `LIMIT`; files that it includes are looked
+    up from where it lies. `first`, of `first_xacro`, is for errors.
     """
     use = f", first used by <{first.tag}> in line {first.line}" if first else ""
     if not (find_spec("xacro") and find_spec("xacrodoc")):

@@ -26,27 +26,14 @@ _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 @dataclass(eq=False, repr=False, slots=True)
 class Element:
-    """One XML element; text between elements is not kept, for URDF has none.
+    """One XML element; text between elements is not kept, for URDF has none."""
 
-    Attributes
-    ----------
-    tag : str
-        With its prefix, if any: prefixes need not be bound.
-    attributes : dict
-    line : int
-        Line of its start tag.
-    origin : str
-        What errors call the document: the path of the file.
-    children : list of Element
-    notes : dict
-        {what is to be told: lines}, shared by all elements of the document.
-    """
-
-    tag: str
+    tag: str  # with its prefix, if any: prefixes need not be bound
     attributes: dict[str, str]
-    line: int
-    origin: str
+    line: int  # of its start tag
+    origin: str  # what errors call the document: the path of the file
     children: list[Element] = field(default_factory=list)
+    # {what is to be told: lines}, shared by all elements of the document.
     notes: dict[str, list[int]] = field(default_factory=dict)
 
     def error(self, message: str) -> UrdfError:
@@ -172,25 +159,9 @@ def told(root: Element) -> list[str]:
 
 
 def parse(document: bytes, origin: str) -> Element:
-    """Parse an XML document without namespaces and entities.
+    """Return the root of an XML document without namespaces and entities.
 
-    Parameters
-    ----------
-    document : bytes
-        In UTF-8 unless it declares another encoding or has a UTF-16 byte order mark.
-    origin : str
-        What errors call the document.
-
-    Returns
-    -------
-    Element
-        The root.
-
-    Raises
-    ------
-    UrdfError
-        If it is not well-formed, declares or uses entities of its own, or is nested too deeply
-        or too large for a robot description.
+    It is in UTF-8 unless it declares another encoding or has a UTF-16 byte order mark.
     """
     if not document.strip():
         raise UrdfError(f"{origin}: is empty; expected a URDF with a <robot>")
@@ -227,7 +198,7 @@ class _Builder:
         self._count = 0
         self.parser = expat.ParserCreate()
         self.parser.StartElementHandler = self._start
-        self.parser.EndElementHandler = self._end
+        self.parser.EndElementHandler = lambda _: self._open.pop()
         # A document type may be named; one that is declared elsewhere is not read.
         self.parser.EntityDeclHandler = self._refuse_entities
         self.parser.NotStandaloneHandler = self._meet_unread_declarations
@@ -267,9 +238,6 @@ class _Builder:
             )
         self._open[-1].children.append(element)
         self._open.append(element)
-
-    def _end(self, _: str) -> None:
-        self._open.pop()
 
     def _meet_unread_declarations(self) -> int:
         self._unread = True

@@ -13,15 +13,19 @@ function problem(message) {
   box.hidden = !message;
 }
 
+const GHOST = "#8fb4ff";
+
 // What is drawn beside the robot; each can be switched off.
 function legendOf(info) {
   const entry = (label, colour, ...path) => ({ label, colour, path: ["meshcat", ...path] });
-  if (info.mode === "modes") return [entry("at rest", "#8fb4ff", "rest")];
+  if (info.mode === "modes") return [entry("at rest", GHOST, "rest")];
   const entries = [
     ...info.trails.map(({ name, colour }) => entry(`path of the ${name}`, colour, "trails", name)),
     ...info.arrows.map(({ kind, colour }) => entry(`${kind} on the base`, colour, "wrench", kind)),
   ];
-  if (info.target) entries.push(entry("target", "#8fb4ff", "target"));
+  const rest = info.rest === null ? "" : `, at rest from ${Number(info.rest.toPrecision(4))} s`;
+  const dashed = info.followed.length > 0;
+  if (info.target) entries.push({ ...entry(dashed ? `reference${rest}` : "target", GHOST, "target"), dashed });
   if (info.linear) entries.push(entry("linear model", "#ff7fc8", "linear"));
   // In the panel thrusters are named in their plot; a strip of pictures has none.
   return [...entries, ...info.plumes.map(({ name, colour }) => ({ label: name, colour, strip: true }))];
@@ -29,13 +33,14 @@ function legendOf(info) {
 
 function makeLegend(viewer, entries) {
   const legend = document.getElementById("legend");
-  for (const { label, colour, path, strip } of entries) {
+  for (const { label, colour, path, strip, dashed } of entries) {
     const row = document.createElement("label"), check = document.createElement("input");
     row.className = strip ? "strip" : "";
     const swatch = document.createElement("i");
     check.type = "checkbox";
     check.checked = true;
     swatch.style.setProperty("--swatch", colour);
+    swatch.className = dashed ? "dashed" : "";
     const set = () => {
       if (path) viewer.set_property(path, "visible", check.checked);
       viewer.set_dirty();
@@ -86,9 +91,9 @@ function main() {
   }
 
   info.t = floats(info.t);
-  for (const each of info.trails) each.points = floats(each.points);
+  for (const each of [...info.trails, ...info.followed]) each.points = floats(each.points);
   for (const each of [...info.arrows, ...info.plumes, ...info.readouts]) each.values = floats(each.values);
-  for (const plot of info.plots) for (const line of plot.lines) line.values = floats(line.values);
+  for (const plot of info.plots) for (const line of plot.lines) for (const key of ["values", "reference"]) line[key] = floats(line[key]);
   paint(info.plots);
   const thrusters = info.plots.filter((plot) => plot.title === "thrusters").flatMap((plot) => plot.lines);
   info.plumes = info.plumes.filter((each) => thrusters.some(({ label }) => label === each.name)); // those that fire
@@ -117,7 +122,7 @@ function main() {
   });
   const goTo = (time) => { player.pause(); player.seek(time); };
   makePassed(panel, info.passed, goTo);
-  plots = info.plots.map((plot) => makePlot(panel, info.t, plot, goTo));
+  plots = info.plots.map((plot) => makePlot(panel, info.t, plot, goTo, info.rest));
   if (plots.length) makeSpan(panel, info.t);
   fitPlots(panel);
   window.addEventListener("resize", () => { if (fitPlots(panel)) window.dispatchEvent(new Event("resize")); });

@@ -44,8 +44,8 @@ function triad({ length, position, quaternion }) {
   return group;
 }
 
-// A tube along all of the path, of which as much is drawn as has been passed.
-function trail({ points, colour, radius }) {
+// A tube along all of the path, of which as much is drawn as has been passed; or all, in dashes.
+function trail({ name, points, colour, radius, dashed }) {
   const group = new THREE.Group();
   const n = points.length / 3;
   const path = [];
@@ -62,8 +62,23 @@ function trail({ points, colour, radius }) {
   curve.getPointAt = (u) => curve.getPoint(u); // the points themselves, not equal lengths
   curve.getTangentAt = (u) => curve.getTangent(u);
   const tube = new THREE.TubeGeometry(curve, path.length - 1, radius, around);
-  const whole = new THREE.Mesh(tube, Object.assign(flat(colour), { transparent: true, opacity: 0.16, depthWrite: false }));
-  const passed = new THREE.Mesh(tube.clone(), flat(colour));
+  const paint = name === "base" ? seenThrough : flat; // it runs inside the body
+  const whole = new THREE.Mesh(tube, Object.assign(paint(colour), { transparent: true, opacity: 0.16, depthWrite: false }));
+  const order = whole.renderOrder = paint === flat ? 0 : 4;
+  if (dashed) {
+    const { array } = tube.index, shown = [];
+    for (let k = 0, on = true, run = 0; k + 1 < path.length; k++) {
+      if (on) shown.push(...array.subarray(6 * around * k, 6 * around * (k + 1)));
+      run += path[k].distanceTo(path[k + 1]);
+      if (run > 8 * radius) { on = !on; run = 0; }
+    }
+    tube.setIndex(shown);
+    whole.material.opacity = 0.8;
+    group.add(whole);
+    return group;
+  }
+  const passed = new THREE.Mesh(tube.clone(), paint(colour));
+  passed.renderOrder = order;
   group.add(whole, passed);
   group.show = (i) => passed.geometry.setDrawRange(0, 6 * around * at[i]);
   return group;
@@ -159,6 +174,7 @@ function makeMarks(viewer, info) {
   };
   info.triads.forEach((each, k) => add([...each.path, `frame ${k}`], triad(each)));
   info.trails.forEach((each) => add(["meshcat", "trails", each.name], trail(each)));
+  info.followed.forEach((each, k) => add(["meshcat", "target", `path ${k}`], trail({ ...each, colour: GHOST, dashed: true })));
   const wrench = viewer.scene_tree.find(["meshcat", "wrench"]).object;
   const base = viewer.scene_tree.find(info.base).object;
   for (const each of info.arrows) {

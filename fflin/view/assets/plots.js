@@ -53,6 +53,8 @@ function makeSpan(parent, t) {
 
 // Give the lines their colours: a name has one in all plots of a family, the first of which has keys.
 function paint(plots) {
+  const first = plots.find((plot) => plot.lines.some((line) => line.reference.length));
+  if (first) first.pale = true; // has the key of the references
   const change = (line) => line.values.reduce((a, b) => Math.max(a, b), -Infinity) - line.values.reduce((a, b) => Math.min(a, b), Infinity);
   for (const family of new Set(plots.map((plot) => plot.family))) {
     const kin = plots.filter((plot) => plot.family === family), most = new Map();
@@ -73,12 +75,12 @@ function paint(plots) {
 }
 
 // Which colour is whose, for this plot and those below it with the same names.
-function makeKeys(plot) {
-  if (!(plot.keys || []).length) return null;
+function makeKeys(named, lines) {
+  if (!(named || []).length) return null;
   const keys = document.createElement("div");
   keys.className = "keys";
-  const grey = new Set(plot.lines.map((line) => line.label));
-  for (const [label, colour] of plot.keys) {
+  const grey = new Set(lines.map((line) => line.label));
+  for (const [label, colour] of named) {
     const key = document.createElement("span");
     key.textContent = label;
     key.style.setProperty("--swatch", colour);
@@ -105,7 +107,7 @@ function fitPlots(panel) {
   return panel.clientWidth !== width;
 }
 
-function makePlot(parent, t, plot, seek) {
+function makePlot(parent, t, plot, seek, rest) {
   const box = document.createElement("div");
   box.className = "plot";
   const name = document.createElement("div"), at = document.createElement("span");
@@ -113,13 +115,16 @@ function makePlot(parent, t, plot, seek) {
   name.append(plot.unit ? `${plot.title} [${plot.unit}]` : plot.title, at);
   at.className = "at";
   const canvas = document.createElement("canvas");
-  const keys = makeKeys(plot);
+  const keys = makeKeys(plot.keys, plot.lines);
   // x, y, z have room beside the title.
   if (keys && keys.textContent.length < 6) name.append(keys);
-  box.append(name, ...(keys && !keys.parentNode ? [keys] : []), canvas);
+  const pale = plot.pale ? makeKeys([["reference", UNNAMED]], []) : null;
+  if (pale) pale.classList.add("pale");
+  if (pale && !(keys && keys.parentNode)) name.append(pale);
+  box.append(name, ...[keys, pale].filter((each) => each && !each.parentNode), canvas);
   parent.append(box);
 
-  const values = [...plot.lines.flatMap((line) => Array.from(line.values)).filter(Number.isFinite), ...plot.lines.flatMap((line) => line.limits)];
+  const values = [...plot.lines.flatMap((line) => [...line.values, ...line.reference]).filter(Number.isFinite), ...plot.lines.flatMap((line) => line.limits)];
   let low = Math.min(0, ...[values.reduce((a, b) => Math.min(a, b), Infinity)]);
   let high = Math.max(0, ...[values.reduce((a, b) => Math.max(a, b), -Infinity)]);
   const least = low, most = high;
@@ -154,14 +159,24 @@ function makePlot(parent, t, plot, seek) {
       context.moveTo(0, y(level)); context.lineTo(width - GUTTER * ratio, y(level));
       context.stroke();
     }
-    context.setLineDash([]);
-    plot.lines.forEach((line) => {
-      context.strokeStyle = line.colour;
-      context.lineWidth = 1.4 * ratio;
+    if (rest !== null) {
+      context.strokeStyle = style.getPropertyValue("--faint");
+      context.setLineDash([ratio, 2 * ratio]);
       context.beginPath();
-      line.values.forEach((value, i) => context.lineTo(x(t[i]), y(value)));
+      context.moveTo(x(rest), 0); context.lineTo(x(rest), height);
       context.stroke();
-    });
+    }
+    context.setLineDash([]);
+    const curve = (values, colour, thickness, alpha) => {
+      context.strokeStyle = colour;
+      context.lineWidth = thickness * ratio;
+      context.globalAlpha = alpha;
+      context.beginPath();
+      values.forEach((value, i) => context.lineTo(x(t[i]), y(value)));
+      context.stroke();
+    };
+    for (const { reference, colour } of plot.lines) curve(reference, colour, 4, 0.4);
+    for (const { values, colour } of plot.lines) curve(values, colour, 1.4, 1);
     context.fillStyle = style.getPropertyValue("--faint");
     context.font = `${11 * ratio}px system-ui, sans-serif`;
     context.textBaseline = "middle";

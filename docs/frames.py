@@ -1,0 +1,50 @@
+"""Print the table of docs/conventions.md on frames: ``python docs/frames.py [ROBOT ...]``.
+
+Ten postures drawn from the joints' limits, the base turned about a random axis and moved by 0.5 m
+for each 90 deg: how many of the loops settle that feed back in each frame.
+"""
+
+import sys
+import warnings
+from dataclasses import replace
+
+import numpy as np
+
+import fflin
+from fflin.analysis.closed_loop import checked_loop
+
+FRAMES = ("hybrid", "local", "world")
+ROBOTS, TURNS, POSTURES = ("canadarm2", "ur5", "panda", "servicer_7dof"), (20, 60, 90, 120, 150), 10
+GAINS = {
+    "lqr(lin)": fflin.lqr,
+    "acceleration_lqr(lin, 1, 1, 1)": lambda lin: fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0),
+}
+
+
+def settled(robot: fflin.Robot, design: str, degrees: float) -> str:
+    """Return the number of loops that settle in each frame, such as 10/9/0."""
+    counts = dict.fromkeys(FRAMES, 0)
+    for k, q in enumerate(fflin.random_configurations(robot, POSTURES).rows(0, POSTURES)):
+        lin = fflin.linearize(robot, q)
+        loop = checked_loop(robot, lin, GAINS[design](lin))
+        x = loop.displaced(np.random.default_rng(k), degrees, 0.5 * degrees / 90.0, 0.0)
+        for frame in FRAMES:
+            there = replace(loop, lin=replace(lin, frame=frame))
+            counts[frame] += there.outcome(x) == "settled"
+    return "/".join(map(str, counts.values()))
+
+
+def main() -> None:
+    """Print the table."""
+    warnings.simplefilter("ignore")
+    titles = "".join(f" {degrees} deg |" for degrees in TURNS)
+    print(f"| gain, robot |{titles}\n| --- |{' --- |' * len(TURNS)}")
+    for design in GAINS:
+        for name in sys.argv[1:] or ROBOTS:
+            robot = fflin.load(name)
+            cells = "".join(f" {settled(robot, design, degrees)} |" for degrees in TURNS)
+            print(f"| `{design}`, {name} |{cells}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,128 @@
+"""What type checkers see of fflin, and what `fflin/__init__.py` makes at run time: its names."""
+
+__version__: str
+
+# Robots
+from fflin.robot.loading import load as load
+from fflin.robot.loading import from_model as from_model
+from fflin.robot.catalog import list_robots as list_robots
+from fflin.robot.robot import Robot as Robot
+from fflin.dynamics.points import configuration as configuration
+from fflin.dynamics.points import velocity as velocity
+from fflin.dynamics.points import effort as effort
+
+# Inputs
+from fflin.robot.inputs import BaseTorque as BaseTorque
+from fflin.robot.inputs import BaseForce as BaseForce
+from fflin.robot.inputs import JointTorque as JointTorque
+from fflin.robot.inputs import Thruster as Thruster
+from fflin.robot.inputs import ReactionWheel as ReactionWheel
+from fflin.robot.input_files import load_inputs as load_inputs
+
+# Outputs
+from fflin.robot.outputs import FullState as FullState
+from fflin.robot.outputs import JointPositions as JointPositions
+from fflin.robot.outputs import JointVelocities as JointVelocities
+from fflin.robot.outputs import BasePose as BasePose
+from fflin.robot.outputs import FramePose as FramePose
+from fflin.robot.outputs import FrameVelocity as FrameVelocity
+from fflin.robot.outputs import RelativePose as RelativePose
+from fflin.robot.outputs import Gyroscope as Gyroscope
+from fflin.robot.outputs import Accelerometer as Accelerometer
+from fflin.robot.outputs import CenterOfMass as CenterOfMass
+from fflin.robot.outputs import Momentum as Momentum
+
+# Linear models
+from fflin.linear.linearization import linearize as linearize
+from fflin.linear.linearization import Linearizer as Linearizer
+from fflin.linear.model import LinearModel as LinearModel
+from fflin.linear.model import Certificate as Certificate
+from fflin.dynamics.state import StateMap as StateMap
+from fflin.linear.equilibrium import equilibrium as equilibrium
+from fflin.linear.equilibrium import Equilibrium as Equilibrium
+from fflin.linear.trajectory import Trajectory as Trajectory
+from fflin.linear.linear_trajectory import linearize_trajectory as linearize_trajectory
+from fflin.linear.linear_trajectory import LinearTrajectory as LinearTrajectory
+from fflin.linear.check import check as check
+from fflin.linear.check import Check as Check
+
+# Analysis
+from fflin.analysis.controllability import controllability as controllability
+from fflin.analysis.controllability import Controllability as Controllability
+from fflin.analysis.observability import observability as observability
+from fflin.analysis.observability import Observability as Observability
+from fflin.analysis.gramians import gramians as gramians
+from fflin.analysis.gramians import Gramians as Gramians
+from fflin.analysis.modes import modes as modes
+from fflin.analysis.modes import Modes as Modes
+from fflin.analysis.modes import Mode as Mode
+from fflin.analysis.momentum import momentum_reduction as momentum_reduction
+from fflin.analysis.momentum import ReducedModel as ReducedModel
+from fflin.analysis.momentum import generalized_inertia as generalized_inertia
+from fflin.analysis.momentum import generalized_jacobian as generalized_jacobian
+from fflin.analysis.validity import validity as validity
+from fflin.analysis.validity import Validity as Validity
+
+# Control
+from fflin.control.lqr import lqr as lqr
+from fflin.control.weights import bryson as bryson
+from fflin.control.gain import Gain as Gain
+from fflin.control.acceleration_lqr import acceleration_lqr as acceleration_lqr
+from fflin.control.sampled_cost import sampled_cost as sampled_cost
+from fflin.control.plan import plan as plan
+from fflin.control.tvlqr import tvlqr as tvlqr
+from fflin.control.gain_schedule import GainSchedule as GainSchedule
+from fflin.control.tvkalman import tvkalman as tvkalman
+from fflin.control.tvkalman import FilterSchedule as FilterSchedule
+from fflin.control.kalman import kalman as kalman
+from fflin.control.kalman import Estimator as Estimator
+from fflin.control.kalman import lqg as lqg
+from fflin.control.kalman import Compensator as Compensator
+
+# Policies
+from fflin.control.policies import StateFeedback as StateFeedback
+from fflin.control.tracking import TrajectoryFeedback as TrajectoryFeedback
+from fflin.control.policies import Allocation as Allocation
+from fflin.control.output_feedback import OutputFeedback as OutputFeedback
+from fflin.control.output_feedback import TrajectoryOutputFeedback as TrajectoryOutputFeedback
+from fflin.batch.gains import ScheduledFeedback as ScheduledFeedback
+
+# Simulation
+from fflin.simulation.simulate import simulate as simulate
+from fflin.simulation.motion import Motion as Motion
+from fflin.view.visualize import visualize as visualize
+
+# Sweeps
+from fflin.batch.sweep import sweep as sweep
+from fflin.batch.linear_batch import LinearBatch as LinearBatch
+from fflin.batch.gains import lqr_batch as lqr_batch
+from fflin.batch.gains import GainBatch as GainBatch
+from fflin.batch.configurations import grid as grid
+from fflin.batch.configurations import Grid as Grid
+from fflin.batch.configurations import random_configurations as random_configurations
+from fflin.batch.configurations import RandomConfigurations as RandomConfigurations
+
+# Figures
+from fflin.analysis.plots import plot_matrices as plot_matrices
+from fflin.analysis.plots import plot_check as plot_check
+from fflin.analysis.plots import plot_modes as plot_modes
+from fflin.analysis.plots import plot_validity as plot_validity
+from fflin.control.plots import plot_poles as plot_poles
+from fflin.control.plots import plot_loops as plot_loops
+from fflin.simulation.motion import plot_motion as plot_motion
+
+# Errors
+from fflin.base.errors import FflinError as FflinError
+from fflin.base.errors import InputError as InputError
+from fflin.base.errors import UnknownNameError as UnknownNameError
+from fflin.base.errors import FileError as FileError
+from fflin.base.errors import MissingPackageError as MissingPackageError
+from fflin.base.errors import ModelError as ModelError
+from fflin.base.errors import UrdfError as UrdfError
+from fflin.base.errors import ChartError as ChartError
+from fflin.base.errors import EquilibriumError as EquilibriumError
+from fflin.base.errors import SingularInertiaError as SingularInertiaError
+from fflin.base.errors import StabilizabilityError as StabilizabilityError
+from fflin.base.errors import DetectabilityError as DetectabilityError
+from fflin.base.errors import SweepError as SweepError
+from fflin.base.errors import FflinWarning as FflinWarning

@@ -1,0 +1,149 @@
+"""What a robot makes of knots and inputs: the guess, what each interval misses, and its slopes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.rotation import rotation_matrices
+from fflin.base.validation import Array
+from fflin.control.stages import Stages
+from fflin.dynamics.state import PIN_ANGULAR, PIN_LINEAR, StateMap
+from fflin.linear.flow import Flow
+from fflin.linear.linearization import Linearizer
+from fflin.robot.robot import Robot
+
+# Runge-Kutta's method of order four: when its stages are, and how much of the one before is added.
+_STAGES, _SHARES = (0.0, 0.5, 0.5, 1.0), (1.0, 2.0, 2.0, 1.0)
+
+# Steps are halved until an interval's end is this accurate in rad, m and s.
+_ACCURACY, _MOST_STEPS = 1e-7, 128
+
+Point = tuple[Array, Array]
+
+
+class Shooting:
+    """The knots at times t (N + 1,) as the starts of N motions that are to meet.
+
+    Steps between configurations and velocities are z = (theta_b, r_b, q_m, nu) (nx,) in base axes,
+    those of the linear models with the rotation vector for twice q_b.
+    """
+
+    def __init__(self, robot: Robot, t: Array, held: bool) -> None:
+        self.state, self.t, self.held, self.steps = StateMap(robot, frame="local"), t, held, 1
+        self._linearizer = Linearizer(robot, moving=True)
+        self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
+        # Of the knots in an integral: by the trapezoidal rule, or as long as each input is held.
+        self.shares = np.full(len(t), t[1])
+        self.shares[[0, -1]] *= (1.0, 1e-9) if held else 0.5
+        self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
+
+    def between(self, start: Point, end: Point) -> Array:
+        """Return the step z (nx,) from a point to another; wheels may be at any angle."""
+        model, state = self.state.robot.model, self.state
+        way = pin.difference(model, start[0], end[0])
+        z = np.concatenate((state.velocities(way), state.velocities(end[1] - start[1])))
+        z[self.wheels] = 0.0
+        return z
+
+    def moved(self, q: Array, v: Array, z: Array) -> Point:
+        """Return knots a step z (N + 1, nx) further."""
+        model, (way, rates) = self.state.robot.model, np.split(z, 2, axis=1)
+        ways = self.state.spread(way)
+        rows = [pin.integrate(model, *each) for each in zip(q, ways, strict=True)]
+        return np.array(rows), v + self.state.spread(rates)
+
+    def missed(self, q: Array, v: Array, u: Array) -> Array:
+        """Return how far the ends of the intervals are from the next knots (N, nx)."""
+        flow = self._flow(q, v, u)
+        knots = enumerate(zip(q[1:], v[1:], strict=True))
+        return np.array(
+            [self.between(knot, flow.end(k, self.steps, q[k], v[k])) for k, knot in knots]
+        )
+
+    def flown(self, start: Point, u: Array) -> Point:
+        """Return the knots q and v (N + 1, ...) of the motion from a point under inputs."""
+        q, v = (np.tile(each, (len(self.t), 1)) for each in start)
+        flow, points = self._flow(q, v, u), [start]
+        for k in range(len(self.t) - 1):
+            points.append(flow.end(k, self.steps, *points[-1]))
+        q, v = map(np.array, zip(*points, strict=True))
+        return q, v
+
+    def refine(self, q: Array, v: Array, u: Array) -> Array:
+        """Take as many steps an interval as it needs, and return what is missed then."""
+        missed = self.missed(q, v, u)
+        while self.steps < _MOST_STEPS:
+            self.steps *= 2
+            before, missed = missed, self.missed(q, v, u)
+            if np.abs(missed - before).max() <= _ACCURACY:
+                break
+        return missed
+
+    def stages(self, q: Array, v: Array, u: Array, missed: Array) -> Stages:
+        """Return the slopes of the intervals' ends, by Runge-Kutta steps of dZ/dt = A Z + B."""
+        flow, (nx, nu) = self._flow(q, v, u), (self.state.nx, u.shape[1])
+        maps = []
+        steps = max(1, self.steps // 4)
+        shares = np.linspace(0.0, 1.0, 2 * steps + 1)
+        shares[-1] -= 1e-8  # at the knot the next input acts
+        for first, last in zip(self.t[:-1], self.t[1:], strict=True):
+            h, Z = (last - first) / steps, np.eye(nx, nx + 2 * nu)
+            F = []
+            for share in shares.tolist():
+                lin, late = self._linearizer(*flow.at(first + share * (last - first))), share
+                late = 0.0 if self.held else share
+                A = self._size[:, None] * lin.A / self._size
+                F.append((A, np.hstack(((1.0 - late) * lin.B, late * lin.B))))
+            for step in range(steps):
+                rate, total = np.zeros_like(Z), np.zeros_like(Z)
+                for at, weight in zip(_STAGES, _SHARES, strict=True):
+                    A, driven = F[2 * step + round(2 * at)]
+                    rate = A @ (Z + at * h * rate)
+                    rate[:, nx:] += driven
+                    total += weight * rate
+                Z = Z + h / 6.0 * total
+            maps.append(Z)
+        A, B, D = np.split(np.array(maps), (nx, nx + nu), axis=2)
+        known = (B @ u[:-1, :, None] + D @ u[1:, :, None])[..., 0]
+        return Stages(A, B, D, missed[:-1] - known)
+
+    def guess(self, start: Point, end: Point) -> tuple[Array, Array, Array]:
+        """Return knots on cubics from a point to another, and inputs near to what these take.
+
+        The base goes round as often as its rates at both ends have it.
+        """
+        model, T = self.state.robot.model, self.t[-1]
+        s, rates = self.t[:, None] / T, np.array((T * start[1], T * end[1]))
+        turned = rotation_matrices(np.array((start[0][3:7], end[0][3:7])))
+        rates[:, PIN_LINEAR] = (turned @ rates[:, PIN_LINEAR, None])[..., 0]
+        way, mean = pin.difference(model, start[0], end[0]), rates.mean(axis=0)
+        way[PIN_LINEAR] = end[0][:3] - start[0][:3]
+        way[PIN_ANGULAR] = turn = pin.log3(turned[0].T @ turned[1])
+        axis = turn if turn.any() else mean[PIN_ANGULAR]
+        axis = axis / (np.linalg.norm(axis) or 1.0)
+        rounds = np.round((mean[PIN_ANGULAR] - turn) @ axis / (2.0 * np.pi))
+        way[PIN_ANGULAR] += 2.0 * np.pi * rounds * axis
+        # Of the rotation vector at the end; on whole turns about the axis there is no other.
+        jacobian = pin.Jexp3(way[PIN_ANGULAR])
+        rates[1, PIN_ANGULAR] = np.linalg.lstsq(jacobian, rates[1, PIN_ANGULAR], rcond=1e-6)[0]
+        late, bend = 3 * way - 2 * rates[0] - rates[1], rates.sum(axis=0) - 2 * way
+        places = s * (rates[0] + s * (late + s * bend))
+        v = (rates[0] + s * (2 * late + 3 * s * bend)) / T
+        steps = np.where(np.arange(len(way)) < 3, 0.0, places)
+        q = np.array([pin.integrate(model, start[0], step) for step in steps])
+        q[:, :3] += places[:, PIN_LINEAR]
+        for turn, rate in zip(places[:, PIN_ANGULAR], v[:, PIN_ANGULAR], strict=True):
+            rate[:] = pin.Jexp3(turn) @ rate
+        v[:, PIN_LINEAR] = (v[:, None, PIN_LINEAR] @ rotation_matrices(q[:, 3:7]))[:, 0]
+        q[-1], v[-1] = end
+        u = np.zeros((len(q), len(self._linearizer().u0)))
+        flow = self._flow(q, v, u)
+        for k, rate in enumerate(np.gradient(v, self.t, axis=0)):
+            wanted = self.state.velocities(rate - flow.rate(q[k], v[k], u[k]))
+            B = self._linearizer(q[k], v[k]).B[len(wanted) :]
+            u[k] = np.linalg.lstsq(B, wanted, rcond=1e-9)[0]
+        return q, v, u
+
+    def _flow(self, q: Array, v: Array, u: Array) -> Flow:
+        return Flow(self.state, self.t, q, v, u, self.held)

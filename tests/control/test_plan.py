@@ -1,0 +1,257 @@
+"""Planned motions: closed forms of the least effort, limits, goals, and what is refused."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.optimize import minimize
+
+import fflin
+from fflin.control.shooting import Shooting
+from fflin.control.stages import Rows, Stages
+
+
+def turned(robot, angle, axis=(0.0, 0.0, 1.0), joints=None, at=(0.0, 0.0, 0.0)):
+    base = pin.SE3(pin.AngleAxis(angle, np.array(axis)).matrix(), np.array(at))
+    return fflin.configuration(robot, joints, base)
+
+
+def missed(robot, motion, q, v=None):
+    v = np.zeros(robot.nv) if v is None else v
+    way = pin.difference(robot.model, q, motion.q[-1])
+    return max(np.abs(way).max(), np.abs(motion.v[-1] - v).max())
+
+
+@pytest.fixture(scope="module")
+def cube():
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(max=1e-3), fflin.BaseForce()])
+    return robot, fflin.linearize(robot).M[2, 2]
+
+
+@pytest.mark.parametrize("angle", [0.5, 3.0, np.pi, -2.0])
+def test_least_effort_about_an_axis_has_the_closed_form(cube, angle):
+    """Held over steps of h, N of them: u = 6 J angle (N - 1 - 2 k) / (h^2 N (N^2 - 1)), which tends
+    to 6 J angle (1 - 2 t / T) / T^2; a turn of pi is no edge."""
+    robot, inertia = cube
+    count, T = 40, 60.0
+    goal = turned(robot, angle)
+    motion = fflin.plan(robot, (goal, None), T, knots=count + 1)
+    k = np.arange(count)
+    h = T / count
+    exact = 6.0 * inertia * angle * (count - 1 - 2 * k) / (h**2 * count * (count**2 - 1))
+    # A goal of pi may be reached either way round.
+    u = motion.u[:-1, 2] * np.sign(motion.u[0, 2] * angle)
+    size = np.abs(exact).max()
+    assert u == pytest.approx(exact, abs=1e-3 * size)
+    assert np.abs(np.delete(motion.u, 2, axis=1)).max() < 1e-8 * size
+    assert missed(robot, motion, goal) < 1e-6 and motion.residual.max() < 1e-7
+    assert (motion.hold, motion.frame) == ("previous", "local")
+    limit = 6.0 * inertia * angle / T**2
+    assert abs(exact[0] / limit - 1.0) == pytest.approx(1.0 / (count + 1), rel=1e-9)
+
+
+def test_least_effort_of_linear_inputs_has_the_closed_form(cube):
+    """Of inputs linear in between, u = c (s - T / 2), with s the time to go from where what an
+    input adds has its centre: at its knot, or a third of a step inside at both ends."""
+    robot, inertia = cube
+    motion = fflin.plan(robot, (turned(robot, 1.0), None), 30.0, knots=31, hold="linear")
+    share, left = np.ones(31), 30.0 - motion.t
+    share[[0, -1]] = 0.5
+    left[[0, -1]] += (-1.0 / 3.0, 1.0 / 3.0)
+    exact = inertia * (left - 15.0) / (share @ (left * (left - 15.0)))
+    assert motion.u[:, 2] == pytest.approx(exact, abs=1e-3 * exact[0])
+    assert motion.hold == "linear" and motion.residual.max() < 1e-7
+
+
+def test_a_turn_in_the_least_time_takes_all_there_is(cube):
+    """T = 2 sqrt(J angle / u_max) is the least time; what is less misses the goal."""
+    robot, inertia = cube
+    least = 2.0 * np.sqrt(inertia / 1e-3)
+    goal = turned(robot, 1.0)
+    motion = fflin.plan(robot, (goal, None), 1.001 * least, knots=101)
+    u = motion.u[:-1, 2]
+    assert np.abs(u).max() <= 1e-3
+    assert (np.abs(u) == 1e-3).sum() >= 90 and (np.diff(np.sign(u)) != 0).sum() == 1
+    assert missed(robot, motion, goal) < 1e-6
+    with pytest.raises(fflin.InputError, match=r"misses omega_b.z by [\d.]+ rad/s, q_b.z by.*more"):
+        fflin.plan(robot, (goal, None), 0.99 * least)
+    # At half the time the turn that is reached is a quarter or less.
+    with pytest.raises(fflin.InputError, match=r"after [\d.]+ s: it misses q_b.z by 0\.\d+ rad"):
+        fflin.plan(robot, (goal, None), 0.5 * least, knots=21)
+
+
+DETUMBLE = {"omega_b.y": 0.1, "joint_1": -0.05, "joint_2": 0.08}
+
+
+@pytest.fixture(scope="module")
+def servicer():
+    """A tumbling chain with damping, springs and gravity, and where it is to end."""
+    robot = fflin.load(
+        *("planar_detumble",), damping="urdf", stiffness={"joint_1": 0.5}, gravity=(0.01, 0, 0.02)
+    )
+    return robot, fflin.velocity(robot, DETUMBLE), turned(robot, 0.4, (0, 1, 0), {"joint_2": 0.9})
+
+
+@pytest.mark.parametrize("hold", ["previous", "linear"])
+def test_a_tumble_ends_within_limits(servicer, hold):
+    robot, v, goal = servicer
+    limits = {"tau_b": 8.0, "F_b": 5.0, "tau_m": 6.0}
+    options = {"v0": v, "knots": 41, "hold": hold, "limits": limits}
+    motion = fflin.plan(robot, (goal, None), 40.0, **options)
+    assert missed(robot, motion, goal) < 1e-6
+    assert (motion.q[0] == robot.neutral()).all() and (motion.v[0] == v).all()
+    assert motion.residual.max() < 1e-6
+    size = np.repeat([8.0, 5.0, 6.0], 3)
+    assert (np.abs(motion.u) <= size).all()
+    # The same again, to the last bit.
+    again = fflin.plan(robot, (goal, None), 40.0, **options)
+    assert (again.u == motion.u).all() and (again.q == motion.q).all()
+    loose = fflin.plan(robot, (goal, None), 40.0, **options | {"limits": None, "R": size**-2.0})
+    effort = (np.square(motion.u / size).sum(), np.square(loose.u / size).sum())
+    assert effort[0] >= 0.99 * effort[1]
+
+
+def test_what_is_planned_is_flown(servicer, tmp_path):
+    """The simulator under the same inputs ends where the plan does; the file says hold and axes."""
+    robot, v, goal = servicer
+    motion = fflin.plan(robot, (goal, None), 20.0, v0=v, knots=41, limits=None)
+    dt = motion.t[1]
+
+    def policy(t, q, v):
+        return motion.u[min(int(t / dt + 1e-9), 39)]
+
+    run = fflin.simulate(robot, policy, v0=v, duration=20.0, dt=dt / 20, sample=dt, frame="local")
+    assert missed(robot, motion, run.q[-1], run.v[-1]) < 1e-5
+    motion.save(tmp_path / "plan.csv")
+    header, first, *_ = (tmp_path / "plan.csv").read_text().splitlines()
+    assert header.endswith("hold,frame") and first.endswith("previous,local")
+    read = fflin.Trajectory.load(tmp_path / "plan.csv", robot)
+    assert (read.u == motion.u).all() and (read.hold, read.frame) == ("previous", "local")
+
+
+def test_joints_keep_within_their_speeds_and_travels():
+    robot = fflin.load("servicer_7dof", lock=["panel_*"])
+    goal = turned(robot, 0.5, (1, 0, 0), {"joint_1": 1.5, "joint_4": -1.0})
+    options = {"knots": 31, "limits": ["urdf", {"tau_b": 60.0, "F_b": 40.0}]}
+    motion = fflin.plan(robot, (goal, None), 10.0, **options)
+    speeds = np.abs(motion.v[:, 6:])
+    assert (speeds <= robot.model.velocityLimit[6:] + 1e-6).all()
+    # Without the limit it would pass it.
+    assert speeds[:, 0].max() == pytest.approx(0.2, abs=1e-6)
+    assert missed(robot, motion, goal) < 1e-6
+    with pytest.raises(fflin.InputError, match="no motion within the limits was found"):
+        fflin.plan(robot, (goal, None), 7.0, **options)
+
+
+def test_wheels_turn_a_body_and_may_keep_what_they_took(tmp_path):
+    """Only wheels act, so that the turn's momentum is theirs, and angles of wheels are no goal."""
+    wheels = [fflin.ReactionWheel(axis, inertia=1e-4, max=1e-3) for axis in np.eye(3)]
+    robot = fflin.load("cubesat", inputs=wheels)
+    v = fflin.velocity(robot, {"omega_b.z": 0.02, "wheel_1": 50.0})
+    goal = turned(robot, 0.8, (0.6, 0.0, 0.8))
+    free = ["r_b", "v_b", "qdot_m"]
+    motion = fflin.plan(robot, (goal, None), 30.0, v0=v, knots=31, free=free)
+    assert np.abs(pin.difference(robot.model, goal, motion.q[-1])[3:6]).max() < 1e-6
+    assert np.abs(motion.v[-1, 3:6]).max() < 1e-6 and motion.residual.max() < 1e-6
+    with pytest.raises(fflin.InputError, match="in `free` what may end anywhere"):
+        fflin.plan(robot, (goal, None), 30.0, v0=v, knots=31, free=["r_b", "v_b"])
+
+
+def test_starts_and_goals_are_given_in_every_form():
+    robot = fflin.load("astrobee_arm", start={"joints": {"arm_proximal": 0.2}})
+    q = fflin.configuration(robot, {"arm_proximal": -0.3})
+    lin = fflin.linearize(robot, q)
+    forms = [lin, (q, None), fflin.StateMap(robot).to_state(q, np.zeros(robot.nv))]
+    found = [fflin.plan(robot, goal, 10.0, knots=11, limits=None) for goal in forms]
+    for motion in found:
+        assert missed(robot, motion, q) < 1e-6
+        assert motion.u == pytest.approx(found[0].u, abs=1e-9)
+    assert (found[0].q[0] == fflin.configuration(robot, {"arm_proximal": 0.2})).all()
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
+    robot, v, goal = servicer
+    shooting = Shooting(robot, np.linspace(0.0, 8.0, 41), held)
+    shooting.steps = 16
+    q, v, u = shooting.guess((robot.neutral(), v), (goal, np.zeros(robot.nv)))
+    q, v = shooting.flown((q[0], v[0]), u)
+    stages = shooting.stages(q, v, u, np.zeros((41, shooting.state.nx)))
+    h = 1e-5
+
+    def ends(z, du):
+        return shooting.missed(*shooting.moved(q, v, z), u + du)
+
+    nx = stages.A.shape[1]
+    for i in range(nx):
+        z = np.zeros((41, nx))
+        z[1, i] = h
+        slope = (ends(z, 0.0) - ends(-z, 0.0))[1] / (2 * h)
+        assert slope == pytest.approx(stages.A[1][:, i], abs=1e-5)
+    for i in range(u.shape[1]):
+        for row, maps in ((1, stages.B), (2, stages.D)):
+            du = np.zeros_like(u)
+            du[row, i] = 1e-2
+            slope = (ends(np.zeros((41, nx)), du) - ends(np.zeros((41, nx)), -du))[1] / 2e-2
+            assert slope == pytest.approx(maps[1][:, i], abs=1e-5)
+
+
+def test_stages_solve_the_quadratic_problem():
+    """Beside SciPy's SLSQP on the same problem, with bounds on both kinds of variable."""
+    rng = np.random.default_rng(3)
+    N, nx, nu = 4, 3, 2
+    A = np.eye(nx) + 0.3 * rng.normal(size=(N, nx, nx))
+    B, D = rng.normal(size=(2, N, nx, nu))
+    stages = Stages(A, B, D, rng.normal(size=(N, nx)))
+    u_rows = Rows(rng.uniform(1, 2, (N + 1, nu)), np.zeros((N + 1, nu)), *_box(0.8, (N + 1, nu)))
+    low, high = _box(1.0, (N + 1, nx))
+    low[0] = high[0] = 0.0
+    z_rows = Rows(rng.uniform(1, 2, (N + 1, nx)), rng.normal(size=(N + 1, nx)), low, high)
+    u, z, _ = stages.least(u_rows, z_rows, np.zeros((N, nx)))
+
+    def split(x):
+        return x[: u.size].reshape(u.shape), x[u.size :].reshape(z.shape)
+
+    def cost(x):
+        v, w = split(x)
+        return u_rows.cost(v) + z_rows.cost(w)
+
+    def left(x):
+        v, w = split(x)
+        rows = [
+            A[k] @ w[k] + B[k] @ v[k] + D[k] @ v[k + 1] + stages.c[k] - w[k + 1] for k in range(N)
+        ]
+        return np.ravel(rows)
+
+    bounds = np.hstack([np.vstack((x.low.ravel(), x.high.ravel())) for x in (u_rows, z_rows)]).T
+    known = minimize(
+        *(cost, np.zeros(u.size + z.size)),
+        bounds=bounds,
+        constraints={"type": "eq", "fun": left},
+        method="SLSQP",
+        options={"ftol": 1e-14, "maxiter": 500},
+    )
+    assert known.success and np.abs(left(np.concatenate((u.ravel(), z.ravel())))).max() < 1e-10
+    assert (np.abs(u) == 0.8).any() and (np.abs(z) == 1.0).any()
+    assert cost(np.concatenate((u.ravel(), z.ravel()))) == pytest.approx(known.fun, rel=1e-8)
+
+
+def _box(size, shape):
+    return np.full(shape, -size), np.full(shape, size)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"knots": 1}, "knots is 1"),
+        ({"hold": "next"}, "hold is 'next', expected 'linear' or 'previous'"),
+        ({"duration": 0.0}, "duration is 0 s, expected a positive time"),
+        ({"free": "r_b.x"}, "free"),
+        ({"R": np.ones((6, 6)) + np.eye(6)}, "a plan takes a diagonal weight"),
+        ({"goal": np.zeros(3)}, r"x has shape \(3,\)"),
+        ({"x0": np.zeros(12), "q0": np.zeros(7)}, "give either"),
+    ],
+)
+def test_what_is_no_plan_is_refused(cube, wrong, said):
+    robot, _ = cube
+    with pytest.raises(fflin.FflinError, match=said):
+        fflin.plan(robot, **{"goal": (None, None), "duration": 1.0} | wrong)
