@@ -1,0 +1,136 @@
+"""Eight runs side by side in the compiled loop, each with a robot and a start of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from fflin.base.rotation import product_matrix
+from fflin.base.validation import Array
+from fflin.campaign.tally import Outcome, Tally
+from fflin.kernel.accelerations import work_space
+from fflin.kernel.compiled import kernel
+from fflin.kernel.tree import LANES, batch_tree
+from fflin.simulation.conservation import Conserved
+from fflin.simulation.packing import packed
+from fflin.simulation.plan import Plan
+from fflin.simulation.plant import Plant
+from fflin.simulation.run import ending_of
+
+_SLICE = 128  # steps whose rows are there at a time
+
+# Takes the first step of some, and their rows (steps, LANES, ..) of q, nu, u, momentum and centre.
+Watcher = Callable[[int, list[Array]], None]
+
+
+class Lanes:
+    """The compiled loop over a plan, with arrays of its own: not to be shared by threads."""
+
+    def __init__(self, plan: Plan, plant: Plant) -> None:
+        tree = batch_tree(plant.robot)
+        assert tree is not None
+        parts = packed(plan, plant, Conserved(plant.robot, plan.q), tree)
+        self._plan, self._state = plan, plant.state
+        mechanics, method, law, channel, (kept, *flags), watch, point, stages = parts
+        self._fresh: list[tuple[Array, Array]] = []
+        mechanics = mechanics._replace(
+            tree=self._wide(mechanics.tree, "bodies"),
+            loads=self._wide(mechanics.loads, "wrench", "stiffness", "damping"),
+            drives=self._wide(mechanics.drives, *mechanics.drives._fields),
+        )
+        path = self._wide(law.path, "e")
+        law = self._wide(law, "y0", "x", "z", "next")._replace(path=path)
+        pulses = self._wide(channel.pulses, "left", "level", "end")
+        channel = self._wide(channel, "held", "pending")._replace(pulses=pulses)
+        kept, point, stages = (self._wide(x, *x._fields) for x in (kept, point, stages))
+        # All starts are given with the base on the side of the chart where this is positive.
+        watch = watch._replace(sign=np.abs(watch.sign))
+        self._parts = mechanics, method, law, channel, (kept, *flags), watch, point, stages
+        self._work = work_space(mechanics.layout.size)
+        self._sizes = [len(each) for each in (point.q, point.nu, point.u)] + [6, 3]
+        self._rows = work_space(_SLICE * sum(self._sizes))
+        self._of = {
+            **{"q": point.q, "nu": point.nu, "bodies": mechanics.tree.bodies, "y0": law.y0},
+            **{"stiffness": mechanics.loads.stiffness, "damping": mechanics.loads.damping},
+            **mechanics.drives._asdict(),
+        }
+        self._turn = product_matrix(plant.state.origin_quaternion)[3]
+
+    def _wide(self, part: Any, *names: str) -> Any:
+        """Return a part with arrays in lanes, which are remembered as they were."""
+        wide = {}
+        for name in names:
+            array = getattr(part, name)
+            wide[name] = work_space(len(array))
+            self._fresh.append((wide[name], array[:, None].copy()))
+        return part._replace(**wide)
+
+    def fly(
+        self, runs: Mapping[str, Array], tally: Tally, watcher: Watcher | None = None
+    ) -> list[Outcome]:
+        """Run up to eight, whose rows differ from the plan; return how each ended."""
+        plan, times, count = self._plan, self._plan.times, len(runs["q"])
+        parts, rows = self._parts, self._rows
+        mechanics, *_, (kept, *_), watch, point, stages = parts
+        for array, fresh in self._fresh:
+            array[:] = fresh
+        of_lane = np.minimum(np.arange(LANES), count - 1)
+        for name, values in runs.items():
+            self._of[name][:] = values[of_lane].T
+        mass = mechanics.tree.bodies[::10].sum(axis=0)
+        kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * mechanics.gravity[:, None]
+        kept.start[9:] = point.q[:3]
+        kernel("loop", "begin")(mechanics, kept, point, self._work)
+        advance = kernel("loop", "advance", "the loop of eight runs at a time")
+        clock, ended = np.zeros(1, dtype=np.intp), dict[int, Outcome]()
+        while clock[0] < times.steps and len(ended) < count:
+            first = int(clock[0])
+            last = min(times.steps, (first // _SLICE + 1) * _SLICE)
+            advance(*parts, clock, last, 1, rows, self._work)
+            taken, done = int(clock[0]) - first, int(clock[0])
+            seen = self._split(rows[: taken * sum(self._sizes)])
+            tally.add(first, *seen[:3])
+            if watcher:
+                watcher(first, seen)
+            square = point.nu * point.nu
+            lost = ~(square < watch.squares[:, None]).all(axis=0)
+            if plan.chart:
+                lost |= self._turn @ point.q[3:7] < 0.0
+            over = done == times.steps
+            if over or lost.any() or done < last:
+                end = [each.T[None] for each in (point.q, point.nu, stages.u)]
+                with np.errstate(invalid="ignore", over="ignore"):
+                    at_end = tally.copy().add(done, *end)
+                for lane in range(count):
+                    said = self._said(runs["q"][lane], lane, done) if lane not in ended else ""
+                    if lane not in ended and (said or over):
+                        ends = seen if (gone := said.startswith("diverged")) else end
+                        values = [each[-1, lane] for each in ends[:3]]
+                        which = tally if gone else at_end
+                        ended[lane] = which.outcome(lane, done, said, *values)
+                # What has ended would stop the others: it goes on as one of them.
+                left = [lane for lane in range(LANES) if of_lane[lane] not in ended]
+                if left and ended:
+                    for array, _ in self._fresh:
+                        array[:, [*ended]] = array[:, left[:1]]
+        return [ended[lane] for lane in range(count)]
+
+    def _said(self, q: Array, lane: int, done: int) -> str:
+        """Say why a run ends where it is, or nothing."""
+        from dataclasses import replace
+
+        point = self._parts[-2]
+        ending = ending_of(replace(self._plan, q=q))
+        v = self._state.spread(point.nu[:, lane])
+        with np.errstate(invalid="ignore", over="ignore"):
+            return ending(done * self._plan.times.dt, point.q[:, lane].copy(), v)
+
+    def _split(self, rows: Array) -> list[Array]:
+        """Return what rows hold, each (steps, LANES, size)."""
+        by_step = rows.reshape(-1, sum(self._sizes), LANES)
+        return [
+            each.transpose(0, 2, 1)
+            for each in np.split(by_step, np.cumsum(self._sizes)[:-1], axis=1)
+        ]
