@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,7 @@ class Lanes:
             drives=self._wide(mechanics.drives, *mechanics.drives._fields),
         )
         path = self._wide(law.path, "e")
-        law = self._wide(law, "y0", "x", "z", "next")._replace(path=path)
+        law = self._wide(law, "offset", "y0", "x", "z", "next")._replace(path=path)
         pulses = self._wide(channel.pulses, "left", "level", "end")
         channel = self._wide(channel, "held", "pending")._replace(pulses=pulses)
         kept, point, stages = (self._wide(x, *x._fields) for x in (kept, point, stages))
@@ -52,7 +53,8 @@ class Lanes:
         self._sizes = [len(each) for each in (point.q, point.nu, point.u)] + [6, 3]
         self._rows = work_space(_SLICE * sum(self._sizes))
         self._of = {
-            **{"q": point.q, "nu": point.nu, "bodies": mechanics.tree.bodies, "y0": law.y0},
+            **{"q": point.q, "nu": point.nu, "bodies": mechanics.tree.bodies},
+            **{"y0": law.y0, "offset": law.offset},
             **{"stiffness": mechanics.loads.stiffness, "damping": mechanics.loads.damping},
             **mechanics.drives._asdict(),
         }
@@ -82,7 +84,7 @@ class Lanes:
         mass = mechanics.tree.bodies[::10].sum(axis=0)
         kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * mechanics.gravity[:, None]
         kept.start[9:] = point.q[:3]
-        kernel("loop", "begin")(mechanics, kept, point, self._work)
+        kernel("loop", "begin", "the start of eight runs")(mechanics, kept, point, self._work)
         advance = kernel("loop", "advance", "the loop of eight runs at a time")
         clock, ended = np.zeros(1, dtype=np.intp), dict[int, Outcome]()
         while clock[0] < times.steps and len(ended) < count:
@@ -117,10 +119,15 @@ class Lanes:
                         array[:, [*ended]] = array[:, left[:1]]
         return [ended[lane] for lane in range(count)]
 
+    def kept(self, t: float) -> tuple[Array, Array]:
+        """Return the momentum (6,) and the centre of mass (3,) that the first is to have."""
+        kept = self._parts[4][0]
+        start, sums = kept.start[:, 0], kept.sums[:, 0]
+        momentum, center = np.split(start[:9] + sums[:9], [6])
+        return momentum, center + t * kept.per_mass[0, 0] * start[:3]
+
     def _said(self, q: Array, lane: int, done: int) -> str:
         """Say why a run ends where it is, or nothing."""
-        from dataclasses import replace
-
         point = self._parts[-2]
         ending = ending_of(replace(self._plan, q=q))
         v = self._state.spread(point.nu[:, lane])

@@ -41,6 +41,7 @@ class Outcome(NamedTuple):
     settle: Array  # (kinds,) [s], since when settled; infinite where it is not
     stop: float  # which of STOPS
     end: float  # [s]
+    said: str  # why it was stopped, if it was
 
 
 class Tally:
@@ -106,6 +107,7 @@ class Tally:
             np.where(late, np.inf, settled * times.dt),
             float(stop if said else 0),
             done * times.dt,
+            said,
         )
 
     def _read(self, q: Array, nu: Array) -> Array:
