@@ -28,8 +28,11 @@ def run_chunks(
     executor: Executor | None = None,
     threads: int = 1,
     progress: Progress | None = None,
+    upto: int | None = None,
 ) -> list[Done]:
     """Do the chunks that a store has not yet, keep what comes of them, return those that failed.
+
+    Only those that begin before row `upto`, where it is given.
 
     ``rows(start, stop)`` is a named tuple; what the store has a name for is kept of it too. Threads
     are of this process, where there is no executor. Warnings of a job are said once.
@@ -38,6 +41,7 @@ def run_chunks(
     spans = [Span(at, min(at + size, store.count)) for at in range(0, store.count, size)]
     left = [span for span in spans if not store.finished(*span)]
     count = store.count - sum(stop - start for start, stop in left)
+    left = [span for span in left if upto is None or span.start < upto]
     if progress and count:
         progress(count, store.count)
     failed: list[Done] = []

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fflin.base.errors import ChartError, InputError
 from fflin.base.validation import Array
 from fflin.batch.dispatch import ChunkResult
 from fflin.campaign.dispersions import Dispersions, Draws, Varied
@@ -26,6 +27,7 @@ from fflin.simulation.simulate import motion_of, planned
 
 # Arrays of a run's outcome; its last field says in words why it was stopped.
 ARRAYS = Outcome._fields[:-1]
+_CHECKED = 4096  # draws at a time
 
 
 class CampaignJob:
@@ -51,6 +53,18 @@ class CampaignJob:
         times = self.plan.times
         several = replace(self.plan, times=times._replace(steps=times.steps * runs))
         self.engine = engine_of(engine, several, self.plant)
+
+    def require_possible(self, runs: int) -> None:
+        """Raise `InputError` where a draw of so many runs makes no robot or no attitude."""
+        turned = any(each.name.startswith("q_b.") for each in self.dispersions.columns)
+        for start in range(0, runs, _CHECKED):
+            draws = self.dispersions.rows(start, min(start + _CHECKED, runs))
+            self.dispersions.require_possible(draws)
+            try:
+                if turned:
+                    self.varied.starts(draws.drawn)
+            except ChartError as error:
+                raise InputError(f"of 'q_b' a start is drawn that is no attitude: {error}") from None
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:

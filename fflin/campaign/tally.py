@@ -34,10 +34,10 @@ class Outcome(NamedTuple):
     v: Array  # (nv,)
     x: Array  # (nx,)
     u: Array  # (nu,)
-    worst_x: Array  # (nx,), largest errors
-    worst_u: Array  # (nu,), largest inputs
+    largest_x: Array  # (nx,), largest errors
+    largest_u: Array  # (nu,), largest inputs
     errors: Array  # (kinds,), at last
-    worst: Array  # (kinds,)
+    largest: Array  # (kinds,)
     settle: Array  # (kinds,) [s], since when settled; infinite where it is not
     stop: float  # which of STOPS
     end: float  # [s]
@@ -58,16 +58,16 @@ class Tally:
         ]
         self._parts.append(g.qdot_m.start + np.array(joints, dtype=int))
         self._circling = 6 + state.unbounded
-        self.worst_x = np.zeros((count, state.nx))
-        self.worst_u = np.zeros((count, len(plan.initial)))
-        self.worst = np.zeros((count, len(KINDS)))
+        self.largest_x = np.zeros((count, state.nx))
+        self.largest_u = np.zeros((count, len(plan.initial)))
+        self.largest = np.zeros((count, len(KINDS)))
         self.outside = np.full((count, len(KINDS)), -1)
 
     def copy(self) -> Tally:
         """Return one that goes its own way from here on."""
         other = object.__new__(Tally)
         other.__dict__ |= {
-            key: value.copy() if key in ("worst_x", "worst_u", "worst", "outside") else value
+            key: value.copy() if key in ("largest_x", "largest_u", "largest", "outside") else value
             for key, value in vars(self).items()
         }
         return other
@@ -75,10 +75,10 @@ class Tally:
     def add(self, first: int, q: Array, nu: Array, u: Array) -> Tally:
         """Take rows (steps, count, ..) from a step on into account."""
         e, sizes = self._errors(first, *(np.ascontiguousarray(each) for each in (q, nu)))
-        np.maximum(self.worst_x, np.abs(e).max(axis=0), out=self.worst_x)
-        np.maximum(self.worst_u, np.abs(u).max(axis=0), out=self.worst_u)
-        largest = np.maximum.accumulate(np.concatenate((self.worst[None], sizes)))[1:]
-        self.worst = largest[-1]
+        np.maximum(self.largest_x, np.abs(e).max(axis=0), out=self.largest_x)
+        np.maximum(self.largest_u, np.abs(u).max(axis=0), out=self.largest_u)
+        largest = np.maximum.accumulate(np.concatenate((self.largest[None], sizes)))[1:]
+        self.largest = largest[-1]
         # Where an error has its largest so far it is outside; so what was outside last stays it
         # when a larger one comes.
         outside = sizes > np.maximum(SETTLED * largest, THERE)
@@ -100,10 +100,10 @@ class Tally:
             self._state.spread(nu),
             self._read(q[None], nu[None])[0],
             u.copy(),
-            self.worst_x[lane],
-            self.worst_u[lane],
+            self.largest_x[lane],
+            self.largest_u[lane],
             sizes[0, 0],
-            self.worst[lane],
+            self.largest[lane],
             np.where(late, np.inf, settled * times.dt),
             float(stop if said else 0),
             done * times.dt,
