@@ -13,11 +13,27 @@ from typing import Any
 
 import numpy as np
 
-from fflin.base.errors import FflinError, FflinWarning, SweepError, listed
+from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
+from fflin.base.validation import whole
 from fflin.batch.dispatch import Dispatch, Done, Job, Rows, Span
 from fflin.batch.store import FileStore, MemoryStore
 
 Progress = Callable[[int, int], object]
+
+
+def check_workers(executor: Any, workers: Any, threads: Any, chunk: Any, progress: Any) -> None:
+    """Raise `InputError` where what is to do the chunks cannot be that."""
+    if executor is not None and workers is not None:
+        raise InputError("executor and workers are both given; give either")
+    if executor is not None and not hasattr(executor, "submit"):
+        raise InputError(
+            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
+        )
+    for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
+        if value is not None:
+            whole(name, value, 1)
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
 
 
 def run_chunks(

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.base.errors import InputError, UnknownNameError
+from fflin.base.errors import ChartError, InputError, UnknownNameError
 from fflin.base.names import by_name, input_keys
 from fflin.base.validation import Array, number
 from fflin.base.validation import by_name as mapping
 from fflin.control.output_feedback import OutputFeedback
 from fflin.control.policies import StateFeedback, bound
+from fflin.dynamics.state import StateMap
 from fflin.kernel.tree import Tree
 from fflin.robot.frames import ROOT
 from fflin.robot.mass_properties import stretched, with_inertias
@@ -23,21 +24,17 @@ from fflin.robot.robot import Robot
 from fflin.simulation.plant import Drives, Plant
 
 _BLOCK = 1024  # runs whose draws are made together, whatever the chunks are
-_OF_BODIES, _OF_INPUTS, _OF_SPRINGS = (
-    ("mass", "com", "inertia"),
-    ("gain", "bias", "fails"),
-    ("stiffness", "damping"),
-)
-_RELATIVE = ("mass", "inertia", "stiffness", "damping")
-_AXES = {"com": "xyz", "inertia": "xyz"}
+_OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz"}  # with their axes
+_OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
+_FACTORS = ("mass", "inertia", *_OF_SPRINGS)
 
 
 class Column(NamedTuple):
     """A number that is drawn for each run, what it changes and of whom."""
 
     name: str
-    kind: str  # state, or what a name ends with
-    at: tuple[int, int]  # which state, body, joint or input, and which of its axes
+    kind: str  # "state", or what a name ends with
+    at: tuple[int, int]  # which state, body, joint, input or sensor, and which of its axes
     inverse: Callable[[Array], Array]  # of the distribution function
 
 
@@ -49,49 +46,55 @@ class Draws(NamedTuple):
 
 
 class Dispersions:
-    """The columns of a campaign, by name; see `monte_carlo`."""
+    """What is drawn, see `monte_carlo`, and what draws make of a robot and its start x0 (nx,)."""
 
-    def __init__(self, given: Any, plant: Plant, policy: Any, seed: int) -> None:
-        self._seed = seed
-        self.columns: list[Column] = []
-        robot, state = plant.robot, plant.state
-        bodies = list(robot._bare.model.names)[ROOT + 1 :]
+    def __init__(self, given: Any, plant: Plant, policy: Any, x0: Array, seed: int) -> None:
+        self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
+        self._model = plant.robot._bare.model
+        bodies = ["base", *list(self._model.names)[ROOT + 1 :]]
+        self._sensors: tuple[str, ...] = ()
+        if isinstance(policy, StateFeedback | OutputFeedback):
+            lin = policy.lin
+            of_states = isinstance(policy, StateFeedback)
+            self._sensors = lin.state_names if of_states else lin.output_names
         known = {
-            **dict.fromkeys(_OF_BODIES, ["base", *bodies]),
-            **dict.fromkeys(_OF_INPUTS, list(input_keys(plant.actuation))),
-            **dict.fromkeys(_OF_SPRINGS, list(robot.joint_names)),
-            "sensor": list(sensors_of(policy)),
-            "state": list(state.names),
+            "state": plant.state.names,
+            "sensor": self._sensors,
+            **dict.fromkeys(_OF_BODIES, bodies),
+            **dict.fromkeys(_OF_INPUTS, input_keys(plant.actuation)),
+            **dict.fromkeys(_OF_SPRINGS, plant.robot.joint_names),
         }
-        sorted_: dict[str, dict[str, Any]] = {}
+        by_kind: dict[str, dict[str, Any]] = {}
         for key, spread in mapping("dispersions", given, "name").items():
             head, _, kind = str(key).rpartition(".")
             kind, head = (kind, head) if kind in known and head else ("state", str(key))
-            sorted_.setdefault(kind, {})[head] = _inverse(str(key), spread)
-        for kind, spreads in sorted_.items():
-            names = known[kind]
-            if kind == "sensor" and not names:
-                raise InputError(
-                    f"'{next(iter(spreads))}.sensor' is dispersed, and a "
-                    f"{type(policy).__name__} has no sensors; StateFeedback and OutputFeedback do"
-                )
-            what = "state to disperse" if kind == "state" else f"{kind} to disperse, of anything,"
-            try:
-                found = by_name(what, spreads, names)
-            except UnknownNameError as error:
-                if kind != "state":
-                    raise
-                others = " | ".join((*_OF_BODIES, *_OF_INPUTS, *_OF_SPRINGS, "sensor"))
-                raise UnknownNameError(f"{error}, or NAME.{{{others}}}") from None
-            for at, inverse in sorted(found.items()):
-                own = names[at] if kind == "state" else f"{names[at]}.{kind}"
-                if kind in _OF_SPRINGS and not getattr(robot.springs, kind)[at]:
-                    raise InputError(f"'{own}' is dispersed, and is 0: nothing times a factor")
-                for axis, letter in enumerate(_AXES.get(kind, " ")):
-                    name = f"{own}.{letter}".rstrip(". ")
-                    self.columns.append(Column(name, kind, (at, axis), inverse))
+            by_kind.setdefault(kind, {})[head] = _inverse(str(key), spread)
+        self.columns: list[Column] = []
+        for kind, spreads in by_kind.items():
+            self._add(kind, spreads, list(known[kind]), " | ".join([*known][1:]))
         if not self.columns:
             raise InputError("dispersions is empty; give at least one, such as {'q_b': 0.05}")
+        self._kinds = {column.kind for column in self.columns}
+
+    def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
+        if kind == "sensor" and not names:
+            raise InputError(
+                f"'{next(iter(spreads))}.sensor' is dispersed, and a "
+                f"{type(self._policy).__name__} has no sensors; StateFeedback and OutputFeedback do"
+            )
+        try:
+            found = by_name(f"{kind} to disperse", spreads, names)
+        except UnknownNameError as error:
+            raise UnknownNameError(
+                f"{error}" + f"; or NAME.({kinds})" * (kind == "state")
+            ) from None
+        for at, inverse in sorted(found.items()):
+            own = names[at] if kind == "state" else f"{names[at]}.{kind}"
+            if kind in _OF_SPRINGS and not getattr(self._plant.robot.springs, kind)[at]:
+                raise InputError(f"'{own}' is dispersed, and is 0, which stays 0 times a factor")
+            for axis, letter in enumerate(_OF_BODIES.get(kind, " ")):
+                name = f"{own}.{letter}".rstrip(". ")
+                self.columns.append(Column(name, kind, (at, axis), inverse))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -103,177 +106,134 @@ class Dispersions:
         first, last = start // _BLOCK, -(-stop // _BLOCK)
         drawn = np.empty(((last - first) * _BLOCK, len(self.columns)))
         for at, column in enumerate(self.columns):
+            key = (self._seed, zlib.crc32(column.name.encode()))
             for block in range(first, last):
-                key = (self._seed, zlib.crc32(column.name.encode()))
                 stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
-                # Of a tail of 0 or 1 the inverse may be infinite.
+                # At 0 and 1 the inverse may be infinite.
                 uniform = np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
                 drawn[(block - first) * _BLOCK :][:_BLOCK, at] = column.inverse(uniform)
         kept = slice(start - first * _BLOCK, stop - first * _BLOCK)
         return Draws(drawn[kept], np.arange(start, stop, dtype=float))
 
-    def require_possible(self, draws: Draws) -> None:
-        """Raise `InputError` where a draw makes no robot."""
-        for at, column in enumerate(self.columns):
-            drawn = draws.drawn[:, at]
-            bad = ~np.isfinite(drawn)
-            if column.kind in _RELATIVE:
-                bad |= drawn <= -1.0
-            if bad.any():
-                row = int(bad.argmax())
-                raise InputError(
-                    f"'{column.name}' is drawn as {drawn[row]:.4g} in run {draws.run[row]:.0f}"
-                    + ", of which no robot is made: expected more than -1, relative; "
-                    * (column.kind in _RELATIVE)
-                    + "take a smaller spread, or a uniform one (least, largest)"
-                )
+    def require_possible(self, runs: int) -> None:
+        """Raise `InputError` where a draw of so many runs makes no robot or no attitude."""
+        for start in range(0, runs, _BLOCK):
+            drawn = self.rows(start, min(start + _BLOCK, runs)).drawn
+            for values, column in zip(drawn.T, self.columns, strict=True):
+                least = -1.0 if column.kind in _FACTORS else -np.inf
+                bad = ~np.isfinite(values) | (values <= least)
+                if bad.any():
+                    run = int(bad.argmax())
+                    raise InputError(
+                        f"'{column.name}' is drawn as {values[run]:.4g} in run {start + run}, of "
+                        f"which no robot is made: expected more than {least:g}; take a smaller "
+                        "spread, or a uniform one (least, largest)"
+                    )
+            try:
+                self.starts(drawn)
+            except ChartError as error:
+                said = f"a start is drawn that is no attitude, of runs {start} on"
+                raise InputError(f"{said}: {error}; take a smaller spread") from None
 
-
-class Varied:
-    """A robot and a start, and what draws make of them."""
-
-    def __init__(self, columns: list[Column], plant: Plant, policy: Any, x0: Array) -> None:
-        self._columns, self._plant, self._policy, self._x0 = columns, plant, policy, x0
-        self.model = plant.robot._bare.model
-
-    def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array | None:
+    def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array:
         """Return the draws (N, size, axes) of a kind, zero where nothing is drawn."""
-        columns = [(at, each.at) for at, each in enumerate(self._columns) if each.kind == kind]
-        if not columns:
-            return None
         found = np.zeros((len(drawn), size, axes))
-        for at, place in columns:
-            found[(slice(None), *place)] = drawn[:, at]
+        for values, column in zip(drawn.T, self.columns, strict=True):
+            if column.kind == kind:
+                found[(slice(None), *column.at)] = values
         return found
 
     def starts(self, drawn: Array) -> tuple[Array, Array]:
         """Return configurations and velocities (N, nq), (N, nv) to begin at."""
-        state, apart = self._plant.state, self._of("state", drawn, len(self._x0))
-        x = self._x0 + (0.0 if apart is None else apart[..., 0])
-        _, q, v = state.points(np.broadcast_to(x, (len(drawn), len(self._x0))))
-        return q, v
+        x = self._x0 + self._of("state", drawn, len(self._x0))[..., 0]
+        return self._plant.state.points(x)[1:]
 
     def bodies(self, drawn: Array) -> dict[int, tuple[Array, Array, Array]]:
         """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of bodies that are drawn."""
-        size, found = self.model.njoints - ROOT, {}
-        of = {kind: self._of(kind, drawn, size, 3 if kind in _AXES else 1) for kind in _OF_BODIES}
-        for at in {each.at[0] for each in self._columns if each.kind in _OF_BODIES}:
-            zero = np.zeros((len(drawn), 3))
-            mass, com, inertia = (zero if of[k] is None else of[k][:, at] for k in _OF_BODIES)
-            body = self.model.inertias[ROOT + at]
-            found[at] = stretched(body, mass[:, 0], com, inertia)
+        size, found = self._model.njoints - ROOT, {}
+        of = [self._of(kind, drawn, size, len(axes)) for kind, axes in _OF_BODIES.items()]
+        for at in sorted({each.at[0] for each in self.columns if each.kind in _OF_BODIES}):
+            found[ROOT + at] = stretched(self._model.inertias[ROOT + at], *(x[:, at] for x in of))
         return found
+
+    def _springs(self, kind: str, drawn: Array) -> Array:
+        robot = self._plant.robot
+        factor: Array = 1.0 + self._of(kind, drawn, robot.n)[..., 0]
+        return factor * getattr(robot.springs, kind)
+
+    def _drives(self, drawn: Array) -> Drives:
+        gain, bias, until = (
+            self._of(kind, drawn, len(self._plant.drives.gain))[..., 0] for kind in _OF_INPUTS
+        )
+        safe = np.ones(until.shape[1], dtype=bool)
+        safe[[each.at[0] for each in self.columns if each.kind == "fails"]] = False
+        until[:, safe] = np.inf
+        return Drives(1.0 + gain, bias, until)
 
     def in_lanes(self, drawn: Array, tree: Tree) -> dict[str, Array]:
         """Return what differs from run to run, as the compiled loop takes it."""
-        plant = self._plant
-        q, v = self.starts(drawn)
-        runs = {"q": q, "nu": plant.state.velocities(v)}
-        if bodies := self.bodies(drawn):
+        plant, (q, v) = self._plant, self.starts(drawn)
+        runs = {"q": q, "nu": plant.state.velocities(v), **self._drives(drawn)._asdict()}
+        if self._kinds & {*_OF_BODIES}:
             parameters = np.tile(tree.bodies.reshape(1, -1, 10), (len(drawn), 1, 1))
-            for at, (mass, com, inertia) in bodies.items():
-                old = self.model.inertias[ROOT + at]
-                before = _parameters(*(np.array([x]) for x in (old.mass, old.lever, old.inertia)))
+            for at, body in self.bodies(drawn).items():
+                old, axes = self._model.inertias[at], tree.axes[at - ROOT]
+                before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
                 # Linear in these, so that wheels in the body stay as they are.
-                parameters[:, at] += _turned(
-                    _parameters(mass, com, inertia) - before, tree.axes[at]
-                )
+                parameters[:, at - ROOT] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(len(drawn), -1)
-        for kind in _OF_SPRINGS:
-            if (factor := self._of(kind, drawn, plant.robot.n)) is not None:
-                runs[kind] = (1.0 + factor[..., 0]) * getattr(plant.robot.springs, kind)
-        sensed = self._of("sensor", drawn, len(sensors_of(self._policy)))
-        if sensed is not None and isinstance(self._policy, OutputFeedback):
-            runs["y0"] = self._policy.compensator.y0 - sensed[..., 0]
-        elif sensed is not None:
-            offset = self._policy.terms(plant.state)[1]
-            runs["offset"] = offset - sensed[..., 0] @ self._policy.K.T
-        return runs | {
-            key: value
-            for key, value in self._drives(drawn)._asdict().items()
-            if (value != getattr(plant.drives, key)).any()
-        }
+        runs |= {kind: self._springs(kind, drawn) for kind in _OF_SPRINGS if kind in self._kinds}
+        if "sensor" in self._kinds:
+            bias = self._of("sensor", drawn, len(self._sensors))[..., 0]
+            if isinstance(self._policy, OutputFeedback):
+                runs["y0"] = self._policy.compensator.y0 - bias
+            else:
+                runs["offset"] = self._policy.terms(plant.state)[1] - bias @ self._policy.K.T
+        return runs
 
-    def _drives(self, drawn: Array) -> Drives:
-        nu = len(self._plant.drives.gain)
-        gain, bias, fails = (self._of(kind, drawn, nu) for kind in _OF_INPUTS)
-        none = np.zeros((len(drawn), nu))
-        until = np.full_like(none, np.inf)
-        if fails is not None:
-            at = [each.at[0] for each in self._columns if each.kind == "fails"]
-            until[:, at] = fails[:, at, 0]
-        return Drives(
-            1.0 + (none if gain is None else gain[..., 0]),
-            none if bias is None else bias[..., 0],
-            until,
-        )
-
-    def policy(self, drawn: Array) -> Any:
-        """Return the policy of a run (k,), with the errors of its sensors."""
-        sensed = self._of("sensor", drawn[None], len(sensors_of(self._policy)))
-        if sensed is None:
-            return self._policy
-        bias = sensed[0, :, 0]
-        if isinstance(self._policy, StateFeedback):
-            return Biased(self._policy, -self._policy.K @ bias)
-        before = self._policy.noise
-        return replace(self._policy, noise=lambda t: bias + (before(t) if before else 0.0))
-
-    def one(self, drawn: Array) -> tuple[Plant, Array, Array]:
-        """Return the robot of a run (k,) with its inputs' errors, and q and v to begin at."""
-        plant, rows = self._plant, drawn[None]
-        robot: Robot = plant.robot
-        q, v = self.starts(rows)
+    def one(self, drawn: Array) -> tuple[Plant, Any, Array, Array]:
+        """Return the robot of a run (k,) with its inputs, its policy, and q and v to begin at."""
+        plant, policy, rows = self._plant, self._policy, drawn[None]
+        robot, (q, v) = plant.robot, self.starts(rows)
         if bodies := self.bodies(rows):
-            of = {ROOT + at: tuple(x[0] for x in each) for at, each in bodies.items()}
-            robot = with_inertias(robot, of)
-        for kind in _OF_SPRINGS:
-            if (factor := self._of(kind, rows, robot.n)) is not None:
-                values = (1.0 + factor[0, :, 0]) * getattr(robot.springs, kind)
-                given = dict(zip(robot.joint_names, values.tolist(), strict=True))
-                robot = replace(robot, **{kind: given})
-        state = type(plant.state)(robot, reference=plant.state.reference, frame=plant.state.frame)
-        faulty = any(each.kind in _OF_INPUTS for each in self._columns)
-        drives = Drives(*(x[0] for x in self._drives(rows))) if faulty else None
-        return Plant(state, plant.disturbance, drives), q[0], v[0]
+            robot = with_inertias(robot, {k: [x[0] for x in body] for k, body in bodies.items()})
+        for kind in self._kinds & {*_OF_SPRINGS}:
+            values = self._springs(kind, rows)[0].tolist()
+            of: Any = {kind: dict(zip(robot.joint_names, values, strict=True))}
+            robot = replace(robot, **of)
+        if "sensor" in self._kinds:
+            bias = self._of("sensor", rows, len(self._sensors))[0, :, 0]
+            if isinstance(policy, OutputFeedback):
+                noise = policy.noise
+                policy = replace(
+                    policy, noise=lambda t: bias + np.asarray(noise(t) if noise else 0.0)
+                )
+            else:
+                policy = _Shifted(policy, -policy.K @ bias)
+        state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
+        drives = Drives(*(x[0] for x in self._drives(rows)))
+        faulty = drives if self._kinds & {*_OF_INPUTS} else None
+        return Plant(state, plant.disturbance, faulty), policy, q[0], v[0]
 
 
 @dataclass(frozen=True)
-class Biased:
+class _Shifted:
     """A policy whose commands are shifted (nu,)."""
 
     policy: Any
     shift: Array
 
     def bind(self, robot: Robot) -> Callable[[float, Array, Array], Array]:
-        """Return policy(t, q, v) -> u for a robot."""
         inner = bound(self.policy, robot)
         return lambda t, q, v: np.asarray(inner(t, q, v)) + self.shift
 
 
-def sensors_of(policy: Any) -> tuple[str, ...]:
-    """Return the names of what a policy measures, as far as that is known."""
-    if isinstance(policy, StateFeedback):
-        return policy.lin.state_names
-    return policy.lin.output_names if isinstance(policy, OutputFeedback) else ()
-
-
-def _parameters(mass: Array, com: Array, inertia: Array) -> Array:
-    """Return m, m c, and I about the origin (xx xy xz yy yz zz) of bodies, (N, 10)."""
+def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
+    """Return m, m c, and I about the origin (xx xy xz yy yz zz) of bodies in axes (N, 10)."""
     square = (com * com).sum(axis=1)[:, None, None] * np.eye(3) - com[:, :, None] * com[:, None]
-    about = inertia + mass[:, None, None] * square
-    return np.column_stack((mass, mass[:, None] * com, about[:, *np.triu_indices(3)]))
-
-
-def _turned(parameters: Array, axes: Array) -> Array:
-    """Return parameters (N, 10) in other axes (3, 3)."""
-    new = parameters.copy()
-    new[:, 1:4] = parameters[:, 1:4] @ axes
-    about = np.empty((len(new), 3, 3))
+    about = axes.T @ (inertia + mass[:, None, None] * square) @ axes
     rows, columns = np.triu_indices(3)
-    about[:, rows, columns] = about[:, columns, rows] = parameters[:, 4:]
-    new[:, 4:] = (axes.T @ about @ axes)[:, rows, columns]
-    return new
+    return np.column_stack((mass, mass[:, None] * (com @ axes), about[:, rows, columns]))
 
 
 def _inverse(name: str, spread: Any) -> Callable[[Array], Array]:

@@ -96,22 +96,20 @@ class Lanes:
             tally.add(first, *seen[:3])
             if watcher:
                 watcher(first, seen)
-            square = point.nu * point.nu
-            lost = ~(square < watch.squares[:, None]).all(axis=0)
-            if plan.chart:
-                lost |= self._turn @ point.q[3:7] < 0.0
+            with np.errstate(invalid="ignore", over="ignore"):
+                lost = ~(point.nu**2 < watch.squares[:, None]).all(axis=0)
+                lost |= (self._turn @ point.q[3:7] < 0.0) & bool(plan.chart)
             over = done == times.steps
             if over or lost.any() or done < last:
-                end = [each.T[None] for each in (point.q, point.nu, stages.u)]
+                end: list[Array] = [x.T[None] for x in (point.q, point.nu, stages.u)]
                 with np.errstate(invalid="ignore", over="ignore"):
                     at_end = tally.copy().add(done, *end)
                 for lane in range(count):
                     said = self._said(runs["q"][lane], lane, done) if lane not in ended else ""
                     if lane not in ended and (said or over):
                         ends = seen if (gone := said.startswith("diverged")) else end
-                        values = [each[-1, lane] for each in ends[:3]]
-                        which = tally if gone else at_end
-                        ended[lane] = which.outcome(lane, done, said, *values)
+                        which, last_of = tally if gone else at_end, [x[-1, lane] for x in ends[:3]]
+                        ended[lane] = which.outcome(lane, done, said, *last_of)
                 # What has ended would stop the others: it goes on as one of them.
                 left = [lane for lane in range(LANES) if of_lane[lane] not in ended]
                 if left and ended:

@@ -8,7 +8,8 @@ import math
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from contextlib import closing, nullcontext
-from dataclasses import fields, is_dataclass
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,13 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.record import content_digest
-from fflin.base.validation import number, whole
+from fflin.base.validation import Array, share, whole
 from fflin.base.version import __version__
-from fflin.batch.run import Progress, failure, run_chunks
+from fflin.batch.run import Progress, check_workers, failure, run_chunks
 from fflin.batch.store import FileStore, MemoryStore, check_room, output_path
 from fflin.batch.workers import OwnWorkers
 from fflin.campaign.campaign import NOT_RUN, Campaign
+from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob
 from fflin.campaign.tally import KINDS
 from fflin.kernel.compiled import available_cores
@@ -137,23 +139,8 @@ def monte_carlo(
         if name not in _OPTIONS:
             raise unknown("option of monte_carlo", name, sorted(_OPTIONS))
     runs, seed = whole("runs", runs, 1), whole("seed", seed, 0)
-    width, confidence = (
-        number(name, value) for name, value in (("width", width), ("confidence", confidence))
-    )
-    for name, value in (("width", width), ("confidence", confidence)):
-        if not 0.0 < value < 1.0:
-            raise InputError(f"{name} is {value:g}, expected a share between 0 and 1")
-    if executor is not None and workers is not None:
-        raise InputError("executor and workers are both given; give either")
-    if executor is not None and not hasattr(executor, "submit"):
-        raise InputError(
-            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
-        )
-    for name, count in (("workers", workers), ("threads", threads), ("chunk", chunk)):
-        if count is not None:
-            whole(name, count, 1)
-    if progress is not None and not callable(progress):
-        raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
+    width, confidence = share("width", width), share("confidence", confidence)
+    check_workers(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
     if path is not None and path.suffix != ".h5":
         raise InputError(f"{path}: a campaign grows in a file .h5; Campaign.save writes .npz")
@@ -161,57 +148,48 @@ def monte_carlo(
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
     check_room(runs, 8 * runs * sum(map(math.prod, shapes.values())), path)
     job.choose(engine, runs)
-    job.require_possible(runs)
+    header = {**_header(job), "seed": seed, "asked": runs}
+    if until is not None:  # it is refused before anything is done
+        nothing = MemoryStore(1, 1, shapes).arrays
+        Campaign.of(nothing, header).met(until)
+    job.dispersions.require_possible(runs)
     threads = threads or available_cores()
     size = _chunk(runs, chunk, workers or threads, until is not None)
-    header = {**_header(job), "seed": seed, "asked": runs}
-    if until is not None:
-        _campaign(MemoryStore(1, 1, shapes).arrays, header, None).met(until)  # refuses what is none
-    store: FileStore | MemoryStore = MemoryStore(runs, size, shapes)
+    store: Any = MemoryStore(runs, size, shapes)
     if path is not None:
         texts = {"header": json.dumps(header), "constant": "[]"}
-        store = FileStore(path, _request(job, runs, until is None), runs, size, shapes, {}, texts)
+        store = FileStore(path, _request(job, runs), runs, size, shapes, {}, texts)
     with closing(store), OwnWorkers(int(workers)) if workers else nullcontext(executor) as others:
-        if others is None and job.engine == "python":
-            threads = 1
+        enough = partial(_enough, store, header, until, width, confidence)
+        how: Any = {"executor": others, "progress": progress}
+        how["threads"] = threads if job.engine == "compiled" else 1
         done = runs if until is None else min(_STAGE, runs)
-        while True:
-            failed = run_chunks(
-                *(job, job.dispersions.rows, store),
-                executor=others,
-                threads=threads,
-                progress=progress,
-                upto=done,
-            )
-            if failed:
-                made = store.read(runs) if path is None else {}
-                raise failure(
-                    failed,
-                    store,
-                    "runs",
-                    lambda kept: _campaign({k: x[kept] for k, x in made.items()}, header, job),
-                )
-            if done == runs or until is None:
-                break
-            found = _campaign(store.read(done), header, None)
-            share = found.fraction(until, confidence=confidence)
-            if share.high - share.low <= width:
+        while not (failed := run_chunks(job, job.dispersions.rows, store, upto=done, **how)):
+            if done == runs or enough(done):
                 break
             done = min(runs, math.ceil(_GROWTH * done / _STAGE) * _STAGE)
+        if failed:
+
+            def others_of(kept: Array) -> Campaign:
+                return Campaign.of({k: x[kept] for k, x in store.arrays.items()}, header, job)
+
+            raise failure(failed, store, "runs", others_of)
         if path is None:
-            return _campaign(store.read(done), header, job)
+            return Campaign.of(store.read(done), header, job)
         for start in range(done, runs, store.chunk):
             stop = min(start + store.chunk, runs)
-            store.write(
-                start, stop, {k: np.full((stop - start, *of), NOT_RUN) for k, of in shapes.items()}
-            )
+            none = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
+            store.write(start, stop, none)
         store.complete()
-    campaign = Campaign.load(path)
-    return _campaign({k: getattr(campaign, k) for k in shapes}, header, job)
+    return replace(Campaign.load(path), _job=job)
 
 
-def _campaign(arrays: Any, header: Any, job: CampaignJob | None) -> Campaign:
-    return Campaign.of(arrays, header, job)
+def _enough(
+    store: Any, header: Any, until: Any, width: float, confidence: float, done: int
+) -> bool:
+    """Whether the interval of what is asked for is narrow enough after so many runs."""
+    found = Campaign.of(store.read(done), header).fraction(until, confidence=confidence)
+    return found.high - found.low <= width
 
 
 def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
@@ -231,22 +209,17 @@ def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
 def _header(job: CampaignJob) -> dict[str, Any]:
     """Return what a campaign has beside its arrays."""
     plan, plant = job.plan, job.plant
-    steered = set(plan.steered or plant.state.names)
-    groups = dict(zip(KINDS, ("q_b", "r_b", "q_m"), strict=False))
     wheels = {f"q_m.{name}" for name in plant.robot.wheels}
-    judged = [
-        kind
-        for kind, group in groups.items()
-        if any(name.startswith(f"{group}.") for name in steered - wheels)
-    ]
+    steered = {name.partition(".")[0] for name in {*(plan.steered or plant.state.names)} - wheels}
+    groups = zip(KINDS, ("q_b", "r_b", "q_m"), strict=False)
     return {
         "kind": "Campaign",
-        "names": job.dispersions.names,
-        "state_names": plant.state.names,
-        "state_units": plant.state.units,
-        "input_names": plant.actuation.names,
-        "input_units": plant.actuation.units,
-        "judged": judged,
+        "names": list(job.dispersions.names),
+        "state_names": list(plant.state.names),
+        "state_units": list(plant.state.units),
+        "input_names": list(plant.actuation.names),
+        "input_units": list(plant.actuation.units),
+        "judged": [kind for kind, group in groups if group in steered],
         "robot": plant.robot.name,
         "urdf_sha256": plant.robot.urdf_sha256,
         "duration": plan.times.steps * plan.times.dt,
@@ -255,33 +228,9 @@ def _header(job: CampaignJob) -> dict[str, Any]:
     }
 
 
-def _request(job: CampaignJob, runs: int, all_of_them: bool) -> str:
-    """Return a hash of what the result depends on, as far as it can be told."""
-    plan, robot = job.plan, job.plant.robot
-    masses = [inertia.toDynamicParameters() for inertia in robot.model.inertias]
-    told = [robot.urdf_sha256, robot.inputs, dict(robot.stiffness), dict(robot.damping)]
-    told += [robot.gravity, plan.times, plan.known, plan.method.__name__, plan.project, runs]
-    told += [job.engine, all_of_them, type(plan.policy).__name__, __version__, pin.__version__]
-    arrays = {
-        "masses": np.concatenate(masses),
-        "start": np.concatenate((plan.q, plan.v)),
-        "limits": np.concatenate((plan.limits.low, plan.limits.high)),
-        # These tell seed and dispersions too.
-        "drawn": job.dispersions.rows(0, min(runs, 1024)).drawn,
-    }
-    for at, values in enumerate(_figures(plan.policy)):
-        arrays[f"policy {at}"] = values
-    return content_digest({"told": repr(told), **arrays})
-
-
-def _figures(policy: Any) -> list[Any]:
-    """Return the arrays of a policy and of what it is made of."""
-    found, left, seen = [], [policy], set[int]()
-    while left:
-        each = left.pop()
-        if isinstance(each, np.ndarray) and each.dtype.kind in "fiu":
-            found.append(each)
-        elif is_dataclass(each) and not isinstance(each, Robot) and id(each) not in seen:
-            seen.add(id(each))
-            left += [getattr(each, item.name) for item in fields(each)]
-    return found
+def _request(job: CampaignJob, runs: int) -> str:
+    """Return a hash of what the result depends on, of which the first run tells most."""
+    draws = job.dispersions.rows(0, min(runs, _STAGE))
+    first = job.run(Draws(draws.drawn[:1], draws.run[:1]), 0).arrays
+    told = repr((runs, job.engine, job.plant.robot.urdf_sha256, __version__, pin.__version__))
+    return content_digest({"told": told, "drawn": draws.drawn, **first})

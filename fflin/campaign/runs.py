@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from fflin.base.errors import ChartError, InputError
 from fflin.base.validation import Array
 from fflin.batch.dispatch import ChunkResult
-from fflin.campaign.dispersions import Dispersions, Draws, Varied
+from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.tally import KINDS, Outcome, Tally
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
@@ -27,7 +26,6 @@ from fflin.simulation.simulate import motion_of, planned
 
 # Arrays of a run's outcome; its last field says in words why it was stopped.
 ARRAYS = Outcome._fields[:-1]
-_CHECKED = 4096  # draws at a time
 
 
 class CampaignJob:
@@ -41,8 +39,7 @@ class CampaignJob:
         self.engine, state = engine, self.plant.state
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
         self.home = self.x0 if self.plan.target is None else self.plan.target
-        self.dispersions = Dispersions(given, self.plant, self.plan.policy, seed)
-        self.varied = Varied(self.dispersions.columns, self.plant, self.plan.policy, self.x0)
+        self.dispersions = Dispersions(given, self.plant, self.plan.policy, self.x0, seed)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # What is bound to the robot is made anew by a worker.
@@ -53,18 +50,6 @@ class CampaignJob:
         times = self.plan.times
         several = replace(self.plan, times=times._replace(steps=times.steps * runs))
         self.engine = engine_of(engine, several, self.plant)
-
-    def require_possible(self, runs: int) -> None:
-        """Raise `InputError` where a draw of so many runs makes no robot or no attitude."""
-        turned = any(each.name.startswith("q_b.") for each in self.dispersions.columns)
-        for start in range(0, runs, _CHECKED):
-            draws = self.dispersions.rows(start, min(start + _CHECKED, runs))
-            self.dispersions.require_possible(draws)
-            try:
-                if turned:
-                    self.varied.starts(draws.drawn)
-            except ChartError as error:
-                raise InputError(f"of 'q_b' a start is drawn that is no attitude: {error}") from None
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
@@ -92,7 +77,7 @@ class CampaignJob:
 
         tree = batch_tree(self.plant.robot)
         assert tree is not None
-        lanes, runs = Lanes(self.plan, self.plant), self.varied.in_lanes(drawn, tree)
+        lanes, runs = Lanes(self.plan, self.plant), self.dispersions.in_lanes(drawn, tree)
         for first in range(0, len(drawn), LANES):
             eight = {key: each[first : first + LANES] for key, each in runs.items()}
             yield from lanes.fly(eight, self._tally(LANES))
@@ -102,8 +87,7 @@ class CampaignJob:
 
     def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:
         """Return the plan of a run (k,), and its robot."""
-        plan, (plant, q, v) = self.plan, self.varied.one(drawn)
-        policy = self.varied.policy(drawn)
+        plan, (plant, policy, q, v) = self.plan, self.dispersions.one(drawn)
         law = law_of(policy, plant, plan.limits, plan.times)
         return replace(plan, q=q, v=v, policy=policy, law=law), plant
 
@@ -138,7 +122,7 @@ class CampaignJob:
         def watch(first: int, rows: list[Array]) -> None:
             kept.append([each[-first % every :: every, 0].copy() for each in rows])
 
-        runs = self.varied.in_lanes(np.tile(drawn, (LANES, 1)), tree)
+        runs = self.dispersions.in_lanes(np.tile(drawn, (LANES, 1)), tree)
         outcome = lanes.fly(runs, self._tally(LANES), watch)[0]
         t = every * plan.times.dt * np.arange(sum(len(each[0]) for each in kept))
         state = plant.state

@@ -78,7 +78,7 @@ class Tally:
         np.maximum(self.largest_x, np.abs(e).max(axis=0), out=self.largest_x)
         np.maximum(self.largest_u, np.abs(u).max(axis=0), out=self.largest_u)
         largest = np.maximum.accumulate(np.concatenate((self.largest[None], sizes)))[1:]
-        self.largest = largest[-1]
+        self.largest[:] = largest[-1]
         # Where an error has its largest so far it is outside; so what was outside last stays it
         # when a larger one comes.
         outside = sizes > np.maximum(SETTLED * largest, THERE)
@@ -86,9 +86,7 @@ class Tally:
         self.outside = np.where(outside.any(axis=0), last, self.outside)
         return self
 
-    def outcome(
-        self, lane: int, done: int, said: str, q: Array, nu: Array, u: Array
-    ) -> Outcome:
+    def outcome(self, lane: int, done: int, said: str, q: Array, nu: Array, u: Array) -> Outcome:
         """Return how one of the runs ended after so many steps, with its last values."""
         times = self._plan.times
         _, sizes = self._errors(done, q[None, None], nu[None, None])
@@ -100,10 +98,10 @@ class Tally:
             self._state.spread(nu),
             self._read(q[None], nu[None])[0],
             u.copy(),
-            self.largest_x[lane],
-            self.largest_u[lane],
+            self.largest_x[lane].copy(),
+            self.largest_u[lane].copy(),
             sizes[0, 0],
-            self.largest[lane],
+            self.largest[lane].copy(),
             np.where(late, np.inf, settled * times.dt),
             float(stop if said else 0),
             done * times.dt,

@@ -115,6 +115,7 @@ def inverse_inertias(tree: Tree, q: Array, out: Array) -> Array:
 
 
 def work_space(size: int) -> Array:
+    """Return an array (size, LANES) with nothing in it yet."""
     space = np.empty((size + 1) * LANES)
     # The kernel's vectors are 64 bytes; where they begin at such an address it is faster.
     first = -(space.ctypes.data // 8) % LANES
