@@ -69,6 +69,8 @@ class Lanes:
             self._fresh.append((wide[name], array[:, None].copy()))
         return part._replace(**wide)
 
+    # A motion that diverges overflows before it is stopped: that is no reason to warn.
+    @np.errstate(over="ignore", invalid="ignore")
     def fly(
         self, runs: Mapping[str, Array], tally: Tally, watcher: Watcher | None = None
     ) -> list[Outcome]:
@@ -96,25 +98,24 @@ class Lanes:
             tally.add(first, *seen[:3])
             if watcher:
                 watcher(first, seen)
-            with np.errstate(invalid="ignore", over="ignore"):
-                lost = ~(point.nu**2 < watch.squares[:, None]).all(axis=0)
-                lost |= (self._turn @ point.q[3:7] < 0.0) & bool(plan.chart)
+            lost = ~(point.nu**2 < watch.squares[:, None]).all(axis=0)
+            lost |= (self._turn @ point.q[3:7] < 0.0) & bool(plan.chart)
             over = done == times.steps
             if over or lost.any() or done < last:
                 end: list[Array] = [x.T[None] for x in (point.q, point.nu, stages.u)]
-                with np.errstate(invalid="ignore", over="ignore"):
-                    at_end = tally.copy().add(done, *end)
+                at_end = tally.copy().add(done, *end)
                 for lane in range(count):
                     said = self._said(runs["q"][lane], lane, done) if lane not in ended else ""
                     if lane not in ended and (said or over):
-                        ends = seen if (gone := said.startswith("diverged")) else end
-                        which, last_of = tally if gone else at_end, [x[-1, lane] for x in ends[:3]]
-                        ended[lane] = which.outcome(lane, done, said, *last_of)
+                        away = said.startswith("diverged")
+                        values = [x[-1, lane] for x in (seen[:3] if away else end)]
+                        which = tally if away else at_end
+                        ended[lane] = which.outcome(lane, done, said, *values)
                 # What has ended would stop the others: it goes on as one of them.
-                left = [lane for lane in range(LANES) if of_lane[lane] not in ended]
-                if left and ended:
+                gone_on = ~np.isin(of_lane, [*ended])
+                if gone_on.any():
                     for array, _ in self._fresh:
-                        array[:, [*ended]] = array[:, left[:1]]
+                        array[:, ~gone_on] = array[:, [gone_on.argmax()]]
         return [ended[lane] for lane in range(count)]
 
     def kept(self, t: float) -> tuple[Array, Array]:
@@ -129,8 +130,7 @@ class Lanes:
         point = self._parts[-2]
         ending = ending_of(replace(self._plan, q=q))
         v = self._state.spread(point.nu[:, lane])
-        with np.errstate(invalid="ignore", over="ignore"):
-            return ending(done * self._plan.times.dt, point.q[:, lane].copy(), v)
+        return ending(done * self._plan.times.dt, point.q[:, lane].copy(), v)
 
     def _split(self, rows: Array) -> list[Array]:
         """Return what rows hold, each (steps, LANES, size)."""

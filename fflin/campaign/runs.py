@@ -91,6 +91,7 @@ class CampaignJob:
         law = law_of(policy, plant, plan.limits, plan.times)
         return replace(plan, q=q, v=v, policy=policy, law=law), plant
 
+    @np.errstate(over="ignore", invalid="ignore")  # of what diverges
     def _one(self, drawn: Array) -> Outcome:
         plan, plant = self.plan_of(drawn)
         run = self._gone(replace(plan, times=plan.times._replace(every=1)), plant)

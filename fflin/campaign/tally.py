@@ -119,8 +119,8 @@ class Tally:
         """Return the errors of the states, and how large each kind is."""
         steps, count = q.shape[:2]
         x = self._read(q.reshape(-1, q.shape[-1]), nu.reshape(-1, nu.shape[-1]))
-        to = self._home
-        e = x - to
+        to: Array = self._home
+        e: Array = x - to
         if self._plan.reference is not None:
             to = np.repeat(self._targets(first, steps), count, axis=0)
             e, at = moving_errors(self._state.frame, x, to), self._circling
