@@ -168,7 +168,7 @@ class Campaign(FrozenArrays):
             figure's own. A run that was stopped meets no text.
         """
         if not isinstance(condition, str):
-            found = np.asarray(condition)
+            found = np.asarray(condition if isinstance(condition, np.ndarray | list) else None)
             if found.shape != (len(self),) or found.dtype != bool:
                 raise InputError(
                     f"condition has shape {found.shape} of {found.dtype}, expected a text such as "

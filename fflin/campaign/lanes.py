@@ -10,7 +10,7 @@ import numpy as np
 
 from fflin.base.rotation import product_matrix
 from fflin.base.validation import Array
-from fflin.campaign.tally import Outcome, Tally
+from fflin.campaign.tally import STOPS, Tally, stop_of
 from fflin.kernel.accelerations import work_space
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES, batch_tree
@@ -21,6 +21,7 @@ from fflin.simulation.plant import Plant
 from fflin.simulation.run import ending_of
 
 _SLICE = 128  # steps whose rows are there at a time
+_DIVERGED = float(STOPS.index("diverged"))
 
 # Takes the first step of some, and their rows (steps, LANES, ..) of q, nu, u, momentum and centre.
 Watcher = Callable[[int, list[Array]], None]
@@ -72,11 +73,15 @@ class Lanes:
     # A motion that diverges overflows before it is stopped: that is no reason to warn.
     @np.errstate(over="ignore", invalid="ignore")
     def fly(
-        self, runs: Mapping[str, Array], tally: Tally, watcher: Watcher | None = None
-    ) -> list[Outcome]:
-        """Run up to eight, whose rows differ from the plan; return how each ended."""
-        plan, times, count = self._plan, self._plan.times, len(runs["q"])
-        parts, rows = self._parts, self._rows
+        self,
+        runs: Mapping[str, Array],
+        tally: Tally,
+        out: Mapping[str, Array],
+        watcher: Watcher | None = None,
+    ) -> list[str]:
+        """Do up to eight, whose rows differ from the plan, into `out`; say why each was stopped."""
+        plan, steps, count = self._plan, self._plan.times.steps, len(runs["q"])
+        parts, rows, width = self._parts, self._rows, sum(self._sizes)
         mechanics, *_, (kept, *_), watch, point, stages = parts
         for array, fresh in self._fresh:
             array[:] = fresh
@@ -88,35 +93,38 @@ class Lanes:
         kept.start[9:] = point.q[:3]
         kernel("loop", "begin", "the start of eight runs")(mechanics, kept, point, self._work)
         advance = kernel("loop", "advance", "the loop of eight runs at a time")
-        clock, ended = np.zeros(1, dtype=np.intp), dict[int, Outcome]()
-        while clock[0] < times.steps and len(ended) < count:
+        clock, going, told = np.zeros(1, dtype=np.intp), np.ones(count, dtype=bool), [""] * count
+        while clock[0] < steps and going.any():
             first = int(clock[0])
-            last = min(times.steps, (first // _SLICE + 1) * _SLICE)
-            advance(*parts, clock, last, 1, rows, self._work)
-            taken, done = int(clock[0]) - first, int(clock[0])
-            seen = self._split(rows[: taken * sum(self._sizes)])
+            advance(*parts, clock, min(steps, (first // _SLICE + 1) * _SLICE), 1, rows, self._work)
+            done = int(clock[0])
+            seen = self._split(rows[: (done - first) * width])
             tally.add(first, *seen[:3])
             if watcher:
                 watcher(first, seen)
             lost = ~(point.nu**2 < watch.squares[:, None]).all(axis=0)
             lost |= (self._turn @ point.q[3:7] < 0.0) & bool(plan.chart)
-            over = done == times.steps
-            if over or lost.any() or done < last:
-                end: list[Array] = [x.T[None] for x in (point.q, point.nu, stages.u)]
-                at_end = tally.copy().add(done, *end)
-                for lane in range(count):
-                    said = self._said(runs["q"][lane], lane, done) if lane not in ended else ""
-                    if lane not in ended and (said or over):
-                        away = said.startswith("diverged")
-                        values = [x[-1, lane] for x in (seen[:3] if away else end)]
-                        which = tally if away else at_end
-                        ended[lane] = which.outcome(lane, done, said, *values)
-                # What has ended would stop the others: it goes on as one of them.
-                gone_on = ~np.isin(of_lane, [*ended])
-                if gone_on.any():
-                    for array, _ in self._fresh:
-                        array[:, ~gone_on] = array[:, [gone_on.argmax()]]
-        return [ended[lane] for lane in range(count)]
+            for lane in np.flatnonzero(lost[:count] & going).tolist():
+                told[lane] = self._said(runs["q"][lane], lane, done)
+            stop = np.array(list(map(stop_of, told)), dtype=float)
+            ending = going & ((stop > 0.0) | (done == steps))
+            if not ending.any():
+                continue
+            stop = stop[of_lane]
+            end = [x.T[None] for x in (point.q, point.nu, stages.u)]
+            # Of what diverged the end is no number.
+            away = (stop == _DIVERGED)[:count]
+            for some, each in ((away, tally), (~away, tally.copy().add(done, *end))):
+                if (some & ending).any():
+                    for name, values in each.outcome(done, stop)._asdict().items():
+                        out[name][some & ending] = values[:count][some & ending]
+            going &= ~ending
+            # What has ended would stop the others: it goes on as one of them.
+            if going.any():
+                over = ~going[of_lane]
+                for array, _ in self._fresh:
+                    array[:, over] = array[:, [going.argmax()]]
+        return told
 
     def kept(self, t: float) -> tuple[Array, Array]:
         """Return the momentum (6,) and the centre of mass (3,) that the first is to have."""

@@ -150,6 +150,8 @@ def monte_carlo(
     job.choose(engine, runs)
     header = {**_header(job), "seed": seed, "asked": runs}
     if until is not None:  # it is refused before anything is done
+        if not isinstance(until, str):
+            raise InputError(f"until is a {type(until).__name__}, expected 'attitude < 1 deg'")
         nothing = MemoryStore(1, 1, shapes).arrays
         Campaign.of(nothing, header).met(until)
     job.dispersions.require_possible(runs)

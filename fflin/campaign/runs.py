@@ -13,7 +13,7 @@ import numpy as np
 from fflin.base.validation import Array
 from fflin.batch.dispatch import ChunkResult
 from fflin.campaign.dispersions import Dispersions, Draws
-from fflin.campaign.tally import KINDS, Outcome, Tally
+from fflin.campaign.tally import KINDS, Outcome, Tally, stop_of
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
 from fflin.simulation.compiled import engine_of
@@ -24,8 +24,7 @@ from fflin.simulation.plant import Plant
 from fflin.simulation.run import Recording, go
 from fflin.simulation.simulate import motion_of, planned
 
-# Arrays of a run's outcome; its last field says in words why it was stopped.
-ARRAYS = Outcome._fields[:-1]
+ARRAYS = Outcome._fields
 
 
 class CampaignJob:
@@ -66,21 +65,25 @@ class CampaignJob:
         drawn, count = np.asarray(rows.drawn), len(rows.drawn)
         if out is None:
             out = {key: np.empty((count, *shape)) for key, shape in self.shapes.items()}
-        outcomes = self._compiled(drawn) if self.engine == "compiled" else map(self._one, drawn)
-        for row, outcome in enumerate(outcomes):
-            for key in ARRAYS:
-                out[key][row] = getattr(outcome, key)
+        if self.engine == "compiled":
+            self._compiled(drawn, out)
+        else:
+            for row in range(count):
+                for key, values in self._one(drawn[row])._asdict().items():
+                    out[key][row] = values[0]
         return ChunkResult(dict(out), [])
 
-    def _compiled(self, drawn: Array) -> Any:
+    def _compiled(self, drawn: Array, out: Mapping[str, Array]) -> None:
         from fflin.campaign.lanes import Lanes
 
         tree = batch_tree(self.plant.robot)
         assert tree is not None
         lanes, runs = Lanes(self.plan, self.plant), self.dispersions.in_lanes(drawn, tree)
         for first in range(0, len(drawn), LANES):
-            eight = {key: each[first : first + LANES] for key, each in runs.items()}
-            yield from lanes.fly(eight, self._tally(LANES))
+            eight, own = (
+                {key: each[first : first + LANES] for key, each in of.items()} for of in (runs, out)
+            )
+            lanes.fly(eight, self._tally(LANES), own)
 
     def _tally(self, count: int) -> Tally:
         return Tally(self.plan, self.plant.state, self.home, count)
@@ -97,7 +100,8 @@ class CampaignJob:
         run = self._gone(replace(plan, times=plan.times._replace(every=1)), plant)
         nu = plant.state.velocities(run.v)
         tally = self._tally(1).add(0, *(each[:, None] for each in (run.q, nu, run.u)))
-        return tally.outcome(0, run.steps, run.stopped, run.q[-1], nu[-1], run.u[-1])
+        stop = np.array([float(stop_of(run.stopped))])
+        return tally.outcome(run.steps, stop)
 
     def _gone(self, plan: Plan, plant: Plant) -> Recording:
         run = go(plan, plant, Conserved(plant.robot, plan.q))
@@ -124,16 +128,16 @@ class CampaignJob:
             kept.append([each[-first % every :: every, 0].copy() for each in rows])
 
         runs = self.dispersions.in_lanes(np.tile(drawn, (LANES, 1)), tree)
-        outcome = lanes.fly(runs, self._tally(LANES), watch)[0]
+        out = {key: np.empty((LANES, *shape)) for key, shape in self.shapes.items()}
+        said = lanes.fly(runs, self._tally(LANES), out, watch)[0]
         t = every * plan.times.dt * np.arange(sum(len(each[0]) for each in kept))
-        state = plant.state
-        if not outcome.said.startswith("diverged"):
-            nu = state.velocities(outcome.v)
-            kept.append([x[None] for x in (outcome.q, nu, outcome.u, *lanes.kept(outcome.end))])
-            t = np.append(t, outcome.end)
+        state, end = plant.state, float(out["end"][0])
+        if not said.startswith("diverged"):
+            nu = state.velocities(out["v"][0])
+            kept.append([x[None] for x in (out["q"][0], nu, out["u"][0], *lanes.kept(end))])
+            t = np.append(t, end)
         q, nu, u, momentum, center = map(np.concatenate, zip(*kept, strict=True))
-        steps = round(outcome.end / plan.times.dt)
-        parts = (t, q, state.spread(nu), u, momentum, center, steps, outcome.said)
+        parts = (t, q, state.spread(nu), u, momentum, center, round(end / plan.times.dt), said)
         return Recording(*parts, "compiled")
 
 

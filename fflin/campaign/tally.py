@@ -28,20 +28,25 @@ STOPS = ("", "diverged", "left the chart", "stopped")
 
 
 class Outcome(NamedTuple):
-    """How a run ended, a row of each array of a campaign."""
+    """How runs ended, a row of each array for each."""
 
-    q: Array  # (nq,), at last
-    v: Array  # (nv,)
-    x: Array  # (nx,)
-    u: Array  # (nu,)
-    largest_x: Array  # (nx,), largest errors
-    largest_u: Array  # (nu,), largest inputs
-    errors: Array  # (kinds,), at last
-    largest: Array  # (kinds,)
-    settle: Array  # (kinds,) [s], since when settled; infinite where it is not
-    stop: float  # which of STOPS
-    end: float  # [s]
-    said: str  # why it was stopped, if it was
+    q: Array  # (N, nq), at last
+    v: Array  # (N, nv)
+    x: Array  # (N, nx)
+    u: Array  # (N, nu)
+    largest_x: Array  # (N, nx), errors
+    largest_u: Array  # (N, nu)
+    errors: Array  # (N, kinds), at last
+    largest: Array  # (N, kinds)
+    settle: Array  # (N, kinds) [s], since when settled; infinite where it is not
+    stop: Array  # (N,), which of STOPS
+    end: Array  # (N,) [s]
+
+
+def stop_of(said: str) -> int:
+    """Return which of the STOPS a sentence tells of."""
+    found = (at for at, word in enumerate(STOPS) if word and said.startswith(word))
+    return next(found, len(STOPS) - 1) if said else 0
 
 
 class Tally:
@@ -74,7 +79,8 @@ class Tally:
 
     def add(self, first: int, q: Array, nu: Array, u: Array) -> Tally:
         """Take rows (steps, count, ..) from a step on into account."""
-        e, sizes = self._errors(first, *(np.ascontiguousarray(each) for each in (q, nu)))
+        x, e, sizes = self._errors(first, *(np.ascontiguousarray(each) for each in (q, nu)))
+        self._last = q[-1], nu[-1], u[-1], x[-1], sizes[-1]
         np.maximum(self.largest_x, np.abs(e).max(axis=0), out=self.largest_x)
         np.maximum(self.largest_u, np.abs(u).max(axis=0), out=self.largest_u)
         largest = np.maximum.accumulate(np.concatenate((self.largest[None], sizes)))[1:]
@@ -86,26 +92,23 @@ class Tally:
         self.outside = np.where(outside.any(axis=0), last, self.outside)
         return self
 
-    def outcome(self, lane: int, done: int, said: str, q: Array, nu: Array, u: Array) -> Outcome:
-        """Return how one of the runs ended after so many steps, with its last values."""
-        times = self._plan.times
-        _, sizes = self._errors(done, q[None, None], nu[None, None])
-        stop = next((k for k, word in enumerate(STOPS) if word and said.startswith(word)), 3)
-        settled = self.outside[lane] + 1
-        late = bool(said) | (settled > (1.0 - DWELL) * (done + 1))
+    def outcome(self, done: int, stop: Array) -> Outcome:
+        """Return how the runs ended in the last row after so many steps, by which of STOPS."""
+        times, (q, nu, u, x, sizes) = self._plan.times, self._last
+        settled = self.outside + 1
+        late = (stop != 0.0)[:, None] | (settled > (1.0 - DWELL) * (done + 1))
         return Outcome(
-            q.copy(),
+            q,
             self._state.spread(nu),
-            self._read(q[None], nu[None])[0],
-            u.copy(),
-            self.largest_x[lane].copy(),
-            self.largest_u[lane].copy(),
-            sizes[0, 0],
-            self.largest[lane].copy(),
+            x,
+            u,
+            self.largest_x,
+            self.largest_u,
+            sizes,
+            self.largest,
             np.where(late, np.inf, settled * times.dt),
-            float(stop if said else 0),
-            done * times.dt,
-            said,
+            stop,
+            np.full(len(stop), done * times.dt),
         )
 
     def _read(self, q: Array, nu: Array) -> Array:
@@ -115,8 +118,8 @@ class Tally:
         x[:, at] -= 2.0 * np.pi * np.round((x[:, at] - to[at]) / (2.0 * np.pi))
         return x
 
-    def _errors(self, first: int, q: Array, nu: Array) -> tuple[Array, Array]:
-        """Return the errors of the states, and how large each kind is."""
+    def _errors(self, first: int, q: Array, nu: Array) -> tuple[Array, ...]:
+        """Return the states, their errors, and how large each kind is."""
         steps, count = q.shape[:2]
         x = self._read(q.reshape(-1, q.shape[-1]), nu.reshape(-1, nu.shape[-1]))
         to: Array = self._home
@@ -131,7 +134,7 @@ class Tally:
         absolute = np.abs(e)
         for kind, part in enumerate(self._parts, 1):
             sizes[:, kind] = absolute[:, part].max(axis=1, initial=0.0)
-        return e.reshape(steps, count, -1), sizes.reshape(steps, count, -1)
+        return tuple(each.reshape(steps, count, -1) for each in (x, e, sizes))
 
     def _targets(self, first: int, steps: int) -> Array:
         """Return the states (steps, nx) of the motion that is followed."""

@@ -38,7 +38,7 @@ def engine_of(engine: Any, plan: Plan, plant: Plant) -> str:
     UnknownNameError
         If there is no such engine.
     """
-    if engine is not None and engine not in ENGINES:
+    if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
         raise unknown("engine", str(engine), list(ENGINES))
     if engine == "python":
         return "python"
