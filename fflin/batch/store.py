@@ -217,14 +217,14 @@ def part_of(path: Path) -> Path:
     return real.with_name(real.name + ".part")
 
 
-def check_room(count: int, size: int, path: Path | None) -> None:
-    """Raise where so many points with a result of so many bytes fit neither file nor memory."""
-    said = f"{count:,} points are {readable(size)}"
+def check_room(count: int, size: int, path: Path | None, what: str = "points") -> None:
+    """Raise where so many points or the like with a result of so many bytes fit neither file nor memory."""
+    said = f"{count:,} {what} are {readable(size)}"
     if path is None:
         if size > (memory := _memory()):
             raise InputError(
                 f"{said}, and the machine has {readable(memory)} of memory; write them to a file "
-                "with out='NAME.h5', or choose fewer points"
+                f"with out='NAME.h5', or choose fewer {what}"
             )
     # An unfinished file has reserved its room already.
     elif path.parent.is_dir() and not part_of(path).exists():

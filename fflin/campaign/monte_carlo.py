@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import math
+import pickle
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from contextlib import closing, nullcontext
@@ -146,7 +147,15 @@ def monte_carlo(
         raise InputError(f"{path}: a campaign grows in a file .h5; Campaign.save writes .npz")
     job = CampaignJob(robot, policy, dispersions, seed, "", {"duration": duration, **options})
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
-    check_room(runs, 8 * runs * sum(map(math.prod, shapes.values())), path)
+    check_room(runs, 8 * runs * sum(map(math.prod, shapes.values())), path, "runs")
+    if executor or workers:
+        try:
+            pickle.dumps(job)
+        except Exception as error:
+            raise InputError(
+                f"robot, policy or spreads cannot be sent to workers ({error}); define what they "
+                "are made of at the top of a module, or leave workers and executor out"
+            ) from None
     job.choose(engine, runs)
     header = {**_header(job), "seed": seed, "asked": runs}
     if until is not None:  # it is refused before anything is done

@@ -465,7 +465,7 @@ BAD = [
     ({"given": {"q_b.sensor": 0.1}}, "no sensors"),
     ({"runs": 0}, "runs is 0"),
     ({"runs": 1.5}, "runs is 1.5"),
-    ({"runs": 10**12}, "memory"),
+    ({"runs": 10**12}, "1,000,000,000,000 runs are .* memory"),
     ({"seed": -1}, "seed is -1"),
     ({"width": 2.0}, "width is 2"),
     ({"until": "nosuch < 1"}, "nosuch"),
@@ -495,6 +495,16 @@ def test_a_policy_in_python_runs_in_python(robots):
         robot, lambda t, q, v: -0.5 * np.ones(6 + robot.n), {"q_b": 0.01}, runs=3, duration=0.1
     )
     assert campaign.engine == "python" and campaign.largest_u.max() == 0.5
+
+
+def test_what_cannot_be_sent_to_workers_is_named(robots):
+    def nothing(t, q, v):
+        return np.zeros(9)
+
+    with pytest.raises(fflin.InputError, match=r"cannot be sent to workers .*nothing"):
+        fflin.monte_carlo(
+            robots["planar_detumble"], nothing, {"q_b": 0.01}, runs=2, duration=0.1, workers=1
+        )
 
 
 def test_what_is_kept_does_not_grow_with_the_duration(robots):
