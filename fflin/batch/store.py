@@ -218,7 +218,7 @@ def part_of(path: Path) -> Path:
 
 
 def check_room(count: int, size: int, path: Path | None, what: str = "points") -> None:
-    """Raise where so many points or the like with a result of so many bytes fit neither file nor memory."""
+    """Raise where so many points, of so many bytes, fit neither file nor memory."""
     said = f"{count:,} {what} are {readable(size)}"
     if path is None:
         if size > (memory := _memory()):

@@ -149,13 +149,7 @@ def monte_carlo(
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
     check_room(runs, 8 * runs * sum(map(math.prod, shapes.values())), path, "runs")
     if executor or workers:
-        try:
-            pickle.dumps(job)
-        except Exception as error:
-            raise InputError(
-                f"robot, policy or spreads cannot be sent to workers ({error}); define what they "
-                "are made of at the top of a module, or leave workers and executor out"
-            ) from None
+        _require_sendable(job)
     job.choose(engine, runs)
     header = {**_header(job), "seed": seed, "asked": runs}
     if until is not None:  # it is refused before anything is done
@@ -193,6 +187,16 @@ def monte_carlo(
             store.write(start, stop, none)
         store.complete()
     return replace(Campaign.load(path), _job=job)
+
+
+def _require_sendable(job: CampaignJob) -> None:
+    try:
+        pickle.dumps(job)
+    except Exception as error:
+        raise InputError(
+            f"robot, policy or spreads cannot be sent to workers ({error}); define what they are "
+            "made of at the top of a module, or leave workers and executor out"
+        ) from None
 
 
 def _enough(
