@@ -20,6 +20,7 @@ from fflin.base.record import reading
 from fflin.base.validation import Array, share, whole
 from fflin.base.writing import as_path
 from fflin.batch.files import read_rows, write_rows
+from fflin.campaign.report import campaign_report
 from fflin.campaign.tally import KINDS
 
 if TYPE_CHECKING:
@@ -104,8 +105,6 @@ class Campaign(FrozenArrays):
         return f"Campaign('{self.robot}', {len(self)} runs of {self.duration:g} s, {lost} stopped)"
 
     def __str__(self) -> str:
-        from fflin.campaign.report import campaign_report
-
         return campaign_report(self)
 
     @property

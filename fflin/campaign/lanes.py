@@ -92,7 +92,7 @@ class Lanes:
         kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * mechanics.gravity[:, None]
         kept.start[9:] = point.q[:3]
         kernel("loop", "begin", "the start of eight runs")(mechanics, kept, point, self._work)
-        advance = kernel("loop", "advance", "the loop of eight runs at a time")
+        advance = kernel("loop", "advance_eight", "the loop of eight runs at a time")
         clock, going, told = np.zeros(1, dtype=np.intp), np.ones(count, dtype=bool), [""] * count
         while clock[0] < steps and going.any():
             first = int(clock[0])

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import Any
 
 from fflin.base.tables import folded, grid
 from fflin.campaign.tally import KINDS, STOPS
 
-if TYPE_CHECKING:
-    from fflin.campaign.campaign import Campaign
 
-
-def campaign_report(campaign: Campaign) -> str:
+def campaign_report(campaign: Any) -> str:
     """Show the quantiles of the errors, and what they go with."""
     count, quantile = len(campaign), campaign.quantile
     by = ", compiled" if campaign.engine == "compiled" else ""

@@ -14,6 +14,7 @@ from fflin.base.validation import Array
 from fflin.batch.dispatch import ChunkResult
 from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.tally import KINDS, Outcome, Tally, stop_of
+from fflin.dynamics.state_rows import states_of
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
 from fflin.simulation.compiled import engine_of
@@ -38,6 +39,10 @@ class CampaignJob:
         self.engine, state = engine, self.plant.state
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
         self.home = self.x0 if self.plan.target is None else self.plan.target
+        if follows := self.plan.reference:
+            t = self.plan.times.dt * np.arange(self.plan.times.steps + 1)
+            q, v, _ = map(np.array, zip(*map(follows, t.tolist()), strict=True))
+            self.home = states_of(state, q, state.velocities(v))
         self.dispersions = Dispersions(given, self.plant, self.plan.policy, self.x0, seed)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -46,9 +51,7 @@ class CampaignJob:
 
     def choose(self, engine: Any, runs: int) -> None:
         """Settle which loop does so many runs."""
-        times = self.plan.times
-        several = replace(self.plan, times=times._replace(steps=times.steps * runs))
-        self.engine = engine_of(engine, several, self.plant)
+        self.engine = engine_of(engine, self.plan, self.plant, runs)
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:

@@ -50,10 +50,14 @@ def stop_of(said: str) -> int:
 
 
 class Tally:
-    """The worst of some runs that go on together, up to now."""
+    """The worst of some runs that go on together, up to now.
+
+    Errors are from `home` (nx,), or from its rows (steps + 1, nx).
+    """
 
     def __init__(self, plan: Plan, state: StateMap, home: Array, count: int) -> None:
-        self._plan, self._state, self._home = plan, state, home
+        self._plan, self._state, self._homes = plan, state, home
+        self._home = home if home.ndim == 1 else home[0]
         g, wheels = state.groups, state.robot.wheels
         joints = [i for i, joint in enumerate(state.robot.joint_names) if joint not in wheels]
         self._spun = [i for i in range(g.q_m.start, g.q_m.stop) if i - g.q_m.start not in joints]
@@ -124,8 +128,8 @@ class Tally:
         x = self._read(q.reshape(-1, q.shape[-1]), nu.reshape(-1, nu.shape[-1]))
         to: Array = self._home
         e: Array = x - to
-        if self._plan.reference is not None:
-            to = np.repeat(self._targets(first, steps), count, axis=0)
+        if self._homes.ndim == 2:
+            to = np.repeat(self._homes[first : first + steps], count, axis=0)
             e, at = moving_errors(self._state.frame, x, to), self._circling
             e[:, at] -= 2.0 * np.pi * np.round(e[:, at] / (2.0 * np.pi))
         e[:, self._spun] = 0.0
@@ -135,10 +139,3 @@ class Tally:
         for kind, part in enumerate(self._parts, 1):
             sizes[:, kind] = absolute[:, part].max(axis=1, initial=0.0)
         return tuple(each.reshape(steps, count, -1) for each in (x, e, sizes))
-
-    def _targets(self, first: int, steps: int) -> Array:
-        """Return the states (steps, nx) of the motion that is followed."""
-        assert self._plan.reference is not None
-        t = (first + np.arange(steps)) * self._plan.times.dt
-        q, v, _ = map(np.array, zip(*map(self._plan.reference, t.tolist()), strict=True))
-        return states_of(self._state, q, self._state.velocities(v))

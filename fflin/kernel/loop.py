@@ -156,3 +156,13 @@ def begin(robot, course, point, work):
     """Write the momentum and the centre of mass of the start into a course."""
     configure(work, robot, point.q)
     start_at(work, robot, course, point)
+
+
+@compiled
+def advance_eight(
+    robot, method, law, channel, course, watch, point, stages, clock, last, every, rows, work
+):
+    """Do as `advance` in eight lanes; kept on disk apart from it."""
+    advance(
+        robot, method, law, channel, course, watch, point, stages, clock, last, every, rows, work
+    )

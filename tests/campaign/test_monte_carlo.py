@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -215,6 +216,17 @@ def test_a_campaign_is_the_same_on_any_workers_and_after_a_kill(tmp_path):
             assert np.array_equal(getattr(one, name), getattr(other, name)), name
         assert np.array_equal(getattr(one, name)[:27], getattr(few, name)), name
     assert len(one) == 90 and one.names == few.names
+
+
+def test_any_executor_does_it(robots):
+    robot, case = robots["planar_detumble"], {"runs": 20, "duration": 0.2, "chunk": 8}
+    here = fflin.monte_carlo(robot, feedback(robot), {"q_b": 0.05}, **case)
+    with ThreadPoolExecutor(2) as executor:
+        there = fflin.monte_carlo(
+            robot, feedback(robot), {"q_b": 0.05}, executor=executor, engine=here.engine, **case
+        )
+    assert all(np.array_equal(getattr(here, name), getattr(there, name)) for name in ARRAYS)
+    assert np.array_equal(there.replay(19).q[-1], here.q[19])
 
 
 def test_another_campaign_does_not_go_on_in_a_file(tmp_path, robots):
