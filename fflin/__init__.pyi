@@ -92,6 +92,10 @@ from fflin.simulation.simulate import simulate as simulate
 from fflin.simulation.motion import Motion as Motion
 from fflin.view.visualize import visualize as visualize
 
+# Campaigns
+from fflin.campaign.monte_carlo import monte_carlo as monte_carlo
+from fflin.campaign.campaign import Campaign as Campaign
+
 # Sweeps
 from fflin.batch.sweep import sweep as sweep
 from fflin.batch.linear_batch import LinearBatch as LinearBatch

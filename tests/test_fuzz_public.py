@@ -39,7 +39,15 @@ def results(name):
 
 
 RESULTS = {
-    *("Certificate", "Check", "Compensator", "Controllability", "Equilibrium", "Estimator"),
+    *(
+        "Campaign",
+        "Certificate",
+        "Check",
+        "Compensator",
+        "Controllability",
+        "Equilibrium",
+        "Estimator",
+    ),
     "FilterSchedule",
     *("Gain", "GainSchedule", "Gramians", "Grid", "LinearModel", "LinearTrajectory", "Mode"),
     *("Modes", "Motion", "Observability", "RandomConfigurations", "ReducedModel", "Robot"),

@@ -14,8 +14,9 @@ import numpy as np
 from fflin.analysis.closed_loop import Loop, checked_loop
 from fflin.analysis.displacement import checked_displacement, joint_unit, scaled, shown
 from fflin.base.errors import FflinError, InputError
+from fflin.base.intervals import clopper_pearson
 from fflin.base.tables import folded
-from fflin.base.validation import Array, number, whole
+from fflin.base.validation import Array, share, whole
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
@@ -209,9 +210,7 @@ def validity(
     loop = checked_loop(robot, lin, gain)
     largest = checked_displacement(loop.lin, attitude, position, joint)
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
-    confidence = number("confidence", confidence)
-    if not 0.0 < confidence < 1.0:
-        raise InputError(f"confidence is {confidence:g}, expected a share between 0 and 1")
+    confidence = share("confidence", confidence)
     if isinstance(frames, str) or not isinstance(frames, Iterable):
         raise InputError(f"frames is {frames!r}, expected several, such as ('hybrid', 'local')")
     loops = {loop.lin.frame: loop} | {each: _in_frame(loop, each) for each in frames}
@@ -271,7 +270,7 @@ def _judged(
         holds=scaled(largest, reach),
         inside=inside,
         inside_rate=(1.0 - confidence) ** (1.0 / inside) if inside else 0.0,
-        rate=_clopper_pearson(settled, samples, confidence),
+        rate=clopper_pearson(settled, samples, confidence)[1:],
         confidence=confidence,
         largest=largest,
         joint_unit=joint_unit(loop.lin),
@@ -332,13 +331,3 @@ def _crossing(errors: Array) -> float:
         return float(min(_LEVELS[at] * TRUSTED / errors[at], _LEVELS[first]))
     pair = slice(first - 1, first + 1)
     return float(np.exp(np.interp(np.log(TRUSTED), np.log(errors[pair]), np.log(_LEVELS[pair]))))
-
-
-def _clopper_pearson(successes: int, count: int, confidence: float) -> tuple[float, float]:
-    from scipy.special import betaincinv
-
-    tail = (1.0 - confidence) / 2.0
-    failures = count - successes
-    low = betaincinv(successes, failures + 1, tail) if successes else 0.0
-    high = betaincinv(successes + 1, failures, 1.0 - tail) if failures else 1.0
-    return float(low), float(high)

@@ -59,6 +59,14 @@ def number(name: str, value: Any) -> float:
     return result
 
 
+def share(name: str, value: Any) -> float:
+    """Return a number between 0 and 1, or raise `InputError`."""
+    found = number(name, value)
+    if not 0.0 < found < 1.0:
+        raise InputError(f"{name} is {found:g}, expected a share between 0 and 1")
+    return found
+
+
 def refuse_masked(name: str, value: Any) -> None:
     """Raise `InputError` where an entry is masked, which NumPy makes NaN or takes as it is."""
     ma: Any = sys.modules.get("numpy.ma")  # what is masked has loaded it

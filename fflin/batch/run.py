@@ -13,11 +13,27 @@ from typing import Any
 
 import numpy as np
 
-from fflin.base.errors import FflinError, FflinWarning, SweepError, listed
+from fflin.base.errors import FflinError, FflinWarning, InputError, SweepError, listed
+from fflin.base.validation import whole
 from fflin.batch.dispatch import Dispatch, Done, Job, Rows, Span
 from fflin.batch.store import FileStore, MemoryStore
 
 Progress = Callable[[int, int], object]
+
+
+def check_workers(executor: Any, workers: Any, threads: Any, chunk: Any, progress: Any) -> None:
+    """Raise `InputError` where what is to do the chunks cannot be that."""
+    if executor is not None and workers is not None:
+        raise InputError("executor and workers are both given; give either")
+    if executor is not None and not hasattr(executor, "submit"):
+        raise InputError(
+            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
+        )
+    for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
+        if value is not None:
+            whole(name, value, 1)
+    if progress is not None and not callable(progress):
+        raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
 
 
 def run_chunks(
@@ -28,8 +44,11 @@ def run_chunks(
     executor: Executor | None = None,
     threads: int = 1,
     progress: Progress | None = None,
+    upto: int | None = None,
 ) -> list[Done]:
     """Do the chunks that a store has not yet, keep what comes of them, return those that failed.
+
+    Only those that begin before row `upto`, where it is given.
 
     ``rows(start, stop)`` is a named tuple; what the store has a name for is kept of it too. Threads
     are of this process, where there is no executor. Warnings of a job are said once.
@@ -38,6 +57,7 @@ def run_chunks(
     spans = [Span(at, min(at + size, store.count)) for at in range(0, store.count, size)]
     left = [span for span in spans if not store.finished(*span)]
     count = store.count - sum(stop - start for start, stop in left)
+    left = [span for span in left if upto is None or span.start < upto]
     if progress and count:
         progress(count, store.count)
     failed: list[Done] = []

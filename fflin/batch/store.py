@@ -29,10 +29,15 @@ class MemoryStore:
     def __init__(self, count: int, chunk: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
         self.count, self.chunk, self.names = count, chunk, tuple(shapes)
         self.arrays = {key: np.empty((count, *shape)) for key, shape in shapes.items()}
+        self._written: set[int] = set()
 
     def finished(self, start: int, stop: int) -> bool:
-        """Whether a chunk is there from before: none is."""
-        return False
+        """Whether a chunk is there."""
+        return start in self._written
+
+    def read(self, stop: int) -> dict[str, Array]:
+        """Return the rows before one."""
+        return self.place(0, stop)
 
     def place(self, start: int, stop: int) -> dict[str, Array]:
         """Return where the rows of a chunk are, to be written."""
@@ -43,6 +48,7 @@ class MemoryStore:
         for key, rows in self.place(start, stop).items():
             if not np.may_share_memory(rows, arrays[key]):
                 rows[:] = arrays[key]
+        self._written.add(start)
 
     def close(self) -> None:
         """Do nothing: memory needs no closing."""
@@ -148,6 +154,11 @@ class FileStore:
                 {key: self._file[key][start:stop] for key in self.names}
             )
 
+    def read(self, stop: int) -> dict[str, Array]:
+        """Return the rows before one."""
+        with self._readable():
+            return {key: self._file[key][:stop] for key in self.names}
+
     def place(self, start: int, stop: int) -> None:
         """Return where the rows of a chunk are, to be written: nowhere in memory."""
 
@@ -206,14 +217,14 @@ def part_of(path: Path) -> Path:
     return real.with_name(real.name + ".part")
 
 
-def check_room(count: int, size: int, path: Path | None) -> None:
-    """Raise where so many points with a result of so many bytes fit neither file nor memory."""
-    said = f"{count:,} points are {readable(size)}"
+def check_room(count: int, size: int, path: Path | None, what: str = "points") -> None:
+    """Raise where so many points, of so many bytes, fit neither file nor memory."""
+    said = f"{count:,} {what} are {readable(size)}"
     if path is None:
         if size > (memory := _memory()):
             raise InputError(
                 f"{said}, and the machine has {readable(memory)} of memory; write them to a file "
-                "with out='NAME.h5', or choose fewer points"
+                f"with out='NAME.h5', or choose fewer {what}"
             )
     # An unfinished file has reserved its room already.
     elif path.parent.is_dir() and not part_of(path).exists():

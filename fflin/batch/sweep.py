@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import pinocchio as pin
 
-from fflin.base.errors import FileError, InputError
+from fflin.base.errors import FileError
 from fflin.base.record import NoRoomError
-from fflin.base.validation import whole
 from fflin.batch.chunks import ChunkJob
 from fflin.batch.configurations import Configurations, as_configurations
 from fflin.batch.linear_batch import LinearBatch
-from fflin.batch.run import Progress, failure, run_chunks
+from fflin.batch.run import Progress, check_workers, failure, run_chunks
 from fflin.batch.store import FileStore, MemoryStore, check_room, output_path
 from fflin.batch.task import SweepTask
 from fflin.batch.workers import OwnWorkers
@@ -113,17 +112,7 @@ def sweep(
     FflinWarning
         Where M is ill-conditioned: once, with the number of points.
     """
-    if executor is not None and workers is not None:
-        raise InputError("executor and workers are both given; give either")
-    if executor is not None and not hasattr(executor, "submit"):
-        raise InputError(
-            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
-        )
-    for name, value in (("workers", workers), ("threads", threads), ("chunk", chunk)):
-        if value is not None:
-            whole(name, value, 1)
-    if progress is not None and not callable(progress):
-        raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
+    check_workers(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
     points = as_configurations(robot, q)
     options: Any = {"frame": frame, "reference": reference, "moving": moving}

@@ -26,6 +26,17 @@ _placement = pin.XYZQUATToSE3
 _TURN = 2.0 * np.pi
 
 
+def states_of(state: StateMap, q: Array, nu: Array) -> Array:
+    """Return the states (N, nx) of rows of valid q (N, nq) and nu (N, 6 + n) in base axes.
+
+    Continuous joints are in (-pi, pi]; a turn of pi gives one of its two values.
+    """
+    quaternion = q[:, 3:7] @ product_matrix(state.origin_quaternion).T
+    quaternion *= np.where(quaternion[:, 3:] < 0.0, -1.0, 1.0)
+    chart = Chart(quaternion[:, :3], quaternion[:, 3:], rotation_matrices(quaternion))
+    return state.compose(chart, state.positions(q), state.joint_positions(q), nu)
+
+
 def state_history(
     state: StateMap, q: Array, v: Array, near: Array | None = None, t: Array | None = None
 ) -> Array:
@@ -35,19 +46,31 @@ def state_history(
     (N,) as many as their rates make between rows, else less than half of one. A turn of pi, where
     the chart ends, gives one of its two values.
     """
-    quaternion = q[:, 3:7] @ product_matrix(state.origin_quaternion).T
-    quaternion *= np.where(quaternion[:, 3:] < 0.0, -1.0, 1.0)
-    chart = Chart(quaternion[:, :3], quaternion[:, 3:], rotation_matrices(quaternion))
-    q_m = state.joint_positions(q)
-    before = np.zeros(q_m.shape[1]) if near is None else near[state.groups.q_m]
     rates = state.velocities(v)
+    x = states_of(state, q, rates)
+    q_m = x[:, state.groups.q_m]
+    before = np.zeros(q_m.shape[1]) if near is None else near[state.groups.q_m]
     if (k := state.unbounded).size:
         q_m[:, k] = np.unwrap(np.vstack((before, q_m))[:, k], axis=0)[1:]
         if t is not None:
             turned = 0.5 * np.diff(t)[:, None] * (rates[1:, 6 + k] + rates[:-1, 6 + k])
             turns = np.round((turned - np.diff(q_m[:, k], axis=0)) / _TURN)
             q_m[1:, k] += _TURN * turns.cumsum(axis=0)
-    return state.compose(chart, state.positions(q), q_m, rates)
+    return x
+
+
+def attitude_errors(x: Array, target: Array) -> Array:
+    """Return the angles (N,) [deg] between the attitudes of states and of a target, or of rows."""
+    at, to = x[:, :3], target[..., :3]
+    scalar, target_scalar = (
+        np.sqrt(np.maximum(0.0, 1.0 - (each * each).sum(axis=-1, keepdims=True)))
+        for each in (at, to)
+    )
+    # The vector part of target^-1 at, whose length is that of half the angle's sine.
+    vector = target_scalar * at - scalar * to - np.cross(to, at)
+    sines: Array = np.minimum(1.0, np.linalg.norm(vector, axis=1))
+    cosines = np.abs(target_scalar * scalar + (at * to).sum(axis=1, keepdims=True))[:, 0]
+    return np.degrees(2.0 * np.arctan2(sines, cosines))
 
 
 def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:

@@ -92,8 +92,8 @@ class BatchAccelerations:
         kernel("linearise", "linearise")(
             *(self._tree, self._layout, self._loads, points),
             (inverse, c, A.reshape(count, -1), columns, couplings),
-            tuple(_work_space(each.shape[1]) for each in points),
-            _work_space(self._layout.size),
+            tuple(work_space(each.shape[1]) for each in points),
+            work_space(self._layout.size),
         )
         inverse, columns = inverse.reshape(count, nv, nv), columns.reshape(count, nv, carried)
         return BatchRates(inverse, c, columns, couplings)
@@ -109,12 +109,13 @@ def inverse_inertias(tree: Tree, q: Array, out: Array) -> Array:
     """
     couplings = np.empty(len(q))
     flat = out.reshape(len(q), -1)
-    spaces = _work_space(q.shape[1]), _work_space(tree.size)
+    spaces = work_space(q.shape[1]), work_space(tree.size)
     kernel("factor", "invert")(tree, q, flat, couplings, *spaces)
     return couplings
 
 
-def _work_space(size: int) -> Array:
+def work_space(size: int) -> Array:
+    """Return an array (size, LANES) with nothing in it yet."""
     space = np.empty((size + 1) * LANES)
     # The kernel's vectors are 64 bytes; where they begin at such an address it is faster.
     first = -(space.ctypes.data // 8) % LANES

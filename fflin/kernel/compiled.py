@@ -58,13 +58,13 @@ def numba_is_there() -> bool:
     return "numba" in sys.modules or find_spec("numba") is not None
 
 
-def loop_pays(steps: int) -> bool:
-    """Whether the compiled loop is there and beats the one in Python over so many steps."""
+def loop_pays(steps: int, name: str = "advance") -> bool:
+    """Whether a compiled loop is there and beats the one in Python over so many steps."""
     if steps < _BREAK_EVEN_LOOP or not numba_is_there():
         return False
     chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
     folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
-    if not any(_kept(folder, "loop", "advance") for folder in folders):
+    if not any(_kept(folder, "loop", name) for folder in folders):
         return steps >= _BREAK_EVEN_COMPILING
     return steps >= _BREAK_EVEN_LOOP_UNLOADED or "numba" in sys.modules
 

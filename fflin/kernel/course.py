@@ -72,6 +72,37 @@ def kept_at(course, t):
 
 
 @inlined
+def start_at(work, robot, course, point):
+    """Write what is to be kept from a point on, whose M must be there."""
+    axes, tree = axes_of(point.q), robot.tree
+    lever = vec.get3(work, tree.inertias + 1)
+    nothing = vec.minus(lever, lever)
+    angular, linear = _lack(work, robot, point.nu, (nothing, nothing))
+    place = vec.minus(vec.get3(point.q, 0), vec.get3(course.start, 9))
+    linear = vec.times(vec.product(axes, linear), -1.0)
+    angular = vec.minus(vec.cross(place, linear), vec.product(axes, angular))
+    vec.put3(course.start, 0, linear)
+    vec.put3(course.start, 3, angular)
+    lever = vec.times(vec.product(axes, lever), load(course.per_mass, 0))
+    vec.put3(course.start, 6, vec.plus(place, lever))
+
+
+@inlined
+def _lack(work, robot, nu, momentum):
+    """Return what a momentum in base axes, angular and linear, is more than that of a velocity."""
+    tree = robot.tree
+    # The base's rows of M nu: its block of a rigid body, and the first six entries of each row.
+    lack = vec.minus6(momentum, spatial_inertia_times(work, tree.inertias, vec.get6(nu, 0)))
+    for index in range(6, len(tree.row)):
+        row = vec.get6(work, tree.packed + tree.row[index])
+        lack = vec.minus6(lack, vec.times6(row, load(nu, index)))
+    angular, linear = lack
+    for index in range(len(robot.loads.stored_body)):
+        angular = vec.minus(angular, stored_momentum(work, tree, robot.loads, index))
+    return angular, linear
+
+
+@inlined
 def impose(work, robot, course, point, t):
     """Shift the base and set its velocity so that both are kept; M must be the point's.
 
@@ -86,16 +117,7 @@ def impose(work, robot, course, point, t):
     vec.put3(point.q, 0, vec.plus(place, vec.get3(course.start, 9)))
     angular = vec.across(axes, vec.minus(angular, vec.cross(place, linear)))
     linear = vec.across(axes, linear)
-    # The base's rows of M nu: its block of a rigid body, and the first six entries of each row.
-    lack = vec.minus6(
-        (angular, linear), spatial_inertia_times(work, tree.inertias, vec.get6(nu, 0))
-    )
-    for index in range(6, len(tree.row)):
-        row = vec.get6(work, tree.packed + tree.row[index])
-        lack = vec.minus6(lack, vec.times6(row, load(nu, index)))
-    angular, linear = lack
-    for index in range(len(robot.loads.stored_body)):
-        angular = vec.minus(angular, stored_momentum(work, tree, robot.loads, index))
+    angular, linear = _lack(work, robot, nu, (angular, linear))
     # The same block solved, by the inertia about the centre of mass.
     xx, xy, xz = vec.get3(work, tree.inertias + 4)
     yy, yz, zz = vec.get3(work, tree.inertias + 7)

@@ -11,22 +11,28 @@ from collections import namedtuple
 from fflin.kernel import vectors as vec
 from fflin.kernel.crba import inwards, outwards
 from fflin.kernel.factor import factorise, solve
-from fflin.kernel.lanes import angle, inlined, load, store
+from fflin.kernel.lanes import angle, chosen, inlined, load, store
 from fflin.kernel.places import attitude, axes_of, columns_of, quaternion_times
 from fflin.kernel.rnea import collect, load_bodies, move_bodies, write_columns
 
 
 class Mechanics(
-    namedtuple("Mechanics", "tree layout loads gravity index circling springy rest row held origin")
+    namedtuple(
+        "Mechanics", "tree layout loads gravity index circling springy rest row held origin drives"
+    )
 ):
     """A robot as the loop reads it; each array of doubles may have a second axis of eight lanes.
 
     Gravity (3,); of each joint its entry of q (`index`), whether that is the cosine of an angle,
     whether it has a spring or damper, and where the spring is at rest; the coordinate that each
     input drives (`row`), -1 for one that is carried; the first of three inputs each that are a
-    vector on the base in reference axes (`held`); and the placement (7,) of the world's origin seen
-    from the reference.
+    vector on the base in reference axes (`held`); the placement (7,) of the world's origin seen
+    from the reference; and the errors of the inputs.
     """
+
+
+class Drives(namedtuple("Drives", "gain bias until")):
+    """What inputs (nu,) give of what is commanded: gain u + bias, and nothing from `until` [s]."""
 
 
 class Point(namedtuple("Point", "q nu u pushing wrench")):
@@ -61,13 +67,16 @@ def seen(robot, q):
 
 
 @inlined
-def turn_inputs(robot, point):
-    """Write the inputs in base axes."""
-    vec.copy(point.u, 0, point.pushing, 0, len(robot.row))
+def turn_inputs(robot, point, t):
+    """Write the inputs as they act at a time, in base axes."""
+    drives, pushing = robot.drives, point.pushing
+    for index in range(len(robot.row)):
+        given = load(drives.gain, index) * load(point.u, index) + load(drives.bias, index)
+        store(pushing, index, chosen(t, load(drives.until, index), given, 0.0))
     for index in range(len(robot.held)):
         at = robot.held[index]
         axes = columns_of(seen(robot, point.q))
-        vec.put3(point.pushing, at, vec.across(axes, vec.get3(point.u, at)))
+        vec.put3(pushing, at, vec.across(axes, vec.get3(pushing, at)))
 
 
 @inlined

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import namedtuple
 
 from fflin.kernel.channel import arrive, limit, send, spare_wheels
-from fflin.kernel.course import add_wrench, begin_step, end_step, impose, kept_at
+from fflin.kernel.course import add_wrench, begin_step, end_step, impose, kept_at, start_at
 from fflin.kernel.forward import accelerate, configure, seen, turn_inputs
 from fflin.kernel.lanes import below, compiled, inlined, load, store
 from fflin.kernel.laws import NOTHING, command
@@ -82,7 +82,7 @@ def _act(channel, law, robot, point, step, stage, t):
         if sample > 0:
             arrive(channel, step, point.u)
         spare_wheels(channel, point.nu, point.u)
-    turn_inputs(robot, point)
+    turn_inputs(robot, point, t)
 
 
 @inlined
@@ -149,3 +149,20 @@ def advance(
         clock[0] = step + 1
         if not _goes_on(robot, watch, point):
             break
+
+
+@compiled
+def begin(robot, course, point, work):
+    """Write the momentum and the centre of mass of the start into a course."""
+    configure(work, robot, point.q)
+    start_at(work, robot, course, point)
+
+
+@compiled
+def advance_eight(
+    robot, method, law, channel, course, watch, point, stages, clock, last, every, rows, work
+):
+    """Do as `advance` in eight lanes; kept on disk apart from it."""
+    advance(
+        robot, method, law, channel, course, watch, point, stages, clock, last, every, rows, work
+    )

@@ -98,30 +98,40 @@ def perturbed(model: pin.Model, seed: Any, **spreads: Any) -> pin.Model:
             raise InputError(f"{key} is {spread:g}, expected 0 or more and less than 1")
     draw, new = np.random.default_rng(whole("seed", seed, 0)), model.copy()
     for index in range(ROOT, model.njoints):
-        drawn = draw.uniform(-1.0, 1.0, 7)
-        new.inertias[index] = _drawn(model.inertias[index], drawn, **checked)
+        drawn = draw.uniform(-1.0, 1.0, (1, 7))
+        if any(checked.values()):
+            sizes = checked["mass"], checked["com"], checked["inertia"]
+            parts = (size * x for size, x in zip(sizes, np.split(drawn, (1, 4), 1), strict=True))
+            mass, com, about = stretched(model.inertias[index], *parts)
+            new.inertias[index] = pin.Inertia(float(mass[0]), com[0], about[0])
     return new
 
 
-def _drawn(body: pin.Inertia, drawn: Array, mass: float, com: float, inertia: float) -> pin.Inertia:
-    r"""Return a body stretched along its frame's axes, shifted, and made heavier.
+def with_inertias(robot: Any, bodies: Mapping[int, Any]) -> Any:
+    """Return a robot with other masses, centres of mass and inertias of its bare model's bodies."""
+    model = robot._bare.model.copy()
+    for index, (mass, com, inertia) in bodies.items():
+        model.inertias[index] = pin.Inertia(float(mass), com, inertia)
+    return robot._of_model(model)
 
-    A stretch S is a congruence, :math:`S \Sigma S`, which keeps Sigma positive.
+
+def stretched(
+    body: pin.Inertia, mass: Array, com: Array, inertia: Array
+) -> tuple[Array, Array, Array]:
+    r"""Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of variants of a body.
+
+    It is stretched along its frame's axes, shifted and made heavier, by relative changes (N, 1),
+    (N, 3), (N, 3). A stretch S is a congruence, :math:`S \Sigma S`, which keeps Sigma positive.
     """
-    if not any((mass, com, inertia)):
-        return body
-    heavier = 1.0 + mass * float(drawn[0])
-    second = 0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia
+    heavier, unit = 1.0 + mass.reshape(-1), np.eye(3)
+    second = 0.5 * np.trace(body.inertia) * unit - body.inertia
     # A body that is none, as some files have them, keeps its shape.
     sound = np.linalg.eigvalsh(second)[0] >= -_ROUNDING * np.trace(second)
-    stretch = np.sqrt(1.0 + inertia * (drawn[4:] if sound else drawn[4]) * np.ones(3))
-    shift = np.zeros(3)
-    if body.mass:
-        shift = com * drawn[1:4] * np.sqrt(np.abs(second.diagonal()) / body.mass)
-    second = heavier * second * np.outer(stretch, stretch)
-    return pin.Inertia(
-        heavier * body.mass, body.lever + shift, np.trace(second) * np.eye(3) - second
-    )
+    stretch = np.sqrt(1.0 + (inertia if sound else inertia[:, :1] * np.ones(3)))
+    shift = com * np.sqrt(np.abs(second.diagonal()) / (body.mass or np.inf))
+    second = heavier[:, None, None] * second * stretch[:, :, None] * stretch[:, None]
+    about = np.trace(second, axis1=1, axis2=2)[:, None, None] * unit - second
+    return heavier * body.mass, body.lever + shift, about
 
 
 def identity(origin: str, model: pin.Model, before: pin.Model) -> str:

@@ -28,8 +28,10 @@ _SLICE, _FIRST_SLICE = 0.05, 16  # [s] and steps between looks at the clock and 
 _LARGEST_FACTOR = 200_000
 
 
-def engine_of(engine: Any, plan: Plan, plant: Plant) -> str:
-    """Return which loop runs a plan: the one that is asked for, or by default the quicker.
+def engine_of(engine: Any, plan: Plan, plant: Plant, runs: int = 0) -> str:
+    """Return which loop does a plan, or so many of its runs eight at a time.
+
+    It is the one that is asked for, or by default the quicker.
 
     Raises
     ------
@@ -38,14 +40,14 @@ def engine_of(engine: Any, plan: Plan, plant: Plant) -> str:
     UnknownNameError
         If there is no such engine.
     """
-    if engine is not None and engine not in ENGINES:
+    if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
         raise unknown("engine", str(engine), list(ENGINES))
     if engine == "python":
         return "python"
     reason = _reason(plan, plant)
     if engine == "compiled" and reason:
         raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
-    if reason or (engine is None and not (_small(plant) and loop_pays(plan.times.steps))):
+    if reason or (engine is None and not (_small(plant) and _pays(plan, runs))):
         return "python"
     return "compiled"
 
@@ -67,6 +69,11 @@ def _reason(plan: Plan, plant: Plant) -> str:
     if not plan.method.origins or batch_tree(robot) is None or not at_home:
         return f"the method {plan.method.__name__} or a joint of '{robot.name}' is of another kind"
     return ""
+
+
+def _pays(plan: Plan, runs: int) -> bool:
+    steps = plan.times.steps
+    return loop_pays(runs * steps, "advance_eight") if runs else loop_pays(steps)
 
 
 def _small(plant: Plant) -> bool:

@@ -17,7 +17,7 @@ from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array
 from fflin.base.writing import as_path, check_ending, write_whole
-from fflin.dynamics.state_rows import moving_errors
+from fflin.dynamics.state_rows import attitude_errors, moving_errors
 from fflin.simulation.passed import Limited, Passed, Saturated, passed, saturated
 
 FORMATS = (*record.FORMATS, ".csv")
@@ -178,16 +178,7 @@ class Motion(Design):
         """Angle (N,) [deg] between the base's attitude and the target's; None without target."""
         if not self.target.size:
             return None
-        at, to = self.x[:, :3], self.target[..., :3]
-        scalar, target_scalar = (
-            np.sqrt(np.maximum(0.0, 1.0 - (each * each).sum(axis=-1, keepdims=True)))
-            for each in (at, to)
-        )
-        # The vector part of target^-1 at, whose length is that of half the angle's sine.
-        vector = target_scalar * at - scalar * to - np.cross(to, at)
-        sines: Array = np.minimum(1.0, np.linalg.norm(vector, axis=1))
-        cosines = np.abs(target_scalar * scalar + (at * to).sum(axis=1, keepdims=True))[:, 0]
-        return np.degrees(2.0 * np.arctan2(sines, cosines))
+        return attitude_errors(self.x, self.target)
 
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
         """Return the motion by knots, with inputs that are held or linear: what it holds to better.

@@ -71,6 +71,7 @@ def _mechanics(plant: Plant, tree: Tree) -> forward.Mechanics:
         np.where(fixed.any(axis=0), np.abs(fixed).argmax(axis=0), -1).astype(np.intp),
         np.array([held.columns.start for held in actuation.held], dtype=np.intp),
         pin.SE3ToXYZQUAT(plant.state.origin),
+        forward.Drives(*plant.drives),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -23,6 +23,14 @@ _DIVERGED = 1e6
 _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
 
+class Drives(NamedTuple):
+    """What inputs (nu,) give of a command u: gain u + bias, and nothing from `until` [s] on."""
+
+    gain: Array
+    bias: Array
+    until: Array
+
+
 class Plant:
     """The nonlinear robot under inputs and a disturbance.
 
@@ -33,9 +41,16 @@ class Plant:
     disturbance : callable, optional
         disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order: on the base linear,
         then angular, in base axes; then on the joints.
+    drives : Drives, optional
+        Errors of the inputs; none by default.
     """
 
-    def __init__(self, state: StateMap, disturbance: Disturbance | None = None) -> None:
+    def __init__(
+        self,
+        state: StateMap,
+        disturbance: Disturbance | None = None,
+        drives: Drives | None = None,
+    ) -> None:
         robot = state.robot
         require_inertia(robot)
         self.state, self.robot = state, robot
@@ -48,6 +63,8 @@ class Plant:
         self.disturbance = disturbance
         self._model, self._data = robot.model, robot.create_data()
         nu = len(self.actuation.names)
+        self.drives = drives or Drives(np.ones(nu), np.zeros(nu), np.full(nu, np.inf))
+        self._faulty = drives is not None
         self._columns = np.column_stack(
             [state.lift(self.actuation.torques(unit)) for unit in np.eye(nu)]
         )
@@ -66,6 +83,9 @@ class Plant:
         The latter is the sum (6,) of all wrenches but gravity's at the base origin, linear then
         angular in base axes.
         """
+        if self._faulty:
+            gain, bias, until = self.drives
+            u = np.where(t < until, gain * u + bias, 0.0)
         if self.actuation.held:
             u = self._in_base_axes(q, u)
         if self._plain and self.disturbance is None:
@@ -79,6 +99,7 @@ class Plant:
 
     def isolated(self, *, driven: bool) -> bool:
         """Whether nothing pushes from outside, whatever the inputs are or where none acts."""
+        driven = driven or bool(self.drives.bias.any())
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         return not (base or self.disturbance is not None or any(self.robot.gravity))
 

@@ -12,14 +12,14 @@ from fflin.base.validation import Array
 from fflin.simulation.passed import lines
 
 # An error has settled once it stays below this share of its largest.
-_SETTLED = 0.02
+SETTLED = 0.02
 
 # An error, in SI units, that is never above this was there all the time; below the other it is
 # shown as none. Rounding moves a robot that stands still by less than either.
-_THERE, _NOTHING = 1e-9, 1e-14
+THERE, _NOTHING = 1e-9, 1e-14
 
 # Share of the rows for which it must have stayed so by the end.
-_DWELL = 0.05
+DWELL = 0.05
 
 # Share of the run with an input at its limit from which on it is there all along.
 _ALL_ALONG = 0.9
@@ -39,13 +39,13 @@ class Course(NamedTuple):
     @property
     def settled(self) -> int:
         """The row from which on it has settled; N where it has not."""
-        outside = np.flatnonzero(self.size > max(_SETTLED * float(self.size.max()), _THERE))
+        outside = np.flatnonzero(self.size > max(SETTLED * float(self.size.max()), THERE))
         return int(outside[-1]) + 1 if len(outside) else 0
 
     @property
     def late(self) -> bool:
         """Whether it has not settled: what flies through its target is there for a moment."""
-        return self.settled > (1.0 - _DWELL) * len(self.size)
+        return self.settled > (1.0 - DWELL) * len(self.size)
 
     @property
     def last(self) -> str:
@@ -57,7 +57,7 @@ class Course(NamedTuple):
         values = (self.size[0], self.size.max(), self.size[-1])
         cells = ["." if value < _NOTHING else f"{value:.3g}" for value in values]
         when = "not yet" if self.late else f"{t[self.settled]:.3g}"
-        if self.size.max() <= _THERE:
+        if self.size.max() <= THERE:
             when = "."
         return [self.title, self.unit, *cells, when]
 
@@ -72,7 +72,7 @@ def motion_report(motion: Any) -> str:
     parts.extend(motion.notes)
     parts = [folded(parts)]
     if kinds:
-        settled = f"within {100.0 * _SETTLED:g} % after [s]"
+        settled = f"within {100.0 * SETTLED:g} % after [s]"
         rows = [["error", "unit", "first", "largest", "last", settled]]
         parts.append(f"\n{grid([*rows, *(kind.row(motion.t) for kind in kinds)], 'll')}\n")
     if kinds or motion.u.any():
@@ -130,7 +130,7 @@ def verdict(motion: Any, kinds: list[Course]) -> str:
         return f"stopped: {motion.stopped}"
     places = [kind for kind in kinds if kind.title in _PLACES]
     judged = [kind for kind in places if kind.steered] or [k for k in kinds if k.steered]
-    moved = [kind for kind in judged if kind.size.max() > _THERE]
+    moved = [kind for kind in judged if kind.size.max() > THERE]
     if motion.tracked:
         said = f"beside its trajectory at the end: {_and([kind.last for kind in judged])}"
     elif failed := [kind.last for kind in moved if kind.late]:

@@ -41,8 +41,9 @@ if TYPE_CHECKING:
     from fflin.control.policies import Policy, StateFeedback
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
-    from fflin.simulation.plan import Event
+    from fflin.simulation.plan import Callback, Event
     from fflin.simulation.plant import Disturbance
+    from fflin.simulation.run import Recording
 
 
 def simulate(
@@ -164,6 +165,46 @@ def simulate(
     ----------
     E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
     """
+    plan, plant = planned(
+        robot,
+        policy,
+        *(x0, q0, v0, duration, dt, method, project, sample, delay, limits, disturbance),
+        *(events, callback, linear, target, frame, reference, every, progress),
+    )
+    engine = engine_of(engine, plan, plant)
+    try:
+        return motion_of(plan, plant, engine)
+    except MemoryError:
+        raise InputError(
+            f"{plan.times.rows} rows of '{robot.name}' do not fit into the memory; take a larger "
+            "dt or `every`"
+        ) from None
+
+
+def planned(
+    robot: Robot,
+    policy: Any,
+    x0: Any = None,
+    q0: Any = None,
+    v0: Any = None,
+    duration: float | None = None,
+    dt: float | None = None,
+    method: str = "cf4",
+    project: bool = True,
+    sample: float | None = None,
+    delay: float = 0.0,
+    limits: Any = None,
+    disturbance: Disturbance | None = None,
+    events: Sequence[Event] = (),
+    callback: Callback | None = None,
+    linear: LinearModel | bool | None = None,
+    target: Any = None,
+    frame: Frame | None = None,
+    reference: pin.SE3 | None = None,
+    every: int | None = None,
+    progress: bool | None = None,
+) -> tuple[Plan, Plant]:
+    """Return what `simulate` does of its arguments, checked, and the robot that moves."""
     policy = followed(policy, robot)
     times = times_of(policy, duration, dt, every, sample, delay)
     policy = followed(policy, robot, held=times.sample > 0)
@@ -228,20 +269,14 @@ def simulate(
         notes=(*notes_of(policy, robot), *times.notes),
         predictor=foresees,
     )
-    try:
-        return _motion(plan, plant, engine_of(engine, plan, plant))
-    except MemoryError:
-        raise InputError(
-            f"{times.steps // times.every} rows of '{robot.name}' do not fit into the memory; take "
-            "a larger dt or `every`"
-        ) from None
+    return plan, plant
 
 
-def _motion(plan: Plan, plant: Plant, engine: str) -> Motion:
-    """Return the motion that a plan leads to."""
+def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = None) -> Motion:
+    """Return the motion that a plan leads to, or led to where its run is given."""
     state, robot = plant.state, plant.robot
     conserved = Conserved(robot, plan.q)
-    run = carried_out(plan, plant, conserved, engine)
+    run = run or carried_out(plan, plant, conserved, engine)
     x = state_history(state, run.q, run.v, plan.near, run.t)
     target = np.zeros(0) if plan.target is None else plan.target
     if plan.reference is not None:

@@ -96,6 +96,11 @@ def sound(folder):
         "modes": {"lin": lin},
         "Momentum": {},
         "momentum_reduction": {"lin": fflin.linearize(robot.replace(inputs=robot.inputs[2:]))},
+        "monte_carlo": {
+            **{"robot": robot, "policy": None, "dispersions": {"q_b": 0.01}, "runs": 2, "seed": 0},
+            **{"duration": 0.02, "until": None, "width": 0.1, "confidence": 0.9, "threads": 1},
+            **{"executor": None, "chunk": None, "progress": None, "out": None, "engine": None},
+        },
         "observability": {"lin": lin},
         "OutputFeedback": {"lin": lin, "compensator": fflin.lqg(gain, filtered), "noise": None},
         "plan": {

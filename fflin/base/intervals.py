@@ -1,0 +1,80 @@
+"""Intervals of a share, a quantile and a mean of independent draws, and rank correlation.
+
+C. J. Clopper and E. S. Pearson, Biometrika 26(4), 1934; H. A. David and H. N. Nagaraja, Order
+Statistics, 3rd edition, 2003, section 7.1.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from fflin.base.validation import Array
+
+
+class Estimate(NamedTuple):
+    """A figure, and the least and largest that it may be at a confidence."""
+
+    value: float
+    low: float
+    high: float
+
+
+def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
+    """Return the share of successes, exact for any count."""
+    from scipy.special import betaincinv
+
+    tail, failures = (1.0 - confidence) / 2.0, count - successes
+    low = betaincinv(successes, failures + 1, tail) if successes else 0.0
+    high = betaincinv(successes + 1, failures, 1.0 - tail) if failures else 1.0
+    return Estimate(successes / count if count else math.nan, float(low), float(high))
+
+
+def quantile(values: Array, p: float, confidence: float) -> Estimate:
+    """Return the p-quantile between two order statistics, whatever the distribution is.
+
+    The bounds are infinite where there are too few values for any.
+    """
+    from scipy.special import bdtr
+
+    count = len(values)
+    ordered = np.concatenate(([-np.inf], np.sort(values), [np.inf]))
+    # How many of them are below the quantile is binomial.
+    below, tail = bdtr(np.arange(count + 1.0), count, p), (1.0 - confidence) / 2.0
+    low, high = np.searchsorted(below, (tail, 1.0 - tail)).tolist()
+    middle = min(max(math.ceil(p * count), 1), count)
+    return Estimate(*map(float, (ordered[middle], ordered[low], ordered[min(high, count) + 1])))
+
+
+def mean(values: Array, confidence: float) -> Estimate:
+    """Return the mean with Student's interval, which takes it for normal."""
+    from scipy.special import stdtrit
+
+    count, middle = len(values), float(values.mean())
+    if count < 2:
+        return Estimate(middle, -math.inf, math.inf)
+    t = float(stdtrit(count - 1, 0.5 + 0.5 * confidence))
+    apart = t * float(values.std(ddof=1)) / math.sqrt(count)
+    return Estimate(middle, middle - apart, middle + apart)
+
+
+def rank_correlations(columns: Array, values: Array) -> Array:
+    """Return Spearman's correlation of each of the columns (N, k) with values (N,); 0 of constants.
+
+    Values may be infinite.
+    """
+    ranks = np.column_stack([_ranks(column) for column in (*columns.T, values)])
+    ranks -= ranks.mean(axis=0)
+    size = np.linalg.norm(ranks, axis=0)
+    shares = ranks / np.where(size > 0.0, size, 1.0)
+    found: Array = shares[:, :-1].T @ shares[:, -1]
+    return found
+
+
+def _ranks(values: Array) -> Array:
+    """Return ranks, ties sharing the mean of theirs."""
+    _, which, counts = np.unique(values, return_inverse=True, return_counts=True)
+    ranks: Array = (np.cumsum(counts) - 0.5 * (counts - 1))[which]
+    return ranks

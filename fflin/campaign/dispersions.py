@@ -1,0 +1,279 @@
+"""What is drawn at random from run to run: spreads by name, and the runs that come of the draws."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fflin.base.errors import ChartError, InputError, UnknownNameError
+from fflin.base.names import by_name, input_keys
+from fflin.base.validation import Array, number
+from fflin.base.validation import by_name as mapping
+from fflin.control.output_feedback import OutputFeedback
+from fflin.control.policies import StateFeedback, bound
+from fflin.dynamics.state import StateMap
+from fflin.kernel.tree import Tree
+from fflin.robot.frames import ROOT
+from fflin.robot.mass_properties import stretched, with_inertias
+from fflin.robot.robot import Robot
+from fflin.simulation.plant import Drives, Plant
+
+_BLOCK = 1024  # runs whose draws are made together, whatever the chunks are
+_OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz"}  # with their axes
+_OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
+_FACTORS = ("mass", "inertia", *_OF_SPRINGS)
+
+
+class Column(NamedTuple):
+    """A number that is drawn for each run, what it changes and of whom."""
+
+    name: str
+    kind: str  # "state", or what a name ends with
+    at: tuple[int, int]  # which state, body, joint, input or sensor, and which of its axes
+    inverse: Callable[[Array], Array]  # of the distribution function
+
+
+class Draws(NamedTuple):
+    """Rows of what is drawn: the values (N, k), and the numbers of the runs (N,)."""
+
+    drawn: Array
+    run: Array
+
+
+class Dispersions:
+    """What is drawn, see `monte_carlo`, and what draws make of a robot and its start x0 (nx,)."""
+
+    def __init__(self, given: Any, plant: Plant, policy: Any, x0: Array, seed: int) -> None:
+        self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
+        self._model = plant.robot._bare.model
+        bodies = ["base", *list(self._model.names)[ROOT + 1 :]]
+        self._sensors: tuple[str, ...] = ()
+        if isinstance(policy, StateFeedback | OutputFeedback):
+            lin = policy.lin
+            of_states = isinstance(policy, StateFeedback)
+            self._sensors = lin.state_names if of_states else lin.output_names
+        known = {
+            "state": plant.state.names,
+            "sensor": self._sensors,
+            **dict.fromkeys(_OF_BODIES, bodies),
+            **dict.fromkeys(_OF_INPUTS, input_keys(plant.actuation)),
+            **dict.fromkeys(_OF_SPRINGS, plant.robot.joint_names),
+        }
+        by_kind: dict[str, dict[str, Any]] = {}
+        for key, spread in mapping("dispersions", given, "name").items():
+            head, _, kind = str(key).rpartition(".")
+            kind, head = (kind, head) if kind in known and head else ("state", str(key))
+            by_kind.setdefault(kind, {})[head] = _inverse(str(key), spread)
+        self.columns: list[Column] = []
+        for kind, spreads in by_kind.items():
+            self._add(kind, spreads, list(known[kind]), " | ".join([*known][1:]))
+        if not self.columns:
+            raise InputError("dispersions is empty; give at least one, such as {'q_b': 0.05}")
+        self._kinds = {column.kind for column in self.columns}
+
+    def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
+        if kind == "sensor" and not names:
+            raise InputError(
+                f"'{next(iter(spreads))}.sensor' is dispersed, and a "
+                f"{type(self._policy).__name__} has no sensors; StateFeedback and OutputFeedback do"
+            )
+        try:
+            found = by_name(f"{kind} to disperse", spreads, names)
+        except UnknownNameError as error:
+            raise UnknownNameError(
+                f"{error}" + f"; or NAME.({kinds})" * (kind == "state")
+            ) from None
+        for at, inverse in sorted(found.items()):
+            own = names[at] if kind == "state" else f"{names[at]}.{kind}"
+            if kind in _OF_SPRINGS and not getattr(self._plant.robot.springs, kind)[at]:
+                raise InputError(f"'{own}' is dispersed, and is 0, which stays 0 times a factor")
+            for axis, letter in enumerate(_OF_BODIES.get(kind, " ")):
+                name = f"{own}.{letter}".rstrip(". ")
+                self.columns.append(Column(name, kind, (at, axis), inverse))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of what is drawn."""
+        return tuple(column.name for column in self.columns)
+
+    def rows(self, start: int, stop: int) -> Draws:
+        """Return what is drawn for some runs; it depends on seed, name and run alone."""
+        first, last = start // _BLOCK, -(-stop // _BLOCK)
+        drawn = np.empty(((last - first) * _BLOCK, len(self.columns)))
+        for at, column in enumerate(self.columns):
+            key = (self._seed, zlib.crc32(column.name.encode()))
+            for block in range(first, last):
+                stream = np.random.Philox(np.random.SeedSequence(key, spawn_key=(block,)))
+                # At 0 and 1 the inverse may be infinite.
+                uniform = np.random.Generator(stream).random(_BLOCK).clip(1e-16, 1.0 - 1e-16)
+                drawn[(block - first) * _BLOCK :][:_BLOCK, at] = column.inverse(uniform)
+        kept = slice(start - first * _BLOCK, stop - first * _BLOCK)
+        return Draws(drawn[kept], np.arange(start, stop, dtype=float))
+
+    def require_possible(self, runs: int) -> None:
+        """Raise `InputError` where a draw of so many runs makes no robot or no attitude."""
+        for start in range(0, runs, _BLOCK):
+            drawn = self.rows(start, min(start + _BLOCK, runs)).drawn
+            for values, column in zip(drawn.T, self.columns, strict=True):
+                least = -1.0 if column.kind in _FACTORS else -np.inf
+                bad = ~np.isfinite(values) | (values <= least)
+                if bad.any():
+                    run = int(bad.argmax())
+                    raise InputError(
+                        f"'{column.name}' is drawn as {values[run]:.4g} in run {start + run}, of "
+                        f"which no robot is made: expected more than {least:g}; take a smaller "
+                        "spread, or a uniform one (least, largest)"
+                    )
+            try:
+                self.starts(drawn)
+            except ChartError as error:
+                said = f"a start is drawn that is no attitude, of runs {start} on"
+                raise InputError(f"{said}: {error}; take a smaller spread") from None
+
+    def _of(self, kind: str, drawn: Array, size: int, axes: int = 1) -> Array:
+        """Return the draws (N, size, axes) of a kind, zero where nothing is drawn."""
+        found = np.zeros((len(drawn), size, axes))
+        for values, column in zip(drawn.T, self.columns, strict=True):
+            if column.kind == kind:
+                found[(slice(None), *column.at)] = values
+        return found
+
+    def starts(self, drawn: Array) -> tuple[Array, Array]:
+        """Return configurations and velocities (N, nq), (N, nv) to begin at."""
+        x = self._x0 + self._of("state", drawn, len(self._x0))[..., 0]
+        return self._plant.state.points(x)[1:]
+
+    def bodies(self, drawn: Array) -> dict[int, tuple[Array, Array, Array]]:
+        """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of bodies that are drawn."""
+        size, found = self._model.njoints - ROOT, {}
+        of = [self._of(kind, drawn, size, len(axes)) for kind, axes in _OF_BODIES.items()]
+        for at in sorted({each.at[0] for each in self.columns if each.kind in _OF_BODIES}):
+            found[ROOT + at] = stretched(self._model.inertias[ROOT + at], *(x[:, at] for x in of))
+        return found
+
+    def _springs(self, kind: str, drawn: Array) -> Array:
+        robot = self._plant.robot
+        factor: Array = 1.0 + self._of(kind, drawn, robot.n)[..., 0]
+        return factor * getattr(robot.springs, kind)
+
+    def _drives(self, drawn: Array) -> Drives:
+        gain, bias, until = (
+            self._of(kind, drawn, len(self._plant.drives.gain))[..., 0] for kind in _OF_INPUTS
+        )
+        safe = np.ones(until.shape[1], dtype=bool)
+        safe[[each.at[0] for each in self.columns if each.kind == "fails"]] = False
+        until[:, safe] = np.inf
+        return Drives(1.0 + gain, bias, until)
+
+    def in_lanes(self, drawn: Array, tree: Tree) -> dict[str, Array]:
+        """Return what differs from run to run, as the compiled loop takes it."""
+        plant, (q, v) = self._plant, self.starts(drawn)
+        runs = {"q": q, "nu": plant.state.velocities(v), **self._drives(drawn)._asdict()}
+        if self._kinds & {*_OF_BODIES}:
+            parameters = np.tile(tree.bodies.reshape(1, -1, 10), (len(drawn), 1, 1))
+            for at, body in self.bodies(drawn).items():
+                old, axes = self._model.inertias[at], tree.axes[at - ROOT]
+                before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
+                # Linear in these, so that wheels in the body stay as they are.
+                parameters[:, at - ROOT] += _parameters(axes, *body) - _parameters(axes, *before)
+            runs["bodies"] = parameters.reshape(len(drawn), -1)
+        runs |= {kind: self._springs(kind, drawn) for kind in _OF_SPRINGS if kind in self._kinds}
+        if "sensor" in self._kinds:
+            bias = self._of("sensor", drawn, len(self._sensors))[..., 0]
+            if isinstance(self._policy, OutputFeedback):
+                runs["y0"] = self._policy.compensator.y0 - bias
+            else:
+                runs["offset"] = self._policy.terms(plant.state)[1] - bias @ self._policy.K.T
+        return runs
+
+    def one(self, drawn: Array) -> tuple[Plant, Any, Array, Array]:
+        """Return the robot of a run (k,) with its inputs, its policy, and q and v to begin at."""
+        plant, policy, rows = self._plant, self._policy, drawn[None]
+        robot, (q, v) = plant.robot, self.starts(rows)
+        if bodies := self.bodies(rows):
+            robot = with_inertias(robot, {k: [x[0] for x in body] for k, body in bodies.items()})
+        for kind in self._kinds & {*_OF_SPRINGS}:
+            values = self._springs(kind, rows)[0].tolist()
+            of: Any = {kind: dict(zip(robot.joint_names, values, strict=True))}
+            robot = replace(robot, **of)
+        if "sensor" in self._kinds:
+            bias = self._of("sensor", rows, len(self._sensors))[0, :, 0]
+            if isinstance(policy, OutputFeedback):
+                noise = policy.noise
+                policy = replace(
+                    policy, noise=lambda t: bias + np.asarray(noise(t) if noise else 0.0)
+                )
+            else:
+                policy = _Shifted(policy, -policy.K @ bias)
+        state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
+        drives = Drives(*(x[0] for x in self._drives(rows)))
+        faulty = drives if self._kinds & {*_OF_INPUTS} else None
+        return Plant(state, plant.disturbance, faulty), policy, q[0], v[0]
+
+
+@dataclass(frozen=True)
+class _Shifted:
+    """A policy whose commands are shifted (nu,)."""
+
+    policy: Any
+    shift: Array
+
+    def bind(self, robot: Robot) -> Callable[[float, Array, Array], Array]:
+        inner = bound(self.policy, robot)
+        return lambda t, q, v: np.asarray(inner(t, q, v)) + self.shift
+
+
+def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
+    """Return m, m c, and I about the origin (xx xy xz yy yz zz) of bodies in axes (N, 10)."""
+    square = (com * com).sum(axis=1)[:, None, None] * np.eye(3) - com[:, :, None] * com[:, None]
+    about = axes.T @ (inertia + mass[:, None, None] * square) @ axes
+    rows, columns = np.triu_indices(3)
+    return np.column_stack((mass, mass[:, None] * (com @ axes), about[:, rows, columns]))
+
+
+def _inverse(name: str, spread: Any) -> Callable[[Array], Array]:
+    """Return the inverse distribution function of a spread."""
+    if hasattr(spread, "ppf"):
+        try:
+            middle = float(spread.ppf(0.5))
+        except Exception:
+            middle = np.nan
+        if not np.isfinite(middle):
+            raise InputError(f"the distribution of '{name}' has no median; freeze it first")
+        return spread.ppf
+    if isinstance(spread, tuple):
+        if len(spread) != 2:
+            raise InputError(f"'{name}' is {spread!r}, expected (least, largest)")
+        least, largest = (number(f"'{name}'", each) for each in spread)
+        if not least <= largest:
+            raise InputError(f"'{name}' is ({least:g}, {largest:g}), expected (least, largest)")
+        return partial(_uniform, least, largest)
+    if isinstance(spread, list | np.ndarray):
+        values = [number(f"'{name}'", each) for each in np.ravel(spread).tolist()]
+        if not values:
+            raise InputError(f"'{name}' has no values to choose from")
+        return partial(_choice, np.array(values))
+    deviation = number(f"'{name}'", spread)
+    if deviation < 0.0:
+        raise InputError(f"'{name}' is {deviation:g}, expected a standard deviation of 0 or more")
+    return partial(_normal, deviation)
+
+
+def _uniform(least: float, largest: float, u: Array) -> Array:
+    return least + (largest - least) * u
+
+
+def _choice(values: Array, u: Array) -> Array:
+    return values[(u * len(values)).astype(int)]
+
+
+def _normal(deviation: float, u: Array) -> Array:
+    from scipy.special import ndtri
+
+    normal: Array = deviation * ndtri(u)
+    return normal

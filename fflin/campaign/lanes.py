@@ -1,0 +1,149 @@
+"""Eight runs side by side in the compiled loop, each with a robot and a start of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from fflin.base.rotation import product_matrix
+from fflin.base.validation import Array
+from fflin.campaign.tally import STOPS, Tally, stop_of
+from fflin.kernel.accelerations import work_space
+from fflin.kernel.compiled import kernel
+from fflin.kernel.tree import LANES, batch_tree
+from fflin.simulation.conservation import Conserved
+from fflin.simulation.packing import packed
+from fflin.simulation.plan import Plan
+from fflin.simulation.plant import Plant
+from fflin.simulation.run import ending_of
+
+_SLICE = 128  # steps whose rows are there at a time
+_DIVERGED = float(STOPS.index("diverged"))
+
+# Takes the first step of some, and their rows (steps, LANES, ..) of q, nu, u, momentum and centre.
+Watcher = Callable[[int, list[Array]], None]
+
+
+class Lanes:
+    """The compiled loop over a plan, with arrays of its own: not to be shared by threads."""
+
+    def __init__(self, plan: Plan, plant: Plant) -> None:
+        tree = batch_tree(plant.robot)
+        assert tree is not None
+        parts = packed(plan, plant, Conserved(plant.robot, plan.q), tree)
+        self._plan, self._state = plan, plant.state
+        mechanics, method, law, channel, (kept, *flags), watch, point, stages = parts
+        self._fresh: list[tuple[Array, Array]] = []
+        mechanics = mechanics._replace(
+            tree=self._wide(mechanics.tree, "bodies"),
+            loads=self._wide(mechanics.loads, "wrench", "stiffness", "damping"),
+            drives=self._wide(mechanics.drives, *mechanics.drives._fields),
+        )
+        path = self._wide(law.path, "e")
+        law = self._wide(law, "offset", "y0", "x", "z", "next")._replace(path=path)
+        pulses = self._wide(channel.pulses, "left", "level", "end")
+        channel = self._wide(channel, "held", "pending")._replace(pulses=pulses)
+        kept, point, stages = (self._wide(x, *x._fields) for x in (kept, point, stages))
+        # All starts are given with the base on the side of the chart where this is positive.
+        watch = watch._replace(sign=np.abs(watch.sign))
+        self._parts = mechanics, method, law, channel, (kept, *flags), watch, point, stages
+        self._work = work_space(mechanics.layout.size)
+        self._sizes = [len(each) for each in (point.q, point.nu, point.u)] + [6, 3]
+        self._rows = work_space(_SLICE * sum(self._sizes))
+        self._of = {
+            **{"q": point.q, "nu": point.nu, "bodies": mechanics.tree.bodies},
+            **{"y0": law.y0, "offset": law.offset},
+            **{"stiffness": mechanics.loads.stiffness, "damping": mechanics.loads.damping},
+            **mechanics.drives._asdict(),
+        }
+        self._turn = product_matrix(plant.state.origin_quaternion)[3]
+
+    def _wide(self, part: Any, *names: str) -> Any:
+        """Return a part with arrays in lanes, which are remembered as they were."""
+        wide = {}
+        for name in names:
+            array = getattr(part, name)
+            wide[name] = work_space(len(array))
+            self._fresh.append((wide[name], array[:, None].copy()))
+        return part._replace(**wide)
+
+    # A motion that diverges overflows before it is stopped: that is no reason to warn.
+    @np.errstate(over="ignore", invalid="ignore")
+    def fly(
+        self,
+        runs: Mapping[str, Array],
+        tally: Tally,
+        out: Mapping[str, Array],
+        watcher: Watcher | None = None,
+    ) -> list[str]:
+        """Do up to eight, whose rows differ from the plan, into `out`; say why each was stopped."""
+        plan, steps, count = self._plan, self._plan.times.steps, len(runs["q"])
+        parts, rows, width = self._parts, self._rows, sum(self._sizes)
+        mechanics, *_, (kept, *_), watch, point, stages = parts
+        for array, fresh in self._fresh:
+            array[:] = fresh
+        of_lane = np.minimum(np.arange(LANES), count - 1)
+        for name, values in runs.items():
+            self._of[name][:] = values[of_lane].T
+        mass = mechanics.tree.bodies[::10].sum(axis=0)
+        kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * mechanics.gravity[:, None]
+        kept.start[9:] = point.q[:3]
+        kernel("loop", "begin", "the start of eight runs")(mechanics, kept, point, self._work)
+        advance = kernel("loop", "advance_eight", "the loop of eight runs at a time")
+        clock, going, told = np.zeros(1, dtype=np.intp), np.ones(count, dtype=bool), [""] * count
+        while clock[0] < steps and going.any():
+            first = int(clock[0])
+            advance(*parts, clock, min(steps, (first // _SLICE + 1) * _SLICE), 1, rows, self._work)
+            done = int(clock[0])
+            seen = self._split(rows[: (done - first) * width])
+            tally.add(first, *seen[:3])
+            if watcher:
+                watcher(first, seen)
+            lost = ~(point.nu**2 < watch.squares[:, None]).all(axis=0)
+            lost |= (self._turn @ point.q[3:7] < 0.0) & bool(plan.chart)
+            for lane in np.flatnonzero(lost[:count] & going).tolist():
+                told[lane] = self._said(runs["q"][lane], lane, done)
+            stop = np.array(list(map(stop_of, told)), dtype=float)
+            ending = going & ((stop > 0.0) | (done == steps))
+            if not ending.any():
+                continue
+            stop = stop[of_lane]
+            end = [x.T[None] for x in (point.q, point.nu, stages.u)]
+            # Of what diverged the end is no number.
+            away = (stop == _DIVERGED)[:count]
+            for some, each in ((away, tally), (~away, tally.copy().add(done, *end))):
+                if (some & ending).any():
+                    for name, values in each.outcome(done, stop)._asdict().items():
+                        out[name][some & ending] = values[:count][some & ending]
+            going &= ~ending
+            # What has ended would stop the others: it goes on as one of them.
+            if going.any():
+                over = ~going[of_lane]
+                for array, _ in self._fresh:
+                    array[:, over] = array[:, [going.argmax()]]
+        return told
+
+    def kept(self, t: float) -> tuple[Array, Array]:
+        """Return the momentum (6,) and the centre of mass (3,) that the first is to have."""
+        kept = self._parts[4][0]
+        start, sums = kept.start[:, 0], kept.sums[:, 0]
+        momentum, center = np.split(start[:9] + sums[:9], [6])
+        return momentum, center + t * kept.per_mass[0, 0] * start[:3]
+
+    def _said(self, q: Array, lane: int, done: int) -> str:
+        """Say why a run ends where it is, or nothing."""
+        point = self._parts[-2]
+        ending = ending_of(replace(self._plan, q=q))
+        v = self._state.spread(point.nu[:, lane])
+        return ending(done * self._plan.times.dt, point.q[:, lane].copy(), v)
+
+    def _split(self, rows: Array) -> list[Array]:
+        """Return what rows hold, each (steps, LANES, size)."""
+        by_step = rows.reshape(-1, sum(self._sizes), LANES)
+        return [
+            each.transpose(0, 2, 1)
+            for each in np.split(by_step, np.cumsum(self._sizes)[:-1], axis=1)
+        ]

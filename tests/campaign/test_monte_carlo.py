@@ -1,0 +1,547 @@
+"""Campaigns: the runs are those of `simulate`, equal for any workers, and statistics that hold."""
+
+import itertools
+import os
+import subprocess
+import sys
+import textwrap
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy import stats
+from scipy.linalg import expm
+
+import fflin
+from fflin.campaign.runs import ARRAYS, CampaignJob
+from fflin.simulation.report import courses
+from tests.support.measured import FELT, POSITIONS, designed
+from tests.support.robots import BUNDLED, LINKS, MIMIC, free_body
+from tests.support.weights import unit_weights
+
+pytestmark = pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+ENGINES = ["python", "compiled"]
+
+START = {"q_b": 0.05, "r_b.x": (-0.1, 0.2), "omega_b": 0.02}
+
+
+@pytest.fixture(autouse=True)
+def _numba(request):
+    if "engine" in request.fixturenames and request.getfixturevalue("engine") == "compiled":
+        pytest.importorskip("numba")
+
+
+def feedback(robot, frame="hybrid"):
+    lin = fflin.linearize(robot, frame=frame)
+    return fflin.StateFeedback(lin, fflin.lqr(lin).K)
+
+
+def both(robot, policy, given, runs=3, tolerance=1e-10, **options):
+    """Hold the runs of eight lanes against those in Python; return those of the lanes."""
+    pytest.importorskip("numba")
+    options = {"duration": 3.0, "dt": 0.01} | options
+    jobs = [CampaignJob(robot, policy, given, 5, name, options) for name in ("python", "compiled")]
+    rows = jobs[0].dispersions.rows(0, runs)
+    python, lanes = (job.run(rows, 0).arrays for job in jobs)
+    for name in ARRAYS:
+        size = np.maximum(1.0, np.where(np.isfinite(python[name]), np.abs(python[name]), 1.0))
+        assert np.array_equal(np.isinf(python[name]), np.isinf(lanes[name])), name
+        with np.errstate(invalid="ignore"):
+            apart = np.nan_to_num(lanes[name] - python[name], nan=0.0)
+        assert (np.abs(apart) <= tolerance * size).all(), name
+    return lanes
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_lanes_give_what_single_runs_give(robots, name):
+    robot = robots[name]
+    given = START | {"*.mass": 0.1, "*.com": 0.1, "*.inertia": (-0.2, 0.2)}
+    if robot.n:
+        given |= {"q_m.*": 0.05, "qdot_m": 0.01}
+    for frame in ("hybrid", "local"):
+        lanes = both(robot, feedback(robot, frame), given)
+        assert len({*lanes["largest"][:, 0]}) == 3
+    lin = feedback(robot).lin
+    inputs = {"*.gain": 0.1, "*.bias": 0.01, "*.sensor": 1e-3}
+    both(robot, feedback(robot), inputs | {f"{lin.input_names[0]}.fails": (0.5, 2.0)})
+
+
+def test_lanes_of_all_kinds_of_forces():
+    spring = {"stiffness": {"joint_*": 2.0}, "damping": {"joint_*": 0.5}}
+    robot = fflin.load(
+        "canadarm2",
+        gravity=(0.3, -0.2, -1.0),
+        inputs=[
+            *(fflin.JointTorque(f"joint_{k}") for k in range(1, 8)),
+            fflin.Thruster("link_3", (0.2, 0.1, 0.0), (1.0, 0.5, 0.2), "jet", max=5.0),
+            fflin.ReactionWheel((1, 2, 2), name="storing", momentum=3.0),
+        ],
+        **spring,
+    )
+    policy = fflin.StateFeedback(fflin.linearize(robot), np.zeros((9, 26)))
+    given = {"joint_*.stiffness": (-0.5, 0.5), "*.damping": 0.1, "joint_3.mass": 0.3}
+    given |= {"jet.bias": (0.1, 1.0), "wheel.bias": 0.2, "qdot_m": 0.1}
+    both(robot, policy, given)
+
+
+def test_wheels_with_inertia_and_their_limits():
+    wheels = [
+        fflin.ReactionWheel(axis, name=f"w{k}", inertia=0.02, max_speed=30.0, max=0.5)
+        for k, axis in enumerate(np.eye(3).tolist())
+    ]
+    robot = free_body((20.0, 30.0, 40.0)).replace(inputs=wheels)
+    lin = fflin.linearize(robot)
+    K = np.zeros((3, lin.A.shape[0]))
+    K[:, :3], K[:, 9:12] = -3.0 * np.eye(3), -8.0 * np.eye(3)
+    given = {"q_b": 0.1, "base.mass": 0.1, "base.com": 0.1, "base.inertia": 0.1, "w0.gain": 0.2}
+    lanes = both(robot, fflin.StateFeedback(lin, K), given, limits="urdf", duration=10.0)
+    assert lanes["largest_x"][:, 12:15].max() <= 30.0 + 1e-9
+
+
+def test_mimic_joints(tmp_path):
+    path = tmp_path / "gripper.urdf"
+    for a, b in itertools.product(("revolute", "continuous", "prismatic"), repeat=2):
+        mimic = '<mimic joint="b" multiplier="-0.7" offset="0.2"/>'
+        path.write_text(MIMIC.format(links=LINKS, a=a, b=b, parent="base", mimic=mimic))
+        robot = fflin.load(path)
+        both(robot, feedback(robot), {"q_m": 0.3, "*.mass": 0.1}, duration=1.0)
+
+
+def test_outputs_samples_delay_and_limits(robots):
+    robot, lin, compensator = designed(POSITIONS)
+    policy = fflin.OutputFeedback(lin, compensator)
+    both(robot, policy, {"q_m": 0.02, "*.sensor": 1e-3, "*.mass": 0.05})
+    limits = {"tau_b": (-0.5, 0.7), "tau_m": 2.0}
+    sampled = {"sample": 0.05, "delay": 0.02, "limits": limits}
+    both(robots["ets_vii"], feedback(robots["ets_vii"]), START, **sampled)
+
+
+def test_a_compensator_that_feels_acceleration_runs_in_python():
+    robot, lin, compensator = designed(FELT)
+    policy = fflin.OutputFeedback(lin, compensator)
+    given = {"q_m": 0.01, "base.mass": 0.1, "*.sensor": 1e-3}
+    campaign = fflin.monte_carlo(robot, policy, given, runs=2, duration=0.2)
+    assert campaign.engine == "python"
+    assert np.array_equal(campaign.replay(1).q[-1], campaign.q[1])
+
+
+def test_along_a_trajectory(robots):
+    robot = robots["ets_vii"]
+    slew = fflin.simulate(robot, feedback(robot), q0=robot.neutral(), duration=2.0, dt=0.1)
+    path = fflin.Trajectory(robot, slew.t, slew.q, slew.v, slew.u, frame="hybrid")
+    along = fflin.linearize_trajectory(robot, path)
+    schedule = fflin.tvlqr(along, *unit_weights(fflin.linearize(robot)))
+    lanes = both(robot, schedule, {"q_b": 0.05, "q_m": 0.1, "*.mass": 0.05}, duration=2.5)
+    assert (lanes["errors"][:, 0] < lanes["largest"][:, 0]).all()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_run_is_flown_again_to_the_last_bit_and_keeps_its_momentum(robots, engine):
+    robot = robots["servicer_7dof"]
+    given = START | {"*.mass": 0.1, "base.inertia": 0.1, "base.com": 0.2, "qdot_m": 0.1}
+    case = {"runs": 11, "duration": 2.0, "dt": 0.02, "engine": engine, "seed": 3}
+    campaign = fflin.monte_carlo(robot, None, given, **case)
+    for run in (0, 10):
+        motion = campaign.replay(run)
+        assert motion.engine == campaign.engine == engine
+        for name in ("q", "v", "u"):
+            assert np.array_equal(getattr(motion, name)[-1], getattr(campaign, name)[run]), name
+        assert motion.momentum_drift.max() < 1e-13 and motion.com_drift.max() < 1e-13
+    masses = campaign.values("drawn base.mass")
+    assert motion.energy[0] > 0.0 and len({*masses}) == 11
+    # The same robot and start by other ways: what `simulate` makes of them is the same run.
+    job = campaign._job
+    plant, _, q, v = job.dispersions.one(campaign.drawn[10])
+    assert plant.robot.mass != robot.mass
+    base = plant.robot.model.inertias[1]
+    assert base.mass == pytest.approx(robot.model.inertias[1].mass * (1.0 + masses[10]), rel=1e-14)
+    other = fflin.simulate(plant.robot, None, q0=q, v0=v, duration=2.0, dt=0.02)
+    assert np.abs(other.q[-1] - campaign.q[10]).max() < 1e-12
+
+
+def test_a_body_that_is_drawn_is_a_body(robots):
+    given = {"*.mass": (-0.9, 2.0), "*.com": 0.5, "*.inertia": (-0.9, 3.0)}
+    job = CampaignJob(robots["canadarm2"], None, given, 0, "python", {"duration": 1.0})
+    bodies = job.dispersions.bodies(job.dispersions.rows(0, 200).drawn)
+    assert len(bodies) == 8
+    for mass, _, inertia in bodies.values():
+        second = 0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3) - inertia
+        assert (mass > 0.0).all()
+        assert np.linalg.eigvalsh(second).min() > 0.0
+
+
+SCRIPT = """
+    import os, sys, fflin
+    def main(path, workers, after):
+        def progress(done, total):
+            if done >= after:
+                os._exit(9)
+        robot = fflin.load("planar_detumble")
+        lin = fflin.linearize(robot)
+        policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+        given = {"q_b": 0.05, "*.mass": 0.1, "q_m": (-0.2, 0.2)}
+        fflin.monte_carlo(robot, policy, given, runs=90, duration=0.4, dt=0.02, chunk=16,
+                          workers=workers, progress=progress, out=path)
+    if __name__ == "__main__":
+        main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
+"""
+
+
+def test_a_campaign_is_the_same_on_any_workers_and_after_a_kill(tmp_path):
+    pytest.importorskip("h5py")
+    script = tmp_path / "campaign.py"
+    script.write_text(textwrap.dedent(SCRIPT))
+
+    def run(name, workers, after=1000):
+        command = [sys.executable, "-W", "ignore", script, tmp_path / name, workers, after]
+        return subprocess.run(list(map(str, command)), env=os.environ, check=False).returncode
+
+    for name, workers in (("one.h5", 1), ("two.h5", 2), ("four.h5", 4)):
+        assert run(name, workers) == 0
+    assert run("killed.h5", 2, 40) == 9
+    assert not (tmp_path / "killed.h5").exists() and (tmp_path / "killed.h5.part").exists()
+    assert run("killed.h5", 1) == 0
+    one, *others = (
+        fflin.Campaign.load(tmp_path / f"{name}.h5") for name in ("one", "two", "four", "killed")
+    )
+    robot = fflin.load("planar_detumble")
+    given = {"q_b": 0.05, "*.mass": 0.1, "q_m": (-0.2, 0.2)}
+    case = {"duration": 0.4, "dt": 0.02, "threads": 2, "engine": one.engine}
+    few = fflin.monte_carlo(robot, feedback(robot), given, runs=27, chunk=8, **case)
+    for name in ("drawn", *ARRAYS):
+        for other in others:
+            assert np.array_equal(getattr(one, name), getattr(other, name)), name
+        assert np.array_equal(getattr(one, name)[:27], getattr(few, name)), name
+    assert len(one) == 90 and one.names == few.names
+
+
+def test_any_executor_does_it(robots):
+    robot, case = robots["planar_detumble"], {"runs": 20, "duration": 0.2, "chunk": 8}
+    here = fflin.monte_carlo(robot, feedback(robot), {"q_b": 0.05}, **case)
+    with ThreadPoolExecutor(2) as executor:
+        there = fflin.monte_carlo(
+            robot, feedback(robot), {"q_b": 0.05}, executor=executor, engine=here.engine, **case
+        )
+    assert all(np.array_equal(getattr(here, name), getattr(there, name)) for name in ARRAYS)
+    assert np.array_equal(there.replay(19).q[-1], here.q[19])
+
+
+def test_another_campaign_does_not_go_on_in_a_file(tmp_path, robots):
+    pytest.importorskip("h5py")
+
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    robot, case = robots["planar_detumble"], {"runs": 24, "duration": 0.1, "chunk": 8}
+    case["out"] = tmp_path / "runs.h5"
+    with pytest.raises(KeyboardInterrupt):
+        fflin.monte_carlo(robot, None, {"omega_b": 0.1}, progress=stop, **case)
+    with pytest.raises(fflin.FileError, match="left behind"):
+        fflin.monte_carlo(robot, None, {"omega_b": 0.1}, seed=1, **case)
+    campaign = fflin.monte_carlo(robot, None, {"omega_b": 0.1}, **case)
+    assert len(campaign) == 24 and np.isfinite(campaign.q).all()
+    assert np.array_equal(campaign.replay(23).q[-1], campaign.q[23])
+
+
+def test_a_dispersion_does_not_change_what_another_draws(robots):
+    robot, case = robots["planar_detumble"], {"runs": 5, "duration": 0.02}
+    one = fflin.monte_carlo(robot, None, {"omega_b.x": 0.1}, **case)
+    two = fflin.monte_carlo(robot, None, {"base.mass": 0.1, "omega_b": 0.1}, **case)
+    name = "drawn omega_b.x"
+    assert np.array_equal(one.values(name), two.values(name))
+    other = fflin.monte_carlo(robot, None, {"omega_b.x": 0.1}, seed=1, **case)
+    assert not np.isin(one.values(name), other.values(name)).any()
+
+
+def test_each_kind_of_spread_has_its_distribution(robots):
+    given = {
+        "q_b.x": 0.05,
+        "q_b.y": (-0.1, 0.2),
+        "r_b.z": [1.0, 2.0, 4.0],
+        "r_b.y": stats.gamma(3.0, scale=0.1),
+    }
+    job = CampaignJob(robots["planar_detumble"], None, given, 0, "python", {"duration": 1.0})
+    of = dict(zip(job.dispersions.names, job.dispersions.rows(0, 4000).drawn.T, strict=True))
+    for name, expected in (
+        ("q_b.x", stats.norm(0.0, 0.05)),
+        ("q_b.y", stats.uniform(-0.1, 0.3)),
+        ("r_b.y", given["r_b.y"]),
+    ):
+        assert stats.kstest(of[name], expected.cdf).pvalue > 1e-3, name
+    values, counts = np.unique(of["r_b.z"], return_counts=True)
+    assert values.tolist() == [1.0, 2.0, 4.0]
+    assert stats.chisquare(counts).pvalue > 1e-3
+    assert np.abs(np.corrcoef(list(of.values())) - np.eye(4)).max() < 0.06
+
+
+def test_a_failed_input_does_nothing_from_then_on(robots):
+    robot, lin = robots["planar_detumble"], fflin.linearize(robots["planar_detumble"])
+    u = np.zeros(lin.B.shape[1])
+    u[2] = 0.5
+    for engine in ("python", "compiled"):
+        if engine == "compiled":
+            pytest.importorskip("numba")
+        spins = []
+        for failing in (1.0, 9.0):
+            campaign = fflin.monte_carlo(
+                robot,
+                fflin.StateFeedback(replace(lin, u0=u), np.zeros(lin.B.shape[::-1])),
+                {"tau_b.z.fails": [failing]},
+                runs=1,
+                duration=2.0,
+                dt=0.01,
+                engine=engine,
+            )
+            spins.append(campaign.v[0, 5])
+        assert spins[0] == pytest.approx(0.5 * spins[1], rel=1e-2)
+        assert spins[0] != 0.0
+
+
+def linear_loop():
+    """A body that is pushed along x alone, and how it takes a start to the end after 4 s."""
+    robot = free_body((2.0, 3.0, 4.0)).replace(inputs=[fflin.BaseForce()])
+    lin = fflin.linearize(robot)
+    K = np.zeros((3, 12))
+    K[0, 3], K[0, 9] = 30.0, 60.0
+    moved = expm(4.0 * (lin.A - lin.B @ K))
+    return robot, fflin.StateFeedback(lin, K), moved[3, [3, 9]]
+
+
+def test_intervals_hold_the_known_answer_as_often_as_they_say():
+    robot, policy, row = linear_loop()
+    spread, held = {"r_b.x": 0.2, "v_b.x": 0.1}, {"mean": 0, "half": 0, "most": 0, "share": 0}
+    truth = stats.norm(0.0, float(np.hypot(*(row * [0.2, 0.1]))))
+    bound = float(truth.ppf(0.7))
+    for seed in range(200):
+        campaign = fflin.monte_carlo(
+            robot, policy, spread, runs=64, duration=4.0, dt=0.2, seed=seed, threads=1
+        )
+        found = {
+            "mean": (campaign.mean("r_b.x", confidence=0.9), 0.0),
+            "half": (campaign.quantile("r_b.x", 0.5, confidence=0.9), 0.0),
+            "most": (campaign.quantile("r_b.x", 0.9, confidence=0.9), truth.ppf(0.9)),
+            "share": (campaign.fraction(f"r_b.x < {bound:.17g} m", confidence=0.9), 0.7),
+        }
+        for name, (each, answer) in found.items():
+            held[name] += each.low <= answer <= each.high
+    # Of a binomial of 200 and 0.9, less than 165 or, of the mean, more than 194 has 1e-3.
+    assert min(held.values()) >= 165
+    assert held["mean"] <= 194
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_runs_that_diverge_are_counted_and_are_in_no_figure(robots, engine):
+    robot = robots["ets_vii"]
+    given = START | {"tau_b.x.gain": [0.0, 0.0, -6.0]}
+    case = {"runs": 12, "duration": 4.0, "dt": 0.02, "engine": engine, "seed": 1}
+    campaign = fflin.monte_carlo(robot, feedback(robot), given, **case)
+    lost = int(campaign.stopped.sum())
+    assert 0 < lost < 12
+    assert campaign.fraction("attitude < 360 deg").value == (12 - lost) / 12
+    for name in ("q", "v", "x", "u", "largest_x", "largest_u", "errors", "largest"):
+        assert np.isfinite(getattr(campaign, name)).all(), name
+    assert np.isposinf(campaign.values("worst attitude")[campaign.stopped]).all()
+    assert np.isposinf(campaign.settle[campaign.stopped]).all()
+    assert np.isfinite(campaign.mean("attitude")).all()
+    assert np.isfinite(campaign.quantile("q_b.x", 0.5).value)
+    assert np.isfinite(list(campaign.sensitivity().values())).all()
+    assert {*campaign.worst(lost)} == {*np.flatnonzero(campaign.stopped).tolist()}
+    said = str(campaign)
+    assert f"{12 - lost} came to their end" in said and "nan" not in said
+    first = campaign.worst(1)[0]
+    motion = campaign.replay(first)
+    assert motion.stopped and campaign.end[first] < 4.0
+    assert np.array_equal(motion.q[-1], campaign.q[first])
+
+
+def test_lanes_stop_as_single_runs_do(robots):
+    robot = robots["ets_vii"]
+    given = START | {"tau_b.x.gain": [0.0, -6.0]}
+    lanes = both(robot, feedback(robot), given, runs=19, tolerance=1e-5, duration=9.0)
+    assert {*lanes["stop"]} >= {0.0} and 0 < (lanes["stop"] > 0).sum() < 19
+
+
+def test_it_stops_when_the_interval_is_narrow_enough(robots, tmp_path):
+    robot, policy, _ = linear_loop()
+    spread = {"r_b.x": 0.2}
+    case = {"duration": 1.0, "dt": 0.5, "until": "position < 1 m", "width": 0.01}
+    campaign = fflin.monte_carlo(robot, policy, spread, runs=4000, **case)
+    share = campaign.fraction("position < 1 m")
+    assert len(campaign) < 4000 and campaign.asked == 4000
+    assert share.high - share.low <= 0.01
+    assert "of 4,000 asked for" in str(campaign)
+    other = fflin.monte_carlo(
+        robot, policy, spread, runs=4000, out=tmp_path / "c.h5", chunk=32, **case
+    )
+    assert np.array_equal(other.x, campaign.x)
+    assert len(fflin.Campaign.load(tmp_path / "c.h5")) == len(campaign)
+
+
+@pytest.fixture(scope="module")
+def campaign(robots):
+    robot = robots["ets_vii"]
+    return fflin.monte_carlo(robot, feedback(robot), START, runs=40, duration=6.0, dt=0.02)
+
+
+@pytest.mark.parametrize("ending", [".npz", ".h5"])
+def test_it_is_saved_and_loaded_to_the_last_bit(campaign, ending, tmp_path):
+    if ending == ".h5":
+        pytest.importorskip("h5py")
+    campaign.save(tmp_path / f"runs{ending}")
+    again = fflin.Campaign.load(tmp_path / f"runs{ending}")
+    assert (again.names, again.asked, again.judged) == (campaign.names, 40, campaign.judged)
+    for name in ("drawn", *ARRAYS):
+        assert np.array_equal(getattr(again, name), getattr(campaign, name))
+    assert str(again) == str(campaign)
+    with pytest.raises(fflin.InputError, match="from a file"):
+        again.replay(0)
+    content = bytearray((tmp_path / f"runs{ending}").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / f"runs{ending}").write_bytes(content)
+    with pytest.raises(fflin.FileError):
+        fflin.Campaign.load(tmp_path / f"runs{ending}")
+
+
+def test_figures_are_those_of_the_motions(campaign):
+    run = campaign.worst(1)[0]
+    motion = campaign.replay(run)
+    of = {name: campaign.values(name)[run] for name in ("attitude", "worst attitude", "position")}
+    assert of["attitude"] == motion.attitude_error[-1]
+    assert of["worst attitude"] == pytest.approx(motion.attitude_error.max(), rel=1e-12)
+    assert of["position"] == pytest.approx(np.abs(motion.error[-1, 3:6]).max(), rel=1e-12)
+    assert campaign.values("worst tau_b.x")[run] == np.abs(motion.u[:, 0]).max()
+    assert campaign.values("worst attitude").max() == of["worst attitude"]
+
+
+def test_the_time_to_settle_is_that_of_the_motions_table(robots):
+    robot = robots["planar_detumble"]
+    campaign = fflin.monte_carlo(
+        robot, feedback(robot), {"q_b": 0.05, "r_b": 0.1}, runs=3, duration=60.0, dt=0.05
+    )
+    for run in range(3):
+        motion = campaign.replay(run)
+        for course in courses(motion):
+            if course.title in ("attitude", "position", "joints"):
+                when = np.inf if course.late else motion.t[course.settled]
+                found = campaign.values(f"settle {course.title}")[run]
+                assert found == pytest.approx(when, rel=1e-12), course.title
+    assert np.isfinite(campaign.values("settle")).any()
+
+
+def test_a_report_is_within_80_columns(campaign):
+    assert max(map(len, str(campaign).splitlines())) <= 80
+    assert "|q_b." in str(campaign)
+    first = next(iter(campaign.sensitivity("worst position")))
+    assert first in ("r_b.x", "|r_b.x|")
+
+
+def test_conditions(campaign):
+    degrees = campaign.values("attitude")
+    assert np.array_equal(campaign.met("attitude < 1 deg"), degrees < 1.0)
+    assert np.array_equal(campaign.met("attitude<0.01 rad"), np.radians(degrees) < 0.01)
+    assert np.array_equal(campaign.met("position <= 3 mm"), campaign.values("position") <= 3e-3)
+    two = campaign.met("worst q_b.x > 0.05 and drawn r_b.x >= 0")
+    assert np.array_equal(
+        two, (campaign.values("worst q_b.x") > 0.05) & (campaign.values("drawn r_b.x") >= 0)
+    )
+    assert campaign.fraction(two).value == two.mean()
+    for text, said in (
+        ("attitude < 1 m", "in m, expected deg"),
+        ("attitude", "expected NAME < NUMBER UNIT"),
+        ("attitude < x", "expected NAME < NUMBER UNIT"),
+    ):
+        with pytest.raises(fflin.InputError, match=said):
+            campaign.fraction(text)
+    with pytest.raises(fflin.UnknownNameError, match="attitude"):
+        campaign.fraction("atitude < 1 deg")
+    with pytest.raises(fflin.InputError, match=r"expected .* \(40,\) True or False"):
+        campaign.fraction([True])
+
+
+BAD = [
+    ({"given": {}}, "dispersions is empty"),
+    ({"given": 3}, "dispersions is a int"),
+    ({"given": {"nosuch": 1.0}}, "no state to disperse named 'nosuch'.*mass"),
+    ({"given": {"nosuch.mass": 1.0}}, "mass to disperse.*base"),
+    ({"given": {"q_b": -1.0}}, "standard deviation of 0 or more"),
+    ({"given": {"q_b": (1.0, 0.0)}}, "least, largest"),
+    ({"given": {"q_b": []}}, "no values"),
+    ({"given": {"q_b": stats.gamma}}, "freeze it"),
+    ({"given": {"q_b": 0.6}}, "no attitude"),
+    ({"given": {"base.mass": 0.5}}, "'base.mass' is drawn as .* no robot is made"),
+    ({"given": {"base.inertia": (-2.0, 0.0)}}, "no robot is made"),
+    ({"given": {"*.stiffness": 0.1}}, "is 0"),
+    ({"given": {"q_b.sensor": 0.1}}, "no sensors"),
+    ({"runs": 0}, "runs is 0"),
+    ({"runs": 1.5}, "runs is 1.5"),
+    ({"runs": 10**12}, "1,000,000,000,000 runs are .* memory"),
+    ({"seed": -1}, "seed is -1"),
+    ({"width": 2.0}, "width is 2"),
+    ({"until": "nosuch < 1"}, "nosuch"),
+    ({"until": "attitude < 1 deg", "chunk": 24}, "chunk is 24"),
+    ({"duration": None}, "duration is missing"),
+    ({"durations": 1.0}, "no option of monte_carlo named 'durations'"),
+    ({"engine": "gpu"}, "engine"),
+    ({"out": "runs.csv"}, "runs.csv"),
+    ({"out": "runs.npz"}, r"\.h5"),
+    ({"workers": 2, "executor": 3}, "give either"),
+]
+
+
+@pytest.mark.parametrize("case, said", BAD, ids=[said for _, said in BAD])
+def test_bad_input_is_one_line(robots, case, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    options = {"given": {"q_b": 0.01}, "runs": 100, "duration": 0.1} | case
+    with pytest.raises(fflin.FflinError, match=said) as caught:
+        fflin.monte_carlo(robots["planar_detumble"], None, options.pop("given"), **options)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_policy_in_python_runs_in_python(robots):
+    robot = robots["planar_detumble"]
+    campaign = fflin.monte_carlo(
+        robot, lambda t, q, v: -0.5 * np.ones(6 + robot.n), {"q_b": 0.01}, runs=3, duration=0.1
+    )
+    assert campaign.engine == "python" and campaign.largest_u.max() == 0.5
+
+
+def test_what_cannot_be_sent_to_workers_is_named(robots):
+    def nothing(t, q, v):
+        return np.zeros(9)
+
+    with pytest.raises(fflin.InputError, match=r"cannot be sent to workers .*nothing"):
+        fflin.monte_carlo(
+            robots["planar_detumble"], nothing, {"q_b": 0.01}, runs=2, duration=0.1, workers=1
+        )
+
+
+def test_what_is_kept_does_not_grow_with_the_duration(robots):
+    robot = robots["planar_detumble"]
+    short, long = (
+        fflin.monte_carlo(robot, None, {"q_b": 0.01}, runs=2, duration=duration, dt=0.01)
+        for duration in (0.1, 3.0)
+    )
+    for name in ("drawn", *ARRAYS):
+        assert getattr(short, name).shape == getattr(long, name).shape
+
+
+def test_the_world_may_be_far_away():
+    pytest.importorskip("numba")
+    robot = fflin.load("planar_detumble")
+    reference = pin.SE3(np.eye(3), np.array([7e6, 0.0, 0.0]))
+    q = np.array([7e6, *robot.neutral()[1:]])
+    lin = fflin.linearize(robot, q, reference=reference)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    both(robot, policy, {"q_b": 0.01, "r_b": 0.01}, tolerance=1e-7, duration=1.0)
+
+
+def test_warnings_are_given_once(robots):
+    robot = robots["ets_vii"]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fflin.monte_carlo(robot, feedback(robot), START, runs=20, duration=0.1, limits=1e-9)
+    assert len([str(each.message) for each in caught]) <= 1
