@@ -145,6 +145,10 @@ def _to_npz(record: Mapping[str, Any], sealed: bool) -> bytes:
 def _from_npz(content: bytes) -> tuple[Record, bool]:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         record = {key: file[key] for key in file.files}
+    # The archive ends with how many entries it has; a length that is damaged hides some of them.
+    end = content[-22:]
+    if end[:4] == b"PK\5\6" and int.from_bytes(end[10:12], "little") != len(record):
+        raise ValueError(DAMAGED)
     return record, check_seal(record)
 
 

@@ -99,6 +99,11 @@ class Channel:
         """Whether the law is asked at every stage."""
         return not self._sample
 
+    @property
+    def cuts(self) -> bool:
+        """Whether what acts may be another than what is asked for."""
+        return bool(self._limited or self._wheels or self._pulses)
+
     def begin(self, step: int, *point: Any) -> Array:
         """Return what acts as a step begins."""
         if not self._sample:

@@ -167,9 +167,9 @@ class Passed:
         self._P, self.K, self._dt, self._sign = P, K, dt, sign
         if dt:
             # A little early, since clocks are rounded.
-            self._starts = [self.first, *(t[1:] - 1e-9 * dt).tolist()]
+            self.starts = [self.first, *(t[1:] - 1e-9 * dt).tolist()]
             return
-        self._starts = t[:-1].tolist()
+        self.starts = t[:-1].tolist()
         across = (0, 2, 1)
         drift, spent = P @ A, K.transpose(across) @ R @ K
         rate = sign * (drift + drift.transpose(across) + Q - spent)
@@ -178,29 +178,29 @@ class Passed:
         pieces = np.zeros((7, *of_B[0].transpose(across).shape))
         for power, reach in enumerate(np.linalg.solve(R, of_B.transpose(0, 1, 3, 2))):
             pieces[power : power + 4] += reach @ powers
-        self._pieces = pieces.transpose(1, 0, 2, 3).reshape(len(t) - 1, 7, -1)
+        self.pieces = pieces.transpose(1, 0, 2, 3).reshape(len(t) - 1, 7, -1)
 
     def gain(self, t: float) -> Array:
         """Return R^-1 B' P (nu, nx), of B and P at a time within the knots."""
-        k = bisect_right(self._starts, t) - 1
+        k = bisect_right(self.starts, t) - 1
         if self._dt:
             return self.K[k]
-        x = t - self._starts[k]
+        x = t - self.starts[k]
         square = x * x
         fourth = square * square
         powers = np.array((1.0, x, square, square * x, fourth, fourth * x, fourth * square))
-        K: Array = powers.dot(self._pieces[k]).reshape(self.K.shape[1:])
+        K: Array = powers.dot(self.pieces[k]).reshape(self.K.shape[1:])
         return K
 
     def cost(self, t: float) -> Array:
         """Return P (nx, nx) at a time within the knots."""
-        k = bisect_right(self._starts, t) - 1
+        k = bisect_right(self.starts, t) - 1
         P: Array = self._P[k] if self._dt else self._cubics(t)
         return P
 
     def residual(self, at: Callable[[float], Coefficients]) -> float:
         """Return the largest relative residual of the differential equation midway."""
-        worst, ends = 0.0, [*self._starts, self.last]
+        worst, ends = 0.0, [*self.starts, self.last]
         for t in (0.5 * (a + b) for a, b in pairwise(ends)):
             P, (A, S, Q) = self._cubics(t), at(t)
             drift = P @ A

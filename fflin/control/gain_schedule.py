@@ -32,7 +32,7 @@ class Schedule(Design):
 
     def __repr__(self) -> str:
         of: Any = self
-        time, wide = f"dt={of.dt:g} s, " if of.dt else "", self._passed.K.shape[1]
+        time, wide = f"dt={of.dt:g} s, " if of.dt else "", self.passed.K.shape[1]
         return (
             f"{type(self).__name__}('{of.robot}', {len(self.t)} knots, {self.t[0]:g} to "
             f"{self.t[-1]:g} s, {time}nx={of.P.shape[1]}, {self.WIDTH}={wide}, "
@@ -48,19 +48,20 @@ class Schedule(Design):
 
         Between the knots that of the model and P there; of samples that of the last one.
         """
-        passed = self._passed
+        passed = self.passed
         if type(t) is not float or not passed.first <= t <= passed.last:
             t = self._within(t)
         return passed.gain(t)
 
     def _within(self, t: float) -> float:
-        t, passed = number("t", t), self._passed
+        t, passed = number("t", t), self.passed
         if not passed.first <= t <= passed.last:
             raise InputError(f"t is {t:g} s, expected {passed.first:g} to {passed.last:g} s")
         return t
 
     @cached_property
-    def _passed(self) -> Passed:
+    def passed(self) -> Passed:
+        """Gain and cost over time."""
         raise NotImplementedError
 
 
@@ -142,9 +143,10 @@ class GainSchedule(Schedule):
 
     def cost_to_go(self, t: float) -> Array:
         """Return P (nx, nx) at a time: a cubic between the knots, or that of the last sample."""
-        return self._passed.cost(self._within(t))
+        return self.passed.cost(self._within(t))
 
     @cached_property
-    def _passed(self) -> Passed:
+    def passed(self) -> Passed:
+        """Gain and cost over time."""
         model = (self.A, self.B, self.Q, self.R)
         return Passed(self.t, self.P, self.K, model, self.dt, -1.0)

@@ -28,6 +28,15 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
 
+def measured_states(state: StateMap) -> list[int] | None:
+    """Return which states the outputs of a robot are, or None where one is no state."""
+    if state.robot.outputs == (FullState(),):
+        return list(range(state.nx))
+    sensing = Sensing(state, state.robot.outputs)
+    whole = len(sensing.states) == len(sensing.names)
+    return [index for _, index in sorted(sensing.states)] if whole else None
+
+
 @dataclass(frozen=True, eq=False)
 class OutputFeedback:
     """The feedback of a sampled compensator, such as `lqg` makes, on the robot's outputs.

@@ -73,6 +73,16 @@ class StateFeedback:
         K.setflags(write=False)
         object.__setattr__(self, "K", K)
 
+    def terms(self, state: StateMap) -> tuple[Array, Array, Array]:
+        """Return K and offset of u = offset - K x of a robot's whole state, and x0 in it."""
+        lin = self.lin
+        fed = np.array([state.names.index(name) for name in lin.state_names])
+        near = np.zeros(state.nx)
+        near[fed] = lin.x0
+        K = np.zeros((len(self.K), state.nx))
+        K[:, fed] = self.K
+        return K, lin.u0 + self.K @ lin.x0, near
+
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
 
@@ -84,12 +94,7 @@ class StateFeedback:
         lin = self.lin
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
         require_fit(lin, robot, state)
-        fed = np.array([state.names.index(name) for name in lin.state_names])
-        near = np.zeros(state.nx)
-        near[fed] = lin.x0
-        K = np.zeros((len(self.K), state.nx))
-        K[:, fed] = self.K
-        command = readout(state, K, lin.u0 + self.K @ lin.x0, near)
+        command = readout(state, *self.terms(state))
 
         def policy(_: float, q: Array, v: Array) -> Array:
             return command(q, v)

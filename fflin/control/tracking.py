@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
 # A clock of many steps is rounded.
-_AT_THE_END = 1.0 + 1e-9
+AT_THE_END = 1.0 + 1e-9
 
 # Returns q, v and u in the policy's axes at a time of the run.
 Reference: TypeAlias = Callable[[float], tuple[Array, Array, Array]]
@@ -86,7 +86,7 @@ class TrajectoryFeedback:
 
     def reference(self, t: float) -> tuple[Array, Array, Array]:
         """Return q, v, and u in base axes that are followed at a time of the run."""
-        if t > self.duration * _AT_THE_END:
+        if t > self.duration * AT_THE_END:
             return self.end.q, self.end.v, self.end.u0
         return self.trajectory.flow.at(float(self.trajectory.t[0]) + max(t, 0.0))
 
@@ -99,7 +99,7 @@ class TrajectoryFeedback:
     def gain(self, t: float) -> Array:
         """Return K (nu, nx) at a time of the run."""
         knots = self.schedule.t
-        if t > self.duration * _AT_THE_END:
+        if t > self.duration * AT_THE_END:
             return self.end_gain
         return self.schedule.gain(float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0])))
 

@@ -91,10 +91,11 @@ class FilterSchedule(Schedule):
 
     def covariance(self, t: float) -> Array:
         """Return P (nx, nx) at a time: a cubic between the knots, or that of the last sample."""
-        return self._passed.cost(self._within(t))
+        return self.passed.cost(self._within(t))
 
     @cached_property
-    def _passed(self) -> Passed:
+    def passed(self) -> Passed:
+        """Gain and cost over time."""
         A, C, L = (each.transpose(0, 2, 1) for each in (self.A, self.C, self.L))
         return Passed(self.t, self.P, L, (A, C, self.W, self.V), self.dt, 1.0)
 
@@ -190,7 +191,7 @@ def tvkalman(
     L = np.linalg.solve(V, fields["C"] @ P).transpose(0, 2, 1)
     fields |= {"t": t, "L": L, "P": P, "W": np.array([at(float(x)).Q for x in t])}
     made = FilterSchedule(residual=np.inf, **fields)
-    return replace(made, residual=made._passed.residual(at))
+    return replace(made, residual=made.passed.residual(at))
 
 
 def _steady(traj: LinearTrajectory, W: Array, V: Array, dt: float) -> Array:

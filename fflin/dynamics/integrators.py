@@ -23,19 +23,43 @@ _integrate = pin.integrate
 class Integrator:
     """Steps of one size of one model."""
 
-    # Of the stages, in what is summed along: v of the end is v + h sum(weights a),
+    # Of the stages: their times in a step of length 1,
+    nodes: ClassVar[tuple[float, ...]]
+    # shares in what is summed along: v of the end is v + h sum(weights a),
     weights: ClassVar[tuple[float, ...]]
     # and in the sum of a sum: a free place of the end is r + h v + h^2 sum(moments a).
     moments: ClassVar[tuple[float, ...]]
     # Largest pole times step with which it is stable on the negative real axis.
     reach: ClassVar[float]
+    # After each stage: 0 where the way to the next begins at the step's first place, 1 where at the
+    # second stage's. Empty where a step is no such combination.
+    origins: ClassVar[tuple[int, ...]] = ()
 
     def __init__(self, model: pin.Model, dt: float) -> None:
         self.model, self.dt = model, dt
+        if self.origins:
+            self._way, self._speed = self.shares(dt)
+            self._stages = np.zeros((1 + len(self.nodes), model.nv))  # v, l1, l2, ...
+
+    @classmethod
+    def shares(cls, dt: float) -> tuple[Array, Array]:
+        """Return those of v and its rates l in what moves q after each stage, and in the new v.
+
+        Row by row; the last of what moves q is that of a second displacement at the end.
+        """
+        raise NotImplementedError
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and v one step later."""
-        raise NotImplementedError
+        model, stages, begins = self.model, self._stages, list[Array]()
+        stages[0] = v
+        for k, node in enumerate(self.nodes, start=1):
+            stages[k] = f(t + node * self.dt, q, v)
+            done = stages[: k + 1]
+            begins.append(q)
+            q = _integrate(model, begins[self.origins[k - 1]], self._way[k - 1, : k + 1].dot(done))
+            v = self._speed[k - 1, : k + 1].dot(done)
+        return _integrate(model, q, self._way[-1].dot(stages)), v
 
 
 class CommutatorFree4(Integrator):
@@ -45,54 +69,39 @@ class CommutatorFree4(Integrator):
 
     .. math:: k_2 = v + \tfrac h2 l_1,\quad k_3 = v + \tfrac h2 l_2,\quad k_4 = v + h l_3
 
-    and what moves q is :math:`\tfrac h2 v` and sums of :math:`l_i`. Each combination is a row of
-    a small matrix, so that a stage is one product with all stages so far. What f gets as v lies
-    in the work space, and the next step overwrites it.
+    and what moves q is :math:`\tfrac h2 v` and sums of :math:`l_i`.
     """
 
+    nodes = (0.0, 0.5, 0.5, 1.0)
     weights = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
     moments = (1.0 / 6.0, 1.0 / 6.0, 1.0 / 6.0, 0.0)
     reach = 2.78
+    origins = (0, 0, 1, 0)
 
-    def __init__(self, model: pin.Model, dt: float) -> None:
-        super().__init__(model, dt)
+    @classmethod
+    def shares(cls, dt: float) -> tuple[Array, Array]:
+        """Return those of v, l1, ..., l4."""
         h, half, twelfth = dt, 0.5 * dt, dt * dt / 12.0
-        self._stages = np.zeros((5, model.nv))  # v, l1, ..., l4
-        self._two, self._three, self._four = (self._stages[:k] for k in (2, 3, 4))
-        self._after_1 = np.array([[half, 0.0], [1.0, half], [half, half * half]])
-        self._after_2 = np.array([[1.0, 0.0, half], [half, 0.0, h * half]])
-        self._after_3 = np.array(
-            [
-                [1.0, 0.0, 0.0, h],
-                [half, twelfth, twelfth, -twelfth],
-                [half, twelfth, twelfth, 3.0 * twelfth],
-            ]
-        )
-        self._after_4 = np.array([1.0, *(h * weight for weight in self.weights)])
-        self._new_1, self._new_3 = np.empty((3, model.nv)), np.empty((3, model.nv))
-        self._new_2 = np.empty((2, model.nv))
-        self._rows = (*self._stages, *self._new_1, *self._new_2, *self._new_3)
-
-    def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return q and v one step later."""
-        model, middle = self.model, t + 0.5 * self.dt
-        at, l1, l2, l3, l4, to_2, v2, to_3, v3, to_4, v4, first, second = self._rows
-        at[:] = v
-        l1[:] = f(t, q, at)
-        self._after_1.dot(self._two, self._new_1)
-        q2 = _integrate(model, q, to_2)
-        l2[:] = f(middle, q2, v2)
-        self._after_2.dot(self._three, self._new_2)
-        l3[:] = f(middle, _integrate(model, q, to_3), v3)
-        self._after_3.dot(self._four, self._new_3)
-        l4[:] = f(t + self.dt, _integrate(model, q2, to_4), v4)
-        end = _integrate(model, _integrate(model, q, first), second)
-        return end, self._after_4.dot(self._stages)
+        way = [
+            [half, 0.0, 0.0, 0.0, 0.0],
+            [half, half * half, 0.0, 0.0, 0.0],
+            [half, 0.0, h * half, 0.0, 0.0],
+            [half, twelfth, twelfth, -twelfth, 0.0],
+            [half, twelfth, twelfth, 3.0 * twelfth, 0.0],
+        ]
+        speed = [
+            [1.0, half, 0.0, 0.0, 0.0],
+            [1.0, 0.0, half, 0.0, 0.0],
+            [1.0, 0.0, 0.0, h, 0.0],
+            [1.0, *(h * weight for weight in cls.weights)],
+        ]
+        return np.array(way), np.array(speed)
 
 
 class RungeKuttaMuntheKaas4(Integrator):
     """Order 4 in the tangent at q, with the inverse of dexp at each stage."""
 
+    nodes = CommutatorFree4.nodes
     weights, moments = CommutatorFree4.weights, CommutatorFree4.moments
     reach = 2.78
 
@@ -122,13 +131,14 @@ class RungeKuttaMuntheKaas4(Integrator):
 class SemiImplicitEuler(Integrator):
     """Order 1: the new velocity moves the configuration."""
 
-    weights = moments = (1.0,)
+    nodes, weights, moments = (0.0,), (1.0,), (1.0,)
     reach = 2.0
+    origins = (0,)
 
-    def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return q and v one step later."""
-        v = v + self.dt * f(t, q, v)
-        return _integrate(self.model, q, self.dt * v), v
+    @classmethod
+    def shares(cls, dt: float) -> tuple[Array, Array]:
+        """Return those of v and its rate."""
+        return np.array([[dt, dt * dt], [0.0, 0.0]]), np.array([[1.0, dt]])
 
 
 INTEGRATORS: dict[str, type[Integrator]] = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import namedtuple
 
 import numpy as np
 
@@ -15,42 +15,25 @@ from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
 
-class Layout(NamedTuple):
+class Layout(namedtuple("Layout", "motion load bias c columns lower held size")):
     """Where the parts of the kernel's work space begin, beyond those of the tree; its size."""
 
-    motion: int
-    load: int
-    bias: int
-    c: int
-    columns: int
-    lower: int
-    held: int
-    size: int
 
-
-class Loads(NamedTuple):
+class Loads(namedtuple("Loads", "body wrench input stored_body stored stiffness damping")):
     """What acts on the bodies and joints of a robot.
 
     Attributes
     ----------
-    body, wrench, input : ndarray (k,), (k, 6), (k,)
+    body, wrench, input : ndarray (k,), (6 k,), (k,)
         Of every input that is carried: its body, the moment and force of a unit about the joint's
         origin, in the body's axes, and its number.
-    stored_body, stored : ndarray (s,), (s, 3)
+    stored_body, stored : ndarray (s,), (3 s,)
         Angular momentum that bodies store, in their axes.
     stiffness, damping : ndarray (n,)
     """
 
-    body: Any
-    wrench: Any
-    input: Any
-    stored_body: Any
-    stored: Any
-    stiffness: Any
-    damping: Any
 
-
-class BatchRates(NamedTuple):
+class BatchRates(namedtuple("BatchRates", "inverse c columns couplings")):
     """What the kernel finds about N points, all in base axes.
 
     Attributes
@@ -64,11 +47,6 @@ class BatchRates(NamedTuple):
     couplings : ndarray (N,)
         Sums of M_ii (M^-1)_ii, which tell how singular M is.
     """
-
-    inverse: Array
-    c: Array
-    columns: Array
-    couplings: Array
 
 
 class BatchAccelerations:
@@ -88,9 +66,9 @@ class BatchAccelerations:
     """
 
     def __init__(self, state: StateMap, actuation: Actuation, tree: Tree) -> None:
-        self._tree, self._loads = tree, _loads(state.robot, actuation, tree)
+        self._tree, self._loads = tree, loads_of(state.robot, actuation, tree)
         self.carried = self._loads.input
-        self._layout = _layout(tree, len(self.carried))
+        self._layout = layout_of(tree, len(self.carried))
 
     def rates(self, q: Array, nu: Array, forces: Array, u: Array, A: Array) -> BatchRates:
         """Return the rates and write their slopes; N is the number of lanes at least.
@@ -110,10 +88,11 @@ class BatchAccelerations:
         """
         (count, nv), carried = nu.shape, len(self.carried)
         inverse, c, couplings = np.empty((count, nv * nv)), np.empty((count, nv)), np.empty(count)
-        columns = np.empty((count, nv * carried))
+        columns, points = np.empty((count, nv * carried)), (q, nu, forces, u)
         kernel("linearise", "linearise")(
-            *(self._tree, self._layout, self._loads, (q, nu, forces, u)),
+            *(self._tree, self._layout, self._loads, points),
             (inverse, c, A.reshape(count, -1), columns, couplings),
+            tuple(_work_space(each.shape[1]) for each in points),
             _work_space(self._layout.size),
         )
         inverse, columns = inverse.reshape(count, nv, nv), columns.reshape(count, nv, carried)
@@ -130,17 +109,20 @@ def inverse_inertias(tree: Tree, q: Array, out: Array) -> Array:
     """
     couplings = np.empty(len(q))
     flat = out.reshape(len(q), -1)
-    kernel("factor", "invert")(tree, q, flat, couplings, _work_space(tree.size))
+    spaces = _work_space(q.shape[1]), _work_space(tree.size)
+    kernel("factor", "invert")(tree, q, flat, couplings, *spaces)
     return couplings
 
 
 def _work_space(size: int) -> Array:
-    space = np.empty(size + LANES)
+    space = np.empty((size + 1) * LANES)
     # The kernel's vectors are 64 bytes; where they begin at such an address it is faster.
-    return space[-(space.ctypes.data // 8) % LANES :]
+    first = -(space.ctypes.data // 8) % LANES
+    return space[first : first + size * LANES].reshape(size, LANES)
 
 
-def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
+def loads_of(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
+    """Return what acts on a robot."""
     body: list[int] = []
     inputs: list[int] = []
     wrenches: list[Array] = []
@@ -155,16 +137,17 @@ def _loads(robot: Robot, actuation: Actuation, tree: Tree) -> Loads:
     stored = [(joint - ROOT, momentum) for joint, momentum in robot.stored_momentum]
     return Loads(
         np.array(body, dtype=np.intp),
-        np.array(wrenches).reshape(-1, 6),
+        np.array(wrenches).ravel(),
         np.array(inputs, dtype=np.intp),
         np.array([index for index, _ in stored], dtype=np.intp),
-        np.array([tree.axes[index].T @ h for index, h in stored]).reshape(-1, 3),
+        np.array([tree.axes[index].T @ h for index, h in stored]).ravel(),
         np.array(robot.springs.stiffness),
         np.array(robot.springs.damping),
     )
 
 
-def _layout(tree: Tree, carried: int) -> Layout:
+def layout_of(tree: Tree, carried: int) -> Layout:
+    """Return the work space for a tree with so many inputs that are carried."""
     from fflin.kernel.rnea import LOAD, MOTION
 
     size, bodies = len(tree.row), len(tree.parent)
@@ -172,4 +155,4 @@ def _layout(tree: Tree, carried: int) -> Layout:
         *(bodies * MOTION, bodies * LOAD, size, size, size * carried),
         *(size * 2 * size, size * 6),
     )
-    return Layout(*(tree.size + int(x) * LANES for x in np.cumsum([0, *sizes])))
+    return Layout(*(tree.size + int(x) for x in np.cumsum([0, *sizes])))

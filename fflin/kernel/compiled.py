@@ -17,6 +17,8 @@ from typing import Any
 # not. To load it takes half a second, which a sweep of that size does not win back but the next
 # ones do: sweeps are seldom alone.
 _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
+# Fewest steps of the loop for which its kernel is: loaded and kept on disk, kept, and neither.
+_BREAK_EVEN_LOOP, _BREAK_EVEN_LOOP_UNLOADED, _BREAK_EVEN_COMPILING = 100, 4000, 20_000
 
 # Files in which Linux tells a container's quota of computing time and its period [us], of version 2
 # and of version 1 of its control groups.
@@ -51,25 +53,48 @@ def pays(count: int) -> bool:
     return count >= _BREAK_EVEN_UNLOADED and find_spec("numba") is not None
 
 
-def kernel(module: str, name: str) -> Any:
+def numba_is_there() -> bool:
+    """Whether the kernel can be compiled."""
+    return "numba" in sys.modules or find_spec("numba") is not None
+
+
+def loop_pays(steps: int) -> bool:
+    """Whether the compiled loop is there and beats the one in Python over so many steps."""
+    if steps < _BREAK_EVEN_LOOP or not numba_is_there():
+        return False
+    chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
+    folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
+    if not any(_kept(folder, "loop", "advance") for folder in folders):
+        return steps >= _BREAK_EVEN_COMPILING
+    return steps >= _BREAK_EVEN_LOOP_UNLOADED or "numba" in sys.modules
+
+
+def kernel(module: str, name: str, what: str = "the batch kernel") -> Any:
     """Return a function of the kernel, compiled at the first call ever and kept on disk."""
     with _TURN:  # threads come here together
-        return _prepared(module, name)
+        return _prepared(module, name, what)
 
 
 @cache
-def _prepared(module: str, name: str) -> Any:
+def _prepared(module: str, name: str, what: str) -> Any:
     compiled = getattr(import_module(f"fflin.kernel.{module}"), name)
     folder = Path(compiled.stats.cache_path)
-    kept = list(folder.glob(f"{module}.{name}-*.nbi"))
-    # numba compares with the function's own file, not with those of the functions that it calls.
-    source = max(file.stat().st_mtime for file in _sources())
-    for entry in [entry for entry in kept if entry.stat().st_mtime < source]:
+    kept = _kept(folder, module, name)
+    for entry in set(folder.glob(f"{module}.{name}-*.nbi")) - set(kept):
         entry.unlink(missing_ok=True)
-        kept.remove(entry)
     if not kept:
-        _log.warning("fflin: compiling the batch kernel, once; it is kept in %s", folder)
+        _log.warning("fflin: compiling %s, once; it is kept in %s", what, folder)
     return compiled
+
+
+def _kept(folder: Path, module: str, name: str) -> list[Path]:
+    """Return what is kept of a function and not older than any source.
+
+    numba compares with the function's own file, not with those of the functions that it calls.
+    """
+    source = max(file.stat().st_mtime for file in _sources())
+    entries = folder.glob(f"{module}.{name}-*.nbi")
+    return [entry for entry in entries if entry.stat().st_mtime >= source]
 
 
 def _sources() -> list[Path]:

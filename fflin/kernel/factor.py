@@ -1,4 +1,4 @@
-"""M^-1 of many configurations at once: CRBA and a sparse factorisation, eight to an instruction.
+"""A sparse factorisation of M, and M^-1 of many configurations, eight to an instruction.
 
 References
 ----------
@@ -7,87 +7,123 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, section 6.5.
 
 from __future__ import annotations
 
-import numba
-
 from fflin.kernel.crba import inwards, outwards
-from fflin.kernel.lanes import load, scatter, splat, store, transpose
+from fflin.kernel.lanes import compiled, inlined, load, splat, store, transpose
 from fflin.kernel.tree import LANES
 
 
-@numba.njit(forceinline=True)
+@inlined
 def factorise(work, tree):
-    """Turn the packed M into U = L^-1 and V = L^-1 D^-1 with M = L^T D L, L of unit diagonal.
+    """Turn the packed M into L, of unit diagonal, and 1 / D where `scaled` is, M = L^T D L.
 
     The sparse factorisation of Featherstone, from the tips to the base, which makes no entry that
     was zero.
     """
-    packed, scaled, diagonal = tree.packed, tree.scaled, tree.diagonal
-    one = splat(1.0)
-    size = len(tree.row)
-    for k in range(size):
-        store(
-            work, diagonal + k * LANES, load(work, packed + (tree.row[k] + tree.depth[k]) * LANES)
-        )
-    for k in range(size - 1, -1, -1):
-        row, depth = packed + tree.row[k] * LANES, tree.depth[k]
-        inverse = one / load(work, row + depth * LANES)
-        store(work, scaled + (tree.row[k] + depth) * LANES, inverse)
-        store(work, row + depth * LANES, one)
+    packed, scaled = tree.packed, tree.scaled
+    for k in range(len(tree.row) - 1, -1, -1):
+        row, depth = packed + tree.row[k], tree.depth[k]
+        inverse = 1.0 / load(work, row + depth)
+        store(work, scaled + (tree.row[k] + depth), inverse)
+        store(work, row + depth, 1.0)
         for t in range(depth - 1, -1, -1):
-            share = load(work, row + t * LANES) * inverse
-            other = packed + tree.row[tree.path[tree.row[k] + t]] * LANES
+            share = load(work, row + t) * inverse
+            other = packed + tree.row[tree.path[tree.row[k] + t]]
             for s in range(t + 1):
-                at = other + s * LANES
-                store(work, at, load(work, at) - share * load(work, row + s * LANES))
-            store(work, row + t * LANES, share)
-    zero = splat(0.0)
+                at = other + s
+                store(work, at, load(work, at) - share * load(work, row + s))
+            store(work, row + t, share)
+
+
+@inlined
+def solve(work, tree, x):
+    """Turn a force at x into the acceleration M^-1 f, by the factor."""
+    packed, size = tree.packed, len(tree.row)
+    for k in range(size - 1, -1, -1):
+        value, row = load(work, x + k), tree.row[k]
+        for t in range(tree.depth[k]):
+            at = x + tree.path[row + t]
+            store(work, at, load(work, at) - load(work, packed + row + t) * value)
+        pivot = load(work, tree.scaled + row + tree.depth[k])
+        store(work, x + k, value * pivot)
     for k in range(size):
-        row, depth = packed + tree.row[k] * LANES, tree.depth[k]
+        value, row = load(work, x + k), tree.row[k]
+        for t in range(tree.depth[k]):
+            value = value - load(work, packed + row + t) * load(work, x + tree.path[row + t])
+        store(work, x + k, value)
+
+
+@inlined
+def keep_diagonal(work, tree):
+    """Write the diagonal of the packed M aside, which its factor overwrites."""
+    for k in range(len(tree.row)):
+        value = load(work, tree.packed + tree.row[k] + tree.depth[k])
+        store(work, tree.diagonal + k, value)
+
+
+@inlined
+def invert_factor(work, tree):
+    """Turn L into U = L^-1, and write V = L^-1 D^-1."""
+    packed, scaled = tree.packed, tree.scaled
+    zero = splat(work, 0.0)
+    for k in range(len(tree.row)):
+        row, depth = packed + tree.row[k], tree.depth[k]
         for t in range(depth):
-            total = zero - load(work, row + t * LANES)
+            total = zero - load(work, row + t)
             for s in range(t + 1, depth):
-                other = packed + tree.row[tree.path[tree.row[k] + s]] * LANES
-                total = total - load(work, row + s * LANES) * load(work, other + t * LANES)
-            store(work, row + t * LANES, total)
+                other = packed + tree.row[tree.path[tree.row[k] + s]]
+                total = total - load(work, row + s) * load(work, other + t)
+            store(work, row + t, total)
             above = tree.path[tree.row[k] + t]
-            pivot = load(work, scaled + (tree.row[above] + tree.depth[above]) * LANES)
-            store(work, scaled + (tree.row[k] + t) * LANES, total * pivot)
+            pivot = load(work, scaled + (tree.row[above] + tree.depth[above]))
+            store(work, scaled + (tree.row[k] + t), total * pivot)
 
 
-@numba.njit(forceinline=True)
+@inlined
 def multiply(work, tree, couplings, first):
     """Write M^-1 = U D^-1 U^T lane beside lane, and sum M_ii (M^-1)_ii."""
     packed, scaled, square = tree.packed, tree.scaled, tree.square
     size = len(tree.row)
-    coupling = splat(0.0)
+    coupling = splat(work, 0.0)
     for i in range(size):
-        left = packed + tree.row[i] * LANES
+        left = packed + tree.row[i]
         for j in range(i + 1):
-            right = scaled + tree.row[j] * LANES
+            right = scaled + tree.row[j]
             total = load(work, left) * load(work, right)
-            for t in range(LANES, tree.common[i, j] * LANES, LANES):
+            for t in range(1, tree.common[i, j]):
                 total = total + load(work, left + t) * load(work, right + t)
-            store(work, square + (i * size + j) * LANES, total)
-            store(work, square + (j * size + i) * LANES, total)
+            store(work, square + (i * size + j), total)
+            store(work, square + (j * size + i), total)
             if i == j:
-                coupling = coupling + total * load(work, tree.diagonal + i * LANES)
-    store(couplings, first, coupling)
+                coupling = coupling + total * load(work, tree.diagonal + i)
+    # The diagonal is not needed any more.
+    store(work, tree.diagonal, coupling)
+    for lane in range(LANES):
+        couplings[first + lane] = work[tree.diagonal, lane]
 
 
-@numba.njit(forceinline=True)
+@inlined
+def pack(rows, first, lanes):
+    """Write the rows of eight points lane beside lane."""
+    for entry in range(len(lanes)):
+        for lane in range(LANES):
+            lanes[entry, lane] = rows[first + lane, entry]
+
+
+@inlined
 def unpack(work, start, entries, out, first, offset):
     """Write entries that stand lane beside lane to the rows of eight points, from a column on."""
-    flat, stride = out.reshape(-1), out.shape[1]
+    stride = out.shape[1]
     whole = entries - entries % LANES
     to = first * stride + offset
     for entry in range(0, whole, LANES):
-        transpose(work, start + entry * LANES, flat, to + entry, stride)
+        transpose(work, start + entry, out, to + entry, stride)
     for entry in range(whole, entries):
-        scatter(flat, to + entry, stride, load(work, start + entry * LANES))
+        for lane in range(LANES):
+            out[first + lane, offset + entry] = work[start + entry, lane]
 
 
-@numba.njit(nogil=True, cache=True, boundscheck=False)
-def invert(tree, q, out, couplings, work):
+@compiled
+def invert(tree, q, out, couplings, lanes, work):
     """Write M^-1 of each configuration.
 
     Parameters
@@ -99,17 +135,18 @@ def invert(tree, q, out, couplings, work):
         Results.
     couplings : ndarray (count,)
         The sums of M_ii (M^-1)_ii, which tell how singular M is.
-    work : ndarray
+    lanes, work : ndarray (nq, 8), (size, 8)
         Work space.
     """
     count, entries = out.shape
-    stride = q.shape[1]
-    configurations = q.reshape(-1)
     for block in range(0, count, LANES):
         # The last block begins early enough to fill the lanes; some points are done twice.
         first = min(block, count - LANES)
-        outwards(work, tree, configurations, first * stride, stride)
+        pack(q, first, lanes)
+        outwards(work, tree, lanes)
         inwards(work, tree)
+        keep_diagonal(work, tree)
         factorise(work, tree)
+        invert_factor(work, tree)
         multiply(work, tree, couplings, first)
         unpack(work, tree.square, entries, out, first, 0)

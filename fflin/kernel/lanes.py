@@ -1,8 +1,13 @@
-"""Eight doubles side by side in numba code: one configuration a lane, one instruction for all.
+"""One number or eight side by side in numba code, by the same lines.
+
+An array of one axis holds numbers, and one of two axes, the second of eight, holds lanes: one
+configuration each, and one instruction for all. `load` gives what an array holds, a double or a
+`Lanes`, and arithmetic takes both; a double counts for every lane. So a function that reads as for
+one number is compiled for either, and each array that it reads may say a thing for all lanes or
+lane by lane.
 
 LLVM does not vectorise loops over several arrays that may overlap. A type of its own leaves it no
-choice, and the code reads as for one number. Where a machine has narrower registers, LLVM splits
-the eight over several.
+choice. Where a machine has narrower registers, LLVM splits the eight over several.
 """
 
 from __future__ import annotations
@@ -28,6 +33,13 @@ _DOUBLE, _INT32 = ir.DoubleType(), ir.IntType(32)
 _VECTOR = ir.VectorType(_DOUBLE, LANES)
 _BYTES = 8  # alignment of a double
 
+# A product and a sum may become one fused instruction, which rounds once; a quotient by zero is
+# infinite; and no references to arrays are counted, which takes three quarters of the time else,
+# and makes no function able to allocate.
+_OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
+inlined = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
+compiled = numba.njit(nogil=True, cache=True, boundscheck=False, **_OPTIONS)
+
 
 class Lanes(numba.types.Type):
     """The type of eight doubles side by side."""
@@ -37,6 +49,8 @@ class Lanes(numba.types.Type):
 
 
 lanes = Lanes()
+double = numba.types.float64
+_NUMBERS = (lanes, double)
 
 
 @register_model(Lanes)
@@ -45,18 +59,42 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(manager, kind, _VECTOR)
 
 
+def _spread(builder: Any, value: Any) -> Any:
+    """Return a double in all lanes; lanes as they are."""
+    if value.type == _VECTOR:
+        return value
+    nothing = ir.Constant(_VECTOR, ir.Undefined)
+    one = builder.insert_element(nothing, value, _INT32(0))
+    return builder.shuffle_vector(one, nothing, ir.Constant(ir.VectorType(_INT32, LANES), None))
+
+
+def _alike(builder: Any, values: Any) -> list[Any]:
+    """Return numbers as lanes where one of them is."""
+    if any(value.type == _VECTOR for value in values):
+        return [_spread(builder, value) for value in values]
+    return list(values)
+
+
+def _together(*kinds: Any) -> Any:
+    """Return the type that such numbers make, or None where one is no number."""
+    if any(kind not in _NUMBERS for kind in kinds):
+        return None
+    return lanes if lanes in kinds else double
+
+
 def _arithmetic(python: Callable[..., Any], instruction: str) -> None:
     @type_callable(python)
     def typed(_: Any) -> Any:
         def typer(left: Any, right: Any) -> Any:
-            return lanes if left == right == lanes else None
+            return lanes if _together(left, right) == lanes else None
 
         return typer
 
-    @lower_builtin(python, Lanes, Lanes)
     def lowered(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        # A product and a sum may become one fused instruction, which rounds once.
-        return getattr(builder, instruction)(*arguments, flags=["contract"])
+        return getattr(builder, instruction)(*_alike(builder, arguments), flags=["contract"])
+
+    for pair in ((Lanes, Lanes), (Lanes, numba.types.Float), (numba.types.Float, Lanes)):
+        lower_builtin(python, *pair)(lowered)
 
 
 for _python, _instruction in (
@@ -68,103 +106,137 @@ for _python, _instruction in (
     _arithmetic(_python, _instruction)
 
 
-def _pointer(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
-    data = context.make_array(kind)(context, builder, array).data
-    return builder.gep(data, [index])
+@type_callable(operator.neg)
+def _typed_negative(_: Any) -> Any:
+    return lambda value: lanes if value == lanes else None
 
 
-def _read(builder: Any, place: Any) -> Any:
-    value = builder.load(builder.bitcast(place, _VECTOR.as_pointer()))
-    value.align = _BYTES
-    return value
+@lower_builtin(operator.neg, Lanes)
+def _negative(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+    return builder.fneg(arguments[0])
+
+
+def _held(array: Any) -> Any:
+    """Return the type of what an array holds."""
+    return lanes if array.ndim == 2 else double
+
+
+def _flat_place(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
+    """Return where a double of a contiguous array is, all of its axes taken for one."""
+    return builder.gep(context.make_array(kind)(context, builder, array).data, [index])
+
+
+def _place(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
+    if _held(kind) == double:
+        return _flat_place(context, builder, kind, array, index)
+    index = builder.mul(index, ir.Constant(index.type, LANES))
+    return builder.bitcast(_flat_place(context, builder, kind, array, index), _VECTOR.as_pointer())
 
 
 def _write(builder: Any, value: Any, place: Any) -> None:
-    written = builder.store(value, builder.bitcast(place, _VECTOR.as_pointer()))
-    written.align = _BYTES
-
-
-def _stepped(builder: Any, first: Any, step: Any, times: int) -> Any:
-    return builder.add(first, builder.mul(step, ir.Constant(step.type, times)))
+    builder.store(value, place).align = _BYTES
 
 
 @intrinsic
 def load(typing: Any, array: Any, index: Any) -> Any:
-    """Read eight doubles of a contiguous array from an index on."""
+    """Read the number or the lanes at an index of a contiguous array."""
 
     def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        return _read(builder, _pointer(context, builder, array, *arguments))
+        value = builder.load(_place(context, builder, array, *arguments))
+        value.align = _BYTES
+        return value
 
-    return lanes(array, numba.types.intp), generate
+    return _held(array)(array, numba.types.intp), generate
 
 
 @intrinsic
 def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write eight doubles to a contiguous array from an index on."""
+    """Write a number or lanes at an index of a contiguous array."""
 
     def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        _write(builder, arguments[2], _pointer(context, builder, array, *arguments[:2]))
+        written = arguments[2]
+        if _held(array) == lanes:
+            written = _spread(builder, written)
+        _write(builder, written, _place(context, builder, array, *arguments[:2]))
         return context.get_dummy_value()
 
-    return numba.types.void(array, numba.types.intp, lanes), generate
+    given = value if _held(array) == lanes and value == lanes else double
+    return numba.types.void(array, numba.types.intp, given), generate
 
 
 @intrinsic
-def splat(typing: Any, value: Any) -> Any:
-    """Put one double in all lanes."""
+def splat(typing: Any, array: Any, value: Any) -> Any:
+    """Return a number as an array holds them, alone or in all lanes."""
 
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), arguments[0], _INT32(0))
-        return builder.shuffle_vector(
-            one, ir.Constant(_VECTOR, ir.Undefined), ir.Constant(ir.VectorType(_INT32, LANES), None)
+        return _spread(builder, arguments[1]) if _held(array) == lanes else arguments[1]
+
+    return _held(array)(array, double), generate
+
+
+def _rounding(name: str) -> Any:
+    @intrinsic
+    def rounded(typing: Any, value: Any) -> Any:
+        def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+            kind = arguments[0].type
+            of = f"v{LANES}f64" if kind == _VECTOR else "f64"
+            function = cgutils.get_or_insert_function(
+                builder.module, ir.FunctionType(kind, [kind]), f"llvm.{name}.{of}"
+            )
+            return builder.call(function, arguments)
+
+        return value(value), generate
+
+    return rounded
+
+
+floor, whole = _rounding("floor"), _rounding("rint")
+
+
+@intrinsic
+def chosen(typing: Any, left: Any, right: Any, less: Any, other: Any) -> Any:
+    """Return `less` where left < right, and `other` elsewhere and where one is no number."""
+
+    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        left, right, less, other = _alike(builder, arguments)
+        return builder.select(builder.fcmp_ordered("<", left, right), less, other)
+
+    return _together(left, right, less, other)(left, right, less, other), generate
+
+
+@intrinsic
+def below(typing: Any, value: Any, bound: Any) -> Any:
+    """Whether a number, or every lane, is less than a bound; not where one is no number."""
+
+    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        value, bound = _alike(builder, arguments)
+        less = builder.fcmp_ordered("<", value, bound)
+        if value.type != _VECTOR:
+            return less
+        return builder.icmp_signed(
+            "==", builder.bitcast(less, ir.IntType(LANES)), ir.Constant(ir.IntType(LANES), -1)
         )
 
-    return lanes(numba.types.float64), generate
+    return numba.types.boolean(value, bound), generate
 
 
 @intrinsic
-def gather(typing: Any, array: Any, index: Any, stride: Any) -> Any:
-    """Read eight doubles of a contiguous array that stand `stride` apart, from an index on."""
-
-    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        values, first, step = arguments
-        result = ir.Constant(_VECTOR, ir.Undefined)
-        for lane in range(LANES):
-            index = _stepped(builder, first, step, lane)
-            place = _pointer(context, builder, array, values, index)
-            result = builder.insert_element(result, builder.load(place), _INT32(lane))
-        return result
-
-    return lanes(array, numba.types.intp, numba.types.intp), generate
-
-
-@intrinsic
-def scatter(typing: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
-    """Write eight doubles to a contiguous array, `stride` apart, from an index on."""
-
-    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
-        values, first, step, eight = arguments
-        for lane in range(LANES):
-            index = _stepped(builder, first, step, lane)
-            place = _pointer(context, builder, array, values, index)
-            builder.store(builder.extract_element(eight, _INT32(lane)), place)
-        return context.get_dummy_value()
-
-    index_type = numba.types.intp
-    return numba.types.void(array, index_type, index_type, lanes), generate
-
-
-@intrinsic
-def floor(typing: Any, value: Any) -> Any:
-    """Round every lane down to a whole number."""
+def angle(typing: Any, sine: Any, cosine: Any) -> Any:
+    """Return the angle of a sine and a cosine, in (-pi, pi]."""
 
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        kind = ir.FunctionType(_VECTOR, [_VECTOR])
-        name = f"llvm.floor.v{LANES}f64"
-        function = cgutils.get_or_insert_function(builder.module, kind, name)
-        return builder.call(function, arguments)
+        kind = ir.FunctionType(_DOUBLE, [_DOUBLE, _DOUBLE])
+        atan2 = cgutils.get_or_insert_function(builder.module, kind, "atan2")
+        pair = _alike(builder, arguments)
+        if pair[0].type == _DOUBLE:
+            return builder.call(atan2, pair)
+        result = ir.Constant(_VECTOR, ir.Undefined)
+        for lane in map(_INT32, range(LANES)):
+            one = builder.call(atan2, [builder.extract_element(each, lane) for each in pair])
+            result = builder.insert_element(result, one, lane)
+        return result
 
-    return lanes(lanes), generate
+    return _together(sine, cosine)(sine, cosine), generate
 
 
 @intrinsic
@@ -178,8 +250,9 @@ def transpose(typing: Any, source: Any, index: Any, target: Any, start: Any, str
         values, first, out, begin, step = arguments
         rows = []
         for row in range(LANES):
-            at = builder.add(first, ir.Constant(first.type, row * LANES))
-            rows.append(_read(builder, _pointer(context, builder, source, values, at)))
+            at = builder.add(first, ir.Constant(first.type, row))
+            rows.append(builder.load(_place(context, builder, source, values, at)))
+            rows[-1].align = _BYTES
         # Swap blocks of 1, 2 and 4 lanes between rows that lie as far apart.
         for size in (1, 2, 4):
             low = [lane if not lane & size else lane - size + LANES for lane in range(LANES)]
@@ -195,8 +268,9 @@ def transpose(typing: Any, source: Any, index: Any, target: Any, start: Any, str
                         builder.shuffle_vector(*pair, mask) for mask in masks
                     )
         for row, value in enumerate(rows):
-            index = _stepped(builder, begin, step, row)
-            _write(builder, value, _pointer(context, builder, target, out, index))
+            at = builder.add(begin, builder.mul(step, ir.Constant(step.type, row)))
+            place = _flat_place(context, builder, target, out, at)
+            _write(builder, value, builder.bitcast(place, _VECTOR.as_pointer()))
         return context.get_dummy_value()
 
     index_type = numba.types.intp

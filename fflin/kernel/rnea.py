@@ -1,4 +1,4 @@
-"""Velocities, accelerations and forces of all bodies at eight points at once: RNEA in base axes.
+"""Velocities, accelerations and forces of all bodies: RNEA in base axes.
 
 All vectors stand in base axes and all moments are about the joints, as in `kernel.crba`.
 
@@ -9,235 +9,230 @@ R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, chapter 5.
 
 from __future__ import annotations
 
-import numba
-
+from fflin.kernel import vectors as vec
 from fflin.kernel.crba import inertia_times
-from fflin.kernel.lanes import gather, load, splat, store
-from fflin.kernel.tree import INERTIA, LANES, PLACE
-from fflin.kernel.vectors import (
-    add,
-    add3,
-    add6,
-    cross,
-    dot6,
-    get3,
-    get6,
-    get_columns,
-    plus,
-    plus6,
-    put3,
-    put6,
-    times,
-    times6,
-    turned,
-)
+from fflin.kernel.lanes import inlined, load, splat, store
+from fflin.kernel.tree import INERTIA, PLACE
 
 # Where the motion vectors of every body begin: velocity, Psi', acceleration without c, that of c
 # alone, and Psi''.
-VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6 * LANES, 12 * LANES, 18 * LANES, 24 * LANES
+VELOCITY, PSI, BIAS, ADDED, PSI2 = 0, 6, 12, 18, 24
 MOTION = 30
 # Where these begin, of all that its joint carries: momentum p, columns of G, stored momentum h,
 # moment and force without c, and those of c on what is carried.
-MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3 * LANES, 12 * LANES, 15 * LANES, 21 * LANES
+MOMENTUM, MOMENTS, STORED, FORCE, CARRIED = 0, 3, 12, 15, 21
 LOAD = 27
 
+_NONE = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 
-@numba.njit(forceinline=True)
+
+@inlined
 def joint_axis(work, tree, body):
     """Return the spatial axis of a joint, angular and linear, for a unit of its coordinate."""
-    z = get3(work, tree.places + (body * PLACE + 6) * LANES)
+    z = vec.get3(work, tree.places + (body * PLACE + 6))
     share = tree.factor[body]
-    return times(z, splat(share * tree.turns[body])), times(z, splat(share * tree.slides[body]))
+    return vec.times(z, share * tree.turns[body]), vec.times(z, share * tree.slides[body])
 
 
-@numba.njit(forceinline=True)
+@inlined
 def motion_cross(velocity, along):
     """Return the rate of a motion vector `along` that is carried by a velocity."""
     w, v = velocity
-    return cross(w, along[0]), plus(cross(w, along[1]), cross(v, along[0]))
+    return vec.cross(w, along[0]), vec.plus(vec.cross(w, along[1]), vec.cross(v, along[0]))
 
 
-@numba.njit(forceinline=True)
+@inlined
 def spatial_inertia_times(work, at, motion):
     """Return inertia times a motion vector, moment and force."""
-    m, h = load(work, at), get3(work, at + LANES)
+    m, h = load(work, at), vec.get3(work, at + 1)
     w, v = motion
-    moment = plus(inertia_times(work, at, w), cross(h, v))
-    return moment, plus(times(v, m), cross(w, h))
+    moment = vec.plus(inertia_times(work, at, w), vec.cross(h, v))
+    return moment, vec.plus(vec.times(v, m), vec.cross(w, h))
 
 
-@numba.njit(forceinline=True)
+@inlined
 def at_joint(work, at, place):
     """Return a motion vector of the carrier at a joint's own origin."""
-    w, v = get6(work, at)
-    return w, plus(v, cross(w, get3(work, place + 9 * LANES)))
+    w, v = vec.get6(work, at)
+    return w, vec.plus(v, vec.cross(w, vec.get3(work, place + 9)))
 
 
-@numba.njit(forceinline=True)
+@inlined
 def at_parent(work, place, force):
     """Return a force at a joint's origin as one at its parent's."""
-    return plus(force[0], cross(get3(work, place + 9 * LANES), force[1])), force[1]
+    return vec.plus(force[0], vec.cross(vec.get3(work, place + 9), force[1])), force[1]
 
 
-@numba.njit(forceinline=True)
-def move_bodies(work, tree, layout, nu, first):
+@inlined
+def move_bodies(work, tree, layout, nu):
     """Write the velocities, and the accelerations without c, outwards; the base does not slide."""
-    stride = nu.shape[1]
-    flat = nu.reshape(-1)
-    zero = splat(0.0)
-    none = zero, zero, zero
     for entry in range(MOTION):
-        store(work, layout.motion + entry * LANES, zero)
-    start = first * stride
-    for axis in range(3):
-        store(work, layout.motion + axis * LANES, gather(flat, start + axis, stride))
+        store(work, layout.motion + entry, 0.0)
+    vec.put3(work, layout.motion, vec.get3(nu, 0))
     for body in range(1, len(tree.parent)):
-        at = layout.motion + body * MOTION * LANES
-        above = layout.motion + tree.parent[body] * MOTION * LANES
-        place = tree.places + body * PLACE * LANES
-        rate = gather(flat, start + tree.coordinate[body], stride)
+        at = layout.motion + body * MOTION
+        above = layout.motion + tree.parent[body] * MOTION
+        place = tree.places + body * PLACE
+        rate = load(nu, tree.coordinate[body])
         axis = joint_axis(work, tree, body)
         velocity = at_joint(work, above + VELOCITY, place)
         psi = motion_cross(velocity, axis)
         bias = at_joint(work, above + BIAS, place)
-        put6(work, at + VELOCITY, plus6(velocity, times6(axis, rate)))
-        put6(work, at + PSI, psi)
-        put6(work, at + BIAS, plus6(bias, times6(psi, rate)))
-        put6(work, at + ADDED, (none, none))
+        vec.put6(work, at + VELOCITY, vec.plus6(velocity, vec.times6(axis, rate)))
+        vec.put6(work, at + PSI, psi)
+        vec.put6(work, at + BIAS, vec.plus6(bias, vec.times6(psi, rate)))
 
 
-@numba.njit(forceinline=True)
-def _load_bodies(work, tree, layout):
-    """Write momenta and forces of the bodies, each alone."""
-    zero = splat(0.0)
-    half = splat(0.5)
+@inlined
+def load_bodies(work, tree, layout, loads):
+    """Write the forces on the bodies, each alone, with its stored momentum."""
     for body in range(len(tree.parent)):
-        at = layout.load + body * LOAD * LANES
-        moving = layout.motion + body * MOTION * LANES
-        inertia = tree.inertias + body * INERTIA * LANES
-        w, v = get6(work, moving + VELOCITY)
-        h = get3(work, inertia + LANES)
-        turning, p = spatial_inertia_times(work, inertia, (w, v))
-        for entry in range(LOAD):
-            store(work, at + entry * LANES, zero)
-        put3(work, at + MOMENTUM, p)
-        # The second moments of mass are half the trace of I, less I.
-        xx, xy, xz = get3(work, inertia + 4 * LANES)
-        yy, yz, zz = get3(work, inertia + 7 * LANES)
-        trace = half * (xx + yy + zz)
-        x = trace - xx, zero - xy, zero - xz
-        y = zero - xy, trace - yy, zero - yz
-        z = zero - xz, zero - yz, trace - zz
-        put3(work, at + MOMENTS, plus(times(v, h[0]), cross(w, x)))
-        put3(work, at + MOMENTS + 3 * LANES, plus(times(v, h[1]), cross(w, y)))
-        put3(work, at + MOMENTS + 6 * LANES, plus(times(v, h[2]), cross(w, z)))
-        moment, force = spatial_inertia_times(work, inertia, get6(work, moving + BIAS))
-        moment = plus(moment, plus(cross(w, turning), cross(v, p)))
-        put6(work, at + FORCE, (moment, plus(force, cross(w, p))))
-
-
-@numba.njit(forceinline=True)
-def _load_stored(work, tree, layout, loads):
-    """Add the momentum that bodies store, and the moments that turn it along."""
+        at = layout.load + body * LOAD + FORCE
+        moving = layout.motion + body * MOTION
+        own = tree.own + body * INERTIA
+        w, v = vec.get6(work, moving + VELOCITY)
+        turning, p = spatial_inertia_times(work, own, (w, v))
+        moment, force = spatial_inertia_times(work, own, vec.get6(work, moving + BIAS))
+        moment = vec.plus(moment, vec.plus(vec.cross(w, turning), vec.cross(v, p)))
+        vec.put6(work, at, (moment, vec.plus(force, vec.cross(w, p))))
     for index in range(len(loads.stored_body)):
         body = loads.stored_body[index]
-        at = layout.load + body * LOAD * LANES
-        stored = loads.stored[index]
-        axes = get_columns(work, tree.places + body * PLACE * LANES)
-        h = turned(axes, stored[0], stored[1], stored[2])
-        add3(work, at + STORED, h)
-        add3(work, at + FORCE, cross(get3(work, layout.motion + body * MOTION * LANES), h))
+        turning = vec.cross(
+            vec.get3(work, layout.motion + body * MOTION), stored_momentum(work, tree, loads, index)
+        )
+        vec.add3(work, layout.load + body * LOAD + FORCE, turning)
 
 
-@numba.njit(forceinline=True)
-def _load_carried(work, tree, layout, loads, u, first):
-    """Add the forces of the carried inputs, and write their generalised force for a unit."""
-    zero = splat(0.0)
-    for entry in range(len(tree.row) * len(loads.body)):
-        store(work, layout.columns + entry * LANES, zero)
-    stride = u.shape[1]
-    flat = u.reshape(-1)
+@inlined
+def load_carried(work, tree, layout, loads, u):
+    """Add the forces of the carried inputs to those on the bodies."""
     for index in range(len(loads.body)):
-        body, unit = loads.body[index], loads.wrench[index]
-        axes = get_columns(work, tree.places + body * PLACE * LANES)
-        wrench = turned(axes, unit[0], unit[1], unit[2]), turned(axes, unit[3], unit[4], unit[5])
-        pushed = zero - gather(flat, first * stride + loads.input[index], stride)
-        add6(work, layout.load + body * LOAD * LANES + FORCE, times6(wrench, pushed))
+        pushed = vec.minus6(_NONE, carried_wrench(work, tree, loads, index))
+        at = layout.load + loads.body[index] * LOAD + FORCE
+        vec.add6(work, at, vec.times6(pushed, load(u, loads.input[index])))
+
+
+@inlined
+def load_momenta(work, tree, layout, loads):
+    """Write the momenta of the bodies, each alone, and nothing of what c does."""
+    zero = splat(work, 0.0)
+    for body in range(len(tree.parent)):
+        at = layout.load + body * LOAD
+        own = tree.own + body * INERTIA
+        w, v = vec.get6(work, layout.motion + body * MOTION + VELOCITY)
+        h = vec.get3(work, own + 1)
+        vec.put3(work, at + MOMENTUM, spatial_inertia_times(work, own, (w, v))[1])
+        # The second moments of mass are half the trace of I, less I.
+        xx, xy, xz = vec.get3(work, own + 4)
+        yy, yz, zz = vec.get3(work, own + 7)
+        trace = 0.5 * (xx + yy + zz)
+        x = trace - xx, -xy, -xz
+        y = -xy, trace - yy, -yz
+        z = -xz, -yz, trace - zz
+        vec.put3(work, at + MOMENTS, vec.plus(vec.times(v, h[0]), vec.cross(w, x)))
+        vec.put3(work, at + MOMENTS + 3, vec.plus(vec.times(v, h[1]), vec.cross(w, y)))
+        vec.put3(work, at + MOMENTS + 6, vec.plus(vec.times(v, h[2]), vec.cross(w, z)))
+        vec.put3(work, at + STORED, (zero, zero, zero))
+        vec.put6(work, at + CARRIED, ((zero, zero, zero), (zero, zero, zero)))
+    for index in range(len(loads.stored_body)):
+        at = layout.load + loads.stored_body[index] * LOAD + STORED
+        vec.add3(work, at, stored_momentum(work, tree, loads, index))
+
+
+@inlined
+def stored_momentum(work, tree, loads, index):
+    """Return momentum that a body stores."""
+    axes = vec.get_columns(work, tree.places + loads.stored_body[index] * PLACE)
+    return vec.product(axes, vec.get3(loads.stored, 3 * index))
+
+
+@inlined
+def carried_wrench(work, tree, loads, index):
+    """Return the wrench of a unit of a carried input at its body's joint."""
+    axes = vec.get_columns(work, tree.places + loads.body[index] * PLACE)
+    moment, force = vec.get6(loads.wrench, 6 * index)
+    return vec.product(axes, moment), vec.product(axes, force)
+
+
+@inlined
+def write_columns(work, tree, layout, loads):
+    """Write the generalised force of a unit of each carried input."""
+    count = len(loads.body)
+    for entry in range(len(tree.row) * count):
+        store(work, layout.columns + entry, 0.0)
+    for index in range(count):
+        body, wrench = loads.body[index], carried_wrench(work, tree, loads, index)
         while body > 0:
-            entry = tree.coordinate[body] * len(loads.body) + index
-            value = dot6(joint_axis(work, tree, body), wrench)
-            add(work, layout.columns + entry * LANES, value)
-            wrench = at_parent(work, tree.places + body * PLACE * LANES, wrench)
+            value = vec.dot6(joint_axis(work, tree, body), wrench)
+            vec.add(work, layout.columns + tree.coordinate[body] * count + index, value)
+            wrench = at_parent(work, tree.places + body * PLACE, wrench)
             body = tree.parent[body]
         for axis in range(3):
-            entry = axis * len(loads.body) + index
-            store(work, layout.columns + entry * LANES, wrench[0][axis])
-            entry += 3 * len(loads.body)
-            store(work, layout.columns + entry * LANES, wrench[1][axis])
+            entry = layout.columns + axis * count + index
+            store(work, entry, wrench[0][axis])
+            store(work, entry + 3 * count, wrench[1][axis])
 
 
-@numba.njit(forceinline=True)
-def load_bodies(work, tree, layout, loads, u, first):
-    """Write momenta and forces of the bodies alone, and what a unit of each carried input is."""
-    _load_bodies(work, tree, layout)
-    _load_stored(work, tree, layout, loads)
-    _load_carried(work, tree, layout, loads, u, first)
-
-
-@numba.njit(forceinline=True)
+@inlined
 def collect(work, tree, layout):
-    """Add the momenta and forces of what is carried, inwards, and write the bias forces."""
+    """Add the forces of what is carried, inwards, and write the bias forces."""
     for index in range(len(tree.row)):
-        store(work, layout.bias + index * LANES, splat(0.0))
+        store(work, layout.bias + index, 0.0)
     for body in range(len(tree.parent) - 1, 0, -1):
-        at = layout.load + body * LOAD * LANES
-        above = layout.load + tree.parent[body] * LOAD * LANES
-        place = tree.places + body * PLACE * LANES
-        d = get3(work, place + 9 * LANES)
-        force = get6(work, at + FORCE)
-        value = dot6(joint_axis(work, tree, body), force)
-        add(work, layout.bias + tree.coordinate[body] * LANES, value)
-        p = get3(work, at + MOMENTUM)
-        add3(work, above + MOMENTUM, p)
-        add3(work, above + STORED, get3(work, at + STORED))
-        columns = get_columns(work, at + MOMENTS)
+        force = vec.get6(work, layout.load + body * LOAD + FORCE)
+        value = vec.dot6(joint_axis(work, tree, body), force)
+        vec.add(work, layout.bias + tree.coordinate[body], value)
+        to = layout.load + tree.parent[body] * LOAD + FORCE
+        vec.add6(work, to, at_parent(work, tree.places + body * PLACE, force))
+    vec.add6(work, layout.bias, vec.get6(work, layout.load + FORCE))
+
+
+@inlined
+def collect_momenta(work, tree, layout):
+    """Add the momenta of what is carried, inwards."""
+    for body in range(len(tree.parent) - 1, 0, -1):
+        at = layout.load + body * LOAD
+        above = layout.load + tree.parent[body] * LOAD
+        d = vec.get3(work, tree.places + body * PLACE + 9)
+        p = vec.get3(work, at + MOMENTUM)
+        vec.add3(work, above + MOMENTUM, p)
+        vec.add3(work, above + STORED, vec.get3(work, at + STORED))
+        columns = vec.get_columns(work, at + MOMENTS)
         for index in range(3):
-            column = plus(columns[index], times(p, d[index]))
-            add3(work, above + MOMENTS + 3 * index * LANES, column)
-        add6(work, above + FORCE, at_parent(work, place, force))
-    at = layout.load + FORCE
-    for index in range(6):
-        add(work, layout.bias + index * LANES, load(work, at + index * LANES))
+            column = vec.plus(columns[index], vec.times(p, d[index]))
+            vec.add3(work, above + MOMENTS + 3 * index, column)
 
 
-@numba.njit(forceinline=True)
+@inlined
 def accelerate_bodies(work, tree, layout):
     """Complete the accelerations with c: write Psi'' outwards, and the forces of c inwards."""
-    for index in range(6):
-        value = load(work, layout.c + index * LANES)
-        store(work, layout.motion + ADDED + index * LANES, value)
+    vec.put6(work, layout.motion + ADDED, vec.get6(work, layout.c))
     for body in range(1, len(tree.parent)):
-        at = layout.motion + body * MOTION * LANES
-        above = layout.motion + tree.parent[body] * MOTION * LANES
-        place = tree.places + body * PLACE * LANES
-        rate = load(work, layout.c + tree.coordinate[body] * LANES)
+        at = layout.motion + body * MOTION
+        above = layout.motion + tree.parent[body] * MOTION
+        place = tree.places + body * PLACE
+        rate = load(work, layout.c + tree.coordinate[body])
         axis = joint_axis(work, tree, body)
         added = at_joint(work, above + ADDED, place)
-        acceleration = plus6(added, at_joint(work, above + BIAS, place))
+        acceleration = vec.plus6(added, at_joint(work, above + BIAS, place))
         velocity = at_joint(work, above + VELOCITY, place)
-        psi = get6(work, at + PSI)
-        put6(work, at + PSI2, plus6(motion_cross(acceleration, axis), motion_cross(velocity, psi)))
-        put6(work, at + ADDED, plus6(added, times6(axis, rate)))
+        psi = vec.get6(work, at + PSI)
+        vec.put6(
+            work,
+            at + PSI2,
+            vec.plus6(motion_cross(acceleration, axis), motion_cross(velocity, psi)),
+        )
+        vec.put6(work, at + ADDED, vec.plus6(added, vec.times6(axis, rate)))
     for body in range(len(tree.parent) - 1, 0, -1):
-        at = layout.load + body * LOAD * LANES
-        inertia = tree.inertias + body * INERTIA * LANES
-        place = tree.places + body * PLACE * LANES
-        above = layout.motion + tree.parent[body] * MOTION * LANES
-        rate = load(work, layout.c + tree.coordinate[body] * LANES)
-        own = spatial_inertia_times(work, inertia, times6(joint_axis(work, tree, body), rate))
-        carried = plus6(get6(work, at + CARRIED), own)
+        at = layout.load + body * LOAD
+        inertia = tree.inertias + body * INERTIA
+        place = tree.places + body * PLACE
+        above = layout.motion + tree.parent[body] * MOTION
+        rate = load(work, layout.c + tree.coordinate[body])
+        own = spatial_inertia_times(work, inertia, vec.times6(joint_axis(work, tree, body), rate))
+        carried = vec.plus6(vec.get6(work, at + CARRIED), own)
         shared = spatial_inertia_times(work, inertia, at_joint(work, above + ADDED, place))
-        add6(work, at + FORCE, plus6(carried, shared))
+        vec.add6(work, at + FORCE, vec.plus6(carried, shared))
         if tree.parent[body] > 0:
-            to = layout.load + tree.parent[body] * LOAD * LANES + CARRIED
-            add6(work, to, at_parent(work, place, carried))
+            to = layout.load + tree.parent[body] * LOAD + CARRIED
+            vec.add6(work, to, at_parent(work, place, carried))

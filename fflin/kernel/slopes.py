@@ -1,4 +1,4 @@
-r"""The slopes of all joint forces at eight points at once: RNEA differentiated.
+r"""The slopes of all joint forces: RNEA differentiated.
 
 RNEA is differentiated in closed form: with the spatial axis S of a joint, the velocity v and
 acceleration a of what carries it, and Psi' = v x S, Psi'' = a x S + v x Psi', the slopes of the
@@ -22,9 +22,8 @@ using spatial vector algebra, IEEE Robotics and Automation Letters 7(2), 2022.
 
 from __future__ import annotations
 
-import numba
-
-from fflin.kernel.lanes import splat, store
+from fflin.kernel import vectors as vec
+from fflin.kernel.lanes import inlined, load, store
 from fflin.kernel.rnea import (
     FORCE,
     LOAD,
@@ -38,132 +37,123 @@ from fflin.kernel.rnea import (
     joint_axis,
     spatial_inertia_times,
 )
-from fflin.kernel.tree import INERTIA, LANES, PLACE
-from fflin.kernel.vectors import (
-    add,
-    add3,
-    cross,
-    dot,
-    dot6,
-    get3,
-    get6,
-    get_columns,
-    minus,
-    plus,
-    plus6,
-    product,
-    times,
-)
+from fflin.kernel.tree import INERTIA, PLACE
 
 
-@numba.njit(forceinline=True)
+@inlined
 def _coriolis(work, at, w):
     """Return 2 B w, moment and force, of what a joint carries."""
-    G = get_columns(work, at + MOMENTS)
+    G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
-    moment = minus(times(w, trace), product(G, w))
-    moment = plus(plus(moment, moment), cross(w, get3(work, at + STORED)))
-    force = cross(w, get3(work, at + MOMENTUM))
-    return moment, plus(force, force)
+    moment = vec.minus(vec.times(w, trace), vec.product(G, w))
+    moment = vec.plus(vec.plus(moment, moment), vec.cross(w, vec.get3(work, at + STORED)))
+    force = vec.cross(w, vec.get3(work, at + MOMENTUM))
+    return moment, vec.plus(force, force)
 
 
-@numba.njit(forceinline=True)
+@inlined
 def _coriolis_transposed(work, at, along):
     """Return 2 B^T s of a motion vector s, which is a moment."""
-    G = get_columns(work, at + MOMENTS)
+    G = vec.get_columns(work, at + MOMENTS)
     trace = G[0][0] + G[1][1] + G[2][2]
     w = along[0]
-    carried = dot(G[0], w), dot(G[1], w), dot(G[2], w)
-    moment = plus(minus(times(w, trace), carried), cross(get3(work, at + MOMENTUM), along[1]))
-    return plus(plus(moment, moment), cross(get3(work, at + STORED), w))
+    carried = vec.dot(G[0], w), vec.dot(G[1], w), vec.dot(G[2], w)
+    moment = vec.plus(
+        vec.minus(vec.times(w, trace), carried), vec.cross(vec.get3(work, at + MOMENTUM), along[1])
+    )
+    return vec.plus(vec.plus(moment, moment), vec.cross(vec.get3(work, at + STORED), w))
 
 
-@numba.njit(forceinline=True)
+@inlined
 def _passive_slopes(work, tree, layout, loads):
     """Write those of springs and dampers, and zeros."""
     size = len(tree.row)
     n, width = size - 6, 2 * size
-    zero = splat(0.0)
     for entry in range(size * width):
-        store(work, layout.lower + entry * LANES, zero)
+        store(work, layout.lower + entry, 0.0)
     for index in range(n):
-        row = layout.lower + (6 + index) * width * LANES
-        store(work, row + (6 + index) * LANES, splat(loads.stiffness[index]))
-        store(work, row + (12 + n + index) * LANES, splat(loads.damping[index]))
+        row = layout.lower + (6 + index) * width
+        store(work, row + (6 + index), load(loads.stiffness, index))
+        store(work, row + (12 + n + index), load(loads.damping, index))
 
 
-@numba.njit(forceinline=True)
+@inlined
 def _add_column(work, at, width, force):
     """Add a moment and force to the rows of the base in a column."""
     for index in range(3):
-        add(work, at + index * width * LANES, force[0][index])
-        add(work, at + (3 + index) * width * LANES, force[1][index])
+        vec.add(work, at + index * width, force[0][index])
+        vec.add(work, at + (3 + index) * width, force[1][index])
 
 
-@numba.njit(forceinline=True)
+@inlined
 def _joint_slopes(work, tree, layout):
     """Add those over each joint, and those of each joint's force over omega_b."""
     n, width = len(tree.row) - 6, 2 * len(tree.row)
-    spin = get3(work, layout.motion)
+    spin = vec.get3(work, layout.motion)
     for body in range(len(tree.parent) - 1, 0, -1):
-        at = layout.load + body * LOAD * LANES
-        moving = layout.motion + body * MOTION * LANES
-        inertia = tree.inertias + body * INERTIA * LANES
+        at = layout.load + body * LOAD
+        moving = layout.motion + body * MOTION
+        inertia = tree.inertias + body * INERTIA
         column = tree.coordinate[body]
         axis = joint_axis(work, tree, body)
-        psi, psi2 = get6(work, moving + PSI), get6(work, moving + PSI2)
+        psi, psi2 = vec.get6(work, moving + PSI), vec.get6(work, moving + PSI2)
         momentum = spatial_inertia_times(work, inertia, axis)
         coriolis = _coriolis_transposed(work, at, axis)
-        moment, force = get6(work, at + FORCE)
-        by_q = plus6(_coriolis(work, at, psi[0]), spatial_inertia_times(work, inertia, psi2))
-        turned = plus(cross(axis[0], moment), cross(axis[1], force)), cross(axis[0], force)
-        by_q = plus6(by_q, turned)
+        moment, force = vec.get6(work, at + FORCE)
+        by_q = vec.plus6(_coriolis(work, at, psi[0]), spatial_inertia_times(work, inertia, psi2))
+        turned = (
+            vec.plus(vec.cross(axis[0], moment), vec.cross(axis[1], force)),
+            vec.cross(axis[0], force),
+        )
+        by_q = vec.plus6(by_q, turned)
         weight = spatial_inertia_times(work, inertia, psi)
-        by_v = plus6(_coriolis(work, at, axis[0]), plus6(weight, weight))
-        own = layout.lower + column * width * LANES
-        q, v = column * LANES, (column + 6 + n) * LANES
+        by_v = vec.plus6(_coriolis(work, at, axis[0]), vec.plus6(weight, weight))
+        own = layout.lower + column * width
+        q, v = column, (column + 6 + n)
         above = body
         while above > 0:
-            place = tree.places + above * PLACE * LANES
+            place = tree.places + above * PLACE
             other = tree.coordinate[above]
             axis = joint_axis(work, tree, above)
-            row = layout.lower + other * width * LANES
-            add(work, row + q, dot6(axis, by_q))
-            add(work, row + v, dot6(axis, by_v))
+            row = layout.lower + other * width
+            vec.add(work, row + q, vec.dot6(axis, by_q))
+            vec.add(work, row + v, vec.dot6(axis, by_v))
             if above != body:
-                moving = layout.motion + above * MOTION * LANES
-                psi, psi2 = get6(work, moving + PSI), get6(work, moving + PSI2)
-                value = dot(coriolis, psi[0]) + dot6(momentum, psi2)
-                add(work, own + other * LANES, value)
-                value = dot6(momentum, psi)
-                value = dot(coriolis, axis[0]) + (value + value)
-                add(work, own + (other + 6 + n) * LANES, value)
+                moving = layout.motion + above * MOTION
+                psi, psi2 = vec.get6(work, moving + PSI), vec.get6(work, moving + PSI2)
+                value = vec.dot(coriolis, psi[0]) + vec.dot6(momentum, psi2)
+                vec.add(work, own + other, value)
+                value = vec.dot6(momentum, psi)
+                value = vec.dot(coriolis, axis[0]) + (value + value)
+                vec.add(work, own + (other + 6 + n), value)
             momentum = at_parent(work, place, momentum)
             by_q, by_v = at_parent(work, place, by_q), at_parent(work, place, by_v)
             above = tree.parent[above]
-        add3(work, own + (6 + n) * LANES, plus(coriolis, cross(momentum[0], spin)))
+        vec.add3(work, own + (6 + n), vec.plus(coriolis, vec.cross(momentum[0], spin)))
         _add_column(work, layout.lower + q, width, by_q)
         _add_column(work, layout.lower + v, width, by_v)
 
 
-@numba.njit(forceinline=True)
+@inlined
 def _base_slopes(work, tree, layout):
     """Write those of the base's force over omega_b."""
     n, width = len(tree.row) - 6, 2 * len(tree.row)
-    zero, one = splat(0.0), splat(1.0)
-    spin = get3(work, layout.motion)
+    zero, one = 0.0, 1.0
+    spin = vec.get3(work, layout.motion)
     axes = (one, zero, zero), (zero, one, zero), (zero, zero, one)
     for index in range(3):
         e = axes[index]
-        weight = spatial_inertia_times(work, tree.inertias, (cross(spin, e), (zero, zero, zero)))
-        moment, force = plus6(_coriolis(work, layout.load, e), weight)
+        weight = spatial_inertia_times(
+            work, tree.inertias, (vec.cross(spin, e), (zero, zero, zero))
+        )
+        moment, force = vec.plus6(_coriolis(work, layout.load, e), weight)
         for axis in range(3):
-            row = layout.lower + (axis * width + 6 + n + index) * LANES
+            row = layout.lower + (axis * width + 6 + n + index)
             store(work, row, moment[axis])
-            store(work, row + 3 * width * LANES, force[axis])
+            store(work, row + 3 * width, force[axis])
 
 
-@numba.njit(forceinline=True)
+@inlined
 def differentiate(work, tree, layout, loads):
     """Write the slopes of M c + bias less the forces over the state, rows of 12 + 2 n.
 

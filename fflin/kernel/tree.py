@@ -1,8 +1,9 @@
-"""A robot's tree as the arrays that the batch kernel reads."""
+"""A robot's tree as the arrays that the kernel reads."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import namedtuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -23,22 +24,29 @@ PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 PLACE, INERTIA = 12, 10
 
 
-class Tree(NamedTuple):
+class Tree(
+    namedtuple(
+        "Tree",
+        "parent fixed index unbounded turns slides bodies axes coordinate factor armature "
+        "target share row depth path common entries places own inertias packed scaled "
+        "diagonal square size",
+    )
+):
     """Bodies in Pinocchio's order, 0 the base; coordinates in state order, 0 to 5 the base's.
 
     Attributes
     ----------
     parent : ndarray (bodies,)
         Body that carries each.
-    fixed : ndarray (bodies, 12)
-        Rotation, row by row, and origin of each joint in its parent, z along the joint's axis.
+    fixed : ndarray (12 bodies,)
+        Columns of the rotation, and origin, of each joint in its parent, z along the joint's axis.
     index : ndarray (bodies,)
         Entry of q of each joint: its angle, length or cosine.
     unbounded : ndarray (bodies,) of bool
         Whether it is stored as (cos, sin).
     turns, slides : ndarray (bodies,)
         Turn and displacement along z for a unit of the joint's coordinate.
-    bodies : ndarray (bodies, 10)
+    bodies : ndarray (10 bodies,), or (10 bodies, 8) of others in each lane
         Mass, times centre, and inertia about the joint's origin (xx xy xz yy yz zz).
     axes : ndarray (bodies, 3, 3)
         Rotation of the frame in which all this stands, z along the joint's axis, in Pinocchio's.
@@ -55,35 +63,9 @@ class Tree(NamedTuple):
         The coordinate of every packed entry.
     common : ndarray (6 + n, 6 + n)
         How many coordinates two rows have in common.
-    entries, places, inertias, packed, scaled, diagonal, square, size : int
+    entries, places, own, inertias, packed, scaled, diagonal, square, size : int
         Entries of the packed M; where the parts of the work space begin; its size.
     """
-
-    parent: Any
-    fixed: Any
-    index: Any
-    unbounded: Any
-    turns: Any
-    slides: Any
-    bodies: Any
-    axes: Any
-    coordinate: Any
-    factor: Any
-    armature: Any
-    target: Any
-    share: Any
-    row: Any
-    depth: Any
-    path: Any
-    common: Any
-    entries: int
-    places: int
-    inertias: int
-    packed: int
-    scaled: int
-    diagonal: int
-    square: int
-    size: int
 
 
 # By robot, as long as it is alive; robots do not change.
@@ -111,7 +93,7 @@ def _tree(robot: Robot) -> Tree | None:
         if body:
             before = places[parent[body]].inverse()
             placement = before * model.jointPlacements[ROOT + body] * places[body]
-            fixed[body] = np.concatenate((placement.rotation.ravel(), placement.translation))
+            fixed[body] = np.concatenate((placement.rotation.ravel("F"), placement.translation))
         inertia = places[body].actInv(model.inertias[ROOT + body])
         inertias[body, 0] = inertia.mass
         inertias[body, 1:4] = inertia.mass * inertia.lever
@@ -133,16 +115,24 @@ def _tree(robot: Robot) -> Tree | None:
     size = 6 + robot.n
     common = _common(paths)
     entries = int(sum(map(len, paths)))
-    sizes = (bodies * PLACE, bodies * INERTIA, entries, entries, size, size * size)
-    starts = [int(x) for x in np.cumsum([0, *sizes]) * LANES]
+    sizes = (
+        bodies * PLACE,
+        bodies * INERTIA,
+        bodies * INERTIA,
+        entries,
+        entries,
+        size,
+        size * size,
+    )
+    starts = [int(x) for x in np.cumsum([0, *sizes])]
     return Tree(
         parent,
-        fixed,
+        fixed.ravel(),
         np.array([joint.idx_q for joint in joints]),
         np.array([joint.nq == 2 for joint in joints]),
         np.array(turns),
         np.array(slides),
-        inertias,
+        inertias.ravel(),
         np.array([place.rotation for place in places]),
         np.array(coordinate),
         np.array(factor),

@@ -143,11 +143,20 @@ def _change_of_coordinates(
 
 
 def compare(
-    state: StateMap, actuation: Actuation, lin: LinearModel, M: Array, A: Array, B: Array
+    state: StateMap,
+    actuation: Actuation,
+    lin: LinearModel,
+    M: Array,
+    A: Array,
+    B: Array,
+    *,
+    steps: Array | None = None,
+    rounding: float = 0.0,
 ) -> list[Block]:
     """Compare a model's A and B with those of another route, block by block.
 
-    `M` is the robot's, for the scales.
+    `M` is the robot's, for the scales. A route that takes steps (nx,) has the terms of the motion
+    there, and their `rounding`, relative to what is asked of it.
 
     A difference is relative to the largest entry of its block, rows of accelerations being
     scaled by the mobility sqrt((M^-1)_ii), so that a light joint does not hide a heavy one.
@@ -163,7 +172,11 @@ def compare(
     groups, inputs = state.groups._asdict(), actuation.groups
     errors, errors_B = _blocks(difference_A, groups, groups), _blocks(difference_B, groups, inputs)
     if errors.any():
-        terms = _cancelling_terms(state, lin, mobility, input_mobility)
+        terms = _cancelling_terms(state, lin, lin.v, mobility, input_mobility)
+        if steps is not None:
+            v = np.abs(lin.v) + state.spread(steps[-nv:])
+            there = _cancelling_terms(state, lin, v, mobility, input_mobility)
+            terms = np.maximum(terms, rounding * there)
         sizes = np.maximum(_blocks(scaled_A, groups, groups), terms)
         errors /= np.where(sizes > 0.0, sizes, 1.0)
     every = ("A", groups, errors.tolist()), ("B", inputs, errors_B.tolist())
@@ -191,14 +204,14 @@ def mobilities(M: Array, B: Array) -> tuple[Array, Array]:
 
 
 def _cancelling_terms(
-    state: StateMap, lin: LinearModel, mobility: Array, input_mobility: Array
+    state: StateMap, lin: LinearModel, v: Array, mobility: Array, input_mobility: Array
 ) -> Array:
     """Size (6, 6) of the terms that may cancel in a block of A, in its scaled units.
 
     The base's own velocity has no influence but in its own axes, and counts for what its
     rounding can do to Pinocchio's derivatives only.
     """
-    speed, rate, momentum = speeds(state, lin.v)
+    speed, rate, momentum = speeds(state, v)
     # What the momentum of wheels does to a turning link, in the units of the rows.
     spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
     still = speed.copy()

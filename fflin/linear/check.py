@@ -39,6 +39,9 @@ _EPS = float(np.finfo(float).eps)
 # Rounding of a difference of outputs: its weights add up to two ulp, each output brings a few.
 _ULPS = 8.0
 
+# And of accelerations at the ends of a step, of which slopes at a slow motion are the difference.
+_STEP_ULPS = 64.0
+
 # Relative to its block an analytic route agrees to round-off times the conditioning of M, with
 # room for the longer chain of operations; for a well-conditioned M, to this.
 _ROUTE_TOLERANCE, _ROUTE_ROUNDING = 1e-9, 1e2 * _EPS
@@ -164,9 +167,14 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
         Row("ABA derivatives", f"{b.matrix}[{b.row}, {b.column}]", b.error, by_aba)
         for b in compare(state, actuation, lin, M, A, B)
     ]
+    steps = difference_steps(state, lin, M)
     rows += [
         Row("differences", f"{b.matrix}[{b.row}, {b.column}]", b.error, difference)
-        for b in compare(state, actuation, lin, M, *_differences(model, lin, M))
+        for b in compare(
+            *(state, actuation, lin, M, *_differences(model, lin, M, steps)),
+            steps=steps[0],
+            rounding=_STEP_ULPS * _EPS / difference,
+        )
     ]
     rows += _output_rows(model, lin, M, difference)
     rows.append(Row("flow", "f", flow_error(model, lin), difference))
@@ -217,17 +225,19 @@ def _point_errors(
     return errors
 
 
-def _differences(model: Nonlinear, lin: LinearModel, M: Array) -> tuple[Array, Array]:
+def _differences(
+    model: Nonlinear, lin: LinearModel, M: Array, steps: tuple[Array, Array]
+) -> tuple[Array, Array]:
     """Return A and B by central differences of the nonlinear model.
 
     It is quadratic in the velocities, and linear in the inputs and in where the base is.
     """
-    step, push = difference_steps(model.state, lin, M)
+    step, push = steps
     bends = np.arange(len(step)) < len(step) - len(M)
     bends[model.state.groups.r_b] = False
     nx, point = len(step), np.concatenate((lin.x0, lin.u0))
-    steps, bends = np.concatenate((step, push)), np.concatenate((bends, push < 0.0))
-    slopes = jacobian(lambda rows: model.rates(rows[:, :nx], rows[:, nx:]), point, steps, bends)
+    every, bends = np.concatenate((step, push)), np.concatenate((bends, push < 0.0))
+    slopes = jacobian(lambda rows: model.rates(rows[:, :nx], rows[:, nx:]), point, every, bends)
     return slopes[:, :nx], slopes[:, nx:]
 
 

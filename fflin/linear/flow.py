@@ -11,6 +11,7 @@ import pinocchio as pin
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
+from fflin.dynamics.actuation import Held
 from fflin.dynamics.integrators import CommutatorFree4
 from fflin.dynamics.state import StateMap
 from fflin.linear.ignorable import rotor_names
@@ -35,6 +36,11 @@ class Flow:
     def __init__(self, state: StateMap, t: Array, q: Array, v: Array, u: Array, held: bool) -> None:
         self._model, self._aba, self._held = state.robot.model, Aba(state), held
         self._t, self._q, self._v, self._u = t, q, v, u
+
+    @property
+    def held(self) -> tuple[Held, ...]:
+        """The inputs that stand in reference axes."""
+        return self._aba.actuation.held
 
     @cached_property
     def residual(self) -> Array:
@@ -115,7 +121,7 @@ class Flow:
     def at(self, t: float) -> tuple[Array, Array, Array]:
         """Return q, v and u in base axes from a time on: cubics with the robot's own rates."""
         k, s = placed(self._t, t)
-        powers, (turns, speeds) = np.array((1.0, s, s * s, s**3)), self._cubics
+        powers, (turns, speeds) = np.array((1.0, s, s * s, s**3)), self.cubics
         q: Array = pin.integrate(self._model, self._q[k], powers.dot(turns[k]))
         return q, powers.dot(speeds[k]), self._in_base_axes(q, self._input(k, s))
 
@@ -135,7 +141,7 @@ class Flow:
         return self._aba.acceleration(q, v, self._in_base_axes(q, u)).copy()
 
     @cached_property
-    def _cubics(self) -> tuple[Array, Array]:
+    def cubics(self) -> tuple[Array, Array]:
         """Coefficients (N - 1, 4, nv) of the way in the tangent at the first knot, and of v."""
         q, v, h = self._q, self._v, np.diff(self._t)[:, None]
         begin = np.array([self.rate(*each) for each in zip(q, v, self._u, strict=True)])

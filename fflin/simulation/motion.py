@@ -74,6 +74,8 @@ class Motion(Design):
         What is to be known of the run.
     limit_names : tuple of str
         The states and inputs that have limits.
+    engine : str
+        What ran the loop, "compiled" or "python"; empty where a file does not tell.
     limits : ndarray (k, 2)
         Their least and largest values, infinite where there is none, whether or not the run was
         kept within.
@@ -116,6 +118,7 @@ class Motion(Design):
     notes: tuple[str, ...] = field(default_factory=tuple)
     limit_names: tuple[str, ...] = field(default_factory=tuple)
     limits: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    engine: str = field(default_factory=str)
 
     def __post_init__(self) -> None:
         rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)

@@ -47,6 +47,7 @@ class Plan:
     q: Array  # (nq,)
     v: Array  # (nv,)
     times: Times
+    policy: Any  # of which the law is
     law: Law | None  # nothing but `initial` acts where there is none
     initial: Array  # (nu,), what acts until the first command arrives
     limits: Saturation  # what acts of a command

@@ -45,7 +45,7 @@ class Plant:
             raise InputError(
                 f"disturbance is a {type(disturbance).__name__}, expected a function of (t, q, v)"
             )
-        self._disturbance = disturbance
+        self.disturbance = disturbance
         self._model, self._data = robot.model, robot.create_data()
         nu = len(self.actuation.names)
         self._columns = np.column_stack(
@@ -68,11 +68,11 @@ class Plant:
         """
         if self.actuation.held:
             u = self._in_base_axes(q, u)
-        if self._plain and self._disturbance is None:
+        if self._plain and self.disturbance is None:
             tau = self._columns.dot(u)
             return _aba(self._model, self._data, q, v, tau), tau[:6]
         push = (self.actuation.columns(self._data, q)[:6] @ u)[_LINEAR_FIRST]
-        if self._disturbance is None:
+        if self.disturbance is None:
             return self._aba.acceleration(q, v, u), push
         disturbed = self._disturbed(t, q, v)
         return self._aba.acceleration(q, v, u, disturbed), push + disturbed[:6]
@@ -80,17 +80,7 @@ class Plant:
     def isolated(self, *, driven: bool) -> bool:
         """Whether nothing pushes from outside, whatever the inputs are or where none acts."""
         base = driven and (self._columns[:6].any() or self.actuation.carried)
-        return not (base or self._disturbance is not None or any(self.robot.gravity))
-
-    def held(self, u: Array) -> Callable[[float, Array, Array], Array]:
-        """Return f(t, q, v) for inputs that stay, with nothing in between where it can be.
-
-        What is held in reference axes must be zero.
-        """
-        if self._plain and self._disturbance is None:
-            model, data, tau = self._model, self._data, self._columns.dot(u)
-            return lambda _, q, v: _aba(model, data, q, v, tau)
-        return lambda t, q, v: self.stage(t, q, v, u)[0]
+        return not (base or self.disturbance is not None or any(self.robot.gravity))
 
     def _in_base_axes(self, q: Array, u: Array) -> Array:
         """Return u (nu,) with what is held in reference axes in base axes, at any turn."""
@@ -101,8 +91,8 @@ class Plant:
         return u
 
     def _disturbed(self, t: float, q: Array, v: Array) -> Array:
-        assert self._disturbance is not None
-        given = self._disturbance(t, q.copy(), v.copy())
+        assert self.disturbance is not None
+        given = self.disturbance(t, q.copy(), v.copy())
         force = as_double(f"disturbance(t, q, v) at t = {t:g} s", given)
         finite = np.isfinite(force).all() or not np.abs(v).max() < _DIVERGED
         if force.shape != (self.robot.nv,) or not finite:

@@ -152,7 +152,7 @@ def _states(predictor: Predictor, plan: Plan, x: Array, steps: int) -> Array:
         limits = limits._replace(wheels=limits.wheels._replace(speeds=lambda e: (x0 + e)[of]))
     channel = Channel(predictor.law(), plan.initial, limits, sample, delay)
     rows = []
-    e = x - x0
+    e: Array = x - x0
     if lin.dt:
         # Between the samples of a sampled model there is nothing to say.
         whole = round(lin.dt / dt)
@@ -166,18 +166,28 @@ def _states(predictor: Predictor, plan: Plan, x: Array, steps: int) -> Array:
         return np.array([*rows, e]) + x0
 
     held = lin.discretize(dt)
-    for step in range(steps):
-        u = channel.begin(step, e)
-        if step % every == 0:
-            rows.append(e)
-        if sample:
-            e = held.A @ e + held.B @ (u - u0) + held.f0
-            continue
+
+    def after(e: Array) -> Array:
         stages: list[Array] = []
         for share in (0.0, 0.5, 0.5, 1.0):
             at = e + share * dt * stages[-1] if stages else e
             stages.append(lin.A @ at + lin.B @ (channel.ask(at) - u0) + lin.f0)
-        e = e + dt / 6.0 * (stages[0] + 2.0 * (stages[1] + stages[2]) + stages[3])
+        whole: Array = e + dt / 6.0 * (stages[0] + 2.0 * (stages[1] + stages[2]) + stages[3])
+        return whole
+
+    shift: Array = np.zeros(0)
+    transition: Array = np.zeros((0, 0))
+    if not sample and not channel.cuts:  # then a step is a matrix and a shift
+        shift = after(np.zeros(len(e)))
+        transition = np.column_stack([after(unit) - shift for unit in np.eye(len(e))])
+    for step in range(steps):
+        u = channel.begin(step, e) if sample else u0
+        if step % every == 0:
+            rows.append(e)
+        if sample:
+            e = held.A @ e + held.B @ (u - u0) + held.f0
+        else:
+            e = transition.dot(e) + shift if len(shift) else after(e)
     return np.array([*rows, e]) + x0
 
 

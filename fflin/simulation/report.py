@@ -66,7 +66,9 @@ def motion_report(motion: Any) -> str:
     """Show whether a motion arrived, what it took, and the figures that prove it."""
     kinds = courses(motion)
     parts = [verdict(motion, kinds)] if kinds or motion.stopped else []
-    parts.append(f"{motion.robot}: {motion.t[-1]:g} s, {len(motion.t)} rows, frame {motion.frame}")
+    by = ", compiled" if motion.engine == "compiled" else ""
+    frame = f"frame {motion.frame}{by}"
+    parts.append(f"{motion.robot}: {motion.t[-1]:g} s, {len(motion.t)} rows, {frame}")
     parts.extend(motion.notes)
     parts = [folded(parts)]
     if kinds:

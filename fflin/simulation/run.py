@@ -34,6 +34,7 @@ class Recording(NamedTuple):
     center: Array  # (N, 3), of mass, where that momentum takes it
     steps: int  # that were begun
     stopped: str  # why it ended before its time, if it did
+    engine: str  # that ran
 
 
 # A motion that diverges overflows before it is stopped: that is no reason to warn.
@@ -58,7 +59,7 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
             plan.callback(t, q.copy(), v.copy(), u.copy())
 
     step, stopped, project = 0, "", plan.project
-    ending, watched = _ending(plan), bool(plan.chart or plan.events)
+    ending, watched = ending_of(plan), bool(plan.chart or plan.events)
     bar = Progress(plan.progress)
     try:
         for step in range(times.steps):
@@ -86,7 +87,7 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
     if not stopped.startswith(("diverged", "interrupted")):
         record(t, u)
     q_of, v_of, u_of, momentum, center = (row[:count] for row in rows)
-    return Recording(t_of[:count], q_of, v_of, u_of, momentum, center, step + 1, stopped)
+    return Recording(t_of[:count], q_of, v_of, u_of, momentum, center, step + 1, stopped, "python")
 
 
 def _advance(
@@ -96,18 +97,6 @@ def _advance(
     take = plan.method(plant.robot.model, plan.times.dt).step
     ask = channel.ask if channel is not None and channel.continuous else None
     pushed = not plant.isolated(driven=channel is not None)
-
-    if not ask and not pushed:
-        acting: Array | None = None
-        rate = plant.held(plan.initial)
-
-        def held(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-            nonlocal acting, rate
-            if u is not acting:
-                acting, rate = u, plant.held(u)
-            return take(rate, t, q, v)
-
-        return held
 
     stage, wrench, wrenches = plant.stage, conserved.wrench, course.wrenches
 
@@ -131,7 +120,7 @@ def _advance(
     return asked
 
 
-def _ending(plan: Plan) -> Callable[[float, Array, Array], str]:
+def ending_of(plan: Plan) -> Callable[[float, Array, Array], str]:
     """Return what says why a run ends where a step has led it; nothing where it goes on."""
     chart = plan.chart
     scalar = chart.scalar(plan.q) if chart else 1.0

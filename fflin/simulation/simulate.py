@@ -18,6 +18,7 @@ from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import state_history
 from fflin.linear.model import LinearModel
 from fflin.robot.limits import chosen_limits
+from fflin.simulation.compiled import carried_out, engine_of
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import (
@@ -31,7 +32,6 @@ from fflin.simulation.plan import (
 )
 from fflin.simulation.plant import Plant
 from fflin.simulation.prediction import predict, predictor
-from fflin.simulation.run import go
 from fflin.simulation.times import times_of
 
 if TYPE_CHECKING:
@@ -68,6 +68,7 @@ def simulate(
     reference: pin.SE3 | None = None,
     every: int | None = None,
     progress: bool | None = None,
+    engine: str | None = None,
 ) -> Motion:
     r"""Simulate a robot under a policy.
 
@@ -134,6 +135,10 @@ def simulate(
         100,000 rows, as many as leave 10,000, which the motion's `notes` say.
     progress : bool, optional
         Whether a bar is shown on stderr; by default on a terminal, for runs that take long.
+    engine : {"python", "compiled"}, optional
+        What runs the loop; by default the compiled one where it can and is the quicker. It needs
+        numba, and no policy, event, callback or disturbance in Python. Both give the same to
+        rounding.
 
     Returns
     -------
@@ -203,6 +208,7 @@ def simulate(
         q=q,
         v=v,
         times=times,
+        policy=policy,
         law=law,
         initial=initial,
         limits=within,
@@ -222,7 +228,7 @@ def simulate(
         predictor=foresees,
     )
     try:
-        return _motion(plan, plant)
+        return _motion(plan, plant, engine_of(engine, plan, plant))
     except MemoryError:
         raise InputError(
             f"{times.steps // times.every} rows of '{robot.name}' do not fit into the memory; take "
@@ -230,11 +236,11 @@ def simulate(
         ) from None
 
 
-def _motion(plan: Plan, plant: Plant) -> Motion:
+def _motion(plan: Plan, plant: Plant, engine: str) -> Motion:
     """Return the motion that a plan leads to."""
     state, robot = plant.state, plant.robot
     conserved = Conserved(robot, plan.q)
-    run = go(plan, plant, conserved)
+    run = carried_out(plan, plant, conserved, engine)
     x = state_history(state, run.q, run.v, plan.near, run.t)
     target = np.zeros(0) if plan.target is None else plan.target
     if plan.reference is not None:
@@ -262,6 +268,7 @@ def _motion(plan: Plan, plant: Plant) -> Motion:
         robot=robot.name,
         urdf_sha256=robot.urdf_sha256,
         stopped=run.stopped,
+        engine=run.engine,
         _robot=robot,
         wheels=tuple(robot.wheels),
         wheel_inertias=np.array(list(robot.wheels.values())),

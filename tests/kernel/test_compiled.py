@@ -48,3 +48,18 @@ def test_code_that_is_older_than_any_source_is_not_taken(compiled, caplog, tmp_p
     kernel_code.kernel("factor", "invert")
     assert kept.exists() is not older
     assert bool(caplog.records) is older
+
+
+@pytest.mark.parametrize("kept", [False, True])
+@pytest.mark.parametrize("loaded", [False, True])
+def test_a_short_run_waits_for_no_compiler(monkeypatch, tmp_path, kept, loaded):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(kernel_code.sys, "modules", {"numba": None} if loaded else {})
+    if kept:
+        (tmp_path / "kernel_0").mkdir()
+        (tmp_path / "kernel_0" / "loop.advance-1.nbi").write_bytes(b"")
+    least = (100 if loaded else 4000) if kept else 20_000
+    assert not kernel_code.loop_pays(least - 1)
+    assert kernel_code.loop_pays(least)
+    monkeypatch.setattr(kernel_code, "find_spec", lambda name: None)
+    assert kernel_code.loop_pays(10**6) is loaded

@@ -152,6 +152,20 @@ def test_rounding_of_a_large_acceleration_is_no_failure():
         assert fflin.check(robot, fflin.linearize(robot, v=v, u=[thrust], moving=True)).ok
 
 
+@pytest.mark.parametrize("speed", [1e-6, 1e-9, 1e-12, 1e-15])
+@pytest.mark.parametrize("name", ["planar_detumble", "canadarm2", "dual_arm", "inspector"])
+def test_a_motion_that_is_almost_at_rest_is_confirmed(name, speed):
+    robot = fflin.load(name)
+    v = speed * np.random.default_rng(0).standard_normal(robot.nv)
+    lin = fflin.Linearizer(robot, moving=True)(robot.neutral(), v)
+    assert fflin.check(robot, lin).ok
+    # What is wrong by more than the rounding of a step is still found.
+    A = lin.A.copy()
+    rows, columns = slice(-6 - robot.n, -3 - robot.n), slice(-3 - robot.n, -robot.n)
+    A[rows, columns] += 1e-9 * np.abs(lin.B[rows]).max()
+    assert not fflin.check(robot, replace(lin, A=A)).ok
+
+
 @pytest.mark.parametrize("moving", [False, True])
 @pytest.mark.parametrize("turn", [np.pi, -np.pi])
 def test_a_continuous_joint_may_pass_half_a_turn(turn, moving):

@@ -1,0 +1,109 @@
+"""Forward dynamics with all that acts on a robot, one configuration or eight at once.
+
+CRBA's M, the bias forces of RNEA and a factor of M. All stands in base axes and the base neither is
+anywhere nor moves along, as no acceleration but those of (3.1) depends on either.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+
+from fflin.kernel import vectors as vec
+from fflin.kernel.crba import inwards, outwards
+from fflin.kernel.factor import factorise, solve
+from fflin.kernel.lanes import angle, inlined, load, store
+from fflin.kernel.places import attitude, axes_of, columns_of, quaternion_times
+from fflin.kernel.rnea import collect, load_bodies, move_bodies, write_columns
+
+
+class Mechanics(
+    namedtuple("Mechanics", "tree layout loads gravity index circling springy rest row held origin")
+):
+    """A robot as the loop reads it; each array of doubles may have a second axis of eight lanes.
+
+    Gravity (3,); of each joint its entry of q (`index`), whether that is the cosine of an angle,
+    whether it has a spring or damper, and where the spring is at rest; the coordinate that each
+    input drives (`row`), -1 for one that is carried; the first of three inputs each that are a
+    vector on the base in reference axes (`held`); and the placement (7,) of the world's origin seen
+    from the reference.
+    """
+
+
+class Point(namedtuple("Point", "q nu u pushing wrench")):
+    """Where a robot is, q (nq,) and nu (6 + n,) in base axes, and the inputs (nu,) there.
+
+    `u` is as it is commanded, `pushing` in base axes; `wrench` (6,) is what the inputs of the last
+    acceleration are at the base's origin, moment and force.
+    """
+
+
+@inlined
+def configure(work, robot, q):
+    """Write the places of all bodies and the packed M at a configuration."""
+    outwards(work, robot.tree, q)
+    inwards(work, robot.tree)
+
+
+@inlined
+def joint_position(robot, q, joint):
+    """Return a joint's angle, in (-pi, pi] where it turns without end, or length."""
+    at = robot.index[joint]
+    value = load(q, at)
+    if robot.circling[joint]:
+        value = angle(load(q, at + 1), value)
+    return value
+
+
+@inlined
+def seen(robot, q):
+    """Return the base's quaternion seen from the reference."""
+    return quaternion_times(attitude(robot.origin), attitude(q))
+
+
+@inlined
+def turn_inputs(robot, point):
+    """Write the inputs in base axes."""
+    vec.copy(point.u, 0, point.pushing, 0, len(robot.row))
+    for index in range(len(robot.held)):
+        at = robot.held[index]
+        axes = columns_of(seen(robot, point.q))
+        vec.put3(point.pushing, at, vec.across(axes, vec.get3(point.u, at)))
+
+
+@inlined
+def accelerate(work, robot, point, rates, to):
+    """Write the rates of nu at a point that is configured into `rates` from `to` on.
+
+    Its M is overwritten by its factor.
+    """
+    tree, layout, loads, nu = robot.tree, robot.layout, robot.loads, point.nu
+    force, size, count = layout.c, len(tree.row), len(loads.body)
+    for index in range(size):
+        store(work, force + index, 0.0)
+    for index in range(len(robot.row)):
+        if robot.row[index] >= 0:
+            vec.add(work, force + robot.row[index], load(point.pushing, index))
+    write_columns(work, tree, layout, loads)
+    for index in range(count):
+        u = load(point.pushing, loads.input[index])
+        for row in range(size):
+            vec.add(work, force + row, load(work, layout.columns + row * count + index) * u)
+    vec.copy(work, force, point.wrench, 0, 6)
+    move_bodies(work, tree, layout, nu)
+    load_bodies(work, tree, layout, loads)
+    collect(work, tree, layout)
+    for index in range(size):
+        vec.add(work, force + index, -load(work, layout.bias + index))
+    for joint in range(len(robot.index)):
+        if robot.springy[joint]:
+            stretch = joint_position(robot, point.q, joint) - load(robot.rest, joint)
+            pull = load(loads.stiffness, joint) * stretch
+            pull = pull + load(loads.damping, joint) * load(nu, 6 + joint)
+            vec.add(work, force + 6 + joint, -pull)
+    factorise(work, tree)
+    solve(work, tree, force)
+    vec.copy(work, force, rates, to, size)
+    # What falls and what turns takes the base's origin along.
+    fall = vec.across(axes_of(point.q), vec.get3(robot.gravity, 0))
+    fall = vec.minus(fall, vec.cross(vec.get3(nu, 0), vec.get3(nu, 3)))
+    vec.put3(rates, to + 3, vec.plus(vec.get3(rates, to + 3), fall))

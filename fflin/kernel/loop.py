@@ -1,0 +1,151 @@
+"""The closed loop, step after step: a policy, forward dynamics, and steps on the manifold."""
+
+from __future__ import annotations
+
+from collections import namedtuple
+
+from fflin.kernel.channel import arrive, limit, send, spare_wheels
+from fflin.kernel.course import add_wrench, begin_step, end_step, impose, kept_at
+from fflin.kernel.forward import accelerate, configure, seen, turn_inputs
+from fflin.kernel.lanes import below, compiled, inlined, load, store
+from fflin.kernel.laws import NOTHING, command
+from fflin.kernel.places import displace
+from fflin.kernel.vectors import copy, put3, put6
+
+
+class Method(namedtuple("Method", "h origin way speed nodes weights moments")):
+    """Steps of h [s], s stages each, by what its displacements and velocities are made of.
+
+    Row by row: shares of v and the stages' accelerations in the displacement after each stage, and
+    the second one after the last (`way`), and in the velocity there (`speed`). A way begins at the
+    step's first place, or at its second stage's where `origin` says 1. `nodes` [s] are the stages'
+    times, `weights` and `moments` their shares in sums along, with h and h^2.
+    """
+
+
+class Watch(namedtuple("Watch", "squares sign")):
+    """When to stop: squares of speeds (6 + n,), and the sign (1,) of q0 in the chart, or 0."""
+
+
+class Stages(namedtuple("Stages", "rates along first second u")):
+    """Work space: v and the accelerations of the stages, a displacement, and two stages' q.
+
+    `u` (nu,) is what acted as the last step began.
+    """
+
+
+@inlined
+def _combine(shares, row, rates, out):
+    """Write a combination of v and the accelerations of the stages."""
+    size = len(out)
+    count = len(rates) // size
+    for index in range(size):
+        total = load(shares, row * count) * load(rates, index)
+        for stage in range(1, count):
+            part = load(rates, stage * size + index)
+            total = total + load(shares, row * count + stage) * part
+        store(out, index, total)
+
+
+@inlined
+def _record(rows, row, point, course, t):
+    """Write a row: q, nu, u, and momentum and centre of mass as they are to be."""
+    at = row * (len(point.q) + len(point.nu) + len(point.u) + 9)
+    for values in (point.q, point.nu, point.u):
+        copy(values, 0, rows, at, len(values))
+        at += len(values)
+    momentum, center = kept_at(course, t)
+    put6(rows, at, momentum)
+    put3(rows, at + 6, center)
+
+
+@inlined
+def _goes_on(robot, watch, point):
+    """Whether all is finite, within bounds, and in the chart."""
+    good = below(-(load(watch.sign, 0) * seen(robot, point.q)[1]), 1e-300)
+    for index in range(len(watch.squares)):
+        rate = load(point.nu, index)
+        good = good and below(rate * rate, load(watch.squares, index))
+    return good
+
+
+@inlined
+def _act(channel, law, robot, point, step, stage, t):
+    """Write the inputs at a stage, as they are commanded and in base axes."""
+    sample = channel.sample
+    if law.kind != NOTHING and (sample == 0 or stage == 0):
+        if sample == 0 or step % sample == 0:
+            command(robot, law, point, t)
+            limit(channel, point.u)
+            if sample > 0:
+                send(channel, step, point.u)
+        if sample > 0:
+            arrive(channel, step, point.u)
+        spare_wheels(channel, point.nu, point.u)
+    turn_inputs(robot, point)
+
+
+@inlined
+def _move(robot, method, stages, point, stage):
+    """Go from a stage, whose acceleration is there, to the next one, or to the end of the step."""
+    rates, along = stages.rates, stages.along
+    if stage == 1:
+        copy(point.q, 0, stages.second, 0, len(point.q))
+    _combine(method.way, stage, rates, along)
+    _combine(method.speed, stage, rates, point.nu)
+    begin = stages.first if method.origin[stage] == 0 else stages.second
+    displace(robot.tree, begin, along, point.q)
+    if stage == len(method.origin) - 1:
+        _combine(method.way, stage + 1, rates, along)
+        displace(robot.tree, point.q, along, point.q)
+
+
+@compiled
+def advance(
+    robot, method, law, channel, course, watch, point, stages, clock, last, every, rows, work
+):
+    """Go on with a run up to a step, or to one that led where `watch` stops.
+
+    The point, the sums of the course, and what law and channel remember are brought up to there.
+
+    Parameters
+    ----------
+    robot, method, law, channel, watch, point, stages
+        As `simulation.packing` makes them.
+    course : tuple of Course, bool, bool
+        And whether it is imposed, and whether anything pushes from outside.
+    clock : ndarray (1,) of int
+        How many steps are done; `last` are to be done.
+    every : int
+        Steps from row to row; 0 where none is recorded.
+    rows : ndarray (rows * width,) or (rows * width, 8)
+        Gets q, nu, u, and the momentum (6,) and centre of mass (3,) that are kept, row by row.
+    work : ndarray (Layout.size,) or (Layout.size, 8)
+    """
+    kept, project, pushed = course
+    h, row = method.h, 0
+    configure(work, robot, point.q)
+    for step in range(clock[0], last):
+        begin_step(kept)
+        copy(point.q, 0, stages.first, 0, len(point.q))
+        copy(point.nu, 0, stages.rates, 0, len(point.nu))
+        for stage in range(len(method.origin)):
+            _act(channel, law, robot, point, step, stage, step * h + method.nodes[stage])
+            if stage == 0:
+                copy(point.u, 0, stages.u, 0, len(point.u))
+                if every > 0 and step % every == 0:
+                    _record(rows, row, point, kept, step * h)
+                    row += 1
+            accelerate(work, robot, point, stages.rates, (1 + stage) * len(point.nu))
+            if pushed:
+                weight, moment = method.weights[stage], method.moments[stage]
+                add_wrench(work, robot, kept, point, weight, moment)
+            _move(robot, method, stages, point, stage)
+            configure(work, robot, point.q)
+        if pushed:
+            end_step(kept, h)
+        if project:
+            impose(work, robot, kept, point, (step + 1) * h)
+        clock[0] = step + 1
+        if not _goes_on(robot, watch, point):
+            break

@@ -1,0 +1,121 @@
+"""The loop over a plan by the compiled kernel, where robot, policy and options allow it."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from fflin.base.errors import InputError, unknown
+from fflin.base.progress import Progress
+from fflin.control.output_feedback import OutputFeedback, measured_states
+from fflin.control.policies import StateFeedback
+from fflin.control.tracking import TrajectoryFeedback
+from fflin.kernel.compiled import kernel, loop_pays, numba_is_there
+from fflin.kernel.tree import batch_tree
+from fflin.robot.frames import ROOT
+from fflin.simulation.conservation import Conserved
+from fflin.simulation.plan import Plan
+from fflin.simulation.plant import Plant
+from fflin.simulation.run import Recording, ending_of, go
+
+ENGINES = ("python", "compiled")
+
+_KNOWN = (StateFeedback, OutputFeedback, TrajectoryFeedback)
+_SLICE, _FIRST_SLICE = 0.05, 16  # [s] and steps between looks at the clock and at Ctrl-C
+# Multiplications in the factor of M, beyond which ABA in the loop in Python is quicker.
+_LARGEST_FACTOR = 200_000
+
+
+def engine_of(engine: Any, plan: Plan, plant: Plant) -> str:
+    """Return which loop runs a plan: the one that is asked for, or by default the quicker.
+
+    Raises
+    ------
+    InputError
+        If the compiled one is asked for and cannot.
+    UnknownNameError
+        If there is no such engine.
+    """
+    if engine is not None and engine not in ENGINES:
+        raise unknown("engine", str(engine), list(ENGINES))
+    if engine == "python":
+        return "python"
+    reason = _reason(plan, plant)
+    if engine == "compiled" and reason:
+        raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
+    if reason or (engine is None and not (_small(plant) and loop_pays(plan.times.steps))):
+        return "python"
+    return "compiled"
+
+
+def _reason(plan: Plan, plant: Plant) -> str:
+    """Say what keeps a plan from the compiled loop; nothing where it can run it."""
+    policy, robot = plan.policy, plant.robot
+    if not numba_is_there():
+        return "numba is not installed (pip install 'fflin[fast]')"
+    if plan.events or plan.callback or plant.disturbance:
+        return "events, callbacks and disturbances are functions in Python"
+    if policy is not None and type(policy) not in _KNOWN:
+        return f"a {type(policy).__name__} decides in Python"
+    if isinstance(policy, OutputFeedback):
+        late = abs(plan.times.sample * plan.times.dt - policy.lin.dt) > 1e-6 * policy.lin.dt
+        if policy.noise is not None or late or measured_states(plant.state) is None:
+            return "noise, outputs that are no states, and other samples than the compensator's"
+    at_home = robot.model.jointPlacements[ROOT].isIdentity(0.0)
+    if not plan.method.origins or batch_tree(robot) is None or not at_home:
+        return f"the method {plan.method.__name__} or a joint of '{robot.name}' is of another kind"
+    return ""
+
+
+def _small(plant: Plant) -> bool:
+    tree = batch_tree(plant.robot)
+    return tree is not None and int((tree.depth**2).sum()) < _LARGEST_FACTOR
+
+
+def carried_out(plan: Plan, plant: Plant, conserved: Conserved, engine: str) -> Recording:
+    """Run a plan to its end by an engine; `plant` and `conserved` are of the robot that moves."""
+    return go(plan, plant, conserved) if engine == "python" else _fly(plan, plant, conserved)
+
+
+def _fly(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
+    """Run a plan by the compiled loop, slice by slice."""
+    from fflin.simulation.packing import packed
+
+    tree, state, times = batch_tree(plant.robot), plant.state, plan.times
+    assert tree is not None
+    advance = kernel("loop", "advance", "the loop of `simulate`")
+    parts = packed(plan, plant, conserved, tree)
+    (mechanics, *_, (kept, *_), _, point, stages) = parts
+    ends = np.cumsum([len(each) for each in (point.q, point.nu, point.u, kept.start[:6])])
+    rows, clock = np.empty((times.rows, ends[-1] + 3)), np.zeros(1, dtype=np.intp)
+    flat, work = rows.reshape(-1), np.empty(mechanics.layout.size)
+    ending, bar = ending_of(plan), Progress(plan.progress)
+    stopped, length = "", _FIRST_SLICE
+    try:
+        while not stopped and clock[0] < times.steps:
+            began, first = time.perf_counter(), -(-int(clock[0]) // times.every)
+            last = min(times.steps, int(clock[0]) + length)
+            advance(*parts, clock, last, times.every, flat[first * rows.shape[1] :], work)
+            stopped = ending(clock[0] * times.dt, point.q, state.spread(point.nu))
+            bar.update(int(clock[0]), times.steps)
+            taken = max(time.perf_counter() - began, 1e-6)
+            length = max(_FIRST_SLICE, int(length * min(8.0, _SLICE / taken)))
+    except KeyboardInterrupt:
+        if not clock[0]:
+            raise
+        stopped = f"interrupted at t = {clock[0] * times.dt:g} s"
+    finally:
+        bar.close()
+    if not np.isfinite(stages.u).all():
+        return go(plan, plant, conserved)  # which says whose command was no number
+    count, end = -(-int(clock[0]) // times.every), clock[0] * times.dt
+    t = np.append(times.every * np.arange(count) * times.dt, end)
+    momentum, center = np.split(kept.start[:9] + kept.sums[:9], [6])
+    center += end * kept.per_mass * kept.start[:3]
+    rows[count] = np.concatenate((point.q, point.nu, stages.u, momentum, center))
+    count += not stopped.startswith(("diverged", "interrupted"))
+    q, nu, u, momentum, center = np.split(rows[:count], ends, axis=1)
+    v, steps = state.spread(nu), int(clock[0])
+    return Recording(t[:count], q, v, u, momentum, center, steps, stopped, "compiled")
