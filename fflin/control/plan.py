@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
 # What may be missed of the goal and of limits of states in rad, m and s; what is sought of it.
-_REACHED, _ENDS = 1e-7, 1e-9
+_REACHED, _ENDS = 1e-7, 1e-8
 
 # Intervals are flown as one motion where they miss each other by no more.
 _MEETS = 1e-10
