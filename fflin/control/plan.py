@@ -33,6 +33,9 @@ _REACHED, _ENDS = 1e-7, 1e-8
 # Intervals are flown as one motion where they miss each other by no more.
 _MEETS = 1e-10
 
+# One motion that ends so near to the goal stays one.
+_NEARLY = 1e-3
+
 # How accurate the ends of intervals are in these while it is sought, and at last.
 _SEEKS, _FLIES = 1e-6, 1e-8
 
@@ -170,7 +173,7 @@ def plan(
     )
 
 
-def _sought(
+def _sought(  # noqa: PLR0915
     shooting: Shooting,
     start: Point,
     end: Point,
@@ -208,7 +211,8 @@ def _sought(
                 (q, v), missed = shooting.flown(start, u), 0.0 * missed
         excess = _excess(space := room(q, v))
         size = max(excess.max(), np.abs(missed).max())
-        if not size < np.inf or (closing and (size <= _ENDS or count == most + _MOST_CLOSING)):
+        ended = count == most + _MOST_CLOSING or (size <= _ENDS and not missed.any())
+        if not size < np.inf or (closing and ended):
             break
         low, high = np.concatenate((space, limits[:, None] - u), axis=2)
         try:
@@ -221,8 +225,10 @@ def _sought(
             break
         z, du, y = least
         if closing:
-            (q, v), u = shooting.moved(q, v, z), np.clip(u + du, *limits)
-            missed = shooting.missed(q, v, u)
+            u = np.clip(u + du, *limits)
+            if missed.any() or size > _NEARLY:
+                q, v = shooting.moved(q, v, z)
+                missed = shooting.missed(q, v, u)
             continue
         # What the multipliers say that it costs to miss (Powell).
         price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
