@@ -1,5 +1,6 @@
 """Run the command line, as ``fflin`` and as ``python -m fflin``."""
 
+import gc
 import signal
 import sys
 
@@ -9,6 +10,7 @@ from fflin.commands.interruption import leave, listen
 def main() -> int:
     """Run the command line on the arguments of this process, and return its exit code."""
     listen()
+    gc.set_threshold(50_000)  # most of what a command makes, it keeps to its end
     try:
         from fflin.commands import cli
 
@@ -17,6 +19,7 @@ def main() -> int:
         leave(reason)
     # All is done and said.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.freeze()  # what ends with the process need not be searched for circles
     return code
 
 

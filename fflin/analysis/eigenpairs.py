@@ -57,8 +57,6 @@ def _significant(lin: LinearModel) -> Array:
 
 def _free_free(A: Array, M: Array, inertia: Array) -> NaturalModes | None:
     """Return the modes of a body at rest with symmetric stiffness; None for any other model."""
-    from scipy.linalg import eigh
-
     nv = len(M)
     N, slope = A[:nv, nv:], A[nv:, :nv] @ A[:nv, nv:]
     if A[:nv, :nv].any() or A[nv:, nv:].any():
@@ -76,7 +74,10 @@ def _free_free(A: Array, M: Array, inertia: Array) -> NaturalModes | None:
         return NaturalModes([], nv, 2 * nv)
     M_star = floating_inertia(unit, felt, np.setdiff1d(np.arange(nv), felt))
     K = -M_star @ by_s[np.ix_(felt, felt)]
-    squares, vectors = eigh((K + K.T) / 2.0, (M_star + M_star.T) / 2.0)
+    # Of the pencil K - omega^2 M*, by M* = L L^T.
+    inverse = np.linalg.inv(np.linalg.cholesky((M_star + M_star.T) / 2.0))
+    squares, vectors = np.linalg.eigh(inverse @ (K + K.T) / 2.0 @ inverse.T)
+    vectors = inverse.T @ vectors
     squares, vectors = _polished(by_s[np.ix_(felt, felt)], squares, vectors)
     found: list[tuple[complex, Any, float]] = []
     for square, vector in zip(squares.tolist(), vectors.T, strict=True):
@@ -141,8 +142,6 @@ def nonzero_eigenpairs(
     times the tolerance are taken for zero. A pair is an eigenvalue, its eigenvector (n,), and a
     bound on what rounding does to the eigenvalue, by its condition number.
     """
-    from scipy.linalg import eig
-
     n, whole = len(A), A
     size = float(np.linalg.norm(A))
     nullity = n - int(np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance))
@@ -155,10 +154,12 @@ def nonzero_eigenpairs(
         A = complement.T @ steps[-1]
     if not len(A):
         return [], nullity
-    values, left, right = eig(A, left=True, right=True)
+    values, right = np.linalg.eig(A)
+    # y x = 1 for the left eigenvectors y; the inverse is not asked of a defective A.
+    left = np.linalg.pinv(right, rcond=EPS)
     pairs = []
-    for value, y, x in zip(values.tolist(), left.T, right.T, strict=True):
-        error = 1e2 * EPS * size / max(abs(np.vdot(y, x)), EPS)
+    for value, y, x in zip(values.tolist(), left, right.T, strict=True):
+        error = 1e2 * EPS * size * min(float(np.linalg.norm(y)), 1.0 / EPS)
         for step in reversed(steps):
             # As A V_0 = 0, an eigenvector V_0 a + V_1 x is A V_1 x, up to a factor.
             x = step @ x  # noqa: PLW2901 - the same vector in a larger space

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -60,7 +61,8 @@ def number(name: str, value: Any) -> float:
 
 def refuse_masked(name: str, value: Any) -> None:
     """Raise `InputError` where an entry is masked, which NumPy makes NaN or takes as it is."""
-    if isinstance(value, np.ma.MaskedArray) and np.ma.getmaskarray(value).any():
+    ma: Any = sys.modules.get("numpy.ma")  # what is masked has loaded it
+    if ma and isinstance(value, ma.MaskedArray) and ma.getmaskarray(value).any():
         raise InputError(f"{name} has masked entries; fill them first")
 
 

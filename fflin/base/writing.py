@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import stat
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -81,12 +80,14 @@ def write_whole(contents: Mapping[Path, bytes]) -> None:
 @contextmanager
 def replacing(*targets: Path) -> Iterator[list[Path]]:
     """Yield a new file for each target, which takes its place where all ends well."""
+    from tempfile import mkstemp
+
     written: dict[Path, Path] = {}
     target = Path()
     try:
         for target in targets:
             real = place(target)
-            handle, name = tempfile.mkstemp(prefix=".fflin-", dir=real.parent)
+            handle, name = mkstemp(prefix=".fflin-", dir=real.parent)
             os.close(handle)
             written[Path(name)] = target
         yield list(written)
@@ -132,10 +133,12 @@ def place(target: Path) -> Path:
 
 def check_place(target: Path, endings: tuple[str, ...] = ()) -> None:
     """Raise `FileError` where no file can be written there, before work is done for it."""
+    from tempfile import TemporaryFile
+
     if endings:
         check_ending(target, endings)
     try:
-        with tempfile.TemporaryFile(prefix=".fflin-", dir=place(target).parent):
+        with TemporaryFile(prefix=".fflin-", dir=place(target).parent):
             pass
     except FileError:
         raise

@@ -71,7 +71,8 @@ class BatchEquations(ABC):
         """Return where M is far from singular, and the angles are such that their sines are."""
         # NaN, from a pivot that is zero, compares false.
         good = (self._least_coupling < couplings) & (couplings < Inertia.warning_coupling)
-        return good & (np.abs(q[:, 7:]) < _FARTHEST).all(axis=1)
+        near = np.abs(q[:, 7:]) < _FARTHEST
+        return good if near.all() else good & near.all(axis=1)
 
 
 class RestEquations(BatchEquations):

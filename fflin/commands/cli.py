@@ -9,31 +9,22 @@ import re
 import sys
 import warnings
 from collections.abc import Sequence
+from importlib import import_module
 from typing import Any, NoReturn
 
 from fflin.base.errors import FflinError, FflinWarning
 from fflin.base.version import __version__
-from fflin.commands import (
-    BAD_INPUT,
-    DONE,
-    analysis,
-    init,
-    models,
-    regulator,
-    simulation,
-    sweeps,
-    tracking,
-    visual,
-)
+from fflin.commands import BAD_INPUT, DONE
 
-# The commands by task, as the help lists them.
+# The commands by task, as the help lists them, each with its module.
 TASKS = {
-    "look at robots": ("robots", "info", "init", "view"),
-    "make and check a linear model": ("linearize", "check"),
-    "judge it": ("analyze", "modes", "validity"),
-    "close the loop": ("lqr", "tvlqr", "simulate"),
-    "go through many points": ("sweep",),
+    "look at robots": {"robots": "models", "info": "models", "init": "init", "view": "visual"},
+    "make and check a linear model": {"linearize": "models", "check": "models"},
+    "judge it": {"analyze": "analysis", "modes": "analysis", "validity": "analysis"},
+    "close the loop": {"lqr": "regulator", "tvlqr": "tracking", "simulate": "simulation"},
+    "go through many points": {"sweep": "sweeps"},
 }
+_MODULES = {name: module for names in TASKS.values() for name, module in names.items()}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -77,7 +68,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Names may hold what the terminal cannot show.
         sys.stdout.reconfigure(errors="backslashreplace")
-    arguments = _parser().parse_args(argv)
+    argv = sys.argv[1:] if argv is None else argv
+    arguments = _parser(argv[0] if argv else "").parse_args(argv)
     try:
         code: int = arguments.run(arguments)
         if sys.stdout is not None:
@@ -106,7 +98,8 @@ def _tell(line: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(asked: str) -> argparse.ArgumentParser:
+    """Make the parser of the command that is asked for, or else of all of them."""
     parser = _Parser(
         prog="fflin",
         usage="fflin [-h] [--version] COMMAND ...",
@@ -117,12 +110,12 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         prog="fflin", metavar="COMMAND", required=True, help=argparse.SUPPRESS
     )
-    for module in (models, init, analysis, regulator, tracking, simulation, visual, sweeps):
-        module.add_commands(commands)
+    for name in [_MODULES[asked]] if asked in _MODULES else dict.fromkeys(_MODULES.values()):
+        import_module(f"fflin.commands.{name}").add_commands(commands)
     # argparse lists all in one group.
     left = {command.dest: command for command in commands._choices_actions}
     commands._choices_actions = []
     for task, names in TASKS.items():
-        parser.add_argument_group(task)._group_actions += [left.pop(name) for name in names]
-    parser.add_argument_group("other")._group_actions += left.values()
+        group = parser.add_argument_group(task)._group_actions
+        group += [left[name] for name in names if name in left]
     return parser

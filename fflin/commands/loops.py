@@ -97,6 +97,7 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
         else:
             options = {"hold": arguments.hold, "frame": arguments.frame}
             motion = Trajectory.load(arguments.trajectory, design, **options)
+            motion.require(strict=arguments.strict)
             _require_own(schedule, motion, arguments)
         policy = TrajectoryFeedback(motion, schedule)
     start = _beside(design, policy, once("--offset", arguments.offset))

@@ -24,8 +24,6 @@ def model_report(lin: LinearModel) -> str:
     """Show a linear model: its point, A, B, C, D and its certificate."""
     import numpy as np
 
-    from fflin.analysis.modes import modes
-
     nx, nu = lin.B.shape
     stays, f0 = lin.is_equilibrium(), np.where(np.abs(lin.f0) > _MOVES, lin.f0, 0.0)
     point = "a fixed point" if stays else "not a fixed point"
@@ -36,11 +34,14 @@ def model_report(lin: LinearModel) -> str:
         head += f", sampled every {lin.dt:g} s"
     parts = [f"{textwrap.fill(head, width(), subsequent_indent='  ')}\n{_units(lin)}"]
     rates = lin.state_units if lin.dt else [_rate(unit) for unit in lin.state_units]
-    # Elsewhere the poles of a frozen model say nothing about stability.
-    growing = modes(lin).unstable if stays and not lin.dt else []
-    if growing:
-        shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
-        parts.append(textwrap.fill(f"unstable: poles with a positive real part {shown}", width()))
+    # Elsewhere the poles of a frozen model say nothing about stability. With A A = 0 all are zero.
+    if stays and not lin.dt and (lin.A @ lin.A).any():
+        from fflin.analysis.modes import modes
+
+        if growing := modes(lin).unstable:
+            shown = ", ".join(f"{mode.pole:.5g}" for mode in growing)
+            shown = f"unstable: poles with a positive real part {shown}"
+            parts.append(textwrap.fill(shown, width()))
     moved = [
         signals(title, values, names, units)
         for title, values, names, units in (

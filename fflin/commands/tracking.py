@@ -51,13 +51,17 @@ def add_trajectory(parser: Container, *, required: bool = False) -> None:
         type=file_name,
         required=required,
         help="go along the motion in FILE, .npz, .mat, .json or .csv with named columns, as "
-        "fflin.Trajectory.load reads it; --frame says the axes that it is in",
+        "fflin.Trajectory.load reads it; --frame says the axes that it is in, by default what it "
+        "says itself, else local",
     )
     parser.add_argument(
         "--hold",
         choices=("linear", "previous"),
-        help="how the inputs of FILE go on between its knots, where it does not say so: linear "
-        "(default), or as they were at the knot before",
+        help="how the inputs of FILE go on between its knots, linear, or as they were at the knot "
+        "before; by default what it says itself, else linear",
+    )
+    parser.add_argument(
+        "--strict", action="store_true", help="refuse a FILE that is no motion of the robot"
     )
     parser.set_defaults(frame=None)
 
@@ -78,7 +82,9 @@ def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> L
         robot or load_robot(arguments),
         {"hold": arguments.hold, "frame": arguments.frame},
     )
-    return linearize_trajectory(robot, Trajectory.load(arguments.trajectory, robot, **options))
+    return linearize_trajectory(
+        robot, Trajectory.load(arguments.trajectory, robot, **options), strict=arguments.strict
+    )
 
 
 def linearize_along(arguments: argparse.Namespace) -> int:

@@ -90,24 +90,8 @@ def rule_weights(
     """Return Q, R and N of a model by a rule, and the rule in words.
 
     The cost of a sampled model is the continuous one under the hold, where it is known what it
-    was sampled from.
-
-    Parameters
-    ----------
-    lin : LinearModel
-    name : {"urdf", "identity"} or None
-        "urdf" is `default_weights`, "identity" 1 on every state and input; by default what the
-        robot has in its `weights`, and "urdf" where it has none.
-    given : mapping
-        Parts "q", "r", "bryson" of those that have their own, as `Robot.replace` takes them.
-    wheel_speeds : bool, optional
-        As in `lqr`.
-    pace : Pace
-
-    Raises
-    ------
-    UnknownNameError
-        If there is no such rule, state or input.
+    was sampled from. The rule is by default what the robot has in its `weights`, and "urdf" where
+    it has none; `given` has parts "q", "r", "bryson" of weights, as `Robot.replace` takes them.
     """
     source = lin.generator or lin
     layers = [(given, False)] if given else []
@@ -233,10 +217,13 @@ def default_weights(
 
 def _damping(lin: LinearModel) -> Array:
     """Return B (m, m) of viscous dampers, 0 where there are none."""
+    m = len(lin.M)
+    if lin.dt or not lin.A[m:, m:].any():  # samples show springs as damping too
+        return np.zeros_like(lin.M)
     D = second_order(lin).D.values
     rates, modes = eigh(0.5 * (D + D.T), lin.M)
-    # What motion brings to one, it takes from another; and samples show springs as damping too.
-    damped: Any = not lin.dt and rates.sum() > 1e-9 * np.abs(rates).sum()
+    # What motion brings to one, it takes from another.
+    damped: Any = rates.sum() > 1e-9 * np.abs(rates).sum()
     forces = lin.M @ modes
     return (forces * rates.clip(0.0)) @ forces.T * damped
 
@@ -325,10 +312,10 @@ def _radius_of_gyration(M: Array) -> float:
 def _largest(K: Array, size: Array, names: tuple[str, ...]) -> Array:
     """Return the largest K d of all displacements d: the base's in any direction, joints' signs."""
     groups = np.array([name.partition(".")[0] for name in names[: len(size)]])
-    scaled = K[:, : len(size)] * size
-    total: Array = np.abs(scaled[:, (groups != "q_b") & (groups != "r_b")]).sum(axis=1)
+    scaled = K[..., : len(size)] * size
+    total: Array = np.abs(scaled[..., (groups != "q_b") & (groups != "r_b")]).sum(axis=-1)
     for group in ("q_b", "r_b"):
-        total += np.linalg.norm(scaled[:, groups == group], axis=1)
+        total += np.linalg.norm(scaled[..., groups == group], axis=-1)
     return total
 
 
@@ -351,16 +338,16 @@ def _fastest(
     """
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
-    speeds = np.zeros(len(T))
-    if any(name.startswith("qdot_m.") for name in lin.limits):
-        for time in np.geomspace(0.1 / rates[-1] ** (1 if (mass == 1.0).all() else 2), 3.0, 60):
-            x = rates * time / math.sqrt(2.0)
-            moving = math.sqrt(2.0) * rates * np.exp(-x) * np.sin(x)
-            if (mass < 1.0).any():
-                fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
-                moving = (rates**2 * (slow - fast) / root).real
-            now = _largest(T @ (moving[:, None] * to_modes), size, lin.state_names)
-            speeds = np.maximum(speeds, now)
+    if not any(name.startswith("qdot_m.") for name in lin.limits):
+        return np.zeros(len(T))
+    first = 0.1 / rates[-1] ** (1 if (mass == 1.0).all() else 2)
+    time = np.geomspace(first, 3.0, 60)[:, None]
+    x = rates * time / math.sqrt(2.0)
+    moving = math.sqrt(2.0) * rates * np.exp(-x) * np.sin(x)
+    if (mass < 1.0).any():
+        fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
+        moving = (rates**2 * (slow - fast) / root).real
+    speeds: Array = _largest(T @ (moving[..., None] * to_modes), size, lin.state_names).max(axis=0)
     return speeds
 
 

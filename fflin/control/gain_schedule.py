@@ -10,6 +10,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.record import NOT_VERIFIED, Design
+from fflin.base.tables import folded
 from fflin.base.validation import Array, number
 from fflin.control.differential_riccati import Passed
 
@@ -120,7 +121,8 @@ class GainSchedule(Schedule):
     def __str__(self) -> str:
         """Show the rule of its weights too."""
         verdict = [] if self.verified else [NOT_VERIFIED]
-        return "\n".join([repr(self), f"weights: {self.weights or 'as given'}", *verdict])
+        said = [repr(self), f"weights: {self.weights or 'as given'}", *verdict]
+        return "\n".join(folded([each]) for each in said)
 
     def trajectory(self, robot: Robot) -> Trajectory:
         """Return the trajectory that it keeps a robot on."""

@@ -188,7 +188,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
             u = self.reference(t + 0.5 * dt * (self.trajectory.hold == "linear"))[2]
             y = seen.y[k]
         else:
-            (lin, L), K = self._rest, gains.K[-1]
+            (lin, L), K = self._rest, self.end_gain
             A, B, C, D, u, y = lin.A, lin.B, lin.C, lin.D, lin.u0, lin.y0
             if k == len(seen.A):
                 # From here on the error is counted from rest.

@@ -25,6 +25,8 @@ _STEPS = 25
 _ROUNDED = 1e-12
 _NEAR = 1e-3
 
+_APART = 1e-5
+
 
 class Solution(NamedTuple):
     """P and K, the poles of A - B K, the relative residual, and what found them."""
@@ -123,28 +125,7 @@ def solve(
     A fully actuated second-order system is solved by its own half-size method, any other and
     where that falls short by SciPy's. Newton's method (Kleinman) refines either, step by step as
     long as it lowers the residual, which is measured in the variables given.
-
-    Parameters
-    ----------
-    A : ndarray (nx, nx)
-    B : ndarray (nx, nu)
-    Q : ndarray (nx, nx)
-        Symmetric.
-    R : ndarray (nu, nu)
-        Symmetric positive definite.
-    N : ndarray (nx, nu), optional
-    dt : float
-        Sampling time; 0 for continuous time.
-
-    Returns
-    -------
-    Solution
-        The method is "structured" or "general".
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If there is no stabilising solution, or none is found.
+    A `numpy.linalg.LinAlgError` says that there is no stabilising solution, or none is found.
 
     References
     ----------
@@ -176,7 +157,9 @@ def half_size(
     return solution if solution is not None and solution.residual <= _SOUND else None
 
 
-def _half_size(equation: Riccati) -> Solution | None:
+def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
+    """Solve from the modes of a loop whose weights on velocities are larger by a part."""
+    found = None
     with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
         source = _bilinear(equation) if equation.discrete else equation
         if source is None:
@@ -186,13 +169,19 @@ def _half_size(equation: Riccati) -> Solution | None:
             # In terms of u + R^-1 N' x the cost has no cross term.
             A = A - source.B @ dtrtrs(source.R_factor, cross, lower=1, trans=1)[0]
             Q = Q - cross.T @ cross
+        scale = np.ones(len(A))
+        scale[len(A) // 2 :] += apart
+        Q = scale[:, None] * Q * scale
         loop = second_order_loop(A, source.B, Q, source.R_factor)
         if loop is None:
             return None
         P = loop.modes.lyapunov_modal(loop.cost)
         modes = None if equation.discrete else loop.modes
-        return _finished(equation, *_refined(equation, P, modes), "structured")
-    return None
+        found = _finished(equation, *_refined(equation, P, modes), "structured")
+    if apart or (found is not None and found.residual <= _SOUND):
+        return found
+    # Modes that coincide, as of critical damping, have no inverse: Newton starts beside them.
+    return _half_size(equation, _APART) or found
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:

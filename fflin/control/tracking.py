@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -46,10 +46,14 @@ class TrajectoryFeedback:
     trajectory : Trajectory
     schedule : GainSchedule
         As `tvlqr` returns it.
+    held : bool
+        Whether what it commands is held for a while, as it is of a sampled schedule in any case:
+        then what it commands at the very end is what holds the robot there.
     """
 
     trajectory: Trajectory
     schedule: GainSchedule
+    held: bool = field(default=False, kw_only=True)
 
     frame = "local"
 
@@ -86,9 +90,36 @@ class TrajectoryFeedback:
 
     def reference(self, t: float) -> tuple[Array, Array, Array]:
         """Return q, v, and u in base axes that are followed at a time of the run."""
-        if t > self.duration * AT_THE_END:
+        return self._point(t, self.duration * AT_THE_END)
+
+    def _point(self, t: float, over: float) -> tuple[Array, Array, Array]:
+        if t > over:
             return self.end.q, self.end.v, self.end.u0
-        return self.trajectory.flow.at(float(self.trajectory.t[0]) + max(t, 0.0))
+        first, last = self.trajectory.t[[0, -1]].tolist()
+        return self.trajectory.flow.at(min(first + max(t, 0.0), last))
+
+    @property
+    def over(self) -> float:
+        """The time [s] after which it commands what holds the end."""
+        held = self.held or self.schedule.dt
+        return self.duration * (2.0 - AT_THE_END if held else AT_THE_END)
+
+    @property
+    def jumps(self) -> bool:
+        """Whether what it commands jumps at knots, where inputs are held between them."""
+        return self.trajectory.hold == "previous" and not self.schedule.dt
+
+    @property
+    def ahead(self) -> float:
+        """How far after a sample [s] an input that changes is most like its mean over it."""
+        return 0.5 * self.schedule.dt if self.trajectory.hold == "linear" else 0.0
+
+    def commanded(self, t: float) -> tuple[Array, Array, Array]:
+        """Return q, v, u of what a command at a time of the run is for."""
+        q, v, u = self._point(t, self.over)
+        if self.ahead and t <= self.over:
+            u = self._point(min(t + self.ahead, self.duration), self.duration)[2]
+        return q, v, u
 
     @cached_property
     def end_gain(self) -> Array:
@@ -99,13 +130,13 @@ class TrajectoryFeedback:
     def gain(self, t: float) -> Array:
         """Return K (nu, nx) at a time of the run."""
         knots = self.schedule.t
-        if t > self.duration * AT_THE_END:
+        if t > self.over:
             return self.end_gain
         return self.schedule.gain(float(knots[0]) + min(max(t, 0.0), float(knots[-1] - knots[0])))
 
     def law(self) -> Callable[[float, Array], Array]:
         """Return law(t, e) -> u of the error at a time of the run."""
-        return lambda t, e: self.reference(t)[2] - self.gain(t) @ e
+        return lambda t, e: self.commanded(t)[2] - self.gain(t) @ e
 
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot.
@@ -123,19 +154,21 @@ class TrajectoryFeedback:
         require_turns(made, origin.nq, robot)
 
         def policy(t: float, q: Array, v: Array) -> Array:
-            q_star, v_star, u_star = self.reference(t)
+            q_star, v_star, u_star = self.commanded(t)
             u: Array = u_star - self.gain(t).dot(moving_error(state, q_star, v_star, q, v))
             return u
 
         return policy
 
 
-def followed(policy: Any, robot: Robot) -> Any:
+def followed(policy: Any, robot: Robot, held: bool = False) -> Any:
     """Return a policy, for a schedule the feedback along its trajectory."""
     if isinstance(policy, Allocation):
-        return replace(policy, policy=followed(policy.policy, policy.design))
+        return replace(policy, policy=followed(policy.policy, policy.design, held))
     if isinstance(policy, GainSchedule):
-        return TrajectoryFeedback(policy.trajectory(robot), policy)
+        return TrajectoryFeedback(policy.trajectory(robot), policy, held=held)
+    if held and isinstance(policy, TrajectoryFeedback):
+        return replace(policy, held=True)
     return policy
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from fflin.analysis.gramians import held_cost
 from fflin.base.errors import DetectabilityError, InputError
+from fflin.base.threads import in_one_thread
 from fflin.base.validation import Array, number
 from fflin.control.differential_riccati import (
     Coefficients,
@@ -100,6 +101,7 @@ class FilterSchedule(Schedule):
         return Passed(self.t, self.P, L, (A, C, self.W, self.V), self.dt, 1.0)
 
 
+@in_one_thread
 def tvkalman(
     traj: LinearTrajectory,
     W: Weight,

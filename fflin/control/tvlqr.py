@@ -9,6 +9,7 @@ import numpy as np
 
 from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
 from fflin.base.names import input_keys
+from fflin.base.threads import in_one_thread
 from fflin.base.validation import Array, number
 from fflin.control.differential_riccati import (
     Coefficients,
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 _TOO_FAST = "P changes too fast; give smaller weights or a larger R"
 
 
+@in_one_thread
 def tvlqr(
     traj: LinearTrajectory,
     Q: Weight | None = None,

@@ -1,10 +1,9 @@
 """How inputs act: the columns that take u to generalised forces, and the wrenches on links."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.rotation import rotation_matrices
@@ -88,7 +87,7 @@ class Actuation:
         # Whether they are tau_b, F_b and every joint's, so that the columns are the identity.
         self.default = self.fixed.shape == (nv, nv) and bool((self.fixed == identity).all())
         # By joint: the inputs that it carries, and their wrenches (6, ..) in its frame.
-        self.wrench_columns: list[tuple[int, NDArray[np.intp], Array]] = [
+        self.wrench_columns: list[tuple[int, Any, Array]] = [
             (joint, np.array([at for at, _ in items]), np.column_stack([w for _, w in items]))
             for joint, items in carried.items()
         ]

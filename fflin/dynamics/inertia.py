@@ -99,7 +99,7 @@ class Inertia:
             coupling = upper.diagonal().dot(inverse.diagonal())
         # Written so that NaN, from a pivot that is zero, fails too.
         if not self.least_coupling < coupling < _WARNING_COUPLING:
-            self._judge(coupling, self._state.project(upper.T))
+            self._judge(coupling, self._state.project(upper.T), out)
         elif self._bounds is not None and not self._in_order.dot(out.diagonal()) < _LARGEST_SHARE:
             self._name_the_lightest(1.0 / out.diagonal())
 
@@ -115,15 +115,22 @@ class Inertia:
             stacklevel=6,
         )
 
-    def _judge(self, coupling: float, M: Array) -> None:
+    def _judge(self, coupling: float, M: Array, inverse: Array) -> None:
         """Refuse or warn of an M whose inverse has lost its digits; name what moves with it."""
         name, scale = self._state.robot.name, np.sqrt(np.maximum(M.diagonal(), 0.0))
         scale[scale == 0.0] = 1.0
-        mode = np.linalg.eigh(M / scale / scale[:, None])[1][:, 0]
+        lost = not self.least_coupling < coupling < _LARGEST_COUPLING  # or NaN
+        if lost:
+            mode = np.linalg.eigh(M / scale / scale[:, None])[1][:, 0]
+        else:  # the same by powers of the inverse, at a tenth of the price
+            stretched = inverse * scale * scale[:, None]
+            mode = stretched[int(stretched.diagonal().argmax())]
+            for _ in range(20):
+                mode = stretched @ mode
+                mode /= np.linalg.norm(mode)
         names = coordinate_names(self._state.robot)
         involved = listed([names[i] for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.1])
-        # Written so that NaN, from a pivot that is zero, fails too.
-        if not self.least_coupling < coupling < _LARGEST_COUPLING:
+        if lost:
             raise SingularInertiaError(
                 f"M of '{name}' is singular at this configuration: {involved} can move together "
                 "without moving mass; choose another configuration, give the links an inertia, or "

@@ -8,7 +8,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from fflin.base.rotation import (
     conjugate,
@@ -143,7 +142,7 @@ def _turned(x: Array) -> tuple[Array, Array]:
     return scalar, rotation_matrices(np.hstack((x[:, :3], scalar)))
 
 
-def _in_reference(frame: str, nx: int) -> list[NDArray[np.integer[Any]]]:
+def _in_reference(frame: str, nx: int) -> list[Any]:
     """Return where states have velocities of the base in reference axes."""
     velocities = np.arange(nx)[nx // 2 :]
     return [velocities[part] for part in compress((ANGULAR, LINEAR), IN_REFERENCE_AXES[frame])]

@@ -14,17 +14,19 @@ _NEAR = 1e-9  # a time this near to a knot, relative to the interval, is the kno
 
 
 class Path(
-    namedtuple("Path", "t q u way speed hold ends held over last starts K order along e point")
+    namedtuple(
+        "Path", "t q u way speed hold ahead ends held over last starts K order along e point"
+    )
 ):
     """A trajectory and its gains, piece by piece.
 
     At the knots t (N,) [s] q and u, row by row, and once more, with nu and K, where the run `ends`
     later, which is when t > `over` [s].
     Between them `way` is the cubic (4, 6 + n) in the share of the interval of the displacement from
-    its knot, and `speed` that of nu; u is linear or on `hold`, and the three inputs from each of
-    `held` on stand in the world's axes. K has `order` coefficients in the time since each of
-    `starts`, and stays after `last` [s]. `along` (6 + n,), the error e (nx,) and the `point` that
-    is followed are work space.
+    its knot, and `speed` that of nu; u is linear or on `hold`, taken `ahead` [s] of the time, and
+    the three inputs from each of `held` on stand in the world's axes. K has `order` coefficients in
+    the time since each of `starts`, and stays after `last` [s]. `along` (6 + n,), the error e (nx,)
+    and the `point` that is followed are work space.
     """
 
 
@@ -38,23 +40,31 @@ def _cubic(coefficients, k, s, out):
 
 
 @inlined
-def _follow(robot, path, t):
-    """Write what is followed at a time of the run, u in base axes; return if it is over."""
-    point, last, knots = path.point, len(path.t) - 2, path.t
-    time, after = knots[0] + max(t, 0.0), path.ends and t > path.over
+def _placed(knots, time):
+    """Return which interval a time is in, and the share of it that is over."""
+    last = len(knots) - 2
     k = max(0, min(np.searchsorted(knots, time, side="right") - 1, last))
     s = (time - knots[k]) / (knots[k + 1] - knots[k])
     if s > 1.0 - _NEAR and k < last:
         k, s = k + 1, 0.0
-    s = 0.0 if s < _NEAR else min(s, 1.0)
+    return k, 0.0 if s < _NEAR else min(s, 1.0)
+
+
+@inlined
+def _follow(robot, path, t):
+    """Write what is followed at a time of the run, u in base axes; return if it is over."""
+    point, last, knots = path.point, len(path.t) - 2, path.t
+    time, after = knots[0] + max(t, 0.0), path.ends and t > path.over
+    k, s = _placed(knots, time)
+    at, share = _placed(knots, min(time + path.ahead, knots[last + 1]))
     if after:
-        k, s = last + 2, 0.0
+        k, at, share = last + 2, last + 2, 0.0
     copy(path.q, k * len(point.q), point.q, 0, len(point.q))
     count = len(point.u)
     for index in range(count):
-        value = path.u[k * count + index]
-        if s > 0.0 and not path.hold:
-            value += s * (path.u[(k + 1) * count + index] - value)
+        value = path.u[at * count + index]
+        if share > 0.0 and not path.hold:
+            value += share * (path.u[(at + 1) * count + index] - value)
         point.u[index] = value
     if after:
         copy(path.speed, 4 * (last + 1) * len(point.nu), point.nu, 0, len(point.nu))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cached_property
 from itertools import pairwise
 
@@ -44,7 +45,11 @@ class Flow:
 
     @cached_property
     def residual(self) -> Array:
-        """How far each interval's end is from the next knot (N - 1,).
+        """How far each interval's end is from the next knot (N - 1,), see `missed`."""
+        return self.missed(range(len(self._t) - 1))
+
+    def missed(self, intervals: Iterable[int]) -> Array:
+        """Return how far the ends of some intervals are from the next knots.
 
         The rates that are missing on the way, relative to the largest of the motion. An observer
         who flies along with the base's mean velocity takes them (Galilei), and each rotor counts
@@ -82,8 +87,8 @@ class Flow:
         found, steps = [], 1
         # What is no motion may diverge, which the residual says.
         with np.errstate(all="ignore"):
-            for k, h in enumerate(np.diff(t)):
-                steps = max(1, steps // 4)
+            for k in intervals:
+                steps, h = max(1, steps // 4), float(t[k + 1] - t[k])
                 end = self.end(k, steps, q[k], v[k])
                 while steps < _MOST_STEPS:
                     before, steps = end, 2 * steps

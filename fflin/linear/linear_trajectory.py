@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
+from fflin.base.threads import in_one_thread
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.linear.flow import placed
@@ -111,6 +112,7 @@ class LinearTrajectory(Trajectory):
 
         return check_all(self.robot, self, f"{self.robot.name}, {len(self)} knots")
 
+    @in_one_thread
     def discretize(self, dt: float) -> LinearTrajectory:
         r"""Sample it along the motion, du held from sample to sample.
 

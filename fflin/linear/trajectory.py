@@ -16,6 +16,7 @@ from fflin.base.errors import FflinError, FflinWarning, InputError
 from fflin.base.frozen import frozen
 from fflin.base.record import Design
 from fflin.base.rotation import rotation_matrices
+from fflin.base.tables import folded
 from fflin.base.validation import Array, as_double, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.actuation import Actuation
@@ -23,8 +24,12 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.flow import Flow
 from fflin.robot.robot import Robot
 
-# A residual from which on the knots are in doubt as a motion of the robot.
-_IN_DOUBT = 1e-2
+# A residual from which on the knots are in doubt as a motion of the robot, and how many of the
+# intervals that miss most are tried with what else may have been meant.
+_IN_DOUBT, _TRIED = 1e-2, 5
+
+# Between two knots the base goes the shorter way, of less than half a turn [rad].
+_FARTHEST_TURN = 2.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -108,7 +113,8 @@ class Trajectory(Design):
 
     def __str__(self) -> str:
         """Show how good a motion of the robot it is."""
-        return f"{super().__str__()}\n{self._doubt() or f'residual {self.residual.max():.1e}'}"
+        doubt = self._doubt() or f"residual {self.residual.max():.1e}"
+        return f"{folded(super().__str__().splitlines())}\n{folded([doubt])}"
 
     @property
     def _state(self) -> StateMap:
@@ -239,24 +245,33 @@ class Trajectory(Design):
         """Say when the knots are no motion of the robot, and what would mend it."""
         found = self.flow.residual
         worst = int(found.argmax())
+        rates = np.linalg.norm(self.v[:, 3:6], axis=1)
+        turns = np.diff(self.t) * np.maximum(rates[1:], rates[:-1])
+        if found[worst] <= _IN_DOUBT and turns.max() > _FARTHEST_TURN:
+            k = int(turns.argmax())
+            return (
+                f"the base turns by {turns[k]:.2g} rad from t = {self.t[k]:g} to {self.t[k + 1]:g} "
+                f"s, more than its ends can tell; give knots at most {_FARTHEST_TURN:g} rad apart"
+            )
         if found[worst] <= _IN_DOUBT:
             return ""
         said = (
-            f"t, q, v, u are not quite a motion of '{self.robot.name}': from t = "
-            f"{self.t[worst]:g} to {self.t[worst + 1]:g} s they miss it by {found[worst]:.2g} of "
-            "its largest rate"
+            f"t, q, v, u are no motion of '{self.robot.name}': from t = {self.t[worst]:g} to "
+            f"{self.t[worst + 1]:g} s they miss it by {found[worst]:.2g} of its largest rate"
         )
-        size, plain, how = float(found[worst]), Trajectory(**self._given), list[str]()
-        while size > _IN_DOUBT and len(how) < 2:
-            tried = {words: other for words, other in _others(plain) if words not in how}
-            sizes = {words: float(other.flow.residual.max()) for words, other in tried.items()}
+        plain, few = Trajectory(**self._given), found.argsort()[-_TRIED:].tolist()
+        once = dict(_others(plain))
+        # Two things may be meant otherwise, neither of which mends it alone.
+        twice = (
+            {f"{first}, {words}": each for words, each in _others(other) if words != first}
+            for first, other in once.items()
+        )
+        for tried in (once, *twice):
+            sizes = {words: float(each.flow.missed(few).max()) for words, each in tried.items()}
             words = min(sizes, key=sizes.__getitem__)
-            if sizes[words] > 0.3 * size:
-                break
-            size, plain = sizes[words], tried[words]
-            how.append(words)
-        if how:
-            return f"{said}; {', '.join(how)} they hold to {size:.0e}"
+            size = sizes[words]
+            if size <= _IN_DOUBT and (size := float(tried[words].flow.residual.max())) <= _IN_DOUBT:
+                return f"{said}; {words} they hold to {size:.0e}"
         return f"{said}; give those of one motion under the robot's own inputs, springs and gravity"
 
     @property
@@ -267,9 +282,16 @@ class Trajectory(Design):
 def _others(traj: Trajectory) -> Iterator[tuple[str, Trajectory]]:
     """Yield what else a trajectory may have been meant to be, and how to say it."""
     robot, R = traj.robot, rotation_matrices(traj.q[:, 3:7])
-    yield "with the input of the knot before", replace(traj, hold="previous")
+    yield "with the input of the knot before (hold='previous')", replace(traj, hold="previous")
     yield "with the input of the knot after", replace(traj, u=traj.u[1:], hold="previous")
-    yield "with inputs linear between the knots", replace(traj, hold="linear")
+    yield "with inputs linear between the knots (hold='linear')", replace(traj, hold="linear")
+    yield "with t in milliseconds", replace(traj, t=1e-3 * traj.t)
+    turning = [joint for joint in robot.joints if not (joint.prismatic or joint.unbounded)]
+    q, v = traj.q.copy(), traj.v.copy()
+    for rows, at in ((q, [x.idx_q for x in turning]), (v, [x.idx_v for x in turning])):
+        rows[:, at] = np.radians(rows[:, at])
+    if turning and not robot.followers:
+        yield "with joints in degrees", replace(traj, q=q, v=v)
     for frame in ("local", "hybrid", "world"):
         yield f"with u in frame {frame}", replace(traj, frame=frame)
     v = traj.v.copy()

@@ -1,9 +1,9 @@
 """Where robots are found: the bundled ones, those of example-robot-data, and any path."""
 
 import os
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 from fflin.base.errors import FileError, InputError, UrdfError, unknown
 
@@ -11,8 +11,7 @@ from fflin.base.errors import FileError, InputError, UrdfError, unknown
 _PRUNED = {"talos_legs": ("torso_1_joint",)}
 
 
-@dataclass(frozen=True)
-class RobotFile:
+class RobotFile(NamedTuple):
     """Where a robot's description lies."""
 
     name: str  # that `load` takes

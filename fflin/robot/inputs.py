@@ -80,7 +80,6 @@ class WrenchInput(Input, ABC):
         """Force [N] and torque [N m] about the frame's origin (6,) of a unit, in the frame."""
 
 
-@dataclass(frozen=True)
 class BaseTorque(Input):
     """Torque tau_b (3) [N m] on the base, in the axes that the velocity frame says.
 
@@ -93,7 +92,6 @@ class BaseTorque(Input):
     KEY, GROUP, ENTRIES = "base_torque", "tau_b", "xyz"
 
 
-@dataclass(frozen=True)
 class BaseForce(Input):
     """Force F_b (3) [N] at the base origin, in the axes that the velocity frame says.
 

@@ -203,12 +203,25 @@ def _robot(
         for joint, mimic in mimics.items()
     )
     robot = Robot(model, name, None, "", joints, followers, locked=locked)
-    if not model.check(robot.create_data()):
+    robot.require_room()
+    if not _depth_first(model.parents.tolist()):
         raise ModelError(
             f"'{name}': the joints are not in depth-first order, in which Pinocchio's CRBA is "
             "wrong; add the joints of one branch before those of the next"
         )
     return robot
+
+
+def _depth_first(parents: Sequence[int]) -> bool:
+    """Whether each joint hangs on the one before it, or on one that this hangs on."""
+    above: list[int] = []
+    for joint, parent in enumerate(parents):
+        while above and above[-1] != parent:
+            above.pop()
+        if joint and not above:
+            return False
+        above.append(joint)
+    return True
 
 
 def _check_root(model: pin.Model, name: str) -> None:

@@ -33,8 +33,11 @@ class Output:
         return [(f"{prefix}{name}.{axis}", unit) for name, unit in self.VECTORS for axis in "xyz"]
 
 
+@dataclass(frozen=True)
 class FrameOutput(Output):
     """An output of frames of the model, on the base or on any link: its fields name them."""
+
+    frame: str
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -42,14 +45,12 @@ class FrameOutput(Output):
         return tuple(getattr(self, item.name) for item in fields(self))
 
 
-@dataclass(frozen=True)
 class FullState(Output):
     """Every state, under its own name, in the order and axes of the state."""
 
     WORD = "state"
 
 
-@dataclass(frozen=True)
 class BasePose(Output):
     """Attitude q_b (3) [1] and position r_b (3) [m] of the base, the states."""
 
@@ -69,7 +70,6 @@ class JointOutput(Output):
             raise InputError(f"joints is {given}, expected a tuple of names, ({given},)")
 
 
-@dataclass(frozen=True)
 class JointPositions(JointOutput):
     """Angles [rad] or lengths [m] of joints, the states.
 
@@ -83,7 +83,6 @@ class JointPositions(JointOutput):
     WORD = "joints"
 
 
-@dataclass(frozen=True)
 class JointVelocities(JointOutput):
     """Rates [rad/s] or [m/s] of joints, the states.
 
@@ -97,7 +96,6 @@ class JointVelocities(JointOutput):
     WORD = "rates"
 
 
-@dataclass(frozen=True)
 class FramePose(FrameOutput):
     """Pose of a frame of the model, on the base or on any link.
 
@@ -112,10 +110,8 @@ class FramePose(FrameOutput):
 
     WORD = "pose"
     VECTORS = (("position", "m"), ("rotation", "rad"))
-    frame: str
 
 
-@dataclass(frozen=True)
 class FrameVelocity(FrameOutput):
     """Velocity of a frame of the model, with the axes of the hybrid velocity of the base.
 
@@ -129,7 +125,6 @@ class FrameVelocity(FrameOutput):
 
     WORD = "velocity"
     VECTORS = (("angular_velocity", "rad/s"), ("velocity", "m/s"))
-    frame: str
 
 
 @dataclass(frozen=True)
@@ -149,11 +144,9 @@ class RelativePose(FrameOutput):
 
     WORD = "relative"
     VECTORS = (("position", "m"), ("rotation", "rad"))
-    frame: str
     to: str
 
 
-@dataclass(frozen=True)
 class CenterOfMass(Output):
     """Position (3) [m] of the centre of mass relative to the reference, in reference axes."""
 
@@ -161,7 +154,6 @@ class CenterOfMass(Output):
     VECTORS = (("com", "m"),)
 
 
-@dataclass(frozen=True)
 class Momentum(Output):
     """Momentum of the whole robot, in reference axes.
 
@@ -173,7 +165,6 @@ class Momentum(Output):
     VECTORS = (("momentum.angular", "N m s"), ("momentum.linear", "N s"))
 
 
-@dataclass(frozen=True)
 class Gyroscope(FrameOutput):
     """What a gyroscope measures: angular velocity (3) [rad/s] of a frame, in its own axes.
 
@@ -184,10 +175,8 @@ class Gyroscope(FrameOutput):
 
     WORD = "gyroscope"
     VECTORS = (("gyroscope", "rad/s"),)
-    frame: str
 
 
-@dataclass(frozen=True)
 class Accelerometer(FrameOutput):
     """What an accelerometer measures: specific force (3) [m/s^2], in its own axes.
 
@@ -202,7 +191,6 @@ class Accelerometer(FrameOutput):
     WORD = "accelerometer"
     VECTORS = (("acceleration", "m/s^2"),)
     FEELS_ACCELERATION = True
-    frame: str
 
 
 # In the order in which a command line lists them.

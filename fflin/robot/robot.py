@@ -454,13 +454,17 @@ class Robot:
         ModelError
             If it would take more than 1 GiB.
         """
+        self.require_room()
+        return self.model.createData()
+
+    def require_room(self) -> None:
+        """Raise `ModelError` where Pinocchio's work space would take more than 1 GiB."""
         size = _DATA_BYTES_PER_NV3 * self.nv**3
         if size > _DATA_LIMIT:
             raise ModelError(
                 f"'{self.name}' has {self.n} joints, for which Pinocchio's Data takes about "
                 f"{size / 2**30:.1f} GiB (limit 1 GiB); lock joints that do not matter"
             )
-        return self.model.createData()
 
     @cached_property
     def unbounded(self) -> dict[int, str]:

@@ -6,7 +6,6 @@ import re
 import reprlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinError, InputError
@@ -47,7 +46,7 @@ class RobotToml:
         self.package_dirs = tuple(path.parent / folder for folder in folders)
         with self.placed("urdf"):
             # The URDF, under the name of the TOML file.
-            self.found = replace(find_robot(given.pop("urdf"), path.parent), name=name)
+            self.found = find_robot(given.pop("urdf"), path.parent)._replace(name=name)
             if self.found.path.suffix.lower() == ".toml":
                 raise InputError(f"urdf is {self.found.path}, expected a URDF or a robot's name")
         with self.placed("outputs"):

@@ -30,6 +30,7 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> tuple[
     nodes, weights, moments = (
         np.array(each) * h for each in (plan.method.nodes, plan.method.weights, plan.method.moments)
     )
+    nodes = np.minimum(nodes, plan.last_node * h)
     origins = np.array(plan.method.origins)
     start = Course(conserved, plan.method, h, plan.q, plan.v)
     kept = course.Course(
@@ -108,7 +109,7 @@ def _path(plan: Plan, plant: Plant) -> tracking.Path:
     none, nowhere, size, nu = np.zeros(0), np.zeros(0, dtype=np.intp), state.nx // 2, plan.initial
     point = forward.Point(plan.q.copy(), np.zeros(size), nu.copy(), none, none)
     path = tracking.Path(
-        *(none, none, none, none, none, False, False, nowhere, 0.0, 0.0, none, none, 1),
+        *(none, none, none, none, none, False, 0.0, False, nowhere, 0.0, 0.0, none, none, 1),
         *(np.zeros(size), np.zeros(state.nx), point),
     )
     if not isinstance(policy, TrajectoryFeedback):
@@ -116,8 +117,7 @@ def _path(plan: Plan, plant: Plant) -> tracking.Path:
     motion, schedule = policy.trajectory, policy.schedule
     way, speed = (state.velocities(each).ravel() for each in motion.flow.cubics)
     q, u = list(motion.q), list(motion.u)
-    over = policy.duration * AT_THE_END
-    ends = plan.times.steps * plan.times.dt > over
+    ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
     held = np.array([each.columns.start for each in motion.flow.held], dtype=np.intp)
     nx, gains = state.nx, schedule.passed
     pieces = (schedule.K if schedule.dt else gains.pieces).reshape(
@@ -139,9 +139,10 @@ def _path(plan: Plan, plant: Plant) -> tracking.Path:
         way=way,
         speed=speed,
         hold=motion.hold == "previous",
+        ahead=policy.ahead,
         ends=bool(ends),
         held=held,
-        over=over,
+        over=policy.over,
         last=gains.last - gains.first,
         starts=np.array(gains.starts),
         K=np.array(pieces).ravel(),

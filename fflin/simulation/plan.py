@@ -30,6 +30,9 @@ Event: TypeAlias = Callable[[float, Array, Array], float]
 LinearLaw: TypeAlias = Callable[[Array], Array]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 
+# A share of a step that is no longer part of what comes after it.
+_BEFORE = 1e-6
+
 LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
 
 
@@ -65,6 +68,11 @@ class Plan:
     steered: tuple[str, ...]  # the states that are known to be fed back
     notes: tuple[str, ...]  # what is to be said of the run
     predictor: Predictor | TrajectoryFeedback | None  # of the linear motion under the same law
+
+    @property
+    def last_node(self) -> float:
+        """When in a step, of 1, its last stage asks: before a knot at its end where inputs jump."""
+        return 1.0 - _BEFORE if getattr(self.policy, "jumps", False) else 1.0
 
     def channel(self) -> Channel | None:
         """Return the way of the law's commands to the inputs, with nothing on it yet."""

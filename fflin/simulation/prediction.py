@@ -13,7 +13,7 @@ from fflin.base.validation import Array
 from fflin.control.channel import Channel
 from fflin.control.output_feedback import OutputFeedback
 from fflin.control.policies import Allocation
-from fflin.control.tracking import TrajectoryFeedback
+from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moved_by, moving_errors
 from fflin.linear.model import LinearModel
@@ -195,13 +195,13 @@ def _errors(policy: TrajectoryFeedback, plan: Plan, e: Array, steps: int) -> Arr
     """Return the errors from a trajectory that the linear models along it have, see `predict`."""
     dt, _, every, sample, delay, *_ = plan.times
     models, limits = policy.models, plan.limits
-    start = float(models.t[0])
+    start, end = models.t[[0, -1]].tolist()
 
     def at(t: float) -> tuple[Array, Array, Array]:
         """Return A, B and the inputs of the trajectory at a time of the run."""
-        if t > policy.duration:
+        if t > policy.duration * AT_THE_END:
             return policy.end.A, policy.end.B, policy.end.u0
-        return (*models.matrices(start + t), policy.reference(t)[2])
+        return (*models.matrices(min(start + t, end)), policy.reference(t)[2])
 
     if limits.wheels:
         names = limits.wheels.names
@@ -213,24 +213,30 @@ def _errors(policy: TrajectoryFeedback, plan: Plan, e: Array, steps: int) -> Arr
 
         limits = limits._replace(wheels=limits.wheels._replace(speeds=speeds))
     channel = Channel(policy.law(), plan.initial, limits, sample, delay)
-    rows, after, ended = [], at(0.0), False
+    rows, after, ended, held = [], at(0.0), False, models.hold == "previous"
     for step in range(steps):
         t = step * dt
-        u = channel.begin(step, t, e)
         if step % every == 0:
             rows.append(e)
-        if not ended and t > policy.duration - 1e-6 * dt:
+        ends = not ended and t > policy.duration - 1e-6 * dt
+        u = None if ends and sample else channel.begin(step, t, e)
+        if ends:
             # From here on the error is counted from rest.
             ended, after = True, at(math.inf)
             stop = policy.reference(policy.duration)[1] - policy.end.v
             e = e + np.concatenate((np.zeros(len(e) // 2), StateMap(models.robot).velocities(stop)))
+        u = channel.begin(step, t, e) if u is None else u
         before, half, after = after, at(t + 0.5 * dt), at(t + dt)
         # What the trajectory holds ends with the step, whatever acts from the next knot on.
-        last = (*after[:2], policy.reference(t + (1.0 - 1e-6) * dt)[2])
+        last = at(t + (1.0 - 1e-6) * dt) if held else after
         stages: list[Array] = []
         for share, (A, B, u_star) in ((0.0, before), (0.5, half), (0.5, half), (1.0, last)):
             to = e + share * dt * stages[-1] if stages else e
-            acting = channel.ask(t + share * dt, to) if channel.continuous and stages else u
+            acting = (
+                channel.ask(t + min(share, plan.last_node) * dt, to)
+                if channel.continuous and stages
+                else u
+            )
             stages.append(A @ to + B @ (acting - u_star))
         e = e + dt / 6.0 * (stages[0] + 2.0 * (stages[1] + stages[2]) + stages[3])
     return np.array([*rows, e])

@@ -100,13 +100,15 @@ def _advance(
 
     stage, wrench, wrenches = plant.stage, conserved.wrench, course.wrenches
 
+    latest = plan.last_node * plan.times.dt
+
     def asked(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-        stages = 0
+        stages, last = 0, t + latest
 
         def f(t: float, q: Array, v: Array) -> Array:
             nonlocal stages
             # The first stage is the point that was asked about already.
-            a, push = stage(t, q, v, ask(t, q, v) if ask and stages else u)
+            a, push = stage(t, q, v, ask(min(t, last), q, v) if ask and stages else u)
             if pushed:
                 wrenches[stages][:] = wrench(q, push)
             stages += 1

@@ -165,6 +165,8 @@ def simulate(
     E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
     """
     policy = followed(policy, robot)
+    times = times_of(policy, duration, dt, every, sample, delay)
+    policy = followed(policy, robot, held=times.sample > 0)
     lin, _ = feedback_of(policy)
     follows, along = reference_of(policy), tracking_of(policy)
     own_frame, own_reference = axes_of(policy)
@@ -183,7 +185,6 @@ def simulate(
     plant = Plant(state, disturbance)
     foresees = predictor(plant, policy, linear)
     q, v = start_of(state, x0, q0, v0, follows)
-    times = times_of(policy, duration, dt, every, sample, delay)
     times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=dt is None)
     acting, known = chosen_limits(robot, limits)
     within = saturation(robot, acting, q, times.dt, times.sample)

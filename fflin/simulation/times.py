@@ -42,7 +42,11 @@ class Times(NamedTuple):
     def notes(self) -> tuple[str, ...]:
         """What is to be said of the rows."""
         said = f"one in {self.every} of {self.steps:,} steps is recorded; every=1 (--every 1) "
-        return (f"{said}records all",) if self.thinned else ()
+        notes: tuple[str, ...] = (f"{said}records all",) if self.thinned else ()
+        if self.sample and self.every % self.sample and self.sample % self.every:
+            aside = f"rows every {self.every} steps miss samples every {self.sample}, where inputs "
+            notes += (f"{aside}change: they are no trajectory",)
+        return notes
 
     @property
     def slow(self) -> float:

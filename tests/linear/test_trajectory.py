@@ -143,7 +143,7 @@ def test_causes_are_tried_out():
         every=20,
     )
     given = fflin.Trajectory(robot, run.t, run.q, run.v, run.u, frame="hybrid")
-    assert "with the input of the knot before they hold to" in said(given)
+    assert "with the input of the knot before (hold='previous') they hold to" in said(given)
     given = fflin.Trajectory(robot, run.t, run.q, run.v, run.u[:-1])
     assert "with u in frame hybrid they hold to" in said(given)
     u = np.vstack((run.u[:1], run.u[:-1]))
@@ -293,3 +293,51 @@ def _of_world(along):
         R = pin.Quaternion(q[3:7]).matrix()
         row[:3], row[3:6] = R @ row[:3], R @ row[3:6]
     return u
+
+
+def test_two_slips_at_once_and_those_of_units_are_named():
+    robot = fflin.load("ets_vii")
+    u = 0.3 * np.random.default_rng(4).normal(size=(5, 12))
+    run = fflin.simulate(
+        *(robot, lambda t, q, v: u[min(int(t / 0.5 + 1e-9), 4)]),
+        v0=fflin.velocity(robot, {"omega_b.z": 0.2, "v_b.x": 0.1, "joint_1": 0.1}),
+        **{"duration": 2.5, "dt": 0.01, "sample": 0.5, "every": 10, "frame": "world"},
+    )
+    state = fflin.StateMap(robot, frame="local")
+    q, v = map(np.array, zip(*map(state.to_pinocchio, run.x), strict=True))
+    given = fflin.Trajectory(robot, run.t, q, v, run.u, hold="linear")
+    both = "with the input of the knot before (hold='previous'), with u and v in frame world"
+    assert f"{both} they hold to" in " ".join(str(given).split())
+    motion = run.trajectory()
+    late = replace(motion, t=1e3 * motion.t)
+    assert "with t in milliseconds they hold to" in " ".join(str(late).split())
+    bounded = fflin.load("canadarm2", lock=["joint_4", "joint_5", "joint_6", "joint_7"])
+    turned = fflin.simulate(
+        *(bounded, lambda t, q, v: 20.0 * np.cos(np.arange(9))),
+        **{"duration": 2.0, "dt": 0.01, "every": 10, "frame": "local"},
+    ).trajectory()
+    assert not bounded.unbounded
+    q, v = turned.q.copy(), turned.v.copy()
+    q[:, 7:], v[:, 6:] = np.degrees(q[:, 7:]), np.degrees(v[:, 6:])
+    degrees = replace(turned, q=q, v=v)
+    assert "with joints in degrees they hold to" in " ".join(str(degrees).split())
+    # What would not mend it is not advised.
+    wild = replace(motion, u=10.0 * motion.u)
+    assert "give those of one motion" in " ".join(str(wild).split())
+
+
+def test_rows_that_miss_the_samples_are_told():
+    robot = fflin.load("cubesat")
+    options = {"duration": 2.0, "dt": 0.01, "sample": 0.1}
+    run = fflin.simulate(robot, lambda t, q, v: np.zeros(6), every=7, **options)
+    assert "rows every 7 steps miss samples every 10" in run.notes[0]
+    for every in (1, 2, 5, 10, 20):
+        assert not fflin.simulate(robot, lambda t, q, v: np.zeros(6), every=every, **options).notes
+
+
+def test_a_base_that_turns_too_far_between_knots_is_told():
+    robot = fflin.load("cubesat")
+    for speed, far in ((3.3, True), (2.0, False)):
+        v0 = fflin.velocity(robot, {"omega_b.z": speed})
+        spin = fflin.simulate(robot, v0=v0, duration=4.0, dt=0.01, every=100).trajectory()
+        assert ("the base turns by 3.3 rad from t = 0 to 1 s" in str(spin)) == far

@@ -249,3 +249,83 @@ def test_the_last_step_ends_on_the_trajectory_whatever_its_time_is_rounded_to():
     for t in (policy.duration, late):
         np.testing.assert_array_equal(policy.reference(t)[1], traj.point(traj.t[-1])[1])
     assert not policy.reference(policy.duration + 1e-6)[1].any()
+
+
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+@pytest.mark.parametrize("how", ["schedule", "option"])
+def test_at_the_very_end_held_inputs_are_those_of_rest(engine, how):
+    """The last input of a motion brakes: held on for a sample it kicks the robot out of rest."""
+    robot = fflin.load("planar_detumble")
+    start = fflin.velocity(robot, {"omega_b.y": 0.02})
+    brake = np.linalg.lstsq(fflin.linearize(robot).B[9:], -start[[3, 4, 5, 0, 1, 2, 6, 7, 8]])[0]
+    run = fflin.simulate(
+        robot,
+        lambda t, q, v: brake,
+        v0=start,
+        duration=1.0,
+        dt=0.01,
+        every=10,
+        frame="local",
+        sample=0.1,
+    )
+    traj = run.trajectory()
+    assert np.abs(traj.v[-1]).max() < 0.1 * np.abs(start).max()
+    sample = 0.1 if how == "schedule" else None
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj), 1.0, 1e3, sample=sample)
+    option = {"sample": 0.1} if how == "option" else {}
+    flown = fflin.simulate(robot, schedule, duration=3.0, dt=0.01, engine=engine, **option)
+    at = np.searchsorted(flown.t, 1.0 - 1e-9)
+    assert np.abs(flown.u[at - 1]).max() > 0.5 * np.abs(brake).max()
+    assert np.abs(flown.u[at]).max() < 0.1 * np.abs(brake).max()
+    assert np.abs(flown.linear - flown.x).max() < 1e-4
+
+
+@pytest.mark.parametrize("engine", ["python", "compiled"])
+def test_inputs_that_jump_at_knots_are_followed_to_the_integrators_order(engine):
+    robot = fflin.load("ets_vii")
+    u = 0.5 * np.random.default_rng(6).normal(size=(5, 12))
+    options = {"duration": 2.0, "frame": "local"}
+    held = fflin.simulate(
+        robot,
+        lambda t, q, v: u[min(int(t / 0.4 + 1e-9), 4)],
+        dt=1e-3,
+        sample=0.4,
+        every=40,
+        **options,
+    )
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, held.trajectory()), 1.0, 1.0, 1.0)
+    errors = []
+    for dt in (0.04, 0.02):
+        run = fflin.simulate(
+            robot, schedule, duration=2.0, dt=dt, engine=engine, every=int(0.4 / dt)
+        )
+        errors.append(np.abs(run.error).max())
+    assert errors[1] < 1e-6
+    assert errors[0] > 8.0 * errors[1]
+
+
+def test_a_sample_of_inputs_that_change_has_their_mean():
+    robot = fflin.load("planar_detumble")
+    traj = swung(robot, 2.0, size=0.5).trajectory()
+    along = fflin.linearize_trajectory(robot, traj)
+    errors = []
+    for sample in (0.2, 0.1):
+        run = fflin.simulate(robot, fflin.tvlqr(along, sample=sample), dt=0.01)
+        errors.append(np.abs(run.error[-1]).max())
+        np.testing.assert_allclose(run.u[0], traj.point(0.5 * sample)[2], atol=1e-12)
+    assert errors[0] > 3.0 * errors[1]
+
+
+@pytest.mark.parametrize("first", [0.0, 0.3])
+def test_a_run_of_just_the_trajectorys_length_needs_no_rest(first):
+    robot = fflin.load(
+        "planar_detumble", gravity=(0.0, 0.0, -9.81), inputs=[fflin.JointTorque("*")]
+    )
+    t = np.linspace(0.0, 0.7, 8)
+    fall = fflin.simulate(robot, duration=0.7, dt=0.01, every=10, frame="local")
+    traj = fflin.Trajectory(robot, first + t, fall.q, fall.v, fall.u)
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(robot, traj), 1.0, 1.0, 1.0, sample=0.07)
+    for dt in (0.07, 0.01):
+        run = fflin.simulate(robot, schedule, dt=dt)
+        assert run.linear is not None
+        assert np.abs(run.error).max() < 1e-4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import sys
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from fflin.robot.urdf.links import Pose, bounded_number, read_pose, refuse_near_miss
 from fflin.robot.urdf.xml import Element, decimal, quoted
@@ -21,8 +21,7 @@ UNLIMITED = sys.float_info.max
 _SHORTEST_AXIS, _LONGEST_AXIS = 1e-6, 1e6
 
 
-@dataclass(frozen=True)
-class Mimic:
+class Mimic(NamedTuple):
     """A joint that moves with another: value = multiplier * leader's value + offset."""
 
     leader: str
@@ -30,8 +29,7 @@ class Mimic:
     offset: float  # [rad|m]
 
 
-@dataclass(frozen=True)
-class JointElement:
+class JointElement(NamedTuple):
     """One joint between two links, and the element that describes it."""
 
     name: str

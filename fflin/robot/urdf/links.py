@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from fflin.base.validation import Array
-from fflin.robot.urdf.xml import Element, quoted
+from fflin.robot.urdf.xml import Element, nearest, quoted
 
 # Beyond it nothing is physical, and products of two such numbers stay far from overflow.
 _ABSURD = 1e30
@@ -24,8 +24,7 @@ _QUATERNION_SLACK = 1e-3
 INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
-@dataclass(frozen=True)
-class Pose:
+class Pose(NamedTuple):
     """Where a frame lies in another, as the file writes it."""
 
     xyz: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m]
@@ -33,8 +32,7 @@ class Pose:
     quaternion: tuple[float, ...] | None = None  # x y z w of unit length, in place of rpy
 
 
-@dataclass(frozen=True)
-class Link:
+class Link(NamedTuple):
     """One link, and the element that describes it."""
 
     name: str
@@ -122,13 +120,10 @@ def bounded_length(element: Element, what: str, of: str, value: float) -> float:
 
 def refuse_near_miss(element: Element, of: str, known: tuple[str, ...]) -> None:
     """Refuse children that are a known element misspelt; others are ignored as URDF has it."""
-    import difflib
-
     for child in element.children:
         if child.tag in known or ":" in child.tag:
             continue
-        near = difflib.get_close_matches(child.tag.lower(), known, n=1, cutoff=0.85)
-        if near:
+        if meant := nearest(child.tag.lower(), known, 0.85):
             raise child.error(
-                f"<{child.tag}> in {of} is not known to URDF; did you mean <{near[0]}>?"
+                f"<{child.tag}> in {of} is not known to URDF; did you mean <{meant}>?"
             )

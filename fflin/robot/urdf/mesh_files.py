@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -21,9 +21,13 @@ def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None
     elif scheme == "file":
         candidates = [Path(unquote(rest))]
     else:
+
+        def folders() -> Iterator[Path]:
+            yield from package_dirs
+            yield from urdf.resolve().parents
+
         inside = Path(*Path(rest).parts[1:])
-        folders = (*package_dirs, *urdf.resolve().parents)
         # A package's own folder may have been given, or be called otherwise.
-        candidates = (folder / part for part in (rest, inside) for folder in folders)
+        candidates = (folder / part for part in (rest, inside) for folder in folders())
     # Unlike Path.is_file, this takes a name that is too long for one that does not exist.
     return next((path for path in candidates if os.path.isfile(path)), None)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import threading
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,8 +38,7 @@ class Advice(NamedTuple):
     note: str
 
 
-@dataclass(frozen=True, eq=False)
-class Description:
+class Description(NamedTuple):
     """A robot as its file describes it."""
 
     model: pin.Model  # free-flyer root joint, zero gravity; mimic joints move freely in it
@@ -66,7 +64,9 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     """Do what `read_urdf` does with the bytes of a file; `path` names it in errors."""
     root = parse(document, str(path))
     notes: list[str] = []
-    first = first_xacro(root)
+    # The marks of xacro, and of what may stand for them.
+    plain = document.replace(b"\0", b"")  # UTF-16 too
+    first = first_xacro(root) if any(x in plain for x in (b"xacro:", b"$", b"&#")) else None
     if path.suffix == ".xacro" or first:
         expanded, notes = expand(path, document, first)
         root = parse(expanded, f"{path} as expanded by xacro")

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from fflin.base.errors import unknown
 from fflin.robot.urdf.joints import JointElement, read_joint
@@ -20,8 +19,7 @@ _LINK_LIMIT = 10_000
 Part = TypeVar("Part", Link, JointElement)
 
 
-@dataclass(frozen=True)
-class Urdf:
+class Urdf(NamedTuple):
     """What a URDF describes, checked: the joints connect the links into one tree."""
 
     name: str  # empty where the file gives none

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import replace
-from html import escape
 
 from fflin.robot.urdf.joints import UNLIMITED, JointElement
 from fflin.robot.urdf.links import INERTIA, Link, Pose
 from fflin.robot.urdf.tree import Urdf
+
+_ENTITIES = {ord(letter): f"&#{ord(letter)};" for letter in "&<>\"'\t\n\r"}
 
 
 def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:
@@ -38,7 +38,7 @@ def _link(link: Link) -> Iterator[str]:
 def _joint(joint: JointElement, counted: bool) -> Iterator[str]:
     unbounded = {"lower": -UNLIMITED, "upper": UNLIMITED}
     if counted:
-        joint = replace(joint, type="revolute", limits=(joint.limits or {}) | unbounded)
+        joint = joint._replace(type="revolute", limits=(joint.limits or {}) | unbounded)
     yield f'<joint name={_quoted(joint.name)} type="{joint.type}">'
     yield f"<parent link={_quoted(joint.parent)}/><child link={_quoted(joint.child)}/>"
     yield _origin(joint.origin)
@@ -68,5 +68,5 @@ def _numbers(values: tuple[float, ...]) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Write an attribute's value. The standard library's writer loads its network client."""
-    return f'"{escape(text).translate({9: "&#9;", 10: "&#10;", 13: "&#13;"})}"'
+    """Write an attribute's value. The standard library's ways load far more than they do."""
+    return f'"{text.translate(_ENTITIES)}"'

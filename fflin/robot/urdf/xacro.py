@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import faulthandler
-import json
 import os
 import signal
-import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 from fflin.base.errors import MissingPackageError, UrdfError
@@ -49,6 +45,10 @@ def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, l
     It is expanded in a process of its own that may take `LIMIT`; files that it includes are looked
     up from where it lies. `first`, of `first_xacro`, is for errors.
     """
+    import json
+    import subprocess
+    from importlib.util import find_spec
+
     use = f", first used by <{first.tag}> in line {first.line}" if first else ""
     if not (find_spec("xacro") and find_spec("xacrodoc")):
         raise MissingPackageError(
@@ -88,6 +88,9 @@ def _expand_here(path: Path, limit: float) -> None:
     # It ends with who started it, or else in time, whatever it does.
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    import faulthandler
+    import json
+
     faulthandler.dump_traceback_later(limit, exit=True)
     import xacro
     from xacrodoc import XacroDoc, packages

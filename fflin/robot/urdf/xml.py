@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from xml.parsers import expat
 
 from fflin.base.errors import UrdfError, listed
@@ -22,6 +23,14 @@ _NEAR = 0.6
 _SPACE = " \t\r\n"
 _ENTITY = re.compile(rb"&(?!(amp|lt|gt|quot|apos);|#)")
 _DECIMAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+
+
+@lru_cache(128)  # a file has a few of them many times
+def nearest(name: str, known: tuple[str, ...], cutoff: float) -> str | None:
+    """Return what of the known is nearest to a name, None where nothing is near."""
+    import difflib
+
+    return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), None)
 
 
 @dataclass(eq=False, repr=False, slots=True)
@@ -74,12 +83,10 @@ class Element:
 
     def allow_only(self, *names: str, of: str) -> None:
         """Refuse a misspelt attribute, a default taken in silence; note others it does not know."""
-        import difflib
-
         for name in self.attributes:
             if name in names or ":" in name:
                 continue
-            if difflib.get_close_matches(name.lower(), names, n=1, cutoff=_NEAR):
+            if nearest(name.lower(), names, _NEAR):
                 raise self.error(
                     f"<{self.tag}> of {of} has an unknown attribute {quoted(name)}; known: "
                     f"{', '.join(names)}; correct it or take it out"

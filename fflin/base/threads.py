@@ -1,0 +1,23 @@
+"""One thread for many small matrices, which several threads of BLAS only wait for each other at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def in_one_thread(function: Callable[P, T]) -> Callable[P, T]:
+    """Let BLAS have one thread within a function."""
+
+    @wraps(function)
+    def limited(*args: P.args, **kwargs: P.kwargs) -> T:
+        from threadpoolctl import threadpool_limits
+
+        with threadpool_limits(1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return limited
