@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from fflin.base.names import chosen, input_keys
 from fflin.base.validation import Array, number, whole
 from fflin.control.saturation import saturation
 from fflin.control.shooting import Point, Shooting
-from fflin.control.stages import Rows
+from fflin.control.stage_qp import StageQP
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
 from fflin.dynamics.actuation import Actuation
@@ -27,18 +27,26 @@ if TYPE_CHECKING:
 
     from fflin.robot.robot import Robot
 
-# What may be missed of the goal in rad, m and s, between knots while it is sought, and at last.
-_REACHED, _MEETS, _ENDS = 1e-6, 1e-7, 1e-9
+# What may be missed of the goal and of limits of states in rad, m and s; what is sought of it.
+_REACHED, _ENDS = 1e-7, 1e-8
 
-# It is sought until an iteration would save less than this share of the effort, or so often.
-_SAVED, _MOST, _MOST_FIRM, _MOST_TRIALS = 5e-3, 30, 10, 10
+# Intervals are flown as one motion where they miss each other by no more.
+_MEETS = 1e-10
+
+# One motion that ends so near to the goal stays one.
+_NEARLY = 1e-3
+
+# How accurate the ends of intervals are in these while it is sought, and at last.
+_SEEKS, _FLIES = 1e-6, 1e-8
+
+# Iterations go on until one would save less than this share of the effort, or so often.
+_SAVED, _MOST, _MOST_CLOSING, _MOST_HALVINGS = 1e-6, 50, 20, 10
 
 # What a step of wheels costs beside others, as they may take any.
 _OF_WHEELS = 1e-6
 
-# A step of this [rad, m] at every knot costs the whole effort to begin with; and so many times
-# more costs what misses the goal.
-_STEP, _FIRMLY = 0.3, 1e9
+# What missing the goal or a limit by 1 rad or m costs, in efforts of the guess.
+_PRICE = 1e3
 
 
 def plan(
@@ -58,11 +66,12 @@ def plan(
     r"""Plan a motion to a goal within limits: a slew from rest to rest, or the end of a tumble.
 
     Of all inputs that stay within their limits, and keep joints and wheels within theirs at the
-    knots, those of a least :math:`\int u^T R\,u\;dt`: a local minimum, or as near to one as 30
-    iterations come. Each solves the quadratic problem that the linear models along the motion make,
-    with the start of each interval a variable of its own (multiple shooting), near enough to the
-    knots for them to hold. The attitude may turn by any angle, and goes round where the rates at
-    both ends have it so; continuous joints take the shorter way.
+    knots, those of a least :math:`\int u^T R\,u\;dt`: a local minimum, or as near to one as 50
+    iterations of sequential quadratic programming come, with the start of each interval a variable
+    of its own (multiple shooting). The linear models along the motion make the quadratic programs,
+    which PIQP solves (``pip install 'fflin[mpc]'``). The attitude may turn by any angle, and goes
+    round where the rates at both ends have it so; continuous joints take the shorter way. Between
+    knots the limits of joints are not seen: take knots near enough for them to hold.
 
     Parameters
     ----------
@@ -96,8 +105,10 @@ def plan(
     Raises
     ------
     InputError
-        If an argument has a wrong size or value, or the goal is not reached within the limits:
-        by how much it is missed.
+        If an argument has a wrong size or value, or no motion to the goal within the limits is
+        found: what the last one tried misses. That none exists is not said.
+    MissingPackageError
+        If PIQP is not installed.
     UnknownNameError
         If a name does not exist.
 
@@ -133,104 +144,137 @@ def plan(
         weights = matrix.diagonal()
         if (matrix != np.diag(weights)).any():
             raise InputError("R has entries off its diagonal; a plan takes a diagonal weight")
-    names = state.names
-    left = {*shooting.wheels, *chosen("state", free, names)}
-    asked = np.array([i not in left for i in range(len(names))])
-    rows = (np.tile(each, (knots, 1)) for each in (np.zeros_like(low), low, high))
-    inputs = Rows(np.outer(shooting.shares, weights), *rows)
-    bounds = np.array([acting.get(name, (-np.inf, np.inf)) for name in names]).T
-    with np.errstate(all="ignore"):  # what leads nowhere may diverge, which the goal's miss says
-        u = _sought(shooting, start, end, inputs, bounds, asked)
+    left = {*shooting.wheels, *chosen("state", free, state.names)}
+    asked = np.array([i not in left for i in range(state.nx)])
+    bounds = np.array([acting.get(name, (-np.inf, np.inf)) for name in state.names]).T
+    room = partial(_room, shooting, end, bounds, asked)
+    with np.errstate(all="ignore"):  # what leads nowhere may diverge, which is said
+        u = _sought(shooting, start, end, weights, np.array((low, high)), room)
         q, v = shooting.flown(start, u)
         missed = np.abs(shooting.between((q[-1], v[-1]), end)) * asked
-    if missed.max() <= _REACHED:
+        passed = _excess(room(q, v))
+    passed[-1, asked] = 0.0
+    passed = passed.max(axis=0)
+    if max(missed.max(), passed.max()) <= _REACHED:
         if asked.all():
             q[-1], v[-1] = end  # at rest, rounding would be all that a check sees
         return Trajectory(robot, t, q, v, u, hold=hold)
     units = ["rad"] * 3 + [*state.units[3:]]
-    worst = [i for i in np.argsort(-missed)[:3] if missed[i] > _REACHED]
-    by = [f"{names[i]} by {missed[i]:.2g} {units[i]}" for i in worst]
+    by = [
+        f"{words} {state.names[i]} by {far[i]:.2g} {units[i]}"
+        for words, far in (("misses", missed), ("exceeds the limit of", passed))
+        for i in np.argsort(-far)[:3]
+        if far[i] > _REACHED
+    ]
     raise InputError(
-        f"no motion within the limits was found that ends at the goal after {duration:g} s: it "
-        f"misses {listed(by) if by else 'it by far'}; give it more time, larger limits, or in "
-        "`free` what may end anywhere"
+        f"no motion within the limits was found that ends at the goal after {duration:g} s; the "
+        f"last one tried {listed(by) if by else 'diverges'}; give more time, wider limits, more "
+        "knots, or in `free` what may end anywhere"
     )
 
 
-class _Iterate(NamedTuple):
-    """Knots and inputs, and what the intervals, and at last the goal, are missed by (N + 1, nx)."""
-
-    q: Array
-    v: Array
-    u: Array
-    missed: Array
-
-
-def _sought(
-    shooting: Shooting, start: Point, end: Point, inputs: Rows, bounds: Array, asked: Array
+def _sought(  # noqa: PLR0915
+    shooting: Shooting,
+    start: Point,
+    end: Point,
+    R: Array,
+    limits: Array,
+    room: Callable[[Array, Array], Array],
 ) -> Array:
-    """Return the inputs (N + 1, nu) of the least effort that lead to the end, or nearest to it."""
-    nx = len(asked)
+    """Return the inputs (N + 1, nu) of the least effort that lead to the end, or nearest to it.
+
+    The Hessian is Gauss and Newton's, to which steps of the states add a cost that falls where
+    whole steps succeed (Levenberg and Marquardt).
+    """
     q, v, u = shooting.guess(start, end)
-    u = np.clip(u, inputs.low, inputs.high)
-    at = _Iterate(q, v, u, np.vstack((shooting.refine(q, v, u), np.zeros(nx))))
-    begun = inputs.cost(u) / (len(q) * _STEP**2) or 1.0
-    near, firm, single = begun, 0, False
-    y: Array = np.zeros((len(q) - 1, nx))
-    owed = np.zeros(nx)  # by the goal to the effort (augmented Lagrangian)
-    slack = np.ones((len(q), nx))
-    slack[:, [*shooting.wheels, *(nx // 2 + i for i in shooting.wheels)]] = _OF_WHEELS
-    for count in range(_MOST + _MOST_FIRM):
-        stages = shooting.stages(*at)
-        room = _room(shooting.state, at, bounds)
-        middle: Array = np.zeros((len(q), nx))
-        middle[-1] = at.missed[-1] + owed
-        share = 1.0  # of what is missed, that is to be closed
-        for _ in range(_MOST_TRIALS):
-            weights: Array = near * slack
-            weights[-1, asked] = _FIRMLY * begun
-            part = stages._replace(c=stages.c - (1.0 - share) * at.missed[:-1])
-            u, z, y = part.least(inputs, Rows(weights, share * middle, *room), y)
-            q, v = shooting.moved(at.q, at.v, z)
-            goal = shooting.between((q[-1], v[-1]), end) * asked
-            new = _Iterate(q, v, u, np.vstack((shooting.missed(q, v, u), goal)))
-            # What the multipliers say that it costs to miss, and more than that.
-            price = 1.5 * np.abs(np.vstack((y, y[-1])))
-            was, now = (
-                inputs.cost(x.u) + float((price * np.abs(x.missed)).sum()) for x in (at, new)
-            )
-            least = inputs.cost(u) + float(price[-1] @ np.abs((at.missed - z)[-1] * asked))
-            least += (1.0 - share) * float((price * np.abs(at.missed)).sum())
-            saved = was - least
-            close = np.abs(new.missed).max() <= _MEETS and saved <= _SAVED * inputs.cost(u)
-            if close or was - now > 0.1 * saved:
-                break
-            near, share = 4.0 * near, 0.5 * share
-        else:
+    nx, nu, rows = shooting.state.nx, len(R), len(q)
+    cost = _shares(shooting, R, u)
+    u = np.clip(u, *limits)
+    shooting.refine(q, v, u, _SEEKS)
+    scale = np.concatenate((np.ones(nx), (rows * cost[1]) ** -0.5))
+    wheels = [*shooting.wheels, *(nx // 2 + i for i in shooting.wheels)]
+    near = begun = np.where(np.isin(range(nx), wheels), _OF_WHEELS, 1.0) / rows
+    soft = np.where(np.arange(nx + nu) < nx, _PRICE, np.full((rows, 1), np.inf))
+    missed, most = shooting.missed(q, v, u), _MOST
+    price = 0.0 * missed
+
+    def merit(u: Array, missed: Array, excess: Array) -> float:
+        lost = (price * np.abs(missed)).sum() + _PRICE * excess.sum()
+        return float((cost * u * u).sum() / 2.0 + lost)
+
+    for count in range(_MOST + _MOST_CLOSING + 1):
+        if closing := count >= most:  # by the least changes that meet the goal
+            if count == most:
+                shooting.refine(q, v, u, _FLIES)
+                near, missed = begun, shooting.missed(q, v, u)
+            if np.abs(missed).max() <= _MEETS:
+                (q, v), missed = shooting.flown(start, u), 0.0 * missed
+        excess = _excess(space := room(q, v))
+        size = max(excess.max(), np.abs(missed).max())
+        ended = count == most + _MOST_CLOSING or (size <= _ENDS and not missed.any())
+        if not size < np.inf or (closing and ended):
             break
-        at, gained, owed = new, was - now > 0.7 * saved, (middle - z)[-1] * asked
-        if not firm and saved > _SAVED * inputs.cost(u) and count < _MOST:
-            near *= 0.1 if gained else 1.0
+        low, high = np.concatenate((space, limits[:, None] - u), axis=2)
+        try:
+            A, B, D = shooting.slopes(q, v, u)
+        except InputError:  # it has diverged
+            break
+        H, g = _blocks(near, cost), np.hstack((np.zeros((rows, nx)), (not closing) * cost * u))
+        least = StageQP(np.zeros(nx), A, B, D, missed, H, g, low, high, soft, scale).solve()
+        if least is None:
+            break
+        z, du, y = least
+        if closing:
+            u = np.clip(u + du, *limits)
+            if missed.any() or size > _NEARLY:
+                q, v = shooting.moved(q, v, z)
+                missed = shooting.missed(q, v, u)
             continue
-        near, firm = max(min(10.0 * near, 1e4 * begun), 100.0 * begun), firm + 1
-        if single or np.abs(at.missed).max() <= _MEETS:
-            # From here on the knots are those of one motion, along which small errors grow.
-            single, (q, v) = True, shooting.flown(start, at.u)
-            missed = np.zeros_like(at.missed)
-            missed[-1] = shooting.between((q[-1], v[-1]), end) * asked
-            at = _Iterate(q, v, at.u, missed)
-            if np.abs(missed).max() <= _ENDS:
+        # What the multipliers say that it costs to miss (Powell).
+        price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
+        was, share = merit(u, missed, excess), 1.0
+        saved = was - merit(u + du, 0.0 * missed, _excess(space - z))
+        for _ in range(_MOST_HALVINGS):
+            new, there = np.clip(u + share * du, *limits), shooting.moved(q, v, share * z)
+            after = shooting.missed(*there, new)
+            if was - merit(new, after, _excess(room(*there))) >= 1e-4 * share * saved:
+                (q, v), u, missed = there, new, after
                 break
-        if firm > _MOST_FIRM:
-            break
-    return at.u if not shooting.held else np.vstack((at.u[:-1], at.u[-2]))
+            share *= 0.5
+        near = near * (0.2 if share == 1.0 else 1.0 if share > 0.25 else 3.0)
+        if saved <= _SAVED * was:
+            most = min(most, count + 1)
+    return u if not shooting.held else np.vstack((u[:-1], u[-2]))
 
 
-def _room(state: StateMap, at: _Iterate, bounds: Array) -> Array:
-    """Return how far knots may move (2, N + 1, nx) for the joints to keep within their limits."""
-    n, nx = state.robot.n, state.nx
-    room = np.full((2, len(at.q), nx), np.inf) * [[[-1.0]], [[1.0]]]
-    room[..., 6 : 6 + n] = bounds[:, None, 6 : 6 + n] - state.joint_positions(at.q)
-    room[..., nx - n :] = bounds[:, None, nx - n :] - state.velocities(at.v)[:, 6:]
-    room[:, 0] = 0.0
+def _shares(shooting: Shooting, R: Array, u: Array) -> Array:
+    """Return what the squares of inputs (N + 1, nu) cost, so that those of the guess cost one."""
+    cost = np.tile(R, (len(u), 1))
+    # Of the knots in an integral: by the trapezoidal rule, or as long as each input is held.
+    if not shooting.held:
+        cost[[0, -1]] *= 0.5
+    cost /= (cost * u * u).sum() or cost.sum()
+    return cost
+
+
+def _blocks(of_x: Array, of_u: Array) -> Array:
+    """Return diagonal blocks (N + 1, nx + nu, nx + nu) of weights (nx,) and (N + 1, nu)."""
+    rows = np.hstack((np.tile(of_x, (len(of_u), 1)), of_u))
+    blocks: Array = rows[:, :, None] * np.eye(rows.shape[1])
+    return blocks
+
+
+def _room(shooting: Shooting, end: Point, bounds: Array, asked: Array, q: Array, v: Array) -> Array:
+    """Return how far knots may move (2, N + 1, nx) within the limits of the joints, to the end."""
+    state, n, nx = shooting.state, shooting.state.robot.n, shooting.state.nx
+    room = np.tile(np.array([[[-np.inf]], [[np.inf]]]), (1, len(q), nx))
+    room[:, 1:, 6 : 6 + n] = bounds[:, None, 6 : 6 + n] - state.joint_positions(q[1:])
+    room[:, 1:, nx - n :] = bounds[:, None, nx - n :] - state.velocities(v[1:])[:, 6:]
+    way = shooting.between((q[-1], v[-1]), end)
+    room[:, -1, asked] = np.clip(way, *room[:, -1])[asked]
     return room
+
+
+def _excess(room: Array) -> Array:
+    """Return how far knots are outside of it (N + 1, nx)."""
+    return np.maximum(np.maximum(room[0], -room[1]), 0.0)

@@ -7,17 +7,12 @@ import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
-from fflin.control.stages import Stages
 from fflin.dynamics.state import PIN_ANGULAR, PIN_LINEAR, StateMap
 from fflin.linear.flow import Flow
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
 
-# Runge-Kutta's method of order four: when its stages are, and how much of the one before is added.
-_STAGES, _SHARES = (0.0, 0.5, 0.5, 1.0), (1.0, 2.0, 2.0, 1.0)
-
-# Steps are halved until an interval's end is this accurate in rad, m and s.
-_ACCURACY, _MOST_STEPS = 1e-7, 128
+_MOST_STEPS = 128
 
 Point = tuple[Array, Array]
 
@@ -30,18 +25,15 @@ class Shooting:
     """
 
     def __init__(self, robot: Robot, t: Array, held: bool) -> None:
-        self.state, self.t, self.held, self.steps = StateMap(robot, frame="local"), t, held, 1
+        self.state, self.t, self.held, self.steps = StateMap(robot, frame="local"), t, held, 4
         self._linearizer = Linearizer(robot, moving=True)
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
-        # Of the knots in an integral: by the trapezoidal rule, or as long as each input is held.
-        self.shares = np.full(len(t), t[1])
-        self.shares[[0, -1]] *= (1.0, 1e-9) if held else 0.5
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
 
     def between(self, start: Point, end: Point) -> Array:
         """Return the step z (nx,) from a point to another; wheels may be at any angle."""
-        model, state = self.state.robot.model, self.state
-        way = pin.difference(model, start[0], end[0])
+        state = self.state
+        way = pin.difference(state.robot.model, start[0], end[0])
         z = np.concatenate((state.velocities(way), state.velocities(end[1] - start[1])))
         z[self.wheels] = 0.0
         return z
@@ -64,49 +56,50 @@ class Shooting:
     def flown(self, start: Point, u: Array) -> Point:
         """Return the knots q and v (N + 1, ...) of the motion from a point under inputs."""
         q, v = (np.tile(each, (len(self.t), 1)) for each in start)
-        flow, points = self._flow(q, v, u), [start]
-        for k in range(len(self.t) - 1):
-            points.append(flow.end(k, self.steps, *points[-1]))
-        q, v = map(np.array, zip(*points, strict=True))
+        flow = self._flow(q, v, u)
+        for k in range(len(q) - 1):
+            q[k + 1], v[k + 1] = flow.end(k, self.steps, q[k], v[k])
         return q, v
 
-    def refine(self, q: Array, v: Array, u: Array) -> Array:
-        """Take as many steps an interval as it needs, and return what is missed then."""
+    def refine(self, q: Array, v: Array, u: Array, accuracy: float) -> None:
+        """Take so many steps that the ends of the intervals are this accurate in rad, m and s."""
         missed = self.missed(q, v, u)
         while self.steps < _MOST_STEPS:
             self.steps *= 2
             before, missed = missed, self.missed(q, v, u)
-            if np.abs(missed - before).max() <= _ACCURACY:
+            if np.abs(missed - before).max() <= accuracy:
                 break
-        return missed
 
-    def stages(self, q: Array, v: Array, u: Array, missed: Array) -> Stages:
-        """Return the slopes of the intervals' ends, by Runge-Kutta steps of dZ/dt = A Z + B."""
-        flow, (nx, nu) = self._flow(q, v, u), (self.state.nx, u.shape[1])
-        maps = []
-        steps = max(1, self.steps // 4)
-        shares = np.linspace(0.0, 1.0, 2 * steps + 1)
-        shares[-1] -= 1e-8  # at the knot the next input acts
-        for first, last in zip(self.t[:-1], self.t[1:], strict=True):
-            h, Z = (last - first) / steps, np.eye(nx, nx + 2 * nu)
-            F = []
-            for share in shares.tolist():
-                lin, late = self._linearizer(*flow.at(first + share * (last - first))), share
-                late = 0.0 if self.held else share
-                A = self._size[:, None] * lin.A / self._size
-                F.append((A, np.hstack(((1.0 - late) * lin.B, late * lin.B))))
-            for step in range(steps):
-                rate, total = np.zeros_like(Z), np.zeros_like(Z)
-                for at, weight in zip(_STAGES, _SHARES, strict=True):
-                    A, driven = F[2 * step + round(2 * at)]
-                    rate = A @ (Z + at * h * rate)
-                    rate[:, nx:] += driven
-                    total += weight * rate
-                Z = Z + h / 6.0 * total
-            maps.append(Z)
-        A, B, D = np.split(np.array(maps), (nx, nx + nu), axis=2)
-        known = (B @ u[:-1, :, None] + D @ u[1:, :, None])[..., 0]
-        return Stages(A, B, D, missed[:-1] - known)
+    def slopes(self, q: Array, v: Array, u: Array) -> list[Array]:
+        """Return those of the intervals' ends over z, the input there and the next one.
+
+        By Runge-Kutta steps of dZ/dt = A Z + B over all intervals at once, along their motions.
+        """
+        flow, (nx, nu), steps = self._flow(q, v, u), (len(self._size), u.shape[1]), self.steps // 4
+        h, Z = self.t[1] / steps, np.tile(np.eye(nx, nx + 2 * nu), (len(q) - 1, 1, 1))
+        at = list(zip(q, v, strict=True))[:-1]
+
+        def rates(half: int) -> tuple[Array, Array]:
+            late = half / (2.0 * steps)
+            if half:
+                part = (late - 0.5 / steps, late)
+                at[:] = [flow.end(k, 2, *x, part) for k, x in enumerate(at)]
+            late = 0.0 if self.held else late
+            new = u[:-1] + late * np.diff(u, axis=0)
+            models = [self._linearizer(*x, each) for x, each in zip(at, new, strict=True)]
+            A, B = (np.array([getattr(lin, name) for lin in models]) for name in "AB")
+            driven = np.concatenate((np.zeros_like(A), (1.0 - late) * B, late * B), axis=2)
+            return self._size[:, None] * A / self._size, driven
+
+        last = rates(0)
+        for step in range(steps):
+            F, total, rate = (last, rates(2 * step + 1), rates(2 * step + 2)), 0.0, 0.0 * Z
+            last = F[2]
+            for i, share, weight in ((0, 0.0, 1.0), (1, 0.5, 2.0), (1, 0.5, 2.0), (2, 1.0, 1.0)):
+                rate = F[i][0] @ (Z + share * h * rate) + F[i][1]
+                total = total + weight * rate
+            Z = Z + h / 6.0 * total
+        return np.split(Z, (nx, nx + nu), axis=2)
 
     def guess(self, start: Point, end: Point) -> tuple[Array, Array, Array]:
         """Return knots on cubics from a point to another, and inputs near to what these take.
@@ -119,20 +112,19 @@ class Shooting:
         rates[:, PIN_LINEAR] = (turned @ rates[:, PIN_LINEAR, None])[..., 0]
         way, mean = pin.difference(model, start[0], end[0]), rates.mean(axis=0)
         way[PIN_LINEAR] = end[0][:3] - start[0][:3]
-        way[PIN_ANGULAR] = turn = pin.log3(turned[0].T @ turned[1])
+        turn = pin.log3(turned[0].T @ turned[1])
         axis = turn if turn.any() else mean[PIN_ANGULAR]
         axis = axis / (np.linalg.norm(axis) or 1.0)
         rounds = np.round((mean[PIN_ANGULAR] - turn) @ axis / (2.0 * np.pi))
-        way[PIN_ANGULAR] += 2.0 * np.pi * rounds * axis
+        way[PIN_ANGULAR] = turn + 2.0 * np.pi * rounds * axis
         # Of the rotation vector at the end; on whole turns about the axis there is no other.
         jacobian = pin.Jexp3(way[PIN_ANGULAR])
         rates[1, PIN_ANGULAR] = np.linalg.lstsq(jacobian, rates[1, PIN_ANGULAR], rcond=1e-6)[0]
         late, bend = 3 * way - 2 * rates[0] - rates[1], rates.sum(axis=0) - 2 * way
         places = s * (rates[0] + s * (late + s * bend))
         v = (rates[0] + s * (2 * late + 3 * s * bend)) / T
-        steps = np.where(np.arange(len(way)) < 3, 0.0, places)
-        q = np.array([pin.integrate(model, start[0], step) for step in steps])
-        q[:, :3] += places[:, PIN_LINEAR]
+        q = np.array([pin.integrate(model, start[0], step) for step in places])
+        q[:, :3] = start[0][:3] + places[:, PIN_LINEAR]
         for turn, rate in zip(places[:, PIN_ANGULAR], v[:, PIN_ANGULAR], strict=True):
             rate[:] = pin.Jexp3(turn) @ rate
         v[:, PIN_LINEAR] = (v[:, None, PIN_LINEAR] @ rotation_matrices(q[:, 3:7]))[:, 0]

@@ -105,14 +105,19 @@ class Flow:
                 )
         return np.where(np.isfinite(found), found, np.inf)
 
-    def end(self, k: int, steps: int, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return q and v at the end of an interval by steps of CF4 (11.1) from q and v on."""
+    def end(
+        self, k: int, steps: int, q: Array, v: Array, over: tuple[float, float] = (0.0, 1.0)
+    ) -> tuple[Array, Array]:
+        """Return q and v by steps of CF4 (11.1) from q and v on, over these shares of an interval.
+
+        By default from knot to knot.
+        """
         start, h = self._t[k], self._t[k + 1] - self._t[k]
-        method = CommutatorFree4(self._model, h / steps)
+        method = CommutatorFree4(self._model, (over[1] - over[0]) * h / steps)
         for step in range(steps):
             q, v = method.step(
                 lambda t, q, v: self.rate(q, v, self._input(k, (t - start) / h)),
-                start + step * method.dt,
+                start + over[0] * h + step * method.dt,
                 q,
                 v,
             )

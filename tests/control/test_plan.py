@@ -3,11 +3,9 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.optimize import minimize
 
 import fflin
 from fflin.control.shooting import Shooting
-from fflin.control.stages import Rows, Stages
 
 
 def turned(robot, angle, axis=(0.0, 0.0, 1.0), joints=None, at=(0.0, 0.0, 0.0)):
@@ -41,9 +39,9 @@ def test_least_effort_about_an_axis_has_the_closed_form(cube, angle):
     # A goal of pi may be reached either way round.
     u = motion.u[:-1, 2] * np.sign(motion.u[0, 2] * angle)
     size = np.abs(exact).max()
-    assert u == pytest.approx(exact, abs=1e-3 * size)
+    assert u == pytest.approx(exact, abs=1e-6 * size)
     assert np.abs(np.delete(motion.u, 2, axis=1)).max() < 1e-8 * size
-    assert missed(robot, motion, goal) < 1e-6 and motion.residual.max() < 1e-7
+    assert missed(robot, motion, goal) < 1e-8 and motion.residual.max() < 1e-8
     assert (motion.hold, motion.frame) == ("previous", "local")
     limit = 6.0 * inertia * angle / T**2
     assert abs(exact[0] / limit - 1.0) == pytest.approx(1.0 / (count + 1), rel=1e-9)
@@ -58,8 +56,8 @@ def test_least_effort_of_linear_inputs_has_the_closed_form(cube):
     share[[0, -1]] = 0.5
     left[[0, -1]] += (-1.0 / 3.0, 1.0 / 3.0)
     exact = inertia * (left - 15.0) / (share @ (left * (left - 15.0)))
-    assert motion.u[:, 2] == pytest.approx(exact, abs=1e-3 * exact[0])
-    assert motion.hold == "linear" and motion.residual.max() < 1e-7
+    assert motion.u[:, 2] == pytest.approx(exact, abs=1e-6 * exact[0])
+    assert motion.hold == "linear" and motion.residual.max() < 1e-8
 
 
 def test_a_turn_in_the_least_time_takes_all_there_is(cube):
@@ -70,12 +68,14 @@ def test_a_turn_in_the_least_time_takes_all_there_is(cube):
     motion = fflin.plan(robot, (goal, None), 1.001 * least, knots=101)
     u = motion.u[:-1, 2]
     assert np.abs(u).max() <= 1e-3
-    assert (np.abs(u) == 1e-3).sum() >= 90 and (np.diff(np.sign(u)) != 0).sum() == 1
+    assert (np.abs(u) >= 1e-3 * (1 - 1e-6)).sum() >= 90 and (np.diff(np.sign(u)) != 0).sum() == 1
     assert missed(robot, motion, goal) < 1e-6
-    with pytest.raises(fflin.InputError, match=r"misses omega_b.z by [\d.]+ rad/s, q_b.z by.*more"):
+    with pytest.raises(fflin.InputError, match=r"misses omega_b.z by 0\.00\d+ rad/s; give"):
         fflin.plan(robot, (goal, None), 0.99 * least)
     # At half the time the turn that is reached is a quarter or less.
-    with pytest.raises(fflin.InputError, match=r"after [\d.]+ s: it misses q_b.z by 0\.\d+ rad"):
+    with pytest.raises(
+        fflin.InputError, match=r"after [\d.]+ s; the last one.*misses q_b.z by 0\.\d+"
+    ):
         fflin.plan(robot, (goal, None), 0.5 * least, knots=21)
 
 
@@ -139,7 +139,7 @@ def test_joints_keep_within_their_speeds_and_travels():
     assert speeds[:, 0].max() == pytest.approx(0.2, abs=1e-6)
     assert missed(robot, motion, goal) < 1e-6
     with pytest.raises(fflin.InputError, match="no motion within the limits was found"):
-        fflin.plan(robot, (goal, None), 7.0, **options)
+        fflin.plan(robot, (goal, None), 4.0, **options)
 
 
 def test_wheels_turn_a_body_and_may_keep_what_they_took(tmp_path):
@@ -172,71 +172,47 @@ def test_starts_and_goals_are_given_in_every_form():
 def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
     robot, v, goal = servicer
     shooting = Shooting(robot, np.linspace(0.0, 8.0, 41), held)
-    shooting.steps = 16
+    shooting.steps = 64
     q, v, u = shooting.guess((robot.neutral(), v), (goal, np.zeros(robot.nv)))
     q, v = shooting.flown((q[0], v[0]), u)
-    stages = shooting.stages(q, v, u, np.zeros((41, shooting.state.nx)))
-    h = 1e-5
+    A, B, D = shooting.slopes(q, v, u)
+    h, nx = 1e-5, A.shape[1]
 
     def ends(z, du):
         return shooting.missed(*shooting.moved(q, v, z), u + du)
 
-    nx = stages.A.shape[1]
     for i in range(nx):
         z = np.zeros((41, nx))
         z[1, i] = h
         slope = (ends(z, 0.0) - ends(-z, 0.0))[1] / (2 * h)
-        assert slope == pytest.approx(stages.A[1][:, i], abs=1e-5)
+        assert slope == pytest.approx(A[1][:, i], abs=1e-8)
     for i in range(u.shape[1]):
-        for row, maps in ((1, stages.B), (2, stages.D)):
+        for row, maps in ((1, B), (2, D)):
             du = np.zeros_like(u)
-            du[row, i] = 1e-2
-            slope = (ends(np.zeros((41, nx)), du) - ends(np.zeros((41, nx)), -du))[1] / 2e-2
-            assert slope == pytest.approx(maps[1][:, i], abs=1e-5)
+            du[row, i] = 1e-3
+            slope = (ends(np.zeros((41, nx)), du) - ends(np.zeros((41, nx)), -du))[1] / 2e-3
+            assert slope == pytest.approx(maps[1][:, i], abs=1e-8)
 
 
-def test_stages_solve_the_quadratic_problem():
-    """Beside SciPy's SLSQP on the same problem, with bounds on both kinds of variable."""
-    rng = np.random.default_rng(3)
-    N, nx, nu = 4, 3, 2
-    A = np.eye(nx) + 0.3 * rng.normal(size=(N, nx, nx))
-    B, D = rng.normal(size=(2, N, nx, nu))
-    stages = Stages(A, B, D, rng.normal(size=(N, nx)))
-    u_rows = Rows(rng.uniform(1, 2, (N + 1, nu)), np.zeros((N + 1, nu)), *_box(0.8, (N + 1, nu)))
-    low, high = _box(1.0, (N + 1, nx))
-    low[0] = high[0] = 0.0
-    z_rows = Rows(rng.uniform(1, 2, (N + 1, nx)), rng.normal(size=(N + 1, nx)), low, high)
-    u, z, _ = stages.least(u_rows, z_rows, np.zeros((N, nx)))
-
-    def split(x):
-        return x[: u.size].reshape(u.shape), x[u.size :].reshape(z.shape)
-
-    def cost(x):
-        v, w = split(x)
-        return u_rows.cost(v) + z_rows.cost(w)
-
-    def left(x):
-        v, w = split(x)
-        rows = [
-            A[k] @ w[k] + B[k] @ v[k] + D[k] @ v[k + 1] + stages.c[k] - w[k + 1] for k in range(N)
-        ]
-        return np.ravel(rows)
-
-    bounds = np.hstack([np.vstack((x.low.ravel(), x.high.ravel())) for x in (u_rows, z_rows)]).T
-    known = minimize(
-        *(cost, np.zeros(u.size + z.size)),
-        bounds=bounds,
-        constraints={"type": "eq", "fun": left},
-        method="SLSQP",
-        options={"ftol": 1e-14, "maxiter": 500},
-    )
-    assert known.success and np.abs(left(np.concatenate((u.ravel(), z.ravel())))).max() < 1e-10
-    assert (np.abs(u) == 0.8).any() and (np.abs(z) == 1.0).any()
-    assert cost(np.concatenate((u.ravel(), z.ravel()))) == pytest.approx(known.fun, rel=1e-8)
-
-
-def _box(size, shape):
-    return np.full(shape, -size), np.full(shape, size)
+def test_a_plan_meets_the_conditions_of_optimality(cube):
+    """Where inputs are free, the slopes of the effort are those of the goal times multipliers; at a
+    limit they would have more."""
+    robot, _ = cube
+    goal = turned(robot, 1.0, np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0))
+    motion = fflin.plan(robot, (goal, None), 6.0, knots=21)
+    shooting = Shooting(robot, motion.t, True)
+    shooting.steps = 16
+    A, B, _ = shooting.slopes(motion.q, motion.v, motion.u)
+    size, reach, maps = np.repeat([1e-3, 1.0], 3), np.eye(A.shape[1]), []
+    for k in range(19, -1, -1):
+        maps.append((reach @ B[k] * size).T)
+        reach = reach @ A[k]
+    slopes, u = np.array(maps[::-1]).reshape(-1, A.shape[1]), (motion.u[:-1] / size).ravel()
+    free = np.abs(u) < 1.0 - 1e-5
+    y = np.linalg.lstsq(slopes[free], u[free], rcond=1e-12)[0]
+    left = u - slopes @ y
+    assert np.abs(left[free]).max() < 1e-5 and (~free).sum() >= 3
+    assert (left[~free] * u[~free] < -1e-3).all()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,71 @@
+"""Quadratic programs over stages: optimality, bounds that are soft, and what has no solution."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from fflin import MissingPackageError
+from fflin.control.stage_qp import StageQP
+
+N, NX, NU = 6, 3, 2
+
+
+def problem(**given):
+    rng = np.random.default_rng(3)
+    shape = (N + 1, NX + NU)
+    roots = rng.normal(size=(*shape, NX + NU))
+    low = np.full(shape, -0.6)
+    low[:, NX:] = -0.2
+    low[0, :NX] = -np.inf
+    values = {
+        "start": rng.normal(size=NX),
+        "A": np.eye(NX) + 0.3 * rng.normal(size=(N, NX, NX)),
+        "B": rng.normal(size=(N, NX, NU)),
+        "D": rng.normal(size=(N, NX, NU)),
+        "c": 0.3 * rng.normal(size=(N, NX)),
+        "H": roots @ roots.transpose(0, 2, 1),
+        "g": rng.normal(size=shape),
+        "low": low,
+        "high": -low,
+        "soft": np.tile(np.where(np.arange(NX + NU) < NX, 5.0, np.inf), (N + 1, 1)),
+        "scale": np.array([1.0, 2.0, 0.3, 5.0, 1.0]),
+    }
+    return StageQP(**values | given)
+
+
+def test_the_solution_meets_the_conditions_of_optimality():
+    """The slopes of the Lagrangian are the prices of the bounds: none inside, outwards at a hard
+    one, no more than `soft` at a soft one and just that beyond it."""
+    qp = problem()
+    x, u, y = qp.solve()
+    w = np.hstack((x, u))
+    after = [qp.A[k] @ x[k] + qp.B[k] @ u[k] + qp.D[k] @ u[k + 1] + qp.c[k] for k in range(N)]
+    assert x[0] == pytest.approx(qp.start, abs=1e-8)
+    assert x[1:] == pytest.approx(np.array(after), abs=1e-7)
+    slopes = (qp.H @ w[..., None])[..., 0] + qp.g
+    for k in range(N):
+        slopes[k] += np.concatenate((qp.A[k].T @ y[k], qp.B[k].T @ y[k]))
+        slopes[k + 1] -= np.concatenate((y[k], -qp.D[k].T @ y[k]))
+    slopes, w, bound, soft = slopes[1:], w[1:], qp.high[1:], qp.soft[1:]
+    out = -slopes * np.sign(w)
+    inside, beyond = np.abs(w) < bound - 1e-5, np.abs(w) > bound + 1e-5
+    assert inside.any() and beyond.any() and (~inside & np.isinf(soft)).any()
+    assert slopes[inside] == pytest.approx(0.0, abs=1e-5)
+    assert out[beyond] == pytest.approx(5.0, abs=1e-5) and not np.isinf(soft[beyond]).any()
+    assert (out[~inside] > -1e-5).all() and (out <= soft + 1e-5).all()
+    assert (np.abs(u) <= 0.2).all()
+
+
+def test_scales_change_nothing_and_hard_bounds_may_leave_nothing():
+    qp = problem()
+    ones = problem(scale=np.ones(NX + NU)).solve()
+    for found, known in zip(qp.solve(), ones, strict=True):
+        assert found == pytest.approx(known, abs=1e-6)
+    assert problem(soft=np.full_like(qp.g, np.inf), start=np.full(NX, 50.0)).solve() is None
+
+
+def test_without_the_solver_it_is_said_how_to_install_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "piqp", None)
+    with pytest.raises(MissingPackageError, match=r"pip install 'fflin\[mpc\]'"):
+        problem().solve()
