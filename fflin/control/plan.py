@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from fflin.base.names import chosen, input_keys
 from fflin.base.validation import Array, number, whole
 from fflin.control.saturation import saturation
 from fflin.control.shooting import Point, Shooting
-from fflin.control.stage_qp import StageQP
+from fflin.control.stage_qp import StageQP, StageSolution
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
 from fflin.dynamics.actuation import Actuation
@@ -173,7 +173,7 @@ def plan(
     )
 
 
-def _sought(  # noqa: PLR0915
+def _sought(
     shooting: Shooting,
     start: Point,
     end: Point,
@@ -187,49 +187,24 @@ def _sought(  # noqa: PLR0915
     whole steps succeed (Levenberg and Marquardt).
     """
     q, v, u = shooting.guess(start, end)
-    nx, nu, rows = shooting.state.nx, len(R), len(q)
-    cost = _shares(shooting, R, u)
-    u = np.clip(u, *limits)
+    cost, u = _shares(shooting, R, u), np.clip(u, *limits)
     shooting.refine(q, v, u, _SEEKS)
-    scale = np.concatenate((np.ones(nx), (rows * cost[1]) ** -0.5))
-    wheels = [*shooting.wheels, *(nx // 2 + i for i in shooting.wheels)]
-    near = begun = np.where(np.isin(range(nx), wheels), _OF_WHEELS, 1.0) / rows
-    soft = np.where(np.arange(nx + nu) < nx, _PRICE, np.full((rows, 1), np.inf))
-    missed, most = shooting.missed(q, v, u), _MOST
+    wheels = [*shooting.wheels, *(shooting.state.nx // 2 + i for i in shooting.wheels)]
+    near = np.where(np.isin(range(shooting.state.nx), wheels), _OF_WHEELS, 1.0) / len(q)
+    search = _Search(shooting, limits, room, cost, near)
+    missed = shooting.missed(q, v, u)
     price = 0.0 * missed
 
     def merit(u: Array, missed: Array, excess: Array) -> float:
         lost = (price * np.abs(missed)).sum() + _PRICE * excess.sum()
         return float((cost * u * u).sum() / 2.0 + lost)
 
-    for count in range(_MOST + _MOST_CLOSING + 1):
-        if closing := count >= most:  # by the least changes that meet the goal
-            if count == most:
-                shooting.refine(q, v, u, _FLIES)
-                near, missed = begun, shooting.missed(q, v, u)
-            if np.abs(missed).max() <= _MEETS:
-                (q, v), missed = shooting.flown(start, u), 0.0 * missed
+    for _ in range(_MOST):
         excess = _excess(space := room(q, v))
-        size = max(excess.max(), np.abs(missed).max())
-        ended = count == most + _MOST_CLOSING or (size <= _ENDS and not missed.any())
-        if not size < np.inf or (closing and ended):
-            break
-        low, high = np.concatenate((space, limits[:, None] - u), axis=2)
-        try:
-            A, B, D = shooting.slopes(q, v, u)
-        except InputError:  # it has diverged
-            break
-        H, g = _blocks(near, cost), np.hstack((np.zeros((rows, nx)), (not closing) * cost * u))
-        least = StageQP(np.zeros(nx), A, B, D, missed, H, g, low, high, soft, scale).solve()
+        least = search.step(q, v, u, missed, near, cost * u)
         if least is None:
-            break
+            return search.acting(u)
         z, du, y = least
-        if closing:
-            u = np.clip(u + du, *limits)
-            if missed.any() or size > _NEARLY:
-                q, v = shooting.moved(q, v, z)
-                missed = shooting.missed(q, v, u)
-            continue
         # What the multipliers say that it costs to miss (Powell).
         price = np.maximum(np.abs(y), 0.5 * (price + np.abs(y)))
         was, share = merit(u, missed, excess), 1.0
@@ -243,8 +218,60 @@ def _sought(  # noqa: PLR0915
             share *= 0.5
         near = near * (0.2 if share == 1.0 else 1.0 if share > 0.25 else 3.0)
         if saved <= _SAVED * was:
-            most = min(most, count + 1)
-    return u if not shooting.held else np.vstack((u[:-1], u[-2]))
+            break
+    return search.acting(search.closed(start, q, v, u))
+
+
+class _Search(NamedTuple):
+    """What stays the same while a plan is sought."""
+
+    shooting: Shooting
+    limits: Array  # least and largest inputs (2, nu)
+    room: Callable[[Array, Array], Array]
+    cost: Array  # of the squares of inputs (N + 1, nu)
+    near: Array  # what steps of the states cost at first (nx,)
+
+    def step(
+        self, q: Array, v: Array, u: Array, missed: Array, near: Array, effort: Array
+    ) -> StageSolution | None:
+        """Return the best step of all knots and inputs; None where there is none."""
+        space, nx = self.room(q, v), self.shooting.state.nx
+        if not max(_excess(space).max(), np.abs(missed).max()) < np.inf:
+            return None
+        try:
+            A, B, D = self.shooting.slopes(q, v, u)
+        except InputError:  # it has diverged
+            return None
+        low, high = np.concatenate((space, self.limits[:, None] - u), axis=2)
+        H, g = _blocks(near, self.cost), np.hstack((np.zeros((len(u), nx)), effort))
+        of_x = np.full((len(u), nx), _PRICE)
+        soft = np.hstack((of_x, np.full(u.shape, np.inf)))
+        scale = np.concatenate((np.ones(nx), (len(u) * self.cost[1]) ** -0.5))
+        return StageQP(np.zeros(nx), A, B, D, missed, H, g, low, high, soft, scale).solve()
+
+    def closed(self, start: Point, q: Array, v: Array, u: Array) -> Array:
+        """Return the inputs that lead to the end in one motion, by the least changes."""
+        shooting = self.shooting
+        shooting.refine(q, v, u, _FLIES)
+        missed = shooting.missed(q, v, u)
+        for _ in range(_MOST_CLOSING):
+            if np.abs(missed).max() <= _MEETS:
+                (q, v), missed = shooting.flown(start, u), 0.0 * missed
+            size = max(_excess(self.room(q, v)).max(), np.abs(missed).max())
+            if size <= _ENDS and not missed.any():
+                break
+            least = self.step(q, v, u, missed, self.near, 0.0 * u)
+            if least is None:
+                break
+            u = np.clip(u + least.u, *self.limits)
+            if missed.any() or size > _NEARLY:
+                q, v = shooting.moved(q, v, least.x)
+                missed = shooting.missed(q, v, u)
+        return u
+
+    def acting(self, u: Array) -> Array:
+        """Return inputs of which the last, where they are held, is that of the last interval."""
+        return np.vstack((u[:-1], u[-2])) if self.shooting.held else u
 
 
 def _shares(shooting: Shooting, R: Array, u: Array) -> Array:

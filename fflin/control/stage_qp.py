@@ -47,9 +47,7 @@ class StageQP(NamedTuple):
     low: Array  # (N + 1, nx + nu)
     high: Array
     soft: Array  # (N + 1, nx + nu)
-    scale: (
-        Array  # (nx + nu,), the sizes that variables may have: the solver works in shares of them
-    )
+    scale: Array  # (nx + nu,), sizes that variables may have, in shares of which it is solved
 
     def solve(self) -> StageSolution | None:
         """Return the solution; None where the hard bounds leave none, or it is not found."""
