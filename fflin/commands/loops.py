@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import math
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import FflinWarning, InputError, listed
-from fflin.base.names import by_name
 from fflin.commands.points import configuration_of, inputs_at, once, placed, velocity_of
 from fflin.commands.regulator import gain_of, regulated_part
 from fflin.commands.tracking import models_along, schedule_of
@@ -17,13 +15,11 @@ from fflin.commands.tracking import models_along, schedule_of
 if TYPE_CHECKING:
     from fflin.base.validation import Array
     from fflin.control.policies import StateFeedback
-    from fflin.control.tracking import TrajectoryFeedback
     from fflin.linear.model import LinearModel
     from fflin.robot.robot import Robot
 
 _WEIGHTS = ("weights", "q", "r", "bryson", "dt")
 _TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce")
-_ANGLES = ("roll", "pitch", "yaw")
 
 
 def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
@@ -100,7 +96,9 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
             motion.require(strict=arguments.strict)
             _require_own(schedule, motion, arguments)
         policy = TrajectoryFeedback(motion, schedule)
-    start = _beside(design, policy, once("--offset", arguments.offset))
+    start: dict[str, Any] = {}
+    if offset := once("--offset", arguments.offset):
+        start["q0"], start["v0"] = policy.beside(offset)
     return (Allocation(policy, design) if arguments.allocate else policy), start
 
 
@@ -119,50 +117,18 @@ def _require_own(schedule: Any, motion: Any, arguments: argparse.Namespace) -> N
         )
 
 
-def _beside(robot: Robot, policy: TrajectoryFeedback, given: dict[str, float]) -> dict[str, Any]:
-    """Return the start that is beside that of a trajectory by what --offset says."""
-    import numpy as np
-    import pinocchio as pin
-
-    from fflin.dynamics.state import StateMap
-    from fflin.dynamics.state_rows import moved_by
-
-    if not given:
-        return {}
-    state = StateMap(robot, frame="local")
-    q, v, _ = policy.reference(0.0)
-    values = by_name("state", given, (*state.names, *_ANGLES))
-    e, angles = np.zeros((1, state.nx)), [values.pop(state.nx + k, None) for k in range(3)]
-    e[0, list(values)] = list(values.values())
-    if angles != [None] * 3:
-        if e[0, :3].any():
-            raise InputError("--offset has q_b and an angle; give either")
-        R = pin.rpy.rpyToMatrix(*(math.radians(angle or 0.0) for angle in angles))
-        e[0, :3] = pin.Quaternion(R).coeffs()[:3] * np.sign(pin.Quaternion(R).coeffs()[3] or 1.0)
-    if not np.linalg.norm(e[0, :3]) < 1.0:
-        raise InputError(f"--offset: |q_b| is {np.linalg.norm(e[0, :3]):.3g}, expected less than 1")
-    # From a chart about the trajectory's start, where the base may be turned by any angle.
-    chart = StateMap(robot, reference=pin.XYZQUATToSE3(q[:7]), frame="local")
-    x = moved_by("local", chart.to_state(q, v)[None], e)[0]
-    q, v = chart.to_pinocchio(x)
-    return {"q0": q, "v0": v}
-
-
 def _about_gain(robot: Robot, gain: Any, path: Path) -> LinearModel:
     """Return the model about the point of a gain, with the base at the world's origin there."""
+    from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.state import StateMap
     from fflin.linear.fit import require_same
     from fflin.linear.linearization import linearize
 
-    state = StateMap(robot, frame=gain.frame)
-    own = (gain.state_names, gain.state_units)
-    require_same(
-        f"{path} is a gain of '{gain.robot}'", robot, "state", own, (state.names, state.units)
-    )
+    state, made = StateMap(robot, frame=gain.frame), f"{path} is a gain of '{gain.robot}'"
+    for kind, there in (("state", state), ("input", Actuation(state))):
+        own = getattr(gain, f"{kind}_names"), getattr(gain, f"{kind}_units")
+        require_same(made, robot, kind, own, (there.names, there.units))
     q, v = state.to_pinocchio(gain.x0)
-    lin = linearize(robot, q, v, frame=gain.frame)
-    inputs = (gain.input_names, gain.input_units), (lin.input_names, lin.input_units)
-    require_same(f"{path} is a gain of '{gain.robot}'", robot, "input", *inputs)
     return linearize(robot, q, v, gain.u0, frame=gain.frame)
 
 

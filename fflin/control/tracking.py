@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.errors import EquilibriumError, InputError
+from fflin.base.names import by_name
 from fflin.base.validation import Array
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.policies import Allocation, fed_back
 from fflin.control.tvlqr import resting_end, steady_regulator
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
-from fflin.dynamics.state_rows import moving_error
+from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.state_rows import moved_by, moving_error
 from fflin.linear.fit import require_same, require_turns
 from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.trajectory import Trajectory
@@ -55,7 +57,7 @@ class TrajectoryFeedback:
     schedule: GainSchedule
     held: bool = field(default=False, kw_only=True)
 
-    frame = "local"
+    frame: ClassVar[Frame] = "local"
 
     def __post_init__(self) -> None:
         if not (
@@ -126,6 +128,43 @@ class TrajectoryFeedback:
         """K (nu, nx) of the regulator of the same weights about `end`."""
         by = self.schedule
         return steady_regulator(self.end, by.Q, by.R, by.dt)[1]
+
+    def beside(self, offset: Mapping[str, float]) -> tuple[Array, Array]:
+        """Return q (nq,) and v (nv,) that are beside where the trajectory begins.
+
+        Parameters
+        ----------
+        offset : mapping
+            {name, group or pattern of states: error in the base's axes there}; or instead of q_b
+            the angles roll, pitch, yaw [deg].
+
+        Raises
+        ------
+        InputError
+            If the attitude is given twice or is none.
+        UnknownNameError
+            If there is no such state.
+        """
+        robot, (q, v, _) = self.trajectory.robot, self.reference(0.0)
+        # A chart about where it begins, which may be turned by any angle itself.
+        chart = StateMap(robot, reference=pin.XYZQUATToSE3(q[:7]), frame=self.frame)
+        values = by_name("state", offset, (*chart.names, "roll", "pitch", "yaw"))
+        e, angles = np.zeros(chart.nx), np.zeros(3)
+        for index, value in values.items():
+            if index < chart.nx:
+                e[index] = value
+            else:
+                angles[index - chart.nx] = value
+        if angles.any():
+            if e[:3].any():
+                raise InputError("the offset has q_b and an angle; give either")
+            turn = pin.Quaternion(pin.rpy.rpyToMatrix(*np.radians(angles))).coeffs()
+            e[:3] = turn[:3] if turn[3] >= 0.0 else -turn[:3]
+        if not np.linalg.norm(e[:3]) < 1.0:
+            raise InputError(
+                f"|q_b| of the offset is {np.linalg.norm(e[:3]):.3g}, expected less than 1"
+            )
+        return chart.to_pinocchio(moved_by(self.frame, chart.to_state(q, v)[None], e[None])[0])
 
     def gain(self, t: float) -> Array:
         """Return K (nu, nx) at a time of the run."""

@@ -162,7 +162,7 @@ def test_a_sampled_trajectory_of_a_mat_file_is_followed_past_its_end(flown):
         (("--target-joint", "joint_1=1"), "--target-joint: a trajectory says"),
         (("--rpy", 1, 0, 0), "--rpy: it starts on the trajectory, or beside it by --offset"),
         (("--offset", "yaw=1", "--offset", "q_b.x=0.1"), "q_b and an angle; give either"),
-        (("--offset", "q_b=0.8"), r"|q_b| is 1.39, expected less than 1"),
+        (("--offset", "q_b=0.8"), r"|q_b| of the offset is 1.39, expected less than 1"),
         (("--offset", "jaw=1"), "no state named 'jaw'; did you mean yaw?"),
         (("--schedule", "other.npz"), "other.npz has the gains of another motion than"),
         (("--schedule", "other.npz", "--q", "q_b=1"), "--q: --schedule has its weights"),

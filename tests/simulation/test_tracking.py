@@ -352,3 +352,17 @@ def test_default_gains_of_samples_bring_errors_to_nothing_within_a_trajectory(sa
     run = fflin.simulate(robot, schedule, q0=q0, v0=traj.v[0], linear=False)
     assert run.attitude_error[0] == pytest.approx(1.0)
     assert run.attitude_error[-1] < degrees
+
+
+def test_a_start_beside_a_trajectory_is_off_by_what_is_asked(case):
+    robot, schedule, traj = case
+    policy = fflin.TrajectoryFeedback(traj, schedule)
+    state = fflin.StateMap(robot, frame="local")
+    q, v = policy.beside({"yaw": 90.0, "q_m": 0.1, "q_m.joint_2": 0.2, "omega_b.y": 0.3})
+    e = moving_error(state, traj.q[0], traj.v[0], q, v)
+    expected = np.zeros(state.nx)
+    expected[2], expected[6 : 6 + robot.n], expected[7] = np.sqrt(0.5), 0.1, 0.2
+    expected[6 + robot.n + 1] = 0.3
+    np.testing.assert_allclose(e, expected, atol=1e-12)
+    with pytest.raises(fflin.InputError, match="q_b and an angle"):
+        policy.beside({"yaw": 1.0, "q_b": 0.1})
