@@ -28,7 +28,8 @@ def leave(reason: KeyboardInterrupt) -> NoReturn:
     """Say in a line that the command was stopped, and end without waiting for threads."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        print(f"fflin: {reason}" if reason.args else "fflin: stopped", file=sys.stderr)
+        # In one piece, between what other processes write.
+        sys.stderr.write(f"fflin: {reason}\n" if reason.args else "fflin: stopped\n")
         if sys.stdout is not None:
             sys.stdout.flush()
     except OSError:  # nobody reads it

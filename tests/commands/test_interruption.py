@@ -44,8 +44,10 @@ def interrupted(command, instant, folder):
         try:
             # It ends with the last process that has it.
             for line in process.stderr:
-                if not line.startswith("import time:"):
-                    said.append(line)
+                # A line of another process may begin before this one's, and end after it.
+                own = line[max(0, line.find("fflin: ")) :]
+                if own.strip() and not own.startswith("import time:"):
+                    said.append(own)
                 seen = 0 if line.endswith(" fflin.commands.interruption\n") else seen + 1
                 if seen == instant:
                     with suppress(ProcessLookupError):
