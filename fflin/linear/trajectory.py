@@ -77,8 +77,14 @@ class Trajectory(Design):
         robot, nu = self.robot, len(Actuation(self._state).names)
         times = as_double("t", self.t)
         times = vector("t", times, times.size, "times of the knots")
-        if len(times) < 2 or (np.diff(times) <= 0.0).any():
+        if len(times) < 2:
             raise InputError("t must hold at least two times, each later than the one before")
+        if (back := np.flatnonzero(np.diff(times) <= 0.0)).size:
+            late, early = times[back[0] : back[0] + 2]
+            raise InputError(
+                f"t[{back[0] + 1}] is {early:.9g} s, after {late:.9g} s; expected each time later "
+                "than the one before"
+            )
         if self.hold is not None and str(self.hold) not in ("linear", "previous"):
             raise InputError(f"hold is {self.hold!r}, expected 'linear' or 'previous'")
         count, u = len(times), as_double("u", self.u)

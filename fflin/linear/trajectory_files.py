@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,10 @@ def _columns(path: Path) -> Record:
     header, *rows = [[cell.strip() for cell in line] for line in lines if any(line)]
     if len({*header}) < len(header):
         raise ValueError("two of its columns have one name")
+    for number, row in enumerate(rows, 2):
+        if len(row) != len(header):
+            cells = f"row {number} has {len(row)} cells, the first {len(header)}"
+            raise ValueError(f"{cells}; separate them by commas")
     return dict(zip(header, zip(*rows, strict=True), strict=True))
 
 
@@ -113,7 +118,11 @@ def _entries(columns: Record, state: StateMap) -> Record:
 
 
 def _numbers(name: str, cells: tuple[str, ...]) -> Array:
-    try:
-        return np.array(cells, dtype=float)
-    except ValueError:
-        raise InputError(f"column {name} has a cell that is no number") from None
+    for row, cell in enumerate(cells, 2):
+        try:
+            finite = math.isfinite(float(cell))
+        except ValueError:
+            finite = False
+        if not finite:
+            raise InputError(f"row {row} of column {name} is {cell!r}, expected a finite number")
+    return np.array(cells, dtype=float)

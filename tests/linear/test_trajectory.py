@@ -296,6 +296,15 @@ def test_files_of_other_programs_are_read(loop, tmp_path):
     write({name: x for name, x in columns.items() if name != "r_b.y"})
     with pytest.raises(fflin.UnknownNameError, match=r"no column named 'r_b\.y'"):
         fflin.Trajectory.load(path, robot)
+    beside = columns["q_m.joint_2"].copy()
+    beside[3] = np.nan
+    write(columns | {"q_m.joint_2": beside})
+    said_ = r"row 5 of column q_m\.joint_2 is 'nan', expected a finite number"
+    with pytest.raises(fflin.InputError, match=said_):
+        fflin.Trajectory.load(path, robot)
+    path.write_text("t,tau_b.x\n1,2\n3\n")
+    with pytest.raises(fflin.FileError, match="row 3 has 1 cells, the first 2"):
+        fflin.Trajectory.load(path, robot)
     path.write_text("t,t\n1,2\n")
     with pytest.raises(fflin.FileError, match="two of its columns have one name"):
         fflin.Trajectory.load(path, robot)
