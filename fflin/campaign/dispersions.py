@@ -241,7 +241,7 @@ def _inverse(name: str, spread: Any) -> Callable[[Array], Array]:
     if hasattr(spread, "ppf"):
         try:
             middle = float(spread.ppf(0.5))
-        except Exception:
+        except Exception:  # of what may call itself a distribution
             middle = np.nan
         if not np.isfinite(middle):
             raise InputError(f"the distribution of '{name}' has no median; freeze it first")

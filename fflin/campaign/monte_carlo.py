@@ -192,7 +192,7 @@ def monte_carlo(
 def _require_sendable(job: CampaignJob) -> None:
     try:
         pickle.dumps(job)
-    except Exception as error:
+    except Exception as error:  # what is sent has its own
         raise InputError(
             f"robot, policy or spreads cannot be sent to workers ({error}); define what they are "
             "made of at the top of a module, or leave workers and executor out"

@@ -186,6 +186,11 @@ def _curve(
         if x is not None:
             times, shown = _broken(t, x, gaps) if gaps else (t, x)
             axes.plot(times, shown[:, i], **{"color": look["color"]} | own)
+    if of.reference is not None:
+        band = of.reference[:, i], of.values[:, i]
+        # Across a half turn of the base one of them may have changed its sign already.
+        near = None if not gaps else (of.reference[:, gaps] * of.values[:, gaps]).sum(axis=1) >= 0.0
+        axes.fill_between(t, *band, where=near, color=look["color"], alpha=0.25, lw=0.0)
 
 
 def _broken(t: Array, x: Array, indices: Sequence[int]) -> tuple[Array, Array]:

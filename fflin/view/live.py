@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.errors import InputError
 from fflin.base.validation import Array
+from fflin.control.tracking import Reference, followed, reference_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
 from fflin.view.motion_page import corner_points, rounded, stage_info, subtitle, triads
@@ -25,7 +27,8 @@ class Live:
     """A robot in a browser, that moves as it is told; made by `visualize(robot)`.
 
     It is served by a thread of this process, to this machine only, and ends with it. Given to
-    `simulate` as its callback, it shows the simulation as it runs.
+    `simulate` as its callback, it shows the simulation as it runs; `follow` shows the trajectory's
+    ghost with it.
 
     Parameters
     ----------
@@ -91,10 +94,30 @@ class Live:
         }
         info["names"][:6] = [f"base {kind} {axis}" for kind in ("turn", "shift") for axis in "xyz"]
         page = build_page(info, connect="'self' ws:")
+        self._reference: Reference | None = None
         self._server = Server(page, self._recorder.commands, self._asked, port)
         self.url = self._recorder.web_url = self._server.url
         self.port = self._server.port
         self.show(q)
+
+    def follow(self, policy: Any) -> Live:
+        """Show as a ghost what a policy or schedule follows, from now on; return itself.
+
+        ``simulate(robot, schedule, callback=live.follow(schedule))``.
+
+        Raises
+        ------
+        InputError
+            If it follows no trajectory.
+        """
+        self._reference = reference_of(followed(policy, self.robot))
+        if self._reference is None:
+            raise InputError(
+                f"policy is a {type(policy).__name__}, which follows no trajectory; give a "
+                "GainSchedule or a TrajectoryFeedback"
+            )
+        Drawing(self.robot, self.meshcat["target"], "ghost")
+        return self
 
     def show(self, q: Array, t: float | None = None) -> None:
         """Put the robot at a configuration.
@@ -123,6 +146,9 @@ class Live:
                 "joints": [self.robot.joint(each["name"]).value(q) for each in self._joints],
                 "coupling": (inertia / np.outer(scale, scale)).round(4).ravel().tolist(),
             }
+            if self._reference is not None and t is not None:
+                ghost = body_poses(self.robot, self._data, self._reference(float(t))[0])
+                state["ghost"] = ghost.round(7).tolist()
             self.q = q
         self._server.update(json.dumps(state))
 

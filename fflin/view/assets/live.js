@@ -72,11 +72,14 @@ function makeLive({ viewer, aim, keepFramed }, info) {
   let last = null;
   const live = { ready: false, state: null, messages: 0 };
 
+  const place = (node, pose) => {
+    node.position.set(pose[0], pose[1], pose[2]);
+    node.quaternion.set(pose[3], pose[4], pose[5], pose[6]);
+  };
   const apply = (state) => {
-    state.poses.forEach((pose, k) => {
-      nodes[k].position.set(pose[0], pose[1], pose[2]);
-      nodes[k].quaternion.set(pose[3], pose[4], pose[5], pose[6]);
-    });
+    state.poses.forEach((pose, k) => place(nodes[k], pose));
+    // What is followed is drawn when it is first asked for.
+    (state.ghost || []).forEach((pose, k) => place(viewer.scene_tree.find([info.bodies[k][0], "target", info.bodies[k][2]]).object, pose));
     state.joints.forEach((x, k) => sliders[k](x));
     if (state.coupling) showHeat(state.coupling);
     document.querySelector("header p").textContent = state.time === null ? info.subtitle : `t = ${state.time.toFixed(2)} s`;

@@ -175,6 +175,16 @@ function makePlot(parent, t, plot, seek, rest) {
       values.forEach((value, i) => context.lineTo(x(t[i]), y(value)));
       context.stroke();
     };
+    // The band between what is followed and what is flown.
+    for (const { values, reference, colour } of plot.lines) {
+      if (!reference.length) continue;
+      context.fillStyle = colour;
+      context.globalAlpha = 0.25;
+      context.beginPath();
+      values.forEach((value, i) => context.lineTo(x(t[i]), y(value)));
+      for (let i = values.length - 1; i >= 0; i--) context.lineTo(x(t[i]), y(reference[i]));
+      context.fill();
+    }
     for (const { reference, colour } of plot.lines) curve(reference, colour, 4, 0.4);
     for (const { values, colour } of plot.lines) curve(values, colour, 1.4, 1);
     context.fillStyle = style.getPropertyValue("--faint");
