@@ -293,14 +293,17 @@ def test_a_reference_is_pale_under_its_curve_and_a_line_is_where_it_rests(browse
     plot = titles.index("joints")
     (colour,) = watched.do(f"fflin.plots[{plot}].lines.map(({{ colour }}) => colour)")
     low, high = (each + 0.06 * 4.0 * s for each, s in ((-2.5, -1), (1.5, 1)))
-    near, values, _ = rows_of(watched, plot, colour, low, high, least=60)
-    full, _, _ = rows_of(watched, plot, colour, low, high)
+    near, values, _ = rows_of(watched, plot, colour, low, high, least=85)
+    band, _, _ = rows_of(watched, plot, colour, low, high, least=30)
+    full, _, _ = rows_of(watched, plot, colour, low, high, least=150)
     times = np.linspace(0.0, 20.0, near.shape[1] + 1)
     for column in range(10, near.shape[1] - 10, 12):
         t = times[column]
         pale = values[near[:, column] & (values < -1.0)]
-        assert np.abs(pale + 2.0 - 0.5 * np.cos(min(t, 15.0))).max() < 0.2
+        assert abs(pale.mean() + 2.0 - 0.5 * np.cos(min(t, 15.0))) < 0.12
         assert not full[values < -1.0, column].any()
+        between = np.abs(values + 0.5) < 0.5  # the two are at least 1.5 apart
+        assert band[between, column].mean() > 0.9 and not near[between, column].any()
         assert full[values > 0.3, column].any()
     assert near[values < -1.0].sum() > 1.5 * near[values > 0.3].sum()  # it is the wider
     assert watched.do(

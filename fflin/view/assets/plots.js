@@ -179,7 +179,7 @@ function makePlot(parent, t, plot, seek, rest) {
     for (const { values, reference, colour } of plot.lines) {
       if (!reference.length) continue;
       context.fillStyle = colour;
-      context.globalAlpha = 0.25;
+      context.globalAlpha = 0.18;
       context.beginPath();
       values.forEach((value, i) => context.lineTo(x(t[i]), y(value)));
       for (let i = values.length - 1; i >= 0; i--) context.lineTo(x(t[i]), y(reference[i]));
