@@ -97,7 +97,7 @@ def plain_urdf(robot: fflin.Robot) -> str:
     """Return a URDF of the bodies that move alone: no meshes, limits, damping or `world` link."""
     model, data = robot.model, robot.create_data()
     pin.computeJointJacobians(model, data, pin.neutral(model))
-    lines = [f'<robot name="{robot.name}">', _link(BASE, model.inertias[1])]
+    lines = [f'<robot name="{robot.name}">', link_urdf(BASE, model.inertias[1])]
     for joint in robot.joints:
         index, kind = model.getJointId(joint.name), "prismatic" if joint.prismatic else "continuous"
         axis = pin.getJointJacobian(model, data, index, pin.LOCAL)[:, joint.idx_v]
@@ -105,7 +105,7 @@ def plain_urdf(robot: fflin.Robot) -> str:
         parent = model.parents[index]
         above = BASE if parent == 1 else f"link {model.names[parent]}"
         lines += [
-            _link(f"link {joint.name}", model.inertias[index]),
+            link_urdf(f"link {joint.name}", model.inertias[index]),
             f'<joint name="{joint.name}" type="{kind}">',
             f'<parent link="{above}"/>',
             f'<child link="link {joint.name}"/>{_origin(model.jointPlacements[index])}',
@@ -115,7 +115,8 @@ def plain_urdf(robot: fflin.Robot) -> str:
     return "\n".join([*lines, "</robot>"])
 
 
-def _link(name: str, inertia: pin.Inertia) -> str:
+def link_urdf(name: str, inertia: pin.Inertia) -> str:
+    """Return the URDF of one body."""
     moments = zip(
         ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
         inertia.inertia[np.triu_indices(3)].tolist(),

@@ -17,6 +17,7 @@ PACKAGES = (
     "numba",
     "mujoco",
     "drake",
+    "bsk",
     "crocoddyl",
     "adam-robotics",
     "casadi",

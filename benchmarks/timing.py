@@ -1,5 +1,6 @@
 """Times of several functions, measured side by side."""
 
+import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,6 +24,11 @@ class Times:
 
     def ratio(self, other: "Times") -> float:
         return self.least / other.least
+
+    def ratios(self, other: "Times") -> tuple[float, float, float]:
+        """Return the least, the median and the largest ratio of the rounds."""
+        each = [a / b for a, b in zip(self.samples, other.samples, strict=True)]
+        return min(each), statistics.median(each), max(each)
 
 
 def interleaved(functions: Mapping[str, Callable[[], object]]) -> dict[str, Times]:

@@ -11,6 +11,8 @@ ORDER = (
     "lqr",
     "simulation_step",
     "trajectory",
+    "loops",
+    "campaigns",
     "start_up",
     "memory",
 )

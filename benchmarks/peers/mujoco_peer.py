@@ -6,7 +6,9 @@ damping and armature zero. Its quaternions are w x y z.
 
 import mujoco
 import numpy as np
+import pinocchio as pin
 
+import fflin
 from benchmarks.peers import Method
 from benchmarks.robots import BASE, Array, Point, plain_urdf
 
@@ -19,15 +21,14 @@ DIFFERENCE = 1e-6
 class MujocoPoint:
     """A model and its data, and where the coordinates of the point lie in them."""
 
-    def __init__(self, point: Point) -> None:
+    def __init__(self, point: Point, *, motors: bool = True, any_inertia: bool = False) -> None:
         spec = mujoco.MjSpec.from_string(plain_urdf(point.robot))
-        spec.compiler.fusestatic = False
+        spec.compiler.fusestatic, spec.compiler.balanceinertia = False, any_inertia
         spec.body(BASE).add_freejoint(name=FREE)
         names = point.robot.joint_names
-        for axis in range(6):
-            _motor(spec, FREE, axis)
-        for name in names:
-            _motor(spec, name, 0)
+        targets = [(FREE, axis) for axis in range(6)] + [(name, 0) for name in names]
+        for joint, axis in targets if motors else ():
+            _motor(spec, joint, axis)
         self.model = model = spec.compile()
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -35,6 +36,8 @@ class MujocoPoint:
         model.opt.timestep = STEP
         model.dof_damping[:] = model.dof_armature[:] = 0.0
         self.data = mujoco.MjData(model)
+        if any_inertia:
+            self._restore_inertias(point.robot)
         self.nv = model.nv
         joints = [model.joint(name) for name in names]
         self.order = np.array([3, 4, 5, 0, 1, 2, *(int(j.dofadr[0]) for j in joints)])
@@ -42,10 +45,22 @@ class MujocoPoint:
         self.inputs = np.array([3, 4, 5, 0, 1, 2, *range(6, self.nv)])
         self.qpos = np.zeros(model.nq)
         self.qpos[3] = 1.0
-        self.qpos[[int(j.qposadr[0]) for j in joints]] = point.q_m
+        self.positions = [int(j.qposadr[0]) for j in joints]
+        self.qpos[self.positions] = point.q_m
         self.qvel, self.ctrl = np.zeros(self.nv), np.zeros(self.nv)
         self.qvel[self.order] = point.nu
         self.ctrl[self.inputs] = point.u
+
+    def _restore_inertias(self, robot: fflin.Robot) -> None:
+        """Undo what the compiler makes of an inertia that no rigid body can have."""
+        names = [BASE, *(f"link {name}" for name in list(robot.model.names)[2:])]
+        for name, inertia in zip(names, robot.model.inertias.tolist()[1:], strict=True):
+            moments, axes = np.linalg.eigh(inertia.inertia)
+            if 2.0 * moments[2] > moments.sum():
+                axes[:, 2] *= np.linalg.det(axes)
+                body = self.model.body(name)
+                body.inertia[:], body.iquat[:] = moments, np.roll(pin.Quaternion(axes).coeffs(), 1)
+        mujoco.mj_setConst(self.model, self.data)
 
 
 def _motor(spec: "mujoco.MjSpec", joint: str, axis: int) -> None:

@@ -1,0 +1,119 @@
+"""A step of the closed loop: state feedback of every coordinate, 10 s in steps of 10 ms."""
+
+import importlib
+from collections.abc import Callable, Iterator
+
+import pinocchio as pin
+
+import fflin
+from benchmarks.closed_loop import Loop, driven, error, true_end, with_wheels
+from benchmarks.contender import Contender
+from benchmarks.peers import WrongResultError
+from benchmarks.tables import Table, figure
+from benchmarks.timing import interleaved
+
+NAMES, BODY = ("cubesat", "ets_vii", "servicer_7dof"), "cubesat"
+STEP, DURATION = 0.01, 10.0  # [s]
+PEERS = {"MuJoCo": "mujoco_loop", "Drake": "drake_loop", "Basilisk": "basilisk_loop"}
+FLOOR = "four pin.aba"
+WORST = 1e-5  # of the errors; what is further off is another loop
+
+
+def run() -> Table:
+    loops = {name: driven(name, STEP, DURATION) for name in NAMES}
+    loops[f"{BODY}, wheels"] = with_wheels(BODY, STEP, DURATION)
+    rows: list[tuple[str, ...]] = []
+    notes: dict[str, None] = {}
+    for name, loop in loops.items():
+        found, said = contenders(loop)
+        notes |= dict.fromkeys(said)
+        rows += measured(name, found)
+    return Table(
+        "Closed-loop step",
+        f"State feedback u = -K x, {DURATION:g} s in steps of {1e3 * STEP:g} ms, each coordinate "
+        "as if alone at 0.3 rad/s: the least time a step; its ratio to four pin.aba called from "
+        "Python, the least, median and largest of the rounds; the error at the end, relative to "
+        "the start, against DOP853 of Pinocchio's accelerations. `held`: the input is computed "
+        "once a step, else at every stage. fflin and MuJoCo take steps of fourth order, Drake of "
+        "third, with its own gain in C++, which makes the frame `world` of it. MuJoCo's feedback "
+        "is in Python: a callback, or between the steps. Basilisk runs its flight software, with "
+        "the gains of the same motion to first order.",
+        ("robot", "loop", "us", "least", "median", "most", "error"),
+        tuple(rows),
+        tuple(notes),
+    )
+
+
+def contenders(loop: Loop) -> tuple[list[Contender], list[str]]:
+    """Return who runs a loop, and what is said of who does not."""
+    found, notes = fflin_contenders(loop), []
+    for peer, module_name in PEERS.items():
+        try:
+            module = importlib.import_module(f"benchmarks.peers.{module_name}")
+        except ImportError as missing:
+            notes.append(f"{peer}: not installed ({missing})")
+            continue
+        try:
+            found += module.contenders(loop)
+        except module.REFUSALS as refusal:
+            robot = f"{loop.robot.name} with wheels" if loop.wheels else loop.robot.name
+            notes.append(f"{peer}: not on {robot}: {' '.join(str(refusal).split())[:80]}")
+    return found, notes
+
+
+def fflin_contenders(loop: Loop) -> list[Contender]:
+    ways = {
+        "fflin": (loop.but(held=False), "compiled"),
+        "fflin, held": (loop.but(held=True), "compiled"),
+        "fflin, in Python": (loop.but(held=False), "python"),
+    }
+    return [_fflin(name, own, engine) for name, (own, engine) in ways.items()]
+
+
+def _fflin(name: str, loop: Loop, engine: str) -> Contender:
+    kept: dict[str, fflin.Motion] = {}
+
+    def call() -> None:
+        # As of the peers, the last state alone is kept.
+        how = {"linear": False, "every": loop.steps, "engine": engine}
+        kept["motion"] = fflin.simulate(loop.robot, loop.policy, **how, **loop.options)
+
+    return Contender(name, loop, call, lambda: kept["motion"].x[-1])
+
+
+def measured(name: str, found: list[Contender]) -> Iterator[tuple[str, ...]]:
+    """Check contenders against the truth of their loops, time them, and return their rows."""
+    errors = {each.name: checked(each) for each in found}
+    loop = found[0].loop
+    times = interleaved({FLOOR: bare(loop), **{each.name: each.run for each in found}})
+    floor = times[FLOOR]
+    for each, taken in times.items():
+        ratios = (figure(ratio) for ratio in taken.ratios(floor))
+        apart = errors.get(each)
+        shown = figure(None) if apart is None else f"{apart:.0e}"
+        yield name, each, figure(taken.least / loop.steps * 1e6), *ratios, shown
+
+
+def checked(contender: Contender) -> float | None:
+    """Return the error of a contender's last state, or raise where it is of another loop."""
+    if contender.end is None:
+        return None
+    contender.run()
+    loop = contender.loop
+    apart = error(loop, contender.end(), true_end(loop))
+    if not apart < WORST:
+        raise WrongResultError(f"{contender.name} on {loop.robot.name}: ends {apart:.1e} apart")
+    return apart
+
+
+def bare(loop: Loop) -> Callable[[], None]:
+    """Return four calls of ABA for every step."""
+    model, data = loop.robot.model, loop.robot.create_data()
+    q, tau = loop.point.q, np.zeros(loop.robot.nv)
+    v = np.full(loop.robot.nv, 0.1)
+
+    def call() -> None:
+        for _ in range(4 * loop.steps):
+            pin.aba(model, data, q, v, tau)
+
+    return call
