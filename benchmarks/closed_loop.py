@@ -51,6 +51,10 @@ class Loop:
     def wheels(self) -> bool:
         return len(self.K) < 6
 
+    def at_rest(self) -> "Loop":
+        """Return the loop with a start without velocities."""
+        return self.but(x0=np.where(np.arange(len(self.x0)) < 6 + self.robot.n, self.x0, 0.0))
+
     def but(self, **changes: object) -> "Loop":
         return replace(self, **changes)
 

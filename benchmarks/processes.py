@@ -96,10 +96,14 @@ def urdf_file() -> Iterator[str]:
 def run_process(name: str, until: str, path: str) -> tuple[float, float]:
     """Return the time [s] and the peak memory [MiB] of a process until `IMPORT` or `FIRST`."""
     lines = f"import {_MODULES[name]}" if until == IMPORT else _PROGRAMS[name]
-    source = f"path = {path!r}\n{lines}\n{_REPORT}"
+    return measured(name, f"path = {path!r}\n{lines}")
+
+
+def measured(name: str, source: str) -> tuple[float, float]:
+    """Return the time [s] and the peak memory [MiB] of a process that runs some lines."""
     start = time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", source],
+        [sys.executable, "-W", "ignore", "-c", f"{source}\n{_REPORT}"],
         capture_output=True,
         text=True,
         check=False,

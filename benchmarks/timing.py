@@ -46,6 +46,27 @@ def interleaved(functions: Mapping[str, Callable[[], object]]) -> dict[str, Time
     return {name: Times(tuple(taken)) for name, taken in samples.items()}
 
 
+def beside(
+    floor: Callable[[], object], functions: Mapping[str, Callable[[], object]], rounds: int
+) -> dict[str, tuple[Times, Times]]:
+    """Time functions that take long, once a round, and a floor before and after each of them.
+
+    Returns the times of each, and those of the floor beside it.
+    """
+    samples: dict[str, list[tuple[float, float]]] = {name: [] for name in functions}
+    for _ in range(rounds):
+        before = _sample(floor, 1)
+        for name, function in functions.items():
+            taken, after = _sample(function, 1), _sample(floor, 1)
+            samples[name].append((taken, (before + after) / 2.0))
+            before = after
+    return {
+        name: (Times(tuple(own)), Times(tuple(of_floor)))
+        for name, pairs in samples.items()
+        for own, of_floor in [zip(*pairs, strict=True)]
+    }
+
+
 def _sample(function: Callable[[], object], loops: int) -> float:
     start = time.perf_counter()
     for _ in range(loops):

@@ -3,6 +3,7 @@
 import importlib
 from collections.abc import Callable, Iterator
 
+import numpy as np
 import pinocchio as pin
 
 import fflin

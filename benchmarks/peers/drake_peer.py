@@ -18,10 +18,7 @@ class DrakePoint:
     def __init__(self, point: Point, *, rest: bool) -> None:
         if not is_rigid(point.robot):
             raise RuntimeError("Drake replaces the inertias that no rigid body can have")
-        self.plant = plant = MultibodyPlant(time_step=0.0)
-        Parser(plant).AddModelsFromString(plain_urdf(point.robot), "urdf")
-        plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
-        plant.Finalize()
+        self.plant = plant = free_plant(plain_urdf(point.robot))
         self.context = plant.CreateDefaultContext()
         base = plant.GetBodyByName(BASE)
         start = base.floating_velocities_start_in_v()
@@ -42,6 +39,15 @@ class DrakePoint:
         plant.SetPositionsAndVelocities(self.context, np.concatenate((q, v)))
         self.port = plant.get_applied_generalized_force_input_port()
         self.port.FixValue(self.context, force)
+
+
+def free_plant(urdf: str) -> MultibodyPlant:
+    """Return a plant in continuous time without gravity."""
+    plant = MultibodyPlant(time_step=0.0)
+    Parser(plant).AddModelsFromString(urdf, "urdf")
+    plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
+    plant.Finalize()
+    return plant
 
 
 def at_rest(point: Point) -> list[Method]:
