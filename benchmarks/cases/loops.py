@@ -35,10 +35,10 @@ def run() -> Table:
         "as if alone at 0.3 rad/s: the least time a step; its ratio to four pin.aba called from "
         "Python, the least, median and largest of the rounds; the error at the end, relative to "
         "the start, against DOP853 of Pinocchio's accelerations. `held`: the input is computed "
-        "once a step, else at every stage. fflin and MuJoCo take steps of fourth order, Drake of "
-        "third, with its own gain in C++, which makes the frame `world` of it. MuJoCo's feedback "
-        "is in Python: a callback, or between the steps. Basilisk runs its flight software, with "
-        "the gains of the same motion to first order.",
+        "once a step, else at every stage; `free`: no feedback, all in C. fflin and MuJoCo take "
+        "steps of fourth order, Drake of third, with its own gain in C++, which makes the frame "
+        "`world` of it. MuJoCo's feedback is in Python: a callback, or between the steps. Basilisk "
+        "runs its flight software, with the gains of the same motion to first order.",
         ("robot", "loop", "us", "least", "median", "most", "error"),
         tuple(rows),
         tuple(notes),
