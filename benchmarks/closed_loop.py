@@ -13,7 +13,7 @@ from benchmarks.peers import WrongResultError
 from benchmarks.robots import Array, Point, load
 
 FREQUENCY, DAMPING = 0.3, 0.7  # [rad/s] of every coordinate alone, slow enough to end in motion
-WHEEL, TORQUE = 3e-6, 0.3  # [kg m^2], and mrpFeedback's gain relative to the inertia [1/s^2]
+WHEEL = 3e-6  # [kg m^2]
 
 
 @dataclass(frozen=True)
