@@ -125,10 +125,8 @@ def _summed(A: Array, Q: Array, steps: int) -> Array:
 
 
 def held_cost(F: Array, W: Array, h: float) -> Array:
-    """Return the integral of e^(F' t) W e^(F t) over [0, h].
-
-    The exponential rounds relative to its largest block, so that W is scaled to the size of F.
-    """
+    """Return the integral of e^(F' t) W e^(F t) over [0, h]."""
+    # The exponential rounds relative to its largest block, so that W is scaled to the size of F.
     square = F @ F
     if not (square @ F).any():
         total, step = np.zeros_like(W), np.float64(h)

@@ -110,19 +110,10 @@ class Hidden(NamedTuple):
 
 
 def hidden(system: SecondOrder, position: Noisy, velocity: Noisy, dt: float) -> Hidden | None:
-    r"""Find the motions that ``position @ s + velocity @ ds/dt`` does not show.
+    """Find the motions that ``position @ s + velocity @ ds/dt`` does not show.
 
-    At a pole p they are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]`. Every row is
-    scaled by what stands in it, so that a slow mode beside a fast one keeps its figures. Where K
-    is symmetric and D symmetric and semidefinite, those of the pole zero come in chains of two
-    at the most, and are the :math:`(s, v)` with :math:`K s = K v = D v = C_s v = 0` and
-    :math:`C_s s + C_v v = 0`.
-
-    What hides from the inputs are the left vectors, which by symmetry are found with
-    :math:`C_s = S^T, C_v = 0`.
-
-    It is None where K or D are of another kind, where sampling every `dt` takes two poles for one,
-    and where a pole is defective, so that eigenvectors do not tell what belongs to it.
+    They are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p; None where
+    eigenvectors do not tell: of other K or D, of aliased or defective poles.
     """
     if not system.symmetric or (dt and _aliased(system.poles[0], dt)):
         return None

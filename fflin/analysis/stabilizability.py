@@ -93,10 +93,8 @@ def require_disturbed(lin: LinearModel, W: Array) -> None:
 
 
 def _root(W: Array) -> Array:
-    """Return a factor L (m, m) with W = L L^T, of a semidefinite matrix of unlike units.
-
-    It has the square root of W's condition, and so reaches what W reaches with less doubt.
-    """
+    """Return a factor L (m, m) with W = L L^T, of a semidefinite matrix of unlike units."""
+    # It has the root of W's condition, and so reaches what W reaches with less doubt.
     size = np.sqrt(W.diagonal())
     size = np.where(size > 0.0, size, 1.0)
     values, vectors = np.linalg.eigh(W / np.outer(size, size))
@@ -113,10 +111,7 @@ def _check_reach(
     complaint: str,
     error: type[FflinError] = InputError,
 ) -> None:
-    """Raise an error where B misses a mode on the boundary, or warn of what is undecided.
-
-    A growing mode may be missed by a weight or a disturbance, whose error is an `InputError`.
-    """
+    """Raise an error where B misses a mode on the boundary, or warn of what is undecided."""
     discrete = bool(lin.dt)
     poles = np.linalg.eigvals(A)
     size = max(float(np.abs(poles - discrete).max()), 1e-300)

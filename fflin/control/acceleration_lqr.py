@@ -196,14 +196,10 @@ def _continuous(s: Array, qp: Array, qv: Array, ra: Array) -> _Channel:
 
 
 def _sampled(s: Array, qp: Array, qv: Array, ra: Array, h: float) -> _Channel:
-    r"""Solve the channels under a hold of length h.
-
-    With :math:`\sigma = (z - 1)(1/z - 1)` the spectral factor of a channel is of second degree,
-
-    .. math:: r_a \sigma^2 + (q_v - q_p s^2 h^2/4) h^2 \sigma + q_p s^2 h^4 = 0,
-
-    and with :math:`\delta = 1 - z` each root gives :math:`\delta^2 - \sigma \delta + \sigma = 0`.
-    """
+    """Solve the channels under a hold of length h."""
+    # With sigma = (z - 1)(1/z - 1) the spectral factor of a channel is of second degree, ra sigma^2
+    # + (qv - qp s^2 h^2 / 4) h^2 sigma + qp s^2 h^4 = 0, and with delta = 1 - z each root gives
+    # delta^2 - sigma delta + sigma = 0.
     step = s * h
     middle = (qv - 0.25 * qp * step**2) * h**2
     last = qp * step**2 * h**2

@@ -40,10 +40,8 @@ def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
 
 
 def pushes_every_way(W: Array, pushing: NDArray[np.bool_]) -> bool:
-    """Whether columns W (6, k), of which some only push, together give every wrench.
-
-    They do where the rank is 6 and some thrusts, all of them positive, cancel one another.
-    """
+    """Whether columns W (6, k), of which some only push, together give every wrench."""
+    # They do where the rank is 6 and some thrusts, all of them positive, cancel one another.
     from scipy.optimize import nnls
 
     size = np.linalg.norm(W, axis=0)

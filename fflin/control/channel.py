@@ -15,19 +15,7 @@ from fflin.control.saturation import Saturation
 
 
 class Law:
-    """A policy whose commands are checked, and which gets copies of q and v.
-
-    Parameters
-    ----------
-    policy : callable
-        policy(t, q, v) -> u (nu,)
-    names : tuple of str
-        Of the inputs.
-    limits : tuple of ndarray (nu,)
-        Within which it will act.
-    slow : float
-        Square of the velocity beyond which it need not be finite: the motion diverges.
-    """
+    """A policy whose commands (nu,) are checked; it gets copies of q and v."""
 
     def __init__(
         self,
@@ -64,20 +52,7 @@ class Law:
 
 
 class Channel:
-    """A command on its way: `law` is asked at each sample, and acts `delay` steps later.
-
-    Parameters
-    ----------
-    law : callable
-        Returns the command (nu,) of whatever it is given.
-    initial : ndarray (nu,)
-        What acts until the first command arrives.
-    limits : Saturation
-    sample : int
-        Steps between samples; 0 for a law that is asked at every stage of every step.
-    delay : int
-        Steps between a sample and its effect.
-    """
+    """A command on its way: `law` is asked at each sample, and acts `delay` steps later."""
 
     def __init__(
         self,

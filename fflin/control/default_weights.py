@@ -89,12 +89,9 @@ def rule_weights(
     wheel_speeds: bool | None = None,
     pace: Pace = AT_A_POINT,
 ) -> tuple[Array, Array, Array | None, str]:
-    """Return Q, R and N of a model by a rule, and the rule in words.
-
-    The cost of a sampled model is the continuous one under the hold, where it is known what it
-    was sampled from. The rule is by default what the robot has in its `weights`, and "urdf" where
-    it has none; `given` has parts "q", "r", "bryson" of weights, as `Robot.replace` takes them.
-    """
+    """Return Q, R and N of a model by a rule, changed by `given` weights, and the rule in words."""
+    # The cost of a sampled model is the continuous one under the hold, where it is known what it
+    # was sampled from. The rule is by default what the robot has in its `weights`, else "urdf".
     source = lin.generator or lin
     layers = [(given, False)] if given else []
     if name is None and lin.weights:
@@ -152,53 +149,7 @@ def _of_regulated(
 def default_weights(
     lin: LinearModel, pace: Pace = AT_A_POINT, momenta: Mapping[str, float] | None = None
 ) -> Weights:
-    r"""Return weights with which a displaced robot comes back within the URDF's limits.
-
-    With the forces S u of the inputs, a model at rest is :math:`M \dot\nu = S u`,
-    :math:`\dot x_1 = N \nu`. Each coordinate i has a displacement :math:`\theta_i`: the base is
-    turned by 30 deg and moved by a tenth of its radius of gyration, and every joint by 0.3 rad, or
-    0.1 m, or a quarter of its travel where that is less. With the stiffness
-    :math:`D_i = \sum_j |M_{ij}| \theta_j / \theta_i`, which no inertia exceeds, the cost is
-
-    .. math:: \delta x_1^T N^{-T} (\bar D \,\#\, M) N^{-1} \delta x_1
-              + \delta u^T R\,\delta u / w^4,\quad
-              R = \operatorname{diag}(S^T D^{-1} S),\ \bar D = S R^{-1} S^T,
-
-    where # is the geometric mean. The coordinates in which :math:`\bar D` and M are diagonal, 1
-    and :math:`\lambda_k`, then come back one by one, damped by 0.71, at
-    :math:`w \lambda_k^{3/8}`: the slowest at w, and those of little inertia faster, so that what
-    the others do does not carry them away. R is diagonal: every input has the margins of an
-    optimal loop whatever the others do, gains of 1/2 and more and 60 deg of phase.
-
-    The bandwidth w is 0.2 rad/s, or what the limits leave: from these displacements, all at once
-    and in any direction, no input exceeds the effort and no joint the speed that the URDF allows.
-    Where nothing limits them, the poles do not depend on the units of mass and length.
-
-    Springs, gravity and motion are in the model, not in the weights; where there are any, the loop
-    is solved and slowed until its inputs hold the limits, or found to need more. Viscous damping
-    B, the semidefinite part of :math:`-M A_{22}`, is what light joints must be moved against: M is
-    :math:`M + B / w` in the weights.
-
-    Parameters
-    ----------
-    lin : LinearModel
-        Whole or reduced; of a sampled one, weights for the sum over its samples.
-    pace : Pace
-        Along a trajectory that of `pace_along`: the displacements are a tenth of those above, and
-        w is 15 over its duration, within 0.2 and 1.5 rad/s, or what the hold leaves.
-    momenta : mapping, optional
-        {qdot_m.WHEEL: most momentum [N m s] that it can take up} of wheels that are not states.
-
-    Raises
-    ------
-    InputError
-        If the model has not coordinates and their rates as states, or an input acts on nothing.
-
-    References
-    ----------
-    A. E. Bryson and Y.-C. Ho, Applied Optimal Control, 1975. M. G. Safonov and M. Athans, Gain and
-    phase margin for multiloop LQG regulators, IEEE Trans. Automatic Control 22(2), 1977.
-    """
+    """Return weights with which a displaced robot comes back within the URDF's limits (10.7)."""
     h = lin.dt or 1.0
     m = len(lin.M)
     A = lin.A - np.eye(len(lin.A)) if lin.dt else lin.A
@@ -334,10 +285,8 @@ def _reach(S: Array, cost: Array, D: Array) -> Array:
 def _fastest(
     T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel, mass: Array
 ) -> Array:
-    """Return the largest of speeds (k,), T over the modes', on the way back at w = 1.
-
-    Modes are of mass (m,), 1 where nothing damps them: what is left is their damping.
-    """
+    """Return the largest of speeds (k,), T over the modes', on the way back at w = 1."""
+    # Modes are of mass (m,), 1 where nothing damps them: what is left is their damping.
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
     if not any(name.startswith("qdot_m.") for name in lin.limits):

@@ -76,10 +76,8 @@ def _passage(coefficients: Coefficients, h: float) -> _Passage:
 
 
 def step_back(early: Coefficients, late: Coefficients, P: Array, h: float) -> Array:
-    """Return P (nx, nx) at the start of an interval of its value at the end, of order four.
-
-    The coefficients are those at the Gauss nodes; where they are the same, the step is exact.
-    """
+    """Return P at the start of an interval of that at the end, of order four, by Gauss nodes."""
+    # Where the coefficients are the same at both nodes, the step is exact.
     if all(np.array_equal(*pair) for pair in zip(early, late, strict=True)):
         return _passage(late, h).back(P)
     for first, second in ((late, early), (early, late)):
@@ -89,13 +87,7 @@ def step_back(early: Coefficients, late: Coefficients, P: Array, h: float) -> Ar
 
 
 def solve_back(at: Callable[[float], Coefficients], knots: Array, P: Array) -> tuple[Array, Array]:
-    """Return times and P there, from its value at the last of the knots back to the first.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If P changes too fast.
-    """
+    """Return times and P there, back from the last knot; `LinAlgError` where P changes too fast."""
 
     def back(a: float, b: float, P: Array) -> Array:
         early, late = (at(a + c * (b - a)) for c in GAUSS)
@@ -127,17 +119,7 @@ def solve_back(at: Callable[[float], Coefficients], knots: Array, P: Array) -> t
 
 
 def sample_back(weights: Array, whole: Array, P: Array) -> tuple[Array, Array, float]:
-    """Return K, P a sample before, and the relative residual of the difference equation.
-
-    Parameters
-    ----------
-    weights : ndarray (nx + nu, nx + nu)
-        What a sample costs, of the error and the input at its start.
-    whole : ndarray (nx, nx + nu)
-        What takes these two to the next sample.
-    P : ndarray (nx, nx)
-        The cost from that on.
-    """
+    """Return K, P a sample before, and the relative residual of the difference equation."""
     nx = len(P)
     total = weights + whole.T @ P @ whole
     K = np.linalg.solve(total[nx:, nx:], total[nx:, :nx])
@@ -151,11 +133,9 @@ def sample_back(weights: Array, whole: Array, P: Array) -> tuple[Array, Array, f
 
 
 class Passed:
-    """P (M, nx, nx) and R^-1 B' P (M, nu, nx) over time, as a schedule is asked for them.
+    """P (M, nx, nx), K = R^-1 B' P over time; `sign` is -1 of a P that goes backwards."""
 
-    Between knots P is a cubic and B a spline; of samples dt [s] apart what is asked for is that of
-    the last one. `sign` is -1 of a P that goes backwards from the end, 1 of one that goes forward.
-    """
+    # Between knots P is a cubic and B a spline; of samples it is what the last one has.
 
     def __init__(
         self, t: Array, P: Array, K: Array, model: tuple[Array, ...], dt: float, sign: float

@@ -169,10 +169,8 @@ _FROM_MODEL = (
 
 
 def fragility(gain: Gain) -> str:
-    """Say what to do about a gain that bears little at its inputs; nothing where it bears enough.
-
-    A continuous optimal loop with a diagonal R has a disk margin of 2/3 at least.
-    """
+    """Say what to do about a gain that bears little at its inputs; else nothing."""
+    # A continuous optimal loop with a diagonal R has a disk margin of 2/3 at least.
     R = gain.R
     alone = np.count_nonzero(R) == np.count_nonzero(R.diagonal())
     if alone and not gain.dt and not gain.N.any():

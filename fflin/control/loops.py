@@ -38,11 +38,9 @@ class Loop(NamedTuple):
 
 
 def input_loops(gain: Gain) -> tuple[Array, Any, list[Loop]]:
-    r"""Return frequencies (k,) [rad/s], the loops' responses (k, nu) there, and what each bears.
-
-    With :math:`T = K (s E - A + B K)^{-1} B` the loop of input i is
-    :math:`L_i = T_{ii}/(1 - T_{ii})`, of a sampled model at :math:`s = e^{j \omega h}`.
-    """
+    """Return frequencies (k,) [rad/s], the loops' responses (k, nu) there, and what each bears."""
+    # With T = K (s E - A + B K)^-1 B the loop of input i is T_ii / (1 - T_ii), of a sampled model
+    # at s = e^(j w h).
     fed = [gain.state_names.index(name) for name in gain.regulated or gain.state_names]
     F, B, K, dt = gain.closed_loop[np.ix_(fed, fed)], gain.B[fed], gain.K[:, fed], gain.dt
 

@@ -31,17 +31,10 @@ class Margins(NamedTuple):
 
 
 def input_margins(A: Array, B: Array, K: Array, R: Array, dt: float) -> Margins:
-    r"""Return the margins at the inputs of a stable loop u = -K x.
-
-    The disk margin is :math:`1/\|(S - T)/2\|_\infty` with the sensitivity S and T = E - S at the
-    inputs, each counted in :math:`\sqrt{R_{ii}}`. The norm comes from eigenvalues of Hamiltonian
-    matrices, not from a grid of frequencies, to five digits.
-
-    References
-    ----------
-    P. Seiler, A. Packard and P. Gahinet, IEEE Control Systems 40(5), 2020. N. A. Bruinsma and
-    M. Steinbuch, Systems and Control Letters 14(4), 1990.
-    """
+    """Return the margins at the inputs of a stable loop u = -K x, to five digits."""
+    # Seiler, Packard and Gahinet, IEEE Control Systems 40(5), 2020: 1/|(S - T)/2| at the inputs,
+    # each counted in sqrt(R_ii). Bruinsma and Steinbuch, Systems and Control Letters 14(4), 1990:
+    # the norm by eigenvalues of Hamiltonian matrices, not from a grid of frequencies.
     scale = np.sqrt(R.diagonal())
     F, G, H, D = A - B @ K, B / scale, -scale[:, None] * K, 0.5 * np.eye(len(K))
     if dt:

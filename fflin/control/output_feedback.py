@@ -198,10 +198,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
 
 
 class _Sample(NamedTuple):
-    """A sample of a compensator: u = u0 + C z, then z = A z + B (y - y0), z having jumped before.
-
-    By the linear model y - y0 = seen e + through (u - u0).
-    """
+    """u = u0 + C (z + jump), then z = A (z + jump) + B (y - y0), y by `seen` and `through`."""
 
     A: Array
     B: Array

@@ -181,11 +181,9 @@ def _sought(
     limits: Array,
     room: Callable[[Array, Array], Array],
 ) -> Array:
-    """Return the inputs (N + 1, nu) of the least effort that lead to the end, or nearest to it.
-
-    The Hessian is Gauss and Newton's, to which steps of the states add a cost that falls where
-    whole steps succeed (Levenberg and Marquardt).
-    """
+    """Return the inputs (N + 1, nu) of the least effort that lead to the end, or nearest to it."""
+    # The Hessian is Gauss and Newton's, to which steps of the states add a cost that falls where
+    # whole steps succeed (Levenberg and Marquardt).
     q, v, u = shooting.guess(start, end)
     cost, u = _shares(shooting, R, u), np.clip(u, *limits)
     shooting.refine(q, v, u, _SEEKS)

@@ -12,11 +12,10 @@ from fflin.robot.inputs import Thruster
 
 
 class Pulses:
-    """What such thrusters (place among the inputs, name, thruster) make of each sample's command.
+    """What thrusters (place, name, thruster) that fire in pulses make of each sample's command."""
 
-    What it asks for and is not fired, for whole steps or the least impulse, is carried to the next.
-    `high` (nu,) is what they give; where it is infinite, one that is on-off gives its own `max`.
-    """
+    # What is asked for and not fired, for whole steps or the least impulse, is carried to the next.
+    # `high` (nu,) is what they give; where it is infinite, one that is on-off gives its own `max`.
 
     def __init__(
         self, thrusters: Sequence[tuple[int, str, Thruster]], high: Array, sample: int, dt: float

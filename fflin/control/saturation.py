@@ -20,12 +20,10 @@ from fflin.robot.robot import Robot
 
 
 class Wheels(NamedTuple):
-    r"""Wheels that turn no faster than their largest speed.
+    r"""Wheels that turn no faster than their largest speed: :math:`u \le J (w_{max} - w) / dt`."""
 
-    Within a step of dt a torque u takes the speed w of a wheel by u dt / J further, where J is what
-    it turns against the rest of the robot, both free: :math:`u \le J (w_{max} - w) / dt`, and
-    likewise below, as far as the motor can.
-    """
+    # Within a step of dt a torque u takes the speed w by u dt / J further, where J is what it turns
+    # against the rest of the robot, both free; likewise below, as far as the motor can.
 
     names: list[str]
     at: list[int]  # where their torques stand among the inputs
@@ -57,11 +55,7 @@ class Saturation(NamedTuple):
 def saturation(
     robot: Robot, limits: Mapping[str, Range], q: Array, dt: float, sample: int
 ) -> Saturation:
-    """Return what acts of a command of a robot at q (nq,), in steps of dt [s].
-
-    `limits` is {name of an input, or qdot_m of a wheel: (least, largest)}; `sample` is how many
-    steps lie between samples, 0 where there are none.
-    """
+    """Return what acts of a command at q, in steps of dt [s], `sample` steps to a sample or 0."""
     inputs = {name: item for item, names in named_inputs(robot.inputs) for name in names}
     names = list(inputs)
     low, high = np.array([limits.get(name, (-math.inf, math.inf)) for name in names]).T

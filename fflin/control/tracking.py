@@ -234,11 +234,9 @@ def steered_by(policy: Any) -> tuple[str, ...]:
 
 @lru_cache(maxsize=2)  # half of a short run's time
 def largest_rate(schedule: GainSchedule) -> float:
-    """Return the magnitude [1/s] that the loop's poles pass for a twentieth of the time alone.
-
-    A large weight at the end makes K large for a moment, which is over before it does harm; the
-    inputs of samples do not follow at all, 0.
-    """
+    """Return the magnitude [1/s] that the loop's poles pass for a twentieth of the time alone."""
+    # A large weight at the end makes K large for a moment, which is over before it does harm; the
+    # inputs of samples do not follow at all, 0.
     if schedule.dt:
         return 0.0
     rates = np.abs(np.linalg.eigvals(schedule.A - schedule.B @ schedule.K)).max(axis=1)

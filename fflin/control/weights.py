@@ -89,10 +89,7 @@ def is_input(kind: str, key: str, lin: LinearModel) -> bool:
 def weights_by_name(
     lin: LinearModel, given: Mapping[str, Any], *, of_robot: bool
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return weights on states and on inputs of the parts "q", "r" and "bryson".
-
-    Of a robot's own weights, what a reduced model has not is left out.
-    """
+    """Return weights on states and on inputs of the parts q, r and bryson."""
     parts = {part: dict(given.get(part, {})) for part in ("q", "r", "bryson")}
     if of_robot:
         names = (*lin.state_names, *input_keys(lin))
@@ -119,31 +116,7 @@ def inverse_square(what: str, size: float) -> float:
 
 
 def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = False) -> Array:
-    """Return a weight as a symmetric matrix.
-
-    Parameters
-    ----------
-    what : str
-        What to call it in an error.
-    value : array_like (k, k) or (k,), float, or mapping
-        The matrix, its diagonal, a number for the whole diagonal, or {name: number} with the
-        names of entries, their groups, or patterns such as ``q_m.hinge_*``.
-    names : sequence of str (k,)
-    definite : bool
-        Whether every direction must cost something; else none may be negative.
-
-    Returns
-    -------
-    ndarray (k, k)
-
-    Raises
-    ------
-    InputError
-        If a size or value is wrong, or the matrix is not symmetric or not positive
-        (semi)definite.
-    UnknownNameError
-        If a name does not exist.
-    """
+    """Return a weight (k, k) of a matrix, a diagonal, a number, or {name or pattern: number}."""
     size = len(names)
     if isinstance(value, Mapping):
         diagonal = _diagonal(what, value, names, complete=definite)

@@ -1,8 +1,4 @@
-"""What each kind of output measures: its value, and its exact derivatives.
-
-Two routes that share nothing: the derivatives, with respect to q, v and dv/dt, come of Pinocchio's
-and make C and D; the values come out of elementary kinematics in the world and check them.
-"""
+"""What each kind of output measures: its value, and by a route apart its derivatives."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias
