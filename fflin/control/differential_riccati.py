@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
+from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.linear.sampling import GAUSS, HEAVY, LIGHT
 
@@ -60,9 +62,10 @@ def _passage(coefficients: Coefficients, h: float) -> _Passage:
     A, S, Q = coefficients
     n = len(A)
     # The costate is scaled so that Q and S are of the same size.
-    unit = math.sqrt(max(_size(Q), 1e-300) / max(_size(S), 1e-300))
+    large_Q, large_S = (max(float(np.linalg.norm(X, 1)), 1e-300) for X in (Q, S))
+    unit = math.sqrt(large_Q / large_S)
     H = np.block([[A, -S * unit], [-Q / unit, -A.T]])
-    doublings = max(0, math.ceil(math.log2(max(4.0 * h * _size(H), 1.0))))
+    doublings = max(0, math.ceil(math.log2(max(4.0 * h * float(np.linalg.norm(H, 1)), 1.0))))
     theta = expm(H * (h / 2**doublings))
     inverse = np.linalg.inv(theta[n:, n:])
     passage = _Passage(
@@ -118,18 +121,36 @@ def solve_back(at: Callable[[float], Coefficients], knots: Array, P: Array) -> t
     return np.array(times[::-1]), np.array(values[::-1])
 
 
-def sample_back(weights: Array, whole: Array, P: Array) -> tuple[Array, Array, float]:
-    """Return K, P a sample before, and the relative residual of the difference equation."""
-    nx = len(P)
-    total = weights + whole.T @ P @ whole
-    K = np.linalg.solve(total[nx:, nx:], total[nx:, :nx])
-    # A sum of squares, which stays positive.
-    law = np.vstack((np.eye(nx), -K))
-    P = _symmetric(law.T @ total @ law)
-    if not np.isfinite(P).all():
-        raise np.linalg.LinAlgError("P changes too fast")
-    terms = np.array((P, -total[:nx, :nx], total[:nx, nx:] @ K))
-    return K, P, _imbalance(terms)
+def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array, Array, float]:
+    """Return K and P of samples, from the last on, and the worst residual.
+
+    A stage is what a sample costs, of the error and the input at its start, (nx + nu, nx + nu),
+    and what takes these two to the next sample (nx, nx + nu).
+    """
+    nx, gains, costs, worst = len(P), list[Array](), [P], 0.0
+    for weights, whole in stages:
+        total = weights + whole.T @ P @ whole
+        K = np.linalg.solve(total[nx:, nx:], total[nx:, :nx])
+        # A sum of squares, which stays positive.
+        law = np.vstack((np.eye(nx), -K))
+        P = _symmetric(law.T @ total @ law)
+        if not np.isfinite(P).all():
+            raise np.linalg.LinAlgError("P changes too fast")
+        worst = max(worst, _imbalance(np.array((P, -total[:nx, :nx], total[:nx, nx:] @ K))))
+        gains.append(K)
+        costs.append(P)
+    return np.array(gains), np.array(costs), worst
+
+
+@contextmanager
+def bounded_by(remedy: str) -> Iterator[None]:
+    """Raise `InputError` where P changes too fast."""
+    try:
+        # A P that overflows is refused, so that NumPy need not warn of it.
+        with np.errstate(over="ignore", invalid="ignore"):
+            yield
+    except np.linalg.LinAlgError:
+        raise InputError(f"P changes too fast; give {remedy}") from None
 
 
 class Passed:
@@ -207,7 +228,3 @@ def _apart(first: Array, second: Array) -> float:
 def _symmetric(matrix: Array) -> Array:
     half: Array = 0.5 * (matrix + matrix.T)
     return half
-
-
-def _size(matrix: Array) -> float:
-    return float(np.abs(matrix).sum(axis=0).max())

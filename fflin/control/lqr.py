@@ -10,8 +10,8 @@ import numpy as np
 from fflin.analysis.wheels import picked, regulated_part
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.base.validation import Array
-from fflin.control.default_weights import rule_weights
 from fflin.control.gain import Gain, for_whole, make_gain
+from fflin.control.weight_rules import rule_weights
 from fflin.control.weights import Weight, cost_weights
 from fflin.linear.model import LinearModel
 

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.names import by_name, input_keys, matching, stands_for_any
+from fflin.base.names import by_name, input_keys, matching
 from fflin.base.validation import Array, dimension, number, vector
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from fflin.linear.linear_trajectory import LinearTrajectory
     from fflin.linear.model import LinearModel
 
 Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
@@ -86,26 +87,6 @@ def is_input(kind: str, key: str, lin: LinearModel) -> bool:
     return sides.pop()
 
 
-def weights_by_name(
-    lin: LinearModel, given: Mapping[str, Any], *, of_robot: bool
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return weights on states and on inputs of the parts q, r and bryson."""
-    parts = {part: dict(given.get(part, {})) for part in ("q", "r", "bryson")}
-    if of_robot:
-        names = (*lin.state_names, *input_keys(lin))
-        parts = {
-            part: {key: x for key, x in values.items() if stands_for_any(key, names)}
-            for part, values in parts.items()
-        }
-    q, r = parts["q"], parts["r"]
-    for name, size in parts["bryson"].items():
-        side = r if is_input("state or input", name, lin) else q
-        if name in side:
-            raise InputError(f"'{name}' has a weight and a largest value; give either")
-        side[name] = inverse_square(f"largest value of '{name}' (--bryson)", size)
-    return q, r
-
-
 def inverse_square(what: str, size: float) -> float:
     """Return 1/size^2, or raise `InputError` where that is no positive number."""
     if size <= 0.0:
@@ -147,26 +128,26 @@ def columns(what: str, value: ArrayLike, rows: int) -> Array:
     return cross_weight(what, value, rows, shape[1])
 
 
-def require_semidefinite(what: str, matrix: Array, names: Sequence[str]) -> None:
+def require_semidefinite(
+    what: str, matrix: Array, names: Sequence[str], definite: bool = False
+) -> None:
     """Raise `InputError` with the lowest eigenvalue where a symmetric matrix is not so."""
-    size = np.abs(matrix).max(initial=0.0)
     values, directions = np.linalg.eigh(matrix)
-    if values[0] < -_ROUNDING * size:
+    if definite or values[0] < -_ROUNDING * np.abs(matrix).max(initial=0.0):
         where = names[int(np.abs(directions[:, 0]).argmax())]
-        raise _negative(what, float(values[0]), where, definite=False)
+        raise _negative(what, float(values[0]), where, definite)
 
 
 def cost_weights(
-    lin: LinearModel, Q: Weight, R: Weight, N: ArrayLike | None
+    of: LinearModel | LinearTrajectory, Q: Weight, R: Weight, N: ArrayLike | None
 ) -> tuple[Array, Array, Array | None]:
     """Return the weights as matrices, checked."""
-    nx, nu = lin.B.shape
-    Q = weight("Q", Q, lin.state_names)
-    R = weight("R", R, input_keys(lin), definite=True)
+    Q = weight("Q", Q, of.state_names)
+    R = weight("R", R, input_keys(of), definite=True)
     if N is None:
         return Q, R, None
-    cross = cross_weight("N", N, nx, nu)
-    require_semidefinite("Q - N R^-1 N'", Q - cross @ np.linalg.solve(R, cross.T), lin.state_names)
+    cross = cross_weight("N", N, len(Q), len(R))
+    require_semidefinite("Q - N R^-1 N'", Q - cross @ np.linalg.solve(R, cross.T), of.state_names)
     return Q, R, cross
 
 
@@ -182,13 +163,9 @@ def _checked_matrix(what: str, value: Any, names: Sequence[str], definite: bool)
         )
     matrix = 0.5 * (matrix + matrix.T)
     try:
-        np.linalg.cholesky(matrix)
+        np.linalg.cholesky(matrix)  # quicker than eigenvalues
     except np.linalg.LinAlgError:
-        if definite:
-            values, directions = np.linalg.eigh(matrix)
-            where = names[int(np.abs(directions[:, 0]).argmax())]
-            raise _negative(what, float(values[0]), where, definite) from None
-        require_semidefinite(what, matrix, names)
+        require_semidefinite(what, matrix, names, definite)
     return matrix
 
 
@@ -196,15 +173,6 @@ def named_weights(what: str, values: Mapping[str, float], names: Sequence[str]) 
     """Return {index: value} of {name, group or pattern: value}."""
     checked = {name: number(f"weight of '{name}'", value) for name, value in values.items()}
     return by_name(what, checked, names)
-
-
-def reweighed(what: str, matrix: Array, values: Mapping[str, float], names: Sequence[str]) -> Array:
-    """Return a weight (k, k) in which what is named has a weight of its own, coupled to nothing."""
-    matrix = matrix.copy()
-    for index, value in named_weights(what, values, names).items():
-        matrix[index], matrix[:, index] = 0.0, 0.0
-        matrix[index, index] = value
-    return matrix
 
 
 def _diagonal(
