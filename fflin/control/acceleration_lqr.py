@@ -10,13 +10,11 @@ import numpy as np
 from fflin.analysis.wheels import regulated_part
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.validation import Array, dimension
-from fflin.control.gain import Gain, for_whole, make_gain
+from fflin.control.gain import Gain, make_gain
 from fflin.control.lqr import require_fixed_point
 from fflin.control.riccati import Riccati, Solution
 from fflin.control.weights import Weight, weight
 from fflin.linear.model import LinearModel
-
-_BEYOND = "the weights or dt make the solution overflow: scale Qp, Qv and Ra nearer to each other"
 
 
 class _Channel(NamedTuple):
@@ -107,30 +105,30 @@ def acceleration_lqr(
     if (rates + qv == 0.0).any():
         name = velocities[int((rates + qv).argmin())]
         raise InputError(f"Qv is 0 for {name}, expected a positive weight on a wheel's speed")
-    with np.errstate(all="ignore"):
-        channel = _channels(rates, qp, qv, ra, lin.dt)
-    stable = np.abs(channel.poles) < 1.0 if lin.dt else channel.poles.real < 0.0
-    if not stable.all() or not all(np.isfinite(part).all() for part in channel):
-        raise InputError(_BEYOND)
-    inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
     pick = np.eye(m)[rates != 0.0]
-    K = inverse @ np.hstack((pick.T * channel.kp, np.diag(channel.kd)))
-    p12 = channel.p12[:, None] * pick
-    P = np.block([[np.diag(channel.p11), p12], [p12.T, np.diag(channel.p22)]])
-    Q = np.diag(np.concatenate((qp, qv)))
     # The residual is that of the same equation with accelerations as inputs.
     hold = np.vstack((0.5 * lin.dt**2 * rates * pick, lin.dt * np.eye(m)))
     by_acceleration = hold if lin.dt else np.vstack((np.zeros_like(pick), np.eye(m)))
+    Q = np.diag(np.concatenate((qp, qv)))
     equation = Riccati(lin.A, by_acceleration, Q, np.diag(ra), None, lin.dt)
-    R = L.T @ (ra[:, None] * L)
     try:
         with np.errstate(all="ignore"):
+            channel = _channels(rates, qp, qv, ra, lin.dt)
+            stable = np.abs(channel.poles) < 1.0 if lin.dt else channel.poles.real < 0.0
+            p12 = channel.p12[:, None] * pick
+            P = np.block([[np.diag(channel.p11), p12], [p12.T, np.diag(channel.p22)]])
             residual = equation.trial(P).residual
     except np.linalg.LinAlgError:
-        raise InputError(_BEYOND) from None
+        stable = np.array(False)
+    if not stable.all():
+        raise InputError(
+            "the weights or dt make the solution overflow: scale Qp, Qv and Ra nearer to each other"
+        )
+    inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
+    K = inverse @ np.hstack((pick.T * channel.kp, np.diag(channel.kd)))
+    R = L.T @ (ra[:, None] * L)
     solution = Solution(P, K, channel.poles, residual, "closed form")
-    gain = make_gain(lin, solution, Q, 0.5 * (R + R.T), None)
-    return for_whole(gain, whole)
+    return make_gain(whole, lin, solution, Q, 0.5 * (R + R.T), None)
 
 
 def _integrators(lin: LinearModel) -> tuple[Array, Array]:

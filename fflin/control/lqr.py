@@ -10,7 +10,7 @@ import numpy as np
 from fflin.analysis.wheels import picked, regulated_part
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.base.validation import Array
-from fflin.control.gain import Gain, for_whole, make_gain
+from fflin.control.gain import Gain, make_gain
 from fflin.control.weight_rules import rule_weights
 from fflin.control.weights import Weight, cost_weights
 from fflin.linear.model import LinearModel
@@ -118,7 +118,7 @@ def lqr(
         S = picked(part.state_names, lin.state_names)
         Q, cross = S @ Q @ S.T, None if cross is None else S @ cross
     solution = _solve(part, Q, R, cross)
-    return for_whole(make_gain(part, solution, Q, R, cross, rule), lin)
+    return make_gain(lin, part, solution, Q, R, cross, rule)
 
 
 def require_fixed_point(lin: LinearModel) -> None:
