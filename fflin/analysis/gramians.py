@@ -100,8 +100,7 @@ def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:
     if duration is None:
         from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
-        W: Array = solve_discrete_lyapunov(A, Q) if dt else solve_continuous_lyapunov(A, -Q)
-        return W
+        return solve_discrete_lyapunov(A, Q) if dt else solve_continuous_lyapunov(A, -Q)
     if not dt:
         return held_cost(A.T, Q, duration)
     steps = round(duration / dt)

@@ -47,10 +47,7 @@ def slopes(lin: LinearModel) -> Array:
 def floating_inertia(M: Array, kept: Any, others: Any) -> Array:
     """Return what coordinates feel while the others float: the Schur complement of M."""
     across = M[np.ix_(others, kept)]
-    felt: Array = M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(
-        M[np.ix_(others, others)], across
-    )
-    return felt
+    return M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(M[np.ix_(others, others)], across)
 
 
 @dataclass(frozen=True)

@@ -192,5 +192,4 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
     full = pin.computeFrameJacobian(model, data, q, index, axes)
     J = state.columns(np.vstack((full[LINEAR], full[ANGULAR])))
     M = state.project(pin.crba(model, data, q).T)
-    result: Array = J[:, 6:] - J[:, :6] @ np.linalg.solve(M[:6, :6], M[:6, 6:])
-    return result
+    return J[:, 6:] - J[:, :6] @ np.linalg.solve(M[:6, :6], M[:6, 6:])

@@ -69,8 +69,7 @@ class SecondOrder:
             if np.abs(matrix - matrix.T).max(initial=0.0) > _SYMMETRIC * np.abs(matrix).max():
                 return False
         drag = np.linalg.eigvalsh(self.D.values / units)
-        least: bool = min(-drag.min(), drag.max()) <= _SYMMETRIC * np.abs(drag).max()
-        return least
+        return min(-drag.min(), drag.max()) <= _SYMMETRIC * np.abs(drag).max()
 
     @cached_property
     def poles(self) -> tuple[Any, Margin]:
@@ -213,8 +212,7 @@ def _simple(system: SecondOrder, shapes: Any, pole: complex) -> bool:
     change = shapes.T @ (2.0 * pole * system.M + system.D.values) @ shapes
     size = np.abs(shapes).T @ (2.0 * abs(pole) * np.abs(system.M) + np.abs(system.D.values))
     least = np.linalg.svd(change, compute_uv=False)[-1]
-    simple: bool = least > _DEFECTIVE * np.linalg.norm(size @ np.abs(shapes))
-    return simple
+    return least > _DEFECTIVE * np.linalg.norm(size @ np.abs(shapes))
 
 
 def _aliased(poles: Any, dt: float) -> bool:
@@ -222,5 +220,4 @@ def _aliased(poles: Any, dt: float) -> bool:
     s = np.concatenate((poles, np.conj(poles), [0.0])) * dt
     apart = s[:, None] - s
     turns = np.round(apart.imag / (2.0 * np.pi))
-    same: bool = ((turns != 0.0) & (np.abs(apart - 2j * np.pi * turns) < _ALIASED)).any()
-    return same
+    return ((turns != 0.0) & (np.abs(apart - 2j * np.pi * turns) < _ALIASED)).any()

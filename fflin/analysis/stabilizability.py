@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +23,7 @@ from fflin.base.errors import (
     listed,
 )
 from fflin.base.validation import Array
-
-if TYPE_CHECKING:
-    from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel
 
 # A relative singular value of the equilibrated Popov-Belevitch-Hautus matrix below this counts as
 # zero: repeated eigenvalues are computed with such errors.
@@ -99,8 +97,7 @@ def _root(W: Array) -> Array:
     size = np.where(size > 0.0, size, 1.0)
     values, vectors = np.linalg.eigh(W / np.outer(size, size))
     rounding = len(W) * np.finfo(float).eps * values[-1:].max(initial=0.0)
-    root: Array = size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
-    return root
+    return size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
 
 
 def _check_reach(

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fflin.analysis.stabilizability import require_stabilizable
 from fflin.analysis.wheels import regulated_part
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.validation import Array, dimension
@@ -152,8 +153,6 @@ def _integrators(lin: LinearModel) -> tuple[Array, Array]:
         )
     sizes = np.abs(L).max(axis=1, keepdims=True)
     if not sizes.all() or np.linalg.matrix_rank(L / sizes, tol=1e-10) < len(s):
-        from fflin.analysis.stabilizability import require_stabilizable
-
         require_stabilizable(lin)
         raise StabilizabilityError("the inputs do not accelerate every coordinate; use lqr")
     return s, L

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
@@ -14,9 +14,7 @@ from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array
 from fflin.control.riccati import half_size, solve
 from fflin.control.saturation import warn_beyond
-
-if TYPE_CHECKING:
-    from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel
 
 # The bandwidth [rad/s] of a loop that no limit slows: it settles in about thirty seconds. Under a
 # hold of h it is this much over h at the most.
@@ -215,8 +213,7 @@ def _fastest(
     if (mass < 1.0).any():
         fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
         moving = (rates**2 * (slow - fast) / root).real
-    speeds: Array = _largest(T @ (moving[..., None] * to_modes), size, lin.state_names).max(axis=0)
-    return speeds
+    return _largest(T @ (moving[..., None] * to_modes), size, lin.state_names).max(axis=0)
 
 
 def _of_speeds(room: Mapping[str, float], speeds: Array) -> list[_Limit]:

@@ -190,14 +190,12 @@ class Passed:
         square = x * x
         fourth = square * square
         powers = np.array((1.0, x, square, square * x, fourth, fourth * x, fourth * square))
-        K: Array = powers.dot(self.pieces[k]).reshape(self.K.shape[1:])
-        return K
+        return powers.dot(self.pieces[k]).reshape(self.K.shape[1:])
 
     def cost(self, t: float) -> Array:
         """Return P (nx, nx) at a time within the knots."""
         k = bisect_right(self.starts, t) - 1
-        P: Array = self._P[k] if self._dt else self._cubics(t)
-        return P
+        return self._P[k] if self._dt else self._cubics(t)
 
     def residual(self, at: Callable[[float], Coefficients]) -> float:
         """Return the largest relative residual of the differential equation midway."""
@@ -226,5 +224,4 @@ def _apart(first: Array, second: Array) -> float:
 
 
 def _symmetric(matrix: Array) -> Array:
-    half: Array = 0.5 * (matrix + matrix.T)
-    return half
+    return 0.5 * (matrix + matrix.T)

@@ -119,8 +119,7 @@ class Gain(Design):
     @property
     def closed_loop(self) -> Array:
         """A - B K (nx, nx)."""
-        loop: Array = self.A - self.B @ self.K
-        return loop
+        return self.A - self.B @ self.K
 
     @cached_property
     def margins(self) -> Margins:

@@ -63,8 +63,7 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalL
 
 
 def _lower(factor: Array, right: Array) -> Array:
-    solution: Array = dtrtrs(factor, right, lower=1)[0]
-    return solution
+    return dtrtrs(factor, right, lower=1)[0]
 
 
 def _inverse(A12: Array) -> Array | None:
@@ -73,5 +72,4 @@ def _inverse(A12: Array) -> Array | None:
         return np.diag(1.0 / diagonal) if diagonal.all() else None
     if np.linalg.cond(A12) > 1e8:
         return None
-    inverse: Array = np.linalg.inv(A12)
-    return inverse
+    return np.linalg.inv(A12)

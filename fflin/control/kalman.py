@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from fflin.analysis.stabilizability import require_detectable, require_disturbed
 from fflin.analysis.wheels import picked, regulated_part, seen_through
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
@@ -14,13 +16,10 @@ from fflin.base.record import Design
 from fflin.base.validation import Array, dimension
 from fflin.control.gain import Gain
 from fflin.control.lqr import require_fixed_point
+from fflin.control.riccati import solve
 from fflin.control.weights import Weight, columns, weight
+from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel, state_space
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from fflin.linear.linear_trajectory import LinearTrajectory
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -194,9 +193,6 @@ def kalman(
     ----------
     R. E. Kalman and R. S. Bucy, J. Basic Engineering 83(1), 1961.
     """
-    from fflin.analysis.stabilizability import require_detectable, require_disturbed
-    from fflin.control.riccati import solve
-
     require_fixed_point(lin)
     noise, through = disturbance(lin, W, G)
     V = weight("V", V, lin.output_names, definite=True)

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from fflin.analysis.stabilizability import require_stabilizable, require_weighed
 from fflin.analysis.wheels import picked, regulated_part
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.base.validation import Array
 from fflin.control.gain import Gain, make_gain
+from fflin.control.riccati import half_size, solve
 from fflin.control.weight_rules import rule_weights
 from fflin.control.weights import Weight, cost_weights
 from fflin.linear.model import LinearModel
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 _SHOWN_RESIDUALS = 6
 
@@ -159,20 +159,15 @@ def _difference(a: Array, b: Array, c: Array) -> Array:
 def _still(poles: Any, dt: float) -> bool:
     """Whether a pole of a stable loop hardly moves."""
     decay = 1.0 - np.abs(poles) if dt else -poles.real
-    still: bool = decay.min() < _STILL * np.abs(poles - 1.0 if dt else poles).max()
-    return still
+    return decay.min() < _STILL * np.abs(poles - 1.0 if dt else poles).max()
 
 
 def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
-    from fflin.control.riccati import half_size, solve
-
     arguments = (lin.A, lin.B, Q, R, N, lin.dt)
     structured = half_size(*arguments)
     if structured is not None and not _still(structured.poles, lin.dt):
         return structured
     # A general solver would fail without saying which mode is to blame.
-    from fflin.analysis.stabilizability import require_stabilizable, require_weighed
-
     require_stabilizable(lin)
     free, A = Q, lin.A
     if N is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, vector
 from fflin.control.kalman import Compensator, kalman
+from fflin.control.policies import Policy
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvkalman import FilterSchedule
 from fflin.dynamics.aba import Aba
@@ -22,10 +23,7 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.fit import Signals, require_fit, require_same
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
-
-if TYPE_CHECKING:
-    from fflin.control.policies import Policy
-    from fflin.robot.robot import Robot
+from fflin.robot.robot import Robot
 
 
 def measured_states(state: StateMap) -> list[int] | None:

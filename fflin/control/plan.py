@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError, listed
 from fflin.base.names import chosen, input_keys
@@ -21,11 +22,7 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.limits import chosen_limits
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from fflin.robot.robot import Robot
+from fflin.robot.robot import Robot
 
 # What may be missed of the goal and of limits of states in rad, m and s; what is sought of it.
 _REACHED, _ENDS = 1e-7, 1e-8
@@ -285,8 +282,7 @@ def _shares(shooting: Shooting, R: Array, u: Array) -> Array:
 def _blocks(of_x: Array, of_u: Array) -> Array:
     """Return diagonal blocks (N + 1, nx + nu, nx + nu) of weights (nx,) and (N + 1, nu)."""
     rows = np.hstack((np.tile(of_x, (len(of_u), 1)), of_u))
-    blocks: Array = rows[:, :, None] * np.eye(rows.shape[1])
-    return blocks
+    return rows[:, :, None] * np.eye(rows.shape[1])
 
 
 def _room(shooting: Shooting, end: Point, bounds: Array, asked: Array, q: Array, v: Array) -> Array:

@@ -66,8 +66,7 @@ class Riccati:
     def gain(self, P: Array) -> Array:
         """Return K (nu, nx), u = -K x."""
         factor, Y = self._factored(P)
-        K: Array = dtrtrs(factor, Y, lower=1, trans=1)[0]
-        return K
+        return dtrtrs(factor, Y, lower=1, trans=1)[0]
 
     def trial(self, P: Array) -> _Trial:
         """Return P with its defect, and that relative to the sum of the norms of its terms."""

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fflin.analysis.gramians import held_cost
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, number
 from fflin.control.weights import Weight, cost_weights
 from fflin.linear.model import LinearModel
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 
 class SampledCost(NamedTuple):

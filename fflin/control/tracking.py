@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -14,19 +14,16 @@ from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
 from fflin.base.validation import Array
 from fflin.control.gain_schedule import GainSchedule
-from fflin.control.policies import Allocation, fed_back
+from fflin.control.policies import Allocation, Policy, fed_back
 from fflin.control.tvlqr import resting_end, steady_regulator
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import Frame, StateMap
 from fflin.dynamics.state_rows import moved_by, moving_error
 from fflin.linear.fit import require_same, require_turns
 from fflin.linear.linear_trajectory import LinearTrajectory, along
+from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from fflin.control.policies import Policy
-    from fflin.linear.model import LinearModel
-    from fflin.robot.robot import Robot
+from fflin.robot.robot import Robot
 
 # A clock of many steps is rounded.
 AT_THE_END = 1.0 + 1e-9
@@ -194,8 +191,7 @@ class TrajectoryFeedback:
 
         def policy(t: float, q: Array, v: Array) -> Array:
             q_star, v_star, u_star = self.commanded(t)
-            u: Array = u_star - self.gain(t).dot(moving_error(state, q_star, v_star, q, v))
-            return u
+            return u_star - self.gain(t).dot(moving_error(state, q_star, v_star, q, v))
 
         return policy
 

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.names import by_name, input_keys, matching
 from fflin.base.validation import Array, dimension, number, vector
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from fflin.linear.linear_trajectory import LinearTrajectory
-    from fflin.linear.model import LinearModel
+from fflin.linear.linear_trajectory import LinearTrajectory
+from fflin.linear.model import LinearModel
 
 Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
 

@@ -42,8 +42,7 @@ class Aba:
         columns = self.actuation.columns(data, q)
         bias = state.forces(pin.nonLinearEffects(self._model, data, q, v))
         forces = np.abs(columns) @ np.abs(u) + np.abs(bias) + np.abs(self._passive_force(q, v))
-        size: Array = np.abs(np.linalg.inv(M)) @ forces
-        return size
+        return np.abs(np.linalg.inv(M)) @ forces
 
     def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return d(nudot)/d(tangent of q, nu, u) in state order, (6 + n, ...); `u` in base axes."""

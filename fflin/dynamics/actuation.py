@@ -111,8 +111,7 @@ class Actuation:
         """Return u (.., nu) with what is held in reference axes in base axes."""
         if not self._held:
             return u
-        in_base: Array = chart.to_base(self._held, u[..., None])[..., 0]
-        return in_base
+        return chart.to_base(self._held, u[..., None])[..., 0]
 
     def rows_in_base_axes(self, q: Array, u: Array) -> Array:
         """Return rows u (N, nu) in base axes at valid configurations (N, nq), at any turn."""

@@ -106,8 +106,7 @@ class Standing(Chart):
 
 def times(matrices: Array, vectors: Array) -> Array:
     """Return matrices (.., 3, 3) times vectors (.., 3)."""
-    product: Array = (matrices @ vectors[..., None])[..., 0]
-    return product
+    return (matrices @ vectors[..., None])[..., 0]
 
 
 def _turned(R: Array, parts: tuple[slice, ...], x: Array, out: Array | None) -> Array:

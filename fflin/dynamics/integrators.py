@@ -97,8 +97,7 @@ class RungeKuttaMuntheKaas4(Integrator):
 
         def rate(theta: Array, velocity: Array) -> Array:
             slope = pin.dIntegrate(model, q, theta, pin.ArgumentPosition.ARG1)
-            result: Array = np.linalg.solve(slope, velocity)
-            return result
+            return np.linalg.solve(slope, velocity)
 
         l1 = f(t, q, v)
         k2, v2 = half * v, v + half * l1

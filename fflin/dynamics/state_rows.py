@@ -115,8 +115,7 @@ def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:
             z_linear[:] = R.dot(v[:3])
             if turned_angular:
                 z_angular[:] = R.dot(v[3:6])
-        result: Array = gains.dot(z)
-        return result
+        return gains.dot(z)
 
     return f
 
