@@ -14,7 +14,8 @@ from fflin.analysis.ranks import Margin
 from fflin.analysis.wheels import certified, leaving, part_of, picked, without
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
-from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.frames import frame_index
 from fflin.robot.robot import Robot

@@ -85,12 +85,7 @@ class Gain(Design):
     regulated: tuple[str, ...] = field(default_factory=tuple)
 
     def __repr__(self) -> str:
-        nu, nx = self.K.shape
-        time = f"dt={self.dt:g} s" if self.dt else "continuous"
-        return (
-            f"Gain('{self.robot}', nx={nx}, nu={nu}, {time}, margin={self.margin:.3g}, "
-            f"residual={self.residual:.1e})"
-        )
+        return titled(self, nx=self.K.shape[1], nu=len(self.K))
 
     def __str__(self) -> str:
         """Show the gain, its poles, and the figures that prove it."""
@@ -126,6 +121,15 @@ class Gain(Design):
         """Gain and phase margins at the inputs, computed when first asked for."""
         S = picked(self.regulated or self.state_names, self.state_names)
         return input_margins(S @ self.A @ S.T, S @ self.B, self.K @ S.T, self.R, self.dt)
+
+
+def titled(record: Any, **sizes: int) -> str:
+    """Say in a line of what robot a record is, its sizes and time, and how well it is solved."""
+    time = f"dt={record.dt:g} s" if record.dt else "continuous"
+    parts = [f"'{record.robot}'", *(f"{key}={size}" for key, size in sizes.items()), time]
+    if hasattr(record, "residual"):
+        parts += [f"margin={record.margin:.3g}", f"residual={record.residual:.1e}"]
+    return f"{type(record).__name__}({', '.join(parts)})"
 
 
 def make_gain(

@@ -14,7 +14,7 @@ from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array, dimension
-from fflin.control.gain import Gain
+from fflin.control.gain import Gain, titled
 from fflin.control.lqr import require_fixed_point
 from fflin.control.riccati import solve
 from fflin.control.weights import Weight, columns, weight
@@ -81,12 +81,7 @@ class Estimator(Design):
     estimated: tuple[str, ...] = field(default_factory=tuple)
 
     def __repr__(self) -> str:
-        nx, ny = self.L.shape
-        time = f"dt={self.dt:g} s" if self.dt else "continuous"
-        return (
-            f"Estimator('{self.robot}', nx={nx}, ny={ny}, {time}, margin={self.margin:.3g}, "
-            f"residual={self.residual:.1e})"
-        )
+        return titled(self, nx=len(self.L), ny=self.L.shape[1])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -124,9 +119,7 @@ class Compensator(Design):
     robot: str
 
     def __repr__(self) -> str:
-        nx, ny = self.B.shape
-        time = f"dt={self.dt:g} s" if self.dt else "continuous"
-        return f"Compensator('{self.robot}', nx={nx}, ny={ny}, nu={len(self.C)}, {time})"
+        return titled(self, nx=len(self.B), ny=self.B.shape[1], nu=len(self.C))
 
     def to_control(self) -> Any:
         """Return a `control.StateSpace` from y - y0 to u - u0, with signal names.

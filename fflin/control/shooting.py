@@ -7,7 +7,8 @@ import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
-from fflin.dynamics.state import PIN_ANGULAR, PIN_LINEAR, StateMap
+from fflin.dynamics.names import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.state import StateMap
 from fflin.linear.flow import Flow
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot

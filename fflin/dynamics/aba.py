@@ -6,7 +6,8 @@ import pinocchio as pin
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import PIN_ANGULAR, StateMap
+from fflin.dynamics.names import PIN_ANGULAR
+from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT
 
 

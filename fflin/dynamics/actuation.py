@@ -9,7 +9,8 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
 from fflin.dynamics.chart import Chart
-from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.state import StateMap
 from fflin.robot.frames import find_frame
 from fflin.robot.inputs import (
     BaseForce,

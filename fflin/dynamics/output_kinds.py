@@ -9,7 +9,7 @@ import pinocchio as pin
 import fflin.robot.outputs as kinds
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.state import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.names import PIN_ANGULAR, PIN_LINEAR
 from fflin.robot.frames import Carried
 
 _LOCAL = pin.ReferenceFrame.LOCAL

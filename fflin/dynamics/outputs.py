@@ -8,8 +8,9 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
+from fflin.dynamics.names import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.output_kinds import KINDS, Point, Sensed, Slopes, World
-from fflin.dynamics.state import PIN_ANGULAR, PIN_LINEAR, StateMap
+from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT, Carried, find_frame
 from fflin.robot.joints import by_joint
 from fflin.robot.outputs import BasePose, FullState, JointOutput, JointPositions, Output

@@ -12,7 +12,8 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.inertia import Inertia
-from fflin.dynamics.state import LINEAR, PIN_ANGULAR, StateMap
+from fflin.dynamics.names import LINEAR, PIN_ANGULAR
+from fflin.dynamics.state import StateMap
 
 
 class Rates(NamedTuple):

@@ -2,7 +2,7 @@
 
 from copy import copy
 from itertools import compress
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import pinocchio as pin
@@ -17,29 +17,17 @@ from fflin.base.rotation import (
 )
 from fflin.base.validation import Array, placement, vector
 from fflin.dynamics.chart import SMALLEST_Q0, Chart
-from fflin.dynamics.names import groups_of, states_of
+from fflin.dynamics.names import (
+    ANGULAR,
+    IN_REFERENCE_AXES,
+    LINEAR,
+    Frame,
+    groups_of,
+    states_of,
+    unknown_frame,
+)
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
-
-Frame = Literal["hybrid", "local", "world"]
-
-# Which base velocities (omega_b, v_b), and wrenches (tau_b, F_b) with them, stand in the axes
-# of the reference instead of the base's.
-IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
-    "hybrid": (False, True),
-    "local": (False, False),
-    "world": (True, True),
-}
-
-# Rows of the base's angular and linear part in any (6 + n) velocity or wrench of state order,
-ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
-# and in Pinocchio's v and spatial vectors.
-PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
-
-
-def unknown_frame(frame: object) -> InputError:
-    """Build the error for what is no frame of velocities."""
-    return InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
 
 
 class StateMap:

@@ -18,7 +18,8 @@ from fflin.base.rotation import (
 )
 from fflin.base.validation import Array
 from fflin.dynamics.chart import Chart
-from fflin.dynamics.state import ANGULAR, IN_REFERENCE_AXES, LINEAR, StateMap
+from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR
+from fflin.dynamics.state import StateMap
 
 Readout: TypeAlias = Callable[[Array, Array], Array]
 
