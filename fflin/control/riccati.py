@@ -11,8 +11,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from fflin.base.validation import Array
-from fflin.control.half_size import second_order_loop
-from fflin.control.lyapunov import ModalMatrix
+from fflin.control.half_size import ModalMatrix, second_order_loop
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 

@@ -18,9 +18,8 @@ from fflin.control import differential_riccati as riccati
 from fflin.control.gain import Gain
 from fflin.control.gain_schedule import GainSchedule
 from fflin.control.lqr import lqr
-from fflin.control.sampled_cost import sampled_cost
 from fflin.control.weight_rules import pace_along, rule_weights
-from fflin.control.weights import Weight, cost_weights, weight
+from fflin.control.weights import Weight, cost_weights, sampled_cost, weight
 from fflin.linear.equilibrium import equilibrium
 from fflin.linear.ignorable import rotor_names
 from fflin.linear.linear_trajectory import LinearTrajectory

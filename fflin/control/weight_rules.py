@@ -13,8 +13,7 @@ from fflin.base.errors import InputError, listed, unknown
 from fflin.base.names import input_keys, stands_for_any
 from fflin.base.validation import Array
 from fflin.control.default_weights import AT_A_POINT, BANDWIDTH, Pace, default_weights
-from fflin.control.sampled_cost import sampled_cost
-from fflin.control.weights import inverse_square, is_input, named_weights
+from fflin.control.weights import inverse_square, is_input, named_weights, sampled_cost
 from fflin.linear.model import LinearModel
 
 # Along a trajectory errors are a tenth of these, and are to be gone within it: so many time

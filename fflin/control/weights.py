@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fflin.analysis.gramians import held_cost
 from fflin.base.errors import InputError
 from fflin.base.names import by_name, input_keys, matching
 from fflin.base.validation import Array, dimension, number, vector
@@ -170,6 +171,70 @@ def named_weights(what: str, values: Mapping[str, float], names: Sequence[str]) 
     """Return {index: value} of {name, group or pattern: value}."""
     checked = {name: number(f"weight of '{name}'", value) for name, value in values.items()}
     return by_name(what, checked, names)
+
+
+class SampledCost(NamedTuple):
+    """Weights of a sum over samples: ``lqr(lin.discretize(dt), *cost)``."""
+
+    Q: Array
+    R: Array
+    N: Array
+
+
+def sampled_cost(
+    lin: LinearModel, dt: float, Q: Weight, R: Weight, N: ArrayLike | None = None
+) -> SampledCost:
+    r"""Return the sum over samples that equals an integral cost under held inputs.
+
+    Equation (10.1) of docs/derivation.md:
+
+    .. math:: \begin{bmatrix} Q_d & N_d \\ N_d^T & R_d \end{bmatrix} = \int_0^h e^{F^T t}
+              \begin{bmatrix} Q & N \\ N^T & R \end{bmatrix} e^{F t}\,dt,\qquad
+              F = \begin{bmatrix} A & B \\ 0 & 0 \end{bmatrix}
+
+    At rest F^3 = 0, and the integral is a polynomial in h, exact; elsewhere it is that of a
+    short step (van Loan), doubled.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        Continuous.
+    dt : float
+        Sampling time h [s].
+    Q, R : see `lqr`
+    N : array_like (nx, nu), optional
+
+    Returns
+    -------
+    SampledCost
+        (Q, R, N) as `lqr` takes them.
+
+    Raises
+    ------
+    InputError
+        If the model is sampled already, `dt` is not positive, or a weight is not one of `lqr`.
+
+    References
+    ----------
+    C. F. van Loan, Computing integrals involving the matrix exponential, IEEE Trans. Automatic
+    Control 23(3), 1978.
+    """
+    if not isinstance(lin, LinearModel) or lin.dt:
+        raise InputError("lin must be a continuous LinearModel; give the one before discretize")
+    h = number("dt", dt)
+    if h <= 0.0:
+        raise InputError(f"dt is {h:g} s, expected a positive sampling time")
+    Q, R, cross = cost_weights(lin, Q, R, N)
+    nx, nu = lin.B.shape
+    F, W = np.zeros((2, nx + nu, nx + nu))
+    W[:nx, :nx], W[nx:, nx:] = Q, R
+    F[:nx, :nx], F[:nx, nx:] = lin.A, lin.B
+    if cross is not None:
+        W[:nx, nx:], W[nx:, :nx] = cross, cross.T
+    total = held_cost(F, W, h)
+    if not np.isfinite(total).all():
+        raise InputError(f"dt is {h:g} s, over which the model overflows")
+    return SampledCost(total[:nx, :nx], total[nx:, nx:], total[:nx, nx:])
 
 
 def _diagonal(

@@ -7,8 +7,7 @@ import pytest
 import scipy.linalg as sl
 
 import fflin
-from fflin.control.half_size import second_order_loop
-from fflin.control.lyapunov import ModalMatrix
+from fflin.control.half_size import ModalMatrix, second_order_loop
 from fflin.control.riccati import Riccati, _bilinear, _finished, _general, half_size, solve
 from tests.support.robots import BUNDLED, random_point, random_tree
 
