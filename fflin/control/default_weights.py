@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import eigh
 
-from fflin.analysis.mechanics import second_order
+from fflin.analysis.mechanics import second_order, slopes
 from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array
 from fflin.control.riccati import half_size, solve
@@ -65,10 +65,8 @@ def default_weights(
     lin: LinearModel, pace: Pace = AT_A_POINT, momenta: Mapping[str, float] | None = None
 ) -> Weights:
     """Return weights with which a displaced robot comes back within the URDF's limits (10.7)."""
-    h = lin.dt or 1.0
     m = len(lin.M)
-    A = lin.A - np.eye(len(lin.A)) if lin.dt else lin.A
-    N = A[:m, m:] / h
+    N = slopes(lin)[:m, m:]
     if N.shape != lin.M.shape or not np.linalg.cond(N) < 1e8:
         raise InputError(
             f"the model of '{lin.robot}' has not the coordinates and their rates as states, which "
@@ -101,7 +99,6 @@ def _of_inertia(
 ) -> Weights:
     """Return the weights of an inertia M (m, m) that damping adds to; N^-1 is `inverse`."""
     h, m, size = lin.dt or 1.0, len(M), _displacements(lin, pace.share)
-    A = lin.A - np.eye(len(lin.A)) if lin.dt else lin.A
     theta = np.abs(inverse) @ size
     D = np.abs(M) @ theta / theta
     S = lin.M @ lin.B[m:] / h
@@ -133,14 +130,15 @@ def _of_inertia(
     taken = np.vstack((T, added[motors]))
     limits = [
         _Limit(pace.bandwidth, ""),
-        *_of_speeds(room, _fastest(taken, rates, to_modes, size, lin, mass)),
-        *_of_efforts(lin, _largest(gain, size, lin.state_names)),
+        *_limits("speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0),
+        *_limits("effort", _efforts(lin), _largest(gain, size, lin.state_names), 2.0),
     ]
     if pace.hold or lin.dt:
         fastest = pace.held / ((pace.hold or lin.dt) * rates[-1])
         limits.append(_Limit(float(fastest), "the time of the hold"))
     limit = min(limits)
-    if A[m:].any() or A[:m, :m].any():
+    rate = slopes(lin)
+    if rate[m:].any() or rate[:m, :m].any():
         limit = _slowed(lin, Q, cost, size, limit)
     R = np.diag(h * cost / limit.bandwidth**4)
     rule = _rule(lin, size, limit, pace.share * TURN) + (
@@ -216,24 +214,19 @@ def _fastest(
     return _largest(T @ (moving[..., None] * to_modes), size, lin.state_names).max(axis=0)
 
 
-def _of_speeds(room: Mapping[str, float], speeds: Array) -> list[_Limit]:
-    """Return what the limits of speeds leave of a bandwidth at which they are these times it."""
+def _limits(what: str, room: Mapping[str, float], used: Array, power: float) -> list[_Limit]:
+    """Return what is left of a bandwidth of 1, with a power of which what is used grows."""
     return [
-        _Limit(limit / speed, f"the speed of {name.partition('.')[2]}")
-        for (name, limit), speed in zip(room.items(), speeds, strict=True)
-        if 0.0 < limit < math.inf and speed > 0.0
+        _Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('.')[2] or name}")
+        for (name, most), size in zip(room.items(), used.tolist(), strict=True)
+        if 0.0 < most < math.inf and size > 0.0
     ]
 
 
-def _of_efforts(lin: LinearModel, use: Array, bandwidth: float = 1.0) -> list[_Limit]:
-    """Return what the limits of the inputs leave of a bandwidth at which they come to `use`."""
-    found = []
-    for name, used, at in zip(lin.input_names, use, lin.u0, strict=True):
-        room = lin.limits.get(name, math.inf) - abs(at)
-        if 0.0 < room < math.inf and used > 0.0:
-            what = f"the effort of {name.partition('.')[2] or name}"
-            found.append(_Limit(bandwidth * math.sqrt(room / used), what))
-    return found
+def _efforts(lin: LinearModel) -> dict[str, float]:
+    """Return what the limits of the inputs leave beside what the point asks for."""
+    inputs = zip(lin.input_names, lin.u0.tolist(), strict=True)
+    return {name: lin.limits.get(name, math.inf) - abs(at) for name, at in inputs}
 
 
 def _slowed(lin: LinearModel, Q: Array, cost: Array, size: Array, limit: _Limit) -> _Limit:
@@ -245,11 +238,11 @@ def _slowed(lin: LinearModel, Q: Array, cost: Array, size: Array, limit: _Limit)
         except np.linalg.LinAlgError:
             break  # which the regulator tells with the reason
         use = _largest(solution.K, size, lin.state_names)
-        least = min(_of_efforts(lin, use, limit.bandwidth), default=limit)
-        if least.bandwidth >= (1.0 - 1e-6) * limit.bandwidth:
+        share, what = min(_limits("effort", _efforts(lin), use, 2.0), default=_Limit(1.0, ""))
+        if share >= 1.0 - 1e-6:
             return limit
         # What springs and gravity ask for stays however slow the loop.
-        limit = least._replace(bandwidth=max(least.bandwidth, 0.3 * limit.bandwidth))
+        limit = _Limit(max(share, 0.3) * limit.bandwidth, what)
         asked = np.abs(lin.u0) + use
     else:
         high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
@@ -273,12 +266,7 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit, turn: float) -> str:
         from_where.append(f"joints from {sizes}")
     source = "the limits of the URDF" if lin.limits else "mass and size, the URDF has no limits"
     slow = f", set by {limit.what}" if limit.what else ""
-    beyond = [
-        name
-        for name, at in zip(lin.input_names, lin.u0, strict=True)
-        if abs(at) >= lin.limits.get(name, math.inf)
-    ]
-    if beyond:
+    if beyond := [name for name, room in _efforts(lin).items() if room <= 0.0]:
         slow += f"; the point alone asks {listed(beyond)} for more than the URDF allows"
     return (
         f"from {source}: {', '.join(from_where)} come back at {limit.bandwidth:.3g} rad/s or "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -55,10 +55,8 @@ def rule_weights(
         raise unknown("rule of weights", name, ("urdf", "identity"))
     named: dict[str, None] = {}
     for layer, of_robot in layers:
-        q, r = weights_by_name(lin, layer, of_robot=of_robot)
-        Q = reweighed("state", Q, q, lin.state_names)
-        R = reweighed("input", R, r, input_keys(lin))
-        named |= dict.fromkeys((*q, *r))
+        Q, R, names = _reweighed(lin, Q, R, layer, of_robot)
+        named |= dict.fromkeys(names)
     if named:
         rule = f"{', '.join(named)} as given, the others {rule}"
     if source.dt == lin.dt:
@@ -95,30 +93,27 @@ def _of_regulated(
     return Q, R, rule
 
 
-def weights_by_name(
-    lin: LinearModel, given: Mapping[str, Any], *, of_robot: bool
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return weights on states and on inputs of the parts q, r and bryson."""
+def _reweighed(
+    lin: LinearModel, Q: Array, R: Array, given: Mapping[str, Any], of_robot: bool
+) -> tuple[Array, Array, list[str]]:
+    """Return Q and R in which what is named has a weight of its own, and the names."""
     parts = {part: dict(given.get(part, {})) for part in ("q", "r", "bryson")}
-    if of_robot:
+    if of_robot:  # a reduced model has not all that a robot's weights name
         names = (*lin.state_names, *input_keys(lin))
-        parts = {
-            part: {key: x for key, x in values.items() if stands_for_any(key, names)}
-            for part, values in parts.items()
-        }
+        for part, values in parts.items():
+            parts[part] = {key: x for key, x in values.items() if stands_for_any(key, names)}
     q, r = parts["q"], parts["r"]
     for name, size in parts["bryson"].items():
         side = r if is_input("state or input", name, lin) else q
         if name in side:
             raise InputError(f"'{name}' has a weight and a largest value; give either")
         side[name] = inverse_square(f"largest value of '{name}' (--bryson)", size)
-    return q, r
-
-
-def reweighed(what: str, matrix: Array, values: Mapping[str, float], names: Sequence[str]) -> Array:
-    """Return a weight (k, k) in which what is named has a weight of its own, coupled to nothing."""
-    matrix = matrix.copy()
-    for index, value in named_weights(what, values, names).items():
-        matrix[index], matrix[:, index] = 0.0, 0.0
-        matrix[index, index] = value
-    return matrix
+    Q, R = Q.copy(), R.copy()
+    for what, matrix, values, keys in (
+        ("state", Q, q, lin.state_names),
+        ("input", R, r, input_keys(lin)),
+    ):
+        for index, value in named_weights(what, values, keys).items():
+            matrix[index], matrix[:, index] = 0.0, 0.0
+            matrix[index, index] = value
+    return Q, R, [*q, *r]
