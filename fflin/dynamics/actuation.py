@@ -37,9 +37,7 @@ class Actuation:
     def __init__(self, state: StateMap) -> None:
         robot, nv = state.robot, 6 + state.robot.n
         self._state, self._model = state, robot.model
-        names: list[str] = []
-        units: list[str] = []
-        kinds: list[str] = []
+        signals: list[tuple[str, str, str]] = []
         columns: list[Array] = []
         held: list[Held] = []
         # Thrusters and wheels that are no joints, by the Pinocchio joint that carries them:
@@ -47,9 +45,7 @@ class Actuation:
         carried: dict[int, list[tuple[int, Array]]] = {}
         identity = np.eye(nv)
         for item, own in named_inputs(robot.inputs):
-            at = len(names)
-            names += own
-            kind, unit = item.GROUP, item.UNIT
+            at, unit = len(columns), item.UNIT
             if isinstance(item, BaseTorque | BaseForce):
                 torque = isinstance(item, BaseTorque)
                 rows = ANGULAR if torque else LINEAR
@@ -68,14 +64,14 @@ class Actuation:
                 wrench = np.array(placement.act(pin.Force(item.wrench)).vector)
                 carried.setdefault(joint, []).append((at, wrench))
                 columns.append(np.zeros(nv))
-            units += [unit] * (len(names) - at)
-            kinds += [kind] * (len(names) - at)
+            signals += [(name, unit, item.GROUP) for name in own]
+        names, units, kinds = (tuple(signal[i] for signal in signals) for i in range(3))
         twice = [name for index, name in enumerate(names) if name in names[:index]]
         if twice:
             raise InputError(f"two inputs are named '{twice[0]}'; give one of them another name")
         # As a model calls them too.
-        self.names = self.input_names = tuple(names)
-        self.units = self.input_units = tuple(units)
+        self.names = self.input_names = names
+        self.units = self.input_units = units
         # {kind: indices}: tau_b, F_b, tau_m, thrust, wheel, in order of appearance.
         self.groups = {
             kind: np.flatnonzero([kind == other for other in kinds])
