@@ -22,21 +22,11 @@ _NOTHING = 1e-6
 
 
 class Margins(NamedTuple):
-    """Changes that every input tolerates at once, whatever the others do.
+    """Changes that every input tolerates at once, whatever the others do."""
 
-    Attributes
-    ----------
-    disk : float
-        The symmetric disk margin, 2 at most; 0 where the loop is at the limit.
-    gain : tuple of float
-        Factors between which the gain of each input may lie.
-    phase : float
-        Lag or lead of each input [deg].
-    """
-
-    disk: float
-    gain: tuple[float, float]
-    phase: float
+    disk: float  # the symmetric disk margin, 2 at most; 0 where the loop is at the limit
+    gain: tuple[float, float]  # factors between which the gain of each input may lie
+    phase: float  # lag or lead of each input [deg]
 
 
 def input_margins(A: Array, B: Array, K: Array, R: Array, dt: float) -> Margins:
