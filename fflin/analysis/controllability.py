@@ -1,7 +1,5 @@
 """Which states the inputs of a linear model can move, and the names of those that they cannot."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 

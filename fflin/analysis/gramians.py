@@ -1,7 +1,5 @@
 """Gramians: the energy that it takes to reach a state, and that a state shows."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A linear model as a mechanical system: its slopes, its forces, the momenta it conserves."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Which states the outputs of a linear model show."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What inputs reach and outputs show, pole by pole, as Popov, Belevitch and Hautus test it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

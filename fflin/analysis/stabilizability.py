@@ -1,7 +1,5 @@
 """What inputs cannot hold and what outputs cannot see, in words."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Reaction wheels in a linear model: whose angle and speed nothing else depends on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import partial

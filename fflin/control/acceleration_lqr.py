@@ -1,7 +1,5 @@
 """The regulator with its cost on accelerations, in closed form."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 

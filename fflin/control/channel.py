@@ -1,7 +1,5 @@
 """How a command reaches the robot: held between samples, late, and within limits."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable

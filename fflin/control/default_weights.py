@@ -1,7 +1,5 @@
 """The weights that a regulator gets where none are given."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """How far a robot is from the one that a controller was made for."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

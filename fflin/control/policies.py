@@ -1,7 +1,5 @@
 """What decides on the inputs: feedback of the state about a point, and allocation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, runtime_checkable

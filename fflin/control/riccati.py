@@ -1,7 +1,5 @@
 """Algebraic Riccati equations: a solution with its residual, from half the size where possible."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """What acts of a command: within limits, up to the largest speed of a wheel, in pulses."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence

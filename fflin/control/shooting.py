@@ -1,7 +1,5 @@
 """What a robot makes of knots and inputs: the guess, what each interval misses, and its slopes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 

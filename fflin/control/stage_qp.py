@@ -1,7 +1,5 @@
 """Quadratic programs over the stages of a linear motion, solved by PIQP."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Feedback along a trajectory, and the reference that it follows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache

@@ -1,7 +1,5 @@
 """The weights that a regulator gets by a rule, and by name."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Weights of a quadratic cost: from matrices, diagonals, numbers and names."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 

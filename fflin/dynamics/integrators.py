@@ -1,7 +1,5 @@
 """Steps of fixed size of a motion on the manifold, by name, of an acceleration f(t, q, v)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import ClassVar, TypeAlias
 

@@ -1,7 +1,5 @@
 """The states of a whole motion at once, linear feedback of a state, and errors from a motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import compress
 from typing import Any, TypeAlias
