@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,9 +19,7 @@ from fflin.linear.fit import require_same
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.robot import Robot
 
-
-def _nothing() -> Array:
-    return np.zeros(0)
+_nothing = partial(np.zeros, 0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

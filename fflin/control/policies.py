@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -23,15 +23,6 @@ from fflin.robot.robot import Robot
 _LEAST = 1e-7
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
-
-
-@runtime_checkable
-class Bindable(Protocol):
-    """A policy that must know the robot before it decides."""
-
-    def bind(self, robot: Robot) -> Policy:
-        """Return the policy for that robot."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,18 +157,22 @@ class Allocation:
         return policy
 
 
+def decider(policy: Any) -> Any:
+    """Return what decides on commands: of an allocation its policy."""
+    return policy.policy if isinstance(policy, Allocation) else policy
+
+
 def axes_of(policy: Any) -> tuple[Frame, pin.SE3 | None]:
     """Return the frame and reference that a policy's state and inputs are in."""
     lin, _ = feedback_of(policy)
     if lin is not None:
         return lin.frame, lin.reference
-    decides = policy.policy if isinstance(policy, Allocation) else policy
-    return getattr(decides, "frame", "hybrid"), None
+    return getattr(decider(policy), "frame", "hybrid"), None
 
 
 def bound(policy: Any, robot: Robot) -> Policy:
     """Return a policy for a robot, or raise `InputError` where it is none."""
-    result = policy.bind(robot) if isinstance(policy, Bindable) else policy
+    result = policy.bind(robot) if hasattr(policy, "bind") else policy
     if not callable(result):
         raise InputError(
             f"policy is a {type(policy).__name__}, expected policy(t, q, v) -> u, such as "
@@ -189,8 +184,7 @@ def bound(policy: Any, robot: Robot) -> Policy:
 def feedback_of(policy: Any) -> tuple[LinearModel | None, Array | None]:
     """Return the model that a policy was made for, and its K, where it has them."""
     lin = getattr(policy, "lin", None)
-    decides = policy.policy if isinstance(policy, Allocation) else policy
-    return (lin if isinstance(lin, LinearModel) else None), getattr(decides, "K", None)
+    return (lin if isinstance(lin, LinearModel) else None), getattr(decider(policy), "K", None)
 
 
 def fed_back(policy: Any) -> tuple[str, ...]:

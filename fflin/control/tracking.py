@@ -12,7 +12,7 @@ from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
 from fflin.base.validation import Array
 from fflin.control.gain_schedule import GainSchedule
-from fflin.control.policies import Allocation, Policy, fed_back
+from fflin.control.policies import Allocation, Policy, decider, fed_back
 from fflin.control.tvlqr import resting_end, steady_regulator
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import Frame, StateMap
@@ -207,14 +207,13 @@ def followed(policy: Any, robot: Robot, held: bool = False) -> Any:
 
 def reference_of(policy: Any) -> Reference | None:
     """Return what a policy follows, where it follows a motion."""
-    decides = policy.policy if isinstance(policy, Allocation) else policy
-    found = getattr(decides, "reference", None)
+    found = getattr(decider(policy), "reference", None)
     return found if callable(found) else None
 
 
 def tracking_of(policy: Any) -> TrajectoryFeedback | None:
     """Return the feedback along a trajectory that a policy is or allocates."""
-    decides = policy.policy if isinstance(policy, Allocation) else policy
+    decides = decider(policy)
     return decides if isinstance(decides, TrajectoryFeedback) else None
 
 
