@@ -238,9 +238,9 @@ class _Search(NamedTuple):
         except InputError:  # it has diverged
             return None
         low, high = np.concatenate((space, self.limits[:, None] - u), axis=2)
-        H, g = _blocks(near, self.cost), np.hstack((np.zeros((len(u), nx)), effort))
-        of_x = np.full((len(u), nx), _PRICE)
-        soft = np.hstack((of_x, np.full(u.shape, np.inf)))
+        weights = np.hstack((np.tile(near, (len(u), 1)), self.cost))
+        H, of_x = weights[:, :, None] * np.eye(weights.shape[1]), np.zeros((len(u), nx))
+        g, soft = np.hstack((of_x, effort)), np.hstack((of_x + _PRICE, np.full(u.shape, np.inf)))
         scale = np.concatenate((np.ones(nx), (len(u) * self.cost[1]) ** -0.5))
         return StageQP(np.zeros(nx), A, B, D, missed, H, g, low, high, soft, scale).solve()
 
@@ -277,12 +277,6 @@ def _shares(shooting: Shooting, R: Array, u: Array) -> Array:
         cost[[0, -1]] *= 0.5
     cost /= (cost * u * u).sum() or cost.sum()
     return cost
-
-
-def _blocks(of_x: Array, of_u: Array) -> Array:
-    """Return diagonal blocks (N + 1, nx + nu, nx + nu) of weights (nx,) and (N + 1, nu)."""
-    rows = np.hstack((np.tile(of_x, (len(of_u), 1)), of_u))
-    return rows[:, :, None] * np.eye(rows.shape[1])
 
 
 def _room(shooting: Shooting, end: Point, bounds: Array, asked: Array, q: Array, v: Array) -> Array:
