@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
+import fflin.robot.inputs as kinds
 from fflin.base.errors import InputError
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
@@ -12,14 +13,6 @@ from fflin.dynamics.chart import Chart
 from fflin.dynamics.names import ANGULAR, LINEAR
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import find_frame
-from fflin.robot.inputs import (
-    BaseForce,
-    BaseTorque,
-    JointTorque,
-    ReactionWheel,
-    WrenchInput,
-    named_inputs,
-)
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 
@@ -44,38 +37,38 @@ class Actuation:
         # (input, wrench (6,) of a unit in its frame).
         carried: dict[int, list[tuple[int, Array]]] = {}
         identity = np.eye(nv)
-        for item, own in named_inputs(robot.inputs):
+        for item, own in kinds.named_inputs(robot.inputs):
             at, unit = len(columns), item.UNIT
-            if isinstance(item, BaseTorque | BaseForce):
-                torque = isinstance(item, BaseTorque)
+            if isinstance(item, kinds.BaseTorque | kinds.BaseForce):
+                torque = isinstance(item, kinds.BaseTorque)
                 rows = ANGULAR if torque else LINEAR
                 columns += list(identity[rows])
                 if state.axes[0 if torque else 1]:
                     held.append(Held(slice(at, at + 3), rows))
-            elif isinstance(item, JointTorque):
+            elif isinstance(item, kinds.JointTorque):
                 index = robot.joints.index(robot.joint(item.joint))
                 unit = robot.joints[index].force_unit
                 columns.append(identity[6 + index])
-            elif isinstance(item, ReactionWheel) and item.inertia:
+            elif isinstance(item, kinds.ReactionWheel) and item.inertia:
                 columns.append(identity[6 + robot.joint_names.index(own[0])])
             else:
-                assert isinstance(item, WrenchInput)
+                assert isinstance(item, kinds.WrenchInput)
                 joint, placement = find_frame(robot.model, item.frame)
                 wrench = np.array(placement.act(pin.Force(item.wrench)).vector)
                 carried.setdefault(joint, []).append((at, wrench))
                 columns.append(np.zeros(nv))
             signals += [(name, unit, item.GROUP) for name in own]
-        names, units, kinds = (tuple(signal[i] for signal in signals) for i in range(3))
+        names, units, groups = (tuple(signal[i] for signal in signals) for i in range(3))
         twice = [name for index, name in enumerate(names) if name in names[:index]]
         if twice:
             raise InputError(f"two inputs are named '{twice[0]}'; give one of them another name")
         # As a model calls them too.
         self.names = self.input_names = names
         self.units = self.input_units = units
-        # {kind: indices}: tau_b, F_b, tau_m, thrust, wheel, in order of appearance.
+        # {group: indices}: tau_b, F_b, tau_m, thrust, wheel, in order of appearance.
         self.groups = {
-            kind: np.flatnonzero([kind == other for other in kinds])
-            for kind in dict.fromkeys(kinds)
+            group: np.flatnonzero([group == other for other in groups])
+            for group in dict.fromkeys(groups)
         }
         # What the frame holds in reference axes.
         self.held, self._held = tuple(held), tuple(vector.columns for vector in held)

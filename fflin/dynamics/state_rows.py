@@ -7,13 +7,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.rotation import (
-    conjugate,
-    product_matrix,
-    quaternion_product,
-    rotation_matrices,
-    rotation_matrix,
-)
+from fflin.base import rotation as turning
 from fflin.base.validation import Array
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR
@@ -27,9 +21,9 @@ _TURN = 2.0 * np.pi
 
 def states_of(state: StateMap, q: Array, nu: Array) -> Array:
     """Return the states (N, nx) of rows of valid q (N, nq) and nu (N, 6 + n) in base axes."""
-    quaternion = q[:, 3:7] @ product_matrix(state.origin_quaternion).T
+    quaternion = q[:, 3:7] @ turning.product_matrix(state.origin_quaternion).T
     quaternion *= np.where(quaternion[:, 3:] < 0.0, -1.0, 1.0)
-    chart = Chart(quaternion[:, :3], quaternion[:, 3:], rotation_matrices(quaternion))
+    chart = Chart(quaternion[:, :3], quaternion[:, 3:], turning.rotation_matrices(quaternion))
     return state.compose(chart, state.positions(q), state.joint_positions(q), nu)
 
 
@@ -80,7 +74,7 @@ def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:
     of_q, of_v, of_angles, of_angular, of_linear, constant = np.split(gains, ends, axis=1)
     at = state.origin
     of_q[:, :3] = -K[:, g.r_b] @ at.rotation
-    turn = product_matrix(state.origin_quaternion)
+    turn = turning.product_matrix(state.origin_quaternion)
     of_q[:, 3:7] = -K[:, g.q_b] @ turn[:3]
     constant[:, 0] = offset - K[:, g.r_b] @ at.translation
     of_q_m = -K[:, g.q_m]
@@ -151,7 +145,7 @@ def moved_by(frame: str, target: Array, e: Array) -> Array:
 def _turned(x: Array) -> tuple[Array, Array]:
     """Return the scalar part (N, 1) of the attitude of states, not negative, and the rotation."""
     scalar = np.sqrt(1.0 - (x[:, :3] ** 2).sum(axis=1, keepdims=True))
-    return scalar, rotation_matrices(np.hstack((x[:, :3], scalar)))
+    return scalar, turning.rotation_matrices(np.hstack((x[:, :3], scalar)))
 
 
 def _in_reference(frame: str, nx: int) -> list[Any]:
@@ -164,9 +158,9 @@ def moving_error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Arr
     """Return the error (nx,) from a moving reference, in its axes."""
     g = state.groups
     e = np.empty(state.nx)
-    turned = quaternion_product(conjugate(q_star[3:7]), q[3:7])
+    turned = turning.quaternion_product(turning.conjugate(q_star[3:7]), q[3:7])
     e[g.q_b] = turned[:3] if turned[3] >= 0.0 else -turned[:3]
-    e[g.r_b] = rotation_matrix(q_star[3:7]).T @ (q[:3] - q_star[:3])
+    e[g.r_b] = turning.rotation_matrix(q_star[3:7]).T @ (q[:3] - q_star[:3])
     apart = pin.difference(state.robot.model, q_star, q)
     e[g.q_m] = state.velocities(apart)[6:]
     e[-6 - state.robot.n :] = state.velocities(v - v_star)
