@@ -53,7 +53,7 @@ def lqr(
 
     Without weights the regulator is one that the robot can bear: its slowest motion comes back at
     0.2 rad/s, or as much slower as the efforts and speeds of the URDF ask for where the base is
-    turned by 30 deg and the joints by 0.3 rad; see (10.7). Every input
+    turned by 30 deg and the joints by 0.3 rad; see (10.7) of docs/derivation.md. Every input
     then bears 60 deg of phase, and any gain from a half up.
 
     Of a model with reaction wheels what can be is regulated, and named in ``gain.regulated``:

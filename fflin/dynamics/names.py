@@ -1,8 +1,4 @@
-"""Names, units and axes of the state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m), and its forces.
-
-The units of the inputs stand in `fflin.robot.inputs`, those of the outputs that are no states in
-`fflin.robot.outputs`, those of a joint in `fflin.robot.joints`; all else is SI.
-"""
+"""Names, units and axes of the state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m) and its forces."""
 
 from typing import Literal, NamedTuple, get_args
 

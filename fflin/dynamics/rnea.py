@@ -1,7 +1,4 @@
-"""The accelerations at a point and their slopes, from CRBA's M and the derivatives of RNEA.
-
-Numbers of equations are those of docs/derivation.md.
-"""
+"""The accelerations at a point and their slopes, from CRBA's M and the derivatives of RNEA."""
 
 from typing import NamedTuple
 
