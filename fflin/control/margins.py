@@ -1,17 +1,12 @@
 """How much a loop's inputs may change before it is unstable: all at once, or each alone."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fflin.base.validation import Array
-
-if TYPE_CHECKING:
-    from fflin.control.gain import Gain
 
 _ACCURACY = 1e-5
 
@@ -92,8 +87,8 @@ class Loop(NamedTuple):
         return low, min((each for each in factors if each > 1.0), default=math.inf)
 
 
-def input_loops(gain: Gain) -> tuple[Array, Any, list[Loop]]:
-    """Return frequencies (k,) [rad/s], the loops' responses (k, nu) there, and what each bears."""
+def input_loops(gain: Any) -> tuple[Array, Any, list[Loop]]:
+    """Return frequencies (k,) [rad/s], responses (k, nu) of a Gain's loops, and what each bears."""
     # With T = K (s E - A + B K)^-1 B the loop of input i is T_ii / (1 - T_ii), of a sampled model
     # at s = e^(j w h).
     fed = [gain.state_names.index(name) for name in gain.regulated or gain.state_names]
