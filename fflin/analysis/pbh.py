@@ -77,6 +77,7 @@ def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = 
     # They are split off by an orthogonal transformation, until there are none: so that the whole of
     # a defective eigenvalue goes. A staircase would carry the rounding of a weak step into the
     # next.
+    # X is A, or (A - E)/dt of a sampled model; `drive` is B, or C^T of the dual pair.
     pair = _scaled(X, M, dt)
     A, to = (pair.A.T, pair.to_x.T) if dual else (pair.A, pair.from_x)
     B = unit_columns(to @ drive)

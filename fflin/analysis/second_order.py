@@ -114,6 +114,8 @@ def hidden(system: SecondOrder, position: Noisy, velocity: Noisy, dt: float) -> 
     They are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p; None where
     eigenvectors do not tell: of other K or D, of aliased or defective poles.
     """
+    # Those of the pole zero come in chains of two at the most: K s = K v = D v = C_s v = 0 and
+    # C_s s + C_v v = 0. What hides from the inputs are, by symmetry, those of C_s = S^T, C_v = 0.
     if not system.symmetric or (dt and _aliased(system.poles[0], dt)):
         return None
     still, margin = _still(system, position, velocity)
@@ -168,6 +170,7 @@ def _at_pole(
     """Return the shapes (nv, k) that are missed at a pole, the pole refined, and the margin."""
     M, K, D = system.M, system.K.values, system.D.values
     for step in range(_REFINEMENTS):
+        # Rows are scaled by what stands in them: a slow mode beside a fast one keeps its figures.
         s = pole if pole.imag else pole.real
         size = abs(s)
         weight = np.sqrt(

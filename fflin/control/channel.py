@@ -22,6 +22,7 @@ class Law:
         limits: tuple[Array, Array],
         slow: float,
     ) -> None:
+        # Beyond `slow`, a square of the velocity, a motion diverges and may make commands infinite.
         self._policy, self._names, self._limits, self._slow = policy, names, limits, slow
         self._shape = (len(names),)
 
@@ -60,6 +61,7 @@ class Channel:
         sample: int,
         delay: int,
     ) -> None:
+        # In steps; `sample` is 0 of a law that is asked at every stage of every step.
         self._law, self._low, self._high = law, limits.low, limits.high
         self._sample, self._delay = sample, delay
         self._limited = bool(np.isfinite((limits.low, limits.high)).any())

@@ -156,6 +156,7 @@ def inertia_bounds(model: pin.Model) -> Array | None:
     # A body's moment about an axis through the base's origin is at most its largest principal
     # moment and its mass times the square of the way to it, from joint to joint. M's diagonal is no
     # larger.
+    # Of joints that turn or slide alone, and these within `STROKE`.
     joints = model.joints.tolist()
     slides = [joint.shortname().startswith("JointModelP") for joint in joints]
     if not all(joint.shortname()[:11] in ("JointModelR", "JointModelP") for joint in joints[2:]):
