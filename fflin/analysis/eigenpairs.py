@@ -135,8 +135,8 @@ def nonzero_eigenpairs(
     With :math:`V_0, V_1` a basis of the null space and of its complement, A is replaced by
     :math:`V_1^T A V_1`, which has the other eigenvalues, until no zeros are left.
     """
-    # A Jordan block of k zeros turns round-off into eigenvalues of its k-th root. A is scaled so that
-    # its entries are comparable; singular values below n times the tolerance are taken for zero.
+    # A Jordan block of k zeros turns round-off into eigenvalues of its k-th root. A is scaled so
+    # that its entries are comparable; singular values below n times the tolerance are zero.
     n, whole = len(A), A
     size = float(np.linalg.norm(A))
     nullity = n - int(np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance))
