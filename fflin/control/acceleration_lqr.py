@@ -110,21 +110,22 @@ def acceleration_lqr(
     by_acceleration = hold if lin.dt else np.vstack((np.zeros_like(pick), np.eye(m)))
     Q = np.diag(np.concatenate((qp, qv)))
     equation = Riccati(lin.A, by_acceleration, Q, np.diag(ra), None, lin.dt)
+    inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
     try:
         with np.errstate(all="ignore"):
             channel = _channels(rates, qp, qv, ra, lin.dt)
             stable = np.abs(channel.poles) < 1.0 if lin.dt else channel.poles.real < 0.0
+            K = inverse @ np.hstack((pick.T * channel.kp, np.diag(channel.kd)))
             p12 = channel.p12[:, None] * pick
             P = np.block([[np.diag(channel.p11), p12], [p12.T, np.diag(channel.p22)]])
             residual = equation.trial(P).residual
+            sound = stable.all() and np.isfinite(K).all()
     except np.linalg.LinAlgError:
-        stable = np.array(False)
-    if not stable.all():
+        sound = False
+    if not sound:
         raise InputError(
             "the weights or dt make the solution overflow: scale Qp, Qv and Ra nearer to each other"
         )
-    inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
-    K = inverse @ np.hstack((pick.T * channel.kp, np.diag(channel.kd)))
     R = L.T @ (ra[:, None] * L)
     solution = Solution(P, K, channel.poles, residual, "closed form")
     return make_gain(whole, lin, solution, Q, 0.5 * (R + R.T), None)
