@@ -68,7 +68,7 @@ from fflin.control.lqr import lqr as lqr
 from fflin.control.weights import bryson as bryson
 from fflin.control.gain import Gain as Gain
 from fflin.control.acceleration_lqr import acceleration_lqr as acceleration_lqr
-from fflin.control.sampled_cost import sampled_cost as sampled_cost
+from fflin.control.weights import sampled_cost as sampled_cost
 from fflin.control.plan import plan as plan
 from fflin.control.tvlqr import tvlqr as tvlqr
 from fflin.control.gain_schedule import GainSchedule as GainSchedule

@@ -1,4 +1,1 @@
-"""What a linear model tells: reach, modes, momenta, how far it can be trusted.
-
-Imports `base`, `robot`, `dynamics` and `linear`.
-"""
+"""What a linear model tells: reach, modes, momenta, how far it can be trusted."""

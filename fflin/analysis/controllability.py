@@ -1,22 +1,12 @@
 """Which states the inputs of a linear model can move, and the names of those that they cannot."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fflin.analysis.mechanics import (
-    ConservedMomenta,
-    at_rest,
-    checked,
-    conserved,
-    rates_of_positions,
-    second_order,
-    slopes,
-    state_sizes,
-)
+from fflin.analysis import mechanics
+from fflin.analysis.mechanics import ConservedMomenta
 from fflin.analysis.names import (
     combination,
     grouped,
@@ -143,14 +133,14 @@ def controllability(lin: LinearModel) -> Controllability:
     P. C. Hughes and R. E. Skelton, Controllability and observability of linear matrix
     second-order systems, J. Applied Mechanics 47(2), 1980.
     """
-    lin = checked(lin)
-    held = conserved(lin)
+    lin = mechanics.checked(lin)
+    held = mechanics.conserved(lin)
     part = _by_second_order(lin, held) or _by_poles(lin, held)
-    fixed, size = part.fixed, state_sizes(lin)
+    fixed, size = part.fixed, mechanics.state_sizes(lin)
     others: Array = np.zeros((len(part.rows), len(lin.A)))
     others[:, held.selected] = part.rows
     # States are named after the coordinates that an input pushes on directly, where possible.
-    driven = second_order(lin.generator or lin).S.values.any(axis=1)
+    driven = mechanics.second_order(lin.generator or lin).S.values.any(axis=1)
     basis, pivots = echelon(held.T @ part.reached, size, np.tile(driven, 2))
     zero = np.full(2 * len(held.weights), 1.0 if lin.dt else 0.0)
     margin = held.margin & fixed.margin
@@ -185,16 +175,16 @@ class _Part(NamedTuple):
 
 def _by_poles(lin: LinearModel, held: ConservedMomenta) -> _Part:
     z, R = held.selected, held.rates
-    found = split_by_poles(slopes(lin)[z] @ held.T, lin.B[z], R.T @ lin.M @ R, lin.dt)
+    found = split_by_poles(mechanics.slopes(lin)[z] @ held.T, lin.B[z], R.T @ lin.M @ R, lin.dt)
     rows, names = _labels(lin, found.rows, held)
     return _Part(found.reached, rows, names, "eigenvalues", found.fixed.seen(R))
 
 
 def _by_second_order(lin: LinearModel, held: ConservedMomenta) -> _Part | None:
-    source, R = at_rest(lin), held.rates
+    source, R = mechanics.at_rest(lin), held.rates
     if source is None:
         return None
-    system, r = second_order(source).restricted(R), len(held.kept)
+    system, r = mechanics.second_order(source).restricted(R), len(held.kept)
     idle, margin = null_space(system.S.T @ np.diag(1.0 / system.size))
     if not system.acting or (not idle.shape[1] and not lin.dt):
         # Inputs reach every momentum that is not conserved, and so the coordinates.
@@ -211,7 +201,7 @@ def _by_second_order(lin: LinearModel, held: ConservedMomenta) -> _Part | None:
     across = pushed / size
     across = np.linalg.qr((across / np.linalg.norm(across, axis=1, keepdims=True)).T, "complete")[0]
     reached = across[:, len(pushed) :] / size[:, None]
-    to_s = np.linalg.inv((rates_of_positions(slopes(source)) @ R)[held.kept])
+    to_s = np.linalg.inv((mechanics.rates_of_positions(mechanics.slopes(source)) @ R)[held.kept])
     reached[:r] = np.linalg.solve(to_s, reached[:r])
     if system.D.values.any():
         rows, names = _labels(lin, np.hstack((pushed[:, :r] @ to_s, pushed[:, r:])), held)
@@ -225,7 +215,7 @@ def _by_second_order(lin: LinearModel, held: ConservedMomenta) -> _Part | None:
 def _labels(lin: LinearModel, rows: Array, held: ConservedMomenta) -> tuple[Array, tuple[str, ...]]:
     """Return the same rows in echelon form, and their names."""
     names = tuple(np.array(lin.state_names)[held.selected])
-    size = 1.0 / state_sizes(lin)[held.selected]
+    size = 1.0 / mechanics.state_sizes(lin)[held.selected]
     rows = echelon(rows.T, size)[0].T
     return rows, tuple(combination(row, names, size) for row in rows)
 
@@ -253,7 +243,11 @@ def _notes(lin: LinearModel, held: ConservedMomenta) -> tuple[str, ...]:
 
 
 def _vibration_rows(
-    found: Hidden, system: SecondOrder, to_s: Array, lin: LinearModel, held: ConservedMomenta
+    found: Hidden,
+    system: SecondOrder,
+    to_s: Array,
+    lin: LinearModel,
+    held: ConservedMomenta,
 ) -> tuple[Array, tuple[str, ...]]:
     """Return the rows that read the undriven modes of an undamped model, and their names."""
     r = len(system.M)

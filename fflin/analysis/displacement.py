@@ -1,7 +1,5 @@
 """Displacements from a point: attitude [deg], position [m] and joints [rad|m] together."""
 
-from __future__ import annotations
-
 from fflin.base.errors import InputError
 from fflin.base.validation import number
 from fflin.linear.model import LinearModel

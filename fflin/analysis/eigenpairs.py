@@ -94,10 +94,8 @@ def _free_free(A: Array, M: Array, inertia: Array) -> NaturalModes | None:
 
 
 def _polished(by_s: Array, squares: Array, vectors: Array) -> tuple[Array, Array]:
-    """Return the pairs of -by_s, after one Newton step from those of its symmetric pencil.
-
-    The Schur complement rounds by the condition of M, while A itself is exact to the last digits.
-    """
+    """Return the pairs of -by_s, after one Newton step from those of its symmetric pencil."""
+    # The Schur complement rounds by the condition of M, while A is exact to the last digits.
     defect = -np.linalg.solve(vectors, by_s @ vectors) - np.diag(squares)
     gaps = squares - squares[:, None]
     # Vectors of equal frequencies are not mixed: any combination of them is a mode.
@@ -132,16 +130,13 @@ def _general(A: Array, weight: Array, fastest: float) -> NaturalModes:
 def nonzero_eigenpairs(
     A: Array, tolerance: float
 ) -> tuple[list[tuple[complex, Vector, float]], int]:
-    r"""Return the eigenpairs of A that are not zero, and the dimension of its null space.
+    """Return the eigenpairs of A that are not zero, each with its rounding, and the nullity.
 
-    A Jordan block of k zeros turns round-off into eigenvalues of :math:`\epsilon^{1/k}`. So, with
-    :math:`V_0, V_1` a basis of the null space and of its complement, A is replaced by
-    :math:`V_1^T A V_1`, which has the other eigenvalues, until nothing is left to split off.
-
-    A is scaled so that its entries are comparable, the largest about 1; singular values below n
-    times the tolerance are taken for zero. A pair is an eigenvalue, its eigenvector (n,), and a
-    bound on what rounding does to the eigenvalue, by its condition number.
+    With :math:`V_0, V_1` a basis of the null space and of its complement, A is replaced by
+    :math:`V_1^T A V_1`, which has the other eigenvalues, until no zeros are left.
     """
+    # A Jordan block of k zeros turns round-off into eigenvalues of its k-th root. A is scaled so
+    # that its entries are comparable; singular values below n times the tolerance are zero.
     n, whole = len(A), A
     size = float(np.linalg.norm(A))
     nullity = n - int(np.count_nonzero(np.linalg.svd(A, compute_uv=False) > n * tolerance))

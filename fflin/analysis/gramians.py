@@ -1,7 +1,5 @@
 """Gramians: the energy that it takes to reach a state, and that a state shows."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -100,8 +98,7 @@ def _gramian(A: Array, Q: Array, dt: float, duration: float | None) -> Array:
     if duration is None:
         from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
-        W: Array = solve_discrete_lyapunov(A, Q) if dt else solve_continuous_lyapunov(A, -Q)
-        return W
+        return solve_discrete_lyapunov(A, Q) if dt else solve_continuous_lyapunov(A, -Q)
     if not dt:
         return held_cost(A.T, Q, duration)
     steps = round(duration / dt)
@@ -125,10 +122,8 @@ def _summed(A: Array, Q: Array, steps: int) -> Array:
 
 
 def held_cost(F: Array, W: Array, h: float) -> Array:
-    """Return the integral of e^(F' t) W e^(F t) over [0, h].
-
-    The exponential rounds relative to its largest block, so that W is scaled to the size of F.
-    """
+    """Return the integral of e^(F' t) W e^(F t) over [0, h]."""
+    # The exponential rounds relative to its largest block, so that W is scaled to the size of F.
     square = F @ F
     if not (square @ F).any():
         total, step = np.zeros_like(W), np.float64(h)

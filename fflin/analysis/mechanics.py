@@ -1,7 +1,5 @@
 """A linear model as a mechanical system: its slopes, its forces, the momenta it conserves."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,10 +45,7 @@ def slopes(lin: LinearModel) -> Array:
 def floating_inertia(M: Array, kept: Any, others: Any) -> Array:
     """Return what coordinates feel while the others float: the Schur complement of M."""
     across = M[np.ix_(others, kept)]
-    felt: Array = M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(
-        M[np.ix_(others, others)], across
-    )
-    return felt
+    return M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(M[np.ix_(others, others)], across)
 
 
 @dataclass(frozen=True)
@@ -78,11 +73,9 @@ class ConservedMomenta:
 
 
 def second_order(lin: LinearModel) -> SecondOrder:
-    """Return the forces of a continuous model, or those that a sampled one shows as it stands.
-
-    The product with M leaves rounding where there is no spring, damper or input. It is put to
-    zero by one floor for springs and one for dampers, per unit of energy, and one for each input.
-    """
+    """Return the forces of a continuous model, or those that a sampled one shows as it stands."""
+    # The product with M leaves rounding where there is no spring, damper or input. It is put to
+    # zero by one floor for springs and one for dampers, per unit of energy, and one for each input.
     nv, M, X = len(lin.M), lin.M, slopes(lin)
     size, N = np.sqrt(M.diagonal()), rates_of_positions(X)
     rates = np.hstack((X[nv:], lin.B[nv:]))
@@ -103,11 +96,9 @@ def second_order(lin: LinearModel) -> SecondOrder:
 
 
 def at_rest(lin: LinearModel) -> LinearModel | None:
-    """Return a model with the second-order structure of the given one, None where it has none.
-
-    That is the continuous one where positions change at the rates of velocities alone, which
-    also tells the structure of what was sampled from it; or a sampled one without forces.
-    """
+    """Return a model with the second-order structure of the given one, None where it has none."""
+    # That is the continuous one where positions change at the rates of velocities alone, which also
+    # tells the structure of what was sampled from it; or a sampled one without forces.
     source, nv = lin.generator or lin, len(lin.M)
     X = slopes(source)
     if X[:nv, :nv].any() or (source.dt and X[nv:].any()):
@@ -123,12 +114,7 @@ def rates_of_positions(X: Array) -> Array:
 
 
 def conserved(lin: LinearModel) -> ConservedMomenta:
-    r"""Find the conserved momenta (9.2): :math:`W M [A_{21}, A_{22}, B_2] = 0`.
-
-    The generalised forces of states and inputs are compared in units of
-    :math:`\sqrt{M_{ii}}` and each is scaled to unit length, so that neither newton against
-    newton metre nor a weak thruster plays a part.
-    """
+    """Find the conserved momenta (9.2): :math:`W M [A_{21}, A_{22}, B_2] = 0`."""
     lin = lin.generator or lin  # it conserves the same momenta
     nv, X, system = len(lin.M), slopes(lin), second_order(lin)
     size = system.size

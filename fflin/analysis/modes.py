@@ -137,7 +137,39 @@ class Modes:
         return np.array(listed)
 
     def __str__(self) -> str:
-        return modes_report(self)
+        """Show how many are rigid, and a table of the others with what moves most."""
+        vibrations, others = len(self.vibrations), len(self.modes) - len(self.vibrations)
+        head = (
+            f"{self.robot}: {counted(self.rigid_body, 'rigid-body mode')} "
+            f"({counted(self.zero_eigenvalues, 'eigenvalue')} at zero), "
+            f"{counted(vibrations, 'vibration')}"
+        )
+        head += f", {counted(others, 'real pole')}" if others else ""
+        if not self.equilibrium:
+            head += "; not an equilibrium, where eigenvalues are those of a frozen model"
+        said = [head]
+        if self.unstable:
+            poles = ", ".join(f"{mode.pole:.5g}" for mode in self.unstable)
+            said.append(f"unstable: poles with a positive real part {poles}")
+        said += [f"note: {note}" for note in self.notes]
+        parts = [textwrap.fill(each, width()) for each in said]
+        rows = [["rad/s", "damping", "time [s]", "", "what moves"]]
+        rows += [
+            [
+                f"{mode.frequency:.6g}" if mode.oscillates else ".",
+                f"{mode.damping_ratio:.4g}" if mode.oscillates else ".",
+                f"{mode.time_constant:.4g}" if mode.pole.real else ".",
+                "unstable" if mode.unstable else "",
+                "",
+            ]
+            for mode in self.modes
+        ]
+        left = max(map(len, grid(rows, "rrrll").splitlines())) - len(rows[0][-1])
+        for row, mode in zip(rows[1:], self.modes, strict=True):
+            row[-1] = _moving_most(mode, self.state_names, width() - left)
+        if self.modes:
+            parts.append(grid(rows, "rrrll"))
+        return "\n\n".join(parts)
 
 
 def modes(lin: LinearModel) -> Modes:
@@ -198,42 +230,6 @@ def _normalised(shape: Array) -> NDArray[np.complexfloating[Any]]:
     # Of several that move equally, such as symmetric panels, the first.
     largest = int(np.flatnonzero(positions >= (1.0 - 1e-9) * positions.max())[0])
     return np.asarray(shape / shape[largest], dtype=complex)
-
-
-def modes_report(found: Modes) -> str:
-    """Show natural modes: how many are rigid, and a table of the others with what moves most."""
-    vibrations, others = len(found.vibrations), len(found.modes) - len(found.vibrations)
-    head = (
-        f"{found.robot}: {counted(found.rigid_body, 'rigid-body mode')} "
-        f"({counted(found.zero_eigenvalues, 'eigenvalue')} at zero), "
-        f"{counted(vibrations, 'vibration')}"
-    )
-    head += f", {counted(others, 'real pole')}" if others else ""
-    if not found.equilibrium:
-        head += "; not an equilibrium, where eigenvalues are those of a frozen model"
-    said = [head]
-    if found.unstable:
-        poles = ", ".join(f"{mode.pole:.5g}" for mode in found.unstable)
-        said.append(f"unstable: poles with a positive real part {poles}")
-    said += [f"note: {note}" for note in found.notes]
-    parts = [textwrap.fill(each, width()) for each in said]
-    rows = [["rad/s", "damping", "time [s]", "", "what moves"]]
-    rows += [
-        [
-            f"{mode.frequency:.6g}" if mode.oscillates else ".",
-            f"{mode.damping_ratio:.4g}" if mode.oscillates else ".",
-            f"{mode.time_constant:.4g}" if mode.pole.real else ".",
-            "unstable" if mode.unstable else "",
-            "",
-        ]
-        for mode in found.modes
-    ]
-    left = max(map(len, grid(rows, "rrrll").splitlines())) - len(rows[0][-1])
-    for row, mode in zip(rows[1:], found.modes, strict=True):
-        row[-1] = _moving_most(mode, found.state_names, width() - left)
-    if found.modes:
-        parts.append(grid(rows, "rrrll"))
-    return "\n\n".join(parts)
 
 
 def _moving_most(mode: Mode, names: Sequence[str], room: int) -> str:

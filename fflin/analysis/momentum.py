@@ -14,7 +14,8 @@ from fflin.analysis.ranks import Margin
 from fflin.analysis.wheels import certified, leaving, part_of, picked, without
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
-from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.robot.frames import frame_index
 from fflin.robot.robot import Robot
@@ -192,5 +193,4 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
     full = pin.computeFrameJacobian(model, data, q, index, axes)
     J = state.columns(np.vstack((full[LINEAR], full[ANGULAR])))
     M = state.project(pin.crba(model, data, q).T)
-    result: Array = J[:, 6:] - J[:, :6] @ np.linalg.solve(M[:6, :6], M[:6, 6:])
-    return result
+    return J[:, 6:] - J[:, :6] @ np.linalg.solve(M[:6, :6], M[:6, 6:])

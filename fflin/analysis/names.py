@@ -1,7 +1,5 @@
 """Names of combinations of states: momenta, what they drive, and sums of the largest terms."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,20 +1,11 @@
 """Which states the outputs of a linear model show."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from fflin.analysis.mechanics import (
-    at_rest,
-    checked,
-    rates_of_positions,
-    second_order,
-    slopes,
-    state_sizes,
-)
+from fflin.analysis import mechanics
 from fflin.analysis.names import combination, undecided, unsettled, with_rates
 from fflin.analysis.pbh import split_by_poles
 from fflin.analysis.ranks import EPS, FixedPoles, Margin, Noisy, echelon, without_rounding
@@ -95,9 +86,9 @@ def observability(lin: LinearModel) -> Observability:
     InputError
         If `lin` is no linear model of positions and their rates.
     """
-    lin = checked(lin)
+    lin = mechanics.checked(lin)
     motions, fixed, method = _unobservable(lin)
-    size = state_sizes(lin)
+    size = mechanics.state_sizes(lin)
     basis, _ = echelon(motions, size)
     scaled_basis = np.linalg.qr(basis * size[:, None], mode="complete")[0]
     return Observability(
@@ -119,9 +110,12 @@ def observability(lin: LinearModel) -> Observability:
 
 def _unobservable(lin: LinearModel) -> tuple[Array, FixedPoles, str]:
     """Return the motions (nx, k) that the outputs miss, their poles, and the method."""
-    source, nv = at_rest(lin), len(lin.M)
+    source, nv = mechanics.at_rest(lin), len(lin.M)
     if source is not None:
-        system, N = second_order(source), rates_of_positions(slopes(source))
+        system, N = (
+            mechanics.second_order(source),
+            mechanics.rates_of_positions(mechanics.slopes(source)),
+        )
         C = np.hstack((lin.C[:, :nv] @ N, lin.C[:, nv:]))
         size = np.tile(system.size, 2)
         each = np.linalg.norm(C / size, axis=1)
@@ -133,5 +127,5 @@ def _unobservable(lin: LinearModel) -> tuple[Array, FixedPoles, str]:
             method = "eigenvalues" if system.acting else "closed form"
             motions = np.vstack((N @ found.motions[:nv], found.motions[nv:]))
             return motions, found.fixed, method
-    part = split_by_poles(slopes(lin), lin.C.T, lin.M, lin.dt, dual=True)
+    part = split_by_poles(mechanics.slopes(lin), lin.C.T, lin.M, lin.dt, dual=True)
     return part.rest, part.fixed, "eigenvalues"

@@ -1,7 +1,5 @@
 """What inputs reach and outputs show, pole by pole, as Popov, Belevitch and Hautus test it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -36,12 +34,10 @@ class _Scaled(NamedTuple):
 
 
 def _scaled(X: Array, M: Array, dt: float) -> _Scaled:
-    """Scale slopes to units of energy, and of time so that A is of size about 1.
-
-    Velocities are L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy, positions
-    likewise over the time unit. The tolerance is twenty times the rounding of M^-1, or that of the
-    exponential which the slopes of a sampled model are a difference of.
-    """
+    """Scale slopes to units of energy, and of time so that A is of size about 1."""
+    # Velocities are L^T nu with M = L L^T, so that |xi|^2 is twice the kinetic energy, positions
+    # likewise over the time unit. The tolerance is twenty times the rounding of M^-1, or that of
+    # the exponential which the slopes of a sampled model are a difference of.
     nv = len(M)
     p, v = slice(0, nv), slice(nv, None)
     L = np.linalg.cholesky(M)
@@ -77,14 +73,11 @@ class Split(NamedTuple):
 
 
 def split_by_poles(X: Array, drive: Array, M: Array, dt: float, *, dual: bool = False) -> Split:
-    """Split the state space of (X, B), eigenvalue by eigenvalue (Popov, Belevitch, Hautus).
-
-    The left vectors with ``w [A - s E, B] = 0`` are found at every eigenvalue s as singular
-    vectors, and split off by an orthogonal transformation, until there are none: so that the
-    whole of a defective eigenvalue goes. A staircase would carry the rounding of a weak step into
-    the next. X (nx, nx) is A, or (A - E)/dt of a sampled model, `drive` (nx, k) is B, or, to split
-    by what outputs show, C^T of the `dual` pair.
-    """
+    """Split the state space of (X, B) by left vectors w [A - s E, B] = 0 at every eigenvalue s."""
+    # They are split off by an orthogonal transformation, until there are none: so that the whole of
+    # a defective eigenvalue goes. A staircase would carry the rounding of a weak step into the
+    # next.
+    # X is A, or (A - E)/dt of a sampled model; `drive` is B, or C^T of the dual pair.
     pair = _scaled(X, M, dt)
     A, to = (pair.A.T, pair.to_x.T) if dual else (pair.A, pair.from_x)
     B = unit_columns(to @ drive)

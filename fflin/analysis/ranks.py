@@ -32,13 +32,7 @@ class Decision(NamedTuple):
 
 
 class Margin(NamedTuple):
-    """How far rank decisions are from doubt: the nearest of those that counted, and of the others.
-
-    Attributes
-    ----------
-    counted, left_out : Decision
-        Of ratios infinity and zero where there was none to decide.
-    """
+    """How far rank decisions are from doubt: the nearest of those that counted, and of others."""
 
     counted: Decision = Decision(np.inf)
     left_out: Decision = Decision(0.0)
@@ -139,10 +133,7 @@ def stacked(rows: list[list[Noisy]]) -> Noisy:
 
 
 def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
-    """Put to zero the entries that are rounding, also beside the largest, in units of energy.
-
-    What is in doubt stays, with that much noise.
-    """
+    """Put to zero the entries that are rounding, also beside the largest, in units of energy."""
     units = rows[:, None] * columns
     size = np.abs(forces.values)
     least = np.maximum(forces.noise, _FLOOR * (size / units).max(initial=0.0) * units)
@@ -152,11 +143,9 @@ def without_rounding(forces: Noisy, rows: Array, columns: Array) -> Noisy:
 
 
 def right_vectors(matrix: Noisy, states: int = 1) -> tuple[Array, Any, int, Margin]:
-    """Return n singular values, right vectors (n, n), the rank, and its margin.
-
-    Rows are brought to unit length, or shorter so that none has more rounding: none hides behind
-    another, and none that is rounding itself hides the others.
-    """
+    """Return n singular values, right vectors (n, n), the rank, and its margin."""
+    # Rows are brought to unit length, or shorter so that none has more rounding: none hides behind
+    # another, and none that is rounding itself hides the others.
     n = matrix.values.shape[1]
     sizes, spread = (np.linalg.norm(entries, axis=1) for entries in matrix)
     real = sizes > 0.0
@@ -204,10 +193,7 @@ def unit_columns(matrix: Array) -> Array:
 
 
 def echelon(columns: Array, weights: Array, preferred: Array | None = None) -> tuple[Array, Array]:
-    """Return a basis of independent columns (m, r), the identity at r pivots, and these.
-
-    `weights` (m,) make rows comparable; pivots are looked for in `preferred` rows first.
-    """
+    """Return a basis of independent columns (m, r), the identity at r pivots, and these."""
     from scipy.linalg import qr
 
     size = columns.shape[1]

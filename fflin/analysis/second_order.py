@@ -69,8 +69,7 @@ class SecondOrder:
             if np.abs(matrix - matrix.T).max(initial=0.0) > _SYMMETRIC * np.abs(matrix).max():
                 return False
         drag = np.linalg.eigvalsh(self.D.values / units)
-        least: bool = min(-drag.min(), drag.max()) <= _SYMMETRIC * np.abs(drag).max()
-        return least
+        return min(-drag.min(), drag.max()) <= _SYMMETRIC * np.abs(drag).max()
 
     @cached_property
     def poles(self) -> tuple[Any, Margin]:
@@ -110,20 +109,13 @@ class Hidden(NamedTuple):
 
 
 def hidden(system: SecondOrder, position: Noisy, velocity: Noisy, dt: float) -> Hidden | None:
-    r"""Find the motions that ``position @ s + velocity @ ds/dt`` does not show.
+    """Find the motions that ``position @ s + velocity @ ds/dt`` does not show.
 
-    At a pole p they are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]`. Every row is
-    scaled by what stands in it, so that a slow mode beside a fast one keeps its figures. Where K
-    is symmetric and D symmetric and semidefinite, those of the pole zero come in chains of two
-    at the most, and are the :math:`(s, v)` with :math:`K s = K v = D v = C_s v = 0` and
-    :math:`C_s s + C_v v = 0`.
-
-    What hides from the inputs are the left vectors, which by symmetry are found with
-    :math:`C_s = S^T, C_v = 0`.
-
-    It is None where K or D are of another kind, where sampling every `dt` takes two poles for one,
-    and where a pole is defective, so that eigenvectors do not tell what belongs to it.
+    They are the null space of :math:`[p^2 M + p D + K; C_s + p C_v]` at each pole p; None where
+    eigenvectors do not tell: of other K or D, of aliased or defective poles.
     """
+    # Those of the pole zero come in chains of two at the most: K s = K v = D v = C_s v = 0 and
+    # C_s s + C_v v = 0. What hides from the inputs are, by symmetry, those of C_s = S^T, C_v = 0.
     if not system.symmetric or (dt and _aliased(system.poles[0], dt)):
         return None
     still, margin = _still(system, position, velocity)
@@ -178,6 +170,7 @@ def _at_pole(
     """Return the shapes (nv, k) that are missed at a pole, the pole refined, and the margin."""
     M, K, D = system.M, system.K.values, system.D.values
     for step in range(_REFINEMENTS):
+        # Rows are scaled by what stands in them: a slow mode beside a fast one keeps its figures.
         s = pole if pole.imag else pole.real
         size = abs(s)
         weight = np.sqrt(
@@ -222,8 +215,7 @@ def _simple(system: SecondOrder, shapes: Any, pole: complex) -> bool:
     change = shapes.T @ (2.0 * pole * system.M + system.D.values) @ shapes
     size = np.abs(shapes).T @ (2.0 * abs(pole) * np.abs(system.M) + np.abs(system.D.values))
     least = np.linalg.svd(change, compute_uv=False)[-1]
-    simple: bool = least > _DEFECTIVE * np.linalg.norm(size @ np.abs(shapes))
-    return simple
+    return least > _DEFECTIVE * np.linalg.norm(size @ np.abs(shapes))
 
 
 def _aliased(poles: Any, dt: float) -> bool:
@@ -231,5 +223,4 @@ def _aliased(poles: Any, dt: float) -> bool:
     s = np.concatenate((poles, np.conj(poles), [0.0])) * dt
     apart = s[:, None] - s
     turns = np.round(apart.imag / (2.0 * np.pi))
-    same: bool = ((turns != 0.0) & (np.abs(apart - 2j * np.pi * turns) < _ALIASED)).any()
-    return same
+    return ((turns != 0.0) & (np.abs(apart - 2j * np.pi * turns) < _ALIASED)).any()

@@ -1,17 +1,15 @@
 """What inputs cannot hold and what outputs cannot see, in words."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from fflin.analysis.controllability import Controllability, controllability
+from fflin.analysis.controllability import controllability
 from fflin.analysis.mechanics import conserved
 from fflin.analysis.names import grouped, with_rates
-from fflin.analysis.observability import Observability, observability
+from fflin.analysis.observability import observability
 from fflin.analysis.ranks import Margin, judged
 from fflin.analysis.wheels import damped_wheels
 from fflin.base.errors import (
@@ -23,9 +21,7 @@ from fflin.base.errors import (
     listed,
 )
 from fflin.base.validation import Array
-
-if TYPE_CHECKING:
-    from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel
 
 # A relative singular value of the equilibrated Popov-Belevitch-Hautus matrix below this counts as
 # zero: repeated eigenvalues are computed with such errors.
@@ -38,13 +34,13 @@ def require_stabilizable(lin: LinearModel) -> None:
         missed = f"the inputs cannot hold {{}}{damped_wheels(lin) or '; add inputs'}"
         _check_reach(lin, lin.A, lin.B, "held by the inputs", missed, StabilizabilityError)
         return
-    found = controllability(lin)
+    found, words = controllability(lin), ""
     if not found.stabilizable:
         weights = conserved(lin).weights
-        words = _forces_missing(lin, weights) if len(weights) else None
-        words = words or f"{', '.join(grouped(found.uncontrollable))}; add inputs"
-        raise _error(StabilizabilityError, f"the inputs cannot hold {words}", found)
-    _warn_of(found.notes)
+        forces = _forces_missing(lin, weights) if len(weights) else None
+        lost = forces or f"{', '.join(grouped(found.uncontrollable))}; add inputs"
+        words = f"the inputs cannot hold {lost}"
+    _conclude(StabilizabilityError, words, found.notes, found.margin)
 
 
 def require_detectable(lin: LinearModel) -> None:
@@ -54,27 +50,21 @@ def require_detectable(lin: LinearModel) -> None:
         _check_reach(lin, lin.A.T, lin.C.T, "shown by the outputs", missed, DetectabilityError)
         return
     found = observability(lin)
-    if not found.detectable:
-        raise _error(DetectabilityError, missed.format(with_rates(found.unobservable)), found)
-    _warn_of(found.notes)
+    words = "" if found.detectable else missed.format(with_rates(found.unobservable))
+    _conclude(DetectabilityError, words, found.notes, found.margin)
 
 
-def _error(
-    kind: type[FflinError], words: str, found: Controllability | Observability
-) -> FflinError:
-    error: Any = kind(words + _doubts(found.notes))
-    error.margin = found.margin
-    return error
-
-
-def _doubts(notes: tuple[str, ...]) -> str:
-    return "".join(f"; {note}" for note in notes if note.startswith("undecided"))
-
-
-def _warn_of(notes: tuple[str, ...], stacklevel: int = 4) -> None:
-    for note in notes:
-        if note.startswith("undecided"):
-            warnings.warn(note, FflinWarning, stacklevel=stacklevel)
+def _conclude(
+    kind: type[FflinError], words: str, notes: Sequence[str], margin: Margin, depth: int = 4
+) -> None:
+    """Raise the error that words say, with what is undecided, or warn of that alone."""
+    doubts = [note for note in notes if note.startswith("undecided")]
+    if words:
+        error: Any = kind("; ".join((words, *doubts)))
+        error.margin = margin
+        raise error
+    for note in doubts:
+        warnings.warn(note, FflinWarning, stacklevel=depth)
 
 
 def require_weighed(lin: LinearModel, A: Array, Q: Array) -> None:
@@ -93,16 +83,13 @@ def require_disturbed(lin: LinearModel, W: Array) -> None:
 
 
 def _root(W: Array) -> Array:
-    """Return a factor L (m, m) with W = L L^T, of a semidefinite matrix of unlike units.
-
-    It has the square root of W's condition, and so reaches what W reaches with less doubt.
-    """
+    """Return a factor L (m, m) with W = L L^T, of a semidefinite matrix of unlike units."""
+    # It has the root of W's condition, and so reaches what W reaches with less doubt.
     size = np.sqrt(W.diagonal())
     size = np.where(size > 0.0, size, 1.0)
     values, vectors = np.linalg.eigh(W / np.outer(size, size))
     rounding = len(W) * np.finfo(float).eps * values[-1:].max(initial=0.0)
-    root: Array = size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
-    return root
+    return size[:, None] * vectors * np.sqrt(np.where(values > rounding, values, 0.0))
 
 
 def _check_reach(
@@ -113,10 +100,7 @@ def _check_reach(
     complaint: str,
     error: type[FflinError] = InputError,
 ) -> None:
-    """Raise an error where B misses a mode on the boundary, or warn of what is undecided.
-
-    A growing mode may be missed by a weight or a disturbance, whose error is an `InputError`.
-    """
+    """Raise an error where B misses a mode on the boundary, or warn of what is undecided."""
     discrete = bool(lin.dt)
     poles = np.linalg.eigvals(A)
     size = max(float(np.abs(poles - discrete).max()), 1e-300)
@@ -139,10 +123,8 @@ def _check_reach(
         "rounding; on another machine it may be decided otherwise"
         for ratio, at, change in margin.doubts
     )
-    if missed:
-        words = _dominant(np.array(missed), lin.state_names)
-        raise error(f"{complaint.format(words)}{_doubts(doubts)}")
-    _warn_of(doubts, 5)
+    words = complaint.format(_dominant(np.array(missed), lin.state_names)) if missed else ""
+    _conclude(error, words, doubts, margin, 5)
 
 
 def _left_null(matrix: Array) -> tuple[Array, Margin]:

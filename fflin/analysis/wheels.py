@@ -1,7 +1,5 @@
 """Reaction wheels in a linear model: whose angle and speed nothing else depends on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import partial
@@ -34,10 +32,8 @@ def wheel_inputs(lin: LinearModel) -> tuple[str, ...]:
 
 
 def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
-    """Return the wheels (k,) on whose angle nothing depends, and those whose speed is so too.
-
-    A speed matters where the carrier turns at the point, and where the wheel has friction.
-    """
+    """Return the wheels (k,) on whose angle nothing depends, and those whose speed is so too."""
+    # A speed matters where the carrier turns at the point, and where the wheel has friction.
     nv, wanted = len(lin.M), {f"q_m.{name}" for name in wheel_inputs(lin)}
     at = np.flatnonzero([name in wanted for name in lin.state_names[:nv]])
     if not len(at):
@@ -54,11 +50,9 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
 
 
 def leaving(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
-    """Return the wheels (k,) that leave a design, (9.5) of docs/derivation.md.
-
-    Inputs that turn nothing at rest may still spin wheels: as many as they do so independently can
-    be held. By default these stay where something else turns the base.
-    """
+    """Return the wheels (k,) that leave a design (9.5)."""
+    # Inputs that turn nothing at rest may still spin wheels: as many as they do so independently
+    # can be held. By default these stay where something else turns the base.
     if wheel_speeds is not None and not isinstance(wheel_speeds, bool | np.bool_):
         raise InputError(f"wheel_speeds is {wheel_speeds!r}, expected True, False or None")
     _, free = ignorable_wheels(lin)
@@ -77,11 +71,9 @@ def leaving(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
 
 
 def regulated_part(lin: LinearModel, wheel_speeds: bool | None = None) -> LinearModel:
-    """Return the model of the states that are regulated; `lin` itself where it has no wheels.
-
-    What is `leaving` leaves it, the angles of other wheels too where nothing depends on them, so
-    that there are fewer positions than rates; and the base's position where no input pushes it.
-    """
+    """Return the model of the states that are regulated; `lin` itself where it has no wheels."""
+    # What is `leaving` leaves it, the angles of other wheels too where nothing depends on them, so
+    # that there are fewer positions than rates; and the base's position where no input pushes it.
     if not wheel_inputs(lin):
         return lin
     source, nv = lin.generator or lin, len(lin.M)

@@ -46,8 +46,7 @@ def about_point(
     robot: Robot, arguments: argparse.Namespace
 ) -> tuple[Any, StateFeedback, LinearModel | None]:
     """Return the policy, the feedback in it, and the model that foresees it at every row."""
-    from fflin.control.bounded import thrusters_push_every_way
-    from fflin.control.policies import Allocation, StateFeedback
+    from fflin.control.policies import Allocation, StateFeedback, thrusters_push_every_way
 
     allocate = thrusters_push_every_way(robot) if arguments.allocate is None else arguments.allocate
     if arguments.gain:

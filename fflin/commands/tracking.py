@@ -116,8 +116,8 @@ def schedule_of(
     along: LinearTrajectory, arguments: argparse.Namespace, Qf: Any = "steady"
 ) -> GainSchedule:
     """Return the regulator along a trajectory that the weights say."""
-    from fflin.control.default_weights import pace_along, rule_weights
     from fflin.control.tvlqr import steady_end, tvlqr
+    from fflin.control.weight_rules import pace_along, rule_weights
 
     options: dict[str, Any] = {"sample": arguments.dt, "weights": arguments.weights}
     given = {key: once(f"--{key}", getattr(arguments, key)) for key in ("q", "r", "bryson")}

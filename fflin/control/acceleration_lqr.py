@@ -1,22 +1,19 @@
 """The regulator with its cost on accelerations, in closed form."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from fflin.analysis.stabilizability import require_stabilizable
 from fflin.analysis.wheels import regulated_part
 from fflin.base.errors import InputError, StabilizabilityError
 from fflin.base.validation import Array, dimension
-from fflin.control.gain import Gain, for_whole, make_gain
+from fflin.control.gain import Gain, make_gain
 from fflin.control.lqr import require_fixed_point
 from fflin.control.riccati import Riccati, Solution
 from fflin.control.weights import Weight, weight
 from fflin.linear.model import LinearModel
-
-_BEYOND = "the weights or dt make the solution overflow: scale Qp, Qv and Ra nearer to each other"
 
 
 class _Channel(NamedTuple):
@@ -107,30 +104,31 @@ def acceleration_lqr(
     if (rates + qv == 0.0).any():
         name = velocities[int((rates + qv).argmin())]
         raise InputError(f"Qv is 0 for {name}, expected a positive weight on a wheel's speed")
-    with np.errstate(all="ignore"):
-        channel = _channels(rates, qp, qv, ra, lin.dt)
-    stable = np.abs(channel.poles) < 1.0 if lin.dt else channel.poles.real < 0.0
-    if not stable.all() or not all(np.isfinite(part).all() for part in channel):
-        raise InputError(_BEYOND)
-    inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
     pick = np.eye(m)[rates != 0.0]
-    K = inverse @ np.hstack((pick.T * channel.kp, np.diag(channel.kd)))
-    p12 = channel.p12[:, None] * pick
-    P = np.block([[np.diag(channel.p11), p12], [p12.T, np.diag(channel.p22)]])
-    Q = np.diag(np.concatenate((qp, qv)))
     # The residual is that of the same equation with accelerations as inputs.
     hold = np.vstack((0.5 * lin.dt**2 * rates * pick, lin.dt * np.eye(m)))
     by_acceleration = hold if lin.dt else np.vstack((np.zeros_like(pick), np.eye(m)))
+    Q = np.diag(np.concatenate((qp, qv)))
     equation = Riccati(lin.A, by_acceleration, Q, np.diag(ra), None, lin.dt)
-    R = L.T @ (ra[:, None] * L)
+    inverse = np.linalg.inv(L) if L.shape[0] == L.shape[1] else np.linalg.pinv(L)
     try:
         with np.errstate(all="ignore"):
+            channel = _channels(rates, qp, qv, ra, lin.dt)
+            stable = np.abs(channel.poles) < 1.0 if lin.dt else channel.poles.real < 0.0
+            K = inverse @ np.hstack((pick.T * channel.kp, np.diag(channel.kd)))
+            p12 = channel.p12[:, None] * pick
+            P = np.block([[np.diag(channel.p11), p12], [p12.T, np.diag(channel.p22)]])
             residual = equation.trial(P).residual
+            sound = stable.all() and np.isfinite(K).all()
     except np.linalg.LinAlgError:
-        raise InputError(_BEYOND) from None
+        sound = False
+    if not sound:
+        raise InputError(
+            "the weights or dt make the solution overflow: scale Qp, Qv and Ra nearer to each other"
+        )
+    R = L.T @ (ra[:, None] * L)
     solution = Solution(P, K, channel.poles, residual, "closed form")
-    gain = make_gain(lin, solution, Q, 0.5 * (R + R.T), None)
-    return for_whole(gain, whole)
+    return make_gain(whole, lin, solution, Q, 0.5 * (R + R.T), None)
 
 
 def _integrators(lin: LinearModel) -> tuple[Array, Array]:
@@ -154,8 +152,6 @@ def _integrators(lin: LinearModel) -> tuple[Array, Array]:
         )
     sizes = np.abs(L).max(axis=1, keepdims=True)
     if not sizes.all() or np.linalg.matrix_rank(L / sizes, tol=1e-10) < len(s):
-        from fflin.analysis.stabilizability import require_stabilizable
-
         require_stabilizable(lin)
         raise StabilizabilityError("the inputs do not accelerate every coordinate; use lqr")
     return s, L
@@ -196,14 +192,10 @@ def _continuous(s: Array, qp: Array, qv: Array, ra: Array) -> _Channel:
 
 
 def _sampled(s: Array, qp: Array, qv: Array, ra: Array, h: float) -> _Channel:
-    r"""Solve the channels under a hold of length h.
-
-    With :math:`\sigma = (z - 1)(1/z - 1)` the spectral factor of a channel is of second degree,
-
-    .. math:: r_a \sigma^2 + (q_v - q_p s^2 h^2/4) h^2 \sigma + q_p s^2 h^4 = 0,
-
-    and with :math:`\delta = 1 - z` each root gives :math:`\delta^2 - \sigma \delta + \sigma = 0`.
-    """
+    """Solve the channels under a hold of length h."""
+    # With sigma = (z - 1)(1/z - 1) the spectral factor of a channel is of second degree, ra sigma^2
+    # + (qv - qp s^2 h^2 / 4) h^2 sigma + qp s^2 h^4 = 0, and with delta = 1 - z each root gives
+    # delta^2 - sigma delta + sigma = 0.
     step = s * h
     middle = (qv - 0.25 * qp * step**2) * h**2
     last = qp * step**2 * h**2

@@ -1,7 +1,5 @@
 """How a command reaches the robot: held between samples, late, and within limits."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable
@@ -15,19 +13,7 @@ from fflin.control.saturation import Saturation
 
 
 class Law:
-    """A policy whose commands are checked, and which gets copies of q and v.
-
-    Parameters
-    ----------
-    policy : callable
-        policy(t, q, v) -> u (nu,)
-    names : tuple of str
-        Of the inputs.
-    limits : tuple of ndarray (nu,)
-        Within which it will act.
-    slow : float
-        Square of the velocity beyond which it need not be finite: the motion diverges.
-    """
+    """A policy whose commands (nu,) are checked; it gets copies of q and v."""
 
     def __init__(
         self,
@@ -36,6 +22,7 @@ class Law:
         limits: tuple[Array, Array],
         slow: float,
     ) -> None:
+        # Beyond `slow`, a square of the velocity, a motion diverges and may make commands infinite.
         self._policy, self._names, self._limits, self._slow = policy, names, limits, slow
         self._shape = (len(names),)
 
@@ -64,20 +51,7 @@ class Law:
 
 
 class Channel:
-    """A command on its way: `law` is asked at each sample, and acts `delay` steps later.
-
-    Parameters
-    ----------
-    law : callable
-        Returns the command (nu,) of whatever it is given.
-    initial : ndarray (nu,)
-        What acts until the first command arrives.
-    limits : Saturation
-    sample : int
-        Steps between samples; 0 for a law that is asked at every stage of every step.
-    delay : int
-        Steps between a sample and its effect.
-    """
+    """A command on its way: `law` is asked at each sample, and acts `delay` steps later."""
 
     def __init__(
         self,
@@ -87,6 +61,7 @@ class Channel:
         sample: int,
         delay: int,
     ) -> None:
+        # In steps; `sample` is 0 of a law that is asked at every stage of every step.
         self._law, self._low, self._high = law, limits.low, limits.high
         self._sample, self._delay = sample, delay
         self._limited = bool(np.isfinite((limits.low, limits.high)).any())

@@ -1,27 +1,18 @@
 """The weights that a regulator gets where none are given."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
 
-from fflin.analysis.mechanics import second_order
-from fflin.analysis.ranks import Noisy, null_space
-from fflin.analysis.wheels import ignorable_wheels, picked, regulated_part, rigid_forces, without
-from fflin.base.errors import InputError, listed, unknown
-from fflin.base.names import input_keys
+from fflin.analysis.mechanics import second_order, slopes
+from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array
 from fflin.control.riccati import half_size, solve
-from fflin.control.sampled_cost import sampled_cost
 from fflin.control.saturation import warn_beyond
-from fflin.control.weights import reweighed, weights_by_name
-
-if TYPE_CHECKING:
-    from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel
 
 # The bandwidth [rad/s] of a loop that no limit slows: it settles in about thirty seconds. Under a
 # hold of h it is this much over h at the most.
@@ -31,11 +22,6 @@ BANDWIDTH, _HELD = 0.2, 0.3
 # gyration, and a joint's [rad], [m], or this share of its travel.
 TURN, WAY, ANGLE, LENGTH, TRAVEL = 30.0, 0.1, 0.3, 0.1, 0.25
 
-# Along a trajectory errors are a tenth of these, and are to be gone within it: so many time
-# constants are to fit in, of a loop that is no slower than at a point, nor faster than this. Under
-# a hold it may use more of it, since the regulator of the samples themselves is exact.
-_BESIDE, _CONSTANTS, _FASTEST, _HELD_ALONG = 0.1, 15.0, 1.5, 1.0
-
 # So many times the loops of springs and gravity are slowed.
 _TRIALS = 8
 
@@ -43,9 +29,6 @@ _TRIALS = 8
 _PASSES = 4
 
 _NOT_ENOUGH = ", which is not enough for all displacements"
-
-# The speeds of wheels come back at this share of the bandwidth.
-_SPEEDS = 0.1
 
 
 class Weights(NamedTuple):
@@ -69,11 +52,6 @@ class Pace(NamedTuple):
 AT_A_POINT = Pace()
 
 
-def pace_along(duration: float, hold: float) -> Pace:
-    """Return the pace of a loop along a trajectory of that duration [s]."""
-    return Pace(min(max(_CONSTANTS / duration, BANDWIDTH), _FASTEST), _BESIDE, hold, _HELD_ALONG)
-
-
 class _Limit(NamedTuple):
     """The largest bandwidth that a limit leaves, and what limits it."""
 
@@ -81,128 +59,12 @@ class _Limit(NamedTuple):
     what: str
 
 
-def rule_weights(
-    lin: LinearModel,
-    name: str | None,
-    given: Mapping[str, Any] | None = None,
-    *,
-    wheel_speeds: bool | None = None,
-    pace: Pace = AT_A_POINT,
-) -> tuple[Array, Array, Array | None, str]:
-    """Return Q, R and N of a model by a rule, and the rule in words.
-
-    The cost of a sampled model is the continuous one under the hold, where it is known what it
-    was sampled from. The rule is by default what the robot has in its `weights`, and "urdf" where
-    it has none; `given` has parts "q", "r", "bryson" of weights, as `Robot.replace` takes them.
-    """
-    source = lin.generator or lin
-    layers = [(given, False)] if given else []
-    if name is None and lin.weights:
-        layers.insert(0, (lin.weights, True))
-        name = lin.weights.get("rule")
-    if name is None or name == "urdf":
-        Q, R, rule = _of_regulated(source, pace._replace(hold=lin.dt or pace.hold), wheel_speeds)
-    elif name == "identity":
-        nx, nu = lin.B.shape
-        Q, R, rule = np.eye(nx), np.eye(nu), "identity: 1 on every state and every input"
-    else:
-        raise unknown("rule of weights", name, ("urdf", "identity"))
-    named: dict[str, None] = {}
-    for layer, of_robot in layers:
-        q, r = weights_by_name(lin, layer, of_robot=of_robot)
-        Q = reweighed("state", Q, q, lin.state_names)
-        R = reweighed("input", R, r, input_keys(lin))
-        named |= dict.fromkeys((*q, *r))
-    if named:
-        rule = f"{', '.join(named)} as given, the others {rule}"
-    if source.dt == lin.dt:
-        return Q, R, None, rule
-    return (*sampled_cost(source, lin.dt, Q, R), rule)
-
-
-def _of_regulated(
-    lin: LinearModel, pace: Pace, wheel_speeds: bool | None
-) -> tuple[Array, Array, str]:
-    """Return Q (nx, nx), R and the rule of what is regulated of a model that may have wheels."""
-    part = regulated_part(lin, wheel_speeds)
-    if part is lin:
-        return default_weights(lin, pace)[:3]
-    wheels, _ = ignorable_wheels(lin)
-    body = regulated_part(without(lin, wheels))
-    at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
-    names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
-    most = np.array([lin.limits[name] for name in names])
-    # A wheel that is at its limit already is counted as one at rest, and told.
-    room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
-    Q, R, rule, bandwidth = default_weights(body, pace, dict(zip(names, room, strict=True)))
-    if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
-        rule += f"; the point alone asks {listed(beyond)} for more than the URDF allows"
-    S = picked(body.state_names, lin.state_names)
-    Q = S.T @ Q @ S
-    if speeds := [name for name in part.state_names if name not in body.state_names]:
-        S, slow = picked(speeds, lin.state_names), _SPEEDS * bandwidth
-        # Inputs R^-1/2 Z n that turn no body change the speeds at X n.
-        root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
-        X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
-        Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
-        rule = f"{rule}; wheel speeds at {slow:.3g} rad/s"
-    return Q, R, rule
-
-
 def default_weights(
     lin: LinearModel, pace: Pace = AT_A_POINT, momenta: Mapping[str, float] | None = None
 ) -> Weights:
-    r"""Return weights with which a displaced robot comes back within the URDF's limits.
-
-    With the forces S u of the inputs, a model at rest is :math:`M \dot\nu = S u`,
-    :math:`\dot x_1 = N \nu`. Each coordinate i has a displacement :math:`\theta_i`: the base is
-    turned by 30 deg and moved by a tenth of its radius of gyration, and every joint by 0.3 rad, or
-    0.1 m, or a quarter of its travel where that is less. With the stiffness
-    :math:`D_i = \sum_j |M_{ij}| \theta_j / \theta_i`, which no inertia exceeds, the cost is
-
-    .. math:: \delta x_1^T N^{-T} (\bar D \,\#\, M) N^{-1} \delta x_1
-              + \delta u^T R\,\delta u / w^4,\quad
-              R = \operatorname{diag}(S^T D^{-1} S),\ \bar D = S R^{-1} S^T,
-
-    where # is the geometric mean. The coordinates in which :math:`\bar D` and M are diagonal, 1
-    and :math:`\lambda_k`, then come back one by one, damped by 0.71, at
-    :math:`w \lambda_k^{3/8}`: the slowest at w, and those of little inertia faster, so that what
-    the others do does not carry them away. R is diagonal: every input has the margins of an
-    optimal loop whatever the others do, gains of 1/2 and more and 60 deg of phase.
-
-    The bandwidth w is 0.2 rad/s, or what the limits leave: from these displacements, all at once
-    and in any direction, no input exceeds the effort and no joint the speed that the URDF allows.
-    Where nothing limits them, the poles do not depend on the units of mass and length.
-
-    Springs, gravity and motion are in the model, not in the weights; where there are any, the loop
-    is solved and slowed until its inputs hold the limits, or found to need more. Viscous damping
-    B, the semidefinite part of :math:`-M A_{22}`, is what light joints must be moved against: M is
-    :math:`M + B / w` in the weights.
-
-    Parameters
-    ----------
-    lin : LinearModel
-        Whole or reduced; of a sampled one, weights for the sum over its samples.
-    pace : Pace
-        Along a trajectory that of `pace_along`: the displacements are a tenth of those above, and
-        w is 15 over its duration, within 0.2 and 1.5 rad/s, or what the hold leaves.
-    momenta : mapping, optional
-        {qdot_m.WHEEL: most momentum [N m s] that it can take up} of wheels that are not states.
-
-    Raises
-    ------
-    InputError
-        If the model has not coordinates and their rates as states, or an input acts on nothing.
-
-    References
-    ----------
-    A. E. Bryson and Y.-C. Ho, Applied Optimal Control, 1975. M. G. Safonov and M. Athans, Gain and
-    phase margin for multiloop LQG regulators, IEEE Trans. Automatic Control 22(2), 1977.
-    """
-    h = lin.dt or 1.0
+    """Return weights with which a displaced robot comes back within the URDF's limits (10.7)."""
     m = len(lin.M)
-    A = lin.A - np.eye(len(lin.A)) if lin.dt else lin.A
-    N = A[:m, m:] / h
+    N = slopes(lin)[:m, m:]
     if N.shape != lin.M.shape or not np.linalg.cond(N) < 1e8:
         raise InputError(
             f"the model of '{lin.robot}' has not the coordinates and their rates as states, which "
@@ -235,7 +97,6 @@ def _of_inertia(
 ) -> Weights:
     """Return the weights of an inertia M (m, m) that damping adds to; N^-1 is `inverse`."""
     h, m, size = lin.dt or 1.0, len(M), _displacements(lin, pace.share)
-    A = lin.A - np.eye(len(lin.A)) if lin.dt else lin.A
     theta = np.abs(inverse) @ size
     D = np.abs(M) @ theta / theta
     S = lin.M @ lin.B[m:] / h
@@ -267,14 +128,15 @@ def _of_inertia(
     taken = np.vstack((T, added[motors]))
     limits = [
         _Limit(pace.bandwidth, ""),
-        *_of_speeds(room, _fastest(taken, rates, to_modes, size, lin, mass)),
-        *_of_efforts(lin, _largest(gain, size, lin.state_names)),
+        *_limits("speed", room, _fastest(taken, rates, to_modes, size, lin, mass), 1.0),
+        *_limits("effort", _efforts(lin), _largest(gain, size, lin.state_names), 2.0),
     ]
     if pace.hold or lin.dt:
         fastest = pace.held / ((pace.hold or lin.dt) * rates[-1])
         limits.append(_Limit(float(fastest), "the time of the hold"))
     limit = min(limits)
-    if A[m:].any() or A[:m, :m].any():
+    rate = slopes(lin)
+    if rate[m:].any() or rate[:m, :m].any():
         limit = _slowed(lin, Q, cost, size, limit)
     R = np.diag(h * cost / limit.bandwidth**4)
     rule = _rule(lin, size, limit, pace.share * TURN) + (
@@ -334,10 +196,8 @@ def _reach(S: Array, cost: Array, D: Array) -> Array:
 def _fastest(
     T: Array, rates: Array, to_modes: Array, size: Array, lin: LinearModel, mass: Array
 ) -> Array:
-    """Return the largest of speeds (k,), T over the modes', on the way back at w = 1.
-
-    Modes are of mass (m,), 1 where nothing damps them: what is left is their damping.
-    """
+    """Return the largest of speeds (k,), T over the modes', on the way back at w = 1."""
+    # Modes are of mass (m,), 1 where nothing damps them: what is left is their damping.
     most = np.sqrt((1.0 - mass) ** 2 + 2.0 * mass * rates**2)
     root = np.sqrt(most**2 - 4.0 * mass * rates**2 + 1e-12j)
     if not any(name.startswith("qdot_m.") for name in lin.limits):
@@ -349,28 +209,22 @@ def _fastest(
     if (mass < 1.0).any():
         fast, slow = (np.exp((x - most) * time / (2.0 * mass)) for x in (-root, root))
         moving = (rates**2 * (slow - fast) / root).real
-    speeds: Array = _largest(T @ (moving[..., None] * to_modes), size, lin.state_names).max(axis=0)
-    return speeds
+    return _largest(T @ (moving[..., None] * to_modes), size, lin.state_names).max(axis=0)
 
 
-def _of_speeds(room: Mapping[str, float], speeds: Array) -> list[_Limit]:
-    """Return what the limits of speeds leave of a bandwidth at which they are these times it."""
+def _limits(what: str, room: Mapping[str, float], used: Array, power: float) -> list[_Limit]:
+    """Return what is left of a bandwidth of 1, with a power of which what is used grows."""
     return [
-        _Limit(limit / speed, f"the speed of {name.partition('.')[2]}")
-        for (name, limit), speed in zip(room.items(), speeds, strict=True)
-        if 0.0 < limit < math.inf and speed > 0.0
+        _Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('.')[2] or name}")
+        for (name, most), size in zip(room.items(), used.tolist(), strict=True)
+        if 0.0 < most < math.inf and size > 0.0
     ]
 
 
-def _of_efforts(lin: LinearModel, use: Array, bandwidth: float = 1.0) -> list[_Limit]:
-    """Return what the limits of the inputs leave of a bandwidth at which they come to `use`."""
-    found = []
-    for name, used, at in zip(lin.input_names, use, lin.u0, strict=True):
-        room = lin.limits.get(name, math.inf) - abs(at)
-        if 0.0 < room < math.inf and used > 0.0:
-            what = f"the effort of {name.partition('.')[2] or name}"
-            found.append(_Limit(bandwidth * math.sqrt(room / used), what))
-    return found
+def _efforts(lin: LinearModel) -> dict[str, float]:
+    """Return what the limits of the inputs leave beside what the point asks for."""
+    inputs = zip(lin.input_names, lin.u0.tolist(), strict=True)
+    return {name: lin.limits.get(name, math.inf) - abs(at) for name, at in inputs}
 
 
 def _slowed(lin: LinearModel, Q: Array, cost: Array, size: Array, limit: _Limit) -> _Limit:
@@ -382,11 +236,11 @@ def _slowed(lin: LinearModel, Q: Array, cost: Array, size: Array, limit: _Limit)
         except np.linalg.LinAlgError:
             break  # which the regulator tells with the reason
         use = _largest(solution.K, size, lin.state_names)
-        least = min(_of_efforts(lin, use, limit.bandwidth), default=limit)
-        if least.bandwidth >= (1.0 - 1e-6) * limit.bandwidth:
+        share, what = min(_limits("effort", _efforts(lin), use, 2.0), default=_Limit(1.0, ""))
+        if share >= 1.0 - 1e-6:
             return limit
         # What springs and gravity ask for stays however slow the loop.
-        limit = least._replace(bandwidth=max(least.bandwidth, 0.3 * limit.bandwidth))
+        limit = _Limit(max(share, 0.3) * limit.bandwidth, what)
         asked = np.abs(lin.u0) + use
     else:
         high = np.array([lin.limits.get(name, math.inf) for name in lin.input_names])
@@ -410,12 +264,7 @@ def _rule(lin: LinearModel, size: Array, limit: _Limit, turn: float) -> str:
         from_where.append(f"joints from {sizes}")
     source = "the limits of the URDF" if lin.limits else "mass and size, the URDF has no limits"
     slow = f", set by {limit.what}" if limit.what else ""
-    beyond = [
-        name
-        for name, at in zip(lin.input_names, lin.u0, strict=True)
-        if abs(at) >= lin.limits.get(name, math.inf)
-    ]
-    if beyond:
+    if beyond := [name for name, room in _efforts(lin).items() if room <= 0.0]:
         slow += f"; the point alone asks {listed(beyond)} for more than the URDF allows"
     return (
         f"from {source}: {', '.join(from_where)} come back at {limit.bandwidth:.3g} rad/s or "

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
+from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.linear.sampling import GAUSS, HEAVY, LIGHT
 
@@ -60,9 +62,10 @@ def _passage(coefficients: Coefficients, h: float) -> _Passage:
     A, S, Q = coefficients
     n = len(A)
     # The costate is scaled so that Q and S are of the same size.
-    unit = math.sqrt(max(_size(Q), 1e-300) / max(_size(S), 1e-300))
+    large_Q, large_S = (max(float(np.linalg.norm(X, 1)), 1e-300) for X in (Q, S))
+    unit = math.sqrt(large_Q / large_S)
     H = np.block([[A, -S * unit], [-Q / unit, -A.T]])
-    doublings = max(0, math.ceil(math.log2(max(4.0 * h * _size(H), 1.0))))
+    doublings = max(0, math.ceil(math.log2(max(4.0 * h * float(np.linalg.norm(H, 1)), 1.0))))
     theta = expm(H * (h / 2**doublings))
     inverse = np.linalg.inv(theta[n:, n:])
     passage = _Passage(
@@ -76,10 +79,8 @@ def _passage(coefficients: Coefficients, h: float) -> _Passage:
 
 
 def step_back(early: Coefficients, late: Coefficients, P: Array, h: float) -> Array:
-    """Return P (nx, nx) at the start of an interval of its value at the end, of order four.
-
-    The coefficients are those at the Gauss nodes; where they are the same, the step is exact.
-    """
+    """Return P at the start of an interval of that at the end, of order four, by Gauss nodes."""
+    # Where the coefficients are the same at both nodes, the step is exact.
     if all(np.array_equal(*pair) for pair in zip(early, late, strict=True)):
         return _passage(late, h).back(P)
     for first, second in ((late, early), (early, late)):
@@ -89,13 +90,7 @@ def step_back(early: Coefficients, late: Coefficients, P: Array, h: float) -> Ar
 
 
 def solve_back(at: Callable[[float], Coefficients], knots: Array, P: Array) -> tuple[Array, Array]:
-    """Return times and P there, from its value at the last of the knots back to the first.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If P changes too fast.
-    """
+    """Return times and P there, back from the last knot; `LinAlgError` where P changes too fast."""
 
     def back(a: float, b: float, P: Array) -> Array:
         early, late = (at(a + c * (b - a)) for c in GAUSS)
@@ -126,36 +121,42 @@ def solve_back(at: Callable[[float], Coefficients], knots: Array, P: Array) -> t
     return np.array(times[::-1]), np.array(values[::-1])
 
 
-def sample_back(weights: Array, whole: Array, P: Array) -> tuple[Array, Array, float]:
-    """Return K, P a sample before, and the relative residual of the difference equation.
+def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array, Array, float]:
+    """Return K and P of samples, from the last on, and the worst residual.
 
-    Parameters
-    ----------
-    weights : ndarray (nx + nu, nx + nu)
-        What a sample costs, of the error and the input at its start.
-    whole : ndarray (nx, nx + nu)
-        What takes these two to the next sample.
-    P : ndarray (nx, nx)
-        The cost from that on.
+    A stage is what a sample costs, of the error and the input at its start, (nx + nu, nx + nu),
+    and what takes these two to the next sample (nx, nx + nu).
     """
-    nx = len(P)
-    total = weights + whole.T @ P @ whole
-    K = np.linalg.solve(total[nx:, nx:], total[nx:, :nx])
-    # A sum of squares, which stays positive.
-    law = np.vstack((np.eye(nx), -K))
-    P = _symmetric(law.T @ total @ law)
-    if not np.isfinite(P).all():
-        raise np.linalg.LinAlgError("P changes too fast")
-    terms = np.array((P, -total[:nx, :nx], total[:nx, nx:] @ K))
-    return K, P, _imbalance(terms)
+    nx, gains, costs, worst = len(P), list[Array](), [P], 0.0
+    for weights, whole in stages:
+        total = weights + whole.T @ P @ whole
+        K = np.linalg.solve(total[nx:, nx:], total[nx:, :nx])
+        # A sum of squares, which stays positive.
+        law = np.vstack((np.eye(nx), -K))
+        P = _symmetric(law.T @ total @ law)
+        if not np.isfinite(P).all():
+            raise np.linalg.LinAlgError("P changes too fast")
+        worst = max(worst, _imbalance(np.array((P, -total[:nx, :nx], total[:nx, nx:] @ K))))
+        gains.append(K)
+        costs.append(P)
+    return np.array(gains), np.array(costs), worst
+
+
+@contextmanager
+def bounded_by(remedy: str) -> Iterator[None]:
+    """Raise `InputError` where P changes too fast."""
+    try:
+        # A P that overflows is refused, so that NumPy need not warn of it.
+        with np.errstate(over="ignore", invalid="ignore"):
+            yield
+    except np.linalg.LinAlgError:
+        raise InputError(f"P changes too fast; give {remedy}") from None
 
 
 class Passed:
-    """P (M, nx, nx) and R^-1 B' P (M, nu, nx) over time, as a schedule is asked for them.
+    """P (M, nx, nx), K = R^-1 B' P over time; `sign` is -1 of a P that goes backwards."""
 
-    Between knots P is a cubic and B a spline; of samples dt [s] apart what is asked for is that of
-    the last one. `sign` is -1 of a P that goes backwards from the end, 1 of one that goes forward.
-    """
+    # Between knots P is a cubic and B a spline; of samples it is what the last one has.
 
     def __init__(
         self, t: Array, P: Array, K: Array, model: tuple[Array, ...], dt: float, sign: float
@@ -189,14 +190,12 @@ class Passed:
         square = x * x
         fourth = square * square
         powers = np.array((1.0, x, square, square * x, fourth, fourth * x, fourth * square))
-        K: Array = powers.dot(self.pieces[k]).reshape(self.K.shape[1:])
-        return K
+        return powers.dot(self.pieces[k]).reshape(self.K.shape[1:])
 
     def cost(self, t: float) -> Array:
         """Return P (nx, nx) at a time within the knots."""
         k = bisect_right(self.starts, t) - 1
-        P: Array = self._P[k] if self._dt else self._cubics(t)
-        return P
+        return self._P[k] if self._dt else self._cubics(t)
 
     def residual(self, at: Callable[[float], Coefficients]) -> float:
         """Return the largest relative residual of the differential equation midway."""
@@ -225,9 +224,4 @@ def _apart(first: Array, second: Array) -> float:
 
 
 def _symmetric(matrix: Array) -> Array:
-    half: Array = 0.5 * (matrix + matrix.T)
-    return half
-
-
-def _size(matrix: Array) -> float:
-    return float(np.abs(matrix).sum(axis=0).max())
+    return 0.5 * (matrix + matrix.T)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -86,40 +85,36 @@ class Gain(Design):
     regulated: tuple[str, ...] = field(default_factory=tuple)
 
     def __repr__(self) -> str:
-        nu, nx = self.K.shape
-        time = f"dt={self.dt:g} s" if self.dt else "continuous"
-        return (
-            f"Gain('{self.robot}', nx={nx}, nu={nu}, {time}, margin={self.margin:.3g}, "
-            f"residual={self.residual:.1e})"
-        )
+        return titled(self, nx=self.K.shape[1], nu=len(self.K))
 
     def __str__(self) -> str:
         """Show the gain, its poles, and the figures that prove it."""
         nu, nx = self.K.shape
         time = f"sampled at {self.dt:g} s" if self.dt else "continuous"
         head = f"{self.robot}: u = u0 - K (x - x0), {nx} states, {nu} inputs"
-        head = textwrap.fill(f"{head}, frame {self.frame}, {time}", width())
         if self.K.size <= _LARGE:
-            body = f"K ({nu} x {nx})\n\n{matrix(self.K, self.input_names, self.state_names)}"
+            shown = f"\n\n{matrix(self.K, self.input_names, self.state_names)}"
         else:
-            body = (
-                f"K ({nu} x {nx}): norms of its blocks; a file holds all of it\n\n{_blocks(self)}"
-            )
-        figures = textwrap.fill(_figures(self), width())
-        parts = [head, body, _poles(self), figures]
-        if left := _unregulated(self):
-            parts.append(textwrap.fill(f"not regulated: {left}", width()))
-        if self.weights:
-            parts.append(textwrap.fill(f"weights: {self.weights}", width()))
-        if fragile := fragility(self):
-            parts.append(textwrap.fill(f"warning: {fragile}", width()))
+            shown = f": norms of its blocks; a file holds all of it\n\n{_blocks(self)}"
+        fold = partial(textwrap.fill, width=width())
+        more = {
+            "not regulated": _unregulated(self),
+            "weights": self.weights,
+            "warning": fragility(self),
+        }
+        parts = [
+            fold(f"{head}, frame {self.frame}, {time}"),
+            f"K ({nu} x {nx}){shown}",
+            _poles(self),
+            fold(_figures(self)),
+            *(fold(f"{what}: {said}") for what, said in more.items() if said),
+        ]
         return "\n\n".join(parts if self.verified else [*parts, NOT_VERIFIED])
 
     @property
     def closed_loop(self) -> Array:
         """A - B K (nx, nx)."""
-        loop: Array = self.A - self.B @ self.K
-        return loop
+        return self.A - self.B @ self.K
 
     @cached_property
     def margins(self) -> Margins:
@@ -128,51 +123,52 @@ class Gain(Design):
         return input_margins(S @ self.A @ S.T, S @ self.B, self.K @ S.T, self.R, self.dt)
 
 
+def titled(record: Any, **sizes: int) -> str:
+    """Say in a line of what robot a record is, its sizes and time, and how well it is solved."""
+    time = f"dt={record.dt:g} s" if record.dt else "continuous"
+    parts = [f"'{record.robot}'", *(f"{key}={size}" for key, size in sizes.items()), time]
+    if hasattr(record, "residual"):
+        parts += [f"margin={record.margin:.3g}", f"residual={record.residual:.1e}"]
+    return f"{type(record).__name__}({', '.join(parts)})"
+
+
 def make_gain(
     lin: LinearModel,
+    part: LinearModel,
     solution: Solution,
     Q: Array,
     R: Array,
     N: Array | None,
     weights: str = "as given",
 ) -> Gain:
-    """Return a gain of a solution (P, K, poles, residual, method)."""
+    """Return a gain of a solution and weights of a part of a model, with the rest not fed back."""
+    S = picked(part.state_names, lin.state_names)
     poles, margin = solution.ordered(lin.dt)
     return Gain(
-        **{key: getattr(solution, key) for key in ("K", "P", "residual", "method")},
         **{key: getattr(lin, key) for key in _FROM_MODEL},
+        K=solution.K @ S,
+        P=S.T @ solution.P @ S,
+        Q=S.T @ Q @ S,
+        R=R,
+        N=np.zeros(lin.B.shape) if N is None else S.T @ N,
         poles=poles,
         margin=margin,
-        Q=Q,
-        R=R,
-        N=np.zeros(lin.B.shape) if N is None else N,
+        residual=solution.residual,
+        method=solution.method,
         weights=weights,
-        regulated=lin.state_names,
-        verified=lin.verified,
+        regulated=part.state_names,
     )
 
 
-def for_whole(gain: Gain, lin: LinearModel) -> Gain:
-    """Return a gain of a part of a model as one of the model, with the rest not fed back."""
-    if gain.state_names == lin.state_names:
-        return gain
-    S = picked(gain.regulated, lin.state_names)
-    values = {key: getattr(lin, key) for key in _FROM_MODEL}
-    values |= {"K": gain.K @ S, "P": S.T @ gain.P @ S, "Q": S.T @ gain.Q @ S, "N": S.T @ gain.N}
-    return replace(gain, **values)
-
-
 _FROM_MODEL = (
-    *("A", "B", "x0", "u0", "dt", "frame", "robot"),
+    *("A", "B", "x0", "u0", "dt", "frame", "robot", "verified"),
     *("state_names", "input_names", "state_units", "input_units"),
 )
 
 
 def fragility(gain: Gain) -> str:
-    """Say what to do about a gain that bears little at its inputs; nothing where it bears enough.
-
-    A continuous optimal loop with a diagonal R has a disk margin of 2/3 at least.
-    """
+    """Say what to do about a gain that bears little at its inputs; else nothing."""
+    # A continuous optimal loop with a diagonal R has a disk margin of 2/3 at least.
     R = gain.R
     alone = np.count_nonzero(R) == np.count_nonzero(R.diagonal())
     if alone and not gain.dt and not gain.N.any():
@@ -209,18 +205,16 @@ def _unregulated(gain: Gain) -> str:
 
 
 def _blocks(gain: Gain) -> str:
-    rows, columns = _groups(gain.input_names), _groups(gain.state_names)
-    values = np.array(
-        [[np.linalg.norm(gain.K[np.ix_(i, j)]) for j in columns.values()] for i in rows.values()]
+    of_rows, of_columns = (
+        np.array([name.partition(".")[0] for name in names])
+        for names in (gain.input_names, gain.state_names)
     )
-    return matrix(values, list(rows), list(columns))
-
-
-def _groups(names: Sequence[str]) -> dict[str, list[int]]:
-    groups: dict[str, list[int]] = {}
-    for index, name in enumerate(names):
-        groups.setdefault(name.partition(".")[0], []).append(index)
-    return groups
+    rows, columns = (list(dict.fromkeys(groups)) for groups in (of_rows, of_columns))
+    norms = [
+        [np.linalg.norm(gain.K[np.ix_(of_rows == i, of_columns == j)]) for j in columns]
+        for i in rows
+    ]
+    return matrix(np.array(norms), rows, columns)
 
 
 def _poles(gain: Gain) -> str:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from functools import cached_property, partial
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,14 +13,13 @@ from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import folded
 from fflin.base.validation import Array, number
 from fflin.control.differential_riccati import Passed
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.linear.fit import require_same
+from fflin.linear.trajectory import Trajectory
+from fflin.robot.robot import Robot
 
-if TYPE_CHECKING:
-    from fflin.linear.trajectory import Trajectory
-    from fflin.robot.robot import Robot
-
-
-def _nothing() -> Array:
-    return np.zeros(0)
+_nothing = partial(np.zeros, 0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -126,11 +125,6 @@ class GainSchedule(Schedule):
 
     def trajectory(self, robot: Robot) -> Trajectory:
         """Return the trajectory that it keeps a robot on."""
-        from fflin.dynamics.actuation import Actuation
-        from fflin.dynamics.state import StateMap
-        from fflin.linear.fit import require_same
-        from fflin.linear.trajectory import Trajectory
-
         if not self.knots.size:
             raise InputError("the file has no trajectory; load it with fflin.Trajectory.load")
         state, made = StateMap(robot), f"the gains are those of '{self.robot}'"

@@ -1,63 +1,70 @@
-"""The optimal loop of a fully actuated second-order system, from half the usual size."""
+"""Modes, Lyapunov equations by them, and the optimal loop of half the usual eigenproblem."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dgeev, dgeqrf, dpotrf, dtrtrs
+from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from fflin.base.validation import Array
-from fflin.control.lyapunov import ModalMatrix, Spectrum
+
+
+class ModalMatrix:
+    """The modes V (n, n) of a real matrix F, those of complex pairs side by side."""
+
+    def __init__(self, V: Any, poles: Any, discrete: bool) -> None:
+        self.V, self.inverse, self.values = V, np.linalg.inv(V), poles
+        across = poles.conj()[:, None]
+        self._factors = -1.0 / (across * poles - 1.0 if discrete else across + poles)
+
+    @classmethod
+    def of(cls, F: Array, discrete: bool) -> ModalMatrix:
+        """Compute the modes of a matrix."""
+        poles, V = np.linalg.eig(F)
+        return cls(V, poles, discrete)
+
+    def lyapunov(self, r: Array) -> Array:
+        """Solve F' D + D F = -r, or where discrete F' D F - D = -r, for a symmetric r (n, n)."""
+        return self.lyapunov_modal(self.V.conj().T @ r @ self.V)
+
+    def lyapunov_modal(self, r: Any) -> Array:
+        """Solve the same where V^H r V is given."""
+        # In the modes the equation is a division.
+        D: Array = (self.inverse.conj().T @ (r * self._factors) @ self.inverse).real
+        return 0.5 * (D + D.T)
+
+    def poles(self, F: Array) -> Any:
+        """Return the eigenvalues of a matrix, read off where these modes decouple it."""
+        M = self.inverse @ F @ self.V
+        values = M.diagonal().astype(complex)
+        M.flat[:: len(M) + 1] = 0.0
+        # Those of a normal matrix times E + X move by the norm of X at most, relatively.
+        if np.linalg.norm(M / np.abs(values)) > 1e-7:
+            return np.linalg.eigvals(F)
+        real, first = self.values.imag == 0.0, np.flatnonzero(self.values.imag)[::2]
+        values[real] = values[real].real
+        values[first + 1] = values[first].conj()
+        return values
 
 
 class OptimalLoop(NamedTuple):
-    """A closed loop by its modes V, and V' (Q + K' R K) V of its gain."""
+    """A closed loop by its modes V, and V^H (Q + K' R K) V of its gain."""
 
     modes: ModalMatrix
-    cost: Array
+    cost: Any
 
 
 def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalLoop | None:
-    r"""Return a stable loop, optimal but for odd powers; None where the system is another.
-
-    A state (x1, x2) of m entries each with
-
-    .. math:: A = \begin{bmatrix} A_{11} & A_{12} \\ A_{21} & A_{22} \end{bmatrix},\qquad
-              B = \begin{bmatrix} 0 \\ L \end{bmatrix},
-
-    :math:`A_{12}` invertible and L of rank m, is :math:`\ddot p = a` behind a feedback. In
-    coordinates in which the weight on a is the identity, the cost is
-    :math:`|a - F p - H \dot p|^2` and quadratic in :math:`(p, \dot p)` with the blocks
-    :math:`Q_{11}, Q_{12}, Q_{22}`, and the closed loop's poles are the stable zeros of
-
-    .. math:: \det(\lambda^4 E - \lambda^2 D + S + \text{odd powers}),\qquad
-              D = Q_{22} + H^T H + F + F^T,\quad S = Q_{11} + F^T F.
-
-    The odd powers come from the antisymmetric parts of :math:`Q_{12} + F^T H` and of H. Where
-    these are zero, as at rest with diagonal weights, the rest is of second degree in
-    :math:`\mu = \lambda^2`: a real eigenproblem of size 2m where the Hamiltonian has 4m,
-
-    .. math:: \begin{bmatrix} 0 & G^T \\ -G & D \end{bmatrix} w = \mu w,\qquad G G^T = S.
-
-    Elsewhere the loop that leaves them out is stable too, and Newton's method starts there.
-
-    Parameters
-    ----------
-    A : ndarray (2m, 2m)
-    B : ndarray (2m, nu)
-    Q : ndarray (2m, 2m)
-        Symmetric; a cross term is eliminated already.
-    R_factor : ndarray (nu, nu)
-        Lower Cholesky factor of R.
-    """
+    """Return a stable loop, optimal but for odd powers (10.5); None where the system is another."""
     nx = len(A)
     m = nx // 2
     if nx != 2 * m or B[:m].any():
         return None
     white = _lower(R_factor, B[m:].T)
     # Of the inverse weight on forces, S = Ls Ls'; squaring it would square its condition.
-    Ls: Array = np.triu(dgeqrf(white)[0][:m]).T
+    triangle: Any = np.linalg.qr(white, mode="r")
+    Ls = triangle.T
     sizes = np.abs(Ls.diagonal())
     singular = len(white) < m or sizes.min() <= 1e-14 * sizes.max()
     A11, A12 = A[:m, :m], A[:m, m:]
@@ -79,29 +86,21 @@ def second_order_loop(A: Array, B: Array, Q: Array, R_factor: Array) -> OptimalL
     G, indefinite = dpotrf(S, lower=1)
     if indefinite:
         return None
-    C = np.zeros((nx, nx), order="F")
-    C[:m, m:], C[m:, :m], C[m:, m:] = G.T, -G, D
-    if not np.isfinite(C).all():
+    squares, W = np.linalg.eig(np.block([[np.zeros((m, m)), G.T], [-G, D]]))
+    if ((squares.imag == 0.0) & (squares.real <= 0.0)).any():
         return None
-    real, imag, _, W, failed = dgeev(C, compute_vl=0, overwrite_a=1)
-    if failed or ((imag == 0.0) & (real <= 0.0)).any():
-        return None
-    spectrum = Spectrum(real, imag)
-    poles = -np.sqrt(spectrum.values)
+    poles = -np.sqrt(squares)
     # The lower half of w is a = mu p.
-    a = W[m:, spectrum.order]
-    motion = np.concatenate(
-        (spectrum.scale(a, 1.0 / spectrum.values), spectrum.scale(a, 1.0 / poles))
-    )
+    a = W[m:]
+    motion = np.concatenate((a / squares, a / poles))
     if not plain:
-        a -= F @ motion[:m] + H @ motion[m:]
-    cost = motion.T @ weight @ motion + a.T @ a
-    return OptimalLoop(ModalMatrix(T @ motion, spectrum, poles, discrete=False), cost)
+        a = a - F @ motion[:m] - H @ motion[m:]
+    cost = motion.conj().T @ weight @ motion + a.conj().T @ a
+    return OptimalLoop(ModalMatrix(T @ motion, poles, discrete=False), cost)
 
 
 def _lower(factor: Array, right: Array) -> Array:
-    solution: Array = dtrtrs(factor, right, lower=1)[0]
-    return solution
+    return dtrtrs(factor, right, lower=1)[0]
 
 
 def _inverse(A12: Array) -> Array | None:
@@ -110,5 +109,4 @@ def _inverse(A12: Array) -> Array | None:
         return np.diag(1.0 / diagonal) if diagonal.all() else None
     if np.linalg.cond(A12) > 1e8:
         return None
-    inverse: Array = np.linalg.inv(A12)
-    return inverse
+    return np.linalg.inv(A12)

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from fflin.analysis.stabilizability import require_detectable, require_disturbed
 from fflin.analysis.wheels import picked, regulated_part, seen_through
 from fflin.base.errors import DetectabilityError, InputError, listed
 from fflin.base.names import input_keys
 from fflin.base.record import Design
 from fflin.base.validation import Array, dimension
-from fflin.control.gain import Gain
+from fflin.control.gain import Gain, titled
 from fflin.control.lqr import require_fixed_point
+from fflin.control.riccati import solve
 from fflin.control.weights import Weight, columns, weight
+from fflin.linear.linear_trajectory import LinearTrajectory
 from fflin.linear.model import LinearModel, state_space
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from fflin.linear.linear_trajectory import LinearTrajectory
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -82,12 +81,7 @@ class Estimator(Design):
     estimated: tuple[str, ...] = field(default_factory=tuple)
 
     def __repr__(self) -> str:
-        nx, ny = self.L.shape
-        time = f"dt={self.dt:g} s" if self.dt else "continuous"
-        return (
-            f"Estimator('{self.robot}', nx={nx}, ny={ny}, {time}, margin={self.margin:.3g}, "
-            f"residual={self.residual:.1e})"
-        )
+        return titled(self, nx=len(self.L), ny=self.L.shape[1])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,9 +119,7 @@ class Compensator(Design):
     robot: str
 
     def __repr__(self) -> str:
-        nx, ny = self.B.shape
-        time = f"dt={self.dt:g} s" if self.dt else "continuous"
-        return f"Compensator('{self.robot}', nx={nx}, ny={ny}, nu={len(self.C)}, {time})"
+        return titled(self, nx=len(self.B), ny=self.B.shape[1], nu=len(self.C))
 
     def to_control(self) -> Any:
         """Return a `control.StateSpace` from y - y0 to u - u0, with signal names.
@@ -194,9 +186,6 @@ def kalman(
     ----------
     R. E. Kalman and R. S. Bucy, J. Basic Engineering 83(1), 1961.
     """
-    from fflin.analysis.stabilizability import require_detectable, require_disturbed
-    from fflin.control.riccati import solve
-
     require_fixed_point(lin)
     noise, through = disturbance(lin, W, G)
     V = weight("V", V, lin.output_names, definite=True)

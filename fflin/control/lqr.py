@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from fflin.analysis.stabilizability import require_stabilizable, require_weighed
 from fflin.analysis.wheels import picked, regulated_part
 from fflin.base.errors import EquilibriumError, FflinWarning, InputError, StabilizabilityError
 from fflin.base.validation import Array
-from fflin.control.default_weights import rule_weights
-from fflin.control.gain import Gain, for_whole, make_gain
+from fflin.control.gain import Gain, make_gain
+from fflin.control.riccati import half_size, solve
+from fflin.control.weight_rules import rule_weights
 from fflin.control.weights import Weight, cost_weights
 from fflin.linear.model import LinearModel
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 _SHOWN_RESIDUALS = 6
 
@@ -53,7 +53,7 @@ def lqr(
 
     Without weights the regulator is one that the robot can bear: its slowest motion comes back at
     0.2 rad/s, or as much slower as the efforts and speeds of the URDF ask for where the base is
-    turned by 30 deg and the joints by 0.3 rad; see `fflin.control.default_weights`. Every input
+    turned by 30 deg and the joints by 0.3 rad; see (10.7) of docs/derivation.md. Every input
     then bears 60 deg of phase, and any gain from a half up.
 
     Of a model with reaction wheels what can be is regulated, and named in ``gain.regulated``:
@@ -118,7 +118,7 @@ def lqr(
         S = picked(part.state_names, lin.state_names)
         Q, cross = S @ Q @ S.T, None if cross is None else S @ cross
     solution = _solve(part, Q, R, cross)
-    return for_whole(make_gain(part, solution, Q, R, cross, rule), lin)
+    return make_gain(lin, part, solution, Q, R, cross, rule)
 
 
 def require_fixed_point(lin: LinearModel) -> None:
@@ -159,20 +159,15 @@ def _difference(a: Array, b: Array, c: Array) -> Array:
 def _still(poles: Any, dt: float) -> bool:
     """Whether a pole of a stable loop hardly moves."""
     decay = 1.0 - np.abs(poles) if dt else -poles.real
-    still: bool = decay.min() < _STILL * np.abs(poles - 1.0 if dt else poles).max()
-    return still
+    return decay.min() < _STILL * np.abs(poles - 1.0 if dt else poles).max()
 
 
 def _solve(lin: LinearModel, Q: Array, R: Array, N: Array | None) -> Any:
-    from fflin.control.riccati import half_size, solve
-
     arguments = (lin.A, lin.B, Q, R, N, lin.dt)
     structured = half_size(*arguments)
     if structured is not None and not _still(structured.poles, lin.dt):
         return structured
     # A general solver would fail without saying which mode is to blame.
-    from fflin.analysis.stabilizability import require_stabilizable, require_weighed
-
     require_stabilizable(lin)
     free, A = Q, lin.A
     if N is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, vector
 from fflin.control.kalman import Compensator, kalman
+from fflin.control.policies import Policy
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvkalman import FilterSchedule
 from fflin.dynamics.aba import Aba
@@ -22,10 +23,7 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.fit import Signals, require_fit, require_same
 from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
-
-if TYPE_CHECKING:
-    from fflin.control.policies import Policy
-    from fflin.robot.robot import Robot
+from fflin.robot.robot import Robot
 
 
 def measured_states(state: StateMap) -> list[int] | None:
@@ -96,7 +94,7 @@ class OutputFeedback:
         require_same(f"the model is one of '{lin.robot}'", robot, "output", own, _sensed(state))
         there = Measuring(state, lin.q), state.read(lin.q, lin.v)
         stays = _Sample(by.A, by.B, by.C, by.u0, by.y0, lin.C, lin.D)
-        return _Loop(state, lin.dt, self.noise, _Law(len(by.A), lambda _: stays), lambda _: there)
+        return _Loop(state, lin.dt, self.noise, len(by.A), lambda _: stays, lambda _: there)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,12 +158,12 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
             state = home.about(home.origin * pin.XYZQUATToSE3(q[:7]))
             return Measuring(state, q), state.read(q, v)
 
-        return _Loop(home, self.filter.dt, self.noise, _Law(self._size, self._sample), there)
+        return _Loop(home, self.filter.dt, self.noise, self._size, self._sample, there)
 
     def law(self) -> Callable[[float, Array], Array]:
         """Return law(t, e) -> u at the samples, on what the linear models measure."""
         law = _Law(self._size, self._sample)
-        return lambda t, e: law(
+        return lambda t, e: law.step(
             t, lambda by, u: by.y0 + by.seen @ (e + by.jump) + by.through @ (u - by.u0)
         )
 
@@ -198,10 +196,7 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
 
 
 class _Sample(NamedTuple):
-    """A sample of a compensator: u = u0 + C z, then z = A z + B (y - y0), z having jumped before.
-
-    By the linear model y - y0 = seen e + through (u - u0).
-    """
+    """u = u0 + C (z + jump), then z = A (z + jump) + B (y - y0), y by `seen` and `through`."""
 
     A: Array
     B: Array
@@ -217,10 +212,11 @@ class _Law:
     """What a compensator does from sample to sample; its estimate begins at zero."""
 
     def __init__(self, size: int, at: Callable[[float], _Sample]) -> None:
-        self.estimate: Array = np.zeros(size)
         self._at = at
+        self.estimate: Array = np.zeros(size)  # of the state at the sample to come
 
-    def __call__(self, t: float, measure: Callable[[_Sample, Array], Array]) -> Array:
+    def step(self, t: float, measure: Callable[[_Sample, Array], Array]) -> Array:
+        """Return the command of a sample, at which y is measured then."""
         by = self._at(t)
         z = self.estimate + by.jump
         u: Array = by.u0 + by.C @ z
@@ -228,19 +224,17 @@ class _Law:
         return u
 
 
-class _Loop:
+class _Loop(_Law):
     """The policy of a law on what the robot measures, relative to where it is to be."""
 
-    def __init__(self, state: StateMap, dt: float, noise: Any, law: _Law, there: Any) -> None:
-        self._dt, self._noise, self._law, self._there = dt, noise, law, there
+    def __init__(
+        self, state: StateMap, dt: float, noise: Any, size: int, at: Any, there: Any
+    ) -> None:
+        super().__init__(size, at)
+        self._dt, self._noise, self._there = dt, noise, there
         self._still: Array = np.zeros(state.robot.nv)
         felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
         self._aba, self._asked = Aba(state) if felt else None, -np.inf
-
-    @property
-    def estimate(self) -> Array:
-        """Of the state of the compensator at the sample to come."""
-        return self._law.estimate
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         apart = t - self._asked
@@ -261,7 +255,7 @@ class _Loop:
                 y = y + vector("noise(t)", self._noise(t), len(y), "one value for each output")
             return y
 
-        return self._law(t, measured)
+        return self.step(t, measured)
 
 
 def _sensed(state: StateMap) -> Signals:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError, listed
 from fflin.base.names import chosen, input_keys
@@ -21,11 +22,7 @@ from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
 from fflin.robot.limits import chosen_limits
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from fflin.robot.robot import Robot
+from fflin.robot.robot import Robot
 
 # What may be missed of the goal and of limits of states in rad, m and s; what is sought of it.
 _REACHED, _ENDS = 1e-7, 1e-8
@@ -181,11 +178,9 @@ def _sought(
     limits: Array,
     room: Callable[[Array, Array], Array],
 ) -> Array:
-    """Return the inputs (N + 1, nu) of the least effort that lead to the end, or nearest to it.
-
-    The Hessian is Gauss and Newton's, to which steps of the states add a cost that falls where
-    whole steps succeed (Levenberg and Marquardt).
-    """
+    """Return the inputs (N + 1, nu) of the least effort that lead to the end, or nearest to it."""
+    # The Hessian is Gauss and Newton's, to which steps of the states add a cost that falls where
+    # whole steps succeed (Levenberg and Marquardt).
     q, v, u = shooting.guess(start, end)
     cost, u = _shares(shooting, R, u), np.clip(u, *limits)
     shooting.refine(q, v, u, _SEEKS)
@@ -243,9 +238,9 @@ class _Search(NamedTuple):
         except InputError:  # it has diverged
             return None
         low, high = np.concatenate((space, self.limits[:, None] - u), axis=2)
-        H, g = _blocks(near, self.cost), np.hstack((np.zeros((len(u), nx)), effort))
-        of_x = np.full((len(u), nx), _PRICE)
-        soft = np.hstack((of_x, np.full(u.shape, np.inf)))
+        weights = np.hstack((np.tile(near, (len(u), 1)), self.cost))
+        H, of_x = weights[:, :, None] * np.eye(weights.shape[1]), np.zeros((len(u), nx))
+        g, soft = np.hstack((of_x, effort)), np.hstack((of_x + _PRICE, np.full(u.shape, np.inf)))
         scale = np.concatenate((np.ones(nx), (len(u) * self.cost[1]) ** -0.5))
         return StageQP(np.zeros(nx), A, B, D, missed, H, g, low, high, soft, scale).solve()
 
@@ -282,13 +277,6 @@ def _shares(shooting: Shooting, R: Array, u: Array) -> Array:
         cost[[0, -1]] *= 0.5
     cost /= (cost * u * u).sum() or cost.sum()
     return cost
-
-
-def _blocks(of_x: Array, of_u: Array) -> Array:
-    """Return diagonal blocks (N + 1, nx + nu, nx + nu) of weights (nx,) and (N + 1, nu)."""
-    rows = np.hstack((np.tile(of_x, (len(of_u), 1)), of_u))
-    blocks: Array = rows[:, :, None] * np.eye(rows.shape[1])
-    return blocks
 
 
 def _room(shooting: Shooting, end: Point, bounds: Array, asked: Array, q: Array, v: Array) -> Array:

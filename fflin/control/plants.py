@@ -1,8 +1,6 @@
 """How far a robot is from the one that a controller was made for."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -10,9 +8,7 @@ from fflin.base.validation import Array
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
 from fflin.robot.inputs import ReactionWheel
-
-if TYPE_CHECKING:
-    from fflin.robot.robot import Robot
+from fflin.robot.robot import Robot
 
 # Less than this, relative to the largest, is no difference.
 _ROUNDING = 1e-9

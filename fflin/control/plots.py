@@ -13,7 +13,7 @@ from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, cycle, drawing, letters_of, logarithmic
 from fflin.base.validation import Array, number
 from fflin.control.gain import Gain
-from fflin.control.loops import Loop, input_loops
+from fflin.control.margins import Loop, input_loops
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:

@@ -1,18 +1,15 @@
 """What decides on the inputs: feedback of the state about a point, and allocation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, TypeAlias
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, as_double
-from fflin.control.bounded import nearest
 from fflin.control.channel import Law
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import Frame, StateMap
@@ -22,16 +19,10 @@ from fflin.linear.model import LinearModel
 from fflin.robot.limits import limits_of
 from fflin.robot.robot import Robot
 
+# The added rows choose the least of what does the same; their effect is below rounding.
+_LEAST = 1e-7
+
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
-
-
-@runtime_checkable
-class Bindable(Protocol):
-    """A policy that must know the robot before it decides."""
-
-    def bind(self, robot: Robot) -> Policy:
-        """Return the policy for that robot."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,18 +157,22 @@ class Allocation:
         return policy
 
 
+def decider(policy: Any) -> Any:
+    """Return what decides on commands: of an allocation its policy."""
+    return policy.policy if isinstance(policy, Allocation) else policy
+
+
 def axes_of(policy: Any) -> tuple[Frame, pin.SE3 | None]:
     """Return the frame and reference that a policy's state and inputs are in."""
     lin, _ = feedback_of(policy)
     if lin is not None:
         return lin.frame, lin.reference
-    decides = policy.policy if isinstance(policy, Allocation) else policy
-    return getattr(decides, "frame", "hybrid"), None
+    return getattr(decider(policy), "frame", "hybrid"), None
 
 
 def bound(policy: Any, robot: Robot) -> Policy:
     """Return a policy for a robot, or raise `InputError` where it is none."""
-    result = policy.bind(robot) if isinstance(policy, Bindable) else policy
+    result = policy.bind(robot) if hasattr(policy, "bind") else policy
     if not callable(result):
         raise InputError(
             f"policy is a {type(policy).__name__}, expected policy(t, q, v) -> u, such as "
@@ -189,8 +184,7 @@ def bound(policy: Any, robot: Robot) -> Policy:
 def feedback_of(policy: Any) -> tuple[LinearModel | None, Array | None]:
     """Return the model that a policy was made for, and its K, where it has them."""
     lin = getattr(policy, "lin", None)
-    decides = policy.policy if isinstance(policy, Allocation) else policy
-    return (lin if isinstance(lin, LinearModel) else None), getattr(decides, "K", None)
+    return (lin if isinstance(lin, LinearModel) else None), getattr(decider(policy), "K", None)
 
 
 def fed_back(policy: Any) -> tuple[str, ...]:
@@ -200,3 +194,54 @@ def fed_back(policy: Any) -> tuple[str, ...]:
         return ()
     used = np.ones(len(lin.state_names)) if K is None else np.abs(K).max(axis=0, initial=0.0)
     return tuple(name for name, size in zip(lin.state_names, used, strict=True) if size)
+
+
+def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
+    """Return u (k,) within its bounds (k,) that makes A u nearest to b, the least of these."""
+    from scipy.optimize import lsq_linear, nnls
+
+    size, unit = float(np.linalg.norm(b)), float(np.linalg.norm(A))
+    if size == 0.0 or unit == 0.0:
+        return np.clip(np.zeros(len(least)), least, most)
+    # Scaled to 1, as the solvers stop at absolute figures.
+    rows = np.vstack((A / unit, _LEAST * np.eye(len(least))))
+    wanted = np.concatenate((b / size, np.zeros(len(least))))
+    low, high = least * (unit / size), most * (unit / size)
+    high = np.maximum(high, low + 1e-15)  # the solver takes no bounds that are equal
+    pushing = least == 0.0
+    free, given = rows[:, ~pushing], np.zeros(len(least))
+    # Most often no other bound is met: thrusts without a largest one, the others without any.
+    Q, R = np.linalg.qr(free)
+    apart = rows[:, pushing] - Q @ (Q.T @ rows[:, pushing])
+    if pushing.any():
+        given[pushing] = nnls(apart, wanted - Q @ (Q.T @ wanted))[0]
+    given[~pushing] = np.linalg.solve(R, Q.T @ (wanted - rows[:, pushing] @ given[pushing]))
+    if (given < low).any() or (given > high).any():
+        given = lsq_linear(rows, wanted, (low, high), method="bvls", tol=1e-14).x
+    return np.clip(given * (size / unit), least, most)
+
+
+def pushes_every_way(W: Array, pushing: NDArray[np.bool_]) -> bool:
+    """Whether columns W (6, k), of which some only push, together give every wrench."""
+    # They do where the rank is 6 and some thrusts, all of them positive, cancel one another.
+    from scipy.optimize import nnls
+
+    size = np.linalg.norm(W, axis=0)
+    W, pushing = W[:, size > 0.0] / size[size > 0.0], pushing[size > 0.0]
+    if np.linalg.matrix_rank(W, tol=1e-6) < len(W):
+        return False
+    if not pushing.any():
+        return True
+    both = np.hstack((W[:, pushing], W[:, ~pushing], -W[:, ~pushing]))
+    return bool(nnls(both, -both.sum(axis=1))[1] < 1e-9)
+
+
+def thrusters_push_every_way(robot: Robot) -> bool:
+    """Whether a robot has thrusters that, with what else acts on its base, push it every way."""
+    actuation = Actuation(StateMap(robot))
+    thrusters = actuation.groups.get("thrust")
+    if thrusters is None:
+        return False
+    W = actuation.columns(robot.create_data(), robot.neutral())[:6]
+    pushing = np.isin(np.arange(W.shape[1]), thrusters)
+    return pushes_every_way(W, pushing)

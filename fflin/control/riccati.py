@@ -1,7 +1,5 @@
 """Algebraic Riccati equations: a solution with its residual, from half the size where possible."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from contextlib import suppress
@@ -11,8 +9,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from fflin.base.validation import Array
-from fflin.control.half_size import second_order_loop
-from fflin.control.lyapunov import ModalMatrix, eigenvalues
+from fflin.control.half_size import ModalMatrix, second_order_loop
 
 _EPS, _TINY = float(np.finfo(float).eps), 1e-300
 
@@ -50,20 +47,7 @@ class _Trial(NamedTuple):
 
 
 class Riccati:
-    r"""The Riccati equation of a continuous or sampled system and a cost with a cross term.
-
-    .. math:: A^T P + P A - (P B + N) R^{-1} (P B + N)^T + Q = 0
-
-    for dt = 0, and else with :math:`W = R + B^T P B`
-
-    .. math:: A^T P A - P - (A^T P B + N) W^{-1} (A^T P B + N)^T + Q = 0.
-
-    Parameters
-    ----------
-    A, B, Q, R, N : ndarray
-        Q and R symmetric, R positive definite.
-    dt : float
-    """
+    """A' P + P A - (P B + N) R^-1 (P B + N)' + Q = 0, or where dt is not zero its sampled twin."""
 
     def __init__(self, A: Array, B: Array, Q: Array, R: Array, N: Array | None, dt: float) -> None:
         self.A, self.B, self.Q, self.R, self.N = A, B, Q, R, N
@@ -79,8 +63,7 @@ class Riccati:
     def gain(self, P: Array) -> Array:
         """Return K (nu, nx), u = -K x."""
         factor, Y = self._factored(P)
-        K: Array = dtrtrs(factor, Y, lower=1, trans=1)[0]
-        return K
+        return dtrtrs(factor, Y, lower=1, trans=1)[0]
 
     def trial(self, P: Array) -> _Trial:
         """Return P with its defect, and that relative to the sum of the norms of its terms."""
@@ -97,11 +80,6 @@ class Riccati:
         if not math.isfinite(residual + size):
             raise np.linalg.LinAlgError("the weights or the model overflow")
         return _Trial(P, defect, residual)
-
-    def closed_loop(self, P: Array) -> Array:
-        """Return A - B K (nx, nx)."""
-        F: Array = self.A - self.B @ self.gain(P)
-        return F
 
     def _factored(self, P: Array) -> tuple[Array, Array]:
         """Return the lower factor of W and Y with K = W^-T Y, so that the gain costs Y' Y."""
@@ -120,16 +98,9 @@ class Riccati:
 def solve(
     A: Array, B: Array, Q: Array, R: Array, N: Array | None = None, dt: float = 0.0
 ) -> Solution:
-    """Solve a Riccati equation for the stabilising P.
+    """Solve for the stabilising P, by half the size or by SciPy; `LinAlgError` where none is found.
 
-    A fully actuated second-order system is solved by its own half-size method, any other and
-    where that falls short by SciPy's. Newton's method (Kleinman) refines either, step by step as
-    long as it lowers the residual, which is measured in the variables given.
-    A `numpy.linalg.LinAlgError` says that there is no stabilising solution, or none is found.
-
-    References
-    ----------
-    D. L. Kleinman, IEEE Trans. Automatic Control 13(1), 1968.
+    Newton's method refines either (D. L. Kleinman, IEEE Trans. Automatic Control 13(1), 1968).
     """
     equation = Riccati(A, B, Q, R, N, dt)
     start = _half_size(equation)
@@ -185,12 +156,7 @@ def _half_size(equation: Riccati, apart: float = 0.0) -> Solution | None:
 
 
 def _bilinear(equation: Riccati) -> Riccati | None:
-    r"""Return the continuous equation that has the same P.
-
-    With :math:`\bar x = (x_{k+1} + x_k)/\sqrt 2` and :math:`\dot{\bar x} = (x_{k+1} - x_k)/\sqrt 2`
-    the step of :math:`x^T P x` is :math:`2 \dot{\bar x}^T P \bar x`. Under an exact hold of a
-    double integrator this is one again, driven in its velocities alone.
-    """
+    """Return the continuous equation that has the same P (10.6)."""
     A, B, Q = equation.A, equation.B, equation.Q
     N = np.zeros_like(B) if equation.N is None else equation.N
     F = np.linalg.inv(A + np.eye(len(A)))
@@ -209,7 +175,7 @@ def _finished(
 ) -> Solution | None:
     K = equation.gain(trial.P)
     F = equation.A - equation.B @ K
-    poles = modes.poles(F) if modes else eigenvalues(F)
+    poles = modes.poles(F) if modes else np.linalg.eigvals(F)
     stable = np.abs(poles).max() < 1.0 if equation.discrete else poles.real.max() < 0.0
     return Solution(trial.P, K, poles, trial.residual, method) if stable else None
 
@@ -225,7 +191,8 @@ def _refined(
         if best.residual <= enough:
             break
         if modes is None:
-            modes, fresh = ModalMatrix.of(equation.closed_loop(trial.P), equation.discrete), True
+            F = equation.A - equation.B @ equation.gain(trial.P)
+            modes, fresh = ModalMatrix.of(F, equation.discrete), True
         better = equation.trial(trial.P + modes.lyapunov(trial.defect))
         gain = trial.residual / max(better.residual, _TINY)
         # Far from the solution a first step may raise the residual and still improve P.

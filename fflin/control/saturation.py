@@ -1,7 +1,5 @@
 """What acts of a command: within limits, up to the largest speed of a wheel, in pulses."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -11,21 +9,18 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import FflinWarning, listed
+from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.base.validation import Array
-from fflin.control.pulses import Pulses
 from fflin.robot.fields import Range
 from fflin.robot.inputs import Thruster, named_inputs
 from fflin.robot.robot import Robot
 
 
 class Wheels(NamedTuple):
-    r"""Wheels that turn no faster than their largest speed.
+    r"""Wheels that turn no faster than their largest speed: :math:`u \le J (w_{max} - w) / dt`."""
 
-    Within a step of dt a torque u takes the speed w of a wheel by u dt / J further, where J is what
-    it turns against the rest of the robot, both free: :math:`u \le J (w_{max} - w) / dt`, and
-    likewise below, as far as the motor can.
-    """
+    # Within a step of dt a torque u takes the speed w by u dt / J further, where J is what it turns
+    # against the rest of the robot, both free; likewise below, as far as the motor can.
 
     names: list[str]
     at: list[int]  # where their torques stand among the inputs
@@ -45,6 +40,59 @@ class Wheels(NamedTuple):
         return u
 
 
+class Pulses:
+    """What thrusters (place, name, thruster) that fire in pulses make of each sample's command."""
+
+    # What is asked for and not fired, for whole steps or the least impulse, is carried to the next.
+    # `high` (nu,) is what they give; where it is infinite, one that is on-off gives its own `max`.
+
+    def __init__(
+        self, thrusters: Sequence[tuple[int, str, Thruster]], high: Array, sample: int, dt: float
+    ) -> None:
+        self.places = [at for at, *_ in thrusters]
+        self.on_off = np.array([item.on_off for *_, item in thrusters])
+        own = np.array([item.ranges[0][1] if item.on_off else np.inf for *_, item in thrusters])
+        self.most = np.where(np.isfinite(high[self.places]), high[self.places], own)
+        self.least = np.array([item.least_impulse or 0.0 for *_, item in thrusters])
+        self._sample, self.time = sample, sample * dt
+        self.quantum = np.where(self.on_off, self.most * dt, 1.0)
+        self.left = np.zeros(len(thrusters))
+        for (_, name, item), most in zip(thrusters, self.most.tolist(), strict=True):
+            if not sample:
+                raise InputError(
+                    f"thruster '{name}' fires from sample to sample (on_off, least_impulse); give "
+                    "the time between samples, or a policy on a sampled model"
+                )
+            if (item.least_impulse or 0.0) > most * self.time:
+                raise InputError(
+                    f"thruster '{name}' has a least impulse of {item.least_impulse:g} N s, but "
+                    f"gives {most * self.time:.3g} N s in a sample; take longer samples"
+                )
+
+    def begin(self, step: int, u: Array) -> None:
+        """Take the command (nu,) of a sample."""
+        wanted = np.minimum(u[self.places], self.most) * self.time + self.left
+        steps = np.clip(np.rint(wanted / self.quantum), 0, self._sample)
+        level = np.clip(wanted / self.time, 0.0, self.most)
+        fired = np.where(self.on_off, steps * self.quantum, level * self.time)
+        # An impulse that misses the least one by rounding is the least one.
+        fires = (fired > 0.0) & (fired >= (1.0 - 1e-9) * self.least)
+        self.left = wanted - fires * fired
+        self._end = step + fires * np.where(self.on_off, steps, self._sample)
+        self._level = np.where(self.on_off, self.most, level)
+        self._firing = np.full(len(fires), False)
+        self._acting = u.copy()
+        self._acting[self.places] = 0.0
+
+    def at(self, step: int) -> Array:
+        """Return what acts (nu,) in a step; the same array while nothing changes."""
+        firing = step < self._end
+        if (firing != self._firing).any():
+            self._firing, self._acting = firing, self._acting.copy()
+            self._acting[self.places] = np.where(firing, self._level, 0.0)
+        return self._acting
+
+
 class Saturation(NamedTuple):
     """What acts of a command of the inputs of a robot."""
 
@@ -57,11 +105,7 @@ class Saturation(NamedTuple):
 def saturation(
     robot: Robot, limits: Mapping[str, Range], q: Array, dt: float, sample: int
 ) -> Saturation:
-    """Return what acts of a command of a robot at q (nq,), in steps of dt [s].
-
-    `limits` is {name of an input, or qdot_m of a wheel: (least, largest)}; `sample` is how many
-    steps lie between samples, 0 where there are none.
-    """
+    """Return what acts of a command at q, in steps of dt [s], `sample` steps to a sample or 0."""
     inputs = {name: item for item, names in named_inputs(robot.inputs) for name in names}
     names = list(inputs)
     low, high = np.array([limits.get(name, (-math.inf, math.inf)) for name in names]).T

@@ -1,13 +1,12 @@
 """What a robot makes of knots and inputs: the guess, what each interval misses, and its slopes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
-from fflin.dynamics.state import PIN_ANGULAR, PIN_LINEAR, StateMap
+from fflin.dynamics.names import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.state import StateMap
 from fflin.linear.flow import Flow
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
@@ -18,11 +17,10 @@ Point = tuple[Array, Array]
 
 
 class Shooting:
-    """The knots at times t (N + 1,) as the starts of N motions that are to meet.
+    """The knots at times t (N + 1,) as the starts of N motions that are to meet."""
 
-    Steps between configurations and velocities are z = (theta_b, r_b, q_m, nu) (nx,) in base axes,
-    those of the linear models with the rotation vector for twice q_b.
-    """
+    # Steps between configurations and velocities are z = (theta_b, r_b, q_m, nu) (nx,) in base
+    # axes, those of the linear models with the rotation vector for twice q_b.
 
     def __init__(self, robot: Robot, t: Array, held: bool) -> None:
         self.state, self.t, self.held, self.steps = StateMap(robot, frame="local"), t, held, 4
@@ -71,10 +69,8 @@ class Shooting:
                 break
 
     def slopes(self, q: Array, v: Array, u: Array) -> list[Array]:
-        """Return those of the intervals' ends over z, the input there and the next one.
-
-        By Runge-Kutta steps of dZ/dt = A Z + B over all intervals at once, along their motions.
-        """
+        """Return those of the intervals' ends over z, the input there and the next one."""
+        # By Runge-Kutta steps of dZ/dt = A Z + B over all intervals at once, along their motions.
         flow, (nx, nu), steps = self._flow(q, v, u), (len(self._size), u.shape[1]), self.steps // 4
         h, Z = self.t[1] / steps, np.tile(np.eye(nx, nx + 2 * nu), (len(q) - 1, 1, 1))
         at = list(zip(q, v, strict=True))[:-1]
@@ -102,10 +98,7 @@ class Shooting:
         return np.split(Z, (nx, nx + nu), axis=2)
 
     def guess(self, start: Point, end: Point) -> tuple[Array, Array, Array]:
-        """Return knots on cubics from a point to another, and inputs near to what these take.
-
-        The base goes round as often as its rates at both ends have it.
-        """
+        """Return knots on cubics from a point to another, and inputs near to what these take."""
         model, T = self.state.robot.model, self.t[-1]
         s, rates = self.t[:, None] / T, np.array((T * start[1], T * end[1]))
         turned = rotation_matrices(np.array((start[0][3:7], end[0][3:7])))

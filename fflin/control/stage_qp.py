@@ -1,7 +1,5 @@
 """Quadratic programs over the stages of a linear motion, solved by PIQP."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -27,14 +25,7 @@ class StageQP(NamedTuple):
     .. math::
         \min \sum_{k=0}^N \tfrac12 w_k^T H_k w_k + g_k^T w_k + \mathrm{soft}_k^T s_k, \quad
         x_{k+1} = A_k x_k + B_k u_k + D_k u_{k+1} + c_k, \quad
-        \mathrm{low}_k - s_k \le w_k \le \mathrm{high}_k + s_k, \quad s_k \ge 0,
-
-    without s where `soft` is infinite: such a bound is hard. Equal bounds ask for a value.
-
-    References
-    ----------
-    R. Schwan, Y. Jiang, D. Kuhn and C. N. Jones, PIQP: a proximal interior-point quadratic
-    programming solver, IEEE Conference on Decision and Control, 2023.
+        \mathrm{low}_k - s_k \le w_k \le \mathrm{high}_k + s_k, \quad s_k \ge 0
     """
 
     start: Array  # x[0] (nx,)

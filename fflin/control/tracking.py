@@ -1,11 +1,9 @@
 """Feedback along a trajectory, and the reference that it follows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import pinocchio as pin
@@ -14,19 +12,16 @@ from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
 from fflin.base.validation import Array
 from fflin.control.gain_schedule import GainSchedule
-from fflin.control.policies import Allocation, fed_back
+from fflin.control.policies import Allocation, Policy, decider, fed_back
 from fflin.control.tvlqr import resting_end, steady_regulator
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import Frame, StateMap
 from fflin.dynamics.state_rows import moved_by, moving_error
 from fflin.linear.fit import require_same, require_turns
 from fflin.linear.linear_trajectory import LinearTrajectory, along
+from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
-
-if TYPE_CHECKING:
-    from fflin.control.policies import Policy
-    from fflin.linear.model import LinearModel
-    from fflin.robot.robot import Robot
+from fflin.robot.robot import Robot
 
 # A clock of many steps is rounded.
 AT_THE_END = 1.0 + 1e-9
@@ -194,8 +189,7 @@ class TrajectoryFeedback:
 
         def policy(t: float, q: Array, v: Array) -> Array:
             q_star, v_star, u_star = self.commanded(t)
-            u: Array = u_star - self.gain(t).dot(moving_error(state, q_star, v_star, q, v))
-            return u
+            return u_star - self.gain(t).dot(moving_error(state, q_star, v_star, q, v))
 
         return policy
 
@@ -213,14 +207,13 @@ def followed(policy: Any, robot: Robot, held: bool = False) -> Any:
 
 def reference_of(policy: Any) -> Reference | None:
     """Return what a policy follows, where it follows a motion."""
-    decides = policy.policy if isinstance(policy, Allocation) else policy
-    found = getattr(decides, "reference", None)
+    found = getattr(decider(policy), "reference", None)
     return found if callable(found) else None
 
 
 def tracking_of(policy: Any) -> TrajectoryFeedback | None:
     """Return the feedback along a trajectory that a policy is or allocates."""
-    decides = policy.policy if isinstance(policy, Allocation) else policy
+    decides = decider(policy)
     return decides if isinstance(decides, TrajectoryFeedback) else None
 
 
@@ -234,11 +227,9 @@ def steered_by(policy: Any) -> tuple[str, ...]:
 
 @lru_cache(maxsize=2)  # half of a short run's time
 def largest_rate(schedule: GainSchedule) -> float:
-    """Return the magnitude [1/s] that the loop's poles pass for a twentieth of the time alone.
-
-    A large weight at the end makes K large for a moment, which is over before it does harm; the
-    inputs of samples do not follow at all, 0.
-    """
+    """Return the magnitude [1/s] that the loop's poles pass for a twentieth of the time alone."""
+    # A large weight at the end makes K large for a moment, which is over before it does harm; the
+    # inputs of samples do not follow at all, 0.
     if schedule.dt:
         return 0.0
     rates = np.abs(np.linalg.eigvals(schedule.A - schedule.B @ schedule.K)).max(axis=1)

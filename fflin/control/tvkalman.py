@@ -2,37 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from fflin.analysis.gramians import held_cost
 from fflin.base.errors import DetectabilityError, InputError
 from fflin.base.threads import in_one_thread
 from fflin.base.validation import Array, number
-from fflin.control.differential_riccati import (
-    Coefficients,
-    Passed,
-    sample_back,
-    solve_back,
-    spread,
-)
+from fflin.control import differential_riccati as riccati
 from fflin.control.gain_schedule import Schedule
 from fflin.control.kalman import disturbance, kalman
 from fflin.control.tvlqr import require_continuous, steady_end
 from fflin.control.weights import Weight, weight
-from fflin.linear.linear_trajectory import along
+from fflin.linear.linear_trajectory import LinearTrajectory, along
 from fflin.linear.sampling import HEAVY, LIGHT
 from fflin.linear.trajectory_sampling import transitions
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import ArrayLike
-
-    from fflin.linear.linear_trajectory import LinearTrajectory
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -95,10 +85,10 @@ class FilterSchedule(Schedule):
         return self.passed.cost(self._within(t))
 
     @cached_property
-    def passed(self) -> Passed:
+    def passed(self) -> riccati.Passed:
         """Gain and cost over time."""
         A, C, L = (each.transpose(0, 2, 1) for each in (self.A, self.C, self.L))
-        return Passed(self.t, self.P, L, (A, C, self.W, self.V), self.dt, 1.0)
+        return riccati.Passed(self.t, self.P, L, (A, C, self.W, self.V), self.dt, 1.0)
 
 
 @in_one_thread
@@ -164,10 +154,10 @@ def tvkalman(
     through = np.broadcast_to(columns, (len(traj.t), *columns.shape[-2:]))
 
     @cache
-    def at(t: float) -> Coefficients:
+    def at(t: float) -> riccati.Coefficients:
         (A, _), (C, by) = traj.matrices(t), traj.between(t, traj.C, through)
         intensity = by @ noise @ by.T
-        return Coefficients(A.T, spread(C.T, V), 0.5 * (intensity + intensity.T))
+        return riccati.Coefficients(A.T, riccati.spread(C.T, V), 0.5 * (intensity + intensity.T))
 
     names: Any = ("state_names", "input_names", "output_names", "verified")
     fields: dict[str, Any] = {key: getattr(traj, key) for key in names}
@@ -178,14 +168,10 @@ def tvkalman(
         P = _steady(traj, at(float(traj.t[0])).Q, V, dt)
     else:
         P = weight("P0", P0, traj.state_names)
-    try:
-        # A P that overflows is refused, so that NumPy need not warn of it.
-        with np.errstate(over="ignore", invalid="ignore"):
-            if sample is not None:
-                return FilterSchedule(**fields, **_sampled(traj, dt, at, V, P))
-            times, found = solve_back(lambda time: at(-time), -traj.t[::-1], P)
-    except np.linalg.LinAlgError:
-        raise InputError("P changes too fast; give a smaller W or a larger V") from None
+    with riccati.bounded_by("a smaller W or a larger V"):
+        if sample is not None:
+            return FilterSchedule(**fields, **_sampled(traj, dt, lambda t: at(t).Q, V, P))
+        times, found = riccati.solve_back(lambda time: at(-time), -traj.t[::-1], P)
     t, P = -times[::-1], found[::-1]
     own, clock = (traj.C, traj.D, traj.y), t.tolist()
     rows = zip(*((*traj.matrices(x), *traj.between(x, *own)) for x in clock), strict=True)
@@ -207,28 +193,26 @@ def _steady(traj: LinearTrajectory, W: Array, V: Array, dt: float) -> Array:
 
 
 def _sampled(
-    traj: LinearTrajectory, dt: float, at: Callable[[float], Coefficients], V: Array, P: Array
+    traj: LinearTrajectory, dt: float, intensity: Callable[[float], Array], V: Array, P: Array
 ) -> dict[str, Any]:
     """Return what the schedule of a filter has whose measurements are sampled."""
-    at_samples = along(traj.resampled(dt))
-    nx, ny = len(P), len(V)
-    maps, gains, found, disturbed, worst = [], [], [P], [], 0.0
-    for C, (steps, whole) in zip(at_samples.C, transitions(traj, traj.matrices, dt), strict=False):
-        weights = np.zeros((nx + ny, nx + ny))
-        W, weights[nx:, nx:] = weights[:nx, :nx], V
-        for F, h, step, (first, second) in steps:
-            mixed = HEAVY * at(first).Q + LIGHT * at(second).Q
-            W[:] = step[:, :nx] @ W @ step[:, :nx].T + held_cost(F[:nx, :nx].T, mixed, h)
-        K, P, missed = sample_back(weights, np.hstack((whole[:, :nx].T, C.T)), P)
-        worst = max(worst, missed)
-        maps.append(whole)
-        gains.append(K.T)
-        found.append(P)
-        disturbed.append(W)
-    held = np.array(maps)
+    at_samples, nx, disturbed = along(traj.resampled(dt)), len(P), list[Array]()
+    held = list(transitions(traj, traj.matrices, dt))
+
+    def stages() -> Iterator[tuple[Array, Array]]:
+        for C, (steps, whole) in zip(at_samples.C, held, strict=False):
+            W = np.zeros((nx, nx))
+            for F, h, step, (first, second) in steps:
+                mixed = HEAVY * intensity(first) + LIGHT * intensity(second)
+                W = step[:, :nx] @ W @ step[:, :nx].T + held_cost(F[:nx, :nx].T, mixed, h)
+            disturbed.append(W)
+            yield block_diag(W, V), np.hstack((whole[:, :nx].T, C.T))
+
+    K, P, residual = riccati.samples_back(stages(), P)
+    L, maps = K.transpose(0, 2, 1), np.array([whole for _, whole in held])
     return {
-        **{"t": at_samples.t, "L": np.array([*gains, gains[-1]]), "P": np.array(found)},
-        **{"A": held[:, :, :nx], "B": held[:, :, nx:], "W": np.array(disturbed)},
+        **{"t": at_samples.t, "L": np.concatenate((L, L[-1:])), "P": P},
+        **{"A": maps[:, :, :nx], "B": maps[:, :, nx:], "W": np.array(disturbed)},
         **{key: getattr(at_samples, key) for key in "CDy"},
-        "residual": worst,
+        "residual": residual,
     }

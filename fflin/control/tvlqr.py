@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
+from fflin.analysis.gramians import held_cost
+from fflin.analysis.momentum import momentum_reduction
 from fflin.base.errors import EquilibriumError, InputError, StabilizabilityError
-from fflin.base.names import input_keys
 from fflin.base.threads import in_one_thread
 from fflin.base.validation import Array, number
-from fflin.control.differential_riccati import (
-    Coefficients,
-    Passed,
-    sample_back,
-    solve_back,
-    spread,
-)
+from fflin.control import differential_riccati as riccati
+from fflin.control.gain import Gain
 from fflin.control.gain_schedule import GainSchedule
-from fflin.control.weights import Weight, weight
-
-if TYPE_CHECKING:
-    from fflin.control.gain import Gain
-    from fflin.linear.linear_trajectory import LinearTrajectory
-    from fflin.linear.model import LinearModel
-    from fflin.linear.trajectory import Trajectory
-
-_TOO_FAST = "P changes too fast; give smaller weights or a larger R"
+from fflin.control.lqr import lqr
+from fflin.control.weight_rules import pace_along, rule_weights
+from fflin.control.weights import Weight, cost_weights, sampled_cost, weight
+from fflin.linear.equilibrium import equilibrium
+from fflin.linear.ignorable import rotor_names
+from fflin.linear.linear_trajectory import LinearTrajectory
+from fflin.linear.linearization import Linearizer
+from fflin.linear.model import LinearModel
+from fflin.linear.trajectory import Trajectory
+from fflin.linear.trajectory_sampling import transitions
 
 
 @in_one_thread
@@ -101,18 +100,14 @@ def tvlqr(
     steady = isinstance(Qf, str)
     if steady and Qf != "steady":
         raise InputError(f"Qf is {Qf!r}, expected 'steady' or a weight")
-    by_rule = Q is None and R is None
+    given, by_rule = list[Any]((Q, R)), Q is None and R is None
     if not by_rule and (weights is not None or Q is None or R is None):
         raise InputError("give Q and R, both, or weights='urdf' or 'identity' without them")
     end: Any = steady_end(traj) if steady or by_rule else None
-    given: list[Any] = [Q, R]
     if by_rule:
-        from fflin.control.default_weights import pace_along, rule_weights
-
         pace = pace_along(float(traj.t[-1] - traj.t[0]), dt)
         *given, _, rule = rule_weights(end, weights, pace=pace)
-    Q = weight("Q", given[0], names)
-    R = weight("R", given[1], input_keys(traj), definite=True)
+    Q, R, _ = cost_weights(traj, given[0], given[1], None)
     Qf = steady_regulator(end, Q, R, sample)[0] if steady else weight("Qf", Qf, names)
     fields: dict[str, Any] = {key: getattr(traj, key) for key in ("q", "v", "u", "hold", "frame")}
     fields |= {"state_names": names, "input_names": traj.input_names, "robot": traj.robot.name}
@@ -120,28 +115,22 @@ def tvlqr(
     fields |= {"verified": traj.verified, "dt": dt}
 
     @cache
-    def at(t: float) -> Coefficients:
+    def at(t: float) -> riccati.Coefficients:
         A, B = traj.matrices(t)
-        return Coefficients(A, spread(B, R), Q)
+        return riccati.Coefficients(A, riccati.spread(B, R), Q)
 
-    try:
-        # A P that overflows is refused, so that NumPy need not warn of it.
-        with np.errstate(over="ignore", invalid="ignore"):
-            if sample is not None:
-                return GainSchedule(**fields, **_sampled(traj, dt, Q, R, Qf))
-            t, P = solve_back(at, traj.t, Qf)
-    except np.linalg.LinAlgError:
-        raise InputError(_TOO_FAST) from None
+    with riccati.bounded_by("smaller weights or a larger R"):
+        if sample is not None:
+            return GainSchedule(**fields, **_sampled(traj, dt, Q, R, Qf))
+        t, P = riccati.solve_back(at, traj.t, Qf)
     A, B = map(np.array, zip(*(traj.matrices(float(x)) for x in t), strict=True))
     K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
-    residual = Passed(t, P, K, (A, B, Q, R), 0.0, -1.0).residual(at)
+    residual = riccati.Passed(t, P, K, (A, B, Q, R), 0.0, -1.0).residual(at)
     return GainSchedule(t=t, K=K, P=P, A=A, B=B, residual=residual, **fields)
 
 
 def require_continuous(traj: LinearTrajectory) -> None:
     """Raise `InputError` where something is no LinearTrajectory in continuous time."""
-    from fflin.linear.linear_trajectory import LinearTrajectory
-
     if not isinstance(traj, LinearTrajectory):
         raise InputError(
             f"traj is a {type(traj).__name__}, expected a LinearTrajectory; "
@@ -165,10 +154,6 @@ def steady_end(traj: LinearTrajectory, end: int = -1) -> LinearModel:
 
 def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
     """Return the model at rest in the last configuration, in base axes; rotors spin on there."""
-    from fflin.linear.equilibrium import equilibrium
-    from fflin.linear.ignorable import rotor_names
-    from fflin.linear.linearization import Linearizer
-
     robot, q, v = traj.robot, traj.q[end], np.zeros(traj.robot.nv)
     rotors = rotor_names(robot)
     spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
@@ -180,9 +165,6 @@ def steady_regulator(
     lin: LinearModel, Q: Array, R: Array, sample: float | None
 ) -> tuple[Array, Array]:
     """Return the cost P (nx, nx) and K (nu, nx) of a regulator about a steady point."""
-    from fflin.analysis.momentum import momentum_reduction
-    from fflin.control.lqr import lqr
-    from fflin.control.sampled_cost import sampled_cost
 
     def regulator(lin: LinearModel, Q: Array) -> Gain:
         if not sample:
@@ -200,25 +182,18 @@ def steady_regulator(
 
 def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) -> dict[str, Any]:
     """Return t, K, P, A, B and the residual of the regulator whose inputs are held."""
-    from fflin.analysis.gramians import held_cost
-    from fflin.linear.trajectory_sampling import transitions
+    nx, W = len(Q), block_diag(Q, R)
+    held = list(transitions(traj, traj.matrices, dt))
 
-    nx, nu = len(Q), len(R)
-    W = np.zeros((nx + nu, nx + nu))
-    W[:nx, :nx], W[nx:, nx:] = Q, R
-    maps, gains, costs, worst = [], [], [P], 0.0
-    for steps, whole in reversed(list(transitions(traj, traj.matrices, dt))):
-        total, way = np.zeros_like(W), np.eye(nx + nu)
-        for F, h, step, _ in steps:
-            total += way.T @ held_cost(F, W, h) @ way
-            way[:nx] = step @ way
-        K, P, missed = sample_back(total, whole, P)
-        worst = max(worst, missed)
-        maps.append(whole)
-        gains.append(K)
-        costs.append(P)
-    maps.reverse()
-    held = np.array(maps)
-    gains = [*gains[::-1], gains[0]]
-    found = {"t": traj.samples(dt), "K": np.array(gains), "P": np.array(costs[::-1])}
-    return found | {"A": held[:, :, :nx], "B": held[:, :, nx:], "residual": worst}
+    def stages() -> Iterator[tuple[Array, Array]]:
+        for steps, whole in reversed(held):
+            total, way = np.zeros_like(W), np.eye(len(W))
+            for F, h, step, _ in steps:
+                total += way.T @ held_cost(F, W, h) @ way
+                way[:nx] = step @ way
+            yield total, whole
+
+    K, P, residual = riccati.samples_back(stages(), P)
+    maps = np.array([whole for _, whole in held])
+    found = {"t": traj.samples(dt), "K": np.concatenate((K[::-1], K[:1])), "P": P[::-1]}
+    return found | {"A": maps[:, :, :nx], "B": maps[:, :, nx:], "residual": residual}

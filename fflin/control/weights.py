@@ -1,20 +1,17 @@
 """Weights of a quadratic cost: from matrices, diagonals, numbers and names."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from fflin.analysis.gramians import held_cost
 from fflin.base.errors import InputError
-from fflin.base.names import by_name, input_keys, matching, stands_for_any
+from fflin.base.names import by_name, input_keys, matching
 from fflin.base.validation import Array, dimension, number, vector
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from fflin.linear.model import LinearModel
+from fflin.linear.linear_trajectory import LinearTrajectory
+from fflin.linear.model import LinearModel
 
 Weight: TypeAlias = "ArrayLike | Mapping[str, float]"
 
@@ -86,29 +83,6 @@ def is_input(kind: str, key: str, lin: LinearModel) -> bool:
     return sides.pop()
 
 
-def weights_by_name(
-    lin: LinearModel, given: Mapping[str, Any], *, of_robot: bool
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Return weights on states and on inputs of the parts "q", "r" and "bryson".
-
-    Of a robot's own weights, what a reduced model has not is left out.
-    """
-    parts = {part: dict(given.get(part, {})) for part in ("q", "r", "bryson")}
-    if of_robot:
-        names = (*lin.state_names, *input_keys(lin))
-        parts = {
-            part: {key: x for key, x in values.items() if stands_for_any(key, names)}
-            for part, values in parts.items()
-        }
-    q, r = parts["q"], parts["r"]
-    for name, size in parts["bryson"].items():
-        side = r if is_input("state or input", name, lin) else q
-        if name in side:
-            raise InputError(f"'{name}' has a weight and a largest value; give either")
-        side[name] = inverse_square(f"largest value of '{name}' (--bryson)", size)
-    return q, r
-
-
 def inverse_square(what: str, size: float) -> float:
     """Return 1/size^2, or raise `InputError` where that is no positive number."""
     if size <= 0.0:
@@ -119,31 +93,7 @@ def inverse_square(what: str, size: float) -> float:
 
 
 def weight(what: str, value: Weight, names: Sequence[str], *, definite: bool = False) -> Array:
-    """Return a weight as a symmetric matrix.
-
-    Parameters
-    ----------
-    what : str
-        What to call it in an error.
-    value : array_like (k, k) or (k,), float, or mapping
-        The matrix, its diagonal, a number for the whole diagonal, or {name: number} with the
-        names of entries, their groups, or patterns such as ``q_m.hinge_*``.
-    names : sequence of str (k,)
-    definite : bool
-        Whether every direction must cost something; else none may be negative.
-
-    Returns
-    -------
-    ndarray (k, k)
-
-    Raises
-    ------
-    InputError
-        If a size or value is wrong, or the matrix is not symmetric or not positive
-        (semi)definite.
-    UnknownNameError
-        If a name does not exist.
-    """
+    """Return a weight (k, k) of a matrix, a diagonal, a number, or {name or pattern: number}."""
     size = len(names)
     if isinstance(value, Mapping):
         diagonal = _diagonal(what, value, names, complete=definite)
@@ -174,26 +124,26 @@ def columns(what: str, value: ArrayLike, rows: int) -> Array:
     return cross_weight(what, value, rows, shape[1])
 
 
-def require_semidefinite(what: str, matrix: Array, names: Sequence[str]) -> None:
+def require_semidefinite(
+    what: str, matrix: Array, names: Sequence[str], definite: bool = False
+) -> None:
     """Raise `InputError` with the lowest eigenvalue where a symmetric matrix is not so."""
-    size = np.abs(matrix).max(initial=0.0)
     values, directions = np.linalg.eigh(matrix)
-    if values[0] < -_ROUNDING * size:
+    if definite or values[0] < -_ROUNDING * np.abs(matrix).max(initial=0.0):
         where = names[int(np.abs(directions[:, 0]).argmax())]
-        raise _negative(what, float(values[0]), where, definite=False)
+        raise _negative(what, float(values[0]), where, definite)
 
 
 def cost_weights(
-    lin: LinearModel, Q: Weight, R: Weight, N: ArrayLike | None
+    of: LinearModel | LinearTrajectory, Q: Weight, R: Weight, N: ArrayLike | None
 ) -> tuple[Array, Array, Array | None]:
     """Return the weights as matrices, checked."""
-    nx, nu = lin.B.shape
-    Q = weight("Q", Q, lin.state_names)
-    R = weight("R", R, input_keys(lin), definite=True)
+    Q = weight("Q", Q, of.state_names)
+    R = weight("R", R, input_keys(of), definite=True)
     if N is None:
         return Q, R, None
-    cross = cross_weight("N", N, nx, nu)
-    require_semidefinite("Q - N R^-1 N'", Q - cross @ np.linalg.solve(R, cross.T), lin.state_names)
+    cross = cross_weight("N", N, len(Q), len(R))
+    require_semidefinite("Q - N R^-1 N'", Q - cross @ np.linalg.solve(R, cross.T), of.state_names)
     return Q, R, cross
 
 
@@ -209,13 +159,9 @@ def _checked_matrix(what: str, value: Any, names: Sequence[str], definite: bool)
         )
     matrix = 0.5 * (matrix + matrix.T)
     try:
-        np.linalg.cholesky(matrix)
+        np.linalg.cholesky(matrix)  # quicker than eigenvalues
     except np.linalg.LinAlgError:
-        if definite:
-            values, directions = np.linalg.eigh(matrix)
-            where = names[int(np.abs(directions[:, 0]).argmax())]
-            raise _negative(what, float(values[0]), where, definite) from None
-        require_semidefinite(what, matrix, names)
+        require_semidefinite(what, matrix, names, definite)
     return matrix
 
 
@@ -225,13 +171,68 @@ def named_weights(what: str, values: Mapping[str, float], names: Sequence[str]) 
     return by_name(what, checked, names)
 
 
-def reweighed(what: str, matrix: Array, values: Mapping[str, float], names: Sequence[str]) -> Array:
-    """Return a weight (k, k) in which what is named has a weight of its own, coupled to nothing."""
-    matrix = matrix.copy()
-    for index, value in named_weights(what, values, names).items():
-        matrix[index], matrix[:, index] = 0.0, 0.0
-        matrix[index, index] = value
-    return matrix
+class SampledCost(NamedTuple):
+    """Weights of a sum over samples: ``lqr(lin.discretize(dt), *cost)``."""
+
+    Q: Array
+    R: Array
+    N: Array
+
+
+def sampled_cost(
+    lin: LinearModel, dt: float, Q: Weight, R: Weight, N: ArrayLike | None = None
+) -> SampledCost:
+    r"""Return the sum over samples that equals an integral cost under held inputs.
+
+    Equation (10.1) of docs/derivation.md:
+
+    .. math:: \begin{bmatrix} Q_d & N_d \\ N_d^T & R_d \end{bmatrix} = \int_0^h e^{F^T t}
+              \begin{bmatrix} Q & N \\ N^T & R \end{bmatrix} e^{F t}\,dt,\qquad
+              F = \begin{bmatrix} A & B \\ 0 & 0 \end{bmatrix}
+
+    At rest F^3 = 0, and the integral is a polynomial in h, exact; elsewhere it is that of a
+    short step (van Loan), doubled.
+
+    Parameters
+    ----------
+    lin : LinearModel
+        Continuous.
+    dt : float
+        Sampling time h [s].
+    Q, R : see `lqr`
+    N : array_like (nx, nu), optional
+
+    Returns
+    -------
+    SampledCost
+        (Q, R, N) as `lqr` takes them.
+
+    Raises
+    ------
+    InputError
+        If the model is sampled already, `dt` is not positive, or a weight is not one of `lqr`.
+
+    References
+    ----------
+    C. F. van Loan, Computing integrals involving the matrix exponential, IEEE Trans. Automatic
+    Control 23(3), 1978.
+    """
+    if not isinstance(lin, LinearModel) or lin.dt:
+        raise InputError("lin must be a continuous LinearModel; give the one before discretize")
+    h = number("dt", dt)
+    if h <= 0.0:
+        raise InputError(f"dt is {h:g} s, expected a positive sampling time")
+    Q, R, cross = cost_weights(lin, Q, R, N)
+    nx, nu = lin.B.shape
+    F, W = np.zeros((2, nx + nu, nx + nu))
+    W[:nx, :nx], W[nx:, nx:] = Q, R
+    F[:nx, :nx], F[:nx, nx:] = lin.A, lin.B
+    if cross is not None:
+        W[:nx, nx:], W[nx:, :nx] = cross, cross.T
+    total = held_cost(F, W, h)
+    if not np.isfinite(total).all():
+        raise InputError(f"dt is {h:g} s, over which the model overflows")
+    return SampledCost(total[:nx, :nx], total[nx:, nx:], total[:nx, nx:])
 
 
 def _diagonal(

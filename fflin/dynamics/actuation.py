@@ -5,20 +5,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
+import fflin.robot.inputs as kinds
 from fflin.base.errors import InputError
 from fflin.base.rotation import rotation_matrices
 from fflin.base.validation import Array
 from fflin.dynamics.chart import Chart
-from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.state import StateMap
 from fflin.robot.frames import find_frame
-from fflin.robot.inputs import (
-    BaseForce,
-    BaseTorque,
-    JointTorque,
-    ReactionWheel,
-    WrenchInput,
-    named_inputs,
-)
 
 _LOCAL = pin.ReferenceFrame.LOCAL
 
@@ -36,49 +30,45 @@ class Actuation:
     def __init__(self, state: StateMap) -> None:
         robot, nv = state.robot, 6 + state.robot.n
         self._state, self._model = state, robot.model
-        names: list[str] = []
-        units: list[str] = []
-        kinds: list[str] = []
+        signals: list[tuple[str, str, str]] = []
         columns: list[Array] = []
         held: list[Held] = []
         # Thrusters and wheels that are no joints, by the Pinocchio joint that carries them:
         # (input, wrench (6,) of a unit in its frame).
         carried: dict[int, list[tuple[int, Array]]] = {}
         identity = np.eye(nv)
-        for item, own in named_inputs(robot.inputs):
-            at = len(names)
-            names += own
-            kind, unit = item.GROUP, item.UNIT
-            if isinstance(item, BaseTorque | BaseForce):
-                torque = isinstance(item, BaseTorque)
+        for item, own in kinds.named_inputs(robot.inputs):
+            at, unit = len(columns), item.UNIT
+            if isinstance(item, kinds.BaseTorque | kinds.BaseForce):
+                torque = isinstance(item, kinds.BaseTorque)
                 rows = ANGULAR if torque else LINEAR
                 columns += list(identity[rows])
                 if state.axes[0 if torque else 1]:
                     held.append(Held(slice(at, at + 3), rows))
-            elif isinstance(item, JointTorque):
+            elif isinstance(item, kinds.JointTorque):
                 index = robot.joints.index(robot.joint(item.joint))
                 unit = robot.joints[index].force_unit
                 columns.append(identity[6 + index])
-            elif isinstance(item, ReactionWheel) and item.inertia:
+            elif isinstance(item, kinds.ReactionWheel) and item.inertia:
                 columns.append(identity[6 + robot.joint_names.index(own[0])])
             else:
-                assert isinstance(item, WrenchInput)
+                assert isinstance(item, kinds.WrenchInput)
                 joint, placement = find_frame(robot.model, item.frame)
                 wrench = np.array(placement.act(pin.Force(item.wrench)).vector)
                 carried.setdefault(joint, []).append((at, wrench))
                 columns.append(np.zeros(nv))
-            units += [unit] * (len(names) - at)
-            kinds += [kind] * (len(names) - at)
+            signals += [(name, unit, item.GROUP) for name in own]
+        names, units, groups = (tuple(signal[i] for signal in signals) for i in range(3))
         twice = [name for index, name in enumerate(names) if name in names[:index]]
         if twice:
             raise InputError(f"two inputs are named '{twice[0]}'; give one of them another name")
         # As a model calls them too.
-        self.names = self.input_names = tuple(names)
-        self.units = self.input_units = tuple(units)
-        # {kind: indices}: tau_b, F_b, tau_m, thrust, wheel, in order of appearance.
+        self.names = self.input_names = names
+        self.units = self.input_units = units
+        # {group: indices}: tau_b, F_b, tau_m, thrust, wheel, in order of appearance.
         self.groups = {
-            kind: np.flatnonzero([kind == other for other in kinds])
-            for kind in dict.fromkeys(kinds)
+            group: np.flatnonzero([group == other for other in groups])
+            for group in dict.fromkeys(groups)
         }
         # What the frame holds in reference axes.
         self.held, self._held = tuple(held), tuple(vector.columns for vector in held)
@@ -95,10 +85,7 @@ class Actuation:
         self._of_carried = [at for items in carried.values() for at, _ in items]
 
     def columns(self, data: pin.Data, q: Array) -> Array:
-        """Return B_u (6 + n, nu), the generalised force in base axes of a unit of each input (6.1).
-
-        Inputs that are held in reference axes are counted as if they were held in base axes.
-        """
+        """Return B_u (6 + n, nu), the force in base axes of a unit of each input (6.1)."""
         if not self.carried:
             return self.fixed
         columns = self.fixed.copy()
@@ -114,8 +101,7 @@ class Actuation:
         """Return u (.., nu) with what is held in reference axes in base axes."""
         if not self._held:
             return u
-        in_base: Array = chart.to_base(self._held, u[..., None])[..., 0]
-        return in_base
+        return chart.to_base(self._held, u[..., None])[..., 0]
 
     def rows_in_base_axes(self, q: Array, u: Array) -> Array:
         """Return rows u (N, nu) in base axes at valid configurations (N, nq), at any turn."""
@@ -129,10 +115,7 @@ class Actuation:
         return chart.to_reference(self._held, by_u.mT, out=None if out is None else out.mT).mT
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
-        """Return the wrench of thrusters and wheels on every joint, in its frame, if there is any.
-
-        It is constant there. Wheels that are joints, and stored momentum, have no part in it.
-        """
+        """Return the wrench of thrusters and wheels on every joint, in its frame, if any."""
         if not self.carried:
             return None
         external = pin.StdVec_Force(self._model.njoints, pin.Force.Zero())

@@ -1,13 +1,30 @@
-"""Names and units of the state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m) and of its forces.
+"""Names, units and axes of the state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m) and its forces."""
 
-The units of the inputs stand in `fflin.robot.inputs`, those of the outputs that are no states in
-`fflin.robot.outputs`, those of a joint in `fflin.robot.joints`; all else is SI.
-"""
+from typing import Literal, NamedTuple, get_args
 
-from typing import NamedTuple
-
+from fflin.base.errors import InputError
 from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.robot import Robot
+
+Frame = Literal["hybrid", "local", "world"]
+
+# Which base velocities (omega_b, v_b), and wrenches (tau_b, F_b) with them, stand in the axes
+# of the reference instead of the base's.
+IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
+    "hybrid": (False, True),
+    "local": (False, False),
+    "world": (True, True),
+}
+
+# Rows of the base's angular and linear part in any (6 + n) velocity or wrench of state order,
+ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
+# and in Pinocchio's v and spatial vectors.
+PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
+
+
+def unknown_frame(frame: object) -> InputError:
+    """Build the error for what is no frame of velocities."""
+    return InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
 
 
 class Groups(NamedTuple):

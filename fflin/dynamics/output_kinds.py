@@ -1,8 +1,4 @@
-"""What each kind of output measures: its value, and its exact derivatives.
-
-Two routes that share nothing: the derivatives, with respect to q, v and dv/dt, come of Pinocchio's
-and make C and D; the values come out of elementary kinematics in the world and check them.
-"""
+"""What each kind of output measures: its value, and by a route apart its derivatives."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeAlias
@@ -13,7 +9,7 @@ import pinocchio as pin
 import fflin.robot.outputs as kinds
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.state import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.names import PIN_ANGULAR, PIN_LINEAR
 from fflin.robot.frames import Carried
 
 _LOCAL = pin.ReferenceFrame.LOCAL
@@ -137,12 +133,10 @@ def _frame_pose(world: World, before: Sequence[Array], frame: Carried) -> Array:
 
 
 def _frame_velocity_slopes(at: Point, to: Sensed, frame: Carried) -> None:
+    _gyroscope_slopes(at, to.part(slice(0, 3)), frame)
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     velocity = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL)
     R = at.R.dot(at.placement(frame).rotation)
-    to.y[:3] = velocity.angular
-    to.by_q[:3] = by_q[PIN_ANGULAR]
-    to.by_v[:3] = jacobian[PIN_ANGULAR]
     # A velocity held in axes that turn turns with them: the frame's, and the base's.
     to.y[3:] = R.dot(velocity.linear) + at.R.dot(at.v_b)
     to.by_q[3:] = R.dot(by_q[PIN_LINEAR] - skew(velocity.linear).dot(jacobian[PIN_ANGULAR]))

@@ -8,8 +8,9 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
+from fflin.dynamics.names import PIN_ANGULAR, PIN_LINEAR
 from fflin.dynamics.output_kinds import KINDS, Point, Sensed, Slopes, World
-from fflin.dynamics.state import PIN_ANGULAR, PIN_LINEAR, StateMap
+from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT, Carried, find_frame
 from fflin.robot.joints import by_joint
 from fflin.robot.outputs import BasePose, FullState, JointOutput, JointPositions, Output
@@ -19,17 +20,12 @@ _STANDING: tuple[Array, Array] = (np.eye(3), np.zeros(3))
 
 
 class Sensing:
-    r"""The outputs of a robot, prepared.
+    """The outputs of a robot, prepared; with `own_reference` relative to the base itself."""
 
-    Neither where the base is nor how fast it moves along changes what happens on the robot
-    (Galilei). So Pinocchio is asked about the robot with its base at the origin, in its own axes,
-    and without the velocity v_b of its origin; rotation, position and velocity of the base are
-    put on afterwards, and an orbit costs no digits. Of the base's acceleration only
-    :math:`\dot v_b + \omega_b \times v_b - g`, in base axes, is felt.
-
-    With `own_reference` the reference is the base's own placement at each point, not that of the
-    state. What is no output, or twice there, is an `InputError`.
-    """
+    # Neither where the base is nor how fast it moves along changes what happens on the robot
+    # (Galilei). So Pinocchio is asked about the robot with its base at the origin, in its own axes,
+    # and without the velocity v_b of its origin; these are put on afterwards, and an orbit costs no
+    # digits. Of the base's acceleration only dv_b/dt + omega_b x v_b - g, in base axes, is felt.
 
     def __init__(
         self, state: StateMap, outputs: Sequence[Output], *, own_reference: bool = False
@@ -64,11 +60,8 @@ class Sensing:
         self.needs_acceleration = any(output.FEELS_ACCELERATION for output in outputs)
 
     def evaluate(self, data: pin.Data, q: Array, v: Array, a: Array) -> Sensed:
-        """Return the outputs and their derivatives at valid q (nq,) and v (nv,).
-
-        What `data` held is lost. The acceleration a (nv,), as pin.aba returns it with gravity's
-        part, is not looked at where `needs_acceleration` is false.
-        """
+        """Return the outputs and their derivatives at valid q (nq,) and v (nv,)."""
+        # What `data` held is lost; a counts where `needs_acceleration` alone.
         ny, nv = len(self.names), len(v)
         by_a = np.zeros((ny, nv)) if self.needs_acceleration else None
         sensed = Sensed(np.zeros(ny), np.zeros((ny, nv)), np.zeros((ny, nv)), by_a)
@@ -106,11 +99,7 @@ class Sensing:
 
 
 class Measuring:
-    """The outputs y of the nonlinear robot, out of elementary kinematics in the world.
-
-    The route by which C and D are checked, and nothing of the one by which they are made. Rotation
-    vectors are counted from the point q (nq,).
-    """
+    """The outputs y by elementary kinematics, to check C and D; turns are counted from q."""
 
     def __init__(self, state: StateMap, q: Array) -> None:
         self.state = state

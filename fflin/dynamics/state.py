@@ -2,44 +2,19 @@
 
 from copy import copy
 from itertools import compress
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import pinocchio as pin
 
+from fflin.base import rotation as turning
 from fflin.base.errors import ChartError, InputError
-from fflin.base.rotation import (
-    conjugate,
-    product_matrix,
-    quaternion_product,
-    rotation_matrices,
-    rotation_matrix,
-)
 from fflin.base.validation import Array, placement, vector
+from fflin.dynamics import names
 from fflin.dynamics.chart import SMALLEST_Q0, Chart
-from fflin.dynamics.names import groups_of, states_of
+from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR, Frame
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
-
-Frame = Literal["hybrid", "local", "world"]
-
-# Which base velocities (omega_b, v_b), and wrenches (tau_b, F_b) with them, stand in the axes
-# of the reference instead of the base's.
-IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
-    "hybrid": (False, True),
-    "local": (False, False),
-    "world": (True, True),
-}
-
-# Rows of the base's angular and linear part in any (6 + n) velocity or wrench of state order,
-ANGULAR, LINEAR = slice(0, 3), slice(3, 6)
-# and in Pinocchio's v and spatial vectors.
-PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
-
-
-def unknown_frame(frame: object) -> InputError:
-    """Build the error for what is no frame of velocities."""
-    return InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
 
 
 class StateMap:
@@ -96,17 +71,15 @@ class StateMap:
                 f"robot is a {type(robot).__name__}, expected a fflin.Robot; fflin.load makes one"
             )
         if not isinstance(frame, str) or frame not in get_args(Frame):
-            raise unknown_frame(frame)
+            raise names.unknown_frame(frame)
         robot.require_unchanged()
-        n = robot.n
-        self.robot = robot
+        n, self.robot = robot.n, robot
         self.frame: Frame = frame
         self.axes = IN_REFERENCE_AXES[frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
         self.nx = 12 + 2 * n
-        self.groups = groups_of(n)
-        states = states_of(robot)
-        self.names, self.units = tuple(states), tuple(states.values())
+        self.groups = names.groups_of(n)
+        self.names, self.units = zip(*names.states_of(robot).items(), strict=True)
         joints = robot.joints
         # Index in Pinocchio's v of each velocity of the state, and in a flat (nv, nv) array.
         self._order = np.array([3, 4, 5, 0, 1, 2, *(j.idx_v for j in joints)], dtype=np.intp)
@@ -138,7 +111,7 @@ class StateMap:
         # their entries survive to the last digit near a turn of pi.
         offset = pin.SE3ToXYZQUAT(oMref.actInv(self.robot.model.jointPlacements[ROOT]))
         self._position, self.origin_quaternion = offset[:3], offset[3:]
-        self._rotation = rotation_matrix(self.origin_quaternion)
+        self._rotation = turning.rotation_matrix(self.origin_quaternion)
         self._aligned = bool((self._rotation == np.eye(3)).all())
 
     @property
@@ -159,16 +132,15 @@ class StateMap:
         ChartError
             If the base is turned by pi from the reference.
         """
-        quaternion = quaternion_product(self.origin_quaternion, q[3:7])
-        if quaternion[3] < 0.0:
-            quaternion = -quaternion
+        quaternion = turning.quaternion_product(self.origin_quaternion, q[3:7])
+        quaternion = -quaternion if quaternion[3] < 0.0 else quaternion
         q0 = float(quaternion[3])
         if q0 < SMALLEST_Q0:
             raise ChartError(
                 "the base is turned by 180 deg from the reference, where the attitude chart "
                 "(quaternion vector part) is singular; give a reference nearer to the base"
             )
-        return Chart(quaternion[:3], q0, rotation_matrix(quaternion))
+        return Chart(quaternion[:3], q0, turning.rotation_matrix(quaternion))
 
     def rotation(self, q: Array) -> Array:
         """Return refMb.rotation (3, 3) at a valid configuration, at any turn."""
@@ -177,11 +149,11 @@ class StateMap:
 
     def gravity(self, q: Array) -> Array:
         """Return the robot's gravity (3,) [m/s^2] in base axes at a valid configuration."""
-        return rotation_matrix(q[3:7]).T @ self._gravity if self._falls else self._gravity
+        return turning.rotation_matrix(q[3:7]).T @ self._gravity if self._falls else self._gravity
 
     def scalar(self, q: Array) -> float:
         """Return q0 at a valid configuration, with the sign of the quaternion in q."""
-        return float(quaternion_product(self.origin_quaternion, q[3:7])[3])
+        return float(turning.quaternion_product(self.origin_quaternion, q[3:7])[3])
 
     def to_state(self, q: Array, v: Array, *, near: Array | None = None) -> Array:
         """Convert a Pinocchio configuration and velocity to a state.
@@ -261,10 +233,10 @@ class StateMap:
                 "is turned by 180 deg from the reference, where the attitude chart is singular"
             )
         relative = np.concatenate((x[:, g.q_b], np.sqrt(square)), axis=1)
-        chart = Chart(relative[:, :3], relative[:, 3:], rotation_matrices(relative))
+        chart = Chart(relative[:, :3], relative[:, 3:], turning.rotation_matrices(relative))
         q = np.empty((len(x), self.robot.nq))
         q[:, :3] = (x[:, g.r_b] - self._position) @ self._rotation
-        turned = relative @ product_matrix(conjugate(self.origin_quaternion)).T
+        turned = relative @ turning.product_matrix(turning.conjugate(self.origin_quaternion)).T
         q[:, 3:7] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
         angles = x[:, g.q_m]
         q[:, self._idx_q] = angles

@@ -1,7 +1,5 @@
 """The states of a whole motion at once, linear feedback of a state, and errors from a motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import compress
 from typing import Any, TypeAlias
@@ -9,16 +7,11 @@ from typing import Any, TypeAlias
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.rotation import (
-    conjugate,
-    product_matrix,
-    quaternion_product,
-    rotation_matrices,
-    rotation_matrix,
-)
+from fflin.base import rotation as turning
 from fflin.base.validation import Array
 from fflin.dynamics.chart import Chart
-from fflin.dynamics.state import ANGULAR, IN_REFERENCE_AXES, LINEAR, StateMap
+from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR
+from fflin.dynamics.state import StateMap
 
 Readout: TypeAlias = Callable[[Array, Array], Array]
 
@@ -27,25 +20,19 @@ _TURN = 2.0 * np.pi
 
 
 def states_of(state: StateMap, q: Array, nu: Array) -> Array:
-    """Return the states (N, nx) of rows of valid q (N, nq) and nu (N, 6 + n) in base axes.
-
-    Continuous joints are in (-pi, pi]; a turn of pi gives one of its two values.
-    """
-    quaternion = q[:, 3:7] @ product_matrix(state.origin_quaternion).T
+    """Return the states (N, nx) of rows of valid q (N, nq) and nu (N, 6 + n) in base axes."""
+    quaternion = q[:, 3:7] @ turning.product_matrix(state.origin_quaternion).T
     quaternion *= np.where(quaternion[:, 3:] < 0.0, -1.0, 1.0)
-    chart = Chart(quaternion[:, :3], quaternion[:, 3:], rotation_matrices(quaternion))
+    chart = Chart(quaternion[:, :3], quaternion[:, 3:], turning.rotation_matrices(quaternion))
     return state.compose(chart, state.positions(q), state.joint_positions(q), nu)
 
 
 def state_history(
     state: StateMap, q: Array, v: Array, near: Array | None = None, t: Array | None = None
 ) -> Array:
-    """Return the states (N, nx) of a motion, rows of valid q (N, nq) and v (N, nv).
-
-    Continuous joints go on counting turns, from the turn nearest to `near` (nx,); with the times t
-    (N,) as many as their rates make between rows, else less than half of one. A turn of pi, where
-    the chart ends, gives one of its two values.
-    """
+    """Return the states (N, nx) of a motion; continuous joints count turns, from `near` on."""
+    # With the times t (N,) as many turns as the rates make between rows, else less than half of
+    # one.
     rates = state.velocities(v)
     x = states_of(state, q, rates)
     q_m = x[:, state.groups.q_m]
@@ -74,12 +61,9 @@ def attitude_errors(x: Array, target: Array) -> Array:
 
 
 def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:
-    """Return f(q, v) = offset - K x(q, v) (m,), x being the state of valid q and v.
-
-    The attitude is linear in the quaternion, the place in the base's, and velocities in reference
-    axes in R v: one product with all these gives f. That takes a fifth of the time of the state.
-    The angle of each continuous joint is taken on the turn nearest to the state `near` (nx,).
-    """
+    """Return f(q, v) = offset - K x(q, v) (m,), with joints on the turn nearest to `near`."""
+    # The attitude is linear in the quaternion, the place in the base's, and velocities in reference
+    # axes in R v: one product with all these gives f, in a fifth of the time of the state.
     robot, g = state.robot, state.groups
     idx_q = np.array([joint.idx_q for joint in robot.joints], dtype=np.intp)
     circling, cos = state.unbounded, idx_q[state.unbounded]
@@ -90,7 +74,7 @@ def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:
     of_q, of_v, of_angles, of_angular, of_linear, constant = np.split(gains, ends, axis=1)
     at = state.origin
     of_q[:, :3] = -K[:, g.r_b] @ at.rotation
-    turn = product_matrix(state.origin_quaternion)
+    turn = turning.product_matrix(state.origin_quaternion)
     of_q[:, 3:7] = -K[:, g.q_b] @ turn[:3]
     constant[:, 0] = offset - K[:, g.r_b] @ at.translation
     of_q_m = -K[:, g.q_m]
@@ -124,8 +108,7 @@ def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:
             z_linear[:] = R.dot(v[:3])
             if turned_angular:
                 z_angular[:] = R.dot(v[3:6])
-        result: Array = gains.dot(z)
-        return result
+        return gains.dot(z)
 
     return f
 
@@ -162,7 +145,7 @@ def moved_by(frame: str, target: Array, e: Array) -> Array:
 def _turned(x: Array) -> tuple[Array, Array]:
     """Return the scalar part (N, 1) of the attitude of states, not negative, and the rotation."""
     scalar = np.sqrt(1.0 - (x[:, :3] ** 2).sum(axis=1, keepdims=True))
-    return scalar, rotation_matrices(np.hstack((x[:, :3], scalar)))
+    return scalar, turning.rotation_matrices(np.hstack((x[:, :3], scalar)))
 
 
 def _in_reference(frame: str, nx: int) -> list[Any]:
@@ -175,9 +158,9 @@ def moving_error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Arr
     """Return the error (nx,) from a moving reference, in its axes."""
     g = state.groups
     e = np.empty(state.nx)
-    turned = quaternion_product(conjugate(q_star[3:7]), q[3:7])
+    turned = turning.quaternion_product(turning.conjugate(q_star[3:7]), q[3:7])
     e[g.q_b] = turned[:3] if turned[3] >= 0.0 else -turned[:3]
-    e[g.r_b] = rotation_matrix(q_star[3:7]).T @ (q[:3] - q_star[:3])
+    e[g.r_b] = turning.rotation_matrix(q_star[3:7]).T @ (q[:3] - q_star[:3])
     apart = pin.difference(state.robot.model, q_star, q)
     e[g.q_m] = state.velocities(apart)[6:]
     e[-6 - state.robot.n :] = state.velocities(v - v_star)

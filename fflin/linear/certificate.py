@@ -13,7 +13,8 @@ from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.inertia import Inertia
-from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.state import StateMap
 from fflin.linear.model import Certificate, LinearModel
 from fflin.robot.robot import Robot
 

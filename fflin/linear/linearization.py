@@ -15,8 +15,9 @@ from fflin.base.frozen import frozen
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, vector
 from fflin.dynamics.chart import Chart, Standing
+from fflin.dynamics.names import ANGULAR, LINEAR
 from fflin.dynamics.rnea import Accelerations, Rates
-from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap
+from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
 from fflin.linear.prepared import prepare

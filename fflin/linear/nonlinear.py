@@ -11,7 +11,8 @@ from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.chart import Chart, times
-from fflin.dynamics.state import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR, StateMap
+from fflin.dynamics.names import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moving_errors, state_history
 from fflin.linear.certificate import mobilities
 from fflin.linear.model import LinearModel

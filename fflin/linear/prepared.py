@@ -15,7 +15,8 @@ from fflin.base.frozen import frozen
 from fflin.base.validation import Array, truth
 from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import Frame, StateMap, unknown_frame
+from fflin.dynamics.names import unknown_frame
+from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.certificate import certify, inertia_matrix
 from fflin.linear.ignorable import ignorable_states
 from fflin.linear.state_equations import at_rest

@@ -11,8 +11,9 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Chart, times
+from fflin.dynamics.names import ANGULAR, LINEAR
 from fflin.dynamics.rnea import Rates
-from fflin.dynamics.state import ANGULAR, LINEAR, StateMap
+from fflin.dynamics.state import StateMap
 
 
 def at_rest(state: StateMap) -> Array:

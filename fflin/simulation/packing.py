@@ -11,8 +11,7 @@ from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array
 from fflin.control.output_feedback import OutputFeedback, measured_states
 from fflin.control.policies import StateFeedback
-from fflin.control.pulses import Pulses
-from fflin.control.saturation import Wheels
+from fflin.control.saturation import Pulses, Wheels
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.kernel import channel, course, forward, laws, loop, tracking
 from fflin.kernel.accelerations import layout_of, loads_of

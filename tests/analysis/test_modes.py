@@ -9,7 +9,6 @@ from scipy.linalg import eigh
 from scipy.optimize import linear_sum_assignment
 
 import fflin
-from fflin.analysis.modes import modes_report
 from fflin.commands import cli
 from fflin.commands.model_text import model_report
 from tests.support.robots import BUNDLED, FRAMES, random_point, random_pose
@@ -254,7 +253,7 @@ def test_null_space_thrust_on_moving_links_is_seen_to_be_unstable(capsys):
     mine = np.array([mode.pole for mode in found.unstable])
     assert matched(np.concatenate((mine, mine[mine.imag > 0].conj())), growing) < 1e-8
     assert found.residual < 1e-12
-    for text in (model_report(lin), modes_report(found), str(found)):
+    for text in (model_report(lin), str(found)):
         assert "unstable: poles with a positive real part" in text
         for mode in found.unstable:
             assert f"{mode.pole:.5g}" in " ".join(text.split())

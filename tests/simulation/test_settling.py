@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.control.bounded import thrusters_push_every_way
+from fflin.control.policies import thrusters_push_every_way
 from fflin.simulation.settling import time_to_settle
 
 

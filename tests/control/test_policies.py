@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog, lsq_linear
 
-from fflin.control.bounded import nearest, pushes_every_way
+from fflin.control.policies import nearest, pushes_every_way
 
 
 @pytest.mark.parametrize("seed", range(40))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fflin
-from fflin.control.loops import input_loops
+from fflin.control.margins import input_loops
 from tests.support.weights import unit_weights
 
 

@@ -1,0 +1,117 @@
+"""The weights that a regulator gets by a rule, and by name."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fflin.analysis.ranks import Noisy, null_space
+from fflin.analysis.wheels import ignorable_wheels, picked, regulated_part, rigid_forces, without
+from fflin.base.errors import InputError, listed, unknown
+from fflin.base.names import input_keys, stands_for_any
+from fflin.base.validation import Array
+from fflin.control.default_weights import AT_A_POINT, BANDWIDTH, Pace, default_weights
+from fflin.control.weights import inverse_square, is_input, named_weights, sampled_cost
+from fflin.linear.model import LinearModel
+
+# Along a trajectory errors are a tenth of these, and are to be gone within it: so many time
+# constants are to fit in, of a loop that is no slower than at a point, nor faster than this. Under
+# a hold it may use more of it, since the regulator of the samples themselves is exact.
+_BESIDE, _CONSTANTS, _FASTEST, _HELD_ALONG = 0.1, 15.0, 1.5, 1.0
+
+# The speeds of wheels come back at this share of the bandwidth.
+_SPEEDS = 0.1
+
+
+def pace_along(duration: float, hold: float) -> Pace:
+    """Return the pace of a loop along a trajectory of that duration [s]."""
+    return Pace(min(max(_CONSTANTS / duration, BANDWIDTH), _FASTEST), _BESIDE, hold, _HELD_ALONG)
+
+
+def rule_weights(
+    lin: LinearModel,
+    name: str | None,
+    given: Mapping[str, Any] | None = None,
+    *,
+    wheel_speeds: bool | None = None,
+    pace: Pace = AT_A_POINT,
+) -> tuple[Array, Array, Array | None, str]:
+    """Return Q, R and N of a model by a rule, changed by `given` weights, and the rule in words."""
+    # The cost of a sampled model is the continuous one under the hold, where it is known what it
+    # was sampled from. The rule is by default what the robot has in its `weights`, else "urdf".
+    source = lin.generator or lin
+    layers = [(given, False)] if given else []
+    if name is None and lin.weights:
+        layers.insert(0, (lin.weights, True))
+        name = lin.weights.get("rule")
+    if name is None or name == "urdf":
+        Q, R, rule = _of_regulated(source, pace._replace(hold=lin.dt or pace.hold), wheel_speeds)
+    elif name == "identity":
+        nx, nu = lin.B.shape
+        Q, R, rule = np.eye(nx), np.eye(nu), "identity: 1 on every state and every input"
+    else:
+        raise unknown("rule of weights", name, ("urdf", "identity"))
+    named: dict[str, None] = {}
+    for layer, of_robot in layers:
+        Q, R, names = _reweighed(lin, Q, R, layer, of_robot)
+        named |= dict.fromkeys(names)
+    if named:
+        rule = f"{', '.join(named)} as given, the others {rule}"
+    if source.dt == lin.dt:
+        return Q, R, None, rule
+    return (*sampled_cost(source, lin.dt, Q, R), rule)
+
+
+def _of_regulated(
+    lin: LinearModel, pace: Pace, wheel_speeds: bool | None
+) -> tuple[Array, Array, str]:
+    """Return Q (nx, nx), R and the rule of what is regulated of a model that may have wheels."""
+    part = regulated_part(lin, wheel_speeds)
+    if part is lin:
+        return default_weights(lin, pace)[:3]
+    wheels, _ = ignorable_wheels(lin)
+    body = regulated_part(without(lin, wheels))
+    at = wheels[[lin.state_names[i + len(lin.M)] in lin.limits for i in wheels]]
+    names, spin = [lin.state_names[i + len(lin.M)] for i in at], np.abs(lin.x0[at + len(lin.M)])
+    most = np.array([lin.limits[name] for name in names])
+    # A wheel that is at its limit already is counted as one at rest, and told.
+    room = np.where(spin < most, most - spin, most) / np.linalg.inv(lin.M).diagonal()[at]
+    Q, R, rule, bandwidth = default_weights(body, pace, dict(zip(names, room, strict=True)))
+    if beyond := [name for name, x, y in zip(names, spin, most, strict=True) if x >= y > 0.0]:
+        rule += f"; the point alone asks {listed(beyond)} for more than the URDF allows"
+    S = picked(body.state_names, lin.state_names)
+    Q = S.T @ Q @ S
+    if speeds := [name for name in part.state_names if name not in body.state_names]:
+        S, slow = picked(speeds, lin.state_names), _SPEEDS * bandwidth
+        # Inputs R^-1/2 Z n that turn no body change the speeds at X n.
+        root, forces = np.sqrt(R.diagonal()), rigid_forces(without(lin, wheels)).values
+        X = S @ lin.B / root @ null_space(Noisy.exact(forces / root))[0] / (lin.dt or 1.0)
+        Q += slow**2 * S.T @ np.linalg.pinv(X @ X.T, 1e-9, hermitian=True) @ S
+        rule = f"{rule}; wheel speeds at {slow:.3g} rad/s"
+    return Q, R, rule
+
+
+def _reweighed(
+    lin: LinearModel, Q: Array, R: Array, given: Mapping[str, Any], of_robot: bool
+) -> tuple[Array, Array, list[str]]:
+    """Return Q and R in which what is named has a weight of its own, and the names."""
+    parts = {part: dict(given.get(part, {})) for part in ("q", "r", "bryson")}
+    if of_robot:  # a reduced model has not all that a robot's weights name
+        names = (*lin.state_names, *input_keys(lin))
+        for part, values in parts.items():
+            parts[part] = {key: x for key, x in values.items() if stands_for_any(key, names)}
+    q, r = parts["q"], parts["r"]
+    for name, size in parts["bryson"].items():
+        side = r if is_input("state or input", name, lin) else q
+        if name in side:
+            raise InputError(f"'{name}' has a weight and a largest value; give either")
+        side[name] = inverse_square(f"largest value of '{name}' (--bryson)", size)
+    Q, R = Q.copy(), R.copy()
+    for what, matrix, values, keys in (
+        ("state", Q, q, lin.state_names),
+        ("input", R, r, input_keys(lin)),
+    ):
+        for index, value in named_weights(what, values, keys).items():
+            matrix[index], matrix[:, index] = 0.0, 0.0
+            matrix[index, index] = value
+    return Q, R, [*q, *r]
