@@ -61,11 +61,7 @@ def list_robots() -> tuple[str, ...]:
 
 
 def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
-    """Find the description of a robot by its name or by a path, relative to the folder.
-
-    A bundled name comes first, then the path of a URDF or of a robot file that exists
-    (``servicer_7dof.toml`` is a bundled one), then a name of example-robot-data.
-    """
+    """Find a robot by a bundled name, a path from the folder or a name of example-robot-data."""
     if not isinstance(robot, str | os.PathLike):
         raise InputError(f"robot is a {type(robot).__name__}, expected a name or a path")
     if isinstance(robot, str) and robot in _bundled():

@@ -242,10 +242,7 @@ def _check_root(model: pin.Model, name: str) -> None:
 def _locked(
     model: pin.Model, locks: Sequence[Lock | None], mimics: Mapping[str, Mimic]
 ) -> tuple[pin.Model, dict[str, Mimic], tuple[str, ...]]:
-    """Weld joints, and what mimics them; of several locks the last goes first.
-
-    Returns the smaller model, the mimics that are left, and "joint=value" of what was welded.
-    """
+    """Weld joints and what mimics them; return the model, the mimics left, and what was welded."""
     movable = list(model.names)[ROOT + 1 :]
 
     def movable_one(name: str) -> str:
@@ -292,10 +289,8 @@ def _listed(lock: Any) -> list[str]:
 
 
 def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
-    """Weld joints at q (nq,). Pinocchio looks frames up by name, which links and joints may share.
-
-    The joints' own frames keep their names, by which it finds them.
-    """
+    """Weld joints at q (nq,)."""
+    # Pinocchio looks frames up by name, which links and joints may share: joints keep theirs.
     names = Counter(frame.name for frame in model.frames.tolist())
     shared: dict[str, str] = {}
     for index, frame in enumerate(model.frames):

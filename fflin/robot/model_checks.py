@@ -51,10 +51,7 @@ def _of_joint(model: pin.Model, index: int) -> Iterator[str]:
 
 
 def change_in(model: pin.Model, made: pin.Model) -> str:
-    """Say what of a model that A, B and C depend on differs from what it was made as.
-
-    Frames may have been added, and limits changed; the answer is then empty.
-    """
+    """Say what A, B and C depend on and was changed; not frames added, nor limits."""
     for what, now, before in (
         ("its joints", model.names.tolist(), made.names.tolist()),
         ("the parents of its joints", model.parents.tolist(), made.parents.tolist()),

@@ -56,11 +56,7 @@ def with_wheels(
     followers: tuple[Follower, ...],
     wheels: Sequence[tuple[str, ReactionWheel]],
 ) -> tuple[pin.Model, tuple[Joint, ...], tuple[Follower, ...]]:
-    """Return a model with one more joint for each wheel, its joints in order, and its followers.
-
-    The bodies of the model, which is not changed, count the wheels. A wheel comes after all joints
-    below its carrier, so that joints stay in depth-first order, without which CRBA would be wrong.
-    """
+    """Return model, joints and followers with a joint for each wheel, whose body counts it."""
     if not wheels:
         return model, joints, followers
     carried: dict[int, list[_Mounted]] = {}
@@ -143,6 +139,7 @@ def _depth_first(
     model: pin.Model, carried: dict[int, list[_Mounted]], root: int = ROOT
 ) -> Iterator[int | tuple[int, _Mounted]]:
     """Yield the joints from a root on, and the wheels of each after all that hang on it."""
+    # Else the joints would not be in depth-first order, without which CRBA is wrong.
     yield root
     for child in model.children[root]:
         yield from _depth_first(model, carried, child)

@@ -63,11 +63,7 @@ class Conserved:
         return total
 
     def wrench(self, q: Array, push: Array) -> Array:
-        """Return the wrench (6,) about the point, in world axes, of what pushes the robot.
-
-        `push` (6,) is the wrench at the base origin in base axes, linear then angular: the sum
-        of all that acts from outside. Gravity is added.
-        """
+        """Return the wrench (6,) about the point, in world axes, of a plant's push and gravity."""
         total: Array = self._base(q).toDualActionMatrix().dot(push)
         if self._weight is not None:
             near = q.copy()
@@ -132,11 +128,7 @@ class Conserved:
         return Histories(energy, momentum, center, of_base)
 
     def momentum_drift(self, history: Histories, expected: Array) -> Array:
-        """Return how far the momentum is from what is expected (N, 6), relative (N,).
-
-        To the largest sum of what base, joints and wheels add to it; about a fixed point the
-        flight of the whole counts too.
-        """
+        """Return how far the momentum is off, relative to what base, joints and wheels add."""
         p = history.momentum[:, :3]
         flight = np.linalg.norm(history.center, axis=1) * np.linalg.norm(p, axis=1)
         shares = (history.of_base, history.momentum - history.of_base)

@@ -157,10 +157,7 @@ def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law |
 
 
 def turning(robot: Robot) -> Array:
-    """Return where angular velocities stand, less those of rotors.
-
-    A rotor may spin as fast as it will: nothing depends on its angle.
-    """
+    """Return where angular velocities stand, less those of rotors, which may be of any size."""
     rotors = rotor_names(robot)
     joints = [joint for joint in robot.joints if not joint.prismatic and joint.name not in rotors]
     return np.array([3, 4, 5, *(joint.idx_v for joint in joints)])

@@ -78,11 +78,7 @@ class Plant:
         )
 
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-        """Return dv/dt (nv,) in Pinocchio's order, and what pushes from outside.
-
-        The latter is the sum (6,) of all wrenches but gravity's at the base origin, linear then
-        angular in base axes.
-        """
+        """Return dv/dt (nv,), and the wrench (6,) on the base but gravity's, in base axes."""
         if self._faulty:
             gain, bias, until = self.drives
             u = np.where(t < until, gain * u + bias, 0.0)

@@ -24,13 +24,7 @@ _WHY_NOT = {Allocation: "an Allocation has thrusters that cannot pull, so that i
 
 
 def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryFeedback | None:
-    """Return what predicts a run: the policy's own model, or the one that is given.
-
-    Raises
-    ------
-    InputError
-        Where one is asked for that cannot.
-    """
+    """Return what predicts a run: the policy's own model, or the one that is given."""
     if isinstance(linear, np.bool_):
         linear = bool(linear)
     if linear is False:
@@ -114,19 +108,7 @@ def _law(policy: Any, lin: LinearModel) -> Callable[[], LinearLaw] | None:
 
 
 def predict(plan: Plan, x: Array, steps: int, target: Array) -> Array:
-    """Return the states (N, nx) of the linear model in closed loop; no rows where it has none.
-
-    Parameters
-    ----------
-    plan : Plan
-        Its model is continuous, or sampled with the time of the samples.
-    x : ndarray (N, nx)
-        The states of the nonlinear robot, where the first row begins.
-    steps : int
-        That are taken; the last one has a row in any case.
-    target : ndarray (N, nx)
-        The states of the trajectory that is followed, where one is.
-    """
+    """Return the states (N, nx) of the linear model in closed loop; no rows where it has none."""
     if plan.predictor is None:
         return x[:0]
     # A prediction that overflows is none.

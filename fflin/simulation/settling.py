@@ -17,11 +17,7 @@ SHORTEST, LONGEST, _LOOK = 60.0, 600.0, 0.5
 
 
 def time_to_settle(robot: Robot, policy: StateFeedback, q: Array, v: Array | None) -> float:
-    """Return the time [s] after which the linear loop stays within a hundredth of each error.
-
-    Of attitude, position and joints, as far as they are fed back; in tens of seconds, and a
-    minute where that is less, or where ten minutes are not enough.
-    """
+    """Return when [s] the linear loop stays within 1 % of each error; in tens of seconds."""
     lin = policy.lin
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     start = state.read(q, np.zeros(robot.nv) if v is None else v, near=state.read(lin.q, lin.v))

@@ -54,11 +54,7 @@ class Times(NamedTuple):
         return float((LARGEST_TURN / self.dt) ** 2)
 
     def require_room(self, width: int, *, chosen: bool) -> None:
-        """Raise `InputError` where rows of so many numbers, or the steps, are too many.
-
-        `chosen` says that the step was chosen here and not given; where the loop's fastest pole
-        asks for many steps, an `FflinWarning` says so.
-        """
+        """Refuse too many rows of so many numbers, or steps; warn of many that were `chosen`."""
         forced = chosen and self.fastest * _STEP > 1.0
         most = _ENDLESS if self.thinned else _MOST_STEPS
         if self.rows * width > _MOST_ENTRIES or self.steps > most:
@@ -145,11 +141,7 @@ def _thinning(steps: int, sample: int) -> int:
 
 
 def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> tuple[float, str]:
-    """Return the largest magnitude [1/s] of the poles of a continuous loop, and what moves there.
-
-    The state is named that takes the largest part in the mode, by the products of its left and
-    right vectors, which have no unit; only where the pole asks for a step below the usual one.
-    """
+    """Return the largest magnitude [1/s] of a continuous loop's poles, and the state that moves."""
     if follows is not None:
         return largest_rate(follows.schedule), ""
     lin, K = feedback_of(policy)

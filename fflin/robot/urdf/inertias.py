@@ -33,12 +33,7 @@ def is_impossible(mass: float, moments: Sequence[float]) -> bool:
 
 
 def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[str]:
-    """Warn of what is odd about the inertia of a link as it stands in the file, `origin`.
-
-    The principal moments of a body are positive, and none is more than the sum of the others.
-    A link that breaks the first is refused, unless the rigid body of which it is a part in the
-    model, all links that fixed joints weld together, outweighs it by far.
-    """
+    """Warn of odd inertias; refuse negative ones that the link's rigid body does not outweigh."""
     unequal, weightless, negligible = [], [], []
     for link in links:
         if link.mass is None:

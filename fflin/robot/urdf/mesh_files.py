@@ -9,11 +9,7 @@ from urllib.parse import unquote
 
 
 def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
-    """Return the file of a mesh, None where it is not there.
-
-    The uri is package://NAME/PATH, file:///PATH, an absolute path or one relative to the URDF. A
-    package is looked for in `package_dirs`, and in the folders that the URDF lies in.
-    """
+    """Return the file of package://NAME/PATH, file:///PATH or a path; None without one."""
     scheme, separator, rest = uri.partition("://")
     candidates: Iterable[Path]
     if not separator:

@@ -9,11 +9,7 @@ from fflin.robot.urdf.xml import enumerated, quoted
 
 
 def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
-    """Return {follower: Mimic of an independent joint} of all joints by name, in their order.
-
-    A joint that follows a follower follows the latter's leader: with q1 = m1 q2 + o1 and
-    q2 = m2 q3 + o2, q1 = m1 m2 q3 + m1 o2 + o1. A <mimic> in a fixed joint is passed over.
-    """
+    """Return {follower: Mimic of an independent joint}, none of fixed joints."""
     written = {name: joint.mimic for name, joint in joints.items() if joint.mimic and joint.freedom}
     resolved: dict[str, Mimic] = {}
     for name in written:
@@ -44,11 +40,7 @@ def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
 
 
 def counted_leaders(joints: dict[str, JointElement], mimics: dict[str, Mimic]) -> set[str]:
-    """Return the continuous leaders whose whole turns matter.
-
-    A turn of the leader more leaves a follower where it is only if that is continuous too and
-    makes a whole number of turns itself.
-    """
+    """Return the continuous leaders a whole turn of which moves a follower elsewhere."""
     return {
         mimic.leader
         for name, mimic in mimics.items()

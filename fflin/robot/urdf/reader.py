@@ -52,11 +52,7 @@ class Description(NamedTuple):
 
 
 def read_urdf(path: Path, prune: Sequence[str] = ()) -> Description:
-    """Read a URDF, or a xacro, as a robot that floats free.
-
-    Joints in `prune` are cut off with all that hangs on them. What is no robot is a `UrdfError`
-    that gives file, line and what to mend; a xacro without xacrodoc is a `MissingPackageError`.
-    """
+    """Read a URDF, or a xacro, as a robot that floats free; what hangs on `prune` is cut off."""
     return describe(read_document(path), path, prune)
 
 

@@ -29,10 +29,7 @@ class Urdf(NamedTuple):
 
 
 def read_description(root: Element, prune: Collection[str] = ()) -> Urdf:
-    """Check the elements of a URDF and return what they describe.
-
-    Joints in `prune` are cut off with all that hangs on them.
-    """
+    """Check the elements of a URDF; joints in `prune` are cut off with all that hangs on them."""
     _check_root(root)
     links = _by_name(read_link, root.find_all("link"))
     if len(links) > _LINK_LIMIT:
