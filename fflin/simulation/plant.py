@@ -15,6 +15,8 @@ from fflin.dynamics.aba import Aba
 from fflin.dynamics.state import StateMap
 from fflin.robot.massless import require_inertia
 
+# Returns of (t, q, v) a generalised force (nv,) in Pinocchio's order: on the base linear, then
+# angular, in base axes; then on the joints.
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
 _aba = pin.aba
@@ -32,24 +34,10 @@ class Drives(NamedTuple):
 
 
 class Plant:
-    """The nonlinear robot under inputs and a disturbance.
-
-    Parameters
-    ----------
-    state : StateMap
-        Its frame says the axes of the inputs on the base.
-    disturbance : callable, optional
-        disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order: on the base linear,
-        then angular, in base axes; then on the joints.
-    drives : Drives, optional
-        Errors of the inputs; none by default.
-    """
+    """The nonlinear robot under inputs in the axes of a state's frame, and a disturbance."""
 
     def __init__(
-        self,
-        state: StateMap,
-        disturbance: Disturbance | None = None,
-        drives: Drives | None = None,
+        self, state: StateMap, disturbance: Disturbance | None = None, drives: Drives | None = None
     ) -> None:
         robot = state.robot
         require_inertia(robot)
@@ -90,7 +78,7 @@ class Plant:
         push = (self.actuation.columns(self._data, q)[:6] @ u)[_LINEAR_FIRST]
         if self.disturbance is None:
             return self._aba.acceleration(q, v, u), push
-        disturbed = self._disturbed(t, q, v)
+        disturbed = self._disturbed(self.disturbance(t, q.copy(), v.copy()), t, v)
         return self._aba.acceleration(q, v, u, disturbed), push + disturbed[:6]
 
     def isolated(self, *, driven: bool) -> bool:
@@ -107,9 +95,7 @@ class Plant:
             u[held.columns] = u[held.columns].dot(R)
         return u
 
-    def _disturbed(self, t: float, q: Array, v: Array) -> Array:
-        assert self.disturbance is not None
-        given = self.disturbance(t, q.copy(), v.copy())
+    def _disturbed(self, given: ArrayLike, t: float, v: Array) -> Array:
         force = as_double(f"disturbance(t, q, v) at t = {t:g} s", given)
         finite = np.isfinite(force).all() or not np.abs(v).max() < _DIVERGED
         if force.shape != (self.robot.nv,) or not finite:
