@@ -1,9 +1,11 @@
-"""Where robots are found: the bundled ones, those of example-robot-data, and any path."""
+"""Where robots are found, the bundled ones or others, and their files of inputs and meshes."""
 
 import os
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import unquote
 
 from fflin.base.errors import FileError, InputError, UrdfError, unknown
 
@@ -97,3 +99,24 @@ def find_inputs(inputs: str | Path) -> Path:
     if path.name == str(inputs) and not path.suffix and not os.path.lexists(path):
         raise unknown("file or bundled set of inputs", str(inputs), sorted(bundled))
     return path
+
+
+def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
+    """Return the file of package://NAME/PATH, file:///PATH or a path; None without one."""
+    scheme, separator, rest = uri.partition("://")
+    candidates: Iterable[Path]
+    if not separator:
+        candidates = (folder / uri for folder in (urdf.parent, *package_dirs))
+    elif scheme == "file":
+        candidates = [Path(unquote(rest))]
+    else:
+
+        def folders() -> Iterator[Path]:
+            yield from package_dirs
+            yield from urdf.resolve().parents
+
+        inside = Path(*Path(rest).parts[1:])
+        # A package's own folder may have been given, or be called otherwise.
+        candidates = (folder / part for part in (rest, inside) for folder in folders())
+    # Unlike Path.is_file, this takes a name that is too long for one that does not exist.
+    return next((path for path in candidates if os.path.isfile(path)), None)

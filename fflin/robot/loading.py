@@ -14,14 +14,13 @@ from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
 from fflin.base.writing import as_path, remember
-from fflin.robot.catalog import RobotFile, find_robot
+from fflin.robot.catalog import RobotFile, find_mesh, find_robot
 from fflin.robot.frames import ROOT
 from fflin.robot.joints import Follower
 from fflin.robot.massless import idle_coordinates, massless_note
 from fflin.robot.model_checks import check_model, check_order, check_root, joint_of
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
-from fflin.robot.urdf.mesh_files import find_mesh
 from fflin.robot.urdf.reader import Advice, read_urdf
 
 Lock = Mapping[str, float | None] | Iterable[str]

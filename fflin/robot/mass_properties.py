@@ -22,7 +22,7 @@ from fflin.base.names import by_name
 from fflin.base.validation import Array, as_double, number, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.robot.frames import ROOT
-from fflin.robot.urdf.inertias import TRIANGLE_SLACK, is_impossible
+from fflin.robot.urdf.links import TRIANGLE_SLACK, is_impossible
 from fflin.robot.wheels import with_inputs
 
 _KEYS = ("mass", "com", "inertia")

@@ -11,7 +11,7 @@ from fflin.base.errors import ModelError
 from fflin.base.validation import is_rotation
 from fflin.robot.frames import ROOT
 from fflin.robot.joints import Joint
-from fflin.robot.urdf.inertias import is_impossible
+from fflin.robot.urdf.links import is_impossible
 
 
 def check_root(model: pin.Model, name: str) -> None:

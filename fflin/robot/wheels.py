@@ -15,7 +15,7 @@ from fflin.robot.fields import checked_inputs, kept_start
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.inputs import Input, ReactionWheel, named_wheels
 from fflin.robot.joints import Joint
-from fflin.robot.urdf.inertias import is_impossible
+from fflin.robot.urdf.links import is_impossible
 
 # What Pinocchio keeps of each degree of freedom, and of each entry of q, beside the joint itself.
 _OF_VELOCITY = (

@@ -12,9 +12,8 @@ import pinocchio as pin
 
 from fflin.base.errors import UrdfError
 from fflin.base.writing import read_input
-from fflin.robot.urdf.inertias import inertia_notes
-from fflin.robot.urdf.joints import Mimic
-from fflin.robot.urdf.mimics import counted_leaders, resolve_mimics
+from fflin.robot.urdf.joints import Mimic, counted_leaders, resolve_mimics
+from fflin.robot.urdf.links import inertia_notes
 from fflin.robot.urdf.tree import Urdf, read_description
 from fflin.robot.urdf.writer import write_urdf
 from fflin.robot.urdf.xacro import expand, first_xacro
