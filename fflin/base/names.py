@@ -60,7 +60,8 @@ def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
     """
     if key in names:
         return [names.index(key)]
-    pattern = _pattern(str(key))
+    # Brackets stand in names of joints: * and ? alone are wild.
+    pattern = re.compile(re.escape(str(key)).replace(r"\*", ".*").replace(r"\?", "."), re.DOTALL)
     of_group = [i for i, name in enumerate(names) if group_of(name) == key]
     found = of_group or [i for i, name in enumerate(names) if pattern.fullmatch(name)]
     if not found:
@@ -121,9 +122,3 @@ def joints_by_name(
 
 def _is_pattern(key: Any) -> bool:
     return "*" in str(key) or "?" in str(key)
-
-
-def _pattern(key: str) -> re.Pattern[str]:
-    """Read * and ? alone as wild: brackets stand in names of joints."""
-    wild = re.escape(key).replace(r"\*", ".*").replace(r"\?", ".")
-    return re.compile(wild, re.DOTALL)

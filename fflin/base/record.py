@@ -125,10 +125,8 @@ def content_digest(entries: Mapping[str, Any]) -> str:
 
 def _to_npz(record: Mapping[str, Any], sealed: bool) -> bytes:
     buffer = io.BytesIO()
-    plain: dict[str, Any] = {
-        key: np.asarray(json.dumps(value) if isinstance(value, dict) else value)
-        for key, value in record.items()
-    }
+    groups = {k: json.dumps(group) for k, group in record.items() if isinstance(group, dict)}
+    plain: dict[str, Any] = {key: np.asarray(value) for key, value in {**record, **groups}.items()}
     if sealed:
         plain[SEAL] = content_digest(plain)
     np.savez(buffer, **plain)
@@ -280,11 +278,8 @@ class Design(FrozenArrays):
 
 def _saved(cls: type[Design]) -> list[Field[Any]]:
     """Return the fields that files have."""
-    return [
-        item
-        for item in fields(cls)
-        if item.name != "verified" and item.name[0] != "_" and item.type != "Robot"
-    ]
+    own = (item for item in fields(cls) if item.name != "verified" and item.name[0] != "_")
+    return [item for item in own if item.type != "Robot"]
 
 
 def _value(cls: type[Design], item: Field[Any], raw: Any) -> Any:

@@ -97,8 +97,8 @@ def by_name(name: str, value: Any, of_what: str) -> Mapping[str, Any]:
 
 def numbers(name: str, value: Any, of_what: str, each: str) -> dict[str, float]:
     """Return {name: finite float} of a mapping by names; an error calls one of them `each`."""
-    values = by_name(name, value, of_what).items()
-    return {key: number(f"{each} '{key}'", entry) for key, entry in values}
+    values = by_name(name, value, of_what)
+    return {key: number(f"{each} '{key}'", entry) for key, entry in values.items()}
 
 
 def dimension(name: str, value: Any) -> int:

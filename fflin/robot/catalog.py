@@ -1,7 +1,7 @@
 """Where robots are found, the bundled ones or others, and their files of inputs and meshes."""
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -110,13 +110,8 @@ def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None
     elif scheme == "file":
         candidates = [Path(unquote(rest))]
     else:
-
-        def folders() -> Iterator[Path]:
-            yield from package_dirs
-            yield from urdf.resolve().parents
-
-        inside = Path(*Path(rest).parts[1:])
+        folders, inside = (*package_dirs, *urdf.resolve().parents), Path(*Path(rest).parts[1:])
         # A package's own folder may have been given, or be called otherwise.
-        candidates = (folder / part for part in (rest, inside) for folder in folders())
+        candidates = (folder / part for part in (rest, inside) for folder in folders)
     # Unlike Path.is_file, this takes a name that is too long for one that does not exist.
     return next((path for path in candidates if os.path.isfile(path)), None)

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
-from fflin.base.validation import dimension, number
+from fflin.base.validation import dimension, number, numbers
 from fflin.robot import inputs as kinds
 from fflin.robot.inputs import Input, JointTorque, named_inputs, named_wheels, three_numbers
 from fflin.robot.joints import Find, by_joint
@@ -140,7 +140,7 @@ def _by_joint(what: str, value: Any, find: Find, joints: Sequence[str]) -> dict[
         if what == "rest":
             raise InputError(f"rest is {value!r}, expected a mapping {{joint: position}}")
         value = dict.fromkeys(joints, value)
-    checked = _numbers(f"{what} of joint", what, value)
+    checked = numbers(what, value, "joint", f"{what} of joint")
     for name, entry in checked.items():
         if what != "rest" and entry < 0.0:
             raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")
@@ -172,13 +172,13 @@ def _start(value: Any, find: Find, joints: Sequence[str]) -> dict[str, Any]:
     """Return where a robot starts, with joints and rates by their full names."""
     start = _parts("start", value, _START)
     if "joints" in start:
-        values = _numbers("start of joint", "start joints", start["joints"])
+        values = numbers("start joints", start["joints"], "joint", "start of joint")
         start["joints"] = by_joint(values, joints, find)
     for name in ("rpy", "position"):
         if name in start:
             start[name] = three_numbers(f"start {name}", start[name])
     if "velocity" in start:
-        rates = _numbers("start velocity", "start velocity", start["velocity"])
+        rates = numbers("start velocity", start["velocity"], "name", "start velocity")
         start["velocity"] = rates_by_name(joints, rates)
     return start
 
@@ -203,7 +203,7 @@ def _weights(value: Any, joints: Sequence[str], inputs: Sequence[Input]) -> dict
         "bryson": ("state or input", (*states, *keys)),
     }
     for part, (kind, names) in parts.items():
-        weights[part] = _numbers(f"{part} of", part, weights.get(part, {}))
+        weights[part] = numbers(part, weights.get(part, {}), "name", f"{part} of")
         for key, entry in weights[part].items():
             matching(kind, key, names)
             if entry < 0.0 or (part != "q" and not entry):
@@ -236,9 +236,3 @@ def _parts(what: str, value: Any, known: Sequence[str]) -> dict[str, Any]:
         if name not in known:
             raise unknown(f"part of {what}", name, known)
     return dict(value)
-
-
-def _numbers(what: str, part: str, value: Any) -> dict[str, float]:
-    if not isinstance(value, Mapping):
-        raise InputError(f"{part} is {value!r}, expected {{name: number}}")
-    return {name: number(f"{what} '{name}'", entry) for name, entry in value.items()}

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.frozen import frozen
 from fflin.base.validation import Array
 from fflin.robot.fields import checked_inputs, kept_start
 from fflin.robot.frames import ROOT, find_frame
@@ -49,9 +50,7 @@ def stored_momentum(model: pin.Model, inputs: Sequence[Input]) -> tuple[tuple[in
         if wheel.momentum:
             joint, axis = carrier(model, wheel)
             stored[joint] = stored.get(joint, np.zeros(3)) + wheel.momentum * axis
-    for momentum in stored.values():
-        momentum.setflags(write=False)
-    return tuple(stored.items())
+    return tuple((joint, frozen(momentum)) for joint, momentum in stored.items())
 
 
 def with_inputs(robot: Any, inputs: Any) -> Any:

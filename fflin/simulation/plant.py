@@ -70,8 +70,10 @@ class Plant:
         if self._faulty:
             gain, bias, until = self.drives
             u = np.where(t < until, gain * u + bias, 0.0)
-        if self.actuation.held:
-            u = self._in_base_axes(q, u)
+        if self.actuation.held:  # in reference axes: in base axes at any turn
+            R, u = self.state.rotation(q), u.copy()
+            for held in self.actuation.held:
+                u[held.columns] = u[held.columns].dot(R)
         if self._plain and self.disturbance is None:
             tau = self._columns.dot(u)
             return _aba(self._model, self._data, q, v, tau), tau[:6]
@@ -86,14 +88,6 @@ class Plant:
         driven = driven or bool(self.drives.bias.any())
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         return not (base or self.disturbance is not None or any(self.robot.gravity))
-
-    def _in_base_axes(self, q: Array, u: Array) -> Array:
-        """Return u (nu,) with what is held in reference axes in base axes, at any turn."""
-        R = self.state.rotation(q)
-        u = u.copy()
-        for held in self.actuation.held:
-            u[held.columns] = u[held.columns].dot(R)
-        return u
 
     def _disturbed(self, given: ArrayLike, t: float, v: Array) -> Array:
         force = as_double(f"disturbance(t, q, v) at t = {t:g} s", given)

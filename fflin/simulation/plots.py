@@ -239,13 +239,8 @@ def _below(figure: Figure, lines: Mapping[str, Line2D], title: str, side: str) -
     letters = 150 if side == "center" else 75
     columns = min(len(lines), 8, max(1, letters // (max(map(len, lines)) + 6)))
     place: Any = f"outside lower {side}"
-    figure.legend(
-        handles=list(lines.values()),
-        loc=place,
-        ncols=columns,
-        handlelength=1.6,
-        title=title,
-    )
+    named = list(lines.values())
+    figure.legend(handles=named, loc=place, ncols=columns, handlelength=1.6, title=title)
 
 
 def _drifts(axes: Axes, t: Array, drifts: Mapping[str, Array]) -> None:

@@ -101,7 +101,9 @@ def times_of(
         made = follows.schedule if follows else getattr(policy, "lin", None)
         sample = getattr(made, "dt", None) or None
     fastest, mode = (0.0, "") if sample else _fastest_pole(policy, follows)
-    duration = _positive("duration", _duration(duration, follows))
+    if duration is None and follows is None:
+        raise InputError("duration is missing; give it [s]")
+    duration = _positive("duration", follows.duration if follows and duration is None else duration)
     delay = number("delay", delay)
     if not 0.0 <= delay <= _FOREVER:
         raise InputError(f"delay is {delay:g} s, expected 0 to {_FOREVER:g} s")
@@ -130,12 +132,6 @@ def times_of(
     if every is None:
         every = _thinning(steps, samples) if thinned else 1
     return Times(dt, steps, every, samples, late, fastest, mode, thinned)
-
-
-def _duration(given: float | None, follows: TrajectoryFeedback | None) -> float:
-    if given is None and follows is None:
-        raise InputError("duration is missing; give it [s]")
-    return follows.duration if given is None and follows else given  # type: ignore[return-value]
 
 
 def _thinning(steps: int, sample: int) -> int:

@@ -78,25 +78,15 @@ def read_joint(element: Element) -> JointElement:
             raise child.error(f"<{child.tag}> in {of} is not read; write it as <mimic>")
         if prefix and local == "rotor_inertia":
             child.note(f"<{child.tag}> of {of} is not in the model")
-    ends = []
-    for end in ("parent", "child"):
-        found = element.require(end, of)
+    ends = {end: element.require(end, of) for end in ("parent", "child")}
+    for found in ends.values():
         found.allow_only("link", of=of)
-        ends.append(found.text("link", f"<{end}> of {of}"))
+    parent, below = (ends[end].text("link", f"<{end}> of {of}") for end in ends)
     damping, friction = _dynamics(element, of, kind)
-    return JointElement(
-        name,
-        kind,
-        ends[0],
-        ends[1],
-        element,
-        read_pose(element, of),
-        _axis(element, of, kind),
-        _limits(element, of, kind),
-        damping,
-        friction,
-        _mimic(element, of),
-    )
+    origin, axis = read_pose(element, of), _axis(element, of, kind)
+    limits, mimic = _limits(element, of, kind), _mimic(element, of)
+    about = element, origin, axis, limits, damping, friction, mimic
+    return JointElement(name, kind, parent, below, *about)
 
 
 def _axis(element: Element, of: str, kind: str) -> tuple[float, ...]:

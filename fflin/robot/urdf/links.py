@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.validation import Array
 from fflin.robot.urdf.xml import Element, enumerated, named, nearest, quoted
 
 # Beyond it nothing is physical, and products of two such numbers stay far from overflow.
@@ -56,12 +55,6 @@ class Link(NamedTuple):
     mass: float | None = None  # [kg]; None where the link has no <inertial>
     com: Pose = Pose()  # centre of mass, and axes of the inertia
     inertia: tuple[float, ...] = (0.0,) * 6  # INERTIA [kg m^2] about the centre of mass
-
-    def principal_inertias(self) -> Array:
-        """Return the eigenvalues (3,) of the inertia, ascending [kg m^2]."""
-        xx, xy, xz, yy, yz, zz = self.inertia
-        moments: Array = np.linalg.eigvalsh(np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))))
-        return moments
 
 
 def read_link(element: Element) -> Link:
@@ -157,7 +150,9 @@ def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[
     for link in links:
         if link.mass is None:
             continue
-        least, middle, largest = link.principal_inertias().tolist()
+        xx, xy, xz, yy, yz, zz = link.inertia
+        tensor = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+        least, middle, largest = np.linalg.eigvalsh(tensor).tolist()
         if is_impossible(link.mass, (least, middle, largest)):
             joint = model.frames[model.getFrameId(link.name, pin.FrameType.BODY)].parentJoint
             of_body = np.linalg.eigvalsh(model.inertias[joint].inertia)[0]

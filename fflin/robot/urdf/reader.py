@@ -73,7 +73,8 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     notes += told(root)
     notes += inertia_notes(urdf.links.values(), model, path.stem)
 
-    meshes = (e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh")
+    named_meshes = (e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh")
+    meshes, digest = tuple(dict.fromkeys(named_meshes)), hashlib.sha256(document).hexdigest()
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
     damping = {joint.name: joint.damping for joint in moving if joint.damping}
     friction = {joint.name: joint.friction for joint in moving if joint.friction}
@@ -95,14 +96,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
             text = f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)"
             advice.append(Advice("passive", zero, text))
     return Description(
-        model,
-        hashlib.sha256(document).hexdigest(),
-        mimics,
-        damping,
-        friction,
-        tuple(dict.fromkeys(meshes)),
-        tuple(notes),
-        tuple(advice),
+        model, digest, mimics, damping, friction, meshes, tuple(notes), tuple(advice)
     )
 
 
