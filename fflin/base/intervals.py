@@ -4,8 +4,6 @@ C. J. Clopper and E. S. Pearson, Biometrika 26(4), 1934; H. A. David and H. N. N
 Statistics, 3rd edition, 2003, section 7.1.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ Every length is held against what is there, so that a damaged or hostile file is
 and nothing worse. Format: "MAT-File Format", The MathWorks, R2023b, chapter 1.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

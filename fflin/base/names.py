@@ -1,7 +1,5 @@
 """Names GROUP.ENTRY of states and inputs; groups, entries and patterns that stand for them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar

@@ -1,7 +1,5 @@
 """TOML files, and the lines on which what they hold stands."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Mapping

@@ -6,8 +6,6 @@ what the umask leaves. Where the target is a link, the file that it leads to is 
 link stays.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """A robot file to begin with: what a URDF says of a robot, and what its names suggest."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

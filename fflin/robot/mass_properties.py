@@ -7,8 +7,6 @@ inequalities for physically-consistent inertial parameter identification, IEEE R
 Automation Letters 3(1), 2018).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from hashlib import sha256

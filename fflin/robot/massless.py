@@ -1,7 +1,5 @@
 """What of a robot can move without moving mass at every configuration, so that M is singular."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from weakref import WeakKeyDictionary
 

@@ -1,7 +1,5 @@
 """What a Pinocchio model must hold before anything is computed, and whether it was changed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reaction wheels on a model: the joints of those with an inertia, the momentum of the others."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple

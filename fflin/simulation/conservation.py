@@ -3,8 +3,6 @@
 Without force from outside, the momentum about a fixed point and r_c(t) = r_c(0) + p t / m stay.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a simulation is to do: its start, times, limits, method and events, checked."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias

@@ -1,7 +1,5 @@
 """The accelerations of a robot in simulation, and what pushes it from outside."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 

@@ -1,7 +1,5 @@
 """The motion that the linear model predicts under the law that the robot is under."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

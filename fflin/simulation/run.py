@@ -1,7 +1,5 @@
 """The loop over a plan: step after step, recorded until it ends."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias

@@ -1,7 +1,5 @@
 """The step of a simulation, how many there are between what happens, and how long it runs."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from typing import Any, NamedTuple

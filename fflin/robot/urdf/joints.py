@@ -1,7 +1,5 @@
 """Joints of a URDF: what they connect, how they move, and which follow others."""
 
-from __future__ import annotations
-
 import math
 import re
 import sys

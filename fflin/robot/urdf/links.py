@@ -1,7 +1,5 @@
 """Links of a URDF: where they are, what they weigh, and what is odd about that."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """From a URDF file to a Pinocchio model with a free-flyer root."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 from collections.abc import Callable, Collection, Sequence

@@ -1,7 +1,5 @@
 """From the elements of a URDF to a checked description: links and joints that form one tree."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable
 from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple, TypeVar

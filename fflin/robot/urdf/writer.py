@@ -1,7 +1,5 @@
 """From a checked description to the URDF that Pinocchio is given: what it needs and no more."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping
 
 from fflin.robot.urdf.joints import UNLIMITED, JointElement

@@ -1,7 +1,5 @@
 """Xacro: told from plain URDF, and expanded by the optional package xacrodoc."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os
