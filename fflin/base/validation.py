@@ -71,11 +71,16 @@ def refuse_masked(name: str, value: Any) -> None:
         raise InputError(f"{name} has masked entries; fill them first")
 
 
+def instance(name: str, value: Any, kind: Any, expected: str) -> Any:
+    """Return what is of a kind, or raise `InputError` that says what was given and expected."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name} is a {type(value).__name__}, expected {expected}")
+    return value
+
+
 def truth(name: str, value: Any) -> bool:
     """Return whether a switch is on, or raise `InputError` where it is no True or False."""
-    if not isinstance(value, bool | np.bool_ | int):
-        raise InputError(f"{name} is a {type(value).__name__}, expected True or False")
-    return bool(value)
+    return bool(instance(name, value, bool | np.bool_ | int, "True or False"))
 
 
 def whole(name: str, value: Any, least: int, largest: int = 2**63 - 1) -> int:
@@ -90,9 +95,8 @@ def whole(name: str, value: Any, least: int, largest: int = 2**63 - 1) -> int:
 
 def by_name(name: str, value: Any, of_what: str) -> Mapping[str, Any]:
     """Return a mapping whose keys are names, or raise `InputError`."""
-    if not isinstance(value, Mapping):
-        raise InputError(f"{name} is a {type(value).__name__}, expected {{{of_what}: value}}")
-    return value
+    mapping: Mapping[str, Any] = instance(name, value, Mapping, f"{{{of_what}: value}}")
+    return mapping
 
 
 def numbers(name: str, value: Any, of_what: str, each: str) -> dict[str, float]:
@@ -110,8 +114,7 @@ def placement(name: str, value: Any) -> pin.SE3:
     """Return a copy of a rigid placement, its rotation normalised where it is one within 1e-6."""
     import pinocchio as pin
 
-    if not isinstance(value, pin.SE3):
-        raise InputError(f"{name} is a {type(value).__name__}, expected a pin.SE3 (placement)")
+    instance(name, value, pin.SE3, "a pin.SE3 (placement)")
     if not np.isfinite(value.homogeneous).all():
         raise InputError(f"{name} has entries that are not finite")
     if not is_rotation(value.rotation):

@@ -15,7 +15,7 @@ import pinocchio as pin
 from fflin.base import record
 from fflin.base.errors import InputError
 from fflin.base.record import Design
-from fflin.base.validation import Array
+from fflin.base.validation import Array, instance
 from fflin.base.writing import as_path, check_ending, write_whole
 from fflin.dynamics.state_rows import attitude_errors, moving_errors
 from fflin.simulation.passed import Limited, Passed, Saturated, passed, saturated
@@ -244,11 +244,8 @@ class Motion(Design):
 
 def require_motion(motion: Any) -> Motion:
     """Return the motion, or raise `InputError` where it is none."""
-    if not isinstance(motion, Motion):
-        raise InputError(
-            f"motion is a {type(motion).__name__}, expected a Motion, as fflin.simulate returns it"
-        )
-    return motion
+    found: Motion = instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
+    return found
 
 
 def plot_motion(

@@ -8,7 +8,7 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.names import group_of
-from fflin.base.validation import Array, vector
+from fflin.base.validation import Array, instance, vector
 from fflin.control.channel import Channel, Law
 from fflin.control.policies import bound
 from fflin.control.saturation import Saturation
@@ -136,14 +136,11 @@ def method_of(name: str, times: Times) -> type[Integrator]:
 
 def events_of(events: Any, callback: Any) -> tuple[Event, ...]:
     """Return the events, which can be called as the callback can."""
-    if not isinstance(events, Sequence):
-        raise InputError(
-            f"events is a {type(events).__name__}, expected a list of functions event(t, q, v)"
-        )
-    for each in (*events, *([] if callback is None else [callback])):
+    found = tuple(instance("events", events, Sequence, "a list of functions event(t, q, v)"))
+    for each in found if callback is None else (*found, callback):
         if not callable(each):
             raise InputError(f"{each!r} is no function of (t, q, v), as an event would be")
-    return tuple(events)
+    return found
 
 
 def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law | None:

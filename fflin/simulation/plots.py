@@ -123,6 +123,8 @@ def draw(
         for axes in figure.axes if rest is not None else ():
             axes.axvline(rest, lw=0.8, ls=":", color="#555555", label="_rest")
         _drifts(figure.add_subplot(next(places)), t, drifts)
+        for axes in figure.axes:
+            axes.margins(x=0.0)
         figure.suptitle(title, fontsize=11)
     return figure
 
@@ -163,7 +165,6 @@ def _histories(
         axes.plot([], [], color="#888888", **_PALE, label="reference")
     if group not in _OF_JOINTS:
         axes.legend(handlelength=1.2)
-    axes.margins(x=0.0)
 
 
 def _curve(
@@ -194,7 +195,6 @@ def _apart(axes: Axes, t: Array, title: str, signals: Signals, indices: list[int
     for color, i in zip(cycle(len(indices)), indices, strict=True):
         _curve(axes, t, signals, i, color=color, lw=1.0)
     axes.set(xlabel="t [s]", ylabel=f"{title}\n{signals.unit(indices)}".strip())
-    axes.margins(x=0.0)
     axes.ticklabel_format(axis="y", scilimits=(-2, 3))
 
 
@@ -211,7 +211,6 @@ def _inputs(axes: Axes, t: Array, panel: _Panel, title: str, colors: Mapping[str
         )
     _limits(axes, signals, indices)
     axes.set(title=title, xlabel="t [s]", ylabel=signals.unit(indices))
-    axes.margins(x=0.0)
     if not title.startswith("joint") and len(indices) <= _MOST_IN_A_PANEL:
         axes.legend(ncols=2 if len(indices) > 3 else 1, handlelength=1.6)
 
@@ -251,7 +250,6 @@ def _drifts(axes: Axes, t: Array, drifts: Mapping[str, Array]) -> None:
     axes.set(title="momentum drift, relative", xlabel="t [s]")
     axes.set_ylim(1e-17, max(1e-13, *(10.0 * float(drift.max()) for drift in shown.values())))
     axes.legend(handlelength=1.2)
-    axes.margins(x=0.0)
 
 
 def _short(name: str) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, instance
 from fflin.control.channel import Channel
 from fflin.control.output_feedback import OutputFeedback
 from fflin.control.policies import Allocation
@@ -55,10 +55,7 @@ def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryF
 
 def _checked(plant: Plant, policy: Any, linear: Any) -> LinearModel:
     """Return the model that is to predict, or raise `InputError` where it is of another run."""
-    if not isinstance(linear, LinearModel):
-        raise InputError(
-            f"linear is a {type(linear).__name__}, expected a fflin.LinearModel, True or False"
-        )
+    instance("linear", linear, LinearModel, "a fflin.LinearModel, True or False")
     state = plant.state
     names = (state.names, plant.actuation.names, state.frame)
     same = (linear.state_names, linear.input_names, linear.frame) == names and not linear.moving

@@ -53,24 +53,17 @@ def _check_root(root: Element) -> None:
     if version.strip().partition(".")[0] != "1":
         raise root.error(f"<robot> has version {quoted(version)}; expected 1.0, 1.1 or 1.2")
     refuse_near_miss(root, "<robot>", ("link", "joint"))
+    parts = {"link": {"inertial"}, "joint": {"parent", "child"}}
     for child in root.children:
         if child.tag == "robot":
             raise child.error(
                 "a <robot> inside <robot>; keep one <robot> with all links and joints"
             )
-        if child.tag in ("link", "joint"):
-            for inner in child.children:
-                if inner.tag in ("link", "joint"):
-                    raise inner.error(
-                        f"<{inner.tag}> inside a <{child.tag}>, where URDF ignores it; put it "
-                        "directly into <robot>"
-                    )
-            continue
-        for inner in child.iterate():
+        direct = child.tag in parts
+        for inner in child.children if direct else child.iterate():
+            # Deeper down, what these names stand for tells itself by what it holds.
             tags = {part.tag for part in inner.children}
-            if (inner.tag == "joint" and tags >= {"parent", "child"}) or (
-                inner.tag == "link" and "inertial" in tags
-            ):
+            if inner.tag in parts and (direct or tags >= parts[inner.tag]):
                 raise inner.error(
                     f"<{inner.tag}> {quoted(inner.attributes.get('name', ''))} stands inside "
                     f"<{child.tag}>, where URDF ignores it; put it directly into <robot>"
