@@ -18,7 +18,7 @@ from fflin.base.record import Design
 from fflin.base.validation import Array, instance
 from fflin.base.writing import as_path, check_ending, write_whole
 from fflin.dynamics.state_rows import attitude_errors, moving_errors
-from fflin.simulation.passed import Limited, Passed, Saturated, passed, saturated
+from fflin.simulation.report import Limited, Passed, Saturated, passed, saturated
 
 FORMATS = (*record.FORMATS, ".csv")
 

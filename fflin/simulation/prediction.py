@@ -39,8 +39,7 @@ def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryF
     if not (linear is None or linear is True):
         own = _checked(plant, policy, linear)
     law = _law(policy, own) if isinstance(own, LinearModel) else None
-    whole = law is not None and own.state_names == plant.state.names
-    if law is not None and whole:
+    if law is not None and own.state_names == plant.state.names:
         return Predictor(own, law)
     if linear is None:
         return None
