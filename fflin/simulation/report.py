@@ -140,12 +140,10 @@ class Course(NamedTuple):
 def motion_report(motion: Any) -> str:
     """Show whether a motion arrived, what it took, and the figures that prove it."""
     kinds = courses(motion)
-    parts = [verdict(motion, kinds)] if kinds or motion.stopped else []
+    head = [verdict(motion, kinds)] if kinds or motion.stopped else []
     by = ", compiled" if motion.engine == "compiled" else ""
-    frame = f"frame {motion.frame}{by}"
-    parts.append(f"{motion.robot}: {motion.t[-1]:g} s, {len(motion.t)} rows, {frame}")
-    parts.extend(motion.notes)
-    parts = [folded(parts)]
+    run = f"{motion.t[-1]:g} s, {len(motion.t)} rows, frame {motion.frame}{by}"
+    parts = [folded([*head, f"{motion.robot}: {run}", *motion.notes])]
     if kinds:
         settled = f"within {100.0 * SETTLED:g} % after [s]"
         rows = [["error", "unit", "first", "largest", "last", settled]]
@@ -156,24 +154,20 @@ def motion_report(motion: Any) -> str:
     if said:
         more = [f"and {len(said) - _MOST} more"] if len(said) > _MOST else []
         parts.append(folded(said[:_MOST] + more))
-    energy = motion.energy
-    parts.append(
-        f"energy {energy[0]:.6g} J at first, {energy[-1]:.6g} J at last; "
-        f"momentum drift {motion.momentum_drift.max():.1e}"
-    )
+    first, last = (f"{energy:.6g} J" for energy in motion.energy[[0, -1]])
+    drift = f"{motion.momentum_drift.max():.1e}"
+    parts.append(f"energy {first} at first, {last} at last; momentum drift {drift}")
     if len(motion.com_drift):
-        largest = motion.com_drift.max()
-        parts.append(f"largest distance of the centre of mass from its line: {largest:.1e} m")
+        far = f"{motion.com_drift.max():.1e} m"
+        parts.append(f"largest distance of the centre of mass from its line: {far}")
     if motion.linear is not None:
         apart = np.abs(motion.x - motion.linear).max(axis=0)
         # Nothing depends on the angle of a wheel, which outgrows all else.
         apart[[motion.state_names.index(f"q_m.{name}") for name in motion.wheels]] = 0.0
         most = int(apart.argmax())
-        unit = motion.state_units[most].replace("1", "")
-        size = f"{apart[most]:.3g} {unit}".rstrip()
-        parts.append(
-            f"largest difference from the linear model: {size} in {motion.state_names[most]}"
-        )
+        size = f"{apart[most]:.3g} {motion.state_units[most]}".removesuffix(" 1")
+        where = f"{size} in {motion.state_names[most]}"
+        parts.append(f"largest difference from the linear model: {where}")
     return "\n".join(parts)
 
 
@@ -192,13 +186,11 @@ def courses(motion: Any) -> list[Course]:
         if group != "q_b" and not (group == "q_m" and entry in motion.wheels):
             columns.setdefault((title, unit), []).append(i)
     attitude = any(name.startswith("q_b.") for name in steered)
-    return [
-        Course("attitude", "deg", motion.attitude_error, attitude),
-        *(
-            Course(*of, sizes[:, at].max(axis=1), any(motion.state_names[i] in steered for i in at))
-            for of, at in columns.items()
-        ),
-    ]
+    found = [Course("attitude", "deg", motion.attitude_error, attitude)]
+    for of, at in columns.items():
+        fed_back = any(motion.state_names[i] in steered for i in at)
+        found.append(Course(*of, sizes[:, at].max(axis=1), fed_back))
+    return found
 
 
 def verdict(motion: Any, kinds: list[Course]) -> str:

@@ -11,30 +11,28 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, truth
 from fflin.control.plants import notes_of
-from fflin.control.policies import axes_of, feedback_of
+from fflin.control.policies import Policy, StateFeedback, axes_of, feedback_of
 from fflin.control.saturation import saturation, warn_beyond
 from fflin.control.tracking import followed, reference_of, steered_by, tracking_of
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Frame, StateMap
 from fflin.dynamics.state_rows import state_history
 from fflin.linear.model import LinearModel
 from fflin.robot.limits import chosen_limits
+from fflin.robot.robot import Robot
 from fflin.simulation.compiled import carried_out, engine_of
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Plan, events_of, law_of, method_of, start_of, target_of, turning
 from fflin.simulation.plant import Disturbance, Plant
 from fflin.simulation.prediction import predict, predictor
+from fflin.simulation.run import Recording
 from fflin.simulation.times import times_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fflin.control.gain_schedule import GainSchedule
-    from fflin.control.policies import Policy, StateFeedback
-    from fflin.dynamics.state import Frame
-    from fflin.robot.robot import Robot
     from fflin.simulation.plan import Callback, Event
-    from fflin.simulation.run import Recording
 
 
 def simulate(

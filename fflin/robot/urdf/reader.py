@@ -44,6 +44,7 @@ class Description(NamedTuple):
     sha256: str  # of the file as it was read, without files that a xacro includes
     mimics: dict[str, Mimic]  # of the joints that follow another, with independent leaders
     damping: dict[str, float]  # {joint: value} where not zero [N m s/rad | N s/m]
+    friction: dict[str, float]  # the same [N m | N]
     meshes: tuple[str, ...]  # mesh files as it names them; they are not read
     notes: tuple[str, ...]  # warnings, one line each
     advice: tuple[Advice, ...] = ()  # those that hold where the robot's fields say no more
@@ -77,14 +78,12 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
     damping = {joint.name: joint.damping for joint in moving if joint.damping}
     friction = {joint.name: joint.friction for joint in moving if joint.friction}
-    advice = []
-    for what, key, values in (
-        ("damping", "damping", damping),
-        ("Coulomb friction", "friction", friction),
-    ):
-        if values:
-            text = f"{path.stem}: {what} unused: {enumerated(list(values))}"
-            advice.append(Advice(key, tuple(values), text))
+    resistances = {"damping": ("damping", damping), "Coulomb friction": ("friction", friction)}
+    advice = [
+        Advice(key, tuple(values), f"{path.stem}: {what} unused: {enumerated(list(values))}")
+        for what, (key, values) in resistances.items()
+        if values
+    ]
     unlimited: dict[tuple[str, ...], list[str]] = {}
     for what in ("effort", "velocity"):
         zero = tuple(joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0)
@@ -94,7 +93,9 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
             joints = named("joint", list(zero)) if len(zero) < 3 else f"{len(zero)} joints"
             text = f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)"
             advice.append(Advice("passive", zero, text))
-    return Description(model, digest, mimics, damping, meshes, tuple(notes), tuple(advice))
+    return Description(
+        model, digest, mimics, damping, friction, meshes, tuple(notes), tuple(advice)
+    )
 
 
 def read_document(path: Path) -> bytes:

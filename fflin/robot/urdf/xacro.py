@@ -5,6 +5,7 @@ import ctypes
 import os
 import signal
 import sys
+from itertools import chain
 from pathlib import Path
 
 from fflin.base.errors import MissingPackageError, UrdfError
@@ -26,14 +27,10 @@ _IGNORED = {
 
 def first_xacro(root: Element) -> Element | None:
     """Return the first element that makes use of xacro; declaring its prefix does not count."""
-    stack = [root]
-    while stack:
-        element = stack.pop()
-        if element.tag.startswith("xacro:"):
+    for element in chain([root], root.iterate(_IGNORED)):
+        marked = any("${" in value or "$(" in value for value in element.attributes.values())
+        if marked or element.tag.startswith("xacro:"):
             return element
-        if any("${" in value or "$(" in value for value in element.attributes.values()):
-            return element
-        stack.extend(child for child in element.children[::-1] if child.tag not in _IGNORED)
     return None
 
 
