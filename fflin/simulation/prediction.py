@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -15,11 +15,20 @@ from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moved_by, moving_errors
 from fflin.linear.model import LinearModel
-from fflin.simulation.plan import LinearLaw, Plan, Predictor
 from fflin.simulation.plant import Plant
+
+# Returns the command (nu,) at a deviation (nx,) from a linear model's point.
+LinearLaw: TypeAlias = Callable[[Array], Array]
 
 _SHARES = (0.0, 0.5, 0.5, 1.0)  # of a step, at which its stages are
 _WHY_NOT = {Allocation: "an Allocation has thrusters that cannot pull, so that it is not linear"}
+
+
+class Predictor(NamedTuple):
+    """A linear model, and what makes the law that it is under, which remembers nothing yet."""
+
+    lin: LinearModel
+    law: Callable[[], LinearLaw]
 
 
 def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryFeedback | None:
@@ -102,7 +111,7 @@ def _law(policy: Any, lin: LinearModel) -> Callable[[], LinearLaw] | None:
     return lambda: feedback
 
 
-def predict(plan: Plan, x: Array, steps: int, target: Array) -> Array:
+def predict(plan: Any, x: Array, steps: int, target: Array) -> Array:
     """Return the states (N, nx) of the linear model in closed loop; no rows where it has none."""
     if plan.predictor is None:
         return x[:0]
@@ -117,7 +126,7 @@ def predict(plan: Plan, x: Array, steps: int, target: Array) -> Array:
     return found if len(found) == len(x) and np.isfinite(found).all() else x[:0]
 
 
-def _states(predictor: Predictor, plan: Plan, x: Array, steps: int) -> Array:
+def _states(predictor: Predictor, plan: Any, x: Array, steps: int) -> Array:
     dt, _, every, sample, delay, *_ = plan.times
     lin, limits = predictor.lin, plan.limits
     x0, u0 = lin.x0, lin.u0
@@ -174,7 +183,7 @@ def _after(dt: float, e: Array, slope: Callable[[int, Array], Array]) -> Array:
     return after
 
 
-def _errors(policy: TrajectoryFeedback, plan: Plan, e: Array, steps: int) -> Array:
+def _errors(policy: TrajectoryFeedback, plan: Any, e: Array, steps: int) -> Array:
     """Return the errors from a trajectory that the linear models along it have, see `predict`."""
     dt, _, every, sample, delay, *_ = plan.times
     models, limits = policy.models, plan.limits
