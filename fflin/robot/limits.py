@@ -29,8 +29,7 @@ def limits_of(robot: Robot) -> dict[str, Range]:
         found |= dict(zip(names, item.ranges, strict=True))
         if isinstance(item, JointTorque) and item.max is None:
             low, high = _either(float(robot.model.effortLimit[robot.joint(item.joint).idx_v]))
-            least = item.ranges[0][0]
-            found[names[0]] = (low if item.min is None else least, high)
+            found[names[0]] = (low if item.min is None else item.ranges[0][0], high)
         if isinstance(item, ReactionWheel) and item.max_speed is not None:
             found[f"qdot_m.{names[0]}"] = _either(item.max_speed)
     known = {*found, *state_keys(robot.joint_names)}

@@ -116,10 +116,8 @@ def _rebuilt(
     model: pin.Model, bodies: Sequence[pin.Inertia], carried: dict[int, list[_Mounted]]
 ) -> pin.Model:
     new = pin.Model()
-    new.name = model.name
-    new.gravity = model.gravity
-    # Old index to new.
-    moved = {0: 0}
+    new.name, new.gravity = model.name, model.gravity
+    moved = {0: 0}  # old index to new
     for item in _depth_first(model, carried):
         if isinstance(item, int):
             placement, name = model.jointPlacements[item], model.names[item]
