@@ -49,16 +49,10 @@ def runs(names: Sequence[str], units: Sequence[str]) -> list[tuple[int, int, str
 
 
 def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
-    """Return where the names are, of that kind, which a key stands for.
-
-    It is a name such as ``tau_m.hinge_1``, a group such as ``tau_m``, or either the name or the
-    entry alone with ``*``, ``?`` for any letters, any one: ``tau_m.hinge_*``, ``hinge_*``, ``*.x``.
-    An entry may stand for itself too, ``hinge_1``. What stands for nothing is an
-    `UnknownNameError`, an entry of several groups an `InputError`.
-    """
+    """Return where the names are that a key stands for: ``tau_m.x``, ``tau_m``, ``x`` or ``*x``."""
     if key in names:
         return [names.index(key)]
-    # Brackets stand in names of joints: * and ? alone are wild.
+    # Of a name or of its entry; brackets stand in names of joints: * and ? alone are wild.
     pattern = re.compile(re.escape(str(key)).replace(r"\*", ".*").replace(r"\?", "."), re.DOTALL)
     of_group = [i for i, name in enumerate(names) if group_of(name) == key]
     found = of_group or [i for i, name in enumerate(names) if pattern.fullmatch(name)]

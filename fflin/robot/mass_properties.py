@@ -136,11 +136,8 @@ def _of_model(robot: Any, model: pin.Model) -> Any:
 def stretched(
     body: pin.Inertia, mass: Array, com: Array, inertia: Array
 ) -> tuple[Array, Array, Array]:
-    r"""Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of variants of a body.
-
-    It is stretched along its frame's axes, shifted and made heavier, by relative changes (N, 1),
-    (N, 3), (N, 3). A stretch S is a congruence, :math:`S \Sigma S`, which keeps Sigma positive.
-    """
+    """Return masses (N,), centres (N, 3), inertias of a body changed by (N, 1), (N, 3), (N, 3)."""
+    # Stretched along its frame's axes by S, its Sigma becomes S Sigma S, which stays positive.
     heavier, unit = 1.0 + mass.reshape(-1), np.eye(3)
     second = 0.5 * np.trace(body.inertia) * unit - body.inertia
     # A body that is none, as some files have them, keeps its shape.
