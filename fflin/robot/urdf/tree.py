@@ -65,8 +65,8 @@ def _check_root(root: Element) -> None:
             tags = {part.tag for part in inner.children}
             if inner.tag in parts and (direct or tags >= parts[inner.tag]):
                 raise inner.error(
-                    f"<{inner.tag}> inside a <{child.tag}>, where URDF ignores it; put it directly "
-                    "into <robot>"
+                    f"<{inner.tag}> inside a <{child.tag}>, where URDF ignores it; put "
+                    f"{quoted(inner.attributes.get('name', ''))} directly into <robot>"
                 )
 
 
