@@ -54,18 +54,14 @@ def grid(rows: Sequence[Sequence[str]], align: str = "l") -> str:
 
 
 def matrix(values: Array, rows: Sequence[str], columns: Sequence[str]) -> str:
-    """Show a matrix with its names; zeros are dots, rows and columns of zeros are left out.
-
-    What is below the rounding of both its row's and its column's largest entry is shown as "~0".
-    What is too wide is folded: the next columns follow below, under the rows that they need.
-    """
+    """Show a matrix with its names, "~0" for rounding; lines of zeros alone are left out."""
     text = [
         [_number(x, below) for x, below in zip(row, limits, strict=True)]
         for row, limits in zip(values.tolist(), rounding(values).tolist(), strict=True)
     ]
-    label = max(map(len, rows))
+    # What is too wide is folded: the next columns follow below, under the rows that they need.
+    label, used = max(map(len, rows)), 0
     folds: list[list[int]] = []
-    used = 0
     for j, name in enumerate(columns):
         if not values[:, j].any():
             continue

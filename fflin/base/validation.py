@@ -28,10 +28,7 @@ DOUBLE = np.dtype(np.float64)
 
 
 def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
-    """Return a vector (size,) of finite native floats: the caller's own array where it is one.
-
-    An error says its name and `of_what` its entries are.
-    """
+    """Return a vector (size,) of finite native floats: the caller's own array where it is one."""
     if type(value) is np.ndarray and value.dtype is DOUBLE:
         array: Array = value
     else:
@@ -74,11 +71,16 @@ def refuse_masked(name: str, value: Any) -> None:
         raise InputError(f"{name} has masked entries; fill them first")
 
 
+def instance(name: str, value: Any, kind: Any, expected: str) -> Any:
+    """Return what is of a kind, or raise `InputError` that says what was given and expected."""
+    if not isinstance(value, kind):
+        raise InputError(f"{name} is a {type(value).__name__}, expected {expected}")
+    return value
+
+
 def truth(name: str, value: Any) -> bool:
     """Return whether a switch is on, or raise `InputError` where it is no True or False."""
-    if not isinstance(value, bool | np.bool_ | int):
-        raise InputError(f"{name} is a {type(value).__name__}, expected True or False")
-    return bool(value)
+    return bool(instance(name, value, bool | np.bool_ | int, "True or False"))
 
 
 def whole(name: str, value: Any, least: int, largest: int = 2**63 - 1) -> int:
@@ -93,31 +95,26 @@ def whole(name: str, value: Any, least: int, largest: int = 2**63 - 1) -> int:
 
 def by_name(name: str, value: Any, of_what: str) -> Mapping[str, Any]:
     """Return a mapping whose keys are names, or raise `InputError`."""
-    if not isinstance(value, Mapping):
-        raise InputError(f"{name} is a {type(value).__name__}, expected {{{of_what}: value}}")
-    return value
+    mapping: Mapping[str, Any] = instance(name, value, Mapping, f"{{{of_what}: value}}")
+    return mapping
 
 
 def numbers(name: str, value: Any, of_what: str, each: str) -> dict[str, float]:
     """Return {name: finite float} of a mapping by names; an error calls one of them `each`."""
-    values = by_name(name, value, of_what).items()
-    return {key: number(f"{each} '{key}'", entry) for key, entry in values}
+    values = by_name(name, value, of_what)
+    return {key: number(f"{each} '{key}'", entry) for key, entry in values.items()}
 
 
 def dimension(name: str, value: Any) -> int:
     """Return how many indices an array has, or raise `InputError` where it is none."""
-    try:
-        return np.ndim(value)
-    except ValueError:
-        raise InputError(f"{name} is not an array: its rows differ in length") from None
+    return _as_array(name, value).ndim
 
 
 def placement(name: str, value: Any) -> pin.SE3:
     """Return a copy of a rigid placement, its rotation normalised where it is one within 1e-6."""
     import pinocchio as pin
 
-    if not isinstance(value, pin.SE3):
-        raise InputError(f"{name} is a {type(value).__name__}, expected a pin.SE3 (placement)")
+    instance(name, value, pin.SE3, "a pin.SE3 (placement)")
     if not np.isfinite(value.homogeneous).all():
         raise InputError(f"{name} has entries that are not finite")
     if not is_rotation(value.rotation):
@@ -134,10 +131,14 @@ def is_rotation(R: Array) -> bool:
 def as_double(name: str, value: ArrayLike) -> Array:
     """Return a new array of native floats, or raise `InputError` where it is none of numbers."""
     refuse_masked(name, value)
-    try:
-        array = np.asarray(value)
-    except ValueError:
-        raise InputError(f"{name} is not an array: its rows differ in length") from None
+    array = _as_array(name, value)
     if array.dtype.kind not in "fiu":
         raise InputError(f"{name} holds {array.dtype} values, expected real numbers")
     return array.astype(np.float64)
+
+
+def _as_array(name: str, value: Any) -> Any:
+    try:
+        return np.asarray(value)
+    except ValueError:
+        raise InputError(f"{name} is not an array: its rows differ in length") from None

@@ -31,7 +31,7 @@ from fflin.campaign.tally import KINDS
 from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES
 from fflin.robot.robot import Robot
-from fflin.simulation.simulate import planned
+from fflin.simulation.plan import planned
 
 # Runs in the largest chunk, and after which it is first looked whether they are enough: chunks are
 # parts of it, so that the number of runs does not depend on them.

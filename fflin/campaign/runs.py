@@ -20,10 +20,10 @@ from fflin.robot.robot import Robot
 from fflin.simulation.compiled import engine_of
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.motion import Motion
-from fflin.simulation.plan import Plan, law_of
+from fflin.simulation.plan import Plan, law_of, planned
 from fflin.simulation.plant import Plant
 from fflin.simulation.run import Recording, go
-from fflin.simulation.simulate import motion_of, planned
+from fflin.simulation.simulate import motion_of
 
 ARRAYS = Outcome._fields
 

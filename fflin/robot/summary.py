@@ -1,7 +1,5 @@
 """What a robot is, in words and tables."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Iterable
@@ -49,25 +47,21 @@ def robot_info(robot: Robot) -> str:
         index = model.getJointId(joint.name)
         depth[index] = depth[model.parents[index]] + 1
         travel = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
-        limits = [
-            *((math.inf, math.inf) if joint.unbounded else travel),
-            *(model.effortLimit[joint.idx_v], model.velocityLimit[joint.idx_v]),
-        ]
+        limits = (math.inf, math.inf) if joint.unbounded else travel
+        limits += model.effortLimit[joint.idx_v], model.velocityLimit[joint.idx_v]
         mass = f"{model.inertias[index].mass:.6g}"
         rows.append(["  " * depth[index] + joint.name, kinds[joint], mass, *map(_limit, limits)])
     frames = [frame.name for frame in model.frames.tolist() if frame.parentJoint >= ROOT]
-    wrapped = textwrap.fill(
-        ", ".join(dict.fromkeys(frames)), width(), initial_indent="  ", subsequent_indent="  "
-    )
     limited = any(cell != "." for row in rows[1:] for cell in row[3:])
-    parts = [head, grid(rows, "ll"), *[_LIMITS] * limited, f"frames\n{wrapped}"]
+    parts = [head, grid(rows, "ll"), *[_LIMITS] * limited]
+    parts.append(f"frames\n{_indented(', '.join(dict.fromkeys(frames)), '  ')}")
     if robot.notes:
-        notes = (
-            textwrap.fill(note, width(), initial_indent="  ", subsequent_indent="    ")
-            for note in robot.notes
-        )
-        parts.append("\n".join(("warnings", *notes)))
+        parts.append("\n".join(("warnings", *(_indented(note, "    ") for note in robot.notes))))
     return "\n\n".join(parts)
+
+
+def _indented(text: str, below: str) -> str:
+    return textwrap.fill(text, width(), initial_indent="  ", subsequent_indent=below)
 
 
 def _limit(value: float) -> str:

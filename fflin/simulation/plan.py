@@ -1,46 +1,46 @@
 """What a simulation is to do: its start, times, limits, method and events, checked."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.names import group_of
-from fflin.base.validation import Array, vector
+from fflin.base.validation import Array, instance, truth, vector
 from fflin.control.channel import Channel, Law
-from fflin.control.policies import bound
-from fflin.control.saturation import Saturation
-from fflin.control.tracking import Reference, TrajectoryFeedback
+from fflin.control.plants import notes_of
+from fflin.control.policies import axes_of, bound, feedback_of
+from fflin.control.saturation import Saturation, saturation, warn_beyond
+from fflin.control.tracking import (
+    Reference,
+    TrajectoryFeedback,
+    followed,
+    reference_of,
+    steered_by,
+    tracking_of,
+)
 from fflin.dynamics import points
 from fflin.dynamics.integrators import Integrator, integrator
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.ignorable import rotor_names
 from fflin.linear.model import LinearModel
 from fflin.robot.fields import Range
+from fflin.robot.limits import chosen_limits
 from fflin.robot.robot import Robot
-from fflin.simulation.plant import Plant
-from fflin.simulation.times import Times
+from fflin.simulation.plant import Disturbance, Plant
+from fflin.simulation.prediction import Predictor, predictor
+from fflin.simulation.times import Times, times_of
 
 Event: TypeAlias = Callable[[float, Array, Array], float]
-# Returns the command (nu,) at a deviation (nx,) from a linear model's point.
-LinearLaw: TypeAlias = Callable[[Array], Array]
 Callback: TypeAlias = Callable[[float, Array, Array, Array], None]
 
 # A share of a step that is no longer part of what comes after it.
 _BEFORE = 1e-6
 
 LARGEST_SPEED = 1e50  # in SI units; beyond it squares overflow
-
-
-class Predictor(NamedTuple):
-    """A linear model, and what makes the law that it is under, which remembers nothing yet."""
-
-    lin: LinearModel
-    law: Callable[[], LinearLaw]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,30 +124,6 @@ def target_of(state: StateMap, target: Any) -> Array | None:
     return goal
 
 
-def method_of(name: str, times: Times) -> type[Integrator]:
-    """Return the integrator of that name, stable at the fastest pole of the loop."""
-    method = integrator(name)
-    if times.fastest * times.dt > method.reach:
-        raise InputError(
-            f"the step dt is {times.dt:g} s, too large for a loop whose fastest pole is at "
-            f"{times.fastest:.4g} 1/s; take at most {method.reach / times.fastest:.2g} s, or "
-            "`sample`"
-        )
-    return method
-
-
-def events_of(events: Any, callback: Any) -> tuple[Event, ...]:
-    """Return the events, which can be called as the callback can."""
-    if not isinstance(events, Sequence):
-        raise InputError(
-            f"events is a {type(events).__name__}, expected a list of functions event(t, q, v)"
-        )
-    for each in (*events, *([] if callback is None else [callback])):
-        if not callable(each):
-            raise InputError(f"{each!r} is no function of (t, q, v), as an event would be")
-    return tuple(events)
-
-
 def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law | None:
     """Return the policy bound to the robot, of which nothing but inputs is taken."""
     if policy is None:
@@ -156,11 +132,101 @@ def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law |
     return Law(bound(policy, plant.robot), plant.actuation.names, within, times.slow)
 
 
-def turning(robot: Robot) -> Array:
-    """Return where angular velocities stand, less those of rotors.
-
-    A rotor may spin as fast as it will: nothing depends on its angle.
-    """
+def planned(
+    robot: Robot,
+    policy: Any,
+    x0: Any = None,
+    q0: Any = None,
+    v0: Any = None,
+    duration: float | None = None,
+    dt: float | None = None,
+    method: str = "cf4",
+    project: bool = True,
+    sample: float | None = None,
+    delay: float = 0.0,
+    limits: Any = None,
+    disturbance: Disturbance | None = None,
+    events: Sequence[Event] = (),
+    callback: Callback | None = None,
+    linear: LinearModel | bool | None = None,
+    target: Any = None,
+    frame: Frame | None = None,
+    reference: pin.SE3 | None = None,
+    every: int | None = None,
+    progress: bool | None = None,
+) -> tuple[Plan, Plant]:
+    """Return what `simulate` does of its arguments, checked, and the robot that moves."""
+    policy = followed(policy, robot)
+    times = times_of(policy, duration, dt, every, sample, delay)
+    policy = followed(policy, robot, held=times.sample > 0)
+    lin, _ = feedback_of(policy)
+    follows, along = reference_of(policy), tracking_of(policy)
+    own_frame, own_reference = axes_of(policy)
+    if lin is not None and (frame is not None or reference is not None):
+        raise InputError("frame and reference are those of the policy's model; leave out")
+    if along and frame not in (None, own_frame):
+        raise InputError(
+            f"frame is {frame!r}, expected '{own_frame}' along a trajectory, whose inputs are in "
+            "base axes; leave it out"
+        )
+    axes = {"reference": own_reference if reference is None else reference}
+    state = StateMap(robot, **axes, frame=own_frame if frame is None else frame)
+    plant = Plant(state, disturbance)
+    foresees = predictor(plant, policy, linear)
+    q, v = start_of(state, x0, q0, v0, follows)
+    times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=dt is None)
+    acting, known = chosen_limits(robot, limits)
+    within = saturation(robot, acting, q, times.dt, times.sample)
+    law = law_of(policy, plant, within, times)
+    signals, cut = (plant.actuation.names, plant.actuation.units), (within.low, within.high)
+    follows = follows if target is None else None
+    goal = target_of(state, lin if target is None else target)
+    initial = np.zeros(len(within.low))
+    # The model's inputs are others where they are allocated to the robot's.
+    if lin is not None and lin.input_names == plant.actuation.names:
+        initial = np.asarray(lin.u0)
+        warn_beyond(robot.name, "at its target", *signals, lin.u0[None], *cut)
+    elif along is policy is not None:
+        initial = along.reference(0.0)[2]
+        warn_beyond(robot.name, "on its trajectory", *signals, along.trajectory.u_base, *cut)
+    near = state.read(*follows(0.0)[:2]) if follows else goal
+    if x0 is not None:
+        near = np.asarray(x0, dtype=float)
+    integrates = integrator(method)
+    if times.fastest * times.dt > integrates.reach:
+        raise InputError(
+            f"the step dt is {times.dt:g} s, too large for a loop whose fastest pole is at "
+            f"{times.fastest:.4g} 1/s; take at most {integrates.reach / times.fastest:.2g} s, or "
+            "`sample`"
+        )
+    called = tuple(instance("events", events, Sequence, "a list of functions event(t, q, v)"))
+    for each in called if callback is None else (*called, callback):
+        if not callable(each):
+            raise InputError(f"{each!r} is no function of (t, q, v), as an event would be")
+    # A rotor may spin as fast as it will: nothing depends on its angle.
     rotors = rotor_names(robot)
     joints = [joint for joint in robot.joints if not joint.prismatic and joint.name not in rotors]
-    return np.array([3, 4, 5, *(joint.idx_v for joint in joints)])
+    plan = Plan(
+        q=q,
+        v=v,
+        times=times,
+        policy=policy,
+        law=law,
+        initial=initial,
+        limits=within,
+        known=known,
+        method=integrates,
+        project=truth("project", project),
+        turning=np.array([3, 4, 5, *(joint.idx_v for joint in joints)]),
+        chart=None if lin is None else state,
+        events=called,
+        callback=callback,
+        progress=progress,
+        near=near,
+        target=goal,
+        reference=follows,
+        steered=steered_by(policy),
+        notes=(*notes_of(policy, robot), *times.notes),
+        predictor=foresees,
+    )
+    return plan, plant

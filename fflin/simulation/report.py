@@ -1,15 +1,13 @@
-"""What is said of a motion: whether it arrived, what it took, what proves it."""
+"""What is said of a motion: whether it arrived, what it took, what it passed, what proves it."""
 
-from __future__ import annotations
-
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from fflin.base.names import group_of, input_keys
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array
-from fflin.simulation.passed import lines
 
 # An error has settled once it stays below this share of its largest.
 SETTLED = 0.02
@@ -24,8 +22,85 @@ DWELL = 0.05
 # Share of the run with an input at its limit from which on it is there all along.
 _ALL_ALONG = 0.9
 
+# Beyond its limit is what is so by more than this share of it: less is the integration's.
+_SHARE = 1e-3
+
+_MOST = 8  # lines of a report
+
+# What has limits: its name, history (N,), unit, and least and largest value (2,).
+Limited: TypeAlias = "tuple[str, Array, str, Array]"
+
 _TITLES = {"r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
 _PLACES = ("attitude", "position", "joints")
+
+
+class Passed(NamedTuple):
+    """A limit that was passed: the farthest value [unit], when [s], and the limit."""
+
+    name: str
+    value: float
+    time: float
+    limit: float
+    unit: str
+    at_first: bool  # whether it was beyond from the start
+
+    def __str__(self) -> str:
+        value = f"{_shown(self.value)} {self.unit}".removesuffix(" 1")
+        said = f"{_name(self.name)} {value} at {_shown(self.time)} s, limit {_shown(self.limit)}"
+        return f"{said}, from the start" if self.at_first else said
+
+
+class Saturated(NamedTuple):
+    """An input, or a wheel's speed, that was at its limit [unit] for a share of the run."""
+
+    name: str
+    limit: float
+    unit: str
+    share: float
+
+    def __str__(self) -> str:
+        size, share = f"{_shown(self.limit)} {self.unit}", 100.0 * self.share
+        percent = f"{share:.2g}" if share < 10.0 else f"{share:.0f}"
+        return f"{_name(self.name)} at its limit of {size} for {percent} % of the run"
+
+
+def passed(t: Array, histories: Iterable[Limited]) -> tuple[Passed, ...]:
+    """Return what went beyond its limit, that first which did so by the largest share of it."""
+    found = []
+    for name, values, unit, limits in histories:
+        size = float(np.abs(limits[np.isfinite(limits)]).max())
+        excess = np.maximum(limits[0] - values, values - limits[1])
+        at = int(excess.argmax())
+        if excess[at] > max(_SHARE * size, 1e-12):
+            limit = float(limits[int(values[at] > limits[1])])
+            first = name.startswith("q_m.") and bool(excess[0] > max(_SHARE * size, 1e-12))
+            one = Passed(name, float(values[at]), float(t[at]), limit, unit, first)
+            found.append((-excess[at] / (size or 1e-12), one))
+    return tuple(one for _, one in sorted(found))
+
+
+def saturated(t: Array, histories: Iterable[Limited]) -> tuple[Saturated, ...]:
+    """Return what was at a limit other than zero, that first which was longest."""
+    held = np.diff(t, append=t[-1:])
+    found = [
+        Saturated(name, limit, unit, float(held[near].sum() / held.sum()))
+        for name, values, unit, limits in histories
+        for limit in limits[np.isfinite(limits) & (limits != 0.0)].tolist()
+        # The speed of a wheel creeps up to its limit, an input is cut to it.
+        if held[
+            near := np.abs(values - limit) <= (1e-3 if "qdot_m." in name else 1e-9) * abs(limit)
+        ].any()
+    ]
+    return tuple(sorted(found, key=lambda each: -each.share))
+
+
+def _name(name: str) -> str:
+    group, _, entry = name.partition(".")
+    return entry if group in ("q_m", "qdot_m") else name
+
+
+def _shown(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 1000.0 else f"{value:.0f}"
 
 
 class Course(NamedTuple):
@@ -65,38 +140,34 @@ class Course(NamedTuple):
 def motion_report(motion: Any) -> str:
     """Show whether a motion arrived, what it took, and the figures that prove it."""
     kinds = courses(motion)
-    parts = [verdict(motion, kinds)] if kinds or motion.stopped else []
+    head = [verdict(motion, kinds)] if kinds or motion.stopped else []
     by = ", compiled" if motion.engine == "compiled" else ""
-    frame = f"frame {motion.frame}{by}"
-    parts.append(f"{motion.robot}: {motion.t[-1]:g} s, {len(motion.t)} rows, {frame}")
-    parts.extend(motion.notes)
-    parts = [folded(parts)]
+    run = f"{motion.t[-1]:g} s, {len(motion.t)} rows, frame {motion.frame}{by}"
+    parts = [folded([*head, f"{motion.robot}: {run}", *motion.notes])]
     if kinds:
         settled = f"within {100.0 * SETTLED:g} % after [s]"
         rows = [["error", "unit", "first", "largest", "last", settled]]
         parts.append(f"\n{grid([*rows, *(kind.row(motion.t) for kind in kinds)], 'll')}\n")
     if kinds or motion.u.any():
         parts.append(_largest_inputs(motion))
-    if said := lines(motion):
-        parts.append(folded(said))
-    energy = motion.energy
-    parts.append(
-        f"energy {energy[0]:.6g} J at first, {energy[-1]:.6g} J at last; "
-        f"momentum drift {motion.momentum_drift.max():.1e}"
-    )
+    said = [*(f"beyond its limit: {each}" for each in motion.passed), *map(str, motion.saturated)]
+    if said:
+        more = [f"and {len(said) - _MOST} more"] if len(said) > _MOST else []
+        parts.append(folded(said[:_MOST] + more))
+    first, last = (f"{energy:.6g} J" for energy in motion.energy[[0, -1]])
+    drift = f"{motion.momentum_drift.max():.1e}"
+    parts.append(f"energy {first} at first, {last} at last; momentum drift {drift}")
     if len(motion.com_drift):
-        largest = motion.com_drift.max()
-        parts.append(f"largest distance of the centre of mass from its line: {largest:.1e} m")
+        far = f"{motion.com_drift.max():.1e} m"
+        parts.append(f"largest distance of the centre of mass from its line: {far}")
     if motion.linear is not None:
         apart = np.abs(motion.x - motion.linear).max(axis=0)
         # Nothing depends on the angle of a wheel, which outgrows all else.
         apart[[motion.state_names.index(f"q_m.{name}") for name in motion.wheels]] = 0.0
         most = int(apart.argmax())
-        unit = motion.state_units[most].replace("1", "")
-        size = f"{apart[most]:.3g} {unit}".rstrip()
-        parts.append(
-            f"largest difference from the linear model: {size} in {motion.state_names[most]}"
-        )
+        size = f"{apart[most]:.3g} {motion.state_units[most]}".removesuffix(" 1")
+        where = f"{size} in {motion.state_names[most]}"
+        parts.append(f"largest difference from the linear model: {where}")
     return "\n".join(parts)
 
 
@@ -115,13 +186,11 @@ def courses(motion: Any) -> list[Course]:
         if group != "q_b" and not (group == "q_m" and entry in motion.wheels):
             columns.setdefault((title, unit), []).append(i)
     attitude = any(name.startswith("q_b.") for name in steered)
-    return [
-        Course("attitude", "deg", motion.attitude_error, attitude),
-        *(
-            Course(*of, sizes[:, at].max(axis=1), any(motion.state_names[i] in steered for i in at))
-            for of, at in columns.items()
-        ),
-    ]
+    found = [Course("attitude", "deg", motion.attitude_error, attitude)]
+    for of, at in columns.items():
+        fed_back = any(motion.state_names[i] in steered for i in at)
+        found.append(Course(*of, sizes[:, at].max(axis=1), fed_back))
+    return found
 
 
 def verdict(motion: Any, kinds: list[Course]) -> str:

@@ -9,41 +9,24 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, truth
-from fflin.control.plants import notes_of
-from fflin.control.policies import axes_of, feedback_of
-from fflin.control.saturation import saturation, warn_beyond
-from fflin.control.tracking import followed, reference_of, steered_by, tracking_of
-from fflin.dynamics.state import StateMap
+from fflin.base.validation import Array
+from fflin.control.policies import Policy, StateFeedback
+from fflin.dynamics.state import Frame
 from fflin.dynamics.state_rows import state_history
 from fflin.linear.model import LinearModel
-from fflin.robot.limits import chosen_limits
+from fflin.robot.robot import Robot
 from fflin.simulation.compiled import carried_out, engine_of
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.motion import Motion
-from fflin.simulation.plan import (
-    Plan,
-    events_of,
-    law_of,
-    method_of,
-    start_of,
-    target_of,
-    turning,
-)
-from fflin.simulation.plant import Plant
-from fflin.simulation.prediction import predict, predictor
-from fflin.simulation.times import times_of
+from fflin.simulation.plan import Event, Plan, planned
+from fflin.simulation.plant import Disturbance, Plant
+from fflin.simulation.prediction import predict
+from fflin.simulation.run import Recording
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from fflin.control.gain_schedule import GainSchedule
-    from fflin.control.policies import Policy, StateFeedback
-    from fflin.dynamics.state import Frame
-    from fflin.robot.robot import Robot
-    from fflin.simulation.plan import Callback, Event
-    from fflin.simulation.plant import Disturbance
-    from fflin.simulation.run import Recording
 
 
 def simulate(
@@ -181,97 +164,6 @@ def simulate(
         ) from None
 
 
-def planned(
-    robot: Robot,
-    policy: Any,
-    x0: Any = None,
-    q0: Any = None,
-    v0: Any = None,
-    duration: float | None = None,
-    dt: float | None = None,
-    method: str = "cf4",
-    project: bool = True,
-    sample: float | None = None,
-    delay: float = 0.0,
-    limits: Any = None,
-    disturbance: Disturbance | None = None,
-    events: Sequence[Event] = (),
-    callback: Callback | None = None,
-    linear: LinearModel | bool | None = None,
-    target: Any = None,
-    frame: Frame | None = None,
-    reference: pin.SE3 | None = None,
-    every: int | None = None,
-    progress: bool | None = None,
-) -> tuple[Plan, Plant]:
-    """Return what `simulate` does of its arguments, checked, and the robot that moves."""
-    policy = followed(policy, robot)
-    times = times_of(policy, duration, dt, every, sample, delay)
-    policy = followed(policy, robot, held=times.sample > 0)
-    lin, _ = feedback_of(policy)
-    follows, along = reference_of(policy), tracking_of(policy)
-    own_frame, own_reference = axes_of(policy)
-    if lin is not None and (frame is not None or reference is not None):
-        raise InputError("frame and reference are those of the policy's model; leave out")
-    if along and frame not in (None, own_frame):
-        raise InputError(
-            f"frame is {frame!r}, expected '{own_frame}' along a trajectory, whose inputs are in "
-            "base axes; leave it out"
-        )
-    state = StateMap(
-        robot,
-        reference=own_reference if reference is None else reference,
-        frame=own_frame if frame is None else frame,
-    )
-    plant = Plant(state, disturbance)
-    foresees = predictor(plant, policy, linear)
-    q, v = start_of(state, x0, q0, v0, follows)
-    times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=dt is None)
-    acting, known = chosen_limits(robot, limits)
-    within = saturation(robot, acting, q, times.dt, times.sample)
-    law = law_of(policy, plant, within, times)
-    signals, cut = (plant.actuation.names, plant.actuation.units), (within.low, within.high)
-    follows = follows if target is None else None
-    goal = target_of(state, lin if target is None else target)
-    initial = np.zeros(len(within.low))
-    # The model's inputs are others where they are allocated to the robot's.
-    if lin is not None and lin.input_names == plant.actuation.names:
-        initial = np.asarray(lin.u0)
-        warn_beyond(robot.name, "at its target", *signals, lin.u0[None], *cut)
-    elif along is policy is not None:
-        initial = along.reference(0.0)[2]
-        warn_beyond(robot.name, "on its trajectory", *signals, along.trajectory.u_base, *cut)
-    near = goal
-    if x0 is not None:
-        near = np.asarray(x0, dtype=float)
-    elif follows:
-        near = state.read(*follows(0.0)[:2])
-    plan = Plan(
-        q=q,
-        v=v,
-        times=times,
-        policy=policy,
-        law=law,
-        initial=initial,
-        limits=within,
-        known=known,
-        method=method_of(method, times),
-        project=truth("project", project),
-        turning=turning(robot),
-        chart=None if lin is None else state,
-        events=events_of(events, callback),
-        callback=callback,
-        progress=progress,
-        near=near,
-        target=goal,
-        reference=follows,
-        steered=steered_by(policy),
-        notes=(*notes_of(policy, robot), *times.notes),
-        predictor=foresees,
-    )
-    return plan, plant
-
-
 def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = None) -> Motion:
     """Return the motion that a plan leads to, or led to where its run is given."""
     state, robot = plant.state, plant.robot
@@ -284,11 +176,8 @@ def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = Non
         target = state_history(state, q, v, plan.near, run.t)
     history = conserved.histories(run.q, run.v)
     return Motion(
-        t=run.t,
-        q=run.q,
-        v=run.v,
+        **{name: getattr(run, name) for name in ("t", "q", "v", "u", "stopped", "engine")},
         x=x,
-        u=run.u,
         target=target,
         prediction=predict(plan, x, run.steps, target),
         energy=history.energy,
@@ -303,8 +192,6 @@ def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = Non
         frame=state.frame,
         robot=robot.name,
         urdf_sha256=robot.urdf_sha256,
-        stopped=run.stopped,
-        engine=run.engine,
         _robot=robot,
         wheels=tuple(robot.wheels),
         wheel_inertias=np.array(list(robot.wheels.values())),

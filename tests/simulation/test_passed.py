@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fflin.simulation.passed import passed, saturated
+from fflin.simulation.report import passed, saturated
 
 
 def test_the_limit_that_was_passed_is_named():

@@ -1,10 +1,8 @@
 """From a URDF file to a Pinocchio model with a free-flyer root."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,11 +10,9 @@ import pinocchio as pin
 
 from fflin.base.errors import UrdfError
 from fflin.base.writing import read_input
-from fflin.robot.urdf.inertias import inertia_notes
-from fflin.robot.urdf.joints import Mimic
-from fflin.robot.urdf.mimics import counted_leaders, resolve_mimics
+from fflin.robot.urdf.joints import UNLIMITED, JointElement, Mimic, counted_leaders, resolve_mimics
+from fflin.robot.urdf.links import INERTIA, Link, Pose, inertia_notes
 from fflin.robot.urdf.tree import Urdf, read_description
-from fflin.robot.urdf.writer import write_urdf
 from fflin.robot.urdf.xacro import expand, first_xacro
 from fflin.robot.urdf.xml import Element, enumerated, named, parse, told
 
@@ -28,6 +24,9 @@ _LARGEST_NV = 322
 # Up to this depth the recursion of the parsers fits the smallest stack of a thread in use, 512 kB.
 _SHALLOW = 100
 _STACK = 16 * 2**20
+
+# What the values of attributes cannot hold as it is.
+_ENTITIES = {ord(letter): f"&#{ord(letter)};" for letter in "&<>\"'\t\n\r"}
 
 
 class Advice(NamedTuple):
@@ -52,11 +51,7 @@ class Description(NamedTuple):
 
 
 def read_urdf(path: Path, prune: Sequence[str] = ()) -> Description:
-    """Read a URDF, or a xacro, as a robot that floats free.
-
-    Joints in `prune` are cut off with all that hangs on them. What is no robot is a `UrdfError`
-    that gives file, line and what to mend; a xacro without xacrodoc is a `MissingPackageError`.
-    """
+    """Read a URDF, or a xacro, as a robot that floats free; what hangs on `prune` is cut off."""
     return describe(read_document(path), path, prune)
 
 
@@ -78,18 +73,17 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     notes += told(root)
     notes += inertia_notes(urdf.links.values(), model, path.stem)
 
-    meshes = (e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh")
+    named_meshes = (e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh")
+    meshes, digest = tuple(dict.fromkeys(named_meshes)), hashlib.sha256(document).hexdigest()
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
     damping = {joint.name: joint.damping for joint in moving if joint.damping}
     friction = {joint.name: joint.friction for joint in moving if joint.friction}
-    advice = []
-    for what, key, values in (
-        ("damping", "damping", damping),
-        ("Coulomb friction", "friction", friction),
-    ):
-        if values:
-            text = f"{path.stem}: {what} unused: {enumerated(list(values))}"
-            advice.append(Advice(key, tuple(values), text))
+    resistances = {"damping": ("damping", damping), "Coulomb friction": ("friction", friction)}
+    advice = [
+        Advice(key, tuple(values), f"{path.stem}: {what} unused: {enumerated(list(values))}")
+        for what, (key, values) in resistances.items()
+        if values
+    ]
     unlimited: dict[tuple[str, ...], list[str]] = {}
     for what in ("effort", "velocity"):
         zero = tuple(joint.name for joint in moving if (joint.limits or {}).get(what) == 0.0)
@@ -100,14 +94,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
             text = f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)"
             advice.append(Advice("passive", zero, text))
     return Description(
-        model,
-        hashlib.sha256(document).hexdigest(),
-        mimics,
-        damping,
-        friction,
-        tuple(dict.fromkeys(meshes)),
-        tuple(notes),
-        tuple(advice),
+        model, digest, mimics, damping, friction, meshes, tuple(notes), tuple(advice)
     )
 
 
@@ -158,3 +145,60 @@ def _with_stack(depth: int, call: Callable[[], pin.Model]) -> pin.Model:
         finally:
             threading.stack_size(usual)
         return built.result()
+
+
+def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:
+    """Write what moves, to the last bit; `counted` joints are revolute, for their turns count."""
+    # urdfdom reads quat_xyzw from version 1.1 on; 1.2 would require limits.
+    lines = [f'<robot name={_quoted(urdf.name)} version="1.1">']
+    for link in urdf.links.values():
+        lines.extend(_link(link))
+    for joint in urdf.joints.values():
+        lines.extend(_joint(joint, joint.name in counted))
+    lines.append("</robot>")
+    return "\n".join(lines)
+
+
+def _link(link: Link) -> Iterator[str]:
+    yield f"<link name={_quoted(link.name)}>"
+    if link.mass is not None:
+        yield f'<inertial>{_origin(link.com)}<mass value="{link.mass!r}"/>'
+        yield f"<inertia {_entries(dict(zip(INERTIA, link.inertia, strict=True)))}/></inertial>"
+    yield "</link>"
+
+
+def _joint(joint: JointElement, counted: bool) -> Iterator[str]:
+    unbounded = {"lower": -UNLIMITED, "upper": UNLIMITED}
+    if counted:
+        joint = joint._replace(type="revolute", limits=(joint.limits or {}) | unbounded)
+    yield f'<joint name={_quoted(joint.name)} type="{joint.type}">'
+    yield f"<parent link={_quoted(joint.parent)}/><child link={_quoted(joint.child)}/>"
+    yield _origin(joint.origin)
+    if joint.freedom == 1:
+        yield f'<axis xyz="{_numbers(joint.axis)}"/>'
+        if joint.damping or joint.friction:
+            yield f'<dynamics damping="{joint.damping!r}" friction="{joint.friction!r}"/>'
+    if joint.type in ("revolute", "prismatic") or joint.limits:
+        limits = unbounded if joint.limits is None else joint.limits
+        yield f"<limit {_entries({'effort': UNLIMITED, 'velocity': UNLIMITED} | limits)}/>"
+    yield "</joint>"
+
+
+def _origin(pose: Pose) -> str:
+    attitude = f'rpy="{_numbers(pose.rpy)}"'
+    if pose.quaternion is not None:
+        attitude = f'quat_xyzw="{_numbers(pose.quaternion)}"'
+    return f'<origin xyz="{_numbers(pose.xyz)}" {attitude}/>'
+
+
+def _entries(values: Mapping[str, float]) -> str:
+    return " ".join(f'{name}="{value!r}"' for name, value in values.items())
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return " ".join(repr(value) for value in values)
+
+
+def _quoted(text: str) -> str:
+    """Write an attribute's value. The standard library's ways load far more than they do."""
+    return f'"{text.translate(_ENTITIES)}"'

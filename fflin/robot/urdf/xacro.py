@@ -1,12 +1,11 @@
 """Xacro: told from plain URDF, and expanded by the optional package xacrodoc."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os
 import signal
 import sys
+from itertools import chain
 from pathlib import Path
 
 from fflin.base.errors import MissingPackageError, UrdfError
@@ -28,23 +27,15 @@ _IGNORED = {
 
 def first_xacro(root: Element) -> Element | None:
     """Return the first element that makes use of xacro; declaring its prefix does not count."""
-    stack = [root]
-    while stack:
-        element = stack.pop()
-        if element.tag.startswith("xacro:"):
+    for element in chain([root], root.iterate(_IGNORED)):
+        marked = any("${" in value or "$(" in value for value in element.attributes.values())
+        if marked or element.tag.startswith("xacro:"):
             return element
-        if any("${" in value or "$(" in value for value in element.attributes.values()):
-            return element
-        stack.extend(child for child in element.children[::-1] if child.tag not in _IGNORED)
     return None
 
 
 def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, list[str]]:
-    """Return a xacro document as plain URDF, and the lines that xacro had to say.
-
-    It is expanded in a process of its own that may take `LIMIT`; files that it includes are looked
-    up from where it lies. `first`, of `first_xacro`, is for errors.
-    """
+    """Return a xacro document as plain URDF, and what xacro said; `first` is for errors."""
     import json
     import subprocess
     from importlib.util import find_spec
@@ -80,10 +71,7 @@ def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, l
 
 
 def _expand_here(path: Path, limit: float) -> None:
-    """Expand what comes in on stdin, in a process of its own.
-
-    To stdout go the files that it read, as a list of JSON in one line, and the expanded document.
-    """
+    """Expand stdin; write to stdout a line of JSON, the files that were read, and the document."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever started it ends it
     # It ends with who started it, or else in time, whatever it does.
     if sys.platform == "linux":

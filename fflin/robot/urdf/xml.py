@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from xml.parsers import expat
@@ -73,13 +73,12 @@ class Element:
             raise self.error(f"{of} has no <{tag}>; add it")
         return found
 
-    def iterate(self) -> Iterator[Element]:
-        """Yield all elements below this one, in document order."""
-        stack = self.children[::-1]
-        while stack:
-            element = stack.pop()
-            yield element
-            stack.extend(element.children[::-1])
+    def iterate(self, skip: Collection[str] = ()) -> Iterator[Element]:
+        """Yield all elements below this one, in document order, none in what is skipped."""
+        for child in self.children:
+            if child.tag not in skip:
+                yield child
+                yield from child.iterate(skip)
 
     def allow_only(self, *names: str, of: str) -> None:
         """Refuse a misspelt attribute, a default taken in silence; note others it does not know."""
@@ -166,10 +165,7 @@ def told(root: Element) -> list[str]:
 
 
 def parse(document: bytes, origin: str) -> Element:
-    """Return the root of an XML document without namespaces and entities.
-
-    It is in UTF-8 unless it declares another encoding or has a UTF-16 byte order mark.
-    """
+    """Return the root of a document in the encoding that it declares, without entities."""
     if not document.strip():
         raise UrdfError(f"{origin}: is empty; expected a URDF with a <robot>")
     builder = _Builder(origin)
