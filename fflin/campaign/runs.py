@@ -12,6 +12,7 @@ import numpy as np
 
 from fflin.base.validation import Array
 from fflin.batch.dispatch import ChunkResult
+from fflin.campaign.dispersion_files import placed
 from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.tally import KINDS, Outcome, Tally, stop_of
 from fflin.dynamics.state_rows import states_of
@@ -32,9 +33,17 @@ class CampaignJob:
     """Runs of a plan with what is drawn; see `Job`."""
 
     def __init__(
-        self, robot: Robot, policy: Any, given: Any, seed: int, engine: str, options: Any
+        self,
+        robot: Robot,
+        policy: Any,
+        given: Any,
+        seed: int,
+        engine: str,
+        options: Any,
+        histories: int = 0,
     ) -> None:
-        self._again = partial(_made, robot, policy, given, seed, options=options)
+        more = {"options": options, "histories": histories}
+        self._again = partial(_made, robot, policy, given, seed, **more)
         self.plan, self.plant = planned(robot, policy, linear=False, progress=False, **options)
         self.engine, state = engine, self.plant.state
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
@@ -43,7 +52,10 @@ class CampaignJob:
             t = self.plan.times.dt * np.arange(self.plan.times.steps + 1)
             q, v, _ = map(np.array, zip(*map(follows, t.tolist()), strict=True))
             self.home = states_of(state, q, state.velocities(v))
-        self.dispersions = Dispersions(given, self.plant, self.plan.policy, self.x0, seed)
+        with placed(given):
+            self.dispersions = Dispersions(given, self.plant, self.plan.policy, self.x0, seed)
+        spread = np.linspace(0.0, self.plan.times.steps, histories)
+        self.steps = np.unique(spread.round().astype(int))
 
     def __reduce__(self) -> tuple[Any, ...]:
         # What is bound to the robot is made anew by a worker.
@@ -57,11 +69,9 @@ class CampaignJob:
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of each array of a run's outcome."""
         robot, nx, nu = self.plant.robot, self.plant.state.nx, len(self.plan.initial)
-        sizes = (robot.nq, robot.nv, nx, nu, nx, nu, *[len(KINDS)] * 3)
-        return {
-            **{key: (size,) for key, size in zip(ARRAYS, sizes, strict=False)},
-            **{key: () for key in ARRAYS[len(sizes) :]},
-        }
+        sizes = [(size,) for size in (robot.nq, robot.nv, nx, nu, nx, nu, *[len(KINDS)] * 3)]
+        histories = [(len(self.steps), size) for size in (len(KINDS), nu)]
+        return dict(zip(ARRAYS, [*sizes, *histories, (), ()], strict=True))
 
     def run(self, rows: Draws, start: int, out: Mapping[str, Array] | None = None) -> ChunkResult:
         """Do some runs."""
@@ -89,7 +99,7 @@ class CampaignJob:
             lanes.fly(eight, self._tally(LANES), own)
 
     def _tally(self, count: int) -> Tally:
-        return Tally(self.plan, self.plant.state, self.home, count)
+        return Tally(self.plan, self.plant.state, self.home, count, self.steps)
 
     def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:
         """Return the plan of a run (k,), and its robot."""
@@ -118,6 +128,35 @@ class CampaignJob:
         if self.engine == "python":
             return motion_of(plan, plant, "python", self._gone(plan, plant))
         return motion_of(plan, plant, "compiled", self._recorded(drawn, plan, plant))
+
+    def courses(self, drawn: Array, most: int) -> list[Array]:
+        """Return some configurations (rows, nq) on the way of runs (N, k), and the last of each."""
+        times, found = self.plan.times, list[Array]()
+        every = -(-times.steps // most)
+        if self.engine == "python":
+            for plan, plant in map(self.plan_of, drawn):
+                rare = replace(plan, times=times._replace(every=every))
+                found.append(self._gone(rare, plant).q)
+            return found
+        from fflin.campaign.lanes import Lanes
+
+        tree, kept = batch_tree(self.plant.robot), list[Array]()
+        assert tree is not None
+        lanes = Lanes(self.plan, self.plant)
+
+        def watch(first: int, rows: list[Array]) -> None:
+            kept.append(rows[0][-first % every :: every].copy())
+
+        for first in range(0, len(drawn), LANES):
+            eight = drawn[first : first + LANES]
+            kept.clear()
+            out = {key: np.empty((len(eight), *shape)) for key, shape in self.shapes.items()}
+            lanes.fly(self.dispersions.in_lanes(eight, tree), self._tally(LANES), out, watch)
+            rows = np.concatenate(kept)
+            for lane, (end, q) in enumerate(zip(out["end"], out["q"], strict=True)):
+                count = -(-round(end / times.dt) // every)
+                found.append(np.vstack((rows[:count, lane], q)))
+        return found
 
     def _recorded(self, drawn: Array, plan: Plan, plant: Plant) -> Recording:
         """Return the recording of a run that goes in all lanes."""

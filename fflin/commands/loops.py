@@ -1,11 +1,11 @@
-"""What closes the loop that the command simulate shows, from files or by design."""
+"""The loop that commands simulate, closed by what files hold or by design."""
 
 from __future__ import annotations
 
 import argparse
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fflin.base.errors import FflinWarning, InputError, listed
 from fflin.commands.points import configuration_of, inputs_at, once, placed, velocity_of
@@ -22,6 +22,15 @@ _WEIGHTS = ("weights", "q", "r", "bryson", "dt")
 _TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce")
 
 
+class Loop(NamedTuple):
+    """A policy, how it is simulated, and where it is one, its state feedback and model."""
+
+    policy: Any
+    options: dict[str, Any]
+    feedback: StateFeedback | None = None
+    lin: LinearModel | None = None
+
+
 def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
     """Refuse options that say nothing beside others."""
     if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name)]:
@@ -33,6 +42,36 @@ def refuse_law(arguments: argparse.Namespace) -> None:
     _refuse(arguments, ("limit", "delay"), "--free has no input to limit or delay")
     names = (*_WEIGHTS, *_TARGETS[:2], "reduce", "allocate", "gain")
     _refuse(arguments, names, "--free has no regulator to give weights, a target or thrusters")
+
+
+def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
+    """Return the loop that the options of `add_loop` say."""
+    from fflin.simulation.settling import SHORTEST, time_to_settle
+
+    given = once("--limit", arguments.limit)
+    options: dict[str, Any] = {
+        "dt": arguments.step,
+        "method": arguments.method,
+        "limits": [arguments.limits, given] if arguments.limits == "urdf" else given or None,
+        "delay": arguments.delay,
+        "duration": arguments.duration,
+    }
+    if arguments.trajectory or arguments.schedule:
+        policy, start = along(robot, arguments)
+        return Loop(policy, options | start)
+    if arguments.offset or arguments.hold:
+        raise InputError("--offset and --hold are of a --trajectory; give one, or leave them out")
+    q, v = start_of(robot, arguments)
+    options |= {"q0": q, "v0": v}
+    if arguments.free:
+        refuse_law(arguments)
+        options["duration"] = SHORTEST if arguments.duration is None else arguments.duration
+        return Loop(None, options | {"frame": arguments.frame})
+    policy, feedback, lin = about_point(robot, arguments)
+    require_held(robot, feedback, q)
+    if arguments.duration is None:
+        options["duration"] = time_to_settle(robot, feedback, q, v)
+    return Loop(policy, options, *([feedback, lin] if policy is feedback else []))
 
 
 def start_of(robot: Robot, arguments: argparse.Namespace) -> tuple[Array, Array | None]:

@@ -147,7 +147,7 @@ def _sweep(arguments: argparse.Namespace) -> int:
     announce = _Announcement(robot, path, options, arguments.yes)
     q, v, u = _points(robot, arguments, v, u, announce)
     bar = Progress()
-    with _executor(arguments.dask) as executor:
+    with executor_of(arguments.dask) as executor:
         announce.say()
         try:
             batch = sweep(
@@ -285,7 +285,7 @@ def _given(path: Path) -> dict[str, Array]:
 
 
 @contextmanager
-def _executor(address: str | None) -> Iterator[Executor | None]:
+def executor_of(address: str | None) -> Iterator[Executor | None]:
     """Yield the executor of a dask scheduler, or None where there is no address."""
     if address is None:
         yield None
@@ -302,4 +302,4 @@ def _executor(address: str | None) -> Iterator[Executor | None]:
         said = " ".join(str(error).split())
         raise InputError(f"no dask scheduler answers at '{address}': {said}") from None
     with client:
-        yield client.get_executor()
+        yield client.getexecutor_of()

@@ -20,6 +20,7 @@ from fflin.commands.arguments import (
 from fflin.commands.points import configuration_of, load_robot
 
 if TYPE_CHECKING:
+    from fflin.campaign.campaign import Campaign
     from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion
 
@@ -46,13 +47,15 @@ def add_commands(commands: Commands) -> None:
     )
 
 
-def add_pictures(command: Container) -> None:
+def add_pictures(
+    command: Container, page: str = "write a page that plays it without a network"
+) -> None:
     """Add the options of a command that makes a motion: files to show it in, and how."""
     command.add_argument(
         "--html",
         metavar="FILE",
         type=file_name,
-        help="write a page that plays it without a network",
+        help=page,
     )
     command.add_argument(
         "--png",
@@ -131,7 +134,9 @@ def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
         check_times(arguments.times, 0.0, duration)
 
 
-def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> list[str]:
+def show_motion(
+    robot: Robot, motion: Motion, arguments: argparse.Namespace, cloud: Campaign | None = None
+) -> list[str]:
     """Write what the options of `add_pictures` ask for, and return a line for each file."""
     files = {name: path for name in _FILES if (path := getattr(arguments, name))}
     if not files:
@@ -148,6 +153,7 @@ def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> 
         speed=arguments.speed,
         follow=arguments.follow,
         tool=arguments.tool,
+        cloud=cloud,
     )
     return [f"wrote {path}: {path.stat().st_size / 1e6:.2f} MB" for path in files.values()]
 
