@@ -18,8 +18,7 @@ from fflin.base.record import reading
 from fflin.base.validation import Array, share, whole
 from fflin.base.writing import as_path
 from fflin.batch.files import read_rows, write_rows
-from fflin.campaign.conditions import bounds_of
-from fflin.campaign.plots import plot_campaign
+from fflin.campaign.conditions import Bound, bounds_of
 from fflin.campaign.report import campaign_report
 from fflin.campaign.tally import KINDS
 
@@ -120,9 +119,13 @@ class Campaign(FrozenArrays):
 
         What the first goal bounds from above, or the worst error of what is steered first.
         """
-        bounds = [each for goal in self.goals for each in bounds_of(goal, self.figure)]
-        bounded = [each.name for each in bounds if each.sign[0] == "<"]
+        bounded = [each.name for each in self.bounds if each.sign[0] == "<"]
         return [*bounded, f"worst {(self.judged or tuple(KINDS))[0]}"][0]
+
+    @property
+    def bounds(self) -> list[Bound]:
+        """What the goals compare."""
+        return [each for goal in self.goals for each in bounds_of(goal, self.figure)]
 
     def values(self, name: str) -> Array:
         """Return a figure of each run (N,) by its name, in SI units but for angles in deg."""
@@ -183,7 +186,7 @@ class Campaign(FrozenArrays):
             return found
         met = ~self.stopped
         for bound in bounds_of(condition, self.figure):
-            met = met & bound.met()
+            met = met & bound.met
         return met
 
     def fraction(self, condition: Any, *, confidence: float = 0.95) -> Estimate:
@@ -262,10 +265,6 @@ class Campaign(FrozenArrays):
         rest = {key: getattr(self, key) for key in _HEADER}
         texts = {"header": json.dumps({"kind": "Campaign", **rest})}
         write_rows(as_path(path), arrays, texts, sealed=True)
-
-    def plot(self, path: str | Path | None = None, **options: Any) -> Any:
-        """Draw the campaign, see `plot_campaign`; into a file where a path is given."""
-        return plot_campaign(self, path, **options)
 
     @classmethod
     def load(cls, path: str | Path) -> Campaign:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,10 +32,10 @@ class Bound(NamedTuple):
     sign: str
     limit: float
 
-    def met(self) -> Array:
-        """Return which runs (N,) are on the right side of it."""
-        found: Array = _COMPARE[self.sign](self.values, self.limit)
-        return found
+    @property
+    def met(self) -> Any:
+        """Which runs (N,) are on the right side of it."""
+        return _COMPARE[self.sign](self.values, self.limit)
 
 
 def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> list[Bound]:

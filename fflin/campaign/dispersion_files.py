@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fflin.base.errors import FflinError, InputError, UnknownNameError, unknown
+from fflin.base.errors import FflinError, InputError, unknown
 from fflin.base.names import stands_for_any
 from fflin.base.toml_file import TomlFile
 from fflin.base.writing import as_path
@@ -26,34 +26,24 @@ _EXPECTED = (
 class DispersionFile(dict[str, Any]):
     """{name, group or pattern: spread} of a file, and the lines on which they stand."""
 
-    def __init__(self, spreads: Mapping[str, Any], document: TomlFile) -> None:
-        super().__init__(spreads)
-        self._document = document
+    document: TomlFile
 
     def __reduce__(self) -> tuple[Any, ...]:
         return dict, (dict(self),)  # a worker has nobody to tell a line
 
-    def placed(self, error: FflinError) -> FflinError:
-        """Return the error with file and line of the spread that it is about in front of it."""
-        quoted = re.findall(r"'([^']*)'", str(error))
-        names = [*quoted, *(name.rpartition(".")[0] for name in quoted)]
-        ways = {key: {key, key.rpartition(".")[0] or key} for key in self}
-        found = [key for key in self if key in quoted]
-        found += [key for key in self if ways[key] & {*quoted[:1]}]
-        found += [key for key in self if any(stands_for_any(x, names) for x in ways[key])]
-        line = self._document.line(_TABLE, *found[:1])
-        return type(error)(f"{self._document.path}:{line}: {error}")
-
 
 @contextmanager
 def placed(dispersions: Any) -> Iterator[None]:
-    """Say where in its file a spread stands that something is wrong about."""
+    """Put file and line of the spread that something is wrong about in front of it."""
     try:
         yield
     except FflinError as error:
         if not isinstance(dispersions, DispersionFile):
             raise
-        raise dispersions.placed(error) from None
+        quoted, file = re.findall(r"'([^']*)'", str(error)), dispersions.document
+        keys = [k for name in quoted for k in dispersions if name in (k, k.rpartition(".")[0])]
+        keys += [key for key in dispersions if stands_for_any(key, quoted)]
+        raise type(error)(f"{file.path}:{file.line(_TABLE, *keys[:1])}: {error}") from None
 
 
 def load_dispersions(path: str | Path) -> dict[str, Any]:
@@ -91,77 +81,65 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
         If the file is not TOML or a value is wrong; with file and line.
     """
     document = TomlFile(as_path(path))
-    for key in document.record:
-        if key != _TABLE:
-            raise document.unknown(f"{unknown('table', key, [_TABLE])}; write [{_TABLE}]", key)
-    table = document.record.get(_TABLE, {})
-    if not isinstance(table, dict) or not table:
-        raise document.error(f"holds no spreads; write [{_TABLE}] and below it q_b = 0.05", _TABLE)
-    return DispersionFile(dict(_spreads(document, table)), document)
+    table = document.record.get(_TABLE)
+    for key in (*document.record, _TABLE):
+        if key != _TABLE or not isinstance(table, dict) or not table:
+            problem = unknown("table", key, [_TABLE]) if key != _TABLE else "holds no spreads"
+            raise document.unknown(f"{problem}; write [{_TABLE}] and below it q_b = 0.05", key)
+    found = DispersionFile()
+    found.document = document
+    for name, value in _names(table):
+        try:
+            found[name] = _spread(value)
+        except FflinError as error:
+            raise type(error)(
+                f"{document.path}:{document.line(_TABLE, name)}: '{name}': {error}"
+            ) from None
+    return found
 
 
-def _spreads(document: TomlFile, table: Any, *way: str) -> Iterator[tuple[str, Any]]:
+def _names(table: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
     """Yield (name, spread); ``base.mass = 0.1`` is the name "base.mass"."""
     for key, value in table.items():
-        place = (*way, key)
         if isinstance(value, dict) and value and not {*value} & {*_FORMS}:
-            yield from _spreads(document, value, *place)
-            continue
-        try:
-            yield ".".join(place), _spread(key, value, bool(way))
-        except UnknownNameError as error:
-            raise document.unknown(error, _TABLE, *place) from None
-        except InputError as error:
-            said = f"'{'.'.join(place)}' {error}"
-            raise document.error(said, _TABLE, *place) from None
+            yield from _names(value, f"{before}{key}.")
+        else:
+            yield f"{before}{key}", value
 
 
-def _spread(key: str, value: Any, below: bool) -> Any:
+def _spread(value: Any) -> Any:
     if is_number(value):
         return value
-    if not isinstance(value, dict):
-        if below and isinstance(value, list):  # of a table whose only key is none of these
-            raise unknown("kind of spread", key, _FORMS)
-        raise InputError(f"is {reprlib.repr(value)}, expected {_EXPECTED}")
-    form = next((form for form in _FORMS if form in value), "")
-    given = value.get(form)
-    others = [each for each in value if each != form]
-    if form == "distribution":
-        return _distribution(given, {each: value[each] for each in others})
-    if others:
-        raise unknown("key of a spread", others[0], [form])
-    if form == "normal" and is_number(given):
+    form, *others = value if isinstance(value, dict) and value else [""]
+    given = value[form] if form else None
+    if isinstance(value, dict) and isinstance(value.get("distribution"), str):
+        return _distribution(**value)
+    numbers = isinstance(given, list) and all(map(is_number, given)) and given
+    if form == "normal" and is_number(given) and not others:
         return given
-    if form == "uniform" and _numbers(given) and len(given) == 2 and given[0] <= given[1]:
+    if form == "uniform" and numbers and len(given) == 2 and not others:
         return tuple(given)
-    if form == "values" and _numbers(given) and given:
+    if form == "values" and numbers and not others:
         return given
-    raise InputError(f"is {reprlib.repr(value)}, expected {_EXPECTED}")
+    raise InputError(f"{reprlib.repr(value)} is no spread, expected {_EXPECTED}")
 
 
-def _numbers(value: Any) -> bool:
-    return isinstance(value, list) and all(map(is_number, value))
-
-
-def _distribution(name: Any, given: dict[str, Any]) -> Any:
+def _distribution(distribution: str, **given: Any) -> Any:
     from scipy import stats
 
-    kinds = stats.rv_continuous | stats.rv_discrete
-    known = [each for each in dir(stats) if isinstance(getattr(stats, each), kinds)]
-    if name not in known:
+    known = [each for each in dir(stats) if hasattr(getattr(stats, each), "ppf")]
+    if (name := distribution) not in known:
         raise unknown("distribution of scipy.stats", name, known)
-    distribution = getattr(stats, name)
-    shapes = [each.strip() for each in (distribution.shapes or "").split(",") if each.strip()]
-    scale = ["scale"] * isinstance(distribution, stats.rv_continuous)
+    shapes = re.findall(r"\w+", getattr(stats, name).shapes or "")
     for key, value in given.items():
-        if key not in (*shapes, "loc", *scale):
-            raise unknown(f"parameter of {name}", key, [*shapes, "loc", *scale])
+        if key not in (*shapes, "loc", "scale"):
+            raise unknown(f"parameter of {name}", key, [*shapes, "loc", "scale"])
         if not is_number(value):
-            raise InputError(f"has {key} = {reprlib.repr(value)}, expected a number")
+            raise InputError(f"{key} is {reprlib.repr(value)}, expected a number")
     if missing := [each for each in shapes if each not in given]:
-        raise InputError(f"is distributed by {name}, which needs {', '.join(missing)}; give it")
-    frozen = distribution(**given)
+        raise InputError(f"{name} needs {', '.join(missing)} too")
+    frozen = getattr(stats, name)(**given)
     if not abs(frozen.ppf(0.5)) < 1e100:
         said = ", ".join(f"{key} = {value:g}" for key, value in given.items())
-        raise InputError(f"has {said}, of which {name} is no distribution")
+        raise InputError(f"{name} is no distribution with {said}")
     return frozen

@@ -153,8 +153,8 @@ def monte_carlo(
     width, confidence = share("width", width), share("confidence", confidence)
     check_workers(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
-    options["duration"], histories = duration, whole("histories", histories, 0)
-    job = CampaignJob(robot, policy, dispersions, seed, "", options, histories)
+    options |= {"duration": duration, "histories": whole("histories", histories, 0)}
+    job = CampaignJob(robot, policy, dispersions, seed, "", options)
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
     check_room(runs, 8 * runs * sum(map(math.prod, shapes.values())), path, "runs")
     if executor or workers:

@@ -33,17 +33,10 @@ class CampaignJob:
     """Runs of a plan with what is drawn; see `Job`."""
 
     def __init__(
-        self,
-        robot: Robot,
-        policy: Any,
-        given: Any,
-        seed: int,
-        engine: str,
-        options: Any,
-        histories: int = 0,
+        self, robot: Robot, policy: Any, given: Any, seed: int, engine: str, options: Any
     ) -> None:
-        more = {"options": options, "histories": histories}
-        self._again = partial(_made, robot, policy, given, seed, **more)
+        self._again = partial(_made, robot, policy, given, seed, options=options)
+        histories = (options := dict(options)).pop("histories", 0)
         self.plan, self.plant = planned(robot, policy, linear=False, progress=False, **options)
         self.engine, state = engine, self.plant.state
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
@@ -138,47 +131,38 @@ class CampaignJob:
                 rare = replace(plan, times=times._replace(every=every))
                 found.append(self._gone(rare, plant).q)
             return found
+        for first in range(0, len(drawn), LANES):
+            (q, *_), out, *_ = self._watched(drawn[first : first + LANES], every)
+            counts = -(-(out["end"] / times.dt).round().astype(int) // every)
+            ends = zip(counts, out["q"], strict=True)
+            found += [np.vstack((q[:count, lane], end)) for lane, (count, end) in enumerate(ends)]
+        return found
+
+    def _watched(self, drawn: Array, every: int) -> tuple[list[Array], dict[str, Array], str, Any]:
+        """Return rows (steps, lanes, ..) of up to eight runs, and how and why these ended."""
         from fflin.campaign.lanes import Lanes
 
-        tree, kept = batch_tree(self.plant.robot), list[Array]()
+        tree, kept = batch_tree(self.plant.robot), list[list[Array]]()
         assert tree is not None
         lanes = Lanes(self.plan, self.plant)
 
         def watch(first: int, rows: list[Array]) -> None:
-            kept.append(rows[0][-first % every :: every].copy())
+            kept.append([each[-first % every :: every].copy() for each in rows])
 
-        for first in range(0, len(drawn), LANES):
-            eight = drawn[first : first + LANES]
-            kept.clear()
-            out = {key: np.empty((len(eight), *shape)) for key, shape in self.shapes.items()}
-            lanes.fly(self.dispersions.in_lanes(eight, tree), self._tally(LANES), out, watch)
-            rows = np.concatenate(kept)
-            for lane, (end, q) in enumerate(zip(out["end"], out["q"], strict=True)):
-                count = -(-round(end / times.dt) // every)
-                found.append(np.vstack((rows[:count, lane], q)))
-        return found
+        out = {key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()}
+        said = lanes.fly(self.dispersions.in_lanes(drawn, tree), self._tally(LANES), out, watch)
+        return list(map(np.concatenate, zip(*kept, strict=True))), out, said[0], lanes
 
     def _recorded(self, drawn: Array, plan: Plan, plant: Plant) -> Recording:
         """Return the recording of a run that goes in all lanes."""
-        from fflin.campaign.lanes import Lanes
-
-        tree, every, kept = batch_tree(self.plant.robot), plan.times.every, list[list[Array]]()
-        assert tree is not None
-        lanes = Lanes(self.plan, self.plant)
-
-        def watch(first: int, rows: list[Array]) -> None:
-            kept.append([each[-first % every :: every, 0].copy() for each in rows])
-
-        runs = self.dispersions.in_lanes(np.tile(drawn, (LANES, 1)), tree)
-        out = {key: np.empty((LANES, *shape)) for key, shape in self.shapes.items()}
-        said = lanes.fly(runs, self._tally(LANES), out, watch)[0]
-        t = every * plan.times.dt * np.arange(sum(len(each[0]) for each in kept))
-        state, end = plant.state, float(out["end"][0])
+        every, state = plan.times.every, plant.state
+        rows, out, said, lanes = self._watched(np.tile(drawn, (LANES, 1)), every)
+        rows, end = [each[:, 0] for each in rows], float(out["end"][0])
+        t = every * plan.times.dt * np.arange(len(rows[0]))
         if not said.startswith("diverged"):
-            nu = state.velocities(out["v"][0])
-            kept.append([x[None] for x in (out["q"][0], nu, out["u"][0], *lanes.kept(end))])
-            t = np.append(t, end)
-        q, nu, u, momentum, center = map(np.concatenate, zip(*kept, strict=True))
+            last = out["q"][0], state.velocities(out["v"][0]), out["u"][0], *lanes.kept(end)
+            rows, t = [np.vstack(x) for x in zip(rows, last, strict=True)], np.append(t, end)
+        q, nu, u, momentum, center = rows
         parts = (t, q, state.spread(nu), u, momentum, center, round(end / plan.times.dt), said)
         return Recording(*parts, "compiled")
 

@@ -4,32 +4,18 @@ from __future__ import annotations
 
 import argparse
 import json
+from typing import Any
 
-from fflin.base.errors import InputError
 from fflin.commands import DONE
-from fflin.commands.arguments import (
-    Commands,
-    add_output_file,
-    add_values,
-    command,
-    count_of,
-    file_name,
-    number,
-    whole,
-)
-from fflin.commands.loop_options import add_loop
-from fflin.commands.loops import loop_of
+from fflin.commands.arguments import Commands, add_options, add_output_file, command
+from fflin.commands.loops import add_loop, loop_of
 from fflin.commands.points import load_robot
-from fflin.commands.sweeps import executor_of
-from fflin.commands.visual import (
-    add_figure,
-    add_pictures,
-    check_figure,
-    check_pictures,
-    show_motion,
-)
+from fflin.commands.sweeps import executor_of, going_on
+from fflin.commands.visual import add_pictures, check_figure, check_pictures, draw, show_motion
 
 _ROWS = 240  # at which errors and inputs are kept for a figure
+_OUTPUTS = ("output_file", "plot", "html", "png", "gif")
+_PASSED = ("runs", "seed", "until", "width", "confidence", "workers", "threads")
 
 
 def add_commands(commands: Commands) -> None:
@@ -46,106 +32,76 @@ def add_commands(commands: Commands) -> None:
     draws, work, shown = map(
         montecarlo.add_argument_group, ("the runs", "who does them", "what is kept and shown")
     )
-    draws.add_argument(
-        "--dispersions",
-        metavar="FILE.toml",
-        type=file_name,
+    add_options(
+        draws,
+        """
+        --dispersions FILE: what is drawn at random, a table [dispersions] in TOML as
+            fflin.load_dispersions reads it
+        --runs N: how many""",
         required=True,
-        help="what is drawn at random, a table [dispersions] as fflin.load_dispersions reads it",
     )
-    draws.add_argument("--runs", metavar="N", type=count_of, required=True, help="how many")
-    draws.add_argument("--seed", metavar="S", type=whole, default=0, help="of the draws; 0")
-    draws.add_argument(
-        "--until",
-        metavar="CONDITION",
-        help="make no more runs once the share that meets it, 'attitude < 1 deg', is known to "
-        "--width",
+    add_options(
+        draws,
+        """
+        --seed S = 0: of the draws; 0 by default
+        --until CONDITION: make no more runs once the share that meets it, 'attitude < 1 deg', is
+            known to --width
+        --width P = 0.02: of the interval of that share; 0.02 by default
+        --confidence P = 0.95: of all intervals; 0.95 by default""",
     )
-    for name, value, what in (("width", 0.02, "--until"), ("confidence", 0.95, "all intervals")):
-        draws.add_argument(
-            f"--{name}", metavar="P", type=number, default=value, help=f"of {what} ({value:g})"
-        )
-    work.add_argument("--workers", metavar="N", type=count_of, help="share them among N processes")
-    work.add_argument("--threads", metavar="N", type=count_of, help="or threads; all cores' else")
-    work.add_argument("--dask", metavar="ADDRESS", help="or the workers of a dask scheduler")
-    add_values(
+    add_options(
+        work,
+        """
+        --workers N: share them among N processes
+        --threads N: or among N threads; by default as many as there are cores
+        --dask ADDRESS: or among the workers of a dask scheduler""",
+    )
+    add_options(
         shown,
-        "--goal",
-        "say the share of runs that meet a condition, 'attitude < 1 deg and settle < 60 s', and "
-        "draw its bounds",
-        metavar="CONDITION",
-        read=str,
+        """
+        --goal CONDITION*: say the share of runs that meet it, 'attitude < 1 deg and settle < 60 s',
+            and draw its bounds
+        --worst K = 3: say the K worst runs; 3 by default
+        --json: print the figures as JSON
+        --plot FILE: draw bands over time, histograms and the worst runs into FILE: .png, .pdf or
+            .svg""",
     )
-    shown.add_argument(
-        "--worst", metavar="K", type=whole, default=3, help="say the K worst runs (3)"
-    )
-    shown.add_argument("--json", action="store_true", help="print the figures as JSON")
-    add_figure(shown, "draw bands of quantiles over time, histograms and the worst runs")
     add_output_file(
         shown,
         "save the runs to FILE: .h5 (HDF5) or .npz; it grows as FILE.part, and the same command "
         "goes on from what is there",
     )
-    add_pictures(shown, "write a page that plays the worst run, with the paths of the others")
+    add_pictures(shown, "that plays the worst run, with the paths of others as thin lines")
 
 
 def _montecarlo(arguments: argparse.Namespace) -> int:
-    from fflin.base.progress import Progress
     from fflin.base.writing import check_distinct
-    from fflin.batch.store import output_path, part_of
+    from fflin.batch.store import output_path
     from fflin.campaign.dispersion_files import load_dispersions
     from fflin.campaign.monte_carlo import monte_carlo
     from fflin.campaign.report import campaign_record, worst_runs
 
-    path, pictures = arguments.output_file, ("html", "png", "gif")
-    check_distinct(path, arguments.plot, *(getattr(arguments, name) for name in pictures))
+    path = arguments.output_file
+    check_distinct(*(getattr(arguments, name) for name in _OUTPUTS))
     check_figure(arguments.plot)
     if path:
         output_path(path)
-    if arguments.workers and arguments.dask:
-        raise InputError("--workers and --dask both share the work; give either")
     dispersions = load_dispersions(arguments.dispersions)
     robot = load_robot(arguments)
     check_pictures(robot, arguments)
-    loop, bar, reached = loop_of(robot, arguments), Progress(), [0, arguments.runs]
-
-    def progress(done: int, total: int) -> None:
-        reached[:] = done, total
-        bar.update(done, total)
-
-    with executor_of(arguments.dask) as executor:
-        try:
-            campaign = monte_carlo(
-                robot,
-                loop.policy,
-                dispersions,
-                **{name: getattr(arguments, name) for name in ("runs", "seed", "until")},
-                **{name: getattr(arguments, name) for name in ("width", "confidence")},
-                **{name: getattr(arguments, name) for name in ("workers", "threads")},
-                goals=arguments.goal,
-                histories=_ROWS if arguments.plot else 0,
-                executor=executor,
-                progress=progress,
-                out=path,
-                **loop.options,
-            )
-        except KeyboardInterrupt:
-            said = "stopped after {:,} of {:,} runs; ".format(*reached)
-            if path and part_of(path).exists():
-                said += f"the same command goes on from {part_of(path)}"
-            else:
-                said += "nothing is kept, which -o FILE.h5 would do"
-            raise KeyboardInterrupt(said) from None
-        finally:
-            bar.close()
+    loop = loop_of(robot, arguments)
+    options: dict[str, Any] = {name: getattr(arguments, name) for name in _PASSED} | loop.options
+    options |= {"goals": arguments.goal, "histories": _ROWS if arguments.plot else 0}
+    with executor_of(arguments) as executor, going_on(path, "runs") as progress:
+        options |= {"executor": executor, "progress": progress, "out": path}
+        campaign = monte_carlo(robot, loop.policy, dispersions, **options)
     lines = [f"wrote {path}"] if path else []
     try:
         if arguments.plot:
-            campaign.plot(arguments.plot)
-            lines.append(f"wrote {arguments.plot}")
-        if any(getattr(arguments, name) for name in pictures):
-            [worst] = campaign.worst(1)
-            lines += show_motion(robot, campaign.replay(worst), arguments, campaign)
+            draw(arguments.plot, "plot_campaign", campaign)
+        if any(getattr(arguments, name) for name in _OUTPUTS[2:]):
+            worst = campaign.replay(campaign.worst(1)[0])
+            lines += show_motion(robot, worst, arguments, campaign)
     finally:
         if arguments.json:
             print(json.dumps(campaign_record(campaign, arguments.worst), indent=2))

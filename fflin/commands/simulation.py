@@ -11,14 +11,11 @@ from fflin.base.names import chosen, input_keys
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
+    add_options,
     add_output_file,
-    add_values,
     command,
-    count_of,
-    file_name,
 )
-from fflin.commands.loop_options import add_loop
-from fflin.commands.loops import loop_of
+from fflin.commands.loops import add_loop, loop_of
 from fflin.commands.points import load_robot
 from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
 
@@ -42,24 +39,13 @@ def add_commands(commands: Commands) -> None:
         "fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png",
     )
     run, shown = add_loop(simulate), simulate.add_argument_group("what is kept and shown of it")
-    run.add_argument(
-        "--every",
-        metavar="N",
-        type=count_of,
-        help="steps from one recorded row to the next; chosen where there are many",
-    )
-    shown.add_argument(
-        "--plot",
-        metavar="FILE",
-        type=file_name,
-        help="draw linear beside nonlinear into FILE: .png, .pdf or .svg",
-    )
-    add_values(
+    add_options(run, "--every N: steps from one row to the next; chosen where there are many")
+    add_options(
         shown,
-        "--show",
-        "what --plot draws: a state or input, a group or a pattern, such as q_m, '*.hinge_*'",
-        metavar="NAME",
-        read=str,
+        """
+        --plot FILE: draw linear beside nonlinear into FILE: .png, .pdf or .svg
+        --show NAME*: what --plot draws: a state or input, a group or a pattern, such as q_m,
+            '*.hinge_*'""",
     )
     add_output_file(shown, "save the motion to FILE: .npz, .mat, .json or .csv")
     add_pictures(shown)

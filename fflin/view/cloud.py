@@ -25,10 +25,8 @@ def drawn_robot(robot: Robot, cloud: Any, motion: Any) -> Robot:
     Raises `InputError` where the cloud is no campaign of the robot.
     """
     if not isinstance(cloud, Campaign):
-        raise InputError(
-            f"cloud is a {type(cloud).__name__}, expected a Campaign, as fflin.monte_carlo returns "
-            "it"
-        )
+        said = f"cloud is a {type(cloud).__name__}, expected a Campaign"
+        raise InputError(f"{said}, as fflin.monte_carlo returns it")
     if cloud.urdf_sha256 != robot.urdf_sha256:
         raise InputError(f"the cloud is of '{cloud.robot}', not of '{robot.name}' as it is given")
     drawn: Robot = getattr(motion, "_robot", None) or robot
@@ -40,20 +38,16 @@ def cloud_of(robot: Robot, campaign: Campaign, tool: str | None) -> list[dict[st
     """Return the paths of base and tool of the runs, or of some of them, evenly chosen."""
     chosen = np.unique(np.linspace(0, len(campaign) - 1, _RUNS).astype(int))
     runs, data = campaign.courses(chosen.tolist(), _ROWS), robot.model.createData()
-    joint, at = find_frame(robot.model, tool) if tool else (ROOT, pin.SE3.Identity())
-    ends = {"base": (ROOT, pin.SE3.Identity()), **({"tool": (joint, at)} if tool else {})}
-    paths: dict[str, list[Any]] = {name: [] for name in ends}
-    for q in (row for run in runs for row in run):
+    ends = {"base": (ROOT, pin.SE3.Identity())}
+    if tool:
+        ends["tool"] = find_frame(robot.model, tool)
+    points = np.empty((len(ends), sum(map(len, runs)), 3))
+    for row, q in enumerate(np.concatenate(runs)):
         pin.forwardKinematics(robot.model, data, q)
-        for name, (of, where) in ends.items():
-            paths[name].append(data.oMi[of].act(where.translation))
+        points[:, row] = [data.oMi[of].act(at.translation) for of, at in ends.values()]
+    said = f"in {len(runs)} of {len(campaign):,} runs"
     return [
-        {
-            "name": name,
-            "label": f"{name} in {len(runs)} of {len(campaign):,} runs",
-            "colour": _COLORS[name],
-            "points": packed(np.array(points)),
-            "counts": [len(run) for run in runs],
-        }
-        for name, points in paths.items()
+        {"name": name, "label": f"{name} {said}", "colour": _COLORS[name], "points": packed(of)}
+        | {"counts": list(map(len, runs))}
+        for name, of in zip(ends, points, strict=True)
     ]
