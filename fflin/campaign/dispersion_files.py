@@ -88,13 +88,12 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
             raise document.unknown(f"{problem}; write [{_TABLE}] and below it q_b = 0.05", key)
     found = DispersionFile()
     found.document = document
-    for name, value in _names(table):
+    for name, value in _names(table or {}):
         try:
             found[name] = _spread(value)
         except FflinError as error:
-            raise type(error)(
-                f"{document.path}:{document.line(_TABLE, name)}: '{name}': {error}"
-            ) from None
+            line = document.line(_TABLE, name)
+            raise type(error)(f"{document.path}:{line}: '{name}': {error}") from None
     return found
 
 
@@ -108,19 +107,14 @@ def _names(table: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, An
 
 
 def _spread(value: Any) -> Any:
-    if is_number(value):
-        return value
-    form, *others = value if isinstance(value, dict) and value else [""]
-    given = value[form] if form else None
-    if isinstance(value, dict) and isinstance(value.get("distribution"), str):
-        return _distribution(**value)
-    numbers = isinstance(given, list) and all(map(is_number, given)) and given
-    if form == "normal" and is_number(given) and not others:
-        return given
-    if form == "uniform" and numbers and len(given) == 2 and not others:
-        return tuple(given)
-    if form == "values" and numbers and not others:
-        return given
+    table: dict[str, Any] = value if isinstance(value, dict) else {"normal": value}
+    if isinstance(table.get("distribution"), str):
+        return _distribution(**table)
+    (form, given), *others = table.items() or [("", None)]
+    entries = given if isinstance(given, list) and form in ("uniform", "values") else [given]
+    right = {"normal": given is not entries, "uniform": len(entries) == 2, "values": given}
+    if not others and all(map(is_number, entries)) and right.get(form):
+        return tuple(entries) if form == "uniform" else given
     raise InputError(f"{reprlib.repr(value)} is no spread, expected {_EXPECTED}")
 
 
@@ -128,18 +122,15 @@ def _distribution(distribution: str, **given: Any) -> Any:
     from scipy import stats
 
     known = [each for each in dir(stats) if hasattr(getattr(stats, each), "ppf")]
-    if (name := distribution) not in known:
-        raise unknown("distribution of scipy.stats", name, known)
-    shapes = re.findall(r"\w+", getattr(stats, name).shapes or "")
-    for key, value in given.items():
-        if key not in (*shapes, "loc", "scale"):
-            raise unknown(f"parameter of {name}", key, [*shapes, "loc", "scale"])
-        if not is_number(value):
-            raise InputError(f"{key} is {reprlib.repr(value)}, expected a number")
-    if missing := [each for each in shapes if each not in given]:
-        raise InputError(f"{name} needs {', '.join(missing)} too")
-    frozen = getattr(stats, name)(**given)
-    if not abs(frozen.ppf(0.5)) < 1e100:
-        said = ", ".join(f"{key} = {value:g}" for key, value in given.items())
-        raise InputError(f"{name} is no distribution with {said}")
-    return frozen
+    if distribution not in known:
+        raise unknown("distribution of scipy.stats", distribution, known)
+    kind = getattr(stats, distribution)
+    try:
+        frozen = kind(**given)
+        if abs(float(frozen.ppf(0.5))) < 1e100:
+            return frozen
+        problem = f"is none with {', '.join(f'{key} = {x:g}' for key, x in given.items())}"
+    except (TypeError, ValueError) as error:
+        problem = str(error).partition("() ")[2] or str(error)
+    shapes = f"{kind.shapes}, " if kind.shapes else ""
+    raise InputError(f"distribution {distribution} {problem}; it takes {shapes}loc, scale")

@@ -20,7 +20,7 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.record import content_digest
-from fflin.base.validation import Array, share, whole
+from fflin.base.validation import share, whole
 from fflin.base.version import __version__
 from fflin.batch.run import Progress, check_workers, failure, run_chunks
 from fflin.batch.store import FileStore, MemoryStore, check_room, output_path
@@ -177,12 +177,11 @@ def monte_carlo(
                 break
             done = min(runs, math.ceil(_GROWTH * done / _STAGE) * _STAGE)
         if failed:
-
-            def others_of(kept: Array) -> Campaign:
-                assert isinstance(store, MemoryStore)
-                return Campaign.of({k: x[kept] for k, x in store.arrays.items()}, header, job)
-
-            raise failure(failed, store, "runs", others_of)
+            rows: Any = store.read(runs)
+            raise failure(
+                *(failed, store, "runs"),
+                lambda kept: Campaign.of({k: x[kept] for k, x in rows.items()}, header, job),
+            )
         if isinstance(store, MemoryStore):
             campaign = Campaign.of(store.read(done), header, job)
             if path is not None:

@@ -138,7 +138,7 @@ class CampaignJob:
             found += [np.vstack((q[:count, lane], end)) for lane, (count, end) in enumerate(ends)]
         return found
 
-    def _watched(self, drawn: Array, every: int) -> tuple[list[Array], dict[str, Array], str, Any]:
+    def _watched(self, drawn: Array, every: int) -> tuple[Any, Any, str, Any]:
         """Return rows (steps, lanes, ..) of up to eight runs, and how and why these ended."""
         from fflin.campaign.lanes import Lanes
 

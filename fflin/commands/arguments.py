@@ -98,9 +98,9 @@ def command(
 def add_options(group: Container, text: str, **more: Any) -> None:
     """Add options, each a line ``--name METAVAR: help`` and those that go on with it.
 
-    A metavar in _READ says how the value is read, one such as a|b what it may be; behind it stand
-    ``*`` where the option is repeatable, or ``= default``. Without one it is a switch, ``--[no-]x``
-    of both ways. What holds of all is in `more`.
+    A metavar in _READ says how the value is read, one such as a|b what it may be, X,Y numbers;
+    behind it stand ``*`` where the option is repeatable, or ``= default``. Without one it is a
+    switch, ``--[no-]x`` of both ways. What holds of all is in `more`.
     """
     for line in re.split(r"\n\s*(?=--)", text.strip()):
         found = _OPTION.fullmatch(" ".join(line.split()))
@@ -109,8 +109,11 @@ def add_options(group: Container, text: str, **more: Any) -> None:
         options: dict[str, Any] = {"help": said + " (repeatable)" * bool(many), **more}
         if not metavar:
             options["action"] = argparse.BooleanOptionalAction if both else "store_true"
-        elif "|" in metavar and "=" not in metavar:
+        elif "|" in metavar:
             options["choices"] = metavar.split("|")
+        elif "," in metavar:
+            options |= {"metavar": (each := tuple(metavar.split(","))), "nargs": len(each)}
+            options["type"] = number
         else:
             options = {"metavar": metavar, "type": _READ.get(metavar, str)} | options
         if many:
@@ -118,11 +121,6 @@ def add_options(group: Container, text: str, **more: Any) -> None:
         if default:
             options["default"] = options.get("type", str)(default)
         group.add_argument(f"--{name}", **options)
-
-
-def _add_vector(command: Container, option: str, entries: str, help: str) -> None:
-    """Add an option of three numbers, which its help calls by these letters."""
-    command.add_argument(option, nargs=3, type=number, metavar=tuple(entries), help=help)
 
 
 def add_robot(command: argparse.ArgumentParser) -> None:
@@ -163,13 +161,10 @@ def add_pose(command: Container) -> None:
     """Add what says where the robot is and how it moves."""
     add_options(
         command,
-        "--joint NAME=VALUE*: put a joint at VALUE [rad|m]; the others are at neutral",
-    )
-    _add_vector(command, "--rpy", "RPY", "base attitude: roll, pitch, yaw [deg] about fixed axes")
-    _add_vector(command, "--position", "XYZ", "base position [m]")
-    add_options(
-        command,
         """
+        --joint NAME=VALUE*: put a joint at VALUE [rad|m]; the others are at neutral
+        --rpy R,P,Y: base attitude: roll, pitch, yaw [deg] about fixed axes
+        --position X,Y,Z: base position [m]
         --velocity NAME=VALUE*: a velocity at the point: the rate [rad/s|m/s] of a joint or wheel,
             or omega_b.x ... v_b.z of the base in base axes""",
     )
@@ -193,14 +188,8 @@ def add_system(command: Container) -> None:
         """
         --stiffness [NAME=]VALUE*: stiffness of a joint [N m/rad|N/m], or one value for all joints
         --damping [NAME=]VALUE*: damping of a joint [N m s/rad|N s/m], or one value for all joints;
-            `urdf`: what the URDF says""",
-    )
-    _add_vector(
-        command, "--gravity", "XYZ", "uniform gravity in world axes [m/s^2]; none by default"
-    )
-    add_options(
-        command,
-        """
+            `urdf`: what the URDF says
+        --gravity X,Y,Z: uniform gravity in world axes [m/s^2]; none by default
         --passive NAME*: a joint without a motor: it gets no torque by default
         --inputs FILE.toml: what acts on the robot, as fflin.load_inputs reads it: a file, or the
             name of a bundled one; `joints` or `base`: those alone; by default those of a

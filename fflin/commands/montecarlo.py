@@ -21,9 +21,7 @@ _PASSED = ("runs", "seed", "until", "width", "confidence", "workers", "threads")
 def add_commands(commands: Commands) -> None:
     """Add montecarlo."""
     montecarlo = command(
-        commands,
-        "montecarlo",
-        _montecarlo,
+        *(commands, "montecarlo", _montecarlo),
         "simulate a loop many times with what is uncertain drawn at random: quantiles, shares, "
         "the worst runs and what they come from",
         "fflin montecarlo ets_vii --dispersions uncertain.toml --runs 1000 --plot runs.png",

@@ -32,9 +32,7 @@ if TYPE_CHECKING:
 def add_commands(commands: Commands) -> None:
     """Add lqr."""
     lqr = command(
-        commands,
-        "lqr",
-        _lqr,
+        *(commands, "lqr", _lqr),
         "design the linear quadratic regulator: gain, poles, residual, margins",
         "fflin lqr canadarm2 -o gain.npz",
     )

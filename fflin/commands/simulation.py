@@ -31,9 +31,7 @@ _OUTPUTS = ("output_file", "plot", "html", "png", "gif")
 def add_commands(commands: Commands) -> None:
     """Add simulate."""
     simulate = command(
-        commands,
-        "simulate",
-        _simulate,
+        *(commands, "simulate", _simulate),
         "let a regulator bring the nonlinear robot from where it is put to the target, or "
         "along a trajectory",
         "fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png",

@@ -42,9 +42,7 @@ _DASK_TIMEOUT = 10  # seconds
 def add_commands(commands: Commands) -> None:
     """Add sweep."""
     sweep = command(
-        commands,
-        "sweep",
-        _sweep,
+        *(commands, "sweep", _sweep),
         "linearise about many points and save them all",
         "fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 -o grid.h5",
     )

@@ -28,9 +28,7 @@ if TYPE_CHECKING:
 def add_commands(commands: Commands) -> None:
     """Add tvlqr."""
     tvlqr = command(
-        commands,
-        "tvlqr",
-        _tvlqr,
+        *(commands, "tvlqr", _tvlqr),
         "design the regulator along a trajectory: the gains over time",
         "fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --dt 0.1 -o gains.npz",
     )

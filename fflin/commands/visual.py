@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fflin.commands import DONE
 from fflin.commands.arguments import (
@@ -23,15 +23,13 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion
 
-_FILES = ("html", "png", "gif")
+_FILES, _SHOWN = ("html", "png", "gif"), ("scene", "follow", "tool")
 
 
 def add_commands(commands: Commands) -> None:
     """Add view."""
     view = command(
-        commands,
-        "view",
-        _view,
+        *(commands, "view", _view),
         "show a robot live in the browser, with a slider for each joint",
         "fflin view servicer_7dof --joint joint_2=0.4",
     )
@@ -121,18 +119,8 @@ def show_motion(
         return []
     from fflin.view.visualize import visualize
 
-    visualize(
-        robot,
-        motion,
-        **files,
-        times=arguments.times,
-        scene=arguments.scene,
-        fps=arguments.fps,
-        speed=arguments.speed,
-        follow=arguments.follow,
-        tool=arguments.tool,
-        cloud=cloud,
-    )
+    how = {name: getattr(arguments, name) for name in ("times", "fps", "speed", *_SHOWN)}
+    visualize(robot, motion, **files, **how, cloud=cloud)
     return [f"wrote {path}: {path.stat().st_size / 1e6:.2f} MB" for path in files.values()]
 
 
@@ -141,15 +129,8 @@ def _view(arguments: argparse.Namespace) -> int:
     from fflin.view.visualize import visualize
 
     robot = load_robot(arguments)
-    live = visualize(
-        robot,
-        open=False,
-        scene=arguments.scene,
-        follow=arguments.follow,
-        tool=arguments.tool,
-        q=configuration_of(robot, arguments, robot.start),
-        port=arguments.port,
-    )
+    how: Any = {name: getattr(arguments, name) for name in (*_SHOWN, "port")}
+    live = visualize(robot, open=False, q=configuration_of(robot, arguments, robot.start), **how)
     assert isinstance(live, Live)  # for there is no motion
     print(f"fflin: {robot.name} at {live.url} (Ctrl-C ends)", file=sys.stderr, flush=True)
     if not arguments.no_open:

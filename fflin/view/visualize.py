@@ -165,11 +165,7 @@ def visualize(
 
         page, notes = mode_page(robot, motion, scene=scene, tool=tool)
     else:
-        if cloud is not None:
-            from fflin.view.cloud import drawn_robot
-
-            robot = drawn_robot(robot, cloud, motion)
-        _check_motion(robot, motion)
+        robot = _check_motion(robot, motion, cloud)
         fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
         from fflin.view.motion_page import motion_page
 
@@ -242,10 +238,15 @@ def _speed(speed: float | None, default: float) -> float:
     return speed
 
 
-def _check_motion(robot: Robot, motion: Motion) -> None:
+def _check_motion(robot: Robot, motion: Motion, cloud: Any) -> Robot:
+    """Return the robot that a motion is of."""
     from fflin.simulation.motion import require_motion
 
     require_motion(motion)
+    if cloud is not None:
+        from fflin.view.cloud import drawn_robot
+
+        robot = drawn_robot(robot, cloud, motion)
     sizes = motion.q.shape[1], motion.u.shape[1]
     expected = robot.nq, len(Actuation(StateMap(robot)).names)
     if sizes != expected or motion.urdf_sha256 != robot.urdf_sha256:
@@ -253,6 +254,7 @@ def _check_motion(robot: Robot, motion: Motion) -> None:
             f"the motion is one of '{motion.robot}', not of '{robot.name}' as it is given; give "
             "the robot that it was simulated with"
         )
+    return robot
 
 
 def _configuration(robot: Robot, name: str, value: Array) -> Array:
