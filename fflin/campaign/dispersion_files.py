@@ -42,7 +42,8 @@ def placed(dispersions: Any) -> Iterator[None]:
             raise
         quoted, file = re.findall(r"'([^']*)'", str(error)), dispersions.document
         keys = [k for name in quoted for k in dispersions if name in (k, k.rpartition(".")[0])]
-        keys += [key for key in dispersions if stands_for_any(key, quoted)]
+        names = [*quoted, *(name.rpartition(".")[0] for name in quoted)]
+        keys += [key for key in dispersions if stands_for_any(key, names)]
         raise type(error)(f"{file.path}:{file.line(_TABLE, *keys[:1])}: {error}") from None
 
 

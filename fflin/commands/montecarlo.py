@@ -11,7 +11,7 @@ from fflin.commands.arguments import Commands, add_options, add_output_file, com
 from fflin.commands.loops import add_loop, loop_of
 from fflin.commands.points import load_robot
 from fflin.commands.sweeps import executor_of, going_on
-from fflin.commands.visual import add_pictures, check_figure, check_pictures, draw, show_motion
+from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
 
 _ROWS = 240  # at which errors and inputs are kept for a figure
 _OUTPUTS = ("output_file", "plot", "html", "png", "gif")
@@ -77,6 +77,7 @@ def _montecarlo(arguments: argparse.Namespace) -> int:
     from fflin.batch.store import output_path
     from fflin.campaign.dispersion_files import load_dispersions
     from fflin.campaign.monte_carlo import monte_carlo
+    from fflin.campaign.plots import plot_campaign
     from fflin.campaign.report import campaign_record, worst_runs
 
     path = arguments.output_file
@@ -96,7 +97,8 @@ def _montecarlo(arguments: argparse.Namespace) -> int:
     lines = [f"wrote {path}"] if path else []
     try:
         if arguments.plot:
-            draw(arguments.plot, "plot_campaign", campaign)
+            plot_campaign(campaign, arguments.plot)
+            lines.append(f"wrote {arguments.plot}")
         if any(getattr(arguments, name) for name in _OUTPUTS[2:]):
             worst = campaign.replay(campaign.worst(1)[0])
             lines += show_motion(robot, worst, arguments, campaign)
