@@ -81,7 +81,11 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
     InputError
         If the file is not TOML or a value is wrong; with file and line.
     """
-    document = TomlFile(as_path(path))
+    try:
+        document = TomlFile(as_path(path))
+    except InputError as error:  # q_b = 1 and q_b.sensor = 1 are a number and a table
+        hint = '; names with dots stand in quotes, "q_b.sensor"' * ("overwrite" in str(error))
+        raise InputError(f"{error}{hint}") from None
     table = document.record.get(_TABLE)
     for key in (*document.record, _TABLE):
         if key != _TABLE or not isinstance(table, dict) or not table:

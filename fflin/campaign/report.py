@@ -45,21 +45,22 @@ def goal_met(campaign: Any, goal: str) -> str:
 
 def whence(campaign: Any) -> dict[str, dict[str, float]]:
     """Return what the worst errors go with beyond what is drawn alike by chance."""
-    doubt = 3.0 / math.sqrt(len(campaign))
+    worst, doubt = [f"worst {kind}" for kind in campaign.judged], 3.0 / math.sqrt(len(campaign))
     return {
         name: {k: x for k, x in campaign.sensitivity(name).items() if abs(x) > doubt}
-        for name in [f"worst {kind}" for kind in campaign.judged[:2]] or [campaign.about]
+        for name in list(dict.fromkeys([campaign.about, *worst]))[:2]
     }
 
 
 def worst_runs(campaign: Any, k: int) -> list[str]:
-    """Show the k worst runs and what of theirs was drawn farthest from the middle."""
+    """Show the k worst runs and what, of what they go with, was drawn farthest from the middle."""
     if not k:
         return []
     about, (values, unit) = campaign.about, campaign.figure(campaign.about)
-    rows = [["run", about, "unit", "settled after [s]", "ended at [s]", "drawn farthest out"]]
+    rows = [["run", about, "unit", "settled after [s]", "ended at [s]", "drawn, above all"]]
     ranks = campaign.drawn.argsort(axis=0).argsort(axis=0)
-    out = abs(ranks / max(len(campaign) - 1, 1) - 0.5)
+    weights = {key.strip("|"): abs(x) for key, x in campaign.sensitivity().items()}
+    out = abs(ranks - ranks.mean()) * [weights[name] for name in campaign.names]
     for run in campaign.worst(k):
         far = int(out[run].argmax())
         stop = STOPS[int(campaign.stop[run])]

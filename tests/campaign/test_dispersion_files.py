@@ -85,6 +85,7 @@ def test_what_is_wrong_has_file_and_line(tmp_path, robots, text, line, said):
         ("\nq_b = 0.1", 2, "no table named 'q_b'; there are: dispersions; write"),
         ("[dispersions]\nq_b = 1\n[input]\nx = 1", 3, "no table named 'input'"),
         ("[dispersions]\nq_b = ", 2, "not TOML"),
+        ("[dispersions]\nq_b = 1\nq_b.sensor = 1", 3, 'dots stand in quotes, "q_b.sensor"'),
     ],
 )
 def test_what_is_no_such_file(tmp_path, text, line, said):

@@ -85,7 +85,7 @@ function trail({ name, points, colour, radius, dashed }) {
 }
 
 // Thin lines along many paths, whose points follow one another.
-function cloud({ points, counts, colour }) {
+function cloud({ name, points, counts, colour }) {
   const pairs = [];
   let first = 0;
   for (const count of counts) {
@@ -97,9 +97,11 @@ function cloud({ points, counts, colour }) {
   geometry.setIndex(pairs);
   const material = new THREE.LineBasicMaterial({
     color: new THREE.Color(colour).convertSRGBToLinear(), toneMapped: false,
-    transparent: true, opacity: 0.3, depthWrite: false,
+    transparent: true, opacity: 0.3, depthWrite: false, depthTest: name !== "base", // inside the body
   });
-  return new THREE.LineSegments(geometry, material);
+  const lines = new THREE.LineSegments(geometry, material);
+  lines.renderOrder = name === "base" ? 4 : 0;
+  return lines;
 }
 
 function forceArrow({ colour, values, most, longest, size }) {
