@@ -261,7 +261,9 @@ def going_on(path: Path | None, what: str) -> Iterator[Callable[[int, int], None
         yield update
     except KeyboardInterrupt:
         said = "stopped" if not reached[1] else "stopped at {:,} of {:,} ".format(*reached) + what
-        if path and part_of(path).exists():
+        if not path:
+            said += "; nothing is kept, which -o FILE would do"
+        elif part_of(path).exists():
             said += f"; the same command goes on from {part_of(path)}"
         raise KeyboardInterrupt(said) from None
     finally:
