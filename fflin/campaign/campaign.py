@@ -146,11 +146,7 @@ class Campaign(FrozenArrays):
         )
         kinds = tuple(KINDS), tuple(KINDS.values())
         groups: list[tuple[Any, Any, Array]] = {
-            "final": [
-                (*kinds, self._beyond(self.errors)),
-                (*states, self.x),
-                (*inputs, self.u),
-            ],
+            "final": [(*kinds, self._beyond(self.errors)), (*states, self.x), (*inputs, self.u)],
             "worst": [
                 (*kinds, self._beyond(self.largest)),
                 (*states, self._beyond(self.largest_x)),

@@ -25,17 +25,12 @@ _SIZES = {  # of units, in those of figures
 
 
 class Bound(NamedTuple):
-    """One comparison of a condition: a figure's name, its values (N,), and the bound on them."""
+    """One comparison of a condition, and which runs (N,) are on the right side of it."""
 
     name: str
-    values: Array
     sign: str
     limit: float
-
-    @property
-    def met(self) -> Any:
-        """Which runs (N,) are on the right side of it."""
-        return _COMPARE[self.sign](self.values, self.limit)
+    met: Any
 
 
 def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> list[Bound]:
@@ -56,5 +51,6 @@ def bounds_of(condition: str, figure: Callable[[str], tuple[Array, str]]) -> lis
         factor = 1.0 if unit in ("", own, *own.split("|")) else max(factors)
         if not factor:
             raise InputError(f"condition {part!r} is in {unit}, expected {own or 'no unit'}")
-        bounds.append(Bound(name, values, sign, factor * limit))
+        limit *= factor
+        bounds.append(Bound(name, sign, limit, _COMPARE[sign](values, limit)))
     return bounds

@@ -28,9 +28,6 @@ class DispersionFile(dict[str, Any]):
 
     document: TomlFile
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return dict, (dict(self),)  # a worker has nobody to tell a line
-
 
 @contextmanager
 def placed(dispersions: Any) -> Iterator[None]:

@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, nullcontext
 from dataclasses import replace
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -168,12 +167,14 @@ def monte_carlo(
     size = _chunk(runs, chunk, workers or threads, until is not None)
     store = _store(job, path, header, size, shapes)
     with closing(store), OwnWorkers(int(workers)) if workers else nullcontext(executor) as others:
-        enough = partial(_enough, store, header, until, width, confidence)
         how: Any = {"executor": others, "progress": progress}
         how["threads"] = threads if job.engine == "compiled" else 1
         done = runs if until is None else min(_STAGE, runs)
         while not (failed := run_chunks(job, job.dispersions.rows, store, upto=done, **how)):
-            if done == runs or enough(done):
+            if done == runs:
+                break
+            found = Campaign.of(store.read(done), header).fraction(until, confidence=confidence)
+            if found.high - found.low <= width:
                 break
             done = min(runs, math.ceil(_GROWTH * done / _STAGE) * _STAGE)
         if failed:
@@ -229,14 +230,6 @@ def _require_sendable(job: CampaignJob) -> None:
             f"robot, policy or spreads cannot be sent to workers ({error}); define what they are "
             "made of at the top of a module, or leave workers and executor out"
         ) from None
-
-
-def _enough(
-    store: Any, header: Any, until: Any, width: float, confidence: float, done: int
-) -> bool:
-    """Whether the interval of what is asked for is narrow enough after so many runs."""
-    found = Campaign.of(store.read(done), header).fraction(until, confidence=confidence)
-    return found.high - found.low <= width
 
 
 def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,8 +19,6 @@ from fflin.campaign.tally import KINDS
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-Panel: TypeAlias = "Callable[[Axes], None]"
 
 # Shares of the runs, from the widest band to the narrowest, and how dark each is.
 _BANDS = ((0.0, "all", 0.13), (0.05, "90 %", 0.22), (0.25, "50 %", 0.38))
@@ -66,22 +62,17 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
     for at, key in enumerate(input_keys(campaign) if campaign.times else ()):
         groups.setdefault(group_of(key), []).append(at)
     kinds = campaign.judged or ("attitude",)
-    rows: list[list[Panel]] = [[partial(_histogram, campaign=campaign, kind=x) for x in kinds]]
-    if campaign.times:
-        rows.insert(0, [partial(_error, campaign=campaign, kind=x, runs=runs) for x in kinds])
-    last: list[Panel] = [
-        partial(_inputs, campaign=campaign, group=group, columns=columns, runs=runs)
-        for group, columns in groups.items()
-    ]
-    last.append(partial(_whence, campaign=campaign))
+    rows: list[Any] = [[(_error, kind, runs) for kind in kinds]] * bool(campaign.times)
+    rows.append([(_histogram, kind) for kind in kinds])
+    last = [*((_inputs, *each, runs) for each in groups.items()), (_whence,)]
     across = math.ceil(len(last) / math.ceil(len(last) / 3))
     rows += [last[at : at + across] for at in range(0, len(last), across)]
     with styled() as figure_class:
         figure = figure_class(figsize=(11.0, 0.8 + 2.6 * len(rows)), layout="constrained")
         keys: dict[str, Any] = {}
         for place, row in zip(figure.add_gridspec(len(rows), 1), rows, strict=True):
-            for cell, panel in zip(place.subgridspec(1, len(row)), row, strict=True):
-                panel(axes := figure.add_subplot(cell))
+            for cell, (panel, *given) in zip(place.subgridspec(1, len(row)), row, strict=True):
+                panel(axes := figure.add_subplot(cell), campaign, *given)
                 keys |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
         below: Any = "outside lower center"
         figure.legend(keys.values(), keys.keys(), loc=below, ncols=7, handlelength=1.8)

@@ -9,9 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
-_OPTION = re.compile(
-    r"--(\[no-\])?([\w-]+)(?: (\S+?)(\*)?(?: = (\S+))?)?: (.+)",
-)
+_OPTION = re.compile(r"--(\[no-\])?([\w-]+)(?: (\S+?)([*!])?(?: = (\S+))?)?: (.+)")
 
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 Container: TypeAlias = "argparse._ActionsContainer"
@@ -99,14 +97,15 @@ def add_options(group: Container, text: str, **more: Any) -> None:
     """Add options, each a line ``--name METAVAR: help`` and those that go on with it.
 
     A metavar in _READ says how the value is read, one such as a|b what it may be, X,Y numbers;
-    behind it stand ``*`` where the option is repeatable, or ``= default``. Without one it is a
-    switch, ``--[no-]x`` of both ways. What holds of all is in `more`.
+    behind it stand ``*`` where the option is repeatable, ``!`` where it is required, or
+    ``= default``. Without one it is a switch, ``--[no-]x`` of both ways. What holds of all is in
+    `more`.
     """
     for line in re.split(r"\n\s*(?=--)", text.strip()):
         found = _OPTION.fullmatch(" ".join(line.split()))
         assert found, line
         both, name, metavar, many, default, said = found.groups()
-        options: dict[str, Any] = {"help": said + " (repeatable)" * bool(many), **more}
+        options: dict[str, Any] = {"help": said + " (repeatable)" * (many == "*"), **more}
         if not metavar:
             options["action"] = argparse.BooleanOptionalAction if both else "store_true"
         elif "|" in metavar:
@@ -116,8 +115,10 @@ def add_options(group: Container, text: str, **more: Any) -> None:
             options["type"] = number
         else:
             options = {"metavar": metavar, "type": _READ.get(metavar, str)} | options
-        if many:
+        if many == "*":
             options |= {"action": "append", "default": []}
+        if many == "!":
+            options["required"] = True
         if default:
             options["default"] = options.get("type", str)(default)
         group.add_argument(f"--{name}", **options)
@@ -125,11 +126,8 @@ def add_options(group: Container, text: str, **more: Any) -> None:
 
 def add_robot(command: argparse.ArgumentParser) -> None:
     """Add ROBOT and --lock."""
-    command.add_argument(
-        "robot",
-        metavar="ROBOT",
-        help="a name of `fflin robots`, or the path of a URDF or of a robot.toml",
-    )
+    what = "a name of `fflin robots`, or the path of a URDF or of a robot.toml"
+    command.add_argument("robot", metavar="ROBOT", help=what)
     add_options(
         command,
         """
@@ -206,6 +204,4 @@ def add_system(command: Container) -> None:
 
 def add_output_file(command: Container, what: str) -> None:
     """Add -o FILE; `what` says which endings there are."""
-    command.add_argument(
-        "-o", "--output-file", metavar="FILE", dest="output_file", type=file_name, help=what
-    )
+    command.add_argument("-o", "--output-file", metavar="FILE", type=file_name, help=what)

@@ -27,33 +27,22 @@ def add_commands(commands: Commands) -> None:
         "fflin montecarlo ets_vii --dispersions uncertain.toml --runs 1000 --plot runs.png",
     )
     add_loop(montecarlo)
-    draws, work, shown = map(
-        montecarlo.add_argument_group, ("the runs", "who does them", "what is kept and shown")
-    )
     add_options(
-        draws,
+        montecarlo.add_argument_group("the runs, and who does them"),
         """
-        --dispersions FILE: what is drawn at random, a table [dispersions] in TOML as
+        --dispersions FILE!: what is drawn at random, a table [dispersions] in TOML as
             fflin.load_dispersions reads it
-        --runs N: how many""",
-        required=True,
-    )
-    add_options(
-        draws,
-        """
+        --runs N!: how many
         --seed S = 0: of the draws; 0 by default
         --until CONDITION: make no more runs once the share that meets it, 'attitude < 1 deg', is
             known to --width
         --width P = 0.02: of the interval of that share; 0.02 by default
-        --confidence P = 0.95: of all intervals; 0.95 by default""",
-    )
-    add_options(
-        work,
-        """
+        --confidence P = 0.95: of all intervals; 0.95 by default
         --workers N: share them among N processes
         --threads N: or among N threads; by default as many as there are cores
         --dask ADDRESS: or among the workers of a dask scheduler""",
     )
+    shown = montecarlo.add_argument_group("what is kept and shown of them")
     add_options(
         shown,
         """

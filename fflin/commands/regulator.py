@@ -7,11 +7,7 @@ import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from fflin.base.errors import (
-    EquilibriumError,
-    FflinWarning,
-    StabilizabilityError,
-)
+from fflin.base.errors import EquilibriumError, FflinWarning, StabilizabilityError
 from fflin.commands import DONE
 from fflin.commands.arguments import (
     Commands,

@@ -9,12 +9,7 @@ from typing import TYPE_CHECKING, Any
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import chosen, input_keys
 from fflin.commands import DONE, FELL_SHORT
-from fflin.commands.arguments import (
-    Commands,
-    add_options,
-    add_output_file,
-    command,
-)
+from fflin.commands.arguments import Commands, add_options, add_output_file, command
 from fflin.commands.loops import add_loop, loop_of
 from fflin.commands.points import load_robot
 from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
@@ -58,8 +53,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     check_distinct(*(getattr(arguments, name) for name in _OUTPUTS))
     if arguments.output_file:
         check_place(arguments.output_file, FORMATS)
-    if arguments.plot:
-        check_figure(arguments.plot)
+    check_figure(arguments.plot)
     check_pictures(robot, arguments)
     if arguments.show:
         from fflin.linear.linearization import linearize

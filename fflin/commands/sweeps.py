@@ -110,8 +110,8 @@ def _range(text: str) -> tuple[str, tuple[float, float]]:
 def _sweep(arguments: argparse.Namespace) -> int:
     import pinocchio as pin
 
-    from fflin.batch.store import output_path
-    from fflin.batch.sweep import sweep
+    from fflin.batch.store import check_room, output_path, part_of, readable
+    from fflin.batch.sweep import planned_bytes, sweep
     from fflin.dynamics.points import effort
 
     path = arguments.output_file
@@ -123,10 +123,22 @@ def _sweep(arguments: argparse.Namespace) -> int:
     u = effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
     reference = pin.SE3.Identity() if arguments.reference == "world" else None
     options: dict[str, Any] = {"frame": arguments.frame, "reference": reference}
-    announce = _Announcement(robot, path, options, arguments.yes)
+    said = ""
+
+    def announce(count: int, *, at_rest: bool) -> None:
+        nonlocal said
+        output_path(path)  # once more, when the inputs are known
+        size = planned_bytes(robot, count, at_rest=at_rest, **options)
+        said = f"{count:,} points of '{robot.name}', {readable(size)}"
+        if size > _LARGE and not arguments.yes:
+            raise InputError(f"{said}: add --yes where it is meant, or choose fewer points")
+        check_room(count, size, path)
+        part = part_of(path)
+        said += f" to {path}" + f", going on from {part}" * part.exists()
+
     q, v, u = _points(robot, arguments, v, u, announce)
     with executor_of(arguments) as executor:
-        announce.say()
+        print(f"fflin: {said}", file=sys.stderr)  # all that was asked for is found good
         with going_on(path, "points") as progress:
             work = {"executor": executor, "workers": arguments.workers, "progress": progress}
             batch = sweep(robot, q, v, u, **options, **work, out=path)
@@ -135,38 +147,12 @@ def _sweep(arguments: argparse.Namespace) -> int:
     return DONE
 
 
-class _Announcement:
-    """Says how many points there are and how large the result is, and stops what is too much."""
-
-    def __init__(self, robot: Robot, path: Path, options: dict[str, Any], agreed: bool) -> None:
-        self._robot, self._path, self._options, self._agreed = robot, path, options, agreed
-        self._said = ""
-
-    def __call__(self, count: int, *, at_rest: bool) -> None:
-        from fflin.batch.store import check_room, output_path, part_of, readable
-        from fflin.batch.sweep import planned_bytes
-
-        output_path(self._path)  # once more, when the inputs are known
-        size = planned_bytes(self._robot, count, at_rest=at_rest, **self._options)
-        said = f"{count:,} points of '{self._robot.name}', {readable(size)}"
-        if size > _LARGE and not self._agreed:
-            raise InputError(f"{said}: add --yes where it is meant, or choose fewer points")
-        check_room(count, size, self._path)
-        part = part_of(self._path)
-        going_on = f", going on from {part}" if part.exists() else ""
-        self._said = f"fflin: {said} to {self._path}{going_on}"
-
-    def say(self) -> None:
-        """Say it, once all that was asked for is found good."""
-        print(self._said, file=sys.stderr)
-
-
 def _points(
     robot: Robot,
     arguments: argparse.Namespace,
     v: Array | None,
     u: Array | None,
-    announce: _Announcement,
+    announce: Callable[..., None],
 ) -> tuple[Array | Configurations, Array | None, Array | None]:
     """Return q, v and u of the points."""
     import numpy as np

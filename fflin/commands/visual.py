@@ -8,14 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fflin.commands import DONE
-from fflin.commands.arguments import (
-    Commands,
-    Container,
-    add_options,
-    add_pose,
-    add_robot,
-    command,
-)
+from fflin.commands.arguments import Commands, Container, add_options, add_pose, add_robot, command
 from fflin.commands.points import configuration_of, load_robot
 
 if TYPE_CHECKING:

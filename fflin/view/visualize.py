@@ -273,11 +273,7 @@ def check_times(times: Sequence[float], start: float, end: float) -> list[float]
 
 
 def _pictures(
-    page: str,
-    outputs: dict[str, Path],
-    motion: Motion,
-    speed: float,
-    times: Sequence[float] | None,
+    page: str, outputs: dict[str, Path], motion: Motion, speed: float, times: Sequence[float] | None
 ) -> dict[Path, bytes]:
     if ".png" not in outputs and ".gif" not in outputs:
         return {}

@@ -36,7 +36,7 @@ def test_all_kinds_of_spreads(tmp_path):
         "q_m.joint_1": (0, 0),
     }
     assert omega.ppf(0.9) == pytest.approx(stats.t(4, scale=0.01).ppf(0.9), rel=1e-14)
-    assert type(pickle.loads(pickle.dumps(found))) is dict
+    assert pickle.loads(pickle.dumps(found)) == found
 
 
 @pytest.mark.parametrize(

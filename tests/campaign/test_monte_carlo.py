@@ -411,10 +411,16 @@ def test_histories_are_those_of_the_motions(robots, engine, tmp_path):
     given = START | {"tau_b.x.gain": [0.0, 0.0, -6.0]}
     case = {"runs": 12, "duration": 4.0, "dt": 0.02, "engine": engine, "seed": 1}
     campaign = fflin.monte_carlo(
-        robot, feedback(robot), given, histories=9, out=tmp_path / "runs.npz", limits=20, **case
+        robot,
+        feedback(robot),
+        given,
+        histories=9,
+        out=tmp_path / "runs.npz",
+        limits={"F_b": 20},
+        **case,
     )
     assert campaign.times == pytest.approx(np.arange(9) * 0.5)
-    assert campaign.input_limits == (20.0,) * 12
+    assert campaign.input_limits == (*[np.inf] * 3, *[20.0] * 3, *[np.inf] * 6)
     assert np.array_equal(
         fflin.Campaign.load(tmp_path / "runs.npz").error_history[:, -1],
         (np.where(campaign.stopped[:, None], np.inf, campaign.errors)),
