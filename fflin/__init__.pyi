@@ -95,6 +95,7 @@ from fflin.view.visualize import visualize as visualize
 # Campaigns
 from fflin.campaign.monte_carlo import monte_carlo as monte_carlo
 from fflin.campaign.campaign import Campaign as Campaign
+from fflin.campaign.dispersion_files import load_dispersions as load_dispersions
 
 # Sweeps
 from fflin.batch.sweep import sweep as sweep
@@ -114,6 +115,7 @@ from fflin.analysis.plots import plot_validity as plot_validity
 from fflin.control.plots import plot_poles as plot_poles
 from fflin.control.plots import plot_loops as plot_loops
 from fflin.simulation.motion import plot_motion as plot_motion
+from fflin.campaign.plots import plot_campaign as plot_campaign
 
 # Errors
 from fflin.base.errors import FflinError as FflinError

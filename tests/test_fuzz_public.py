@@ -102,10 +102,12 @@ OPTIONS = {
     "modes": ("--stiffness", "--damping"),
     "simulate": ("--duration", "--step", "--delay", "--limit", "--rpy", "--q", "--dt"),
     "sweep": ("--random", "--seed", "--grid", "--range"),
+    "montecarlo": ("--runs", "--seed", "--width", "--confidence", "--worst", "--duration"),
 }
 NAMED = {"--limit": "tau_m=", "--q": "q_b=", "--r": "tau_b=", "--range": "joint_1=0:"}
 NAMED |= {"--grid": "joint_1=0:1:"}
 SOUND = {"simulate": ["--duration", "0.02"], "sweep": ["--random", "2"]}
+SOUND["montecarlo"] = ["--runs", "2", "--duration", "0.02", "--dispersions", "uncertain.toml"]
 
 
 def arguments_of(command, option, value):
@@ -118,8 +120,10 @@ def arguments_of(command, option, value):
 @pytest.mark.parametrize(
     ("command", "option"), [(name, option) for name, many in OPTIONS.items() for option in many]
 )
-def test_odd_options_end_in_one_line(command, option, capsys, recwarn):
+def test_odd_options_end_in_one_line(command, option, capsys, recwarn, tmp_path, monkeypatch):
     wrong = []
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "uncertain.toml").write_text("[dispersions]\nq_b = 0.01\n")
     for value in NUMBERS:
         try:
             code = main(arguments_of(command, option, value))

@@ -32,7 +32,8 @@ def test_python_examples_run(tmp_path, page):
 
 
 def test_inputs_of_the_guide_are_read(tmp_path):
-    block, whole = code_blocks("toml", (ROOT / "docs" / "guide.md").read_text(encoding="utf-8"))
+    text = (ROOT / "docs" / "guide.md").read_text(encoding="utf-8")
+    block, whole, _ = code_blocks("toml", text)
     (tmp_path / "mysat.toml").write_text(whole)
     mysat = fflin.load(tmp_path / "mysat.toml")
     assert mysat.limits["q_m.joint_2"] == (-1.5, 1.5) and mysat.stiffness["panel_left"] == 100.0
@@ -42,6 +43,29 @@ def test_inputs_of_the_guide_are_read(tmp_path):
     robot = fflin.load("servicer_7dof", inputs=fflin.load_inputs(path))
     names = fflin.linearize(robot).input_names
     assert names[3:] == ("tau_m.joint_1", "nozzle", "wheel_z")
+
+
+def test_the_campaign_of_the_guide_runs(tmp_path):
+    pytest.importorskip("h5py")
+    text = (ROOT / "docs" / "guide.md").read_text(encoding="utf-8")
+    *_, toml = code_blocks("toml", text)
+    (tmp_path / "uncertain.toml").write_text(toml)
+    [line] = [x for block in code_blocks("sh", text) for x in block.splitlines() if "monte" in x]
+    done = subprocess.run(
+        [sys.executable, "-m", *shlex.split(line)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert max(map(len, done.stdout.splitlines())) <= 80
+    assert {x.name for x in tmp_path.iterdir()} == {
+        *("uncertain.toml", "runs.h5", "runs.png", "worst.html")
+    }
+    assert (tmp_path / "worst.html").stat().st_size < 6e6
+    campaign = fflin.Campaign.load(tmp_path / "runs.h5")
+    assert len(campaign) == 400 and campaign.goals == ("attitude < 0.1 deg",)
 
 
 @pytest.mark.skipif(not which("octave"), reason="needs Octave")

@@ -51,7 +51,7 @@ def hdf5() -> Any:
 
 def is_constant(array: Array) -> bool:
     """Whether all rows of an array are one row, held once."""
-    return array.strides[0] == 0
+    return array.strides[0] == 0 and array.size > 0
 
 
 def write_rows(

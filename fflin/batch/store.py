@@ -77,8 +77,9 @@ class FileStore:
         shapes: Mapping[str, tuple[int, ...]],
         constants: Mapping[str, Array],
         texts: Mapping[str, str],
+        what: str = "sweep",
     ) -> None:
-        self.path, self.part = path, part_of(path)
+        self.path, self.part, self.what = path, part_of(path), what
         self.count, self.chunk, self.names = count, chunk, tuple(shapes)
         self._constants, self._texts = constants, texts
         self.resumed = self.part.exists()
@@ -115,8 +116,8 @@ class FileStore:
         with self._readable():
             if self._file.attrs.get("request") != request:
                 raise FileError(
-                    f"{self.part} is what another sweep left behind; remove it, or choose another "
-                    "name"
+                    f"{self.part} is what another {self.what} left behind; remove it, or choose "
+                    "another name"
                 )
             self.chunk = int(self._file.attrs.get("chunk", self.chunk))
             for key, value in self._constants.items():

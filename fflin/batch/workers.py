@@ -100,7 +100,7 @@ class OwnWorkers(Executor):
         except (EOFError, OSError):
             self._end(process)
             raise NoWorkers(
-                'a worker did not start; call sweep under `if __name__ == "__main__":`'
+                'a worker did not start; make the call under `if __name__ == "__main__":`'
             ) from None
         self._mine.process = process
         return process

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
-import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +18,7 @@ from fflin.base.record import reading
 from fflin.base.validation import Array, share, whole
 from fflin.base.writing import as_path
 from fflin.batch.files import read_rows, write_rows
+from fflin.campaign.conditions import Bound, bounds_of
 from fflin.campaign.report import campaign_report
 from fflin.campaign.tally import KINDS
 
@@ -28,17 +27,6 @@ if TYPE_CHECKING:
     from fflin.simulation.motion import Motion
 
 NOT_RUN = -1.0  # where `stop` is this, a file has no run
-
-_COMPARED = re.compile(r"\s*(.+?)\s*(<=|>=|<|>)\s*([-+.\de]+)\s*(.*?)\s*")
-_COMPARE = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}
-_DEGREE = math.pi / 180.0
-_SIZES = {  # of units, in those of figures
-    ("deg", "rad"): _DEGREE,
-    ("rad", "deg"): 1.0 / _DEGREE,
-    ("deg/s", "rad/s"): _DEGREE,
-    ("mm", "m"): 1e-3,
-    ("mm/s", "m/s"): 1e-3,
-}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,11 +51,18 @@ class Campaign(FrozenArrays):
         Largest errors of the states and largest inputs, without sign, as far as each run went.
     errors, largest, settle : ndarray (N, 6)
         Of each kind, at last, at most, and since when [s], infinite where it is not settled.
+    times : tuple of float
+        [s], when the histories have their rows; none unless they were asked for.
+    error_history, input_history : ndarray (N, M, 6), (N, M, nu)
+        Errors of each kind, and what acted, at each of these times; of a run that was stopped
+        infinite, and zero, from then on.
     stop, end : ndarray (N,)
         0 where a run came to its end, 1 where it diverged, 2 where it left the chart, 3 else; and
         when [s].
     asked : int
         How many runs were asked for; more than there are where `until` was met before.
+    goals : tuple of str
+        The conditions that report and figure tell the shares of.
     """
 
     drawn: Array
@@ -80,6 +75,8 @@ class Campaign(FrozenArrays):
     errors: Array
     largest: Array
     settle: Array
+    error_history: Array
+    input_history: Array
     stop: Array
     end: Array
     names: tuple[str, ...]
@@ -87,6 +84,8 @@ class Campaign(FrozenArrays):
     state_units: tuple[str, ...]
     input_names: tuple[str, ...]
     input_units: tuple[str, ...]
+    input_limits: tuple[float, ...]  # largest magnitudes that act, infinite where there are none
+    times: tuple[float, ...]
     judged: tuple[str, ...]  # the kinds that are steered
     robot: str
     urdf_sha256: str
@@ -95,6 +94,8 @@ class Campaign(FrozenArrays):
     seed: int
     asked: int
     engine: str
+    goals: tuple[str, ...]
+    confidence: float
     _job: CampaignJob | None = field(default=None, kw_only=True)
 
     def __len__(self) -> int:
@@ -114,15 +115,24 @@ class Campaign(FrozenArrays):
 
     @property
     def about(self) -> str:
-        """The figure that is asked about by default: the worst error of what is steered first."""
-        return f"worst {(self.judged or tuple(KINDS))[0]}"
+        """The figure that is asked about by default.
+
+        What the first goal bounds from above, or the worst error of what is steered first.
+        """
+        bounded = [each.name for each in self.bounds if each.sign[0] == "<"]
+        return [*bounded, f"worst {(self.judged or tuple(KINDS))[0]}"][0]
+
+    @property
+    def bounds(self) -> list[Bound]:
+        """What the goals compare."""
+        return [each for goal in self.goals for each in bounds_of(goal, self.figure)]
 
     def values(self, name: str) -> Array:
         """Return a figure of each run (N,) by its name, in SI units but for angles in deg."""
-        return self._named(name)[0]
+        return self.figure(name)[0]
 
-    def _named(self, name: str) -> tuple[Array, str]:
-        """Return a figure of each run, and its unit."""
+    def figure(self, name: str) -> tuple[Array, str]:
+        """Return a figure of each run (N,), and its unit."""
         if name == "end":
             return self.end, "s"
         if name == "settle":
@@ -136,11 +146,7 @@ class Campaign(FrozenArrays):
         )
         kinds = tuple(KINDS), tuple(KINDS.values())
         groups: list[tuple[Any, Any, Array]] = {
-            "final": [
-                (*kinds, self._beyond(self.errors)),
-                (*states, self.x),
-                (*inputs, self.u),
-            ],
+            "final": [(*kinds, self._beyond(self.errors)), (*states, self.x), (*inputs, self.u)],
             "worst": [
                 (*kinds, self._beyond(self.largest)),
                 (*states, self._beyond(self.largest_x)),
@@ -175,22 +181,8 @@ class Campaign(FrozenArrays):
                 )
             return found
         met = ~self.stopped
-        for part in condition.split(" and "):
-            match = _COMPARED.fullmatch(part)
-            try:
-                name, sign, bound, unit = match.groups() if match else ("", "", "", "")
-                limit = float(bound)
-            except ValueError:
-                raise InputError(
-                    f"condition {part!r} cannot be read, expected NAME < NUMBER UNIT, such as "
-                    "'attitude < 1 deg'"
-                ) from None
-            values, own = self._named(name)
-            factors = [_SIZES.get((unit, each), 0.0) for each in own.split("|")]
-            factor = 1.0 if unit in ("", own, *own.split("|")) else max(factors)
-            if not factor:
-                raise InputError(f"condition {part!r} is in {unit}, expected {own or 'no unit'}")
-            met = met & _COMPARE[sign](values, factor * limit)
+        for bound in bounds_of(condition, self.figure):
+            met = met & bound.met
         return met
 
     def fraction(self, condition: Any, *, confidence: float = 0.95) -> Estimate:
@@ -249,12 +241,19 @@ class Campaign(FrozenArrays):
             If there is no such run, or the campaign is from a file.
         """
         at = whole("run", run, 0, len(self) - 1)
+        return self._flown().replay(np.array(self.drawn[at]))
+
+    def courses(self, runs: Sequence[int], most: int) -> list[Array]:
+        """Return configurations (at most `most` + 1, nq) on the way of some runs, evenly apart."""
+        return self._flown().courses(np.array(self.drawn[list(runs)]), most)
+
+    def _flown(self) -> CampaignJob:
         if self._job is None:
             raise InputError(
                 "the campaign is from a file, without its robot and policy; make the same call of "
                 "monte_carlo and replay its run: the same seed draws the same"
             )
-        return self._job.replay(np.array(self.drawn[at]))
+        return self._job
 
     def save(self, path: str | Path) -> None:
         """Write it to a .npz or .h5 file, whole or not at all."""

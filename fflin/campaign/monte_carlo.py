@@ -6,11 +6,11 @@ import inspect
 import json
 import math
 import pickle
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import closing, nullcontext
 from dataclasses import replace
-from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,13 @@ import pinocchio as pin
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.record import content_digest
-from fflin.base.validation import Array, share, whole
+from fflin.base.validation import share, whole
 from fflin.base.version import __version__
 from fflin.batch.run import Progress, check_workers, failure, run_chunks
 from fflin.batch.store import FileStore, MemoryStore, check_room, output_path
 from fflin.batch.workers import OwnWorkers
 from fflin.campaign.campaign import NOT_RUN, Campaign
+from fflin.campaign.dispersion_files import placed
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.runs import CampaignJob
 from fflin.campaign.tally import KINDS
@@ -51,6 +52,7 @@ def monte_carlo(
     runs: int,
     duration: float | None = None,
     seed: int = 0,
+    goals: Sequence[str] = (),
     until: str | None = None,
     width: float = 0.02,
     confidence: float = 0.95,
@@ -58,6 +60,7 @@ def monte_carlo(
     workers: int | None = None,
     threads: int | None = None,
     chunk: int | None = None,
+    histories: int = 0,
     progress: Progress | None = None,
     out: str | Path | None = None,
     engine: str | None = None,
@@ -74,7 +77,7 @@ def monte_carlo(
     policy : callable, StateFeedback, OutputFeedback, TrajectoryFeedback, GainSchedule or None
         As of `simulate`.
     dispersions : mapping
-        {name, group or pattern: spread}. A name is one of
+        {name, group or pattern: spread}, or what `load_dispersions` read. A name is one of
 
         - a state, ``q_b``, ``r_b.x``, ``q_m.*``, ``omega_b``: added to the start;
         - ``BODY.mass``, ``BODY.com``, ``BODY.inertia`` of ``base`` or the body of a joint, relative
@@ -96,19 +99,25 @@ def monte_carlo(
     seed : int
         The same seed draws the same, whatever the number of runs, workers and chunks, and whatever
         else is dispersed.
+    goals : sequence of str, optional
+        Conditions as `Campaign.fraction` takes them, ``"attitude < 1 deg"``; report and figure
+        show the shares that meet them and their bounds.
     until : str, optional
-        A condition as `Campaign.fraction` takes it, ``"attitude < 1 deg"``: no more runs are made
+        One more of these: no more runs are made
         once the interval of its share is no wider than `width`, which is looked at after 256 runs
         and each time there are a quarter more.
     width, confidence : float
-        Of that interval.
+        Of that interval; the confidence is that of the report's too.
     executor, workers, threads, progress : optional
         As of `sweep`; an executor's workers import the modules of the policy.
     chunk : int, optional
         Runs in a chunk, a multiple of 8; with `until` a part of 256.
+    histories : int, optional
+        At how many times, evenly spread over the duration, errors and inputs of each run are kept,
+        as bands over time need them.
     out : str or Path, optional
-        .h5 file to write. It grows as NAME.part; the same call made again after a crash goes on
-        from the chunks that are there and intact.
+        .h5 or .npz file to write. It grows as NAME.part; the same call made again after a crash
+        goes on from the chunks that are there and intact.
     engine : {"python", "compiled"}, optional
         As of `simulate`.
     **options
@@ -143,50 +152,74 @@ def monte_carlo(
     width, confidence = share("width", width), share("confidence", confidence)
     check_workers(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)
-    if path is not None and path.suffix != ".h5":
-        raise InputError(f"{path}: a campaign grows in a file .h5; Campaign.save writes .npz")
-    job = CampaignJob(robot, policy, dispersions, seed, "", {"duration": duration, **options})
+    options |= {"duration": duration, "histories": whole("histories", histories, 0)}
+    job = CampaignJob(robot, policy, dispersions, seed, "", options)
     shapes = {"drawn": (len(job.dispersions.names),), **job.shapes}
     check_room(runs, 8 * runs * sum(map(math.prod, shapes.values())), path, "runs")
     if executor or workers:
         _require_sendable(job)
     job.choose(engine, runs)
-    header = {**_header(job), "seed": seed, "asked": runs}
-    if until is not None:  # it is refused before anything is done
-        if not isinstance(until, str):
-            raise InputError(f"until is a {type(until).__name__}, expected 'attitude < 1 deg'")
-        nothing = MemoryStore(1, 1, shapes).arrays
-        Campaign.of(nothing, header).met(until)
-    job.dispersions.require_possible(runs)
+    header = _header(job) | {"seed": seed, "asked": runs, "confidence": confidence}
+    header["goals"] = _goals(goals, until, shapes, header)
+    with placed(dispersions):
+        job.dispersions.require_possible(runs)
     threads = threads or available_cores()
     size = _chunk(runs, chunk, workers or threads, until is not None)
-    store: Any = MemoryStore(runs, size, shapes)
-    if path is not None:
-        texts = {"header": json.dumps(header), "constant": "[]"}
-        store = FileStore(path, _request(job, runs), runs, size, shapes, {}, texts)
+    store = _store(job, path, header, size, shapes)
     with closing(store), OwnWorkers(int(workers)) if workers else nullcontext(executor) as others:
-        enough = partial(_enough, store, header, until, width, confidence)
         how: Any = {"executor": others, "progress": progress}
         how["threads"] = threads if job.engine == "compiled" else 1
         done = runs if until is None else min(_STAGE, runs)
         while not (failed := run_chunks(job, job.dispersions.rows, store, upto=done, **how)):
-            if done == runs or enough(done):
+            if done == runs:
+                break
+            found = Campaign.of(store.read(done), header).fraction(until, confidence=confidence)
+            if found.high - found.low <= width:
                 break
             done = min(runs, math.ceil(_GROWTH * done / _STAGE) * _STAGE)
         if failed:
-
-            def others_of(kept: Array) -> Campaign:
-                return Campaign.of({k: x[kept] for k, x in store.arrays.items()}, header, job)
-
-            raise failure(failed, store, "runs", others_of)
-        if path is None:
-            return Campaign.of(store.read(done), header, job)
+            rows: Any = store.read(runs)
+            raise failure(
+                *(failed, store, "runs"),
+                lambda kept: Campaign.of({k: x[kept] for k, x in rows.items()}, header, job),
+            )
+        if isinstance(store, MemoryStore):
+            campaign = Campaign.of(store.read(done), header, job)
+            if path is not None:
+                campaign.save(path)
+            return campaign
         for start in range(done, runs, store.chunk):
             stop = min(start + store.chunk, runs)
             none = {key: np.full((stop - start, *of), NOT_RUN) for key, of in shapes.items()}
             store.write(start, stop, none)
         store.complete()
-    return replace(Campaign.load(path), _job=job)
+        if store.path.suffix == ".npz":
+            Campaign.load(store.part).save(store.path)
+            store.discard()
+    return replace(Campaign.load(store.path), _job=job)
+
+
+def _goals(given: Any, until: Any, shapes: Any, header: dict[str, Any]) -> list[str]:
+    """Return the goals; what is none is refused before anything is done."""
+    goals = [given] if isinstance(given, str) else given
+    if not isinstance(goals, list | tuple):
+        raise InputError(f"goals is a {type(given).__name__}, expected ['attitude < 1 deg']")
+    goals = [*goals, *([] if until is None or until in goals else [until])]
+    for goal in goals:
+        if not isinstance(goal, str):
+            raise InputError(f"a goal is a {type(goal).__name__}, expected 'attitude < 1 deg'")
+        Campaign.of(MemoryStore(1, 1, shapes).arrays, header | {"goals": []}).met(goal)
+    return goals
+
+
+def _store(
+    job: CampaignJob, path: Path | None, header: dict[str, Any], size: int, shapes: Any
+) -> FileStore | MemoryStore:
+    if path is None or (path.suffix == ".npz" and find_spec("h5py") is None):
+        return MemoryStore(header["asked"], size, shapes)
+    texts = {"header": json.dumps(header), "constant": "[]"}
+    request = _request(job, header)
+    return FileStore(path, request, header["asked"], size, shapes, {}, texts, what="campaign")
 
 
 def _require_sendable(job: CampaignJob) -> None:
@@ -197,14 +230,6 @@ def _require_sendable(job: CampaignJob) -> None:
             f"robot, policy or spreads cannot be sent to workers ({error}); define what they are "
             "made of at the top of a module, or leave workers and executor out"
         ) from None
-
-
-def _enough(
-    store: Any, header: Any, until: Any, width: float, confidence: float, done: int
-) -> bool:
-    """Whether the interval of what is asked for is narrow enough after so many runs."""
-    found = Campaign.of(store.read(done), header).fraction(until, confidence=confidence)
-    return found.high - found.low <= width
 
 
 def _chunk(runs: int, given: int | None, workers: int, staged: bool) -> int:
@@ -240,12 +265,14 @@ def _header(job: CampaignJob) -> dict[str, Any]:
         "duration": plan.times.steps * plan.times.dt,
         "dt": plan.times.dt,
         "engine": job.engine,
+        "times": (job.steps * plan.times.dt).tolist(),
+        "input_limits": np.fmax(-plan.limits.low, plan.limits.high).tolist(),
     }
 
 
-def _request(job: CampaignJob, runs: int) -> str:
+def _request(job: CampaignJob, header: dict[str, Any]) -> str:
     """Return a hash of what the result depends on, of which the first run tells most."""
-    draws = job.dispersions.rows(0, min(runs, _STAGE))
+    draws = job.dispersions.rows(0, min(header["asked"], _STAGE))
     first = job.run(Draws(draws.drawn[:1], draws.run[:1]), 0).arrays
-    told = repr((runs, job.engine, job.plant.robot.urdf_sha256, __version__, pin.__version__))
+    told = repr((header, __version__, pin.__version__))
     return content_digest({"told": told, "drawn": draws.drawn, **first})

@@ -8,25 +8,94 @@ from typing import Any
 from fflin.base.tables import folded, grid
 from fflin.campaign.tally import KINDS, STOPS
 
+_SHARES = (0.5, 0.95, 0.99)
+
 
 def campaign_report(campaign: Any) -> str:
-    """Show the quantiles of the errors, and what they go with."""
+    """Show the quantiles of the errors, shares of goals, and what the errors go with."""
     count, quantile = len(campaign), campaign.quantile
     by = ", compiled" if campaign.engine == "compiled" else ""
     few = f" of {campaign.asked:,} asked for" if count < campaign.asked else ""
     title = f"{campaign.robot}: {count:,} runs{few}, {campaign.duration:g} s each"
-    stops = {word: int((campaign.stop == at).sum()) for at, word in enumerate(STOPS) if at}
-    said = ", ".join(f"{number:,} {word}" for word, number in stops.items() if number)
-    ended = f"{count - sum(stops.values()):,} came to their end; {said or 'none was stopped'}"
     rows = [["error", "unit", "half", "95 %", "99 %", "worst 95 %", "settled after [s]"]]
     for name, unit in KINDS.items():
-        figures = [quantile(name, p).value for p in (0.5, 0.95, 0.99)]
+        figures = [quantile(name, p).value for p in _SHARES]
         figures += [quantile(f"{of} {name}", 0.95).value for of in ("worst", "settle")]
         rows.append([name, unit, *(f"{x:.3g}" for x in figures)])
-    told, doubt = [], 3.0 / math.sqrt(count)  # of what is drawn alike by chance
-    for name in [f"worst {kind}" for kind in campaign.judged[:2]] or [campaign.about]:
-        found = [item for item in campaign.sensitivity(name).items() if abs(item[1]) > doubt]
-        first = ", ".join(f"{key}\u00a0{value:+.2f}" for key, value in found[:4])
+    told = [goal_met(campaign, goal) for goal in campaign.goals]
+    for name, found in whence(campaign).items():
+        first = ", ".join(f"{key}\u00a0{value:+.2f}" for key, value in list(found.items())[:4])
         told.append(f"{name} goes with (rank correlation): {first or 'nothing that is told'}")
-    head = folded([f"{title}, seed {campaign.seed}{by}", ended])
+    head = folded([f"{title}, seed {campaign.seed}{by}", ended_of(campaign)])
     return "\n".join([head, "", grid(rows, "ll"), "", folded(told)])
+
+
+def ended_of(campaign: Any) -> str:
+    """Say how many runs came to their end, and why others did not."""
+    said = ", ".join(f"{number:,} {word}" for word, number in _stops(campaign).items())
+    return f"{int((campaign.stop == 0.0).sum()):,} came to their end; {said or 'none was stopped'}"
+
+
+def goal_met(campaign: Any, goal: str) -> str:
+    """Say which share of the runs meets a goal."""
+    met = campaign.fraction(goal, confidence=campaign.confidence)
+    value, low, high = (f"{100.0 * x:.4g}" for x in met)
+    return f"{goal}: {value} % ({low} to {high} % at {100.0 * campaign.confidence:g} % confidence)"
+
+
+def whence(campaign: Any) -> dict[str, dict[str, float]]:
+    """Return what the worst errors go with beyond what is drawn alike by chance."""
+    worst, doubt = [f"worst {kind}" for kind in campaign.judged], 3.0 / math.sqrt(len(campaign))
+    return {
+        name: {k: x for k, x in campaign.sensitivity(name).items() if abs(x) > doubt}
+        for name in list(dict.fromkeys([campaign.about, *worst]))[:2]
+    }
+
+
+def worst_runs(campaign: Any, k: int) -> list[str]:
+    """Show the k worst runs and what, of what they go with, was drawn farthest from the middle."""
+    if not k:
+        return []
+    about, (values, unit) = campaign.about, campaign.figure(campaign.about)
+    rows = [["run", about, "unit", "settled after [s]", "ended at [s]", "drawn, above all"]]
+    ranks = campaign.drawn.argsort(axis=0).argsort(axis=0)
+    weights = {key.strip("|"): abs(x) for key, x in campaign.sensitivity().items()}
+    out = abs(ranks - ranks.mean()) * [weights[name] for name in campaign.names]
+    for run in campaign.worst(k):
+        far = int(out[run].argmax())
+        stop = STOPS[int(campaign.stop[run])]
+        ended = f"{campaign.end[run]:g}{', ' * bool(stop)}{stop}"
+        settled = f"{campaign.values('settle')[run]:.3g}"
+        drawn = f"{campaign.names[far]} = {campaign.drawn[run, far]:.3g}"
+        rows.append([str(run), f"{values[run]:.3g}", unit, settled, ended, drawn])
+    return ["", grid(rows, "rrlrll"), ""]
+
+
+def campaign_record(campaign: Any, worst: int) -> dict[str, Any]:
+    """Return the same for programs: [value, low, high] of each, null where one is infinite."""
+
+    def plain(values: Any) -> list[float | None]:
+        return [x if math.isfinite(x) else None for x in values]
+
+    names = [f"{of}{kind}" for kind in KINDS for of in ("", "worst ", "settle ")]
+    sure = {"confidence": campaign.confidence}
+    header = ("robot", "urdf_sha256", "asked", "duration", "dt", "seed", "engine", "confidence")
+    return {
+        **{key: getattr(campaign, key) for key in header},
+        "runs": len(campaign),
+        "stopped": _stops(campaign),
+        "units": KINDS,
+        "quantiles": {
+            name: {f"{p:g}": plain(campaign.quantile(name, p, **sure)) for p in _SHARES}
+            for name in names
+        },
+        "goals": {goal: plain(campaign.fraction(goal, **sure)) for goal in campaign.goals},
+        "goes_with": whence(campaign),
+        "worst": campaign.worst(worst) if worst else [],
+    }
+
+
+def _stops(campaign: Any) -> dict[str, int]:
+    """Return how many runs were stopped, by why."""
+    counts = {word: int((campaign.stop == at).sum()) for at, word in enumerate(STOPS) if at}
+    return {word: number for word, number in counts.items() if number}

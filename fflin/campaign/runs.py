@@ -12,6 +12,7 @@ import numpy as np
 
 from fflin.base.validation import Array
 from fflin.batch.dispatch import ChunkResult
+from fflin.campaign.dispersion_files import placed
 from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.tally import KINDS, Outcome, Tally, stop_of
 from fflin.dynamics.state_rows import states_of
@@ -35,6 +36,7 @@ class CampaignJob:
         self, robot: Robot, policy: Any, given: Any, seed: int, engine: str, options: Any
     ) -> None:
         self._again = partial(_made, robot, policy, given, seed, options=options)
+        histories = (options := dict(options)).pop("histories", 0)
         self.plan, self.plant = planned(robot, policy, linear=False, progress=False, **options)
         self.engine, state = engine, self.plant.state
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
@@ -43,7 +45,10 @@ class CampaignJob:
             t = self.plan.times.dt * np.arange(self.plan.times.steps + 1)
             q, v, _ = map(np.array, zip(*map(follows, t.tolist()), strict=True))
             self.home = states_of(state, q, state.velocities(v))
-        self.dispersions = Dispersions(given, self.plant, self.plan.policy, self.x0, seed)
+        with placed(given):
+            self.dispersions = Dispersions(given, self.plant, self.plan.policy, self.x0, seed)
+        spread = np.linspace(0.0, self.plan.times.steps, histories)
+        self.steps = np.unique(spread.round().astype(int))
 
     def __reduce__(self) -> tuple[Any, ...]:
         # What is bound to the robot is made anew by a worker.
@@ -57,11 +62,9 @@ class CampaignJob:
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of each array of a run's outcome."""
         robot, nx, nu = self.plant.robot, self.plant.state.nx, len(self.plan.initial)
-        sizes = (robot.nq, robot.nv, nx, nu, nx, nu, *[len(KINDS)] * 3)
-        return {
-            **{key: (size,) for key, size in zip(ARRAYS, sizes, strict=False)},
-            **{key: () for key in ARRAYS[len(sizes) :]},
-        }
+        sizes = [(size,) for size in (robot.nq, robot.nv, nx, nu, nx, nu, *[len(KINDS)] * 3)]
+        histories = [(len(self.steps), size) for size in (len(KINDS), nu)]
+        return dict(zip(ARRAYS, [*sizes, *histories, (), ()], strict=True))
 
     def run(self, rows: Draws, start: int, out: Mapping[str, Array] | None = None) -> ChunkResult:
         """Do some runs."""
@@ -89,7 +92,7 @@ class CampaignJob:
             lanes.fly(eight, self._tally(LANES), own)
 
     def _tally(self, count: int) -> Tally:
-        return Tally(self.plan, self.plant.state, self.home, count)
+        return Tally(self.plan, self.plant.state, self.home, count, self.steps)
 
     def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:
         """Return the plan of a run (k,), and its robot."""
@@ -119,27 +122,47 @@ class CampaignJob:
             return motion_of(plan, plant, "python", self._gone(plan, plant))
         return motion_of(plan, plant, "compiled", self._recorded(drawn, plan, plant))
 
-    def _recorded(self, drawn: Array, plan: Plan, plant: Plant) -> Recording:
-        """Return the recording of a run that goes in all lanes."""
+    def courses(self, drawn: Array, most: int) -> list[Array]:
+        """Return some configurations (rows, nq) on the way of runs (N, k), and the last of each."""
+        times, found = self.plan.times, list[Array]()
+        every = -(-times.steps // most)
+        if self.engine == "python":
+            for plan, plant in map(self.plan_of, drawn):
+                rare = replace(plan, times=times._replace(every=every))
+                found.append(self._gone(rare, plant).q)
+            return found
+        for first in range(0, len(drawn), LANES):
+            (q, *_), out, *_ = self._watched(drawn[first : first + LANES], every)
+            counts = -(-(out["end"] / times.dt).round().astype(int) // every)
+            ends = zip(counts, out["q"], strict=True)
+            found += [np.vstack((q[:count, lane], end)) for lane, (count, end) in enumerate(ends)]
+        return found
+
+    def _watched(self, drawn: Array, every: int) -> tuple[Any, Any, str, Any]:
+        """Return rows (steps, lanes, ..) of up to eight runs, and how and why these ended."""
         from fflin.campaign.lanes import Lanes
 
-        tree, every, kept = batch_tree(self.plant.robot), plan.times.every, list[list[Array]]()
+        tree, kept = batch_tree(self.plant.robot), list[list[Array]]()
         assert tree is not None
         lanes = Lanes(self.plan, self.plant)
 
         def watch(first: int, rows: list[Array]) -> None:
-            kept.append([each[-first % every :: every, 0].copy() for each in rows])
+            kept.append([each[-first % every :: every].copy() for each in rows])
 
-        runs = self.dispersions.in_lanes(np.tile(drawn, (LANES, 1)), tree)
-        out = {key: np.empty((LANES, *shape)) for key, shape in self.shapes.items()}
-        said = lanes.fly(runs, self._tally(LANES), out, watch)[0]
-        t = every * plan.times.dt * np.arange(sum(len(each[0]) for each in kept))
-        state, end = plant.state, float(out["end"][0])
+        out = {key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()}
+        said = lanes.fly(self.dispersions.in_lanes(drawn, tree), self._tally(LANES), out, watch)
+        return list(map(np.concatenate, zip(*kept, strict=True))), out, said[0], lanes
+
+    def _recorded(self, drawn: Array, plan: Plan, plant: Plant) -> Recording:
+        """Return the recording of a run that goes in all lanes."""
+        every, state = plan.times.every, plant.state
+        rows, out, said, lanes = self._watched(np.tile(drawn, (LANES, 1)), every)
+        rows, end = [each[:, 0] for each in rows], float(out["end"][0])
+        t = every * plan.times.dt * np.arange(len(rows[0]))
         if not said.startswith("diverged"):
-            nu = state.velocities(out["v"][0])
-            kept.append([x[None] for x in (out["q"][0], nu, out["u"][0], *lanes.kept(end))])
-            t = np.append(t, end)
-        q, nu, u, momentum, center = map(np.concatenate, zip(*kept, strict=True))
+            last = out["q"][0], state.velocities(out["v"][0]), out["u"][0], *lanes.kept(end)
+            rows, t = [np.vstack(x) for x in zip(rows, last, strict=True)], np.append(t, end)
+        q, nu, u, momentum, center = rows
         parts = (t, q, state.spread(nu), u, momentum, center, round(end / plan.times.dt), said)
         return Recording(*parts, "compiled")
 

@@ -39,6 +39,8 @@ class Outcome(NamedTuple):
     errors: Array  # (N, kinds), at last
     largest: Array  # (N, kinds)
     settle: Array  # (N, kinds) [s], since when settled; infinite where it is not
+    error_history: Array  # (N, times, kinds), infinite where a run was stopped before
+    input_history: Array  # (N, times, nu), zero there
     stop: Array  # (N,), which of STOPS
     end: Array  # (N,) [s]
 
@@ -52,10 +54,10 @@ def stop_of(said: str) -> int:
 class Tally:
     """The worst of some runs that go on together, up to now.
 
-    Errors are from `home` (nx,), or from its rows (steps + 1, nx).
+    Errors are from `home` (nx,), or from its rows (steps + 1, nx). Those at some `steps` are kept.
     """
 
-    def __init__(self, plan: Plan, state: StateMap, home: Array, count: int) -> None:
+    def __init__(self, plan: Plan, state: StateMap, home: Array, count: int, steps: Array) -> None:
         self._plan, self._state, self._homes = plan, state, home
         self._home = home if home.ndim == 1 else home[0]
         g, wheels = state.groups, state.robot.wheels
@@ -71,13 +73,15 @@ class Tally:
         self.largest_u = np.zeros((count, len(plan.initial)))
         self.largest = np.zeros((count, len(KINDS)))
         self.outside = np.full((count, len(KINDS)), -1)
+        self.steps = steps
+        self.error_history = np.full((count, len(steps), len(KINDS)), np.inf)
+        self.input_history = np.zeros((count, len(steps), len(plan.initial)))
 
     def copy(self) -> Tally:
         """Return one that goes its own way from here on."""
         other = object.__new__(Tally)
         other.__dict__ |= {
-            key: value.copy() if key in ("largest_x", "largest_u", "largest", "outside") else value
-            for key, value in vars(self).items()
+            key: value if key[0] == "_" else value.copy() for key, value in vars(self).items()
         }
         return other
 
@@ -87,6 +91,9 @@ class Tally:
         self._last = q[-1], nu[-1], u[-1], x[-1], sizes[-1]
         np.maximum(self.largest_x, np.abs(e).max(axis=0), out=self.largest_x)
         np.maximum(self.largest_u, np.abs(u).max(axis=0), out=self.largest_u)
+        kept = slice(*np.searchsorted(self.steps, (first, first + len(sizes))))
+        for history, each in ((self.error_history, sizes), (self.input_history, u)):
+            history[:, kept] = each[self.steps[kept] - first].swapaxes(0, 1)
         largest = np.maximum.accumulate(np.concatenate((self.largest[None], sizes)))[1:]
         self.largest[:] = largest[-1]
         # Where an error has its largest so far it is outside; so what was outside last stays it
@@ -111,6 +118,8 @@ class Tally:
             sizes,
             self.largest,
             np.where(late, np.inf, settled * times.dt),
+            self.error_history,
+            self.input_history,
             stop,
             np.full(len(stop), done * times.dt),
         )

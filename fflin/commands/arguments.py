@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
+
+_OPTION = re.compile(r"--(\[no-\])?([\w-]+)(?: (\S+?)([*!])?(?: = (\S+))?)?: (.+)")
 
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 Container: TypeAlias = "argparse._ActionsContainer"
@@ -64,6 +67,14 @@ def lock(text: str) -> tuple[str, float | None]:
     return assignment(text) if "=" in text else (text, None)
 
 
+_READ: dict[str, Callable[[str], Any]] = {
+    **dict.fromkeys(("FILE", "FILE.npz"), file_name),
+    **dict.fromkeys(("T", "H", "P", "FPS", "SPEED"), number),
+    **{"N": count_of, "S": whole, "K": whole, "[NAME=]VALUE": passive, "NAME[=VALUE]": lock},
+    **dict.fromkeys(("NAME=VALUE", "NAME=W"), assignment),
+}
+
+
 def command(
     commands: Commands,
     name: str,
@@ -82,39 +93,46 @@ def command(
     return command
 
 
-def add_values(
-    command: Container,
-    option: str,
-    help: str,
-    *,
-    metavar: str = "NAME=VALUE",
-    read: Callable[[str], Any] = assignment,
-) -> None:
-    """Add an option that may be given several times; none by default."""
-    command.add_argument(
-        option, metavar=metavar, type=read, action="append", default=[], help=f"{help} (repeatable)"
-    )
+def add_options(group: Container, text: str, **more: Any) -> None:
+    """Add options, each a line ``--name METAVAR: help`` and those that go on with it.
 
-
-def _add_vector(command: Container, option: str, entries: str, help: str) -> None:
-    """Add an option of three numbers, which its help calls by these letters."""
-    command.add_argument(option, nargs=3, type=number, metavar=tuple(entries), help=help)
+    A metavar in _READ says how the value is read, one such as a|b what it may be, X,Y numbers;
+    behind it stand ``*`` where the option is repeatable, ``!`` where it is required, or
+    ``= default``. Without one it is a switch, ``--[no-]x`` of both ways. What holds of all is in
+    `more`.
+    """
+    for line in re.split(r"\n\s*(?=--)", text.strip()):
+        found = _OPTION.fullmatch(" ".join(line.split()))
+        assert found, line
+        both, name, metavar, many, default, said = found.groups()
+        options: dict[str, Any] = {"help": said + " (repeatable)" * (many == "*"), **more}
+        if not metavar:
+            options["action"] = argparse.BooleanOptionalAction if both else "store_true"
+        elif "|" in metavar:
+            options["choices"] = metavar.split("|")
+        elif "," in metavar:
+            options |= {"metavar": (each := tuple(metavar.split(","))), "nargs": len(each)}
+            options["type"] = number
+        else:
+            options = {"metavar": metavar, "type": _READ.get(metavar, str)} | options
+        if many == "*":
+            options |= {"action": "append", "default": []}
+        if many == "!":
+            options["required"] = True
+        if default:
+            options["default"] = options.get("type", str)(default)
+        group.add_argument(f"--{name}", **options)
 
 
 def add_robot(command: argparse.ArgumentParser) -> None:
     """Add ROBOT and --lock."""
-    command.add_argument(
-        "robot",
-        metavar="ROBOT",
-        help="a name of `fflin robots`, or the path of a URDF or of a robot.toml",
-    )
-    add_values(
+    what = "a name of `fflin robots`, or the path of a URDF or of a robot.toml"
+    command.add_argument("robot", metavar="ROBOT", help=what)
+    add_options(
         command,
-        "--lock",
-        "weld a joint, at VALUE [rad|m] or at neutral; NAME may be a pattern, 'hinge_*', here and "
-        "below",
-        metavar="NAME[=VALUE]",
-        read=lock,
+        """
+        --lock NAME[=VALUE]*: weld a joint, at VALUE [rad|m] or at neutral; NAME may be a pattern,
+            'hinge_*', here and below""",
     )
 
 
@@ -129,93 +147,61 @@ def add_point(command: argparse.ArgumentParser) -> None:
 
 def add_reference(command: argparse.ArgumentParser) -> None:
     """Add what attitude and position are relative to."""
-    command.add_argument(
-        "--reference",
-        choices=("base", "world"),
-        default="base",
-        help="what attitude and position are relative to: the base where it stands (default), "
-        "or the world",
+    add_options(
+        command,
+        """
+        --reference base|world = base: what attitude and position are relative to: the base where it
+            stands (default), or the world""",
     )
 
 
 def add_pose(command: Container) -> None:
     """Add what says where the robot is and how it moves."""
-    add_values(command, "--joint", "put a joint at VALUE [rad|m]; the others are at neutral")
-    _add_vector(command, "--rpy", "RPY", "base attitude: roll, pitch, yaw [deg] about fixed axes")
-    _add_vector(command, "--position", "XYZ", "base position [m]")
-    add_values(
+    add_options(
         command,
-        "--velocity",
-        "a velocity at the point: the rate [rad/s|m/s] of a joint or wheel, or omega_b.x ... "
-        "v_b.z of the base in base axes",
+        """
+        --joint NAME=VALUE*: put a joint at VALUE [rad|m]; the others are at neutral
+        --rpy R,P,Y: base attitude: roll, pitch, yaw [deg] about fixed axes
+        --position X,Y,Z: base position [m]
+        --velocity NAME=VALUE*: a velocity at the point: the rate [rad/s|m/s] of a joint or wheel,
+            or omega_b.x ... v_b.z of the base in base axes""",
     )
 
 
 def add_inputs_there(command: Container) -> None:
     """Add what says the inputs at the point."""
-    add_values(
-        command, "--effort", "an input at the point, by its name in u, such as tau_m.joint_1"
-    )
-    command.add_argument(
-        "--equilibrium",
-        action="store_true",
-        help="take the least inputs that balance springs, gravity and a steady motion at the "
-        "point; refused where there are none",
+    add_options(
+        command,
+        """
+        --effort NAME=VALUE*: an input at the point, by its name in u, such as tau_m.joint_1
+        --equilibrium: take the least inputs that balance springs, gravity and a steady motion at
+            the point; refused where there are none""",
     )
 
 
 def add_system(command: Container) -> None:
     """Add what acts on the robot, what is watched of it, and in which axes."""
-    for name, unit in (("stiffness", "N m/rad|N/m"), ("damping", "N m s/rad|N s/m")):
-        add_values(
-            command,
-            f"--{name}",
-            f"{name} of a joint [{unit}], or one value for all joints"
-            + ("; `urdf`: what the URDF says" if name == "damping" else ""),
-            metavar="[NAME=]VALUE",
-            read=passive,
-        )
-    _add_vector(
+    add_options(
         command,
-        "--gravity",
-        "XYZ",
-        "uniform gravity in world axes [m/s^2]; none by default",
-    )
-    add_values(
-        command,
-        "--passive",
-        "a joint without a motor: it gets no torque by default",
-        metavar="NAME",
-        read=str,
-    )
-    command.add_argument(
-        "--inputs",
-        metavar="FILE.toml",
-        help="what acts on the robot, as fflin.load_inputs reads it: a file, or the name of a "
-        "bundled one; `joints` or `base`: those alone; by default those of a robot.toml, or torque "
-        "and force on the base and every joint's",
-    )
-    add_values(
-        command,
-        "--output",
-        "what is watched: state (default), base, joints, rates, joints:NAME, rates:NAME (a joint "
-        "or a pattern), com, momentum, frame:NAME (pose "
-        "and velocity), pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME; "
-        "relative:NAME:TO, as another frame sees it",
-        metavar="SPEC",
-        read=str,
-    )
-    command.add_argument(
-        "--frame",
-        choices=("hybrid", "local", "world"),
-        default="hybrid",
-        help="axes of velocities and wrenches: angular in base axes and linear in reference axes "
-        "(hybrid, default), both in base axes (local), both in reference axes (world)",
+        """
+        --stiffness [NAME=]VALUE*: stiffness of a joint [N m/rad|N/m], or one value for all joints
+        --damping [NAME=]VALUE*: damping of a joint [N m s/rad|N s/m], or one value for all joints;
+            `urdf`: what the URDF says
+        --gravity X,Y,Z: uniform gravity in world axes [m/s^2]; none by default
+        --passive NAME*: a joint without a motor: it gets no torque by default
+        --inputs FILE.toml: what acts on the robot, as fflin.load_inputs reads it: a file, or the
+            name of a bundled one; `joints` or `base`: those alone; by default those of a
+            robot.toml, or torque and force on the base and every joint's
+        --output SPEC*: what is watched: state (default), base, joints, rates, joints:NAME,
+            rates:NAME (a joint or a pattern), com, momentum, frame:NAME (pose and velocity),
+            pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME; relative:NAME:TO, as
+            another frame sees it
+        --frame hybrid|local|world = hybrid: axes of velocities and wrenches: angular in base axes
+            and linear in reference axes (hybrid, default), both in base axes (local), both in
+            reference axes (world)""",
     )
 
 
 def add_output_file(command: Container, what: str) -> None:
     """Add -o FILE; `what` says which endings there are."""
-    command.add_argument(
-        "-o", "--output-file", metavar="FILE", dest="output_file", type=file_name, help=what
-    )
+    command.add_argument("-o", "--output-file", metavar="FILE", type=file_name, help=what)

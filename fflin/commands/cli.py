@@ -22,7 +22,7 @@ TASKS = {
     "make and check a linear model": {"linearize": "models", "check": "models"},
     "judge it": {"analyze": "analysis", "modes": "analysis", "validity": "analysis"},
     "close the loop": {"lqr": "regulator", "tvlqr": "tracking", "simulate": "simulation"},
-    "go through many points": {"sweep": "sweeps"},
+    "go through many": {"sweep": "sweeps", "montecarlo": "montecarlo"},
 }
 _MODULES = {name: module for names in TASKS.values() for name, module in names.items()}
 

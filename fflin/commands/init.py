@@ -9,28 +9,19 @@ from pathlib import Path
 
 from fflin.base.errors import FileError, InputError
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, command, file_name
+from fflin.commands.arguments import Commands, add_options, add_output_file, command
 
 
 def add_commands(commands: Commands) -> None:
     """Add init."""
     init = command(
-        commands,
-        "init",
-        _init,
+        *(commands, "init", _init),
         "write a robot.toml with what a URDF suggests: inputs, limits, joints without a motor",
         "fflin init my.urdf && fflin simulate my.toml",
     )
     init.add_argument("robot", metavar="URDF", help="its path, or a name of `fflin robots`")
-    init.add_argument(
-        "-o",
-        "--output-file",
-        metavar="FILE.toml",
-        dest="output_file",
-        type=file_name,
-        help="where to; by default the URDF's name with .toml, in this folder",
-    )
-    init.add_argument("--force", action="store_true", help="write over a file that is there")
+    add_output_file(init, "where to; by default the URDF's name with .toml, in this folder")
+    add_options(init, "--force: write over a file that is there")
 
 
 def _init(arguments: argparse.Namespace) -> int:

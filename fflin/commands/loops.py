@@ -1,16 +1,24 @@
-"""What closes the loop that the command simulate shows, from files or by design."""
+"""The loop that commands simulate, closed by what files hold or by design."""
 
 from __future__ import annotations
 
 import argparse
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fflin.base.errors import FflinWarning, InputError, listed
+from fflin.commands.arguments import (
+    Container,
+    add_inputs_there,
+    add_options,
+    add_pose,
+    add_robot,
+    add_system,
+)
 from fflin.commands.points import configuration_of, inputs_at, once, placed, velocity_of
-from fflin.commands.regulator import gain_of, regulated_part
-from fflin.commands.tracking import models_along, schedule_of
+from fflin.commands.regulator import add_weights, gain_of, regulated_part
+from fflin.commands.tracking import add_trajectory, models_along, schedule_of
 
 if TYPE_CHECKING:
     from fflin.base.validation import Array
@@ -19,7 +27,17 @@ if TYPE_CHECKING:
     from fflin.robot.robot import Robot
 
 _WEIGHTS = ("weights", "q", "r", "bryson", "dt")
+_GROUPS = "where it starts", "where it is to be", "what regulates it", "the run", "the robot"
 _TARGETS = ("target_joint", "target_velocity", "effort", "equilibrium", "reduce")
+
+
+class Loop(NamedTuple):
+    """A policy, how it is simulated, and where it is one, its state feedback and model."""
+
+    policy: Any
+    options: dict[str, Any]
+    feedback: StateFeedback | None = None
+    lin: LinearModel | None = None
 
 
 def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
@@ -33,6 +51,87 @@ def refuse_law(arguments: argparse.Namespace) -> None:
     _refuse(arguments, ("limit", "delay"), "--free has no input to limit or delay")
     names = (*_WEIGHTS, *_TARGETS[:2], "reduce", "allocate", "gain")
     _refuse(arguments, names, "--free has no regulator to give weights, a target or thrusters")
+
+
+def add_loop(command: argparse.ArgumentParser) -> Container:
+    """Add all that says the loop; return the group of the run's options."""
+    add_robot(command)
+    start, goal, law, run, system = map(command.add_argument_group, _GROUPS)
+    add_system(system)
+    add_pose(start)
+    add_options(
+        start,
+        """
+        --offset NAME=VALUE*: how far from the trajectory's start it starts, in the base's axes
+            there: a state, group or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw
+            [deg]""",
+    )
+    add_options(
+        goal,
+        """
+        --target-joint NAME=VALUE*: where a joint is to go [rad|m]; the others go to neutral, the
+            base to the world's origin
+        --target-velocity NAME=VALUE*: a velocity of the target, such as the speed of a wheel that
+            is to be held; it starts with it where --velocity does not say otherwise""",
+    )
+    add_inputs_there(goal)
+    add_trajectory(goal)
+    add_weights(law)
+    add_options(
+        law,
+        """
+        --schedule FILE: follow the trajectory with these gains, as tvlqr saves them; without it
+            they are designed
+        --gain FILE: regulate with this gain, as lqr saves it, about the point it was designed for
+        --[no-]allocate: whether to design with torque and force on the base, and let the thrusters,
+            none of which pulls, give what comes nearest; by default where they push every way; else
+            a thrust below zero is cut
+        --free: let it move without a regulator or any input
+        --limits urdf|none = urdf: what cuts the inputs: efforts of the URDF, max and min of the
+            inputs and speeds of wheels (urdf, default), or only what --limit says (none)
+        --limit NAME=VALUE*: largest magnitude of an input, a group of them such as tau_m, or a
+            pattern; goes first
+        --delay T = 0: time from a sample to its effect [s]""",
+    )
+    add_options(
+        run,
+        """
+        --duration T: time [s]; by default that of the trajectory, or from 60 to 600, what the
+            linear loop takes to settle
+        --step H: step of the integration [s]; chosen by default
+        --method METHOD = cf4: cf4 (default), rkmk4 or semi_implicit_euler""",
+    )
+    return run
+
+
+def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
+    """Return the loop that the options of `add_loop` say."""
+    from fflin.simulation.settling import SHORTEST, time_to_settle
+
+    given = once("--limit", arguments.limit)
+    options: dict[str, Any] = {
+        "dt": arguments.step,
+        "method": arguments.method,
+        "limits": [arguments.limits, given] if arguments.limits == "urdf" else given or None,
+        "delay": arguments.delay,
+        "duration": arguments.duration,
+    }
+    if arguments.trajectory or arguments.schedule:
+        policy, start = along(robot, arguments)
+        return Loop(policy, options | start)
+    if arguments.offset or arguments.hold:
+        raise InputError("--offset and --hold are of a --trajectory; give one, or leave them out")
+    q, v = start_of(robot, arguments)
+    options |= {"q0": q, "v0": v}
+    if arguments.free:
+        refuse_law(arguments)
+        options["duration"] = SHORTEST if arguments.duration is None else arguments.duration
+        return Loop(None, options | {"frame": arguments.frame})
+    policy, feedback, lin = about_point(robot, arguments)
+    require_held(robot, feedback, q)
+    if arguments.duration is None:
+        options["duration"] = time_to_settle(robot, feedback, q, v)
+    return Loop(policy, options, *([feedback, lin] if policy is feedback else []))
 
 
 def start_of(robot: Robot, arguments: argparse.Namespace) -> tuple[Array, Array | None]:

@@ -11,11 +11,11 @@ from fflin.base.errors import FflinError, FflinWarning
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
+    add_options,
     add_output_file,
     add_point,
     add_robot,
     command,
-    number,
 )
 from fflin.commands.points import linear_model, load_robot
 from fflin.commands.tracking import add_trajectory, check_along, linearize_along
@@ -32,29 +32,21 @@ def add_commands(commands: Commands) -> None:
         commands, "info", _info, "show tree, joints, masses and limits", "fflin info servicer_7dof"
     )
     add_robot(info)
-    info.add_argument(
-        "--inputs", metavar="FILE.toml", help="show these as well: a file, or a bundled one's name"
-    )
+    add_options(info, "--inputs FILE.toml: show these as well: a file, or a bundled one's name")
     linearize = command(
-        commands,
-        "linearize",
-        _linearize,
+        *(commands, "linearize", _linearize),
         "show or save A, B, C, D",
         "fflin linearize ets_vii --joint joint_2=0.5 -o ets_vii.mat",
     )
     add_point(linearize)
-    linearize.add_argument(
-        "--dt", metavar="H", type=number, help="sample it, with inputs held over H [s]"
-    )
+    add_options(linearize, "--dt H: sample it, with inputs held over H [s]")
     add_trajectory(linearize)
     add_output_file(
         linearize, "save to FILE: .npz, .mat, .json, or .csv (one file a matrix: NAME.A.csv, ...)"
     )
     add_figure(linearize, "draw the pattern of A and B")
     check = command(
-        commands,
-        "check",
-        _check,
+        *(commands, "check", _check),
         "check A and B by two other routes; exit 1 where they do not hold",
         "fflin check canadarm2 --rpy 20 0 0 --reference world --frame world",
     )

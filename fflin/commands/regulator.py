@@ -7,20 +7,15 @@ import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from fflin.base.errors import (
-    EquilibriumError,
-    FflinWarning,
-    StabilizabilityError,
-)
+from fflin.base.errors import EquilibriumError, FflinWarning, StabilizabilityError
 from fflin.commands import DONE
 from fflin.commands.arguments import (
     Commands,
     Container,
+    add_options,
     add_output_file,
     add_point,
-    add_values,
     command,
-    number,
 )
 from fflin.commands.points import linear_model, once
 from fflin.commands.visual import add_figure, check_figure, draw
@@ -33,9 +28,7 @@ if TYPE_CHECKING:
 def add_commands(commands: Commands) -> None:
     """Add lqr."""
     lqr = command(
-        commands,
-        "lqr",
-        _lqr,
+        *(commands, "lqr", _lqr),
         "design the linear quadratic regulator: gain, poles, residual, margins",
         "fflin lqr canadarm2 -o gain.npz",
     )
@@ -47,46 +40,22 @@ def add_commands(commands: Commands) -> None:
 
 def add_weights(command: Container) -> None:
     """Add what is regulated and at which cost: --q, --r, --bryson, --dt, --reduce and so on."""
-    command.add_argument(
-        "--weights",
-        choices=("urdf", "identity"),
-        help="what weighs what is not named: `urdf` (default), with which the inputs keep within "
-        "the limits of the URDF where the base is turned by 30 deg and the joints by 0.3 rad, or "
-        "`identity`, 1 on each",
-    )
-    add_values(
+    add_options(
         command,
-        "--q",
-        "weight on states: a name, a group or a pattern, such as q_m.joint_1, q_b, q_m.hinge_*",
-        metavar="NAME=W",
-    )
-    add_values(
-        command,
-        "--r",
-        "weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*",
-        metavar="NAME=W",
-    )
-    add_values(
-        command,
-        "--bryson",
-        "largest acceptable value of a state, an input or a group: its weight is 1/VALUE^2",
-    )
-    command.add_argument(
-        "--dt",
-        metavar="H",
-        type=number,
-        help="design for inputs held over H [s]; the cost stays the continuous one",
-    )
-    command.add_argument(
-        "--reduce",
-        action="store_true",
-        help="regulate the part that the inputs can hold where momentum is conserved",
-    )
-    command.add_argument(
-        "--wheel-speeds",
-        action=argparse.BooleanOptionalAction,
-        help="bring the speeds of reaction wheels back to the point's: by default where thrusters "
-        "or a torque on the base can make them; also those that turn nothing else, or none",
+        """
+        --weights urdf|identity: what weighs what is not named: `urdf` (default), with which the
+            inputs keep within the limits of the URDF where the base is turned by 30 deg and the
+            joints by 0.3 rad, or `identity`, 1 on each
+        --q NAME=W*: weight on states: a name, a group or a pattern, such as q_m.joint_1, q_b,
+            q_m.hinge_*
+        --r NAME=W*: weight on inputs: a name, a group or a pattern, such as tau_b, tau_m.hinge_*
+        --bryson NAME=VALUE*: largest acceptable value of a state, an input or a group: its weight
+            is 1/VALUE^2
+        --dt H: design for inputs held over H [s]; the cost stays the continuous one
+        --reduce: regulate the part that the inputs can hold where momentum is conserved
+        --[no-]wheel-speeds: bring the speeds of reaction wheels back to the point's: by default
+            where thrusters or a torque on the base can make them; also those that turn nothing
+            else, or none""",
     )
 
 

@@ -9,35 +9,15 @@ from typing import TYPE_CHECKING, Any
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.names import chosen, input_keys
 from fflin.commands import DONE, FELL_SHORT
-from fflin.commands.arguments import (
-    Commands,
-    add_inputs_there,
-    add_output_file,
-    add_pose,
-    add_robot,
-    add_system,
-    add_values,
-    command,
-    count_of,
-    file_name,
-    number,
-)
-from fflin.commands.loops import about_point, along, refuse_law, require_held, start_of
-from fflin.commands.points import load_robot, once
-from fflin.commands.regulator import add_weights
-from fflin.commands.tracking import add_trajectory
+from fflin.commands.arguments import Commands, add_options, add_output_file, command
+from fflin.commands.loops import add_loop, loop_of
+from fflin.commands.points import load_robot
 from fflin.commands.visual import add_pictures, check_figure, check_pictures, show_motion
 
 if TYPE_CHECKING:
     from fflin.control.policies import StateFeedback
     from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion
-
-
-_GROUPS = (
-    *("where it starts", "where it is to be", "what regulates it", "the run", "the robot"),
-    "what is kept and shown of it",
-)
 
 # The options that name a file to write.
 _OUTPUTS = ("output_file", "plot", "html", "png", "gif")
@@ -46,108 +26,19 @@ _OUTPUTS = ("output_file", "plot", "html", "png", "gif")
 def add_commands(commands: Commands) -> None:
     """Add simulate."""
     simulate = command(
-        commands,
-        "simulate",
-        _simulate,
+        *(commands, "simulate", _simulate),
         "let a regulator bring the nonlinear robot from where it is put to the target, or "
         "along a trajectory",
         "fflin simulate ets_vii --rpy 30 0 0 --duration 60 --html loop.html --plot loop.png",
     )
-    add_robot(simulate)
-    start, goal, law, run, system, shown = map(simulate.add_argument_group, _GROUPS)
-    add_system(system)
-    add_pose(start)
-    add_values(
-        start,
-        "--offset",
-        "how far from the trajectory's start it starts, in the base's axes there: a state, group "
-        "or pattern such as r_b.x, q_m, omega_b.z, or roll, pitch, yaw [deg]",
-    )
-    add_values(
-        goal,
-        "--target-joint",
-        "where a joint is to go [rad|m]; the others go to neutral, the base to the world's origin",
-    )
-    add_values(
-        goal,
-        "--target-velocity",
-        "a velocity of the target, such as the speed of a wheel that is to be held; it starts with "
-        "it where --velocity does not say otherwise",
-    )
-    add_inputs_there(goal)
-    add_trajectory(goal)
-    add_weights(law)
-    law.add_argument(
-        "--schedule",
-        metavar="FILE",
-        type=file_name,
-        help="follow the trajectory with these gains, as tvlqr saves them; without it they are "
-        "designed",
-    )
-    law.add_argument(
-        "--gain",
-        metavar="FILE",
-        type=file_name,
-        help="regulate with this gain, as lqr saves it, about the point it was designed for",
-    )
-    law.add_argument(
-        "--allocate",
-        action=argparse.BooleanOptionalAction,
-        help="whether to design with torque and force on the base, and let the thrusters, none of "
-        "which pulls, give what comes nearest; by default where they push every way; else a "
-        "thrust below zero is cut",
-    )
-    law.add_argument(
-        "--free", action="store_true", help="let it move without a regulator or any input"
-    )
-    law.add_argument(
-        "--limits",
-        choices=("urdf", "none"),
-        default="urdf",
-        help="what cuts the inputs: efforts of the URDF, max and min of the inputs and speeds of "
-        "wheels (urdf, default), or only what --limit says (none)",
-    )
-    add_values(
-        law,
-        "--limit",
-        "largest magnitude of an input, a group of them such as tau_m, or a pattern; goes first",
-    )
-    law.add_argument(
-        "--delay",
-        metavar="T",
-        type=number,
-        default=0.0,
-        help="time from a sample to its effect [s]",
-    )
-    run.add_argument(
-        "--duration",
-        metavar="T",
-        type=number,
-        help="time [s]; by default that of the trajectory, or from 60 to 600, what the linear loop "
-        "takes to settle",
-    )
-    run.add_argument(
-        "--step", metavar="H", type=number, help="step of the integration [s]; chosen by default"
-    )
-    run.add_argument(
-        "--every",
-        metavar="N",
-        type=count_of,
-        help="steps from one recorded row to the next; chosen where there are many",
-    )
-    run.add_argument("--method", default="cf4", help="cf4 (default), rkmk4 or semi_implicit_euler")
-    shown.add_argument(
-        "--plot",
-        metavar="FILE",
-        type=file_name,
-        help="draw linear beside nonlinear into FILE: .png, .pdf or .svg",
-    )
-    add_values(
+    run, shown = add_loop(simulate), simulate.add_argument_group("what is kept and shown of it")
+    add_options(run, "--every N: steps from one row to the next; chosen where there are many")
+    add_options(
         shown,
-        "--show",
-        "what --plot draws: a state or input, a group or a pattern, such as q_m, '*.hinge_*'",
-        metavar="NAME",
-        read=str,
+        """
+        --plot FILE: draw linear beside nonlinear into FILE: .png, .pdf or .svg
+        --show NAME*: what --plot draws: a state or input, a group or a pattern, such as q_m,
+            '*.hinge_*'""",
     )
     add_output_file(shown, "save the motion to FILE: .npz, .mat, .json or .csv")
     add_pictures(shown)
@@ -162,8 +53,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     check_distinct(*(getattr(arguments, name) for name in _OUTPUTS))
     if arguments.output_file:
         check_place(arguments.output_file, FORMATS)
-    if arguments.plot:
-        check_figure(arguments.plot)
+    check_figure(arguments.plot)
     check_pictures(robot, arguments)
     if arguments.show:
         from fflin.linear.linearization import linearize
@@ -208,35 +98,12 @@ def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     from fflin.simulation.simulate import simulate
     from fflin.simulation.times import SHORTEST, time_to_settle
 
-    given = once("--limit", arguments.limit)
-    options: dict[str, Any] = {
-        "dt": arguments.step,
-        "every": arguments.every,
-        "method": arguments.method,
-        "limits": [arguments.limits, given] if arguments.limits == "urdf" else given or None,
-        "delay": arguments.delay,
-        "duration": arguments.duration,
-    }
-    if arguments.trajectory or arguments.schedule:
-        policy, start = along(robot, arguments)
-        return simulate(robot, policy, **options, **start)
-    if arguments.offset or arguments.hold:
-        raise InputError("--offset and --hold are of a --trajectory; give one, or leave them out")
-    q, v = start_of(robot, arguments)
-    options |= {"q0": q, "v0": v}
-    if arguments.free:
-        refuse_law(arguments)
-        options["duration"] = SHORTEST if arguments.duration is None else arguments.duration
-        return simulate(robot, frame=arguments.frame, **options)
-    policy, feedback, lin = about_point(robot, arguments)
-    require_held(robot, feedback, q)
-    if arguments.duration is None:
-        options["duration"] = time_to_settle(robot, feedback, q, v)
-    if policy is not feedback:
-        return simulate(robot, policy, **options)
+    loop = loop_of(robot, arguments)
     # At every row, where a sampled model has the samples alone.
-    motion = simulate(robot, policy, **options, linear=lin)
-    _warn_of_cut_thrust(robot, motion, feedback)
+    foresees: dict[str, Any] = {"linear": loop.lin} if loop.feedback else {}
+    motion = simulate(robot, loop.policy, every=arguments.every, **loop.options, **foresees)
+    if loop.feedback:
+        _warn_of_cut_thrust(robot, motion, loop.feedback)
     return motion
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,17 +14,15 @@ from fflin.base.errors import FileError, InputError, MissingPackageError
 from fflin.commands import DONE
 from fflin.commands.arguments import (
     Commands,
+    add_options,
     add_output_file,
     add_pose,
     add_reference,
     add_robot,
     add_system,
-    add_values,
     command,
     count_of,
-    file_name,
     number,
-    whole,
 )
 from fflin.commands.points import configuration_of, load_robot, once, velocity_of
 
@@ -44,57 +42,41 @@ _DASK_TIMEOUT = 10  # seconds
 def add_commands(commands: Commands) -> None:
     """Add sweep."""
     sweep = command(
-        commands,
-        "sweep",
-        _sweep,
+        *(commands, "sweep", _sweep),
         "linearise about many points and save them all",
         "fflin sweep servicer_7dof --grid joint_2=-1:1:21 --grid joint_4=-2:0:11 -o grid.h5",
     )
     add_robot(sweep)
     points = sweep.add_argument_group("points", "one of these; at rest, unless --velocity says so")
-    add_values(
+    add_options(
         points,
-        "--grid",
-        "N values of a joint [rad|m] from LO to HI; of several joints all combinations, the last "
-        "one varies fastest",
-        metavar="JOINT=LO:HI:N",
-        read=_axis,
+        """--grid JOINT=LO:HI:N*: N values of a joint [rad|m] from LO to HI; of several joints all
+            combinations, the last one varies fastest""",
+        type=_axis,
     )
-    points.add_argument(
-        "--random", metavar="N", type=count_of, help="N points drawn evenly from the joints' limits"
-    )
-    points.add_argument(
-        "--configurations",
-        metavar="FILE.npz",
-        type=file_name,
-        help="q (N, nq) in Pinocchio's order, as numpy.savez writes it, and if it has them v "
-        "(N, nv) and u (N, nu)",
-    )
-    points.add_argument(
-        "--seed", metavar="S", type=whole, default=0, help="of --random; 0 by default"
-    )
-    add_values(
+    add_options(
         points,
-        "--range",
-        "of --random: range of a joint in place of its limits",
-        metavar="JOINT=LO:HI",
-        read=_range,
+        """
+        --random N: N points drawn evenly from the joints' limits
+        --configurations FILE.npz: q (N, nq) in Pinocchio's order, as numpy.savez writes it, and if
+            it has them v (N, nv) and u (N, nu)
+        --seed S = 0: of --random; 0 by default""",
     )
+    ranges = "--range JOINT=LO:HI*: of --random: range of a joint in place of its limits"
+    add_options(points, ranges, type=_range)
     add_pose(sweep)
-    add_values(sweep, "--effort", "an input at all points, by its name in u, such as tau_m.joint_1")
+    add_options(
+        sweep,
+        "--effort NAME=VALUE*: an input at all points, by its name in u, such as tau_m.joint_1",
+    )
     add_system(sweep)
     add_reference(sweep)
-    sweep.add_argument(
-        "--workers",
-        metavar="N",
-        type=count_of,
-        help="share the work among N processes, at most one for each core",
-    )
-    sweep.add_argument(
-        "--dask", metavar="ADDRESS", help="share it among the workers of a dask scheduler"
-    )
-    sweep.add_argument(
-        "--yes", action="store_true", help="do not stop at results of more than 10 GB"
+    add_options(
+        sweep,
+        """
+        --workers N: share the work among N processes, at most one for each core
+        --dask ADDRESS: share it among the workers of a dask scheduler
+        --yes: do not stop at results of more than 10 GB""",
     )
     add_output_file(
         sweep,
@@ -128,76 +110,41 @@ def _range(text: str) -> tuple[str, tuple[float, float]]:
 def _sweep(arguments: argparse.Namespace) -> int:
     import pinocchio as pin
 
-    from fflin.base.progress import Progress
-    from fflin.batch.store import output_path, part_of
-    from fflin.batch.sweep import sweep
+    from fflin.batch.store import check_room, output_path, part_of, readable
+    from fflin.batch.sweep import planned_bytes, sweep
     from fflin.dynamics.points import effort
 
     path = arguments.output_file
     if path is None:
         raise InputError("-o says where the models go: a file .h5 or .npz")
-    if arguments.workers and arguments.dask:
-        raise InputError("--workers and --dask both share the work; give either")
     output_path(path)
     robot = load_robot(arguments)
     v = velocity_of(robot, arguments)
     u = effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
     reference = pin.SE3.Identity() if arguments.reference == "world" else None
     options: dict[str, Any] = {"frame": arguments.frame, "reference": reference}
-    announce = _Announcement(robot, path, options, arguments.yes)
+    said = ""
+
+    def announce(count: int, *, at_rest: bool) -> None:
+        nonlocal said
+        output_path(path)  # once more, when the inputs are known
+        size = planned_bytes(robot, count, at_rest=at_rest, **options)
+        said = f"{count:,} points of '{robot.name}', {readable(size)}"
+        if size > _LARGE and not arguments.yes:
+            raise InputError(f"{said}: add --yes where it is meant, or choose fewer points")
+        check_room(count, size, path)
+        part = part_of(path)
+        said += f" to {path}" + f", going on from {part}" * part.exists()
+
     q, v, u = _points(robot, arguments, v, u, announce)
-    bar = Progress()
-    with _executor(arguments.dask) as executor:
-        announce.say()
-        try:
-            batch = sweep(
-                robot,
-                q,
-                v,
-                u,
-                **options,
-                executor=executor,
-                workers=arguments.workers,
-                progress=bar.update,
-                out=path,
-            )
-        except KeyboardInterrupt:
-            if part_of(path).exists():
-                raise KeyboardInterrupt(
-                    f"stopped; the same command goes on from {part_of(path)}"
-                ) from None
-            raise
-        finally:
-            bar.close()
+    with executor_of(arguments) as executor:
+        print(f"fflin: {said}", file=sys.stderr)  # all that was asked for is found good
+        with going_on(path, "points") as progress:
+            work = {"executor": executor, "workers": arguments.workers, "progress": progress}
+            batch = sweep(robot, q, v, u, **options, **work, out=path)
     states, inputs = len(batch.state_names), len(batch.input_names)
     print(f"wrote {path}: {len(batch):,} points, {states} states, {inputs} inputs")
     return DONE
-
-
-class _Announcement:
-    """Says how many points there are and how large the result is, and stops what is too much."""
-
-    def __init__(self, robot: Robot, path: Path, options: dict[str, Any], agreed: bool) -> None:
-        self._robot, self._path, self._options, self._agreed = robot, path, options, agreed
-        self._said = ""
-
-    def __call__(self, count: int, *, at_rest: bool) -> None:
-        from fflin.batch.store import check_room, output_path, part_of, readable
-        from fflin.batch.sweep import planned_bytes
-
-        output_path(self._path)  # once more, when the inputs are known
-        size = planned_bytes(self._robot, count, at_rest=at_rest, **self._options)
-        said = f"{count:,} points of '{self._robot.name}', {readable(size)}"
-        if size > _LARGE and not self._agreed:
-            raise InputError(f"{said}: add --yes where it is meant, or choose fewer points")
-        check_room(count, size, self._path)
-        part = part_of(self._path)
-        going_on = f", going on from {part}" if part.exists() else ""
-        self._said = f"fflin: {said} to {self._path}{going_on}"
-
-    def say(self) -> None:
-        """Say it, once all that was asked for is found good."""
-        print(self._said, file=sys.stderr)
 
 
 def _points(
@@ -205,7 +152,7 @@ def _points(
     arguments: argparse.Namespace,
     v: Array | None,
     u: Array | None,
-    announce: _Announcement,
+    announce: Callable[..., None],
 ) -> tuple[Array | Configurations, Array | None, Array | None]:
     """Return q, v and u of the points."""
     import numpy as np
@@ -285,11 +232,39 @@ def _given(path: Path) -> dict[str, Array]:
 
 
 @contextmanager
-def _executor(address: str | None) -> Iterator[Executor | None]:
+def going_on(path: Path | None, what: str) -> Iterator[Callable[[int, int], None]]:
+    """Yield what shows the progress to a file; say of Ctrl-C how far it came and what is kept."""
+    from fflin.base.progress import Progress
+    from fflin.batch.store import part_of
+
+    bar, reached = Progress(), [0, 0]
+
+    def update(done: int, total: int) -> None:
+        reached[:] = done, total
+        bar.update(done, total)
+
+    try:
+        yield update
+    except KeyboardInterrupt:
+        said = "stopped" if not reached[1] else "stopped at {:,} of {:,} ".format(*reached) + what
+        if not path:
+            said += "; nothing is kept, which -o FILE would do"
+        elif part_of(path).exists():
+            said += f"; the same command goes on from {part_of(path)}"
+        raise KeyboardInterrupt(said) from None
+    finally:
+        bar.close()
+
+
+@contextmanager
+def executor_of(arguments: argparse.Namespace) -> Iterator[Executor | None]:
     """Yield the executor of a dask scheduler, or None where there is no address."""
+    address = arguments.dask
     if address is None:
         yield None
         return
+    if arguments.workers:
+        raise InputError("--workers and --dask both share the work; give either")
     try:
         from distributed import Client
     except ImportError:
@@ -302,4 +277,4 @@ def _executor(address: str | None) -> Iterator[Executor | None]:
         said = " ".join(str(error).split())
         raise InputError(f"no dask scheduler answers at '{address}': {said}") from None
     with client:
-        yield client.get_executor()
+        yield client.getexecutor_of()

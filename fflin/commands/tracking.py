@@ -10,12 +10,11 @@ from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
     Container,
+    add_options,
     add_output_file,
     add_robot,
     add_system,
-    add_values,
     command,
-    file_name,
 )
 from fflin.commands.points import load_robot, once
 from fflin.commands.regulator import add_weights
@@ -29,9 +28,7 @@ if TYPE_CHECKING:
 def add_commands(commands: Commands) -> None:
     """Add tvlqr."""
     tvlqr = command(
-        commands,
-        "tvlqr",
-        _tvlqr,
+        *(commands, "tvlqr", _tvlqr),
         "design the regulator along a trajectory: the gains over time",
         "fflin tvlqr planar_detumble --trajectory plan.csv --hold previous --dt 0.1 -o gains.npz",
     )
@@ -39,29 +36,24 @@ def add_commands(commands: Commands) -> None:
     add_system(tvlqr)
     add_trajectory(tvlqr, required=True)
     add_weights(tvlqr)
-    add_values(tvlqr, "--qf", "weight at the end; by default that of the steady regulator there")
+    add_options(
+        tvlqr, "--qf NAME=VALUE*: weight at the end; by default that of the steady regulator there"
+    )
     add_output_file(tvlqr, "save the gains to FILE: .npz, .mat or .json")
 
 
 def add_trajectory(parser: Container, *, required: bool = False) -> None:
     """Add --trajectory and --hold; then --frame is by default what the file says."""
-    parser.add_argument(
-        "--trajectory",
-        metavar="FILE",
-        type=file_name,
-        required=required,
-        help="go along the motion in FILE, .npz, .mat, .json or .csv with named columns, as "
-        "fflin.Trajectory.load reads it; --frame says the axes that it is in, by default what it "
-        "says itself, else local",
-    )
-    parser.add_argument(
-        "--hold",
-        choices=("linear", "previous"),
-        help="how the inputs of FILE go on between its knots, linear, or as they were at the knot "
-        "before; by default what it says itself, else linear",
-    )
-    parser.add_argument(
-        "--strict", action="store_true", help="refuse a FILE that is no motion of the robot"
+    trajectory = """--trajectory FILE: go along the motion in FILE, .npz, .mat, .json or .csv with
+        named columns, as fflin.Trajectory.load reads it; --frame says the axes that it is in, by
+        default what it says itself, else local"""
+    add_options(parser, trajectory, required=required)
+    add_options(
+        parser,
+        """
+        --hold linear|previous: how the inputs of FILE go on between its knots, linear, or as they
+            were at the knot before; by default what it says itself, else linear
+        --strict: refuse a FILE that is no motion of the robot""",
     )
     parser.set_defaults(frame=None)
 

@@ -5,95 +5,67 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fflin.commands import DONE
-from fflin.commands.arguments import (
-    Commands,
-    Container,
-    add_pose,
-    add_robot,
-    command,
-    file_name,
-    number,
-)
+from fflin.commands.arguments import Commands, Container, add_options, add_pose, add_robot, command
 from fflin.commands.points import configuration_of, load_robot
 
 if TYPE_CHECKING:
+    from fflin.campaign.campaign import Campaign
     from fflin.robot.robot import Robot
     from fflin.simulation.motion import Motion
 
-_FILES = ("html", "png", "gif")
+_FILES, _SHOWN = ("html", "png", "gif"), ("scene", "follow", "tool")
 
 
 def add_commands(commands: Commands) -> None:
     """Add view."""
     view = command(
-        commands,
-        "view",
-        _view,
+        *(commands, "view", _view),
         "show a robot live in the browser, with a slider for each joint",
         "fflin view servicer_7dof --joint joint_2=0.4",
     )
     add_robot(view)
     add_pose(view)
     _add_scene(view)
-    view.add_argument(
-        "--no-open", action="store_true", help="open no browser; the address is on stderr"
-    )
-    view.add_argument(
-        "--port", type=int, default=0, metavar="N", help="port on 127.0.0.1; a free one by default"
-    )
+    add_options(view, "--no-open: open no browser; the address is on stderr")
+    add_options(view, "--port N = 0: port on 127.0.0.1; a free one by default", type=int)
 
 
-def add_pictures(command: Container) -> None:
+def add_pictures(command: Container, page: str = "that plays it without a network") -> None:
     """Add the options of a command that makes a motion: files to show it in, and how."""
-    command.add_argument(
-        "--html",
-        metavar="FILE",
-        type=file_name,
-        help="write a page that plays it without a network",
+    add_options(
+        command,
+        f"""
+        --html FILE: write a page {page}
+        --png FILE: write a picture (takes Chromium): a strip of four, or at the --times that are
+            given
+        --gif FILE: write an animated picture (takes Chromium)""",
     )
-    command.add_argument(
-        "--png",
-        metavar="FILE",
-        type=file_name,
-        help="write a picture (takes Chromium): a strip of four, or at the --times that are given",
-    )
-    command.add_argument(
-        "--gif", metavar="FILE", type=file_name, help="write an animated picture (takes Chromium)"
-    )
-    command.add_argument(
-        "--times", metavar="T", type=number, nargs="+", help="when [s] pictures are taken"
-    )
+    add_options(command, "--times T: when [s] pictures are taken", nargs="+")
     _add_scene(command)
-    command.add_argument(
-        "--fps", type=number, default=30.0, help="frames per second of watching (default 30)"
-    )
-    command.add_argument(
-        "--speed", type=number, help="seconds of motion per second of watching (default 1)"
+    add_options(
+        command,
+        """
+        --fps FPS = 30: frames per second of watching (default 30)
+        --speed SPEED: seconds of motion per second of watching (default 1)""",
     )
 
 
 def _add_scene(command: Container) -> None:
-    command.add_argument(
-        "--scene",
-        choices=("space", "lab"),
-        help="sky and planet, or a floor with a grid (default where there is gravity)",
-    )
-    command.add_argument("--tool", metavar="FRAME", help="frame whose axes and trail are drawn")
-    command.add_argument(
-        "--follow",
-        action=argparse.BooleanOptionalAction,
-        help="whether the camera follows the base (default: on a long way)",
+    add_options(
+        command,
+        """
+        --scene space|lab: sky and planet, or a floor with a grid (default where there is gravity)
+        --tool FRAME: frame whose axes and trail are drawn
+        --[no-]follow: whether the camera follows the base (default: on a long way)""",
     )
 
 
-def add_figure(command: argparse.ArgumentParser, what: str) -> None:
+def add_figure(command: Container, what: str) -> None:
     """Add --plot FILE."""
-    command.add_argument(
-        "--plot", metavar="FILE", type=file_name, help=f"{what} into FILE: .png, .pdf or .svg"
-    )
+    add_options(command, f"--plot FILE: {what} into FILE: .png, .pdf or .svg")
 
 
 def check_figure(path: Path | None) -> None:
@@ -131,24 +103,17 @@ def check_pictures(robot: Robot, arguments: argparse.Namespace) -> None:
         check_times(arguments.times, 0.0, duration)
 
 
-def show_motion(robot: Robot, motion: Motion, arguments: argparse.Namespace) -> list[str]:
+def show_motion(
+    robot: Robot, motion: Motion, arguments: argparse.Namespace, cloud: Campaign | None = None
+) -> list[str]:
     """Write what the options of `add_pictures` ask for, and return a line for each file."""
     files = {name: path for name in _FILES if (path := getattr(arguments, name))}
     if not files:
         return []
     from fflin.view.visualize import visualize
 
-    visualize(
-        robot,
-        motion,
-        **files,
-        times=arguments.times,
-        scene=arguments.scene,
-        fps=arguments.fps,
-        speed=arguments.speed,
-        follow=arguments.follow,
-        tool=arguments.tool,
-    )
+    how = {name: getattr(arguments, name) for name in ("times", "fps", "speed", *_SHOWN)}
+    visualize(robot, motion, **files, **how, cloud=cloud)
     return [f"wrote {path}: {path.stat().st_size / 1e6:.2f} MB" for path in files.values()]
 
 
@@ -157,15 +122,8 @@ def _view(arguments: argparse.Namespace) -> int:
     from fflin.view.visualize import visualize
 
     robot = load_robot(arguments)
-    live = visualize(
-        robot,
-        open=False,
-        scene=arguments.scene,
-        follow=arguments.follow,
-        tool=arguments.tool,
-        q=configuration_of(robot, arguments, robot.start),
-        port=arguments.port,
-    )
+    how: Any = {name: getattr(arguments, name) for name in (*_SHOWN, "port")}
+    live = visualize(robot, open=False, q=configuration_of(robot, arguments, robot.start), **how)
     assert isinstance(live, Live)  # for there is no motion
     print(f"fflin: {robot.name} at {live.url} (Ctrl-C ends)", file=sys.stderr, flush=True)
     if not arguments.no_open:

@@ -138,7 +138,4 @@ def _weld(vertices: Array, faces: Indices, cell: float) -> tuple[Array, Indices]
     _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     faces = faces[np.sort(kept)]
     used, compact = np.unique(faces, return_inverse=True)
-    return (
-        vertices[first[used]].astype(np.float32),
-        compact.reshape(-1, 3).astype(np.uint32),
-    )
+    return (vertices[first[used]].astype(np.float32), compact.reshape(-1, 3).astype(np.uint32))

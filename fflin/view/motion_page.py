@@ -20,6 +20,7 @@ from fflin.view.recorder import Recorder
 from fflin.view.scene import Animation, Drawing, Visualizer, body_paths
 
 if TYPE_CHECKING:
+    from fflin.campaign.campaign import Campaign
     from fflin.dynamics.state import Frame
     from fflin.simulation.motion import Motion
 
@@ -45,6 +46,7 @@ def motion_page(
     follow: bool | None,
     target: Array | None,
     tool: str | None,
+    cloud: Campaign | None = None,
 ) -> tuple[str, tuple[str, ...]]:
     """Return the page of a motion, and what could not be drawn; see `visualize`."""
     shown = frame_indices(motion.t, fps, speed)
@@ -87,6 +89,10 @@ def motion_page(
         shown_points = frame_points(drawing, film, info["size"], follow=True)
     info |= panel(robot, motion, shown, goal)
     info |= marks(robot, film, tool, info["size"], goals)
+    if cloud is not None:
+        from fflin.view.cloud import cloud_of
+
+        info["cloud"] = cloud_of(robot, cloud, tool)
     info |= {
         "mode": "motion",
         "t": packed(t),

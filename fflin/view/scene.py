@@ -87,11 +87,7 @@ class Drawing:
     """
 
     def __init__(
-        self,
-        robot: Robot,
-        visualizer: Visualizer,
-        look: str = "real",
-        sent: set[str] | None = None,
+        self, robot: Robot, visualizer: Visualizer, look: str = "real", sent: set[str] | None = None
     ) -> None:
         self.robot = robot
         self._visualizer = visualizer

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from os import PathLike
 
     from fflin.analysis.modes import Modes
+    from fflin.campaign.campaign import Campaign
     from fflin.simulation.motion import Motion
     from fflin.view.live import Live
 
@@ -49,6 +50,7 @@ def visualize(
     follow: bool | None = None,
     target: Array | None = None,
     tool: str | None = None,
+    cloud: Campaign | None = None,
     q: Array | None = None,
     port: int = 0,
 ) -> Live | Path | None:
@@ -93,6 +95,9 @@ def visualize(
         to. Where there is none the change from the start is shown instead, and no ghost.
     tool : str, optional
         Frame whose trail is drawn; "tool" or the last link of the longest chain by default.
+    cloud : Campaign, optional
+        Of `monte_carlo`: the paths of base and tool in up to 240 of its runs, as thin lines. The
+        motion may be a run of it, `Campaign.replay`, which is shown with the bodies that it drew.
     q : array_like (nq,), optional
         Where a live robot stands first; by default at its `start`, or neutral.
     port : int
@@ -160,14 +165,13 @@ def visualize(
 
         page, notes = mode_page(robot, motion, scene=scene, tool=tool)
     else:
-        _check_motion(robot, motion)
+        robot = _check_motion(robot, motion, cloud)
         fps, speed = check_rates(fps, speed, float(motion.t[-1] - motion.t[0]))
         from fflin.view.motion_page import motion_page
 
         goal = None if target is None else _configuration(robot, "target", target)
-        page, notes = motion_page(
-            robot, motion, scene=scene, fps=fps, speed=speed, follow=follow, target=goal, tool=tool
-        )
+        how: Any = {"scene": scene, "fps": fps, "speed": speed, "follow": follow}
+        page, notes = motion_page(robot, motion, **how, target=goal, tool=tool, cloud=cloud)
         contents = _pictures(page, outputs, motion, speed, times)
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)
@@ -234,10 +238,15 @@ def _speed(speed: float | None, default: float) -> float:
     return speed
 
 
-def _check_motion(robot: Robot, motion: Motion) -> None:
+def _check_motion(robot: Robot, motion: Motion, cloud: Any) -> Robot:
+    """Return the robot that a motion is of."""
     from fflin.simulation.motion import require_motion
 
     require_motion(motion)
+    if cloud is not None:
+        from fflin.view.cloud import drawn_robot
+
+        robot = drawn_robot(robot, cloud, motion)
     sizes = motion.q.shape[1], motion.u.shape[1]
     expected = robot.nq, len(Actuation(StateMap(robot)).names)
     if sizes != expected or motion.urdf_sha256 != robot.urdf_sha256:
@@ -245,6 +254,7 @@ def _check_motion(robot: Robot, motion: Motion) -> None:
             f"the motion is one of '{motion.robot}', not of '{robot.name}' as it is given; give "
             "the robot that it was simulated with"
         )
+    return robot
 
 
 def _configuration(robot: Robot, name: str, value: Array) -> Array:
@@ -263,11 +273,7 @@ def check_times(times: Sequence[float], start: float, end: float) -> list[float]
 
 
 def _pictures(
-    page: str,
-    outputs: dict[str, Path],
-    motion: Motion,
-    speed: float,
-    times: Sequence[float] | None,
+    page: str, outputs: dict[str, Path], motion: Motion, speed: float, times: Sequence[float] | None
 ) -> dict[Path, bytes]:
     if ".png" not in outputs and ".gif" not in outputs:
         return {}

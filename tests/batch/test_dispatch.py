@@ -300,7 +300,7 @@ def test_workers_that_cannot_start_are_one_line(tmp_path):
     command = [sys.executable, "-W", "ignore", script]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert done.returncode == 3
-    assert 'call sweep under `if __name__ == "__main__":`' in done.stdout
+    assert 'make the call under `if __name__ == "__main__":`' in done.stdout
 
 
 def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(robot, killing, tmp_path):

@@ -405,6 +405,53 @@ def test_it_is_saved_and_loaded_to_the_last_bit(campaign, ending, tmp_path):
         fflin.Campaign.load(tmp_path / f"runs{ending}")
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_histories_are_those_of_the_motions(robots, engine, tmp_path):
+    robot = robots["ets_vii"]
+    given = START | {"tau_b.x.gain": [0.0, 0.0, -6.0]}
+    case = {"runs": 12, "duration": 4.0, "dt": 0.02, "engine": engine, "seed": 1}
+    campaign = fflin.monte_carlo(
+        robot,
+        feedback(robot),
+        given,
+        histories=9,
+        out=tmp_path / "runs.npz",
+        limits={"F_b": 20},
+        **case,
+    )
+    assert campaign.times == pytest.approx(np.arange(9) * 0.5)
+    assert campaign.input_limits == (*[np.inf] * 3, *[20.0] * 3, *[np.inf] * 6)
+    assert np.array_equal(
+        fflin.Campaign.load(tmp_path / "runs.npz").error_history[:, -1],
+        (np.where(campaign.stopped[:, None], np.inf, campaign.errors)),
+    )
+    assert {*campaign.stopped} == {True, False}
+    for run in range(12):
+        motion = campaign.replay(run)
+        rows = np.arange(0, len(motion.t), 25)
+        errors, inputs = campaign.error_history[run], campaign.input_history[run]
+        assert errors[: len(rows), 0] == pytest.approx(motion.attitude_error[rows], abs=1e-12)
+        sizes = np.abs(motion.error[rows, 3:6]).max(axis=1)
+        assert errors[: len(rows), 1] == pytest.approx(sizes, abs=1e-12)
+        assert np.array_equal(inputs[: len(rows)], motion.u[rows])
+        assert np.isposinf(errors[len(rows) :]).all() and not inputs[len(rows) :].any()
+        [way] = campaign.courses([run], 10)
+        assert np.array_equal(way[:-1], motion.q[::20][: len(way) - 1])
+        assert np.array_equal(way[-1], campaign.q[run])
+
+
+def test_goals_are_told_and_say_what_the_worst_is(robots):
+    robot = robots["ets_vii"]
+    goals = ["position < 1 mm and settle < 5 s", "attitude > 0 deg"]
+    case = {"runs": 30, "duration": 6.0, "dt": 0.02, "goals": goals, "confidence": 0.9}
+    campaign = fflin.monte_carlo(robot, feedback(robot), START, until="attitude < 2 deg", **case)
+    assert campaign.goals == (*goals, "attitude < 2 deg") and campaign.about == "position"
+    assert campaign.worst(1) == [int(campaign.values("position").argmax())]
+    share = campaign.fraction("attitude < 2 deg", confidence=0.9)
+    assert f"attitude < 2 deg: {100 * share.value:.4g} % (" in str(campaign)
+    assert "at 90 % confidence)" in str(campaign)
+
+
 def test_figures_are_those_of_the_motions(campaign):
     run = campaign.worst(1)[0]
     motion = campaign.replay(run)
@@ -486,7 +533,10 @@ BAD = [
     ({"durations": 1.0}, "no option of monte_carlo named 'durations'"),
     ({"engine": "gpu"}, "engine"),
     ({"out": "runs.csv"}, "runs.csv"),
-    ({"out": "runs.npz"}, r"\.h5"),
+    ({"histories": -1}, "histories is -1"),
+    ({"goals": 3}, "goals is a int"),
+    ({"goals": [3]}, "a goal is a int"),
+    ({"goals": ["attitude < 1 m"]}, "in m, expected deg"),
     ({"workers": 2, "executor": 3}, "give either"),
 ]
 

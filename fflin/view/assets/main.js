@@ -23,6 +23,7 @@ function legendOf(info) {
     ...info.trails.map(({ name, colour }) => entry(`path of the ${name}`, colour, "trails", name)),
     ...info.arrows.map(({ kind, colour }) => entry(`${kind} on the base`, colour, "wrench", kind)),
   ];
+  entries.push(...(info.cloud ?? []).map(({ name, label, colour }) => entry(label, colour, "cloud", name)));
   const rest = info.rest === null ? "" : `, at rest from ${Number(info.rest.toPrecision(4))} s`;
   const dashed = info.followed.length > 0;
   if (info.target) entries.push({ ...entry(dashed ? `reference${rest}` : "target", GHOST, "target"), dashed });
@@ -91,7 +92,7 @@ function main() {
   }
 
   info.t = floats(info.t);
-  for (const each of [...info.trails, ...info.followed]) each.points = floats(each.points);
+  for (const each of [...info.trails, ...info.followed, ...(info.cloud ?? [])]) each.points = floats(each.points);
   for (const each of [...info.arrows, ...info.plumes, ...info.readouts]) each.values = floats(each.values);
   for (const plot of info.plots) for (const line of plot.lines) for (const key of ["values", "reference"]) line[key] = floats(line[key]);
   paint(info.plots);

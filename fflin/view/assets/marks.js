@@ -84,6 +84,26 @@ function trail({ name, points, colour, radius, dashed }) {
   return group;
 }
 
+// Thin lines along many paths, whose points follow one another.
+function cloud({ name, points, counts, colour }) {
+  const pairs = [];
+  let first = 0;
+  for (const count of counts) {
+    for (let k = first; k + 1 < first + count; k++) pairs.push(k, k + 1);
+    first += count;
+  }
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(points, 3));
+  geometry.setIndex(pairs);
+  const material = new THREE.LineBasicMaterial({
+    color: new THREE.Color(colour).convertSRGBToLinear(), toneMapped: false,
+    transparent: true, opacity: 0.3, depthWrite: false, depthTest: name !== "base", // inside the body
+  });
+  const lines = new THREE.LineSegments(geometry, material);
+  lines.renderOrder = name === "base" ? 4 : 0;
+  return lines;
+}
+
 function forceArrow({ colour, values, most, longest, size }) {
   const group = arrow(colour, 0.010 * size, seenThrough(colour));
   group.show = (i) => {
@@ -175,6 +195,7 @@ function makeMarks(viewer, info) {
   info.triads.forEach((each, k) => add([...each.path, `frame ${k}`], triad(each)));
   info.trails.forEach((each) => add(["meshcat", "trails", each.name], trail(each)));
   info.followed.forEach((each, k) => add(["meshcat", "target", `path ${k}`], trail({ ...each, colour: GHOST, dashed: true })));
+  (info.cloud ?? []).forEach((each) => add(["meshcat", "cloud", each.name], cloud(each)));
   const wrench = viewer.scene_tree.find(["meshcat", "wrench"]).object;
   const base = viewer.scene_tree.find(info.base).object;
   for (const each of info.arrows) {

@@ -1,0 +1,169 @@
+"""The figure of a campaign: bands over time with the worst runs on top, histograms, and whence."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.figures import COLORS, saved, styled, target_of
+from fflin.base.names import group_of, input_keys
+from fflin.base.validation import Array, whole
+from fflin.campaign.campaign import Campaign
+from fflin.campaign.report import ended_of, goal_met
+from fflin.campaign.tally import KINDS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Shares of the runs, from the widest band to the narrowest, and how dark each is.
+_BANDS = ((0.0, "all", 0.13), (0.05, "90 %", 0.22), (0.25, "50 %", 0.38))
+_INK, _GOAL = COLORS[0], "#555555"
+_WORST = (COLORS[1], COLORS[3], COLORS[4], COLORS[2], COLORS[7])
+_DECADES, _BARS, _BINS = 6, 10, 48
+
+
+def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: int = 3) -> Figure:
+    """Draw the errors of a campaign over time and at last, inputs, and what errors go with.
+
+    Bands hold all runs, 90 and 50 % of them; on top are the worst runs by `Campaign.about`. A run
+    that was stopped is above all others from then on. Dashed lines are the bounds of the goals and
+    the limits of inputs. Without histories there are histograms alone.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        With ``histories`` for what is drawn over time.
+    path : str or Path, optional
+        .png, .pdf or .svg to save to.
+    worst : int
+        How many runs are drawn on top, up to five.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    MissingPackageError
+        If matplotlib is not installed.
+    FileError
+        If the ending is another or the file cannot be written.
+    """
+    if not isinstance(campaign, Campaign):
+        said = f"campaign is a {type(campaign).__name__}, expected a Campaign"
+        raise InputError(f"{said}, as fflin.monte_carlo returns it")
+    target, top = target_of(path), whole("worst", worst, 0, len(_WORST))
+    runs, groups = campaign.worst(top) if top else [], dict[str, list[int]]()
+    for at, key in enumerate(input_keys(campaign) if campaign.times else ()):
+        groups.setdefault(group_of(key), []).append(at)
+    kinds = campaign.judged or ("attitude",)
+    rows: list[Any] = [[(_error, kind, runs) for kind in kinds]] * bool(campaign.times)
+    rows.append([(_histogram, kind) for kind in kinds])
+    last = [*((_inputs, *each, runs) for each in groups.items()), (_whence,)]
+    across = math.ceil(len(last) / math.ceil(len(last) / 3))
+    rows += [last[at : at + across] for at in range(0, len(last), across)]
+    with styled() as figure_class:
+        figure = figure_class(figsize=(11.0, 0.8 + 2.6 * len(rows)), layout="constrained")
+        keys: dict[str, Any] = {}
+        for place, row in zip(figure.add_gridspec(len(rows), 1), rows, strict=True):
+            for cell, (panel, *given) in zip(place.subgridspec(1, len(row)), row, strict=True):
+                panel(axes := figure.add_subplot(cell), campaign, *given)
+                keys |= dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+        below: Any = "outside lower center"
+        figure.legend(keys.values(), keys.keys(), loc=below, ncols=7, handlelength=1.8)
+        title = f"{campaign.robot}: {len(campaign):,} runs of {campaign.duration:g} s; "
+        goals = [goal_met(campaign, goal) for goal in campaign.goals]
+        figure.suptitle("\n".join([title + ended_of(campaign), *goals]), fontsize=11)
+        return saved(figure, target)
+
+
+def _bands(
+    axes: Axes, campaign: Campaign, values: Array, runs: list[int], of: Any = slice(None)
+) -> None:
+    """Draw bands of values (N, M) of runs over time, and some of all runs on top."""
+    # Each bound is the value of a run, since means with what is infinite are no numbers.
+    most = 1.15 * float(np.where(np.isfinite(values), values, 0.0).max(initial=0.0)) or 1.0
+    shown, t = np.minimum(values[of], most), campaign.times
+    for tail, name, dark in _BANDS:
+        low, high = np.quantile(shown, (tail, 1.0 - tail), axis=0, method="inverted_cdf")
+        axes.fill_between(t, low, high, color=_INK, alpha=dark, lw=0, label=name)
+    half = np.quantile(shown, 0.5, axis=0, method="inverted_cdf")
+    axes.plot(t, half, color=_INK, lw=1.8, label="half")
+    for color, run in zip(_WORST, runs, strict=False):
+        known = np.where(np.isfinite(values[run]), values[run], np.nan)
+        axes.plot(t, known, color=color, lw=1.1, label=f"run {run}")
+    axes.set(xlabel="t [s]", xlim=(t[0], t[-1]), ylim=(0.0, most))
+
+
+def _error(axes: Axes, campaign: Campaign, kind: str, runs: list[int]) -> None:
+    history = campaign.error_history[..., list(KINDS).index(kind)]
+    _bands(axes, campaign, history, runs)
+    ends = np.quantile(history, 0.05, axis=0, method="inverted_cdf")
+    most, least = axes.get_ylim()[1], float(ends[ends > 0.0].min(initial=np.inf))
+    if least < 0.05 * most:  # so that the ends are told apart
+        axes.set(yscale="log", ylim=(max(0.5 * least, most * 10.0**-_DECADES), 1.5 * most))
+    _goals(axes.axhline, campaign, kind)
+    axes.set(title=f"{kind} error", ylabel=f"[{KINDS[kind]}]")
+
+
+def _goals(draw: Any, campaign: Campaign, *names: str) -> None:
+    """Draw the bounds that goals have on these figures."""
+    for bound in campaign.bounds:
+        if bound.name in names:
+            draw(bound.limit, ls="--", lw=1.0, color=_GOAL, label="goal or limit")
+
+
+def _histogram(axes: Axes, campaign: Campaign, kind: str) -> None:
+    """Draw how an error is spread, at last and at its worst, of the runs that were not stopped."""
+    names = {kind: ("at last", _INK), f"worst {kind}": ("at its worst", COLORS[1])}
+    of = {name: campaign.values(name)[~campaign.stopped] for name in names}
+    values = np.append(list(of.values()), 0.0)
+    most = float(values.max()) or 1.0
+    least = max(float(values[values > 0.0].min(initial=most)), most * 10.0**-_DECADES)
+    edges = np.linspace(0.0, 1.02 * most, _BINS)
+    if least < 0.05 * most:
+        edges = np.geomspace(0.8 * least, 1.3 * most, _BINS)
+        axes.set_xscale("log")
+    for name, (said, color) in names.items():
+        kept: Any = edges
+        axes.hist(of[name].clip(*edges[[0, -1]]), kept, color=color, alpha=0.55, label=said)
+        for p, style in ((0.5, "-"), (0.95, "-."), (0.99, ":")):
+            at = campaign.quantile(name, p).value
+            if math.isfinite(at):
+                axes.axvline(at, color=color, lw=1.2, ls=style, label=f"{100 * p:g} % below")
+    _goals(axes.axvline, campaign, *names)
+    axes.set(xlabel=f"{kind} error [{KINDS[kind]}]", ylabel="runs", xlim=edges[[0, -1]])
+
+
+def _inputs(
+    axes: Axes, campaign: Campaign, group: str, columns: list[int], runs: list[int]
+) -> None:
+    """Draw the largest input of a group, of the runs that were not stopped, below its limit."""
+    largest = np.abs(campaign.input_history[..., columns]).max(axis=2)
+    if not campaign.stopped.all():
+        _bands(axes, campaign, largest, runs, ~campaign.stopped)
+    limit = min(campaign.input_limits[at] for at in columns)
+    if limit < 2.0 * (most := axes.get_ylim()[1]):
+        axes.axhline(limit, ls="--", lw=1.0, color=_GOAL, label="goal or limit")
+        axes.set_ylim(0.0, max(most, 1.08 * limit))
+    units = "|".join(dict.fromkeys(campaign.input_units[at] for at in columns))
+    axes.set(title=f"largest of {group}", ylabel=f"[{units}]")
+
+
+def _whence(axes: Axes, campaign: Campaign) -> None:
+    """Draw what the worst runs go with, beside what is drawn alike by chance."""
+    found = list(campaign.sensitivity().items())[:_BARS][::-1]
+    doubt = min(1.0, 3.0 / math.sqrt(len(campaign)))
+    axes.axvspan(-doubt, doubt, color="#999999", alpha=0.18, lw=0)
+    colors = [_INK if size > 0.0 else COLORS[1] for _, size in found]
+    axes.barh([name for name, _ in found], [size for _, size in found], color=colors, height=0.7)
+    axes.axvline(0.0, color="#333333", lw=0.8)
+    axes.set(title=f"what the {campaign.about} goes with", xlabel="rank correlation; grey: chance")
+    axes.set(xlim=(-1.0, 1.0), xticks=(-1.0, -0.5, 0.0, 0.5, 1.0))
+    axes.grid(visible=False, axis="y")
+    axes.tick_params(axis="y", labelsize=8)

@@ -1,0 +1,89 @@
+"""The figure of a campaign shows its figures."""
+
+import numpy as np
+import pytest
+
+import fflin
+
+pytest.importorskip("matplotlib")
+pytestmark = pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+
+
+@pytest.fixture(scope="module")
+def campaign(robots):
+    robot = robots["ets_vii"]
+    lin = fflin.linearize(robot)
+    return fflin.monte_carlo(
+        robot,
+        fflin.StateFeedback(lin, fflin.lqr(lin).K),
+        {"q_b": 0.05, "tau_b.x.gain": [0.0, 0.0, 0.0, 0.0, -6.0]},
+        runs=40,
+        duration=4.0,
+        dt=0.02,
+        histories=21,
+        limits={"F_b": 0.5},
+        goals=["attitude < 3 deg and worst position < 1 m"],
+        seed=3,
+    )
+
+
+def of(figure, title):
+    [axes] = [each for each in figure.axes if each.get_title() == title]
+    return axes
+
+
+def test_bands_hold_their_share_of_the_runs_and_the_worst_are_on_top(campaign):
+    figure = fflin.plot_campaign(campaign, worst=2)
+    axes = of(figure, "attitude error")
+    history = campaign.error_history[..., 0]
+    half, *worst = [x for x in axes.get_lines() if not x.get_label().startswith("goal")]
+    ordered = np.sort(history, axis=0)
+    assert np.array_equal(half.get_ydata(), ordered[19])
+    assert [x.get_label() for x in worst] == [f"run {run}" for run in campaign.worst(2)]
+    for line, run in zip(worst, campaign.worst(2), strict=True):
+        known = np.isfinite(history[run])
+        assert np.array_equal(line.get_ydata()[known], history[run][known])
+    whole, most, middle = axes.collections
+    assert campaign.stopped.any()
+    for band, low, high in ((whole, 0, 39), (most, 1, 37), (middle, 9, 29)):
+        at = band.get_paths()[0].vertices
+        top = 1.15 * history[np.isfinite(history)].max()
+        for k, t in enumerate(campaign.times):
+            here = at[np.isclose(at[:, 0], t), 1]
+            assert here.min() == pytest.approx(min(ordered[low, k], top))
+            assert here.max() == pytest.approx(min(ordered[high, k], top))
+
+
+def test_goals_limits_and_histograms(campaign):
+    figure = fflin.plot_campaign(campaign)
+    goal = "goal or limit"
+    bounds = [x for x in of(figure, "attitude error").get_lines() if x.get_label() == goal]
+    assert [x.get_ydata()[0] for x in bounds] == [3.0]
+    limits = [x for x in of(figure, "largest of F_b").get_lines() if x.get_label() == goal]
+    assert [x.get_ydata()[0] for x in limits] == [0.5]
+    assert not [x for x in of(figure, "largest of tau_b").get_lines() if x.get_label() == goal]
+    [position] = [x for x in figure.axes if x.get_xlabel() == "position error [m]"]
+    assert [x.get_xdata()[0] for x in position.get_lines() if x.get_label() == goal] == [1.0]
+    counts = [int(sum(bar.get_height() for bar in bars)) for bars in position.containers]
+    assert counts == [int((~campaign.stopped).sum())] * 2
+    bars = of(figure, "what the attitude goes with").containers[0]
+    sizes = sorted(campaign.sensitivity().values(), key=abs)
+    assert [bar.get_width() for bar in bars] == sizes[-10:]
+    assert "% confidence" in figure.get_suptitle() and "left the chart" in figure.get_suptitle()
+
+
+def test_without_histories_and_with_none_that_ended(robots, campaign, tmp_path):
+    robot = robots["planar_detumble"]
+    few = fflin.monte_carlo(robot, None, {"omega_b": 0.01}, runs=3, duration=0.1)
+    figure = fflin.plot_campaign(few, tmp_path / "few.svg")
+    assert len(figure.axes) == 4 and (tmp_path / "few.svg").stat().st_size > 1000
+    lost = np.flatnonzero(campaign.stopped)
+    arrays = {
+        name: getattr(campaign, name)[lost]
+        for name in fflin.Campaign.__annotations__
+        if isinstance(getattr(campaign, name, None), np.ndarray)
+    }
+    header = {name: getattr(campaign, name) for name in fflin.Campaign.__annotations__}
+    fflin.plot_campaign(fflin.Campaign.of(arrays, header), tmp_path / "lost.png")
+    with pytest.raises(fflin.InputError, match="expected a Campaign"):
+        fflin.plot_campaign(3)

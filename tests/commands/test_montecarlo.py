@@ -1,0 +1,189 @@
+"""fflin montecarlo as a user runs it."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from tests.support.commands import refused, run
+from tests.support.patience import PATIENCE
+
+TOML = '[dispersions]\nq_b = 0.05\n"*.mass" = 0.1\nq_m = {uniform = [-0.2, 0.2]}\n'
+SHORT = ("--dispersions", "u.toml", "--duration", "0.4", "--step", "0.02")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "u.toml").write_text(TOML)
+    return tmp_path
+
+
+def test_it_flies_what_python_flies_and_says_it_as_text_and_json(folder, robots):
+    robot = robots["planar_detumble"]
+    options = ("--runs", 30, "--seed", 4, "--limit", "tau_b=2", "--goal", "attitude < 4 deg")
+    command = ("montecarlo", "planar_detumble", *SHORT, *options, "--rpy", 5, 0, 0)
+    code, out, err = run(*command, "-o", "runs.npz", cwd=folder)
+    assert code == 0 and not err
+    campaign = fflin.Campaign.load(folder / "runs.npz")
+    lin, turn = fflin.linearize(robot), pin.rpy.rpyToMatrix(np.radians(5.0), 0.0, 0.0)
+    there = fflin.monte_carlo(
+        robot,
+        fflin.StateFeedback(lin, fflin.lqr(lin).K),
+        fflin.load_dispersions(folder / "u.toml"),
+        **{"q0": fflin.configuration(robot, base=pin.SE3(turn, np.zeros(3))), "runs": 30},
+        **{"seed": 4, "duration": 0.4, "dt": 0.02, "limits": ["urdf", {"tau_b": 2.0}]},
+    )
+    assert np.abs(there.x - campaign.x).max() < 1e-9
+    assert campaign.input_limits[:3] == (2.0,) * 3
+    assert campaign.values("worst attitude").mean() > 5.0
+    share = campaign.fraction("attitude < 4 deg")
+    assert f"attitude < 4 deg: {100 * share.value:.4g} % (" in out and "wrote runs.npz" in out
+    assert max(map(len, out.splitlines())) <= 80
+    assert re.search(rf"^ *{campaign.worst(1)[0]} +[\d.]+ +deg", out, re.MULTILINE)
+    code, out, _ = run(*command, "--worst", 2, "--json", cwd=folder)
+    said = json.loads(out)
+    assert said["worst"] == campaign.worst(2) and said["stopped"] == {}
+    assert said["goals"] == {"attitude < 4 deg": list(share)}
+    found = said["quantiles"]["worst attitude"]["0.5"]
+    assert found == list(campaign.quantile("worst attitude", 0.5))
+    assert said["quantiles"]["attitude"]["0.99"][2] is None  # of 30 runs there is no bound
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--runs", "0"), "0 is too few"),
+        (("--runs", "1000000000000"), "1,000,000,000,000 runs are .* of memory"),
+        (("--runs", "1000000000000", "-o", "x.h5"), "1,000,000,000,000 runs are .* are free"),
+        (("--runs", "3", "-o", "x.csv"), "x.csv.*expected one of .npz, .h5"),
+        (("--runs", "3", "--goal", "attitude < 1 m"), "in m, expected deg"),
+        (("--runs", "3", "--until", "nosuch < 1"), "no figure named 'nosuch'"),
+        (("--runs", "3", "--dispersions", "none.toml"), "none.toml: cannot be read"),
+        (("--runs", "3", "--dispersions", "bad.toml"), "bad.toml:2: no state to .* 'nosuch'"),
+        (("--runs", "3", "--workers", "2", "--dask", "x"), "give either"),
+        (("--runs", "3", "--plot", "x.gif"), "x.gif"),
+        (("--runs", "3", "-o", "x.h5", "--plot", "x.h5"), "x.h5"),
+        (("--runs", "3", "--width", "2"), "width is 2"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(arguments, said, folder):
+    (folder / "bad.toml").write_text("[dispersions]\nnosuch = 1\n")
+    error = refused("montecarlo", "planar_detumble", *SHORT, *arguments, cwd=folder)
+    assert re.search(said, error), error
+    assert {x.name for x in folder.iterdir()} == {"u.toml", "bad.toml"}
+
+
+INTERRUPTED = """
+import os, signal, sys
+from fflin.base import progress
+from fflin.__main__ import main
+def update(bar, done, total):
+    if done >= 32:
+        os.kill(os.getpid(), signal.SIG_HOW)
+progress.Progress.update = update
+if __name__ == "__main__":
+    sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize(("how", "ending"), [("INT", ".h5"), ("INT", ".npz"), ("KILL", ".npz")])
+def test_the_same_command_goes_on_after_ctrl_c_and_a_kill(folder, how, ending):
+    pytest.importorskip("h5py")
+    command = ["montecarlo", "planar_detumble", *SHORT, "--runs", "90", "--threads", "1"]
+    out = ["-o", f"x{ending}"]
+    done = _interrupted([*command, *out], how, folder)
+    part = f"x{ending}.part"
+    assert {x.name for x in folder.iterdir()} == {"u.toml", part}
+    if how == "INT":
+        assert done.returncode == 130 and not done.stdout
+        last = done.stderr.splitlines()[-1]
+        said = rf"fflin: stopped at \d+ of 90 runs; the same command goes on from {part}"
+        assert re.fullmatch(said, last)
+    error = refused(*command, *out, "--seed", "1", cwd=folder)
+    assert f"{part} is what another campaign left behind" in error
+    assert run(*command, *out, cwd=folder)[0] == 0
+    assert run(*command, "-o", f"y{ending}", cwd=folder)[0] == 0
+    one, two = (fflin.Campaign.load(folder / f"{name}{ending}") for name in "xy")
+    assert np.array_equal(one.x, two.x) and len(one) == 90
+    assert {x.name for x in folder.iterdir()} == {"u.toml", f"x{ending}", f"y{ending}"}
+
+
+def _interrupted(command, how, folder):
+    script = INTERRUPTED.replace("SIG_HOW", f"SIG{how}")
+    return subprocess.run(
+        [sys.executable, "-c", script, *command],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+
+
+def test_ctrl_c_without_a_file_says_that_nothing_is_kept(folder):
+    done = _interrupted(["montecarlo", "planar_detumble", *SHORT, "--runs", "90"], "INT", folder)
+    assert done.returncode == 130
+    last = done.stderr.splitlines()[-1]
+    assert re.fullmatch(r"fflin: stopped at \d+ of 90 runs; nothing is kept, which .*", last)
+
+
+def test_a_killed_worker_costs_nothing(folder):
+    pytest.importorskip("h5py")
+    script = (
+        "import os, signal, multiprocessing as mp\n"
+        "from fflin.batch import store\n"
+        "keep = store.FileStore.write\n"
+        "def write(self, *given):\n"
+        "    keep(self, *given)\n"
+        "    if not os.path.exists('died'):\n"
+        "        open('died', 'w').close()\n"
+        "        os.kill(mp.active_children()[0].pid, signal.SIGKILL)\n"
+        "if __name__ == '__main__':\n"
+        "    import sys\n"
+        "    from fflin.__main__ import main\n"
+        "    store.FileStore.write = write\n"
+        "    sys.exit(main())\n"
+    )
+    (folder / "main.py").write_text(script)
+    command = ["montecarlo", "planar_detumble", *SHORT, "--runs", "90", "--workers", "2"]
+    done = subprocess.run(
+        [sys.executable, "main.py", *command, "-o", "x.h5"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        env=os.environ,
+        check=False,
+    )
+    assert (done.returncode, (folder / "died").exists()) == (0, True), done.stderr
+    assert run(*command[:-2], "-o", "y.h5", cwd=folder)[0] == 0
+    one, two = (fflin.Campaign.load(folder / f"{name}.h5") for name in "xy")
+    assert np.array_equal(one.x, two.x)
+
+
+def test_a_full_disk_is_said_and_leaves_nothing(folder):
+    pytest.importorskip("h5py")
+    small = folder / "small"
+    small.mkdir()
+    if subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", small], check=False
+    ).returncode:
+        pytest.skip("no right to mount a small disk")
+    try:
+        command = ["montecarlo", "planar_detumble", *SHORT]
+        error = refused(*command, "--runs", "2000", "-o", small / "x.h5", cwd=folder)
+        assert re.search(r"2,000 runs are .*: only .* are free in", error)
+        code, _, err = run(*command, "--runs", "8", "--plot", small / "x.png", cwd=folder)
+        assert code in (0, 2) and ("No space left" in err) == (code == 2)
+        code, out, err = run(*command, "--runs", "8", "--html", small / "x.html", cwd=folder)
+        assert code == 2 and "came to their end" in out
+        assert err.endswith("x.html: cannot be written: No space left on device\n")
+        assert not {x.name for x in small.iterdir()} - {"x.png"}
+    finally:
+        subprocess.run(["umount", small], check=True)
