@@ -79,6 +79,10 @@ from fflin.control.kalman import Estimator as Estimator
 from fflin.control.kalman import lqg as lqg
 from fflin.control.kalman import Compensator as Compensator
 
+# Uncertainty
+from fflin.uncertainty.sensitivity import sensitivity as sensitivity
+from fflin.uncertainty.sensitivity import Sensitivity as Sensitivity
+
 # Policies
 from fflin.control.policies import StateFeedback as StateFeedback
 from fflin.control.tracking import TrajectoryFeedback as TrajectoryFeedback

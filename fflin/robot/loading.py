@@ -17,6 +17,7 @@ from fflin.base.writing import as_path, remember
 from fflin.robot.catalog import RobotFile, find_robot
 from fflin.robot.frames import ROOT
 from fflin.robot.joints import Follower, Joint
+from fflin.robot.link_masses import LinkMass
 from fflin.robot.massless import idle_coordinates, massless_note
 from fflin.robot.model_checks import check_model
 from fflin.robot.robot import Robot
@@ -137,6 +138,7 @@ def _load(
         notes=description.notes,
         package_dirs=folders,
         urdf_damping=damping,
+        links={name: LinkMass.of(link) for name, link in description.links.items()},
     )
     return loaded, description.advice
 

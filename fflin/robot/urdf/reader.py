@@ -14,6 +14,7 @@ from fflin.base.errors import UrdfError
 from fflin.base.writing import read_input
 from fflin.robot.urdf.inertias import inertia_notes
 from fflin.robot.urdf.joints import Mimic
+from fflin.robot.urdf.links import Link
 from fflin.robot.urdf.mimics import counted_leaders, resolve_mimics
 from fflin.robot.urdf.tree import Urdf, read_description
 from fflin.robot.urdf.writer import write_urdf
@@ -47,6 +48,7 @@ class Description(NamedTuple):
     damping: dict[str, float]  # {joint: value} where not zero [N m s/rad | N s/m]
     friction: dict[str, float]  # the same [N m | N]
     meshes: tuple[str, ...]  # mesh files as it names them; they are not read
+    links: dict[str, Link]  # those that weigh something
     notes: tuple[str, ...]  # warnings, one line each
     advice: tuple[Advice, ...] = ()  # those that hold where the robot's fields say no more
 
@@ -106,6 +108,7 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
         damping,
         friction,
         tuple(dict.fromkeys(meshes)),
+        {name: link for name, link in urdf.links.items() if link.mass},
         tuple(notes),
         tuple(advice),
     )
