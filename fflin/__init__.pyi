@@ -82,6 +82,9 @@ from fflin.control.kalman import Compensator as Compensator
 # Uncertainty
 from fflin.uncertainty.sensitivity import sensitivity as sensitivity
 from fflin.uncertainty.sensitivity import Sensitivity as Sensitivity
+from fflin.uncertainty.uncertain import uncertain as uncertain
+from fflin.uncertainty.uncertain import Uncertain as Uncertain
+from fflin.uncertainty.lft import LFT as LFT
 
 # Policies
 from fflin.control.policies import StateFeedback as StateFeedback

@@ -46,6 +46,7 @@ class Piece(NamedTuple):
     mass: float
     inertia: Array
     frame: pin.SE3  # on the joint, in which its centre of mass is given
+    whole: bool = False  # whether it is a body of several links
 
 
 def pieces_of(robot: Robot) -> tuple[dict[str, Piece], dict[str, str]]:
@@ -64,9 +65,8 @@ def pieces_of(robot: Robot) -> tuple[dict[str, Piece], dict[str, str]]:
             of_body.setdefault(joint, {})[name] = piece
     for joint in range(ROOT, model.njoints):
         body, named = model.inertias[joint], of_body.get(joint, {})
-        whole = Piece(
-            joint, pin.SE3(np.eye(3), body.lever), body.mass, body.inertia, pin.SE3.Identity()
-        )
+        at, own_axes = pin.SE3(np.eye(3), body.lever), pin.SE3.Identity()
+        whole = Piece(joint, at, body.mass, body.inertia, own_axes, len(named) > 1)
         total = sum((as_inertia(each) for each in named.values()), pin.Inertia.Zero())
         difference = np.abs(total.matrix() - body.matrix()).max()
         if difference <= _ROUNDING * np.abs(body.matrix()).max():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,7 +19,7 @@ from fflin.robot.wheels import carrier
 
 AXES = "xyz"
 # (row, column) of the six entries of an inertia.
-_ENTRIES = {a + b: (AXES.index(a), AXES.index(b)) for a, b in ("xx", "yy", "zz", "xy", "xz", "yz")}
+ENTRIES = {a + b: (AXES.index(a), AXES.index(b)) for a, b in ("xx", "yy", "zz", "xy", "xz", "yz")}
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,9 @@ class Parameter:
 
     Attributes
     ----------
-    name, unit : str
+    of, part : str
+        Whose it is, and which: "arm" and "inertia.xx".
+    unit : str
     value : float
         What it is now.
     bodies : mapping
@@ -40,13 +42,19 @@ class Parameter:
         (Pinocchio joint, input, change (6,) of the wrench of a unit of it in the joint's frame).
     """
 
-    name: str
+    of: str
+    part: str
     unit: str
     value: float
     bodies: dict[int, Array] = field(default_factory=dict)
     spring: int = -1
     damper: int = -1
     wrench: tuple[int, int, Array] | None = None
+
+    @property
+    def name(self) -> str:
+        """Whose it is and which."""
+        return f"{self.of}.{self.part}"
 
 
 class Parameters(dict[str, Parameter]):
@@ -61,10 +69,14 @@ class Parameters(dict[str, Parameter]):
     def find(self, key: str) -> list[str]:
         """Return the names that a name or pattern stands for."""
         body, dot, rest = str(key).partition(".")
-        names = list(self)
         if key not in self and body in self._also:
             key = f"{self._also[body]}{dot}{rest}"
-        return [names[i] for i in matching("parameter", key, names)]
+        return matched(key, list(self))
+
+
+def matched(key: str, names: Sequence[str]) -> list[str]:
+    """Return the names that a name or pattern stands for."""
+    return [names[i] for i in matching("parameter", key, names)]
 
 
 def moments(mass: float, first: Array, inertia: Array) -> Array:
@@ -76,7 +88,7 @@ def _of_piece(name: str, piece: Piece) -> Iterator[Parameter]:
     """Give mass, centre of mass, inertia and density of a link or body."""
 
     def change(part: str, unit: str, value: float, parameters: Array) -> Parameter:
-        return Parameter(f"{name}.{part}", unit, value, {piece.joint: parameters})
+        return Parameter(name, part, unit, value, {piece.joint: parameters})
 
     m, c, turn = piece.mass, piece.placement.translation, piece.placement.rotation
     C = skew(c)
@@ -85,7 +97,7 @@ def _of_piece(name: str, piece: Piece) -> Iterator[Parameter]:
     for axis, at, d in zip(AXES, own, piece.frame.rotation.T, strict=True):
         D = skew(d)
         yield change(f"com.{axis}", "m", at, moments(0.0, m * d, m * (D.T @ C + C.T @ D)))
-    for entry, (row, column) in _ENTRIES.items():
+    for entry, (row, column) in ENTRIES.items():
         unit_inertia = np.zeros((3, 3))
         unit_inertia[row, column] = unit_inertia[column, row] = 1.0
         about = turn @ unit_inertia @ turn.T
@@ -100,9 +112,8 @@ def _of_joints(robot: Robot) -> Iterator[Parameter]:
         per = "m" if joint.prismatic else "rad"
         force = "N" if joint.prismatic else "N m"
         stiffness, damping, _ = (each[index].item() for each in robot.springs)
-        name = f"{joint.name}.stiffness"
-        yield Parameter(name, f"{force}/{per}", stiffness, spring=index)
-        yield Parameter(f"{joint.name}.damping", f"{force} s/{per}", damping, damper=index)
+        yield Parameter(joint.name, "stiffness", f"{force}/{per}", stiffness, spring=index)
+        yield Parameter(joint.name, "damping", f"{force} s/{per}", damping, damper=index)
 
 
 def _of_inputs(robot: Robot) -> Iterator[Parameter]:
@@ -122,8 +133,10 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
                     ("direction", "1", along @ d, tilted),
                 ):
                     in_joint = np.array(placement.act(pin.Force(wrench)).vector)
-                    name = f"{names[0]}.{part}.{letter}"
-                    yield Parameter(name, unit, float(value), wrench=(joint, first, in_joint))
+                    at_input = (joint, first, in_joint)
+                    yield Parameter(
+                        names[0], f"{part}.{letter}", unit, float(value), wrench=at_input
+                    )
         if isinstance(item, ReactionWheel) and item.inertia:
             joint, axis = carrier(robot.model, item)
             own = robot.model.getJointId(names[0])
@@ -132,4 +145,4 @@ def _of_inputs(robot: Robot) -> Iterator[Parameter]:
                 own: moments(0.0, np.zeros(3), np.outer(spin, spin)),
                 joint: moments(0.0, np.zeros(3), -np.outer(axis, axis)),
             }
-            yield Parameter(f"{names[0]}.inertia", "kg m^2", float(item.inertia), bodies)
+            yield Parameter(names[0], "inertia", "kg m^2", float(item.inertia), bodies)

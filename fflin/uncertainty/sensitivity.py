@@ -349,8 +349,8 @@ def _table(found: Sensitivity) -> str:
     lin, sizes = found.lin, [max(np.abs(x).max(), 1e-300) for x in (found.lin.A, found.lin.B)]
     rows = []
     for one, dA, dB in zip(found.parameters.values(), found.dA, found.dB, strict=True):
-        small = ".com." in one.name or ".position." in one.name
-        step = 0.01 if small else 0.1 * (abs(one.value) or float(".direction." in one.name))
+        small = one.part.partition(".")[0] in ("com", "position")
+        step = 0.01 if small else 0.1 * (abs(one.value) or float(one.part[:9] == "direction"))
         effect = [step * np.abs(d).max() / size for d, size in zip((dA, dB), sizes, strict=True)]
         if max(effect) > 0.0:
             change = f"{step:.3g} {one.unit}"
