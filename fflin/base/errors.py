@@ -118,8 +118,6 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     elif not names:
         hint = "there are none"
     else:
-        shown = ", ".join(map(_visible, names[:12])) + (
-            f", ... ({len(names)} in all)" if len(names) > 12 else ""
-        )
-        hint = f"there are: {shown}"
+        hint = f"there are: {', '.join(map(_visible, names[:12]))}"
+        hint += f", ... ({len(names)} in all)" if len(names) > 12 else ""
     return UnknownNameError(f"no {kind} named '{name}'; {hint}")

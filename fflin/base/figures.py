@@ -14,7 +14,6 @@ from fflin.base.writing import as_path, check_ending, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from fflin.base.validation import Array
 
@@ -56,10 +55,7 @@ def letters_of(count: float, room: float) -> float:
 
 
 def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float) -> None:
-    """Scale an axis so that values which differ by more than a factor of 10 are told apart.
-
-    What is below the rounding of `unit` stands at zero.
-    """
+    """Scale an axis so that values of very different sizes are told apart, but for rounding."""
     sizes = [abs(value) for value in values.tolist() if abs(value) > 1e-9 * unit]
     if not sizes or max(sizes) < 10.0 * min(sizes):
         return
@@ -71,24 +67,22 @@ def logarithmic(axes: Axes, axis: Literal["x", "y"], values: Array, unit: float)
 
 
 @contextmanager
-def styled() -> Iterator[Any]:
-    """Give the class of figures without a window, and the style for as long as one is drawn."""
+def drawing(path: str | Path | None, width: float, height: float, **options: Any) -> Iterator[Any]:
+    """Give a figure of a size [in] in the style, without a window; saved where there is a path."""
+    target = None if path is None else as_path(path)
+    if target is not None:
+        check_ending(target, FORMATS)
     require_matplotlib()
     import matplotlib
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(_STYLE):
-        yield Figure
-
-
-@contextmanager
-def drawing(path: str | Path | None, width: float, height: float, **options: Any) -> Iterator[Any]:
-    """Give a figure of a size [in] in the style, without a window; saved where there is a path."""
-    target = target_of(path)
-    with styled() as figure_class:
-        figure = figure_class(**{"figsize": (width, height), "layout": "constrained"} | options)
+        figure = Figure(**{"figsize": (width, height), "layout": "constrained"} | options)
         yield figure
-        saved(figure, target)
+        if target is not None:
+            content = io.BytesIO()
+            figure.savefig(content, format=target.suffix[1:])
+            write_whole({target: content.getvalue()})
 
 
 def require_matplotlib() -> None:
@@ -102,21 +96,3 @@ def require_matplotlib() -> None:
     except ValueError as error:  # of the environment's MPLBACKEND, or of a settings file
         said = str(error).partition(";")[0]
         raise MissingPackageError(f"matplotlib cannot be loaded: {said}; mend MPLBACKEND") from None
-
-
-def target_of(path: str | Path | None) -> Path | None:
-    """Return the path of a figure, checked, or None."""
-    if path is None:
-        return None
-    target = as_path(path)
-    check_ending(target, FORMATS)
-    return target
-
-
-def saved(figure: Figure, target: Path | None) -> Figure:
-    """Return the figure, written where there is a target."""
-    if target is not None:
-        content = io.BytesIO()
-        figure.savefig(content, format=target.suffix[1:])
-        write_whole({target: content.getvalue()})
-    return figure

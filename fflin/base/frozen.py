@@ -1,7 +1,5 @@
 """Results that nobody changes by accident: their arrays are read-only."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any
 

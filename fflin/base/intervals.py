@@ -4,8 +4,6 @@ C. J. Clopper and E. S. Pearson, Biometrika 26(4), 1934; H. A. David and H. N. N
 Statistics, 3rd edition, 2003, section 7.1.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
@@ -33,10 +31,7 @@ def clopper_pearson(successes: int, count: int, confidence: float) -> Estimate:
 
 
 def quantile(values: Array, p: float, confidence: float) -> Estimate:
-    """Return the p-quantile between two order statistics, whatever the distribution is.
-
-    The bounds are infinite where there are too few values for any.
-    """
+    """Return the p-quantile between two order statistics; infinite ones where there are too few."""
     from scipy.special import bdtr
 
     count = len(values)
@@ -61,10 +56,7 @@ def mean(values: Array, confidence: float) -> Estimate:
 
 
 def rank_correlations(columns: Array, values: Array) -> Array:
-    """Return Spearman's correlation of each of the columns (N, k) with values (N,); 0 of constants.
-
-    Values may be infinite.
-    """
+    """Return Spearman's correlation of columns (N, k) with values (N,), also infinite ones."""
     ranks = np.column_stack([_ranks(column) for column in (*columns.T, values)])
     ranks -= ranks.mean(axis=0)
     size = np.linalg.norm(ranks, axis=0)

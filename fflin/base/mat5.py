@@ -4,8 +4,6 @@ Every length is held against what is there, so that a damaged or hostile file is
 and nothing worse. Format: "MAT-File Format", The MathWorks, R2023b, chapter 1.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib
@@ -32,10 +30,7 @@ _LARGEST, _DEEPEST = 2**31, 16
 
 
 def read_mat(content: bytes) -> dict[str, Any]:
-    """Return the variables of a file: arrays, texts, lists of cells, and structs as dicts.
-
-    Variables of other kinds, such as functions and sparse matrices, are left out.
-    """
+    """Return the variables: arrays, texts, lists of cells, structs as dicts; no others."""
     if content[124:128] not in (b"\0\1IM", b"\1\0MI"):
         hint = ", but of version 7.3; write it with save -v7" * (content[126:128] == b"IM")
         raise ValueError(f"not a MATLAB file of level 5{hint}")

@@ -1,7 +1,5 @@
 """Names GROUP.ENTRY of states and inputs; groups, entries and patterns that stand for them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -20,10 +18,7 @@ def group_of(name: str) -> str:
 
 
 def input_keys(of: Any) -> tuple[str, ...]:
-    """Return GROUP.ENTRY of each input of a model, or of what else has their names and units.
-
-    Thrusters and wheels have names of their own; that one pushes and the other turns tells them.
-    """
+    """Return GROUP.ENTRY of each input of a model, or of what else has their names and units."""
     return tuple(
         name if group_of(name) in _GROUPS else f"{_OF_UNIT.get(unit, 'input')}.{name}"
         for name, unit in zip(of.input_names, of.input_units, strict=True)
@@ -63,7 +58,8 @@ def matching(kind: str, key: str, names: Sequence[str]) -> list[int]:
     """
     if key in names:
         return [names.index(key)]
-    pattern = _pattern(str(key))
+    # Brackets stand in names of joints: * and ? alone are wild.
+    pattern = re.compile(re.escape(str(key)).replace(r"\*", ".*").replace(r"\?", "."), re.DOTALL)
     of_group = [i for i, name in enumerate(names) if group_of(name) == key]
     found = of_group or [i for i, name in enumerate(names) if pattern.fullmatch(name)]
     if not found:
@@ -89,10 +85,7 @@ def stands_for_any(key: str, names: Sequence[str]) -> bool:
 
 
 def by_name(kind: str, values: Mapping[str, T], names: Sequence[str]) -> dict[int, T]:
-    """Return {index: value} of {key: value}, with keys as `matching` reads them.
-
-    A pattern goes before a group, and a name before both, whichever stands first.
-    """
+    """Return {index: value} of {key: value}; patterns go before groups, and names before both."""
     found: dict[int, T] = {}
     groups = {*map(group_of, names)}
     for key in sorted(values, key=lambda key: 1 if _is_pattern(key) else 2 * (key not in groups)):
@@ -115,10 +108,7 @@ def chosen(kind: str, keys: Sequence[str], names: Sequence[str]) -> list[int]:
 def joints_by_name(
     kind: str, values: Mapping[str, T], joints: Sequence[str], find: Callable[[str], str]
 ) -> dict[str, T]:
-    """Return {joint: value} of {joint or pattern: value}; the group ``q_m`` is all joints.
-
-    `find` returns the joint of a single name, which need not be among `joints`, or raises.
-    """
+    """Return {joint: value} of {joint, pattern or group: value}; `find` checks a single name."""
     many = {key: value for key, value in values.items() if key == "q_m" or _is_pattern(key)}
     states = [f"q_m.{name}" for name in joints]
     found = {joints[i]: value for i, value in by_name(kind, many, states).items()}
@@ -130,9 +120,3 @@ def joints_by_name(
 
 def _is_pattern(key: Any) -> bool:
     return "*" in str(key) or "?" in str(key)
-
-
-def _pattern(key: str) -> re.Pattern[str]:
-    """Read * and ? alone as wild: brackets stand in names of joints."""
-    wild = re.escape(key).replace(r"\*", ".*").replace(r"\?", ".")
-    return re.compile(wild, re.DOTALL)

@@ -1,7 +1,5 @@
 """A progress bar on stderr, for runs that take long and on terminals alone."""
 
-from __future__ import annotations
-
 import sys
 import time
 

@@ -28,7 +28,6 @@ from fflin.base.errors import FileError, InputError
 from fflin.base.frozen import FrozenArrays
 from fflin.base.writing import as_path, check_ending, read_file, reason, shown, write_whole
 
-FORMATS = (".npz", ".mat", ".json")
 SEAL = "sha256"
 
 Record = dict[str, Any]
@@ -52,18 +51,14 @@ def write_record(path: Path, record: Mapping[str, Any], *, sealed: bool) -> None
     """Write a record, in the format that the ending says; with its digest where `sealed`."""
     check_ending(path, FORMATS)
     require_finite(record)
-    encode = {".npz": _to_npz, ".mat": _to_mat, ".json": _to_json}[path.suffix]
-    write_whole({path: encode(record, sealed)})
+    write_whole({path: _CODECS[path.suffix][0](record, sealed)})
 
 
 def read_record(path: Path) -> tuple[Record, bool]:
-    """Return the record in a file, and whether it is verified; to be called within `reading`.
-
-    Arrays may have other shapes of the same order: .mat knows no vectors, .json no empty matrices.
-    """
+    """Return the record in a file, and whether it is verified; to be called within `reading`."""
+    # Arrays may have other shapes of that order: .mat knows no vectors, .json no empty matrices.
     check_ending(path, FORMATS)
-    decode = {".npz": _from_npz, ".mat": _from_mat, ".json": _from_json}[path.suffix]
-    return decode(read_file(path, path.suffix))
+    return _CODECS[path.suffix][1](read_file(path, path.suffix))
 
 
 @contextmanager
@@ -77,10 +72,8 @@ def reading(path: Path, what: str) -> Iterator[None]:
         raise
     except FileNotFoundError:
         raise FileError(f"{path}: cannot be read: No such file or directory") from None
-    except MemoryError:
-        raise NoRoomError(f"{shown(path)}: does not fit into the memory") from None
     except Exception as error:  # each decoder has its own dozen
-        if isinstance(error, OSError) and error.errno == ENOMEM:
+        if isinstance(error, MemoryError) or getattr(error, "errno", None) == ENOMEM:
             raise NoRoomError(f"{shown(path)}: does not fit into the memory") from None
         raise FileError(f"{shown(path)}: not a {what} saved by fflin ({reason(error)})") from None
 
@@ -132,10 +125,8 @@ def content_digest(entries: Mapping[str, Any]) -> str:
 
 def _to_npz(record: Mapping[str, Any], sealed: bool) -> bytes:
     buffer = io.BytesIO()
-    plain: dict[str, Any] = {
-        key: np.asarray(json.dumps(value) if isinstance(value, dict) else value)
-        for key, value in record.items()
-    }
+    groups = {k: json.dumps(group) for k, group in record.items() if isinstance(group, dict)}
+    plain: dict[str, Any] = {key: np.asarray(value) for key, value in {**record, **groups}.items()}
     if sealed:
         plain[SEAL] = content_digest(plain)
     np.savez(buffer, **plain)
@@ -210,6 +201,14 @@ def _from_json(content: bytes) -> tuple[Record, bool]:
     return record, bool(found)
 
 
+_CODECS = {
+    ".npz": (_to_npz, _from_npz),
+    ".mat": (_to_mat, _from_mat),
+    ".json": (_to_json, _from_json),
+}
+FORMATS = tuple(_CODECS)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Design(FrozenArrays):
     """A result of arrays, names and figures that saves and loads; the arrays are read-only.
@@ -268,34 +267,26 @@ class Design(FrozenArrays):
             record, verified = read_record(source)
             if text(record["kind"]) != name:
                 raise ValueError(f"it is a {text(record['kind'])}")
-            # What has a default came later than some files.
-            stored = [
-                item
+            values = {
+                item.name: _value(cls, item, record[item.name])
                 for item in _saved(cls)
+                # What has a default came later than some files.
                 if item.name in record or item.default_factory is MISSING
-            ]
-            values = {item.name: _value(cls, item, record[item.name]) for item in stored}
+            }
             return cls(**given, **values, verified=verified)
 
 
 def _saved(cls: type[Design]) -> list[Field[Any]]:
     """Return the fields that files have."""
-    return [
-        item
-        for item in fields(cls)
-        if item.name != "verified" and item.name[0] != "_" and item.type != "Robot"
-    ]
+    own = (item for item in fields(cls) if item.name != "verified" and item.name[0] != "_")
+    return [item for item in own if item.type != "Robot"]
 
 
 def _value(cls: type[Design], item: Field[Any], raw: Any) -> Any:
     """Return a field's value; its annotation says what it is."""
-    kind = str(item.type)
-    if kind == "float":
-        return figure(raw)
-    if kind.startswith("str"):
-        return text(raw)
-    if kind.startswith("tuple"):
-        return texts(raw)
+    for kind, of_kind in (("float", figure), ("str", text), ("tuple", texts)):
+        if str(item.type).startswith(kind):
+            return of_kind(raw)
     if isinstance(raw, dict):
         raw = np.array(raw["real"]) + 1j * np.array(raw["imag"])
     array = np.asarray(raw)
@@ -303,5 +294,5 @@ def _value(cls: type[Design], item: Field[Any], raw: Any) -> Any:
         raise ValueError(f"{item.name} is not an array of finite numbers")
     array = array.astype(complex if array.dtype.kind == "c" else float)
     if item.name in cls.OPEN:
-        array[np.abs(array) > _LARGEST] = np.copysign(np.inf, array[np.abs(array) > _LARGEST])
+        array = np.where(np.abs(array) > _LARGEST, np.copysign(np.inf, array), array)
     return array.ravel() if item.name in cls.VECTORS else array

@@ -1,7 +1,5 @@
 """One thread for many small matrices, which several threads of BLAS only wait for each other at."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import wraps
 from typing import ParamSpec, TypeVar

@@ -1,7 +1,5 @@
 """TOML files, and the lines on which what they hold stands."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Mapping
@@ -38,11 +36,7 @@ _LINE = re.compile(rf"\s*(?:(\[\[?)\s*{_KEY}\]|{_KEY}=)")
 
 
 class TomlFile:
-    """What a TOML file holds, in tables and keys whose lines are known.
-
-    Its `record` is as tomllib reads it. A place in it is written as keys and, in an array of
-    tables, indices: ``input``, 3, ``axis``.
-    """
+    """What a file holds, and the lines of places such as ``input``, 3, ``axis``."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -28,10 +28,7 @@ DOUBLE = np.dtype(np.float64)
 
 
 def vector(name: str, value: ArrayLike, size: int, of_what: str) -> Array:
-    """Return a vector (size,) of finite native floats: the caller's own array where it is one.
-
-    An error says its name and `of_what` its entries are.
-    """
+    """Return a vector (size,) of finite native floats: the caller's own array where it is one."""
     if type(value) is np.ndarray and value.dtype is DOUBLE:
         array: Array = value
     else:
@@ -100,16 +97,13 @@ def by_name(name: str, value: Any, of_what: str) -> Mapping[str, Any]:
 
 def numbers(name: str, value: Any, of_what: str, each: str) -> dict[str, float]:
     """Return {name: finite float} of a mapping by names; an error calls one of them `each`."""
-    values = by_name(name, value, of_what).items()
-    return {key: number(f"{each} '{key}'", entry) for key, entry in values}
+    values = by_name(name, value, of_what)
+    return {key: number(f"{each} '{key}'", entry) for key, entry in values.items()}
 
 
 def dimension(name: str, value: Any) -> int:
     """Return how many indices an array has, or raise `InputError` where it is none."""
-    try:
-        return np.ndim(value)
-    except ValueError:
-        raise InputError(f"{name} is not an array: its rows differ in length") from None
+    return _as_array(name, value).ndim
 
 
 def placement(name: str, value: Any) -> pin.SE3:
@@ -134,10 +128,14 @@ def is_rotation(R: Array) -> bool:
 def as_double(name: str, value: ArrayLike) -> Array:
     """Return a new array of native floats, or raise `InputError` where it is none of numbers."""
     refuse_masked(name, value)
-    try:
-        array = np.asarray(value)
-    except ValueError:
-        raise InputError(f"{name} is not an array: its rows differ in length") from None
+    array = _as_array(name, value)
     if array.dtype.kind not in "fiu":
         raise InputError(f"{name} holds {array.dtype} values, expected real numbers")
     return array.astype(np.float64)
+
+
+def _as_array(name: str, value: Any) -> Any:
+    try:
+        return np.asarray(value)
+    except ValueError:
+        raise InputError(f"{name} is not an array: its rows differ in length") from None

@@ -6,8 +6,6 @@ what the umask leaves. Where the target is a link, the file that it leads to is 
 link stays.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator, Mapping
@@ -106,7 +104,9 @@ def replacing(*targets: Path) -> Iterator[list[Path]]:
 def install(temporary: Path, target: Path) -> None:
     """Let a file that is whole take the place of its target."""
     real = place(target)
-    os.chmod(temporary, real.stat().st_mode & 0o777 if real.exists() else 0o666 & ~_umask())
+    mask = os.umask(0o077)  # it can be read only by setting it
+    os.umask(mask)
+    os.chmod(temporary, real.stat().st_mode & 0o777 if real.exists() else 0o666 & ~mask)
     os.replace(temporary, real)
 
 
@@ -176,10 +176,3 @@ def shown(path: str | Path) -> str:
     """Show a path in an error; one that is too long for a file by its ends."""
     text = str(path)
     return text if len(text) < 500 else f"{text[:60]} ... {text[-60:]}"
-
-
-def _umask() -> int:
-    # It can be read only by setting it.
-    mask = os.umask(0o077)
-    os.umask(mask)
-    return mask

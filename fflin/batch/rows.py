@@ -9,8 +9,9 @@ import numpy as np
 
 from fflin.base.errors import FflinError, InputError
 from fflin.base.validation import NORM_TOLERANCE, Array, as_double, dimension, vector
+from fflin.robot.coordinates import ROUND_OFF
 from fflin.robot.joints import Joint
-from fflin.robot.robot import ROUND_OFF, Robot
+from fflin.robot.robot import Robot
 
 # Where a joint stands in q: (index, -1), or, where it is stored so, those of (cos, sin).
 Column: TypeAlias = tuple[int, int]

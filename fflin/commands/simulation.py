@@ -205,8 +205,8 @@ def _leave_earlier(arguments: argparse.Namespace) -> list[str]:
 
 def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     """Return the motion that the arguments ask for."""
-    from fflin.simulation.settling import SHORTEST, time_to_settle
     from fflin.simulation.simulate import simulate
+    from fflin.simulation.times import SHORTEST, time_to_settle
 
     given = once("--limit", arguments.limit)
     options: dict[str, Any] = {

@@ -1,9 +1,11 @@
-"""Where robots are found: the bundled ones, those of example-robot-data, and any path."""
+"""Where robots are found, the bundled ones or others, and their files of inputs and meshes."""
 
 import os
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import unquote
 
 from fflin.base.errors import FileError, InputError, UrdfError, unknown
 
@@ -61,11 +63,7 @@ def list_robots() -> tuple[str, ...]:
 
 
 def find_robot(robot: str | Path, folder: str | Path = "") -> RobotFile:
-    """Find the description of a robot by its name or by a path, relative to the folder.
-
-    A bundled name comes first, then the path of a URDF or of a robot file that exists
-    (``servicer_7dof.toml`` is a bundled one), then a name of example-robot-data.
-    """
+    """Find a robot by a bundled name, a path from the folder or a name of example-robot-data."""
     if not isinstance(robot, str | os.PathLike):
         raise InputError(f"robot is a {type(robot).__name__}, expected a name or a path")
     if isinstance(robot, str) and robot in _bundled():
@@ -101,3 +99,19 @@ def find_inputs(inputs: str | Path) -> Path:
     if path.name == str(inputs) and not path.suffix and not os.path.lexists(path):
         raise unknown("file or bundled set of inputs", str(inputs), sorted(bundled))
     return path
+
+
+def find_mesh(uri: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
+    """Return the file of package://NAME/PATH, file:///PATH or a path; None without one."""
+    scheme, separator, rest = uri.partition("://")
+    candidates: Iterable[Path]
+    if not separator:
+        candidates = (folder / uri for folder in (urdf.parent, *package_dirs))
+    elif scheme == "file":
+        candidates = [Path(unquote(rest))]
+    else:
+        folders, inside = (*package_dirs, *urdf.resolve().parents), Path(*Path(rest).parts[1:])
+        # A package's own folder may have been given, or be called otherwise.
+        candidates = (folder / part for part in (rest, inside) for folder in folders)
+    # Unlike Path.is_file, this takes a name that is too long for one that does not exist.
+    return next((path for path in candidates if os.path.isfile(path)), None)

@@ -1,7 +1,5 @@
 """A robot file to begin with: what a URDF says of a robot, and what its names suggest."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -28,10 +26,7 @@ _SWING, _DAMPED = math.pi, 0.01
 
 
 def draft(robot: Robot, urdf: str) -> str:
-    """Return the text of a robot file of a robot that is as its URDF is, with nothing said of it.
-
-    `urdf` is what the file names the URDF by.
-    """
+    """Return the text of a robot file for a robot whose URDF, named `urdf`, says all."""
     model = robot.model
     idle = [joint for joint in robot.joints if model.effortLimit[joint.idx_v] == 0.0]
     names = ", ".join(_text(joint.name) for joint in idle)

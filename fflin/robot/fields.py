@@ -1,24 +1,15 @@
 """What of a robot its user may set: inputs, passive joints, gravity, its start; checked once."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias
 
 from fflin.base.errors import InputError, ModelError, unknown
 from fflin.base.names import by_name, matching, rates_by_name, stands_for_any, state_keys
-from fflin.base.validation import dimension, number
-from fflin.robot.inputs import (
-    KINDS,
-    BaseForce,
-    BaseTorque,
-    Input,
-    JointTorque,
-    Thruster,
-    named_inputs,
-    named_wheels,
-    three_numbers,
-)
+from fflin.base.validation import dimension, number, numbers
+from fflin.robot import inputs as kinds
+from fflin.robot.inputs import Input, JointTorque, named_inputs, named_wheels, three_numbers
 from fflin.robot.joints import Find, by_joint
 from fflin.robot.outputs import Output
 
@@ -45,37 +36,26 @@ def checked_fields(
     inputs: Sequence[Input],
     urdf_damping: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Return fields, as `Robot.replace` takes them but for passive and inputs, as a robot has them.
-
-    `own` are the joints that are no wheels, which one value for all stands for, and `urdf_damping`
-    is what damping="urdf" stands for.
-    """
-    checked: dict[str, Any] = {}
-    for name, value in fields.items():
-        if name == "friction":
-            raise ModelError(
-                "dry friction is not differentiable at rest, so that no linear model has it; use "
-                "damping, or simulate with it"
-            )
-        if name not in FIELDS:
+    """Return fields of `Robot.replace`, but passive and inputs; `own` are the joints but wheels."""
+    if "friction" in fields:
+        raise ModelError(
+            "dry friction is not differentiable at rest, so that no linear model has it; use "
+            "damping, or simulate with it"
+        )
+    check: dict[str, Callable[[Any], Any]] = {
+        "outputs": _outputs,
+        "gravity": lambda value: three_numbers("gravity", value),
+        "limits": lambda value: given_limits(inputs, joints, value),
+        "weights": lambda value: _weights(value, joints, inputs),
+        "start": lambda value: _start(value, find, joints),
+        "stiffness": lambda value: _by_joint("stiffness", value, find, own),
+        "damping": lambda value: _damping(value, find, own, urdf_damping),
+        "rest": lambda value: _by_joint("rest", value, find, own),
+    }
+    for name in fields:
+        if name not in check:
             raise unknown("field of a robot", name, FIELDS)
-        if name == "outputs":
-            checked[name] = _outputs(value)
-        elif name == "gravity":
-            checked[name] = three_numbers("gravity", value)
-        elif name == "limits":
-            checked[name] = given_limits(inputs, joints, value)
-        elif name == "weights":
-            checked[name] = _weights(value, joints, inputs)
-        elif name == "start":
-            checked[name] = _start(value, find, joints)
-        elif name == "damping" and isinstance(value, str):
-            if value != "urdf":
-                raise InputError(f"damping is '{value}', expected 'urdf', a number or a mapping")
-            checked[name] = dict(urdf_damping)
-        else:
-            checked[name] = _by_joint(name, value, find, own)
-    return checked
+    return {name: check[name](value) for name, value in fields.items()}
 
 
 def checked_inputs(
@@ -88,19 +68,21 @@ def checked_inputs(
         raise InputError("inputs is empty; a model needs at least one")
     for item in value:
         if not isinstance(item, Input):
-            raise InputError(
-                f"{item!r} is not an input; expected {', '.join(kind.__name__ for kind in KINDS)}"
-            )
+            known = ", ".join(kind.__name__ for kind in kinds.KINDS)
+            raise InputError(f"{item!r} is not an input; expected {known}")
     value = [one for item in value for one in _spread(item, find, joints, passive)]
     if not value:
         raise InputError("inputs are torques of joints that all are passive; name another input")
-    names = [item.name for item in value if isinstance(item, Thruster) and item.name]
-    names += [name for name, _ in named_wheels(value)]
-    kinds = BaseTorque | BaseForce | JointTorque
-    plain = [replace(x, min=None, max=None) for x in value if isinstance(x, kinds)]
-    twice = [str(x) for x in (*names, *plain) if (*names, *plain).count(x) > 1]
-    if twice:
-        raise InputError(f"input {twice[0]} stands there twice")
+    # What has a name is told by that, all else by what it is but for its limits.
+    named = [item for item in value if isinstance(item, kinds.WrenchInput)]
+    told: list[Any] = [
+        item.name for item in named if isinstance(item, kinds.Thruster) and item.name
+    ]
+    told += [name for name, _ in named_wheels(value)]
+    told += [replace(item, min=None, max=None) for item in value if item not in named]
+    for each in told:
+        if told.count(each) > 1:
+            raise InputError(f"input {each} stands there twice")
     return tuple(value)
 
 
@@ -116,22 +98,16 @@ def _spread(item: Input, find: Find, joints: Sequence[str], passive: Sequence[st
 
 def _input_keys(inputs: Sequence[Input]) -> tuple[str, ...]:
     """Return the names of the inputs, as `fflin.base.names.input_keys` has those of a model."""
-    return tuple(
-        name if name.startswith(f"{item.GROUP}.") else f"{item.GROUP}.{name}"
-        for item, names in named_inputs(inputs)
-        for name in names
-    )
+    pairs = ((item.GROUP, name) for item, names in named_inputs(inputs) for name in names)
+    return tuple(name if name.startswith(f"{of}.") else f"{of}.{name}" for of, name in pairs)
 
 
 def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> dict[str, Range]:
-    """Return {name of an input or state: (least, largest)} of what a caller gives.
-
-    Which is the largest magnitude of all inputs, or {name, group or pattern of inputs or states:
-    largest magnitude, or (least, largest)}. A thruster never pulls.
-    """
+    """Return {name of an input or state: (least, largest)} of a magnitude, or of some by name."""
     keys, states, named = _input_keys(inputs), state_keys(joints), named_inputs(inputs)
     names = [*(name for _, own in named for name in own), *states]
-    pushing = {name for item, own in named if not item.PULLS for name in own}
+    floors = [0.0 if not item.PULLS else -math.inf for item, own in named for _ in own]
+    floors += [-math.inf] * len(states)
     if not isinstance(given, Mapping):
         given = dict.fromkeys(dict.fromkeys(item.GROUP for item in inputs), given)
     ranges = {str(key): _range(key, value) for key, value in given.items()}
@@ -144,7 +120,6 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> 
     found = {i: limits for i, limits in found.items() if names[i] not in wheels}
     found |= by_name("input or state", of_states, (*keys, *states))
     found |= by_name("input", of_inputs, keys)
-    floors = [0.0 if name in pushing else -math.inf for name in names]
     return {
         names[i]: (max(low, floors[i]), max(high, floors[i])) for i, (low, high) in found.items()
     }
@@ -160,15 +135,24 @@ def _outputs(value: Any) -> tuple[Output, ...]:
 
 
 def _by_joint(what: str, value: Any, find: Find, joints: Sequence[str]) -> dict[str, float]:
+    """Return {joint: value} of a mapping, or of one value for all where none can be negative."""
     if not isinstance(value, Mapping):
         if what == "rest":
             raise InputError(f"rest is {value!r}, expected a mapping {{joint: position}}")
         value = dict.fromkeys(joints, value)
-    checked = {name: number(f"{what} of joint '{name}'", entry) for name, entry in value.items()}
+    checked = numbers(what, value, "joint", f"{what} of joint")
     for name, entry in checked.items():
         if what != "rest" and entry < 0.0:
             raise InputError(f"{what} of joint '{name}' is {entry:g}, expected 0 or more")
     return by_joint(checked, joints, find)
+
+
+def _damping(value: Any, find: Find, joints: Sequence[str], urdf: Mapping[str, float]) -> Any:
+    if not isinstance(value, str):
+        return _by_joint("damping", value, find, joints)
+    if value != "urdf":
+        raise InputError(f"damping is '{value}', expected 'urdf', a number or a mapping")
+    return dict(urdf)
 
 
 def _range(name: str, value: Any) -> Range:
@@ -188,13 +172,13 @@ def _start(value: Any, find: Find, joints: Sequence[str]) -> dict[str, Any]:
     """Return where a robot starts, with joints and rates by their full names."""
     start = _parts("start", value, _START)
     if "joints" in start:
-        values = _numbers("start of joint", "start joints", start["joints"])
+        values = numbers("start joints", start["joints"], "joint", "start of joint")
         start["joints"] = by_joint(values, joints, find)
     for name in ("rpy", "position"):
         if name in start:
             start[name] = three_numbers(f"start {name}", start[name])
     if "velocity" in start:
-        rates = _numbers("start velocity", "start velocity", start["velocity"])
+        rates = numbers("start velocity", start["velocity"], "name", "start velocity")
         start["velocity"] = rates_by_name(joints, rates)
     return start
 
@@ -202,12 +186,9 @@ def _start(value: Any, find: Find, joints: Sequence[str]) -> dict[str, Any]:
 def kept_start(start: Mapping[str, Any], joints: Sequence[str]) -> dict[str, Any]:
     """Return of a start what is of these joints, of which some wheels are none."""
     names = {*joints, *state_keys(joints)}
-    return {
-        part: {key: x for key, x in value.items() if key in names}
-        if isinstance(value, Mapping)
-        else value
-        for part, value in start.items()
-    }
+    of_joints = {part: start[part] for part in ("joints", "velocity") if part in start}
+    kept = {part: {k: x for k, x in of.items() if k in names} for part, of in of_joints.items()}
+    return {**start, **kept}
 
 
 def _weights(value: Any, joints: Sequence[str], inputs: Sequence[Input]) -> dict[str, Any]:
@@ -222,7 +203,7 @@ def _weights(value: Any, joints: Sequence[str], inputs: Sequence[Input]) -> dict
         "bryson": ("state or input", (*states, *keys)),
     }
     for part, (kind, names) in parts.items():
-        weights[part] = _numbers(f"{part} of", part, weights.get(part, {}))
+        weights[part] = numbers(part, weights.get(part, {}), "name", f"{part} of")
         for key, entry in weights[part].items():
             matching(kind, key, names)
             if entry < 0.0 or (part != "q" and not entry):
@@ -255,9 +236,3 @@ def _parts(what: str, value: Any, known: Sequence[str]) -> dict[str, Any]:
         if name not in known:
             raise unknown(f"part of {what}", name, known)
     return dict(value)
-
-
-def _numbers(what: str, part: str, value: Any) -> dict[str, float]:
-    if not isinstance(value, Mapping):
-        raise InputError(f"{part} is {value!r}, expected {{name: number}}")
-    return {name: number(f"{what} '{name}'", entry) for name, entry in value.items()}

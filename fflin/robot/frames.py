@@ -17,11 +17,9 @@ class Carried(NamedTuple):
 
 
 def frame_index(model: pin.Model, name: str) -> int:
-    """Return the index of a frame of the robot; a link's comes before a joint's of that name.
-
-    Pinocchio's own look-up refuses a name that a link and a joint share, and takes a link called
-    universe for the world.
-    """
+    """Return the index of a frame of the robot; a link's comes before a joint's of that name."""
+    # Pinocchio's own look-up refuses a name that a link and a joint share, and takes a link called
+    # universe for the world.
     frames = {i: f for i, f in enumerate(model.frames.tolist()) if f.parentJoint >= ROOT}
     # The comparison with an array would be one.
     found = [i for i, f in frames.items() if isinstance(name, str) and f.name == name]

@@ -1,6 +1,7 @@
 """Inputs from a TOML file."""
 
 import reprlib
+from collections.abc import Callable
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,30 @@ from fflin.robot.fields import FIELDS
 from fflin.robot.inputs import KINDS, Input
 
 _TYPES = {kind.KEY: kind for kind in KINDS}
-_VECTORS = ("position", "direction", "axis")
-_NUMBERS = ("inertia", "momentum", "max", "min", "max_speed", "least_impulse")
 
 # The keys of a robot file; one that has no `urdf` holds inputs alone.
 ROBOT_KEYS = ("urdf", "package_dirs", "lock", "input", *(x for x in FIELDS if x != "inputs"))
+
+
+def _is_number(value: Any) -> bool:
+    # The limit keeps lengths finite, and integers that are no floats out.
+    return type(value) in (int, float) and abs(value) < 1e100
+
+
+def _is_vector(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))
+
+
+# What a value is to be, and how an error says so.
+NAME = (lambda x: isinstance(x, str) and x != "", "a name in quotes")
+NUMBER = (_is_number, "a finite number")
+_VECTOR = (_is_vector, "three finite numbers, [x, y, z]")
+_EITHER = (lambda x: _is_number(x) or _is_vector(x), "a finite number or three of them")
+_EXPECTED: dict[str, tuple[Callable[[Any], bool], str]] = {
+    **dict.fromkeys(("position", "direction", "axis"), _VECTOR),
+    **dict.fromkeys(("inertia", "momentum", "max", "min", "max_speed", "least_impulse"), NUMBER),
+    "on_off": (lambda x: isinstance(x, bool), "true or false"),
+}
 
 
 def load_inputs(path: str | Path) -> tuple[Input, ...]:
@@ -113,14 +133,13 @@ def read_inputs(document: TomlFile) -> tuple[Input, ...]:
             shown = f"the name '{what}'" if isinstance(what, str) else what
             first = document.line("input", seen[what])
             message = f"{shown} stands in line {first} already; take one out"
-            raise _error(document, index, "name", message)
+            raise _error(document, message, index, "name")
         seen[what] = index
         inputs.append(item)
     return tuple(inputs)
 
 
-def _error(document: TomlFile, index: int, key: str | None, message: str) -> InputError:
-    place = () if key is None else (key,)
+def _error(document: TomlFile, message: str, index: int, *place: str) -> InputError:
     return document.error(f"input {index + 1}: {message}", "input", index, *place)
 
 
@@ -129,9 +148,8 @@ def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
     if kind is None:
         near = [key for key in table if key.lower() == "type"]
         hint = f" ('{near[0]}' is not)" if near else ""
-        raise _error(
-            document, index, None, f"has no key 'type'{hint}; give one of {', '.join(_TYPES)}"
-        )
+        message = f"has no key 'type'{hint}; give one of {', '.join(_TYPES)}"
+        raise _error(document, message, index)
     if not isinstance(kind, str) or kind not in _TYPES:
         shown = kind if isinstance(kind, str) else reprlib.repr(kind)
         raise document.unknown(unknown("type of input", shown, _TYPES), "input", index, "type")
@@ -142,35 +160,18 @@ def _input(document: TomlFile, index: int, table: dict[str, Any]) -> Input:
         if key not in known:
             problem = unknown(f"key of a {kind}", key, ("type", *known))
             raise document.unknown(problem, "input", index, key)
-        right, expected = isinstance(value, str) and value != "", "a name in quotes"
-        if key in _VECTORS:
-            right, expected = _is_vector(value), "three finite numbers, [x, y, z]"
-        elif key in _NUMBERS:
-            right, expected = is_number(value), "a finite number"
-            if key in ("max", "min") and len(_TYPES[kind].ENTRIES) > 1:
-                right, expected = right or _is_vector(value), "a finite number or three of them"
-        elif key == "on_off":
-            right, expected = isinstance(value, bool), "true or false"
-        if not right:
-            raise _error(
-                document, index, key, f"{key} is {reprlib.repr(value)}, expected {expected}"
-            )
+        right, expected = _EXPECTED.get(key, NAME)
+        if key in ("max", "min") and len(_TYPES[kind].ENTRIES) > 1:
+            right, expected = _EITHER
+        if not right(value):
+            message = f"{key} is {reprlib.repr(value)}, expected {expected}"
+            raise _error(document, message, index, key)
     for key, field in known.items():
         if field.default is MISSING and key not in values:
-            raise _error(document, index, None, f"a {kind} needs the key '{key}'; add it")
+            raise _error(document, f"a {kind} needs the key '{key}'; add it", index)
     try:
         return _TYPES[kind](**values)
     except InputError as error:
         message = str(error)  # begins with what is wrong, "thruster direction is ..."
-        wrong = next((key for key in values if f" {key} is " in message), None)
-        raise _error(document, index, wrong, message) from None
-
-
-def _is_vector(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 3 and all(map(is_number, value))
-
-
-def is_number(value: Any) -> bool:
-    """Whether a value of a TOML file is a finite number."""
-    # The limit keeps lengths finite, and integers that are no floats out.
-    return type(value) in (int, float) and abs(value) < 1e100
+        wrong = [key for key in values if f" {key} is " in message]
+        raise _error(document, message, index, *wrong[:1]) from None

@@ -6,9 +6,8 @@ from typing import NamedTuple, TypeAlias, TypeVar
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError
 from fflin.base.names import joints_by_name
-from fflin.base.validation import NORM_TOLERANCE, Array
+from fflin.base.validation import Array
 
 T = TypeVar("T")
 
@@ -71,30 +70,3 @@ Find: TypeAlias = Callable[[str], Joint]
 def by_joint(values: Mapping[str, T], joints: Sequence[str], find: Find) -> dict[str, T]:
     """Return {joint: value} of {joint or pattern: value}; the group ``q_m`` is all joints."""
     return joints_by_name("joint", values, joints, lambda name: find(name).name)
-
-
-def followed(followers: Sequence[Follower], q: Array) -> Array:
-    """Return a copy of q (nq,) with the followers put right where they are within 1e-6."""
-    placed = q.copy()
-    for follower in followers:
-        follower.place(placed)
-    for joint, leader, *_ in followers:
-        part = slice(joint.idx_q, joint.idx_q + 1 + joint.unbounded)
-        error = np.abs(placed[part] - q[part]).max()
-        if error > NORM_TOLERANCE * max(1.0, np.abs(placed[part]).max()):
-            raise InputError(
-                f"joint '{joint.name}' is at {joint.value(q):.9g}, but it mimics '{leader.name}', "
-                f"which puts it at {joint.value(placed):.9g}; `configuration` places mimic joints"
-            )
-    return placed
-
-
-def check_followers_rates(followers: Sequence[Follower], v: Array) -> None:
-    """Refuse a velocity (nv,) in which a joint does not move as its leader makes it."""
-    for joint, leader, multiplier, _ in followers:
-        expected = multiplier * v[leader.idx_v]
-        if abs(v[joint.idx_v] - expected) > NORM_TOLERANCE * max(1.0, abs(expected)):
-            raise InputError(
-                f"v[{joint.idx_v}] of joint '{joint.name}' is {v[joint.idx_v]:.9g}, but it mimics "
-                f"'{leader.name}', which makes it {expected:.9g}"
-            )

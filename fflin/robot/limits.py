@@ -18,13 +18,9 @@ _OPEN: Range = (-math.inf, math.inf)
 
 
 def limits_of(robot: Robot) -> dict[str, Range]:
-    """Return {name of an input or state: (least, largest)} of those that have a limit.
-
-    Of the URDF ``tau_m`` within the effort [N m | N], ``qdot_m`` within the velocity
-    [rad/s | m/s] and ``q_m`` within the travel [rad | m], where a limit of zero, which exporters
-    write for none, is none. Before it go `min` and `max` of the inputs and the speed of wheels,
-    and before those `Robot.limits`.
-    """
+    """Return {name of an input or state: (least, largest)} of what has a limit."""
+    # Of the URDF, where zero, which exporters write for none, is none; before it go the inputs'
+    # own limits, and before those `Robot.limits`.
     found: dict[str, Range] = {}
     for joint in robot.joints:
         found[f"q_m.{joint.name}"] = _travel(robot, joint)
@@ -43,11 +39,7 @@ def limits_of(robot: Robot) -> dict[str, Range]:
 
 
 def magnitudes_of(robot: Robot) -> dict[str, float]:
-    """Return {name of an input or state: limit}: of what is limited both ways, the lesser one.
-
-    Of ``q_m`` the whole travel, of a thruster its largest thrust. What is limited to zero, or not
-    at all, is left out.
-    """
+    """Return {name of an input or state: magnitude} of what is limited both ways, travels whole."""
     sizes = {
         name: largest - least if name.startswith("q_m.") or least >= 0.0 else min(-least, largest)
         for name, (least, largest) in limits_of(robot).items()
@@ -56,11 +48,7 @@ def magnitudes_of(robot: Robot) -> dict[str, float]:
 
 
 def chosen_limits(robot: Robot, limits: Any) -> tuple[dict[str, Range], dict[str, Range]]:
-    """Return {name: (least, largest)} of what cuts the inputs of a run, and of all that is known.
-
-    `limits` is that of `simulate`: nothing, "urdf" for all that `limits_of` knows, what
-    `given_limits` takes, or a list of the two, where what is given goes first.
-    """
+    """Return what cuts the inputs of a run, by the limits of `simulate`, and all known limits."""
     own, cutting = limits_of(robot), dict[str, Range]()
     given: dict[str, Range] = {}
     several = isinstance(limits, list | tuple) and any(isinstance(x, str) for x in limits)

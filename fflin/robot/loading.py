@@ -14,15 +14,14 @@ from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
 from fflin.base.writing import as_path, remember
-from fflin.robot.catalog import RobotFile, find_robot
+from fflin.robot.catalog import RobotFile, find_mesh, find_robot
 from fflin.robot.frames import ROOT
-from fflin.robot.joints import Follower, Joint
+from fflin.robot.joints import Follower
 from fflin.robot.link_masses import LinkMass
 from fflin.robot.massless import idle_coordinates, massless_note
-from fflin.robot.model_checks import check_model
+from fflin.robot.model_checks import check_model, check_order, check_root, joint_of
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
-from fflin.robot.urdf.mesh_files import find_mesh
 from fflin.robot.urdf.reader import Advice, read_urdf
 
 Lock = Mapping[str, float | None] | Iterable[str]
@@ -124,9 +123,8 @@ def _load(
     description = read_urdf(found.path, found.prune)
     loaded = _robot(description.model, found.name, locks, description.mimics)
     folders = (*package_dirs, *found.package_dirs)
-    # They are read when the robot is drawn, and no output may take their place before.
-    meshes = (find_mesh(uri, found.path, folders) for uri in description.meshes)
-    remember(*filter(None, meshes))
+    # Meshes are read when the robot is drawn, and no output may take their place before.
+    remember(*filter(None, (find_mesh(uri, found.path, folders) for uri in description.meshes)))
     damping = {name: description.damping.get(name, 0.0) for name in loaded.joint_names}
     # That of mimic joints counts with that of their leaders: the power is the same.
     for joint, leader, multiplier, _ in loaded.followers:
@@ -193,11 +191,11 @@ def _folders(package_dirs: Any) -> tuple[Path, ...]:
 def _robot(
     model: pin.Model, name: str, locks: Sequence[Lock | None], mimics: Mapping[str, Mimic]
 ) -> Robot:
-    _check_root(model, name)
+    check_root(model, name)
     locked: tuple[str, ...] = ()
     if any(lock is not None for lock in locks):
         model, mimics, locked = _locked(model, locks, mimics)
-    all_joints = [_joint(model, index) for index in range(ROOT + 1, model.njoints)]
+    all_joints = [joint_of(model, index) for index in range(ROOT + 1, model.njoints)]
     by_name = {joint.name: joint for joint in all_joints}
     joints = tuple(joint for joint in all_joints if joint.name not in mimics)
     followers = tuple(
@@ -206,60 +204,25 @@ def _robot(
     )
     robot = Robot(model, name, None, "", joints, followers, locked=locked)
     robot.require_room()
-    if not _depth_first(model.parents.tolist()):
-        raise ModelError(
-            f"'{name}': the joints are not in depth-first order, in which Pinocchio's CRBA is "
-            "wrong; add the joints of one branch before those of the next"
-        )
+    check_order(model, name)
     return robot
-
-
-def _depth_first(parents: Sequence[int]) -> bool:
-    """Whether each joint hangs on the one before it, or on one that this hangs on."""
-    above: list[int] = []
-    for joint, parent in enumerate(parents):
-        while above and above[-1] != parent:
-            above.pop()
-        if joint and not above:
-            return False
-        above.append(joint)
-    return True
-
-
-def _check_root(model: pin.Model, name: str) -> None:
-    root = model.joints[ROOT].shortname() if model.njoints > ROOT else "none"
-    if root != "JointModelFreeFlyer":
-        raise ModelError(
-            f"'{name}': the root joint is {root}, expected JointModelFreeFlyer; build the model "
-            "with pin.JointModelFreeFlyer() as its root joint"
-        )
-    fixed = [model.names[i] for i in range(ROOT + 1, model.njoints) if model.parents[i] == 0]
-    if fixed:
-        raise ModelError(
-            f"'{name}': joint '{fixed[0]}' hangs on the world beside the free-flyer; "
-            "everything that moves must hang on one base"
-        )
 
 
 def _locked(
     model: pin.Model, locks: Sequence[Lock | None], mimics: Mapping[str, Mimic]
 ) -> tuple[pin.Model, dict[str, Mimic], tuple[str, ...]]:
-    """Weld joints, and what mimics them; of several locks the last goes first.
-
-    Returns the smaller model, the mimics that are left, and "joint=value" of what was welded.
-    """
+    """Weld joints and what mimics them; return the model, the mimics left, and what was welded."""
     movable = list(model.names)[ROOT + 1 :]
 
-    def movable_one(name: str) -> str:
+    def found(name: str) -> str:
         if name not in movable:
             raise unknown("joint to lock", name, movable)
         return name
 
     given: dict[str, float | None] = {}
-    for lock in (lock for lock in locks if lock is not None):
-        keys = [lock] if isinstance(lock, str) else _listed(lock)
-        asked = {key: lock[key] if isinstance(lock, Mapping) else None for key in keys}
-        given |= joints_by_name("joint to lock", asked, movable, movable_one)
+    for lock in locks:
+        if lock is not None:
+            given |= joints_by_name("joint to lock", _asked(lock), movable, found)
     values = {n: None if x is None else number(f"lock '{n}'", x) for n, x in given.items()}
     for name, mimic in mimics.items():
         leader_value = values.get(mimic.leader, 0.0) or 0.0
@@ -273,7 +236,7 @@ def _locked(
         indices.append(index)
         locked.append(f"{name}={0.0 if value is None else value!r}")
         if value is not None:
-            _joint(model, index).place(q, value)
+            joint_of(model, index).place(q, value)
         # Without a frame for the joint, which models built in code may lack, Pinocchio crashes.
         if not model.existFrame(name, pin.FrameType.JOINT):
             model.addJointFrame(index)
@@ -281,23 +244,20 @@ def _locked(
     return _reduced(model, indices, q), left, tuple(locked)
 
 
-def _listed(lock: Any) -> list[str]:
-    try:
-        names = list(lock)
-    except TypeError:
-        names = [None]
+def _asked(lock: Any) -> dict[str, float | None]:
+    """Return {joint or pattern: value, or None at neutral} of what a caller locks."""
+    listed: Any = [lock] if isinstance(lock, str) else lock
+    names: list[Any] = [*listed] if isinstance(listed, Iterable) else [None]
     if not all(isinstance(name, str) for name in names):
         raise InputError(
             f"lock is a {type(lock).__name__}, expected {{joint: value}} or names of joints"
         )
-    return names
+    return dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(names)
 
 
 def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
-    """Weld joints at q (nq,). Pinocchio looks frames up by name, which links and joints may share.
-
-    The joints' own frames keep their names, by which it finds them.
-    """
+    """Weld joints at q (nq,)."""
+    # Pinocchio looks frames up by name, which links and joints may share: joints keep theirs.
     names = Counter(frame.name for frame in model.frames.tolist())
     shared: dict[str, str] = {}
     for index, frame in enumerate(model.frames):
@@ -310,20 +270,3 @@ def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
     for frame in reduced.frames:
         frame.name = shared.get(frame.name, frame.name)
     return reduced
-
-
-def _joint(model: pin.Model, index: int) -> Joint:
-    joint = model.joints[index]
-    kind = joint.shortname()
-    name = model.names[index]
-    if kind == "JointModelMimic":
-        raise ModelError(
-            f"joint '{name}' is a JointModelMimic, for which Pinocchio has no derivatives; load "
-            "the URDF with fflin.load, or build the model with mimic=False"
-        )
-    if joint.nv != 1 or joint.nq not in (1, 2):
-        raise ModelError(
-            f"joint '{name}' is a {kind.removeprefix('JointModel')} of {joint.nv} "
-            f"degrees of freedom, expected one; lock it (lock=['{name}'])"
-        )
-    return Joint(name, joint.idx_q, joint.idx_v, joint.nq == 2, kind.startswith("JointModelP"))

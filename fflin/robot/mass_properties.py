@@ -7,9 +7,8 @@ inequalities for physically-consistent inertial parameter identification, IEEE R
 Automation Letters 3(1), 2018).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
+from dataclasses import replace
 from hashlib import sha256
 from typing import Any
 
@@ -21,15 +20,17 @@ from fflin.base.names import by_name
 from fflin.base.validation import Array, as_double, number, vector, whole
 from fflin.base.validation import by_name as mapping
 from fflin.robot.frames import ROOT
-from fflin.robot.urdf.inertias import TRIANGLE_SLACK, is_impossible
+from fflin.robot.urdf.links import TRIANGLE_SLACK, is_impossible
+from fflin.robot.wheels import with_inputs
 
 _KEYS = ("mass", "com", "inertia")
 _SYMMETRIC = 1e-9
 _ROUNDING = 1e-12
 
 
-def with_bodies(model: pin.Model, bodies: Any) -> pin.Model:
-    """Return a copy of a model with other bodies, as `Robot.with_mass_properties` takes them."""
+def with_bodies(robot: Any, bodies: Any) -> Any:
+    """Return a robot with other bodies, see `Robot.with_mass_properties`."""
+    model = robot._bare.model
     given = mapping("bodies", bodies, "body")
     index_of = {"base": ROOT, **{model.names[i]: i for i in range(ROOT, model.njoints)}}
     links: dict[int, list[str]] = {}
@@ -50,7 +51,7 @@ def with_bodies(model: pin.Model, bodies: Any) -> pin.Model:
         if done.setdefault(index, value) is not value:
             raise InputError(f"the body '{body}' is given twice, as '{name}' too; give it once")
         new.inertias[index] = _given(name, value, model.inertias[index])
-    return new
+    return _of_model(robot, new)
 
 
 def _given(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
@@ -90,8 +91,9 @@ def _given(name: str, value: Any, old: pin.Inertia) -> pin.Inertia:
     return pin.Inertia(mass, com, inertia)
 
 
-def perturbed(model: pin.Model, seed: Any, **spreads: Any) -> pin.Model:
-    """Return a copy of a model with its bodies drawn at random, see `Robot.perturbed`."""
+def perturbed(robot: Any, seed: Any, **spreads: Any) -> Any:
+    """Return a robot with its bodies drawn at random, see `Robot.perturbed`."""
+    model = robot._bare.model
     checked = {key: number(key, value) for key, value in spreads.items()}
     for key, spread in checked.items():
         if not 0.0 <= spread < 1.0:
@@ -104,7 +106,7 @@ def perturbed(model: pin.Model, seed: Any, **spreads: Any) -> pin.Model:
             parts = (size * x for size, x in zip(sizes, np.split(drawn, (1, 4), 1), strict=True))
             mass, com, about = stretched(model.inertias[index], *parts)
             new.inertias[index] = pin.Inertia(float(mass[0]), com[0], about[0])
-    return new
+    return _of_model(robot, new)
 
 
 def with_inertias(robot: Any, bodies: Mapping[int, Any]) -> Any:
@@ -112,7 +114,23 @@ def with_inertias(robot: Any, bodies: Mapping[int, Any]) -> Any:
     model = robot._bare.model.copy()
     for index, (mass, com, inertia) in bodies.items():
         model.inertias[index] = pin.Inertia(float(mass), com, inertia)
-    return robot._of_model(model)
+    return _of_model(robot, model)
+
+
+def _of_model(robot: Any, model: pin.Model) -> Any:
+    """Return a robot with a model that has other masses and no wheels, and a hash of its own."""
+    robot.require_unchanged()
+    bare, told = robot._bare, robot.urdf_sha256
+    masses, before = (
+        b"".join(body.toDynamicParameters().tobytes() for body in each.inertias.tolist())
+        for each in (model, bare.model)
+    )
+    if masses != before:
+        told = sha256(told.encode() + masses).hexdigest()
+    other = replace(bare, model=model, urdf_sha256=told)
+    if bare is robot:
+        return other
+    return with_inputs(replace(robot, urdf_sha256=told, _wheelless=other), robot.inputs)
 
 
 def stretched(
@@ -132,12 +150,3 @@ def stretched(
     second = heavier[:, None, None] * second * stretch[:, :, None] * stretch[:, None]
     about = np.trace(second, axis1=1, axis2=2)[:, None, None] * unit - second
     return heavier * body.mass, body.lever + shift, about
-
-
-def identity(origin: str, model: pin.Model, before: pin.Model) -> str:
-    """Return the hash that tells a robot from those with other masses; its own for the same."""
-    new, old = (
-        b"".join(body.toDynamicParameters().tobytes() for body in each.inertias.tolist())
-        for each in (model, before)
-    )
-    return origin if new == old else sha256(origin.encode() + new).hexdigest()

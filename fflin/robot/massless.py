@@ -1,7 +1,5 @@
 """What of a robot can move without moving mass at every configuration, so that M is singular."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from weakref import WeakKeyDictionary
 
@@ -28,13 +26,10 @@ _INVOLVED = 0.1
 
 
 def idle_coordinates(robot: Robot) -> tuple[str, ...]:
-    r"""Name what can move together without moving mass, at every configuration; nothing mostly.
-
-    :math:`\nu^T M \nu` is the sum over bodies of :math:`m |v|^2 + \omega^T I \omega` and over
-    joints of their armature's share. It vanishes only if the velocity of every mass, every turn
-    that has inertia and every rate that has an armature do: whether some :math:`\nu` makes them
-    do so is a question of geometry, decided without the masses, whose rounding could hide it.
-    """
+    """Name what can move together without moving mass, at every configuration; nothing mostly."""
+    # The energy vanishes only if the velocity of every mass, every turn that has inertia and every
+    # rate that has an armature do: a question of geometry, decided without the masses, whose
+    # rounding could hide it.
     if robot not in _FOUND:
         _FOUND[robot] = _idle(robot)
     return _FOUND[robot]

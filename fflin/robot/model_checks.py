@@ -1,7 +1,5 @@
 """What a Pinocchio model must hold before anything is computed, and whether it was changed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,7 +7,57 @@ import pinocchio as pin
 
 from fflin.base.errors import ModelError
 from fflin.base.validation import is_rotation
-from fflin.robot.urdf.inertias import is_impossible
+from fflin.robot.frames import ROOT
+from fflin.robot.joints import Joint
+from fflin.robot.urdf.links import is_impossible
+
+
+def check_root(model: pin.Model, name: str) -> None:
+    """Refuse a model that is not one tree on one free-flyer."""
+    root = model.joints[ROOT].shortname() if model.njoints > ROOT else "none"
+    if root != "JointModelFreeFlyer":
+        raise ModelError(
+            f"'{name}': the root joint is {root}, expected JointModelFreeFlyer; build the model "
+            "with pin.JointModelFreeFlyer() as its root joint"
+        )
+    fixed = [model.names[i] for i in range(ROOT + 1, model.njoints) if model.parents[i] == 0]
+    if fixed:
+        raise ModelError(
+            f"'{name}': joint '{fixed[0]}' hangs on the world beside the free-flyer; "
+            "everything that moves must hang on one base"
+        )
+
+
+def joint_of(model: pin.Model, index: int) -> Joint:
+    """Return a joint, or refuse one that has not one degree of freedom."""
+    joint = model.joints[index]
+    kind = joint.shortname()
+    name = model.names[index]
+    if kind == "JointModelMimic":
+        raise ModelError(
+            f"joint '{name}' is a JointModelMimic, for which Pinocchio has no derivatives; load "
+            "the URDF with fflin.load, or build the model with mimic=False"
+        )
+    if joint.nv != 1 or joint.nq not in (1, 2):
+        raise ModelError(
+            f"joint '{name}' is a {kind.removeprefix('JointModel')} of {joint.nv} "
+            f"degrees of freedom, expected one; lock it (lock=['{name}'])"
+        )
+    return Joint(name, joint.idx_q, joint.idx_v, joint.nq == 2, kind.startswith("JointModelP"))
+
+
+def check_order(model: pin.Model, name: str) -> None:
+    """Refuse joints of which one hangs neither on the one before it nor on what that hangs on."""
+    above: list[int] = []
+    for joint, parent in enumerate(model.parents.tolist()):
+        while above and above[-1] != parent:
+            above.pop()
+        if joint and not above:
+            raise ModelError(
+                f"'{name}': the joints are not in depth-first order, in which Pinocchio's CRBA is "
+                "wrong; add the joints of one branch before those of the next"
+            )
+        above.append(joint)
 
 
 def check_model(model: pin.Model, name: str) -> None:
@@ -24,8 +72,7 @@ def check_model(model: pin.Model, name: str) -> None:
 
 
 def _of_parent(model: pin.Model, index: int) -> Iterator[str]:
-    parent = model.parents[index]
-    if not parent < index:
+    if not (parent := model.parents[index]) < index:
         yield f"has the parent {parent}, expected a joint before {index}"
 
 
@@ -51,25 +98,17 @@ def _of_joint(model: pin.Model, index: int) -> Iterator[str]:
 
 
 def change_in(model: pin.Model, made: pin.Model) -> str:
-    """Say what of a model that A, B and C depend on differs from what it was made as.
-
-    Frames may have been added, and limits changed; the answer is then empty.
-    """
-    for what, now, before in (
-        ("its joints", model.names.tolist(), made.names.tolist()),
-        ("the parents of its joints", model.parents.tolist(), made.parents.tolist()),
-        ("its gravity", model.gravity, made.gravity),
-    ):
-        if now != before:
+    """Say what A, B and C depend on and was changed; not frames added, nor limits."""
+    for what, key in {"its joints": "names", "the parents of its joints": "parents"}.items():
+        if getattr(model, key).tolist() != getattr(made, key).tolist():
             return what
-    for what, now, before in (
-        ("the axis", model.joints, made.joints),
-        ("the placement", model.jointPlacements, made.jointPlacements),
-        ("the inertia", model.inertias, made.inertias),
-    ):
-        for name, one, other in zip(made.names, now, before, strict=True):
-            if one != other:
-                return f"{what} of joint '{name}'"
+    if model.gravity != made.gravity:
+        return "its gravity"
+    of_joints = {"axis": "joints", "placement": "jointPlacements", "inertia": "inertias"}
+    for what, key in of_joints.items():
+        pairs = zip(made.names, getattr(model, key), getattr(made, key), strict=True)
+        for name in (name for name, now, before in pairs if now != before):
+            return f"the {what} of joint '{name}'"
     if not np.array_equal(model.armature, made.armature):
         return "its armature"
     for frame, before in zip(model.frames, made.frames, strict=False):

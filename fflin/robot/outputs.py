@@ -201,13 +201,7 @@ KINDS: tuple[type[Output], ...] = (
 
 
 def parse_output(text: str) -> tuple[Output, ...]:
-    """Read one output as it is written on a command line.
-
-    That is ``state``, ``base``, ``joints``, ``rates``, ``com`` or ``momentum``; of some joints
-    ``joints:NAME``, ``rates:NAME``, where a name may be a pattern; of a frame ``pose:NAME``,
-    ``velocity:NAME``, both as ``frame:NAME``, ``gyroscope:NAME``, ``accelerometer:NAME``; or of
-    two ``relative:NAME:TO``.
-    """
+    """Read outputs as a command line has them: WORD, joints:NAME, pose:NAME, relative:NAME:TO."""
     word, colon, rest = text.partition(":")
     kinds = {kind.WORD: (kind,) for kind in KINDS} | {"frame": (FramePose, FrameVelocity)}
     if word not in kinds:

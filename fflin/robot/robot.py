@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -12,25 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, ModelError, unknown
-from fflin.base.validation import DOUBLE, NORM_TOLERANCE, Array, vector
-from fflin.robot.fields import Range, checked_fields, checked_inputs, checked_passive, kept_start
+from fflin.base.errors import InputError, unknown
+from fflin.base.validation import Array
+from fflin.robot.coordinates import Coordinates
+from fflin.robot.fields import Range, checked_fields, checked_passive
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
-from fflin.robot.joints import Follower, Joint, check_followers_rates, followed
+from fflin.robot.joints import Follower, Joint
 from fflin.robot.link_masses import LinkMass
-from fflin.robot.model_checks import change_in
 from fflin.robot.outputs import FullState, Output
-from fflin.robot.wheels import stored_momentum, with_wheels
-
-_CONFIGURATION = "a configuration in Pinocchio's order"
-
-# What renormalising a unit quaternion leaves: two ulp of unity.
-ROUND_OFF = 2.0 * float(np.finfo(float).eps)
-
-# Data holds a third-order tensor of nv^3 entries among others: about 32 nv^3 bytes in all.
-_DATA_BYTES_PER_NV3 = 32
-_DATA_LIMIT = 2**30
+from fflin.robot.wheels import stored_momentum, with_inputs
 
 
 class Springs(NamedTuple):
@@ -42,7 +32,7 @@ class Springs(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Robot:
+class Robot(Coordinates):
     """A robot floating free; made by `load` or `from_model`.
 
     Attributes
@@ -180,7 +170,7 @@ class Robot:
         if "passive" in fields:
             robot = robot._without_motors(fields.pop("passive"))
         if "inputs" in fields:
-            robot = robot._with_inputs(fields.pop("inputs"))
+            robot = with_inputs(robot, fields.pop("inputs"))
         joints, own = robot.joint_names, robot._bare.joint_names
         known = (robot.joint, joints, own, robot.inputs, self.urdf_damping)
         robot = replace(robot, **checked_fields(fields, *known))
@@ -215,7 +205,7 @@ class Robot:
         """
         from fflin.robot.mass_properties import with_bodies
 
-        return self._of_model(with_bodies(self._bare.model, bodies))
+        return with_bodies(self, bodies)
 
     def perturbed(
         self, *, mass: float = 0.1, com: float = 0.1, inertia: float = 0.1, seed: int = 0
@@ -240,8 +230,7 @@ class Robot:
         """
         from fflin.robot.mass_properties import perturbed
 
-        model = perturbed(self._bare.model, seed, mass=mass, com=com, inertia=inertia)
-        return self._of_model(model)
+        return perturbed(self, seed, mass=mass, com=com, inertia=inertia)
 
     @property
     def used_frames(self) -> tuple[str, ...]:
@@ -265,26 +254,6 @@ class Robot:
         """Stiffness, damping and rest positions (n,) in state order."""
         given = (self.stiffness, self.damping, self.rest)
         return Springs(*(np.array([x.get(name, 0.0) for name in self.joint_names]) for x in given))
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Names of the n independent joints in state order."""
-        return tuple(joint.name for joint in self.joints)
-
-    @property
-    def n(self) -> int:
-        """Number of independent joints."""
-        return len(self.joints)
-
-    @cached_property
-    def nq(self) -> int:
-        """Size of Pinocchio's configuration."""
-        return int(self.model.nq)
-
-    @cached_property
-    def nv(self) -> int:
-        """Size of Pinocchio's velocity: 6 + n, and one for each mimic joint."""
-        return int(self.model.nv)
 
     @property
     def mass(self) -> float:
@@ -319,76 +288,6 @@ class Robot:
             raise InputError(f"joint '{name}' is locked; lock it at another value instead")
         raise unknown("joint", name, self.joint_names)
 
-    def neutral(self) -> Array:
-        """Return the neutral configuration (nq,): mimic joints where their leaders put them."""
-        q = pin.neutral(self.model)
-        self.follow(q)
-        return q
-
-    def follow(self, q: Array) -> None:
-        """Put the mimic joints of a configuration where their leaders say."""
-        for follower in self.followers:
-            follower.place(q)
-
-    def checked_configuration(self, q: Array) -> Array:
-        """Return `q` as a valid configuration of this robot.
-
-        Parameters
-        ----------
-        q : array_like (nq,)
-            Configuration in Pinocchio's order. Its quaternion, the (cos, sin) of every continuous
-            joint and the mimic joints are put right where they are within 1e-6.
-
-        Returns
-        -------
-        ndarray (nq,)
-            `q` itself where nothing was to be done, never modified.
-
-        Raises
-        ------
-        InputError
-            If the size is wrong, an entry is not finite, a part is not of unit length, or a mimic
-            joint is not where its leader puts it.
-        """
-        if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != (self.nq,):
-            q = vector("q", q, self.nq, _CONFIGURATION)
-        entries = q.tolist()
-        if not math.isfinite(sum(entries)):
-            vector("q", q, self.nq, _CONFIGURATION)  # says which entry it is
-        x, y, z, w = entries[3:7]
-        worst = abs(x * x + y * y + z * z + w * w - 1.0)
-        if worst > NORM_TOLERANCE:
-            raise InputError(
-                f"the base quaternion q[3:7] has length {np.linalg.norm(q[3:7]):.9g}, expected 1; "
-                "normalise it (x, y, z, w)"
-            )
-        for index in self.unbounded:
-            c, s = entries[index], entries[index + 1]
-            excess = abs(c * c + s * s - 1.0)
-            if excess > worst:
-                worst = excess
-                if excess > NORM_TOLERANCE:
-                    raise InputError(
-                        f"(cos, sin) of continuous joint '{self.unbounded[index]}', "
-                        f"q[{index}:{index + 2}], has length {np.hypot(c, s):.9g}, expected 1"
-                    )
-        if worst > ROUND_OFF:
-            q = pin.normalize(self.model, q)
-        return followed(self.followers, q) if self.followers else q
-
-    def checked_velocity(self, v: Array) -> Array:
-        """Return `v` as a valid velocity (nv,), never modified.
-
-        Raises
-        ------
-        InputError
-            If the size is wrong, an entry is not finite, or a mimic joint does not move as its
-            leader makes it.
-        """
-        v = vector("v", v, self.nv, "a velocity in Pinocchio's order")
-        check_followers_rates(self.followers, v)
-        return v
-
     @property
     def _bare(self) -> Robot:
         """The robot without the wheels among its joints."""
@@ -402,76 +301,3 @@ class Robot:
         if not inputs:
             raise InputError("passive leaves no input; a model needs at least one")
         return replace(self, passive=joints, inputs=inputs)
-
-    def _with_inputs(self, inputs: Any) -> Robot:
-        """Return the robot with other inputs, and with the wheels among them as joints."""
-        bare = self._bare
-        checked = checked_inputs(inputs, bare.joint, bare.joint_names, self.passive)
-        wheels = [(name, wheel) for name, wheel in named_wheels(checked) if wheel.inertia]
-        model, joints, followers = with_wheels(bare.model, bare.joints, bare.followers, wheels)
-        names = [joint.name for joint in joints]
-        of_joints: dict[str, Any] = {
-            field: {name: x for name, x in getattr(self, field).items() if name in names}
-            for field in ("stiffness", "damping", "rest")
-        }
-        return replace(
-            self,
-            model=model,
-            joints=joints,
-            followers=followers,
-            inputs=checked,
-            start=kept_start(self.start, names),
-            _wheelless=bare if wheels else None,
-            **of_joints,
-        )
-
-    def _of_model(self, model: pin.Model) -> Robot:
-        """Return the robot with a model that has other masses and no wheels."""
-        from fflin.robot.mass_properties import identity
-
-        self.require_unchanged()
-        told = identity(self.urdf_sha256, model, self._bare.model)
-        other = replace(self._bare, model=model, urdf_sha256=told)
-        if self._wheelless is None:
-            return other
-        return replace(self, urdf_sha256=told, _wheelless=other)._with_inputs(self.inputs)
-
-    def require_unchanged(self) -> None:
-        """Raise `ModelError` where the model was changed in place after the robot was made.
-
-        Results prepared before the change would be of another robot than those made after it.
-        """
-        assert self._as_made is not None
-        made = self._as_made[1]
-        # Tells in a microsecond that nothing at all was changed.
-        if self.model != made and (change := change_in(self.model, made)):
-            raise ModelError(
-                f"the model of '{self.name}' was changed after the robot was made: {change}; make "
-                "a robot of it with fflin.from_model(model)"
-            )
-
-    def create_data(self) -> pin.Data:
-        """Make Pinocchio's work space for this robot.
-
-        Raises
-        ------
-        ModelError
-            If it would take more than 1 GiB.
-        """
-        self.require_room()
-        return self.model.createData()
-
-    def require_room(self) -> None:
-        """Raise `ModelError` where Pinocchio's work space would take more than 1 GiB."""
-        size = _DATA_BYTES_PER_NV3 * self.nv**3
-        if size > _DATA_LIMIT:
-            raise ModelError(
-                f"'{self.name}' has {self.n} joints, for which Pinocchio's Data takes about "
-                f"{size / 2**30:.1f} GiB (limit 1 GiB); lock joints that do not matter"
-            )
-
-    @cached_property
-    def unbounded(self) -> dict[int, str]:
-        """{index of the cosine in q: joint} of the joints that turn without end."""
-        joints = (*self.joints, *(follower.joint for follower in self.followers))
-        return {joint.idx_q: joint.name for joint in joints if joint.unbounded}

@@ -13,7 +13,7 @@ from fflin.base.names import stands_for_any
 from fflin.base.toml_file import TomlFile, flat
 from fflin.robot.catalog import find_robot
 from fflin.robot.fields import FIELDS
-from fflin.robot.input_files import check_keys, is_number, read_inputs
+from fflin.robot.input_files import NAME, NUMBER, check_keys, read_inputs
 from fflin.robot.outputs import parse_output
 
 if TYPE_CHECKING:
@@ -57,10 +57,7 @@ class RobotToml:
         self._fields = {key: given[key] for key in FIELDS if key in given}
 
     def applied(self, robot: Robot) -> Robot:
-        """Return the robot of the URDF with what the file says.
-
-        Of joints that the file does not lock and that are locked nevertheless, it says nothing.
-        """
+        """Return the robot of the URDF with what the file says, but of joints that others lock."""
         locked = [each.rpartition("=")[0] for each in robot.locked]
         gone = [name for name in locked if not any(stands_for_any(x, [name]) for x in self.lock)]
         for key, value in self._fields.items():
@@ -71,10 +68,7 @@ class RobotToml:
 
     @contextmanager
     def placed(self, key: str) -> Iterator[None]:
-        """Put file and line in front of what is wrong about a key.
-
-        Of the lock, where others lock joints too, about a joint that it names.
-        """
+        """Put file and line in front of what is wrong about a key, of the lock if it names it."""
         try:
             yield
         except FflinError as error:
@@ -107,11 +101,9 @@ class RobotToml:
             parts = {part: flat(x) if isinstance(x, dict) else x for part, x in parts.items()}
             value = parts.get("", parts)
         named = key in _OF_NAMES and not isinstance(value, dict)
+        right, expected = NAME if named else NUMBER
         for *place, leaf in _leaves(value, key):
-            right, expected = is_number(leaf), "a finite number"
-            if named:
-                right, expected = isinstance(leaf, str) and leaf != "", "a name in quotes"
-            if not right and not (isinstance(leaf, str) and place in _WORDS):
+            if not right(leaf) and not (isinstance(leaf, str) and place in _WORDS):
                 shown = f"{'.'.join(place)} is {reprlib.repr(leaf)}, expected {expected}"
                 raise self._document.error(shown, *place)
         return [value] if key in _OF_NAMES[1:] and isinstance(value, str) else value

@@ -1,7 +1,5 @@
 """What a robot is, in words and tables."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Iterable

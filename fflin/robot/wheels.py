@@ -1,17 +1,20 @@
 """Reaction wheels on a model: the joints of those with an inertia, the momentum of the others."""
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
+from fflin.base.frozen import frozen
 from fflin.base.validation import Array
+from fflin.robot.fields import checked_inputs, kept_start
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.inputs import Input, ReactionWheel, named_wheels
-from fflin.robot.joints import Follower, Joint
-from fflin.robot.urdf.inertias import is_impossible
+from fflin.robot.joints import Joint
+from fflin.robot.urdf.links import is_impossible
 
 # What Pinocchio keeps of each degree of freedom, and of each entry of q, beside the joint itself.
 _OF_VELOCITY = (
@@ -45,24 +48,40 @@ def stored_momentum(model: pin.Model, inputs: Sequence[Input]) -> tuple[tuple[in
         if wheel.momentum:
             joint, axis = carrier(model, wheel)
             stored[joint] = stored.get(joint, np.zeros(3)) + wheel.momentum * axis
-    for momentum in stored.values():
-        momentum.setflags(write=False)
-    return tuple(stored.items())
+    return tuple((joint, frozen(momentum)) for joint, momentum in stored.items())
 
 
-def with_wheels(
-    model: pin.Model,
-    joints: tuple[Joint, ...],
-    followers: tuple[Follower, ...],
-    wheels: Sequence[tuple[str, ReactionWheel]],
-) -> tuple[pin.Model, tuple[Joint, ...], tuple[Follower, ...]]:
-    """Return a model with one more joint for each wheel, its joints in order, and its followers.
+def with_inputs(robot: Any, inputs: Any) -> Any:
+    """Return a robot with other inputs, and with the wheels among them as joints."""
+    bare = robot._bare
+    checked = checked_inputs(inputs, bare.joint, bare.joint_names, robot.passive)
+    wheels = [(name, wheel) for name, wheel in named_wheels(checked) if wheel.inertia]
+    model, joints, followers = bare.model, bare.joints, bare.followers
+    if wheels:
+        model = _with_wheels(model, wheels)
+        turning = (Joint(name, 0, 0, unbounded=True, prismatic=False) for name, _ in wheels)
+        placed = [joint.within(model) for joint in (*joints, *turning)]
+        joints = tuple(sorted(placed, key=lambda joint: joint.idx_v))
+        followers = tuple(
+            each._replace(joint=each.joint.within(model), leader=each.leader.within(model))
+            for each in followers
+        )
+    names = [joint.name for joint in joints]
+    of_joints: dict[str, Any] = {
+        field: {name: x for name, x in getattr(robot, field).items() if name in names}
+        for field in ("stiffness", "damping", "rest")
+    }
+    return replace(
+        robot,
+        **{"model": model, "joints": joints, "followers": followers, "inputs": checked},
+        start=kept_start(robot.start, names),
+        _wheelless=bare if wheels else None,
+        **of_joints,
+    )
 
-    The bodies of the model, which is not changed, count the wheels. A wheel comes after all joints
-    below its carrier, so that joints stay in depth-first order, without which CRBA would be wrong.
-    """
-    if not wheels:
-        return model, joints, followers
+
+def _with_wheels(model: pin.Model, wheels: Sequence[tuple[str, ReactionWheel]]) -> pin.Model:
+    """Return a model with one more joint for each wheel, which the bodies of this one count."""
     carried: dict[int, list[_Mounted]] = {}
     bodies = [pin.Inertia(body) for body in model.inertias.tolist()]
     for name, wheel in wheels:
@@ -75,14 +94,7 @@ def with_wheels(
         of = "the base" if joint == ROOT else f"the link of joint '{model.names[joint]}'"
         bodies[joint] = _without(bodies[joint], mounted, of)
         carried.setdefault(joint, []).append(mounted)
-    new = _rebuilt(model, bodies, carried)
-    turning = (Joint(name, 0, 0, unbounded=True, prismatic=False) for name, _ in wheels)
-    new_joints = [joint.within(new) for joint in (*joints, *turning)]
-    new_followers = (
-        follower._replace(joint=follower.joint.within(new), leader=follower.leader.within(new))
-        for follower in followers
-    )
-    return new, tuple(sorted(new_joints, key=lambda joint: joint.idx_v)), tuple(new_followers)
+    return _rebuilt(model, bodies, carried)
 
 
 def _without(body: pin.Inertia, wheel: _Mounted, of: str) -> pin.Inertia:
@@ -143,6 +155,7 @@ def _depth_first(
     model: pin.Model, carried: dict[int, list[_Mounted]], root: int = ROOT
 ) -> Iterator[int | tuple[int, _Mounted]]:
     """Yield the joints from a root on, and the wheels of each after all that hang on it."""
+    # Else the joints would not be in depth-first order, without which CRBA is wrong.
     yield root
     for child in model.children[root]:
         yield from _depth_first(model, carried, child)

@@ -3,8 +3,6 @@
 Without force from outside, the momentum about a fixed point and r_c(t) = r_c(0) + p t / m stay.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -31,17 +29,10 @@ class Histories(NamedTuple):
 
 
 class Conserved:
-    """Energy and momentum of a robot.
+    """Energy, and momentum: linear, then angular about a fixed point, in world axes."""
 
-    Momentum is linear, then angular about a fixed point, in world axes. That point stands in for
-    the world's origin throughout, for digits would be lost far away from it.
-
-    Parameters
-    ----------
-    robot : Robot
-    start : ndarray (nq,)
-        A configuration; the point is near its base.
-    """
+    # The point, near the base of `start`, stands in for the world's origin throughout, for digits
+    # would be lost far away from it.
 
     def __init__(self, robot: Robot, start: Array) -> None:
         self._robot, self.mass = robot, robot.mass
@@ -58,16 +49,11 @@ class Conserved:
 
     def about_point(self, history: Histories) -> Array:
         """Return the momentum (N, 6) about the point."""
-        total = history.momentum.copy()
-        total[:, 3:] += np.cross(history.center, total[:, :3])
-        return total
+        p, about_center = np.split(history.momentum, 2, axis=1)
+        return np.hstack((p, about_center + np.cross(history.center, p)))
 
     def wrench(self, q: Array, push: Array) -> Array:
-        """Return the wrench (6,) about the point, in world axes, of what pushes the robot.
-
-        `push` (6,) is the wrench at the base origin in base axes, linear then angular: the sum
-        of all that acts from outside. Gravity is added.
-        """
+        """Return the wrench (6,) about the point, in world axes, of a plant's push and gravity."""
         total: Array = self._base(q).toDualActionMatrix().dot(push)
         if self._weight is not None:
             near = q.copy()
@@ -78,18 +64,10 @@ class Conserved:
         return total
 
     def impose(self, q: Array, v: Array, momentum: Array, center: Array) -> None:
-        r"""Shift the base of `q` and set its velocity in `v`, in place, so that both are kept.
-
-        The centre of mass comes to `center` (3,), seen from the point, and the momentum (6,) is
-        the given one:
-
-        .. math::
-
-            r_b = r_c - R\, c_b, \qquad \nu_b = M_{bb}^{-1} (H_b - M_{bm} \dot q_m)
-
-        The velocity is corrected by what the momentum lacks, so that rounding is of the second
-        order. M is in base axes, and a shift leaves it as it is.
-        """
+        """Shift the base of `q` and set its velocity in `v`, in place, so that both are kept."""
+        # r_b = r_c - R c_b and nu_b = M_bb^-1 (H_b - M_bm qdot_m); the velocity is corrected by
+        # what the momentum lacks, so that rounding is of the second order. M is in base axes, and
+        # a shift leaves it as it is.
         _crba(self._model, self._data, q)
         if self._stored:
             pin.forwardKinematics(self._model, self._data, q)
@@ -132,11 +110,7 @@ class Conserved:
         return Histories(energy, momentum, center, of_base)
 
     def momentum_drift(self, history: Histories, expected: Array) -> Array:
-        """Return how far the momentum is from what is expected (N, 6), relative (N,).
-
-        To the largest sum of what base, joints and wheels add to it; about a fixed point the
-        flight of the whole counts too.
-        """
+        """Return how far the momentum is off, relative to what base, joints and wheels add."""
         p = history.momentum[:, :3]
         flight = np.linalg.norm(history.center, axis=1) * np.linalg.norm(p, axis=1)
         shares = (history.of_base, history.momentum - history.of_base)
@@ -167,27 +141,17 @@ class Conserved:
 
 
 class Course:
-    r"""Momentum and centre of mass as the impulse from outside takes them, step by step.
+    """Momentum and centre of mass as the impulse from outside takes them, step by step: (11.2)."""
 
-    .. math:: H(t) = H(0) + \int w\,dt, \qquad r_c(t) = r_c(0) + \int p / m\,dt
-
-    (11.2) of docs/derivation.md, where w is summed with the weights of the integrator's stages, and
-    p with those of its positions.
-
-    Attributes
-    ----------
-    momentum : ndarray (6,)
-        About the point.
-    wrenches : tuple of ndarray (6,)
-        Of the stages of a step, about the point, to be written.
-    """
+    momentum: Array  # (6,) about the point
+    wrenches: tuple[Array, ...]  # (6,) of the stages of a step, about the point, to be written
 
     def __init__(
         self, conserved: Conserved, method: type[Integrator], h: float, q: Array, v: Array
     ) -> None:
         history = conserved.histories(q[None], v[None])
         per_mass = 1.0 / conserved.mass
-        self.momentum: Array = conserved.about_point(history)[0]
+        self.momentum = conserved.about_point(history)[0]
         self._momentum, self._start = self.momentum, history.center[0]
         # The line that is followed while nothing pushes: place and velocity.
         self._line = np.column_stack((self._start, self.momentum[:3] * per_mass))
@@ -196,10 +160,8 @@ class Course:
         # wrenches of a step. Where nothing pushes they stay zero, so that no rounding adds up.
         self._stack = np.zeros((2 + len(method.weights), 6))
         self._sums, self.wrenches = self._stack[:2], tuple(self._stack[2:])
-        weights, moments = np.array(method.weights), np.array(method.moments)
-        self._after = np.array(
-            [[1.0, 0.0, *(h * weights)], [h * per_mass, 1.0, *(h * h * per_mass * moments)]]
-        )
+        weights, moments = h * np.array(method.weights), h * h * np.array(method.moments)
+        self._after = np.array([[1.0, 0.0, *weights], [h * per_mass, 1.0, *(per_mass * moments)]])
 
     def center(self, t: float) -> Array:
         """Return where the centre of mass is (3,), seen from the point."""

@@ -83,12 +83,7 @@ class Motion(Design):
 
     OPEN: ClassVar = ("limits",)
     VECTORS: ClassVar = (
-        "t",
-        "energy",
-        "momentum_drift",
-        "com_drift",
-        "placement",
-        "wheel_inertias",
+        *("t", "energy", "momentum_drift", "com_drift", "placement", "wheel_inertias"),
     )
 
     t: Array
@@ -123,9 +118,8 @@ class Motion(Design):
     def __post_init__(self) -> None:
         rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)
         may_lack = (self.prediction, self.com_drift)
-        if {len(each) for each in rows} != {len(self.t)} or any(
-            len(each) not in (0, len(self.t)) for each in may_lack
-        ):
+        count = len(self.t)
+        if any(len(x) != count for x in rows) or any(len(x) not in (0, count) for x in may_lack):
             raise InputError("the rows of the motion are not as many as its times")
         if self.target.size in (0, self.x.shape[1]):  # of .mat, which knows no vectors
             object.__setattr__(self, "target", self.target.ravel())
@@ -176,9 +170,7 @@ class Motion(Design):
     @property
     def attitude_error(self) -> Array | None:
         """Angle (N,) [deg] between the base's attitude and the target's; None without target."""
-        if not self.target.size:
-            return None
-        return attitude_errors(self.x, self.target)
+        return attitude_errors(self.x, self.target) if self.target.size else None
 
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
         """Return the motion by knots, with inputs that are held or linear: what it holds to better.
@@ -216,10 +208,12 @@ class Motion(Design):
         return saturated(self.t, (each for each in self._limited() if each[0] in names))
 
     def _limited(self) -> Iterator[Limited]:
-        names = (*self.state_names, *self.input_names)
-        units, values = (*self.state_units, *self.input_units), np.hstack((self.x, self.u)).T
+        names, units = self.state_names + self.input_names, self.state_units + self.input_units
+        found = dict(
+            zip(names, zip(np.hstack((self.x, self.u)).T, units, strict=True), strict=True)
+        )
         for name, limits in zip(self.limit_names, self.limits, strict=True):
-            yield name, values[names.index(name)], units[names.index(name)], limits
+            yield name, *found[name], limits
 
     def save(self, path: str | Path) -> None:
         """Write it to a .npz, .mat, .json or .csv file, whole or not at all.

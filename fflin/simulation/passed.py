@@ -1,7 +1,5 @@
 """Which limits a motion passed, and which inputs were at theirs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any, NamedTuple, TypeAlias
 

@@ -1,7 +1,5 @@
 """What a simulation is to do: its start, times, limits, method and events, checked."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
@@ -157,10 +155,7 @@ def law_of(policy: Any, plant: Plant, limits: Saturation, times: Times) -> Law |
 
 
 def turning(robot: Robot) -> Array:
-    """Return where angular velocities stand, less those of rotors.
-
-    A rotor may spin as fast as it will: nothing depends on its angle.
-    """
+    """Return where angular velocities stand, less those of rotors, which may be of any size."""
     rotors = rotor_names(robot)
     joints = [joint for joint in robot.joints if not joint.prismatic and joint.name not in rotors]
     return np.array([3, 4, 5, *(joint.idx_v for joint in joints)])

@@ -1,7 +1,5 @@
 """The accelerations of a robot in simulation, and what pushes it from outside."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
@@ -15,6 +13,8 @@ from fflin.dynamics.aba import Aba
 from fflin.dynamics.state import StateMap
 from fflin.robot.massless import require_inertia
 
+# Returns of (t, q, v) a generalised force (nv,) in Pinocchio's order: on the base linear, then
+# angular, in base axes; then on the joints.
 Disturbance: TypeAlias = Callable[[float, Array, Array], ArrayLike]
 
 _aba = pin.aba
@@ -32,24 +32,10 @@ class Drives(NamedTuple):
 
 
 class Plant:
-    """The nonlinear robot under inputs and a disturbance.
-
-    Parameters
-    ----------
-    state : StateMap
-        Its frame says the axes of the inputs on the base.
-    disturbance : callable, optional
-        disturbance(t, q, v) -> generalised force (nv,) in Pinocchio's order: on the base linear,
-        then angular, in base axes; then on the joints.
-    drives : Drives, optional
-        Errors of the inputs; none by default.
-    """
+    """The nonlinear robot under inputs in the axes of a state's frame, and a disturbance."""
 
     def __init__(
-        self,
-        state: StateMap,
-        disturbance: Disturbance | None = None,
-        drives: Drives | None = None,
+        self, state: StateMap, disturbance: Disturbance | None = None, drives: Drives | None = None
     ) -> None:
         robot = state.robot
         require_inertia(robot)
@@ -78,23 +64,21 @@ class Plant:
         )
 
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-        """Return dv/dt (nv,) in Pinocchio's order, and what pushes from outside.
-
-        The latter is the sum (6,) of all wrenches but gravity's at the base origin, linear then
-        angular in base axes.
-        """
+        """Return dv/dt (nv,), and the wrench (6,) on the base but gravity's, in base axes."""
         if self._faulty:
             gain, bias, until = self.drives
             u = np.where(t < until, gain * u + bias, 0.0)
-        if self.actuation.held:
-            u = self._in_base_axes(q, u)
+        if self.actuation.held:  # in reference axes: in base axes at any turn
+            R, u = self.state.rotation(q), u.copy()
+            for held in self.actuation.held:
+                u[held.columns] = u[held.columns].dot(R)
         if self._plain and self.disturbance is None:
             tau = self._columns.dot(u)
             return _aba(self._model, self._data, q, v, tau), tau[:6]
         push = (self.actuation.columns(self._data, q)[:6] @ u)[_LINEAR_FIRST]
         if self.disturbance is None:
             return self._aba.acceleration(q, v, u), push
-        disturbed = self._disturbed(t, q, v)
+        disturbed = self._disturbed(self.disturbance(t, q.copy(), v.copy()), t, v)
         return self._aba.acceleration(q, v, u, disturbed), push + disturbed[:6]
 
     def isolated(self, *, driven: bool) -> bool:
@@ -103,17 +87,7 @@ class Plant:
         base = driven and (self._columns[:6].any() or self.actuation.carried)
         return not (base or self.disturbance is not None or any(self.robot.gravity))
 
-    def _in_base_axes(self, q: Array, u: Array) -> Array:
-        """Return u (nu,) with what is held in reference axes in base axes, at any turn."""
-        R = self.state.rotation(q)
-        u = u.copy()
-        for held in self.actuation.held:
-            u[held.columns] = u[held.columns].dot(R)
-        return u
-
-    def _disturbed(self, t: float, q: Array, v: Array) -> Array:
-        assert self.disturbance is not None
-        given = self.disturbance(t, q.copy(), v.copy())
+    def _disturbed(self, given: ArrayLike, t: float, v: Array) -> Array:
         force = as_double(f"disturbance(t, q, v) at t = {t:g} s", given)
         finite = np.isfinite(force).all() or not np.abs(v).max() < _DIVERGED
         if force.shape != (self.robot.nv,) or not finite:

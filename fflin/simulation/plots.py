@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fflin.base.figures import COLORS, cycle, saved, styled, target_of
+from fflin.base.figures import COLORS, cycle, drawing
 from fflin.base.validation import Array
 
 if TYPE_CHECKING:
@@ -33,10 +33,7 @@ _GROUPS = {
 
 
 class Signals(NamedTuple):
-    """Histories (N, k), with names GROUP.NAME and units, and limits (2,) by name.
-
-    Beside them those of the linear model, and the reference that they follow.
-    """
+    """Histories (N, k) with names GROUP.NAME, limits (2,) by name, and what they go beside."""
 
     values: Array
     names: Sequence[str]
@@ -81,13 +78,7 @@ def draw(
     rest: float | None = None,
     path: str | Path | None = None,
 ) -> Figure:
-    """Draw states, those of the linear model dashed, inputs and {label: drift} over time.
-
-    `wheels` is {name: inertia} of the joints that are wheels; their momenta are drawn where the
-    inertia is known. What they are `apart` from is drawn below the states, with its title. A thin
-    line marks the time at which a reference comes to `rest`.
-    """
-    target = target_of(path)
+    """Draw states, what they are `apart` from, inputs, `wheels` {name: inertia} and drifts."""
     groups: dict[str, list[int]] = {}
     for index, name in enumerate(states.names):
         group, _, entry = name.partition(".")
@@ -97,11 +88,9 @@ def draw(
     across = 3 if len(groups) > 4 else 4
     # With the drift, in as few rows of up to four as there can be.
     rows = math.ceil((len(panels) + 1) / 4)
-    with styled() as figure_class:
-        both = apart is not None
-        heights = [3.0, 1.2][: 1 + both] * math.ceil(len(groups) / across) or [0.01]
-        size = (11.0, 0.3 + 3.0 * rows + 0.9 * sum(heights))
-        figure = figure_class(figsize=size, layout="constrained")
+    both = apart is not None
+    heights = [3.0, 1.2][: 1 + both] * math.ceil(len(groups) / across) or [0.01]
+    with drawing(path, 11.0, 0.3 + 3.0 * rows + 0.9 * sum(heights)) as figure:
         above, below = figure.add_gridspec(2, 1, height_ratios=[sum(heights), 3.0 * rows])
         spaces = {"hspace": 0.06, "wspace": 0.06}
         grid = above.subgridspec(len(heights), across, height_ratios=heights, **spaces)
@@ -135,7 +124,7 @@ def draw(
             axes.axvline(rest, lw=0.8, ls=":", color="#555555", label="_rest")
         _drifts(figure.add_subplot(next(places)), t, drifts)
         figure.suptitle(title, fontsize=11)
-        return saved(figure, target)
+    return figure
 
 
 def _panels(states: Signals, inputs: Signals, wheels: Mapping[str, float]) -> dict[str, _Panel]:
@@ -250,13 +239,8 @@ def _below(figure: Figure, lines: Mapping[str, Line2D], title: str, side: str) -
     letters = 150 if side == "center" else 75
     columns = min(len(lines), 8, max(1, letters // (max(map(len, lines)) + 6)))
     place: Any = f"outside lower {side}"
-    figure.legend(
-        handles=list(lines.values()),
-        loc=place,
-        ncols=columns,
-        handlelength=1.6,
-        title=title,
-    )
+    named = list(lines.values())
+    figure.legend(handles=named, loc=place, ncols=columns, handlelength=1.6, title=title)
 
 
 def _drifts(axes: Axes, t: Array, drifts: Mapping[str, Array]) -> None:

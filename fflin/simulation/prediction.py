@@ -1,7 +1,5 @@
 """The motion that the linear model predicts under the law that the robot is under."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
@@ -20,17 +18,12 @@ from fflin.linear.model import LinearModel
 from fflin.simulation.plan import LinearLaw, Plan, Predictor
 from fflin.simulation.plant import Plant
 
+_SHARES = (0.0, 0.5, 0.5, 1.0)  # of a step, at which its stages are
 _WHY_NOT = {Allocation: "an Allocation has thrusters that cannot pull, so that it is not linear"}
 
 
 def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryFeedback | None:
-    """Return what predicts a run: the policy's own model, or the one that is given.
-
-    Raises
-    ------
-    InputError
-        Where one is asked for that cannot.
-    """
+    """Return what predicts a run: the policy's own model, or the one that is given."""
     if isinstance(linear, np.bool_):
         linear = bool(linear)
     if linear is False:
@@ -114,19 +107,7 @@ def _law(policy: Any, lin: LinearModel) -> Callable[[], LinearLaw] | None:
 
 
 def predict(plan: Plan, x: Array, steps: int, target: Array) -> Array:
-    """Return the states (N, nx) of the linear model in closed loop; no rows where it has none.
-
-    Parameters
-    ----------
-    plan : Plan
-        Its model is continuous, or sampled with the time of the samples.
-    x : ndarray (N, nx)
-        The states of the nonlinear robot, where the first row begins.
-    steps : int
-        That are taken; the last one has a row in any case.
-    target : ndarray (N, nx)
-        The states of the trajectory that is followed, where one is.
-    """
+    """Return the states (N, nx) of the linear model in closed loop; no rows where it has none."""
     if plan.predictor is None:
         return x[:0]
     # A prediction that overflows is none.
@@ -167,19 +148,16 @@ def _states(predictor: Predictor, plan: Plan, x: Array, steps: int) -> Array:
 
     held = lin.discretize(dt)
 
-    def after(e: Array) -> Array:
-        stages: list[Array] = []
-        for share in (0.0, 0.5, 0.5, 1.0):
-            at = e + share * dt * stages[-1] if stages else e
-            stages.append(lin.A @ at + lin.B @ (channel.ask(at) - u0) + lin.f0)
-        whole: Array = e + dt / 6.0 * (stages[0] + 2.0 * (stages[1] + stages[2]) + stages[3])
-        return whole
+    def slope(_: int, e: Array) -> Array:
+        rate: Array = lin.A @ e + lin.B @ (channel.ask(e) - u0) + lin.f0
+        return rate
 
     shift: Array = np.zeros(0)
     transition: Array = np.zeros((0, 0))
     if not sample and not channel.cuts:  # then a step is a matrix and a shift
-        shift = after(np.zeros(len(e)))
-        transition = np.column_stack([after(unit) - shift for unit in np.eye(len(e))])
+        shift = _after(dt, np.zeros(len(e)), slope)
+        columns = [_after(dt, unit, slope) - shift for unit in np.eye(len(e))]
+        transition = np.column_stack(columns)
     for step in range(steps):
         u = channel.begin(step, e) if sample else u0
         if step % every == 0:
@@ -187,8 +165,17 @@ def _states(predictor: Predictor, plan: Plan, x: Array, steps: int) -> Array:
         if sample:
             e = held.A @ e + held.B @ (u - u0) + held.f0
         else:
-            e = transition.dot(e) + shift if len(shift) else after(e)
+            e = transition.dot(e) + shift if len(shift) else _after(dt, e, slope)
     return np.array([*rows, e]) + x0
+
+
+def _after(dt: float, e: Array, slope: Callable[[int, Array], Array]) -> Array:
+    """Return e a step later, by the classical Runge-Kutta method, of its slope at each stage."""
+    stages: list[Array] = []
+    for stage, share in enumerate(_SHARES):
+        stages.append(slope(stage, e + share * dt * stages[-1] if stages else e))
+    after: Array = e + dt / 6.0 * (stages[0] + 2.0 * (stages[1] + stages[2]) + stages[3])
+    return after
 
 
 def _errors(policy: TrajectoryFeedback, plan: Plan, e: Array, steps: int) -> Array:
@@ -229,14 +216,14 @@ def _errors(policy: TrajectoryFeedback, plan: Plan, e: Array, steps: int) -> Arr
         before, half, after = after, at(t + 0.5 * dt), at(t + dt)
         # What the trajectory holds ends with the step, whatever acts from the next knot on.
         last = at(t + (1.0 - 1e-6) * dt) if held else after
-        stages: list[Array] = []
-        for share, (A, B, u_star) in ((0.0, before), (0.5, half), (0.5, half), (1.0, last)):
-            to = e + share * dt * stages[-1] if stages else e
-            acting = (
-                channel.ask(t + min(share, plan.last_node) * dt, to)
-                if channel.continuous and stages
-                else u
-            )
-            stages.append(A @ to + B @ (acting - u_star))
-        e = e + dt / 6.0 * (stages[0] + 2.0 * (stages[1] + stages[2]) + stages[3])
+        points = (before, half, half, last)
+
+        def slope(stage: int, e: Array, t: float = t, u: Array = u, points: Any = points) -> Array:
+            A, B, u_star = points[stage]
+            if stage and channel.continuous:
+                u = channel.ask(t + min(_SHARES[stage], plan.last_node) * dt, e)
+            rate: Array = A @ e + B @ (u - u_star)
+            return rate
+
+        e = _after(dt, e, slope)
     return np.array([*rows, e])

@@ -1,7 +1,5 @@
 """What is said of a motion: whether it arrived, what it took, what proves it."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

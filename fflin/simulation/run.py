@@ -1,7 +1,5 @@
 """The loop over a plan: step after step, recorded until it ends."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
@@ -58,9 +56,8 @@ def go(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
         if plan.callback is not None:
             plan.callback(t, q.copy(), v.copy(), u.copy())
 
-    step, stopped, project = 0, "", plan.project
+    step, stopped, project, bar = 0, "", plan.project, Progress(plan.progress)
     ending, watched = ending_of(plan), bool(plan.chart or plan.events)
-    bar = Progress(plan.progress)
     try:
         for step in range(times.steps):
             t = step * dt
@@ -97,9 +94,7 @@ def _advance(
     take = plan.method(plant.robot.model, plan.times.dt).step
     ask = channel.ask if channel is not None and channel.continuous else None
     pushed = not plant.isolated(driven=channel is not None)
-
     stage, wrench, wrenches = plant.stage, conserved.wrench, course.wrenches
-
     latest = plan.last_node * plan.times.dt
 
     def asked(t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:

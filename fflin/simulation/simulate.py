@@ -21,16 +21,8 @@ from fflin.robot.limits import chosen_limits
 from fflin.simulation.compiled import carried_out, engine_of
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.motion import Motion
-from fflin.simulation.plan import (
-    Plan,
-    events_of,
-    law_of,
-    method_of,
-    start_of,
-    target_of,
-    turning,
-)
-from fflin.simulation.plant import Plant
+from fflin.simulation.plan import Plan, events_of, law_of, method_of, start_of, target_of, turning
+from fflin.simulation.plant import Disturbance, Plant
 from fflin.simulation.prediction import predict, predictor
 from fflin.simulation.times import times_of
 
@@ -42,7 +34,6 @@ if TYPE_CHECKING:
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
     from fflin.simulation.plan import Callback, Event
-    from fflin.simulation.plant import Disturbance
     from fflin.simulation.run import Recording
 
 
@@ -218,11 +209,8 @@ def planned(
             f"frame is {frame!r}, expected '{own_frame}' along a trajectory, whose inputs are in "
             "base axes; leave it out"
         )
-    state = StateMap(
-        robot,
-        reference=own_reference if reference is None else reference,
-        frame=own_frame if frame is None else frame,
-    )
+    axes = {"reference": own_reference if reference is None else reference}
+    state = StateMap(robot, **axes, frame=own_frame if frame is None else frame)
     plant = Plant(state, disturbance)
     foresees = predictor(plant, policy, linear)
     q, v = start_of(state, x0, q0, v0, follows)
@@ -241,11 +229,9 @@ def planned(
     elif along is policy is not None:
         initial = along.reference(0.0)[2]
         warn_beyond(robot.name, "on its trajectory", *signals, along.trajectory.u_base, *cut)
-    near = goal
+    near = state.read(*follows(0.0)[:2]) if follows else goal
     if x0 is not None:
         near = np.asarray(x0, dtype=float)
-    elif follows:
-        near = state.read(*follows(0.0)[:2])
     plan = Plan(
         q=q,
         v=v,
@@ -284,11 +270,8 @@ def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = Non
         target = state_history(state, q, v, plan.near, run.t)
     history = conserved.histories(run.q, run.v)
     return Motion(
-        t=run.t,
-        q=run.q,
-        v=run.v,
+        **{name: getattr(run, name) for name in ("t", "q", "v", "u", "stopped", "engine")},
         x=x,
-        u=run.u,
         target=target,
         prediction=predict(plan, x, run.steps, target),
         energy=history.energy,
@@ -303,8 +286,6 @@ def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = Non
         frame=state.frame,
         robot=robot.name,
         urdf_sha256=robot.urdf_sha256,
-        stopped=run.stopped,
-        engine=run.engine,
         _robot=robot,
         wheels=tuple(robot.wheels),
         wheel_inertias=np.array(list(robot.wheels.values())),

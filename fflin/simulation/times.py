@@ -1,24 +1,28 @@
-"""The step of a simulation, and how many steps there are between what happens."""
+"""The step of a simulation, how many there are between what happens, and how long it runs."""
 
-from __future__ import annotations
-
+import math
 import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fflin.base.errors import FflinWarning, InputError
-from fflin.base.validation import number, whole
-from fflin.control.policies import feedback_of
+from fflin.base.validation import Array, number, whole
+from fflin.control.policies import StateFeedback, fed_back, feedback_of
 from fflin.control.tracking import TrajectoryFeedback, largest_rate, tracking_of
+from fflin.dynamics.state import StateMap
+from fflin.linear.sampling import held_exponential
+from fflin.robot.robot import Robot
 
+# Of a run whose duration is not given [s], and between looks at the linear loop.
+SHORTEST, LONGEST, _LOOK = 60.0, 600.0, 0.5
 LARGEST_TURN = 1.0  # within one step [rad], beyond which no integrator follows
 _STEP = 0.01  # [s]
 _MOST_ENTRIES, _MOST_STEPS = 500_000_000, 10_000_000_000
 _MANY_STEPS, _ENDLESS = 50_000, 10_000_000  # half a minute, and some hours that nobody asked for
 _MANY_ROWS, _FEW_ROWS = 100_000, 10_000  # that nobody reads, and that a page or a plot shows
 _ALIKE = 1e-3  # parts in a mode, relative, of which the first is named
-_LONGEST = 1e100  # [s]; the square of its inverse is still a number
+_FOREVER = 1e100  # [s]; the square of its inverse is still a number
 
 
 class Times(NamedTuple):
@@ -54,11 +58,7 @@ class Times(NamedTuple):
         return float((LARGEST_TURN / self.dt) ** 2)
 
     def require_room(self, width: int, *, chosen: bool) -> None:
-        """Raise `InputError` where rows of so many numbers, or the steps, are too many.
-
-        `chosen` says that the step was chosen here and not given; where the loop's fastest pole
-        asks for many steps, an `FflinWarning` says so.
-        """
+        """Refuse too many rows of so many numbers, or steps; warn of many that were `chosen`."""
         forced = chosen and self.fastest * _STEP > 1.0
         most = _ENDLESS if self.thinned else _MOST_STEPS
         if self.rows * width > _MOST_ENTRIES or self.steps > most:
@@ -99,10 +99,12 @@ def times_of(
         made = follows.schedule if follows else getattr(policy, "lin", None)
         sample = getattr(made, "dt", None) or None
     fastest, mode = (0.0, "") if sample else _fastest_pole(policy, follows)
-    duration = _positive("duration", _duration(duration, follows))
+    if duration is None and follows is None:
+        raise InputError("duration is missing; give it [s]")
+    duration = _positive("duration", follows.duration if follows and duration is None else duration)
     delay = number("delay", delay)
-    if not 0.0 <= delay <= _LONGEST:
-        raise InputError(f"delay is {delay:g} s, expected 0 to {_LONGEST:g} s")
+    if not 0.0 <= delay <= _FOREVER:
+        raise InputError(f"delay is {delay:g} s, expected 0 to {_FOREVER:g} s")
     if every is not None:
         every = whole("every", every, 1)
     if dt is None:
@@ -130,12 +132,6 @@ def times_of(
     return Times(dt, steps, every, samples, late, fastest, mode, thinned)
 
 
-def _duration(given: float | None, follows: TrajectoryFeedback | None) -> float:
-    if given is None and follows is None:
-        raise InputError("duration is missing; give it [s]")
-    return follows.duration if given is None and follows else given  # type: ignore[return-value]
-
-
 def _thinning(steps: int, sample: int) -> int:
     """Return the steps from row to row, for rows that are few and fall on samples, if there are."""
     least = -(-steps // _FEW_ROWS)
@@ -145,11 +141,7 @@ def _thinning(steps: int, sample: int) -> int:
 
 
 def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> tuple[float, str]:
-    """Return the largest magnitude [1/s] of the poles of a continuous loop, and what moves there.
-
-    The state is named that takes the largest part in the mode, by the products of its left and
-    right vectors, which have no unit; only where the pole asks for a step below the usual one.
-    """
+    """Return the largest magnitude [1/s] of a continuous loop's poles, and the state that moves."""
     if follows is not None:
         return largest_rate(follows.schedule), ""
     lin, K = feedback_of(policy)
@@ -189,6 +181,29 @@ def _part_of(sample: float, largest: float, *times: float) -> float:
 
 def _positive(name: str, value: Any) -> float:
     time = number(name, value)
-    if not 1.0 / _LONGEST < time <= _LONGEST:
-        raise InputError(f"{name} is {time:g} s, expected more than 0 and at most {_LONGEST:g} s")
+    if not 1.0 / _FOREVER < time <= _FOREVER:
+        raise InputError(f"{name} is {time:g} s, expected more than 0 and at most {_FOREVER:g} s")
     return time
+
+
+def time_to_settle(robot: Robot, policy: StateFeedback, q: Array, v: Array | None) -> float:
+    """Return when [s] the linear loop stays within 1 % of each error; in tens of seconds."""
+    lin = policy.lin
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    start = state.read(q, np.zeros(robot.nv) if v is None else v, near=state.read(lin.q, lin.v))
+    e = start[[state.names.index(name) for name in lin.state_names]] - lin.x0
+    step = lin.dt or _LOOK
+    loop: Array = lin.A - lin.B @ policy.K
+    if not lin.dt:
+        loop = held_exponential(loop, np.zeros((len(loop), 0)), step)[0]
+    places = [f"q_m.{name}" for name in robot.joint_names if name not in robot.wheels]
+    kinds = [[f"{group}.{axis}" for axis in "xyz"] for group in ("q_b", "r_b")] + [places]
+    fed = {*fed_back(policy)}
+    rows = [[i for i, name in enumerate(lin.state_names) if name in fed & {*k}] for k in kinds]
+    course = [e]
+    for _ in range(math.ceil(LONGEST / step)):
+        course.append(loop @ course[-1])
+    errors = np.array([np.abs(np.array(course)[:, of]).max(axis=1, initial=0.0) for of in rows])
+    away = (errors > 0.01 * errors.max(axis=1, keepdims=True)).any(axis=0)
+    last = float(np.flatnonzero(away).max(initial=0)) * step
+    return max(SHORTEST, 10.0 * math.ceil(last / 10.0)) if last < 0.99 * LONGEST else SHORTEST

@@ -11,9 +11,9 @@ import pinocchio as pin
 
 from fflin.base.errors import FflinError
 from fflin.base.writing import shown
+from fflin.robot.catalog import find_mesh
 from fflin.robot.robot import ROOT, Robot
 from fflin.robot.urdf.links import read_pose
-from fflin.robot.urdf.mesh_files import find_mesh
 from fflin.robot.urdf.reader import read_document
 from fflin.robot.urdf.xacro import expand, first_xacro
 from fflin.robot.urdf.xml import Element, named, parse

@@ -5,7 +5,7 @@ import pytest
 
 import fflin
 from fflin.control.bounded import thrusters_push_every_way
-from fflin.simulation.settling import time_to_settle
+from fflin.simulation.times import time_to_settle
 
 
 def course(robot, policy, q):

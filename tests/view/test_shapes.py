@@ -7,8 +7,7 @@ import umsgpack
 from scipy.spatial import cKDTree
 
 import fflin
-from fflin.robot.catalog import find_robot
-from fflin.robot.urdf.mesh_files import find_mesh
+from fflin.robot.catalog import find_mesh, find_robot
 from fflin.view.shapes import shapes
 from tests.support.meshes import tetrahedron
 from tests.support.motions import settling

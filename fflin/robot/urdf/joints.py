@@ -1,14 +1,20 @@
-"""Joints of a URDF: what they connect and how they move."""
-
-from __future__ import annotations
+"""Joints of a URDF: what they connect, how they move, and which follow others."""
 
 import math
 import re
 import sys
 from typing import NamedTuple
 
-from fflin.robot.urdf.links import Pose, bounded_number, read_pose, refuse_near_miss
-from fflin.robot.urdf.xml import Element, decimal, quoted
+from fflin.base.errors import unknown
+from fflin.robot.urdf.links import (
+    Pose,
+    bounded,
+    bounded_length,
+    bounded_number,
+    read_pose,
+    refuse_near_miss,
+)
+from fflin.robot.urdf.xml import Element, decimal, enumerated, quoted
 
 # Degrees of freedom of the types of joint.
 FREEDOM = dict(fixed=0, revolute=1, continuous=1, prismatic=1, planar=3, floating=6)
@@ -70,25 +76,15 @@ def read_joint(element: Element) -> JointElement:
             raise child.error(f"<{child.tag}> in {of} is not read; write it as <mimic>")
         if prefix and local == "rotor_inertia":
             child.note(f"<{child.tag}> of {of} is not in the model")
-    ends = []
-    for end in ("parent", "child"):
-        found = element.require(end, of)
+    ends = {end: element.require(end, of) for end in ("parent", "child")}
+    for found in ends.values():
         found.allow_only("link", of=of)
-        ends.append(found.text("link", f"<{end}> of {of}"))
+    parent, below = (ends[end].text("link", f"<{end}> of {of}") for end in ends)
     damping, friction = _dynamics(element, of, kind)
-    return JointElement(
-        name,
-        kind,
-        ends[0],
-        ends[1],
-        element,
-        read_pose(element, of),
-        _axis(element, of, kind),
-        _limits(element, of, kind),
-        damping,
-        friction,
-        _mimic(element, of),
-    )
+    origin, axis = read_pose(element, of), _axis(element, of, kind)
+    limits, mimic = _limits(element, of, kind), _mimic(element, of)
+    about = element, origin, axis, limits, damping, friction, mimic
+    return JointElement(name, kind, parent, below, *about)
 
 
 def _axis(element: Element, of: str, kind: str) -> tuple[float, ...]:
@@ -170,3 +166,63 @@ def _mimic(element: Element, of: str) -> Mimic | None:
         bounded_number(found, "multiplier", of, 1.0),
         bounded_number(found, "offset", of, 0.0),
     )
+
+
+def resolve_mimics(joints: dict[str, JointElement]) -> dict[str, Mimic]:
+    """Return {follower: Mimic of an independent joint}, none of fixed joints."""
+    written = {name: joint.mimic for name, joint in joints.items() if joint.mimic and joint.freedom}
+    resolved: dict[str, Mimic] = {}
+    for name in written:
+        chain = [name]
+        while (follower := chain[-1]) in written and follower not in resolved:
+            _check_mimic(joints[follower], written[follower], joints)
+            leader = written[follower].leader
+            if leader in chain:
+                loop = [*chain[chain.index(leader) :], leader]
+                raise joints[follower].element.error(
+                    f"the mimic joints {enumerated(loop)} follow each other in a circle; one of "
+                    "them must be free"
+                    if len(loop) > 2
+                    else f"joint {quoted(name)} mimics itself; name the joint that it follows"
+                )
+            chain.append(leader)
+        for follower in reversed(chain[:-1]):
+            own = written[follower]
+            above = resolved.get(own.leader, Mimic(own.leader, 1.0, 0.0))
+            element, of = joints[follower].element, f"joint {quoted(follower)}"
+            limit = bounded_length if joints[follower].type == "prismatic" else bounded
+            resolved[follower] = Mimic(
+                above.leader,
+                bounded(element, "multiplier", of, own.multiplier * above.multiplier),
+                limit(element, "offset", of, own.multiplier * above.offset + own.offset),
+            )
+    return {name: resolved[name] for name in written}
+
+
+def counted_leaders(joints: dict[str, JointElement], mimics: dict[str, Mimic]) -> set[str]:
+    """Return the continuous leaders a whole turn of which moves a follower elsewhere."""
+    return {
+        mimic.leader
+        for name, mimic in mimics.items()
+        if joints[mimic.leader].type == "continuous"
+        and not (joints[name].type == "continuous" and mimic.multiplier.is_integer())
+    }
+
+
+def _check_mimic(joint: JointElement, mimic: Mimic, joints: dict[str, JointElement]) -> None:
+    if joint.freedom != 1:
+        raise joint.element.error(
+            f"joint {quoted(joint.name)} is {joint.type} and has a <mimic>; only a joint of one "
+            "degree of freedom can follow another"
+        )
+    if mimic.leader not in joints:
+        error = unknown("joint", mimic.leader[:60], [name[:60] for name in joints])
+        raise joint.element.error(
+            f"joint {quoted(joint.name)} mimics a joint that does not exist: {error}"
+        )
+    leader = joints[mimic.leader]
+    if leader.freedom != 1:
+        raise joint.element.error(
+            f"joint {quoted(joint.name)} mimics {quoted(leader.name)}, which is {leader.type}; "
+            "a leader has one degree of freedom"
+        )

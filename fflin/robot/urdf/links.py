@@ -1,13 +1,12 @@
-"""Links of a URDF: where they are and what they weigh."""
+"""Links of a URDF: where they are, what they weigh, and what is odd about that."""
 
-from __future__ import annotations
-
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
-from fflin.base.validation import Array
-from fflin.robot.urdf.xml import Element, nearest, quoted
+from fflin.robot.urdf.xml import Element, enumerated, named, nearest, quoted
 
 # Beyond it nothing is physical, and products of two such numbers stay far from overflow.
 _ABSURD = 1e30
@@ -19,6 +18,20 @@ _FARTHEST = 1e7  # [m]
 # Quaternions are written with four digits often, seldom with fewer.
 _QUATERNION_SLACK = 1e-3
 
+# Rounding of the six numbers leaves a singular inertia with eigenvalues of about -1e-16 of the
+# largest when they are written in full; CAD programs write fewer digits.
+_NEGATIVE_SLACK = 1e-9
+
+# A point mass that a CAD program integrates has the inertia of rounding, of either sign: that
+# of a body within a micrometre of its centre.
+_POINT = 1e-6  # [m]
+
+# A negative moment this small against that of the rigid body it is fixed to changes M no more
+# than the last digits of published figures do.
+_LOST_IN_BODY = 1e-6
+
+# Published figures have three digits or more, and a flat plate's lie on the bound.
+TRIANGLE_SLACK = 1e-3
 
 # The entries of an inertia as URDF orders them.
 INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -40,12 +53,6 @@ class Link(NamedTuple):
     mass: float | None = None  # [kg]; None where the link has no <inertial>
     com: Pose = Pose()  # centre of mass, and axes of the inertia
     inertia: tuple[float, ...] = (0.0,) * 6  # INERTIA [kg m^2] about the centre of mass
-
-    def principal_inertias(self) -> Array:
-        """Return the eigenvalues (3,) of the inertia, ascending [kg m^2]."""
-        xx, xy, xz, yy, yz, zz = self.inertia
-        moments: Array = np.linalg.eigvalsh(np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))))
-        return moments
 
 
 def read_link(element: Element) -> Link:
@@ -127,3 +134,41 @@ def refuse_near_miss(element: Element, of: str, known: tuple[str, ...]) -> None:
             raise child.error(
                 f"<{child.tag}> in {of} is not known to URDF; did you mean <{meant}>?"
             )
+
+
+def is_impossible(mass: float, moments: Sequence[float]) -> bool:
+    """Tell whether the principal moments, ascending [kg m^2], are negative beyond rounding."""
+    # A body within the radius r of its centre has moments of at most mass r^2.
+    return moments[0] < -max(_NEGATIVE_SLACK * moments[-1], mass * _POINT**2)
+
+
+def inertia_notes(links: Iterable[Link], model: pin.Model, origin: str) -> list[str]:
+    """Warn of odd inertias; refuse negative ones that the link's rigid body does not outweigh."""
+    unequal, weightless, negligible = [], [], []
+    for link in links:
+        if link.mass is None:
+            continue
+        xx, xy, xz, yy, yz, zz = link.inertia
+        tensor = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+        least, middle, largest = np.linalg.eigvalsh(tensor).tolist()
+        if is_impossible(link.mass, (least, middle, largest)):
+            joint = model.frames[model.getFrameId(link.name, pin.FrameType.BODY)].parentJoint
+            of_body = np.linalg.eigvalsh(model.inertias[joint].inertia)[0]
+            if abs(least) > _LOST_IN_BODY * of_body:
+                raise link.element.error(
+                    f"the inertia of link {quoted(link.name)} has principal moments {least:.3g}, "
+                    f"{middle:.3g}, {largest:.3g} kg m^2; none can be negative: correct ixx ... izz"
+                )
+            negligible.append(link.name)
+        elif largest - middle - least > TRIANGLE_SLACK * abs(largest):
+            unequal.append(link.name)
+        if link.mass == 0.0 and any(link.inertia):
+            weightless.append(link.name)
+    lost = f"the inertia of {named('link', negligible)} has a negative principal moment, of no "
+    notes = (
+        (negligible, f"{lost}account beside the links it is fixed to"),
+        # One principal moment is more than the sum of the others.
+        (unequal, f"inertia of no rigid body: {enumerated(unequal)}"),
+        (weightless, f"an inertia and no mass: {named('link', weightless)}"),
+    )
+    return [f"{origin}: {text}" for names, text in notes if names]

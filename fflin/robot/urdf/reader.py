@@ -1,7 +1,5 @@
 """From a URDF file to a Pinocchio model with a free-flyer root."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 from collections.abc import Callable, Collection, Sequence
@@ -12,10 +10,8 @@ import pinocchio as pin
 
 from fflin.base.errors import UrdfError
 from fflin.base.writing import read_input
-from fflin.robot.urdf.inertias import inertia_notes
-from fflin.robot.urdf.joints import Mimic
-from fflin.robot.urdf.links import Link
-from fflin.robot.urdf.mimics import counted_leaders, resolve_mimics
+from fflin.robot.urdf.joints import Mimic, counted_leaders, resolve_mimics
+from fflin.robot.urdf.links import Link, inertia_notes
 from fflin.robot.urdf.tree import Urdf, read_description
 from fflin.robot.urdf.writer import write_urdf
 from fflin.robot.urdf.xacro import expand, first_xacro
@@ -54,11 +50,7 @@ class Description(NamedTuple):
 
 
 def read_urdf(path: Path, prune: Sequence[str] = ()) -> Description:
-    """Read a URDF, or a xacro, as a robot that floats free.
-
-    Joints in `prune` are cut off with all that hangs on them. What is no robot is a `UrdfError`
-    that gives file, line and what to mend; a xacro without xacrodoc is a `MissingPackageError`.
-    """
+    """Read a URDF, or a xacro, as a robot that floats free; what hangs on `prune` is cut off."""
     return describe(read_document(path), path, prune)
 
 
@@ -80,7 +72,8 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
     notes += told(root)
     notes += inertia_notes(urdf.links.values(), model, path.stem)
 
-    meshes = (e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh")
+    named_meshes = (e.attributes.get("filename", "") for e in root.iterate() if e.tag == "mesh")
+    meshes, digest = tuple(dict.fromkeys(named_meshes)), hashlib.sha256(document).hexdigest()
     moving = [joint for joint in urdf.joints.values() if joint.freedom]
     damping = {joint.name: joint.damping for joint in moving if joint.damping}
     friction = {joint.name: joint.friction for joint in moving if joint.friction}
@@ -101,16 +94,9 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
             joints = named("joint", list(zero)) if len(zero) < 3 else f"{len(zero)} joints"
             text = f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)"
             advice.append(Advice("passive", zero, text))
+    weights = {name: link for name, link in urdf.links.items() if link.mass}
     return Description(
-        model,
-        hashlib.sha256(document).hexdigest(),
-        mimics,
-        damping,
-        friction,
-        tuple(dict.fromkeys(meshes)),
-        {name: link for name, link in urdf.links.items() if link.mass},
-        tuple(notes),
-        tuple(advice),
+        model, digest, mimics, damping, friction, meshes, weights, tuple(notes), tuple(advice)
     )
 
 

@@ -1,8 +1,7 @@
 """From the elements of a URDF to a checked description: links and joints that form one tree."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
+from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple, TypeVar
 
 from fflin.base.errors import unknown
@@ -29,10 +28,7 @@ class Urdf(NamedTuple):
 
 
 def read_description(root: Element, prune: Collection[str] = ()) -> Urdf:
-    """Check the elements of a URDF and return what they describe.
-
-    Joints in `prune` are cut off with all that hangs on them.
-    """
+    """Check the elements of a URDF; joints in `prune` are cut off with all that hangs on them."""
     _check_root(root)
     links = _by_name(read_link, root.find_all("link"))
     if len(links) > _LINK_LIMIT:
@@ -42,7 +38,7 @@ def read_description(root: Element, prune: Collection[str] = ()) -> Urdf:
     joints = _by_name(read_joint, root.find_all("joint"))
     depths = _check_tree(root, links, joints)
     if prune:
-        dropped = _hanging_on(prune, joints)
+        dropped = _hanging_on(prune, depths, joints)
         joints = {n: joint for n, joint in joints.items() if joint.child not in dropped}
         links = {n: link for n, link in links.items() if n not in dropped}
     _drop_world(links, joints)
@@ -99,7 +95,6 @@ def _check_tree(
 ) -> dict[str, int]:
     """Check that the joints connect the links into one tree; return each link's depth."""
     above: dict[str, JointElement] = {}
-    below: dict[str, list[str]] = {name: [] for name in links}
     for joint in joints.values():
         of = f"joint {quoted(joint.name)}"
         for end, name in (("parent", joint.parent), ("child", joint.child)):
@@ -118,7 +113,6 @@ def _check_tree(
                 "closed loops cannot be described"
             )
         above[joint.child] = joint
-        below[joint.parent].append(joint.child)
 
     roots = [name for name in links if name not in above]
     if len(roots) > 1:
@@ -126,23 +120,19 @@ def _check_tree(
             f"the links fall into {len(roots)} parts, with roots {enumerated(roots)}; connect "
             "them by joints"
         )
-    depths = {name: 1 for name in roots}
-    stack = list(roots)
-    while stack:
-        name = stack.pop()
-        for child in below[name]:
-            depths[child] = depths[name] + 1
-            stack.append(child)
-    if len(depths) < len(links):
-        lost = next(name for name in links if name not in depths)
-        way = [lost]
-        while (parent := above[way[-1]].parent) not in way:
-            way.append(parent)
-        loop = [above[name].name for name in way[way.index(parent) :]]
-        raise above[parent].element.error(
-            f"{named('joint', loop)} form a closed loop that hangs on nothing; correct a parent "
-            "or child in it"
-        )
+    depths = dict.fromkeys(roots, 1)
+    try:
+        for name in TopologicalSorter(
+            {x.child: [x.parent] for x in joints.values()}
+        ).static_order():
+            if name in above:
+                depths[name] = depths[above[name].parent] + 1
+    except CycleError as error:
+        loop = [above[name] for name in error.args[1][:0:-1]]
+        raise loop[0].element.error(
+            f"{named('joint', [joint.name for joint in loop])} form a closed loop that hangs on "
+            "nothing; correct a parent or child in it"
+        ) from None
     deepest = max(depths, key=depths.__getitem__)
     if depths[deepest] > _DEPTH_LIMIT:
         raise root.error(
@@ -167,18 +157,16 @@ def _drop_world(links: dict[str, Link], joints: dict[str, JointElement]) -> None
     del links[root.name], joints[first.name]
 
 
-def _hanging_on(prune: Collection[str], joints: dict[str, JointElement]) -> set[str]:
-    below: dict[str, list[str]] = {}
-    for joint in joints.values():
-        below.setdefault(joint.parent, []).append(joint.child)
-    stack = []
+def _hanging_on(
+    prune: Collection[str], links: Iterable[str], joints: dict[str, JointElement]
+) -> set[str]:
+    """Return what hangs on joints, of links of which each comes after its parent."""
     for name in prune:
         if name not in joints:
             raise unknown("joint to prune", name, joints)
-        stack.append(joints[name].child)
-    dropped: set[str] = set()
-    while stack:
-        name = stack.pop()
-        dropped.add(name)
-        stack.extend(below.get(name, ()))
+    dropped = {joints[name].child for name in prune}
+    parents = {joint.child: joint.parent for joint in joints.values()}
+    for name in links:
+        if parents.get(name) in dropped:
+            dropped.add(name)
     return dropped

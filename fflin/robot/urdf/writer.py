@@ -1,7 +1,5 @@
 """From a checked description to the URDF that Pinocchio is given: what it needs and no more."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping
 
 from fflin.robot.urdf.joints import UNLIMITED, JointElement
@@ -12,11 +10,7 @@ _ENTITIES = {ord(letter): f"&#{ord(letter)};" for letter in "&<>\"'\t\n\r"}
 
 
 def write_urdf(urdf: Urdf, counted: Collection[str] = ()) -> str:
-    """Write a description without visuals, collisions and extensions, its numbers to the last bit.
-
-    Continuous joints whose whole turns count, `counted`, become revolute ones without bounds, for
-    Pinocchio stores a continuous one as (cos, sin).
-    """
+    """Write what moves, to the last bit; `counted` joints are revolute, for their turns count."""
     # urdfdom reads quat_xyzw from version 1.1 on; 1.2 would require limits.
     lines = [f'<robot name={_quoted(urdf.name)} version="1.1">']
     for link in urdf.links.values():

@@ -1,7 +1,5 @@
 """Xacro: told from plain URDF, and expanded by the optional package xacrodoc."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os
@@ -40,11 +38,7 @@ def first_xacro(root: Element) -> Element | None:
 
 
 def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, list[str]]:
-    """Return a xacro document as plain URDF, and the lines that xacro had to say.
-
-    It is expanded in a process of its own that may take `LIMIT`; files that it includes are looked
-    up from where it lies. `first`, of `first_xacro`, is for errors.
-    """
+    """Return a xacro document as plain URDF, and what xacro said; `first` is for errors."""
     import json
     import subprocess
     from importlib.util import find_spec
@@ -80,10 +74,7 @@ def expand(path: Path, document: bytes, first: Element | None) -> tuple[bytes, l
 
 
 def _expand_here(path: Path, limit: float) -> None:
-    """Expand what comes in on stdin, in a process of its own.
-
-    To stdout go the files that it read, as a list of JSON in one line, and the expanded document.
-    """
+    """Expand stdin; write to stdout a line of JSON, the files that were read, and the document."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever started it ends it
     # It ends with who started it, or else in time, whatever it does.
     if sys.platform == "linux":

@@ -166,10 +166,7 @@ def told(root: Element) -> list[str]:
 
 
 def parse(document: bytes, origin: str) -> Element:
-    """Return the root of an XML document without namespaces and entities.
-
-    It is in UTF-8 unless it declares another encoding or has a UTF-16 byte order mark.
-    """
+    """Return the root of a document in the encoding that it declares, without entities."""
     if not document.strip():
         raise UrdfError(f"{origin}: is empty; expected a URDF with a <robot>")
     builder = _Builder(origin)
