@@ -10,6 +10,8 @@ from fflin.robot.robot import Robot as Robot
 from fflin.dynamics.points import configuration as configuration
 from fflin.dynamics.points import velocity as velocity
 from fflin.dynamics.points import effort as effort
+from fflin.dynamics.capture import capture as capture
+from fflin.dynamics.capture import Capture as Capture
 
 # Inputs
 from fflin.robot.inputs import BaseTorque as BaseTorque
