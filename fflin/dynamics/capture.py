@@ -11,7 +11,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import folded
-from fflin.base.validation import Array, vector
+from fflin.base.validation import Array, dimension, vector
 from fflin.base.validation import placement as checked_placement
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT, find_frame
@@ -153,8 +153,8 @@ def _beside(other: Robot, at: pin.SE3, q: Any, v: Any) -> tuple[Array, Array]:
     configuration[:7] = pin.SE3ToXYZQUAT(root.actInv(at))
     if v is None:
         return configuration, np.zeros(other.nv)
-    if np.shape(v) == (6,) and other.n:
-        v = np.concatenate((v, np.zeros(other.nv - 6)))
+    if other.n and dimension("payload_v", v) == 1 and len(v) == 6:
+        v = np.concatenate((vector("payload_v", v, 6, "a twist"), np.zeros(other.nv - 6)))
     expected = "the twist (linear, angular) of the payload" + ", and its joints" * bool(other.n)
     v = vector("payload_v", v, other.nv, expected)
     return configuration, other.checked_velocity(v)

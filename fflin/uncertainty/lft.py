@@ -16,7 +16,7 @@ from fflin.base.errors import InputError
 from fflin.base.names import matching
 from fflin.base.record import Design
 from fflin.base.tables import grid
-from fflin.base.validation import Array, numbers
+from fflin.base.validation import Array, as_double, numbers
 from fflin.linear.model import state_space
 
 
@@ -109,9 +109,13 @@ class LFT(Design):
         InputError
             If there are others than k deltas, or M is singular there.
         """
-        rows = self.deltas(values) if isinstance(values, Mapping) else np.asarray(values, float)
-        if rows.shape[-1:] != self.repeats.shape:
-            raise InputError(f"deltas have shape {rows.shape}, expected (.., {len(self.repeats)})")
+        if isinstance(values, Mapping):
+            values = self.deltas(values)
+        rows = as_double("values", values)
+        if not np.isfinite(rows).all() or rows.shape[-1:] != self.repeats.shape:
+            raise InputError(
+                f"deltas have shape {rows.shape}, expected (.., {len(self.repeats)}), finite"
+            )
         delta = np.repeat(rows, self.repeats.astype(int), axis=-1)
         within = np.eye(len(self.D11)) - self.D11 * delta[..., None, :]
         given = np.concatenate((self.C1, self.D12), axis=1)

@@ -209,6 +209,8 @@ class Sensitivity:
             {parameter: largest difference, relative to what it changes of A and B}: of the order
             1e-9, the differences' own.
         """
+        if isinstance(names, str) or not isinstance(names, Iterable | None):
+            raise InputError(f"names is {names!r}, expected several, such as ['base.mass']")
         asked = [n for n, one in self.parameters.items() if one.bodies] if names is None else names
         return {name: _difference(self, self[name].name) for name in asked}
 
