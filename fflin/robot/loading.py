@@ -247,7 +247,10 @@ def _locked(
 def _asked(lock: Any) -> dict[str, float | None]:
     """Return {joint or pattern: value, or None at neutral} of what a caller locks."""
     listed: Any = [lock] if isinstance(lock, str) else lock
-    names: list[Any] = [*listed] if isinstance(listed, Iterable) else [None]
+    try:
+        names = [*listed]
+    except TypeError:
+        names = [None]
     if not all(isinstance(name, str) for name in names):
         raise InputError(
             f"lock is a {type(lock).__name__}, expected {{joint: value}} or names of joints"

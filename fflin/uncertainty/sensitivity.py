@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -193,14 +193,14 @@ class Sensitivity:
         slopes[:, apart.min(axis=1) <= _EQUAL * max(np.abs(poles).max(), _EQUAL)] = np.nan
         return poles, slopes
 
-    def check(self, names: Iterable[str] | None = None) -> dict[str, float]:
+    def check(self, names: Sequence[str] | None = None) -> dict[str, float]:
         """Hold derivatives of A and B against differences of another route to them.
 
         The robot is changed by small steps, and A and B are built from the derivatives of ABA.
 
         Parameters
         ----------
-        names : iterable of str, optional
+        names : sequence of str, optional
             Parameters of bodies; all of them by default.
 
         Returns
@@ -209,10 +209,11 @@ class Sensitivity:
             {parameter: largest difference, relative to what it changes of A and B}: of the order
             1e-9, the differences' own.
         """
-        if isinstance(names, str) or not isinstance(names, Iterable | None):
+        if names is None:
+            names = [name for name, one in self.parameters.items() if one.bodies]
+        if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
             raise InputError(f"names is {names!r}, expected several, such as ['base.mass']")
-        asked = [n for n, one in self.parameters.items() if one.bodies] if names is None else names
-        return {name: _difference(self, self[name].name) for name in asked}
+        return {name: _difference(self, self[name].name) for name in names}
 
     def __str__(self) -> str:
         """Tell what 10 % of each parameter changes, the most first; 1 cm of a centre of mass."""
