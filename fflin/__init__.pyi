@@ -10,6 +10,8 @@ from fflin.robot.robot import Robot as Robot
 from fflin.dynamics.points import configuration as configuration
 from fflin.dynamics.points import velocity as velocity
 from fflin.dynamics.points import effort as effort
+from fflin.dynamics.capture import capture as capture
+from fflin.dynamics.capture import Capture as Capture
 
 # Inputs
 from fflin.robot.inputs import BaseTorque as BaseTorque
@@ -78,6 +80,13 @@ from fflin.control.kalman import kalman as kalman
 from fflin.control.kalman import Estimator as Estimator
 from fflin.control.kalman import lqg as lqg
 from fflin.control.kalman import Compensator as Compensator
+
+# Uncertainty
+from fflin.uncertainty.sensitivity import sensitivity as sensitivity
+from fflin.uncertainty.sensitivity import Sensitivity as Sensitivity
+from fflin.uncertainty.uncertain import uncertain as uncertain
+from fflin.uncertainty.uncertain import Uncertain as Uncertain
+from fflin.uncertainty.lft import LFT as LFT
 
 # Policies
 from fflin.control.policies import StateFeedback as StateFeedback

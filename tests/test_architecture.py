@@ -11,4 +11,4 @@ def test_the_picture_is_made_from_the_code_and_no_import_runs_up():
     picture = rooms["drawing"]()
     assert (DOCS / "rooms.svg").read_text(encoding="utf-8") == picture, "run python docs/rooms.py"
     assert 'class="up"' not in picture
-    assert len(rooms["rooms"]()) == 12
+    assert len(rooms["rooms"]()) == 13

@@ -41,6 +41,7 @@ def results(name):
 RESULTS = {
     *(
         "Campaign",
+        "Capture",
         "Certificate",
         "Check",
         "Compensator",
@@ -50,6 +51,7 @@ RESULTS = {
     ),
     "FilterSchedule",
     *("Gain", "GainSchedule", "Gramians", "Grid", "LinearModel", "LinearTrajectory", "Mode"),
+    *("LFT", "Sensitivity", "Uncertain"),
     *("Modes", "Motion", "Observability", "RandomConfigurations", "ReducedModel", "Robot"),
     "Validity",
 }

@@ -30,7 +30,7 @@ _ARRAYS = ("A", "B_lower", "C", "D", "f0", "u0", "q", "v", "_root")
 _MAYBE = ("_x0", "_y0", "_reference", "_drift")
 
 # What a model computes when it is asked for it, by its fields' names.
-_OF_ROBOT = ("_certify", "_inertia", "_ignorable", "_limits", "weights", "_require_unchanged")
+_OF_ROBOT = ("_certify", "_inertia", "_ignorable", "_limits", "weights", "_robot")
 
 
 def texts_of(batch: Any, count: int) -> dict[str, str]:

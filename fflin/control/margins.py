@@ -36,13 +36,13 @@ def input_margins(A: Array, B: Array, K: Array, R: Array, dt: float) -> Margins:
         inverse = np.linalg.inv(F + np.eye(len(F)))
         D = D - H @ inverse @ G
         F, G, H = inverse @ (F - np.eye(len(F))), 2.0**0.5 * inverse @ G, 2.0**0.5 * H @ inverse
-    disk = min(1.0 / _norm(F, G, H, D), 2.0)
+    disk = min(1.0 / largest_gain(F, G, H, D), 2.0)
     gain = ((2.0 - disk) / (2.0 + disk), (2.0 + disk) / (2.0 - disk) if disk < 2.0 else math.inf)
     return Margins(disk, gain, math.degrees(2.0 * math.atan(disk / 2.0)))
 
 
-def _norm(A: Array, B: Array, C: Array, D: Array) -> float:
-    """Return the largest gain over all frequencies of a stable system."""
+def largest_gain(A: Array, B: Array, C: Array, D: Array) -> float:
+    """Return the largest gain over all frequencies of a stable system, to five digits."""
 
     def gain(frequency: float) -> float:
         response = D + C @ np.linalg.solve(1j * frequency * np.eye(len(A)) - A, B)

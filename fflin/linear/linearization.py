@@ -108,7 +108,7 @@ class Linearizer:
             "_when_asked": {
                 "x0": partial(_state_at_rest, ready.map),
                 "y0": partial(_state_at_rest, ready.map),
-                "_reference": partial(_own_reference, robot),
+                "_reference": partial(own_reference, robot),
             },
         }
 
@@ -194,7 +194,7 @@ class Linearizer:
             array.setflags(write=False)
         x0.setflags(write=False)
         values = {"A": A, "B": B, "C": C, "D": D, "f0": f0, "x0": x0, "u0": u, "y0": y0}
-        reference = _own_reference(self.robot, q) if ready.own_reference else ready.reference
+        reference = own_reference(self.robot, q) if ready.own_reference else ready.reference
         fields = {**ready.common, **values, "q": q, "v": v, "_reference": reference}
         if ready.moving:
             own_rate = frozen(drift(state, f0, rates.gravity))
@@ -279,7 +279,8 @@ def _state_at_rest(state: StateMap, q: Array) -> Array:
     return frozen(x0)
 
 
-def _own_reference(robot: Robot, q: Array) -> Array:
+def own_reference(robot: Robot, q: Array) -> Array:
+    """Return where the base of a configuration is (7,), which a model is about by default."""
     root = robot.model.jointPlacements[ROOT]
     if root.isIdentity(0.0):
         return q[:7]

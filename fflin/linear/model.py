@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import pinocchio as pin
 
     from fflin.dynamics.state import Frame
+    from fflin.robot.robot import Robot
 
 _new, _set = object.__new__, object.__setattr__
 
@@ -127,8 +128,7 @@ class LinearModel(FrozenArrays):
     verified: bool = True
     _limits: Callable[[], Mapping[str, float]] | None = None
     weights: Mapping[str, Any] = field(default_factory=dict)
-    # Raises `ModelError` where the robot that it was made of was changed.
-    _require_unchanged: Callable[[], None] | None = None
+    _robot: Robot | None = None  # that it was made of; None where it is from a file
 
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> LinearModel:
@@ -206,8 +206,8 @@ class LinearModel(FrozenArrays):
 
     def require_unchanged(self) -> None:
         """Raise `ModelError` where the robot was changed in place after it was made."""
-        if self._require_unchanged is not None:
-            self._require_unchanged()
+        if self._robot is not None:
+            self._robot.require_unchanged()
 
     @property
     def generator(self) -> LinearModel | None:

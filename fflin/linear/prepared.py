@@ -125,7 +125,7 @@ def prepare(
             "_ignorable": partial(ignorable_states, robot),
             "_limits": partial(magnitudes_of, robot),
             "weights": robot.weights,
-            "_require_unchanged": robot.require_unchanged,
+            "_robot": robot,
         },
         rest={
             "A": frozen(at_rest(state)),

@@ -17,6 +17,7 @@ from fflin.base.writing import as_path, remember
 from fflin.robot.catalog import RobotFile, find_mesh, find_robot
 from fflin.robot.frames import ROOT
 from fflin.robot.joints import Follower
+from fflin.robot.link_masses import LinkMass
 from fflin.robot.massless import idle_coordinates, massless_note
 from fflin.robot.model_checks import check_model, check_order, check_root, joint_of
 from fflin.robot.robot import Robot
@@ -135,6 +136,7 @@ def _load(
         notes=description.notes,
         package_dirs=folders,
         urdf_damping=damping,
+        links={name: LinkMass.of(link) for name, link in description.links.items()},
     )
     return loaded, description.advice
 

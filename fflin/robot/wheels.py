@@ -131,7 +131,7 @@ def _rebuilt(
         index = new.addJoint(moved[parent], pin.JointModelRUBZ(), placement, name)
         spinning = pin.Inertia(0.0, np.zeros(3), inertia * np.outer(_Z, _Z))
         new.appendBodyToJoint(index, spinning, pin.SE3.Identity())
-    _carry_over(model, new, moved)
+    carry_over(model, new, moved)
     # The parent of a frame is an index among frames: they stay in order, and new ones come last.
     for frame in model.frames.tolist()[1:]:
         copy = pin.Frame(frame)
@@ -161,7 +161,7 @@ def _depth_first(
         yield root, wheel
 
 
-def _carry_over(model: pin.Model, new: pin.Model, moved: dict[int, int]) -> None:
+def carry_over(model: pin.Model, new: pin.Model, moved: dict[int, int]) -> None:
     """Copy what a model keeps of its joints beside them."""
     for names, begin, length in (_OF_VELOCITY, "idx_vs", "nvs"), (_OF_POSITION, "idx_qs", "nqs"):
         sizes, old_at, new_at = getattr(model, length), getattr(model, begin), getattr(new, begin)

@@ -45,6 +45,8 @@ def sound(folder):
     rows = [np.tile(row, (3, 1)) for row in (q, v, u)]
     along = fflin.linearize_trajectory(robot, t, *rows)
     schedule = fflin.tvlqr(along, 1.0, 1.0, 1.0)
+    sensitive = fflin.sensitivity(lin)
+    uncertain = fflin.uncertain(robot, {"base.mass": 0.1})
     batch = fflin.sweep(robot, [q, q])
     found = {"robot": robot, "q": q, "v": v, "u": u}
     place = {"frame": "hybrid", "reference": pin.SE3.Identity(), "moving": False}
@@ -61,6 +63,11 @@ def sound(folder):
         "BaseTorque": {"max": (1.0, 1.0, 1.0), "min": None},
         "bryson": {"lin": lin, "largest": {"q_b": 1.0}},
         "CenterOfMass": {},
+        "capture": {
+            **{"robot": robot, "frame": "hand", "payload": pin.Inertia.Random(), "q": q, "v": v},
+            **{"placement": pin.SE3.Identity(), "payload_q": None, "payload_v": np.zeros(6)},
+            "prefix": "caught",
+        },
         "check": {"robot": robot, "lin": lin},
         "configuration": {"robot": robot, "joints": {joint: 0.1}, "base": pin.SE3.Identity()},
         "controllability": {"lin": lin},
@@ -139,6 +146,7 @@ def sound(folder):
         },
         "sampled_cost": {"lin": lin, "dt": 0.1} | weights,
         "ScheduledFeedback": {"lin": lin, "gains": fflin.lqr_batch(batch, **weights)},
+        "sensitivity": {"lin": lin},
         "simulate": {
             **{"robot": robot, "policy": None, "q0": q, "v0": v, "duration": 0.02, "dt": 0.01},
             **{"method": "cf4", "sample": None, "delay": 0.0, "limits": None, "events": ()},
@@ -164,6 +172,7 @@ def sound(folder):
         },
         "tvkalman": {"traj": along, "W": 1.0, "V": 1.0, "G": along.B, "P0": 1.0, "sample": None},
         "tvlqr": {"traj": along, "Qf": 1.0, "sample": None, "weights": None} | weights,
+        "uncertain": {"robot": robot, "ranges": {"base.mass": 0.1, "link_1.com.x": (0.1, 0.2)}},
         "validity": {
             **{"robot": robot, "lin": lin, "gain": None, "attitude": 5.0, "position": 0.1},
             **{"joint": 0.1, "samples": 1, "seed": 0, "confidence": 0.9, "executor": None},
@@ -174,6 +183,14 @@ def sound(folder):
             **{"robot": robot, "motion": motion, "html": folder / "a.html", "open": False},
             **{"tool": None, "fps": 10.0, "speed": 1.0, "scene": "space", "cloud": None},
         },
+        "Sensitivity.along": {"self": sensitive, "direction": {"base.mass": 1.0}},
+        "Sensitivity.check": {"self": sensitive, "names": ["base.mass"]},
+        "Sensitivity.poles": {"self": sensitive, "gain": gain.K},
+        "Uncertain.at": {"self": uncertain, "values": {"base.mass": 100.0}},
+        "Uncertain.lft": {"self": uncertain, "q": q},
+        "Uncertain.samples": {"self": uncertain, "n": 1, "seed": 0},
+        "LFT.at": {"self": uncertain.lft(), "values": {"base.mass": 100.0}},
+        "LFT.load": {"path": "nosuch.npz"},
         "LinearTrajectory.discretize": {"self": along, "dt": 0.01},
         "LinearTrajectory.load": {"path": "nosuch.npz", "robot": robot},
         "LinearTrajectory.matrices": {"self": along, "t": 0.015},

@@ -46,6 +46,7 @@ class Description(NamedTuple):
     damping: dict[str, float]  # {joint: value} where not zero [N m s/rad | N s/m]
     friction: dict[str, float]  # the same [N m | N]
     meshes: tuple[str, ...]  # mesh files as it names them; they are not read
+    links: dict[str, Link]  # those that weigh something
     notes: tuple[str, ...]  # warnings, one line each
     advice: tuple[Advice, ...] = ()  # those that hold where the robot's fields say no more
 
@@ -93,8 +94,9 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
             joints = named("joint", list(zero)) if len(zero) < 3 else f"{len(zero)} joints"
             text = f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)"
             advice.append(Advice("passive", zero, text))
+    weights = {name: link for name, link in urdf.links.items() if link.mass}
     return Description(
-        model, digest, mimics, damping, friction, meshes, tuple(notes), tuple(advice)
+        model, digest, mimics, damping, friction, meshes, weights, tuple(notes), tuple(advice)
     )
 
 

@@ -1,0 +1,202 @@
+r"""The linear-fractional form of a robot at rest: which signals each parameter multiplies.
+
+The force that a link takes of an acceleration a is the chain
+
+    s = T X a,   f = D s,   F = X^T T^T f
+
+with X the Jacobian of its centre of mass in the axes of its inertia, D = blkdiag(m E, I), and T = E
+where that centre stays. A mass multiplies 3 signals, an entry of the inertia 1 on the diagonal and
+2 beside it, a density 6, a coordinate of the centre of mass 2 in T and 2 in T^T. Fewer would not
+do: these are the ranks of what each changes of M, since X has full rank on a free base.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.state import StateMap
+from fflin.robot.link_masses import Piece
+from fflin.uncertainty.parameters import AXES, ENTRIES, Parameter
+
+_LOCAL = pin.ReferenceFrame.LOCAL
+
+
+class Range(NamedTuple):
+    """A parameter, the middle of its range, and half the width."""
+
+    parameter: Parameter
+    middle: float
+    half: float
+
+    @property
+    def shift(self) -> float:
+        """How far the middle is from what the robot has."""
+        return self.middle - self.parameter.value
+
+    @property
+    def repeats(self) -> int:
+        """How many signals it multiplies."""
+        part = self.parameter.part
+        if part[:8] == "inertia." and part[8] == part[9]:
+            return 1
+        return _REPEATS.get(part.partition(".")[0], 1)
+
+
+# An inertia's entry beside the diagonal, or a wheel's inertia, which its carrier loses.
+_REPEATS = {"mass": 3, "density": 6, "com": 4, "inertia": 2}
+
+
+class Fraction(NamedTuple):
+    """A, B1, B2, C1, D11, D12 of the accelerations (6 + n, ..) and of z, over x, w and u."""
+
+    a: tuple[Array, Array, Array]
+    z: tuple[Array, Array, Array]
+
+
+def fraction(
+    state: StateMap,
+    actuation: Actuation,
+    q: Array,
+    pieces: Mapping[str, Piece],
+    ranges: Sequence[Range],
+) -> Fraction:
+    """Return the form about a point at rest where nothing pulls."""
+    form = _Form(state, actuation, q, ranges)
+    of_pieces: dict[str, dict[str, int]] = {}
+    for at, each in enumerate(ranges):
+        one = each.parameter
+        if one.of in pieces and one.part in OF_PIECES:
+            of_pieces.setdefault(one.of, {})[one.part] = at
+        else:
+            form.add_alone(at)
+    for name, parts in of_pieces.items():
+        form.add_piece(pieces[name], parts)
+    return form.solved()
+
+
+OF_PIECES = {
+    *("mass", "density"),
+    *(f"com.{axis}" for axis in AXES),
+    *(f"inertia.{entry}" for entry in ENTRIES),
+}
+
+
+class _Form:
+    """Signals are rows over (a, x, u, w); z fills as parameters come, the force adds up."""
+
+    def __init__(
+        self, state: StateMap, actuation: Actuation, q: Array, ranges: Sequence[Range]
+    ) -> None:
+        self.state, self.ranges, model = state, ranges, state.robot.model
+        still = q.copy()
+        still[:3] = 0.0
+        self.data = state.robot.create_data()
+        columns = np.array(actuation.columns(self.data, still))
+        pin.computeJointJacobians(model, self.data, still)
+        self.jacobians = {
+            joint: state.columns(pin.getJointJacobian(model, self.data, joint, _LOCAL))
+            for joint in range(1, model.njoints)
+        }
+        M = np.diag(state.project(np.diag(model.armature)).diagonal())
+        for joint, J in self.jacobians.items():
+            M += J.T @ model.inertias[joint].matrix() @ J
+        repeats = [each.repeats for each in ranges]
+        self.sizes = (len(M), state.nx, columns.shape[1], sum(repeats))
+        self.ends = np.cumsum(self.sizes)
+        self.unit = np.eye(self.ends[-1])
+        self.next = list(np.cumsum((0, *repeats[:-1])))
+        self.z = np.zeros((sum(repeats), self.ends[-1]))
+        # What is taken less what is given; zero by the equation of motion.
+        self.force = np.zeros((len(M), self.ends[-1]))
+        g, (stiffness, damping, _) = state.groups, state.robot.springs
+        a, x, u, _ = self.parts(self.force)
+        a[:], u[:] = M, -columns
+        x[6:, g.q_m], x[6:, g.qdot_m] = np.diag(stiffness), np.diag(damping)
+
+    def parts(self, signals: Array) -> list[Array]:
+        """Return the views over a, x, u and w."""
+        return np.split(signals, self.ends[:-1], axis=1)
+
+    def times(self, at: int, signals: Array) -> Array:
+        """Return the parameter's shift from now times signals, with the w that it varies by."""
+        one, first = self.ranges[at], self.next[at]
+        self.next[at] += len(signals)
+        self.z[first : self.next[at]] = one.half * signals
+        return one.shift * signals + self.unit[self.ends[2] + first : self.ends[2] + self.next[at]]
+
+    def add_piece(self, piece: Piece, parts: Mapping[str, int]) -> None:
+        """Put the chain of a link in place of what it takes now."""
+        J = piece.placement.inverse().toActionMatrix() @ self.jacobians[piece.joint]
+        shifts = []
+        for axis, direction in zip(AXES, piece.frame.rotation.T, strict=True):
+            if (at := parts.get(f"com.{axis}")) is not None:
+                cross = -skew(piece.placement.rotation.T @ direction)
+                left, sizes, right = np.linalg.svd(cross)
+                shifts.append((at, left[:, :2] * sizes[:2], right[:2]))
+        D = np.zeros((6, 6))
+        D[:3, :3], D[3:, 3:] = piece.mass * np.eye(3), piece.inertia
+        now = J @ self.unit[: self.sizes[0]]
+        s = now.copy()
+        for at, left, right in shifts:  # v' = v + omega x d
+            s[:3] += left @ self.times(at, right @ now[3:])
+        f = D @ s
+        if "mass" in parts:
+            f[:3] += self.times(parts["mass"], s[:3])
+        for entry, (i, j) in ENTRIES.items():
+            if f"inertia.{entry}" in parts:
+                rows = [i] if i == j else [i, j]
+                turned = self.times(parts[f"inertia.{entry}"], s[[3 + row for row in rows]])
+                for row, signal in zip(reversed(rows), turned, strict=True):
+                    f[3 + row] += signal
+        if "density" in parts:
+            f = f + self.times(parts["density"], f)
+        back = f.copy()
+        for at, left, right in shifts:
+            back[3:] += right.T @ self.times(at, left.T @ f[:3])
+        self.force += J.T @ (back - D @ now)
+
+    def add_alone(self, at: int) -> None:
+        """Add what a parameter of a joint, a thruster or a wheel changes."""
+        one = self.ranges[at].parameter
+        _, x, u, _ = np.split(self.unit, self.ends[:-1])
+        if one.spring >= 0:
+            self.force[6 + one.spring] += self.times(at, x[[6 + one.spring]])[0]
+        elif one.damper >= 0:
+            row = self.state.groups.qdot_m.start + one.damper
+            self.force[6 + one.damper] += self.times(at, x[[row]])[0]
+        elif one.wrench:
+            joint, column, wrench = one.wrench
+            given = self.jacobians[joint].T @ wrench
+            self.force -= np.outer(given, self.times(at, u[[column]])[0])
+        else:
+            change = sum(
+                self.jacobians[joint].T @ _matrix(parameters) @ self.jacobians[joint]
+                for joint, parameters in one.bodies.items()
+            )
+            values, vectors = np.linalg.eigh(change)
+            most = np.argsort(-np.abs(values))[: self.ranges[at].repeats]
+            L = vectors[:, most]
+            a = self.unit[: self.sizes[0]]
+            self.force += L @ self.times(at, (values[most, None] * L.T) @ a)
+
+    def solved(self) -> Fraction:
+        """Solve the equation of motion for a, and put it into z."""
+        (M, *others), (Z, *direct) = self.parts(self.force), self.parts(self.z)
+        x, u, w = (-np.linalg.solve(M, each) for each in others)
+        zx, zu, zw = (d + Z @ each for d, each in zip(direct, (x, u, w), strict=True))
+        return Fraction((x, w, u), (zx, zw, zu))
+
+
+def _matrix(parameters: Array) -> Array:
+    """Return the spatial inertia (6, 6), linear first, of dynamic parameters (10,)."""
+    m, first = parameters[0], skew(parameters[1:4])
+    xx, xy, yy, xz, yz, zz = parameters[4:]
+    about = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+    return np.block([[m * np.eye(3), -first], [first, about]])

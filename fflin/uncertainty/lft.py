@@ -1,0 +1,164 @@
+r"""Linear-fractional models: A and B as exact functions of uncertain parameters.
+
+:math:`\dot x = A x + B_1 w + B_2 u,\; z = C_1 x + D_{11} w + D_{12} u,\; w = \Delta z` with
+:math:`\Delta = \mathrm{diag}(\delta_k E_{r_k})`, each :math:`\delta_k` between -1 and 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.names import matching
+from fflin.base.record import Design
+from fflin.base.tables import grid
+from fflin.base.validation import Array, as_double, numbers
+from fflin.linear.model import state_space
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LFT(Design):
+    r"""An uncertain linear model, exact for every value of its parameters; prints its blocks.
+
+    Attributes
+    ----------
+    A, B1, B2 : ndarray
+        Of the state: (nx, nx), (nx, nw), (nx, nu).
+    C1, D11, D12 : ndarray
+        Of z (nw,).
+    C2, D21, D22 : ndarray
+        Of the outputs (ny,).
+    parameters : tuple of str
+        What is uncertain, in the order of the blocks.
+    repeats : ndarray (k,)
+        How often each delta stands in Delta.
+    middle, half : ndarray (k,)
+        A parameter is middle + half delta.
+    units : tuple of str
+    state_names, input_names, output_names : tuple of str
+    robot : str
+    """
+
+    VECTORS: ClassVar = ("repeats", "middle", "half")
+
+    A: Array
+    B1: Array
+    B2: Array
+    C1: Array
+    D11: Array
+    D12: Array
+    C2: Array
+    D21: Array
+    D22: Array
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    repeats: Array
+    middle: Array
+    half: Array
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    robot: str
+
+    def __repr__(self) -> str:
+        total = int(self.repeats.sum())
+        return f"LFT('{self.robot}', nx={len(self.A)}, {len(self.repeats)} parameters, nw={total})"
+
+    def __str__(self) -> str:
+        rows = [("parameter", "least", "largest", "", "repeated")]
+        for name, unit, middle, half, repeats in zip(
+            *(self.parameters, self.units, self.middle, self.half, self.repeats), strict=True
+        ):
+            ends = f"{middle - half:.6g}", f"{middle + half:.6g}"
+            rows.append((name, *ends, "" if unit == "1" else unit, f"{repeats:g}"))
+        rows.append(("in all", "", "", "", f"{self.repeats.sum():g}"))
+        return f"{self!r}\n{grid(rows, 'lrrlr')}"
+
+    @property
+    def dt(self) -> float:
+        """Zero: it is continuous."""
+        return 0.0
+
+    def deltas(self, values: Mapping[str, float]) -> Array:
+        """Return delta (k,) of {parameter or pattern: value}; 0 where nothing is given."""
+        found = np.zeros(len(self.parameters))
+        for key, value in numbers("values", values, "parameter", "value").items():
+            for at in matching("parameter", key, self.parameters):
+                found[at] = (value - self.middle[at]) / self.half[at]
+        return found
+
+    def at(self, values: Mapping[str, float] | Array) -> tuple[Array, Array, Array, Array]:
+        r"""Return A, B, C and D of parameters.
+
+        Parameters
+        ----------
+        values : mapping or array_like (.., k)
+            {parameter: value}, in the middle of its range where it is not named; or rows of deltas.
+
+        Returns
+        -------
+        A, B, C, D : ndarray
+            :math:`A + B_1 \Delta (E - D_{11} \Delta)^{-1} C_1` and so on, of each row.
+
+        Raises
+        ------
+        InputError
+            If there are others than k deltas, or M is singular there.
+        """
+        if isinstance(values, Mapping):
+            values = self.deltas(values)
+        rows = as_double("values", values)
+        if not np.isfinite(rows).all() or rows.shape[-1:] != self.repeats.shape:
+            raise InputError(
+                f"deltas have shape {rows.shape}, expected (.., {len(self.repeats)}), finite"
+            )
+        delta = np.repeat(rows, self.repeats.astype(int), axis=-1)
+        within = np.eye(len(self.D11)) - self.D11 * delta[..., None, :]
+        given = np.concatenate((self.C1, self.D12), axis=1)
+        try:
+            by = delta[..., None] * np.linalg.solve(
+                within, np.broadcast_to(given, (*delta.shape, given.shape[1]))
+            )
+        except np.linalg.LinAlgError:
+            raise InputError("M is singular at these parameters; give narrower ranges") from None
+        nx = len(self.A)
+        return (
+            self.A + self.B1 @ by[..., :nx],
+            self.B2 + self.B1 @ by[..., nx:],
+            self.C2 + self.D21 @ by[..., :nx],
+            self.D22 + self.D21 @ by[..., nx:],
+        )
+
+    def to_control(self) -> Any:
+        """Return a `control.StateSpace` from (w, u) to (z, y), its channels named.
+
+        w and z are named ``w.PARAMETER.1`` and ``z.PARAMETER.1``, with underscores for the dots.
+
+        Raises
+        ------
+        MissingPackageError
+            If python-control is not installed.
+        """
+        channels = [
+            f"{name}.{at + 1}"
+            for name, repeats in zip(self.parameters, self.repeats, strict=True)
+            for at in range(int(repeats))
+        ]
+        return state_space(
+            _Open(self, channels), np.block([[self.D11, self.D12], [self.D21, self.D22]])
+        )
+
+
+class _Open:
+    """An LFT as a plain system, for `state_space`."""
+
+    def __init__(self, lft: LFT, channels: list[str]) -> None:
+        self.A, self.dt = lft.A, 0.0
+        self.B, self.C = np.hstack((lft.B1, lft.B2)), np.vstack((lft.C1, lft.C2))
+        self.state_names = lft.state_names
+        self.input_names = (*(f"w.{name}" for name in channels), *lft.input_names)
+        self.output_names = (*(f"z.{name}" for name in channels), *lft.output_names)

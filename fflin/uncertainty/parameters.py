@@ -1,0 +1,148 @@
+"""The parameters of a robot by name, and what each of them is a change of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.names import matching
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.robot.frames import find_frame
+from fflin.robot.inputs import ReactionWheel, Thruster, named_inputs
+from fflin.robot.link_masses import Piece, pieces_of
+from fflin.robot.robot import Robot
+from fflin.robot.wheels import carrier
+
+AXES = "xyz"
+# (row, column) of the six entries of an inertia.
+ENTRIES = {a + b: (AXES.index(a), AXES.index(b)) for a, b in ("xx", "yy", "zz", "xy", "xz", "yz")}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter, and how a unit of it changes the robot.
+
+    Attributes
+    ----------
+    of, part : str
+        Whose it is, and which: "arm" and "inertia.xx".
+    unit : str
+    value : float
+        What it is now.
+    bodies : mapping
+        {Pinocchio joint: change (10,)} of the dynamic parameters of bodies: mass, first moment, and
+        inertia xx, xy, yy, xz, yz, zz at the joint's frame.
+    spring, damper : int
+        The joint whose stiffness or damping it is, in state order; -1 for none.
+    wrench : tuple or None
+        (Pinocchio joint, input, change (6,) of the wrench of a unit of it in the joint's frame).
+    """
+
+    of: str
+    part: str
+    unit: str
+    value: float
+    bodies: dict[int, Array] = field(default_factory=dict)
+    spring: int = -1
+    damper: int = -1
+    wrench: tuple[int, int, Array] | None = None
+
+    @property
+    def name(self) -> str:
+        """Whose it is and which."""
+        return f"{self.of}.{self.part}"
+
+
+class Parameters(dict[str, Parameter]):
+    """What can be changed of a robot, by name; a body of one link has that of its joint too."""
+
+    def __init__(self, robot: Robot) -> None:
+        pieces, self._also = pieces_of(robot)
+        of_pieces = (each for name, piece in pieces.items() for each in _of_piece(name, piece))
+        found = (*of_pieces, *_of_joints(robot), *_of_inputs(robot))
+        super().__init__((each.name, each) for each in found)
+
+    def find(self, key: str) -> list[str]:
+        """Return the names that a name or pattern stands for."""
+        body, dot, rest = str(key).partition(".")
+        if key not in self and body in self._also:
+            key = f"{self._also[body]}{dot}{rest}"
+        return matched(key, list(self))
+
+
+def matched(key: str, names: Sequence[str]) -> list[str]:
+    """Return the names that a name or pattern stands for."""
+    return [names[i] for i in matching("parameter", key, names)]
+
+
+def moments(mass: float, first: Array, inertia: Array) -> Array:
+    """Return the dynamic parameters (10,) of a mass, a first moment and an inertia."""
+    return np.array((mass, *first, *inertia[np.triu_indices(3)][[0, 1, 3, 2, 4, 5]]))
+
+
+def _of_piece(name: str, piece: Piece) -> Iterator[Parameter]:
+    """Give mass, centre of mass, inertia and density of a link or body."""
+
+    def change(part: str, unit: str, value: float, parameters: Array) -> Parameter:
+        return Parameter(name, part, unit, value, {piece.joint: parameters})
+
+    m, c, turn = piece.mass, piece.placement.translation, piece.placement.rotation
+    C = skew(c)
+    yield change("mass", "kg", m, moments(1.0, c, C.T @ C))
+    own = piece.frame.actInv(c).tolist()
+    for axis, at, d in zip(AXES, own, piece.frame.rotation.T, strict=True):
+        D = skew(d)
+        yield change(f"com.{axis}", "m", at, moments(0.0, m * d, m * (D.T @ C + C.T @ D)))
+    for entry, (row, column) in ENTRIES.items():
+        unit_inertia = np.zeros((3, 3))
+        unit_inertia[row, column] = unit_inertia[column, row] = 1.0
+        about = turn @ unit_inertia @ turn.T
+        value = float(piece.inertia[row, column])
+        yield change(f"inertia.{entry}", "kg m^2", value, moments(0.0, np.zeros(3), about))
+    whole = m * C.T @ C + turn @ piece.inertia @ turn.T
+    yield change("density", "1", 1.0, moments(m, m * c, whole))
+
+
+def _of_joints(robot: Robot) -> Iterator[Parameter]:
+    for index, joint in enumerate(robot.joints):
+        per = "m" if joint.prismatic else "rad"
+        force = "N" if joint.prismatic else "N m"
+        stiffness, damping, _ = (each[index].item() for each in robot.springs)
+        yield Parameter(joint.name, "stiffness", f"{force}/{per}", stiffness, spring=index)
+        yield Parameter(joint.name, "damping", f"{force} s/{per}", damping, damper=index)
+
+
+def _of_inputs(robot: Robot) -> Iterator[Parameter]:
+    at = 0
+    for item, names in named_inputs(robot.inputs):
+        first, at = at, at + len(names)
+        if isinstance(item, Thruster):
+            joint, placement = find_frame(robot.model, item.frame)
+            where, along = np.array(item.position), np.array(item.direction)
+            for letter, d in zip(AXES, np.eye(3), strict=True):
+                # A direction is of unit length: only what turns it counts.
+                turned = d - along * (along @ d)
+                moved = np.concatenate((np.zeros(3), np.cross(d, along)))
+                tilted = np.concatenate((turned, np.cross(where, turned)))
+                for part, unit, value, wrench in (
+                    ("position", "m", where @ d, moved),
+                    ("direction", "1", along @ d, tilted),
+                ):
+                    in_joint = np.array(placement.act(pin.Force(wrench)).vector)
+                    at_input = (joint, first, in_joint)
+                    yield Parameter(
+                        names[0], f"{part}.{letter}", unit, float(value), wrench=at_input
+                    )
+        if isinstance(item, ReactionWheel) and item.inertia:
+            joint, axis = carrier(robot.model, item)
+            own = robot.model.getJointId(names[0])
+            spin = robot.model.jointPlacements[own].rotation.T @ axis
+            bodies = {
+                own: moments(0.0, np.zeros(3), np.outer(spin, spin)),
+                joint: moments(0.0, np.zeros(3), -np.outer(axis, axis)),
+            }
+            yield Parameter(names[0], "inertia", "kg m^2", float(item.inertia), bodies)

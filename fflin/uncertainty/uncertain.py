@@ -1,0 +1,283 @@
+"""A robot with uncertain parameters: its linear-fractional form, its samples, its worst."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.tables import grid
+from fflin.base.validation import Array, number, numbers, vector, whole
+from fflin.base.validation import by_name as mapping
+from fflin.dynamics.state import StateMap
+from fflin.linear.linearization import linearize
+from fflin.linear.prepared import prepare
+from fflin.robot.link_masses import Piece
+from fflin.robot.robot import Robot
+from fflin.uncertainty.fraction import Range, fraction
+from fflin.uncertainty.lft import LFT
+from fflin.uncertainty.parameters import Parameter
+from fflin.uncertainty.variants import Variants
+from fflin.uncertainty.worst import Worst, searched
+
+# Draws for one that makes a robot, before it is said that hardly any does.
+_TRIES = 1000
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Uncertain:
+    """A robot some of whose parameters lie in ranges; made by `uncertain`.
+
+    Attributes
+    ----------
+    robot : Robot
+        As it is.
+    ranges : tuple of Range
+        Each with its `parameter`, the `middle` and `half` the width.
+    """
+
+    robot: Robot
+    ranges: tuple[Range, ...]
+    _variants: Variants
+
+    def __repr__(self) -> str:
+        return f"Uncertain('{self.robot.name}', {len(self.ranges)} parameters)"
+
+    def __str__(self) -> str:
+        rows: list[tuple[str, ...]] = [("parameter", "is", "least", "largest", "")]
+        for one, middle, half in self.ranges:
+            ends = (one.value, middle - half, middle + half)
+            unit = "" if one.unit == "1" else one.unit
+            rows.append((one.name, *(f"{x:.6g}" for x in ends), unit))
+        return f"{self!r}\n{grid(rows, 'lrrrl')}"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(each.parameter.name for each in self.ranges)
+
+    def lft(self, q: Array | None = None) -> LFT:
+        """Return the model at rest as an exact linear-fractional function of the parameters.
+
+        Parameters
+        ----------
+        q : array_like (nq,), optional
+            Configuration; neutral by default.
+
+        Raises
+        ------
+        InputError
+            If the point is no fixed point whatever the parameters: springs out of rest, gravity,
+            stored momentum; or if an output feels accelerations or masses.
+        """
+        robot = self.robot
+        lin = linearize(robot, q)
+        rest = robot.springs.rest - StateMap(robot).joint_positions(lin.q)
+        pulled = [rest[each.parameter.spring] for each in self.ranges if each.parameter.spring >= 0]
+        if lin.f0.any() or any(pulled) or any(robot.gravity) or robot.stored_momentum:
+            pulls = "gravity" if any(robot.gravity) else "a spring out of its rest"
+            raise InputError(
+                "the point is no fixed point whatever the parameters: there is "
+                f"{'stored momentum' if robot.stored_momentum else pulls}; take a point at rest "
+                "without, or samples(n), and linearise each"
+            )
+        return _lft(self, lin)
+
+    def at(self, values: Mapping[str, float]) -> Robot:
+        """Return the robot of {parameter or pattern: value}; those that are not named stay.
+
+        Raises
+        ------
+        InputError
+            If a body of these is no rigid body.
+        """
+        given = numbers("values", values, "parameter", "value").items()
+        find = self._variants.parameters.find
+        return self._variants.robot({name: x for key, x in given for name in find(key)})
+
+    def makes(self, delta: Array) -> bool:
+        """Whether there is a robot of deltas (k,)."""
+        return not self._variants.refusal(self.values(delta))
+
+    def draws(self, n: int, *, seed: int = 0) -> tuple[Array, int]:
+        """Return deltas (n, k) of robots, uniform in their ranges, and how many made none."""
+        count, draw = whole("n", n, 1), np.random.default_rng(whole("seed", seed, 0))
+        found, lost = list[Array](), 0
+        while len(found) < count:
+            delta = draw.uniform(-1.0, 1.0, len(self.ranges))
+            if why := self._variants.refusal(self.values(delta)):
+                lost += 1
+                if lost >= _TRIES * (len(found) + 1):
+                    raise InputError(
+                        f"of {lost} robots in these ranges {len(found)} were physical: {why}; give "
+                        "narrower ranges"
+                    )
+                continue
+            found.append(delta)
+        return np.array(found), lost
+
+    def values(self, delta: Array) -> dict[str, float]:
+        """Return {parameter: value} of deltas (k,)."""
+        pairs = zip(self.ranges, delta, strict=True)
+        return {each.parameter.name: float(each.middle + each.half * d) for each, d in pairs}
+
+    def samples(self, n: int, *, seed: int = 0) -> list[Robot]:
+        """Return robots with parameters drawn uniformly from their ranges.
+
+        Parameters
+        ----------
+        n : int
+        seed : int
+            The same seed draws the same.
+
+        Returns
+        -------
+        list of Robot
+            What makes no rigid body, its pseudo-inertia not positive, is drawn again.
+
+        Raises
+        ------
+        InputError
+            If hardly any draw is physical.
+        """
+        return [self.at(self.values(delta)) for delta in self.draws(n, seed=seed)[0]]
+
+    def worst(
+        self, gain: Any, q: Array | None = None, *, samples: int = 200, seed: int = 0
+    ) -> Worst:
+        """Search the worst loop u = -K x over the set, and bound how far the set is safe.
+
+        Parameters
+        ----------
+        gain : Gain or array_like (nu, nx)
+            K, which makes the loop of the middle of the ranges stable.
+        q : array_like (nq,), optional
+            As of `lft`.
+        samples : int
+            Draws, from the worst of which a local search goes on; corners are tried too.
+        seed : int
+            The same seed draws the same.
+
+        Returns
+        -------
+        Worst
+
+        Raises
+        ------
+        InputError
+            If K has a wrong size or the loop in the middle is unstable; else as of `lft`.
+        """
+        return searched(self, self.lft(q), gain, whole("samples", samples, 1), seed)
+
+
+def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
+    """Say which parameters of a robot are uncertain, and how much.
+
+    Parameters
+    ----------
+    robot : Robot
+    ranges : mapping
+        {parameter: range}, the parameters those of `sensitivity`, or patterns. A number is a
+        relative half width, 0.2 for 20 %; a pair the least and the largest value. ``{link:
+        {"mass": .., "inertia.xx": ..}}`` says several of a link.
+
+    Returns
+    -------
+    Uncertain
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such parameter.
+    InputError
+        If a range is empty, is relative to 0, or has no physical robot in its middle.
+
+    References
+    ----------
+    P. M. Wensing, S. Kim and J.-J. E. Slotine, IEEE Robotics and Automation Letters 3(1), 2018, on
+    when an inertia is that of a body.
+    """
+    if not isinstance(robot, Robot):
+        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
+    robot.require_unchanged()
+    given: dict[str, Any] = {}
+    for key, value in mapping("ranges", ranges, "parameter").items():
+        if isinstance(value, Mapping):
+            given |= {f"{key}.{part}": each for part, each in value.items()}
+        else:
+            given[key] = value
+    if not given:
+        raise InputError("ranges is empty, expected {parameter: 0.2 or (least, largest)}")
+    variants, found = Variants(robot), dict[str, Range]()
+    parameters = variants.parameters
+    for key, value in given.items():
+        for name in parameters.find(key):
+            found[name] = _range(parameters[name], value)
+    for name in found:
+        if ".direction." in name:
+            raise InputError(
+                f"'{name}' turns a unit vector, in which the model is no fraction; see sensitivity"
+            )
+    _refuse_overlap(variants.pieces, found)
+    made = Uncertain(robot, tuple(found.values()), variants)
+    if why := variants.refusal(made.values(np.zeros(len(found)))):
+        raise InputError(f"the middle of the ranges is no robot: {why}")
+    return made
+
+
+def _refuse_overlap(pieces: Mapping[str, Piece], found: Mapping[str, Range]) -> None:
+    asked = {each.parameter.of for each in found.values()} & pieces.keys()
+    for name in asked:
+        for other in asked - {name}:
+            if pieces[name].whole and pieces[name].joint == pieces[other].joint:
+                raise InputError(f"'{other}' is a link of the body '{name}'; give one of them")
+
+
+def _range(one: Parameter, value: Any) -> Range:
+    if isinstance(value, tuple | list):
+        least, largest = vector(f"range of '{one.name}'", value, 2, "(least, largest)").tolist()
+    else:
+        share = number(f"range of '{one.name}'", value)
+        if not one.value:
+            raise InputError(
+                f"'{one.name}' is 0, of which {share:g} is nothing; give (least, largest)"
+            )
+        least, largest = sorted((one.value * (1.0 - share), one.value * (1.0 + share)))
+    if not least < largest:
+        raise InputError(
+            f"range of '{one.name}' is from {least:g} to {largest:g}, expected less and more"
+        )
+    return Range(one, 0.5 * (least + largest), 0.5 * (largest - least))
+
+
+def _lft(of: Uncertain, lin: Any) -> LFT:
+    ready = prepare(of.robot, frame=lin.frame, reference=None, moving=False)
+    if ready.sensing is not None and (lin.D.any() or ready.sensing.needs_acceleration):
+        raise InputError("an output feels accelerations; leave it out with robot.replace(outputs=)")
+    form = fraction(ready.map, ready.actuation, lin.q, of._variants.pieces, of.ranges)
+    nv, nw = len(lin.A) // 2, len(form.z[0])
+    x, w, u = form.a
+    A = np.vstack((lin.A[:nv], x))
+    return LFT(
+        A=A,
+        B1=np.vstack((np.zeros((nv, nw)), w)),
+        B2=np.vstack((np.zeros((nv, u.shape[1])), u)),
+        C1=form.z[0],
+        D11=form.z[1],
+        D12=form.z[2],
+        C2=np.array(lin.C),
+        D21=np.zeros((len(lin.C), nw)),
+        D22=np.array(lin.D),
+        parameters=of.names,
+        units=tuple(each.parameter.unit for each in of.ranges),
+        repeats=np.array([float(each.repeats) for each in of.ranges]),
+        middle=np.array([each.middle for each in of.ranges]),
+        half=np.array([each.half for each in of.ranges]),
+        state_names=lin.state_names,
+        input_names=lin.input_names,
+        output_names=lin.output_names,
+        robot=lin.robot,
+    )

@@ -1,0 +1,174 @@
+"""A rigid grasp: momentum, the weld, the energy lost, and the limit of a stiff one."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from tests.support.robots import random_point, random_pose
+
+DEBRIS = pin.Inertia(500.0, np.array([0.1, 0.2, 0.3]), np.diag([100.0, 120.0, 90.0]))
+CASES = {
+    "servicer_7dof": ("tool", DEBRIS),
+    "planar_detumble": ("hand", DEBRIS),
+    "ets_vii": ("tool", "planar_detumble"),
+    "robots/inspector.toml": ("gripper", "ets_vii"),
+}
+
+
+def grasped(name, seed=0, speed=0.2):
+    rng = np.random.default_rng(seed)
+    frame, payload = CASES[name]
+    robot = fflin.load(name)
+    q, v, _ = random_point(robot, rng, speed=speed)
+    options = {"q": q, "v": v, "placement": random_pose(rng, 70.0)}
+    options["payload_v"] = speed * rng.standard_normal(6)
+    if isinstance(payload, str):
+        payload = fflin.load(payload)
+        options["payload_q"], options["payload_v"], _ = random_point(payload, rng, speed=speed)
+    return robot, frame, payload, options, fflin.capture(robot, frame, payload, **options)
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_momentum_is_kept_and_energy_lost(name):
+    *_, found = grasped(name)
+    size = np.abs(found.momentum).max()
+    assert np.abs(found.momentum_after - found.momentum).max() < 1e-13 * size
+    assert found.energy_lost > 0.0
+    assert fflin.check(found.robot, fflin.linearize(found.robot, found.q, found.v)).ok
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_the_weld_is_closed_and_the_impulse_changes_both(name):
+    robot, frame, payload, options, found = grasped(name)
+    whole = found.robot
+    data = whole.create_data()
+    pin.forwardKinematics(whole.model, data, found.q, found.v)
+    pin.updateFramePlacements(whole.model, data)
+    local = pin.ReferenceFrame.LOCAL
+    grasp, held = (whole.model.getFrameId(each, pin.FrameType.BODY) for each in (frame, "payload"))
+    relative = data.oMf[grasp].actInv(data.oMf[held])
+    assert relative.isApprox(options["placement"], 1e-12)
+    twist = pin.getFrameVelocity(whole.model, data, held, local)
+    from_grasp = relative.actInv(pin.getFrameVelocity(whole.model, data, grasp, local))
+    assert np.abs(twist.vector - from_grasp.vector).max() < 1e-12
+    # What the robot's own motion changes by is what the impulse makes of it, joints free.
+    names = [name for name in robot.model.names if name not in ("universe",)]
+    v = np.concatenate(
+        [
+            found.v[(j := whole.model.joints[whole.model.getJointId(name)]).idx_v :][: j.nv]
+            for name in names
+        ]
+    )
+    own = robot.create_data()
+    pin.computeJointJacobians(robot.model, own, options["q"])
+    pin.updateFramePlacements(robot.model, own)
+    J = pin.getFrameJacobian(
+        robot.model, own, robot.model.getFrameId(frame, pin.FrameType.BODY), local
+    )
+    J = options["placement"].toActionMatrixInverse() @ J
+    M = pin.crba(robot.model, own, options["q"])
+    M = np.triu(M) + np.triu(M, 1).T
+    change = M @ (v - options["v"]) - J.T @ found.impulse
+    assert np.abs(change).max() < 1e-9 * np.abs(M @ options["v"]).max()
+    if isinstance(payload, pin.Inertia):
+        before = pin.Motion(np.array(options["payload_v"]))
+        impulse = payload * before - payload * pin.Motion(twist.vector)
+        assert np.abs(impulse.vector - found.impulse).max() < 1e-10 * np.abs(found.impulse).max()
+
+
+def test_it_is_the_limit_of_a_stiff_grasp():
+    """A spring and damper at the grasp, the stiffer the nearer: the rest halves with its time."""
+    rng = np.random.default_rng(3)
+    robot = fflin.load("ets_vii")
+    q, v, _ = random_point(robot, rng, speed=0.05)
+    payload = pin.Inertia(200.0, np.zeros(3), np.diag([30.0, 40.0, 50.0]))
+    twist = 0.05 * rng.standard_normal(6)
+    found = fflin.capture(robot, "tool", payload, q=q, v=v, payload_v=twist)
+    data, model = robot.create_data(), robot.model
+    tool = model.frames[model.getFrameId("tool")]
+    free = pin.Model()
+    free.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")
+    free.appendBodyToJoint(1, payload, pin.SE3.Identity())
+    free_data = free.createData()
+    pin.forwardKinematics(model, data, q)
+    q_p = pin.SE3ToXYZQUAT(data.oMi[tool.parentJoint] * tool.placement)
+
+    def rates(q, v, q_p, v_p, stiffness, damping):
+        pin.forwardKinematics(model, data, q, v)
+        at = data.oMi[tool.parentJoint] * tool.placement
+        held = pin.XYZQUATToSE3(q_p)
+        twist = tool.placement.actInv(data.v[tool.parentJoint])
+        behind = at.actInv(held)
+        apart = pin.log6(behind).vector
+        closing = behind.act(pin.Motion(v_p)).vector - twist.vector
+        pull = pin.Force(stiffness * apart + damping * closing)
+        outside = pin.StdVec_Force(model.njoints, pin.Force.Zero())
+        outside[tool.parentJoint] = tool.placement.act(pull)
+        other = pin.StdVec_Force(2, pin.Force.Zero())
+        other[1] = -behind.actInv(pull)
+        a = pin.aba(model, data, q, v, np.zeros(model.nv), outside)
+        return a.copy(), pin.aba(free, free_data, q_p, v_p, np.zeros(6), other).copy()
+
+    def after(rate, steps=4000):
+        """Velocity after 24 time constants of a grasp that is damped critically or more."""
+        stiffness = np.array([200.0, 200.0, 200.0, 40.0, 40.0, 40.0]) * rate**2
+        damping, h = 2.0 * stiffness / rate, 24.0 / rate / steps
+        state = [q.copy(), v.copy(), q_p.copy(), twist.copy()]
+        for _ in range(steps):
+            a, b = rates(*state, stiffness, damping)
+            middle = [
+                pin.integrate(model, state[0], 0.5 * h * state[1]),
+                state[1] + 0.5 * h * a,
+                pin.integrate(free, state[2], 0.5 * h * state[3]),
+                state[3] + 0.5 * h * b,
+            ]
+            a, b = rates(*middle, stiffness, damping)
+            state = [
+                pin.integrate(model, state[0], h * middle[1]),
+                state[1] + h * a,
+                pin.integrate(free, state[2], h * middle[3]),
+                state[3] + h * b,
+            ]
+        return state[1]
+
+    slow, fast = after(4e4), after(8e4)
+    errors = [np.abs(each - found.v).max() for each in (slow, fast)]
+    jump = np.abs(found.v - v).max()
+    assert errors[1] < 0.02 * jump and 1.7 < errors[0] / errors[1] < 2.3
+    assert np.abs(2.0 * fast - slow - found.v).max() < 0.1 * errors[1]
+
+
+def test_the_names_of_the_payload_have_its_prefix():
+    robot, payload = fflin.load("ets_vii"), fflin.load("servicer_7dof")
+    payload = payload.replace(stiffness={"panel_left": 80.0})
+    found = fflin.capture(robot, "tool", payload, prefix="client")
+    assert found.robot.stiffness == {"client.panel_left": 80.0}
+    assert "client.joint_1" in found.robot.joint_names
+    assert found.robot.inputs == robot.inputs and found.energy_lost == 0.0
+    S = fflin.sensitivity(fflin.linearize(found.robot))
+    assert S.parameters["client.link_3.mass"].value == pytest.approx(9.5)
+    again = fflin.capture(found.robot, "client.tool", DEBRIS)
+    assert again.robot.mass == pytest.approx(robot.mass + payload.mass + 500.0)
+
+
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_what_is_wrong_is_one_line():
+    robot, other = fflin.load("ets_vii"), fflin.load("cubesat")
+    cases = [
+        (lambda: fflin.capture(robot, "claw", DEBRIS), "claw"),
+        (lambda: fflin.capture(robot, "tool", 5.0), "expected a pin.Inertia"),
+        (lambda: fflin.capture("ets_vii", "tool", DEBRIS), "expected a fflin.Robot"),
+        (lambda: fflin.capture(robot, "tool", DEBRIS, prefix="tool"), "give another prefix"),
+        (lambda: fflin.capture(robot, "tool", DEBRIS, prefix="a.b"), "without dots"),
+        (lambda: fflin.capture(robot, "tool", DEBRIS, payload_v=[1.0]), "payload_v"),
+        (lambda: fflin.capture(robot, "tool", DEBRIS, placement=3), "placement"),
+        (lambda: fflin.capture(robot, "tool", pin.Inertia.Zero()), "no rigid body"),
+        (lambda: fflin.capture(robot, "tool", other.replace(gravity=(0, 0, -9.8))), "gravity"),
+    ]
+    for call, said in cases:
+        with pytest.raises(fflin.FflinError) as error:
+            call()
+        assert said in str(error.value) and "\n" not in str(error.value)

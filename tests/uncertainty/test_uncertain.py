@@ -1,0 +1,208 @@
+"""Uncertain robots: the exact fraction, samples, and the worst loop."""
+
+import numpy as np
+import pytest
+
+import fflin
+
+CASES = {
+    "cubesat": {
+        "base.mass": 0.2,
+        "base.com.x": (-0.01, 0.02),
+        "base.com.y": (-0.01, 0.01),
+        "base.inertia.xx": 0.2,
+        "base.inertia.xy": (-1e-4, 1e-4),
+    },
+    "servicer_7dof": {
+        "base.mass": 0.2,
+        "link_3.density": 0.3,
+        "link_7": {"com.x": (-0.05, 0.02), "com.z": (-0.2, -0.1), "mass": 0.1, "density": 0.1},
+        "link_7.inertia.xz": (-0.001, 0.001),
+        "panel_left.stiffness": (80.0, 120.0),
+        "panel_left.damping": (0.0, 1.0),
+    },
+    "planar_detumble": {
+        "target": {"mass": 0.2, "density": 0.1, "com.x": (-0.1, 0.1)},
+        "hand.mass": 0.5,
+        "link_1.com.y": (-0.02, 0.01),
+    },
+    "robots/inspector.toml": {
+        "base.density": 0.1,
+        "wheel_x.inertia": 0.2,
+        "top_left_front.position.z": 0.1,
+        "hinge_*.stiffness": 0.3,
+        "gripper.inertia.zz": 0.1,
+    },
+}
+
+
+def posed(robot, seed=0):
+    """A configuration with joints that have no spring at random."""
+    rng = np.random.default_rng(seed)
+    free = [j.name for j in robot.joints if "panel" not in j.name and j.name not in robot.stiffness]
+    return fflin.configuration(robot, {name: rng.uniform(-2.0, 2.0) for name in free})
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_the_fraction_is_the_model_linearised_again(name):
+    robot = fflin.load(name)
+    if name == "servicer_7dof":
+        robot = robot.replace(stiffness={"panel_right": 50.0})
+    of = fflin.uncertain(robot, CASES[name])
+    q = posed(robot)
+    lft = of.lft(q)
+    draws, _ = of.draws(6, seed=1)
+    for delta, made in zip(draws, of.samples(6, seed=1), strict=True):
+        lin = fflin.linearize(made, q)
+        A, B, C, D = lft.at(of.values(delta))
+        assert np.abs(A - lin.A).max() < 1e-11 * np.abs(lin.A).max()
+        assert np.abs(B - lin.B).max() < 1e-11 * np.abs(lin.B).max()
+        assert (C == lin.C).all() and (D == lin.D).all()
+    rows = lft.at(draws)
+    assert np.allclose(rows[1][5], B, rtol=1e-12, atol=0.0) and rows[0].shape == (6, *A.shape)
+
+
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_no_block_is_larger_than_the_rank_of_what_it_changes():
+    robot = fflin.load("planar_detumble")
+    q = posed(robot)
+    S = fflin.sensitivity(fflin.linearize(robot, q))
+    M = np.linalg.inv(S.lin.B[-9:])
+    linear = ["link_2.mass", "link_2.inertia.yy", "link_2.inertia.xy", "hand.density"]
+    for name in linear:
+        ends = (-1e-4, 1e-4) if name.endswith("xy") else 0.1
+        lft = fflin.uncertain(robot, {name: ends}).lft(q)
+        M_p = -M @ S[name].dB[-9:] @ M
+        sizes = np.linalg.svd(M_p, compute_uv=False)
+        assert lft.repeats == [np.sum(sizes > 1e-9 * sizes[0])]
+    # M is quadratic in a centre of mass: the order of the least realisation of d M1 + d^2 M2 is
+    # the rank of [[M1, M2], [M2, 0]].
+    of = fflin.uncertain(robot, {"link_2.com.x": (-0.1, 0.1)})
+    value = S.parameters["link_2.com.x"].value
+    more, less, now = (
+        np.linalg.inv(fflin.linearize(of.at({"link_2.com.x": value + d}), q).B[-9:])
+        for d in (0.1, -0.1, 0.0)
+    )
+    M1, M2 = 0.5 * (more - less), 0.5 * (more + less) - now
+    sizes = np.linalg.svd(np.block([[M1, M2], [M2, 0.0 * M2]]), compute_uv=False)
+    assert of.lft(q).repeats == [np.sum(sizes > 1e-9 * sizes[0])]
+
+
+def test_it_is_printed_saved_and_handed_on(tmp_path):
+    robot = fflin.load("cubesat")
+    of = fflin.uncertain(robot, CASES["cubesat"])
+    lft = of.lft()
+    for text in (str(of), str(lft)):
+        assert all(len(line) <= 80 for line in text.splitlines())
+    assert "in all" in str(lft) and str(lft).splitlines()[-1].endswith("14")
+    for ending in ("npz", "mat", "json"):
+        lft.save(tmp_path / f"u.{ending}")
+        again = fflin.LFT.load(tmp_path / f"u.{ending}")
+        assert again.parameters == lft.parameters and (again.D11 == lft.D11).all()
+    control = pytest.importorskip("control")
+    plant = lft.to_control()
+    assert plant.input_labels[0] == "w_base_mass_1" and plant.nstates == 12
+    delta = np.array([0.5, -0.3, 0.2, 0.9, -0.7])
+    of_w = np.diag(np.repeat(delta, lft.repeats.astype(int)))
+    closed = control.ss(lft.A, np.hstack((lft.B1, lft.B2)), plant.C, plant.D)
+    assert closed.ninputs == plant.ninputs
+    A, *_ = lft.at(delta)
+    within = np.linalg.inv(np.eye(14) - of_w @ plant.D[:14, :14])
+    assert np.allclose(plant.A + plant.B[:, :14] @ within @ of_w @ plant.C[:14], A, atol=1e-12)
+
+
+def test_samples_are_rigid_bodies_and_corners_that_are_none_are_counted():
+    robot = fflin.load("servicer_7dof")
+    of = fflin.uncertain(robot, {"link_3.inertia.xx": 0.3, "link_3.mass": 0.3})
+    draws, lost = of.draws(30, seed=2)
+    assert lost > 0 and (of.draws(30, seed=2)[0] == draws).all()
+    for made in of.samples(5, seed=2):
+        body = made.model.inertias[made.model.getJointId("joint_3")]
+        second = 0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia
+        assert np.linalg.eigvalsh(second)[0] > -1e-9
+    worst = of.worst(fflin.lqr(fflin.linearize(robot)), samples=20)
+    assert worst.excluded >= 1 and worst.tried >= 20
+
+
+def test_the_worst_loop_of_one_parameter_is_at_its_end():
+    robot = fflin.load("cubesat")
+    lin = fflin.linearize(robot)
+    gain = fflin.lqr(lin)
+    of = fflin.uncertain(robot, {"base.density": (0.5, 2.0)})
+    worst = of.worst(gain, samples=20)
+    damping, gains = [], []
+    for density in np.linspace(0.5, 2.0, 61):
+        other = fflin.linearize(of.at({"base.density": density}))
+        F = other.A - other.B @ gain.K
+        poles = np.linalg.eigvals(F)
+        damping.append((-poles.real / np.abs(poles)).min())
+        gains.append(
+            max(
+                np.linalg.norm(np.linalg.solve(1j * w * np.eye(12) - F, other.B), 2)
+                for w in np.geomspace(1e-4, 1e1, 400)
+            )
+        )
+    assert worst.damping.value == pytest.approx(min(damping), rel=1e-6)
+    assert worst.damping.parameters["base.density"] == pytest.approx(2.0)
+    assert worst.gain.value == pytest.approx(max(gains), rel=1e-3)
+    assert worst.gain.value > max(gains) * (1.0 - 1e-5)
+    assert worst.unstable == 0
+
+
+def test_the_bound_is_that_of_the_structured_singular_value():
+    ab13md = pytest.importorskip("slycot").ab13md
+    # A real number that multiplies one signal: only at frequencies without end, where M is
+    # singular for an inertia of 0, is the loop at its limit.
+    robot = fflin.load("cubesat")
+    gain = fflin.lqr(fflin.linearize(robot))
+    worst = fflin.uncertain(robot, {"base.inertia.xx": 0.3}).worst(gain, samples=5)
+    assert worst.safe == pytest.approx(1.0 / 0.3, rel=1e-6)
+    # Packard and Doyle: of one full block it is the largest singular value, of a repeated one no
+    # more than that; of a diagonal one the bound by D Z D^-1.
+    Z = np.array([[1.0, 4.0], [0.25, 1.0]])
+    assert ab13md(Z, [2], [2])[0] == pytest.approx(np.linalg.norm(Z, 2), rel=1e-6)
+    assert ab13md(Z, [1, 1], [2, 2])[0] == pytest.approx(2.0, rel=1e-6)
+
+
+def test_what_is_safe_is_stable_and_no_more_is_promised():
+    pytest.importorskip("slycot")
+    robot = fflin.load("ets_vii")
+    gain = fflin.lqr(fflin.linearize(robot))
+    of = fflin.uncertain(robot, {"base.mass": 0.5, "link_6.mass": 0.5, "link_6.com.z": (-0.3, 0.3)})
+    worst, lft = of.worst(gain, samples=10), of.lft()
+    rng = np.random.default_rng(5)
+    for delta in min(worst.safe, 1.0) * rng.uniform(-1.0, 1.0, (200, 3)):
+        A, B, *_ = lft.at(delta)
+        assert np.linalg.eigvals(A - B @ gain.K).real.max() < 0.0
+
+
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_what_is_wrong_is_one_line():
+    robot = fflin.load("servicer_7dof")
+    of = fflin.uncertain(robot, {"base.mass": 0.2})
+    cases = [
+        (lambda: fflin.uncertain(robot, {}), "ranges is empty"),
+        (lambda: fflin.uncertain(robot, {"link_99.mass": 0.1}), "no parameter"),
+        (lambda: fflin.uncertain(robot, {"base.mass": (3.0, 2.0)}), "expected less and more"),
+        (lambda: fflin.uncertain(robot, {"link_1.com.y": 0.1}), "give (least, largest)"),
+        (lambda: fflin.uncertain(robot, {"base.mass": (-3.0, 2.0)}), "is no robot"),
+        (lambda: fflin.uncertain(robot, {"base.inertia.xx": (1e-3, 2e-3)}), "is no robot"),
+        (lambda: of.at({"base.mass": -1.0}), "the mass of 'base' is -1 kg"),
+        (lambda: of.worst(np.zeros((2, 2))), "gain has shape"),
+        (lambda: of.worst(np.zeros((15, 30))), "unstable"),
+        (lambda: of.lft().at([0.0, 0.0]), "deltas have shape"),
+    ]
+    for call, said in cases:
+        with pytest.raises(fflin.FflinError) as error:
+            call()
+        assert said in str(error.value) and "\n" not in str(error.value)
+    sprung = robot.replace(stiffness={"panel_left": 80.0}, gravity=(0.0, 0.0, -9.8))
+    with pytest.raises(fflin.InputError, match="gravity"):
+        fflin.uncertain(sprung, {"base.mass": 0.1}).lft()
+    bent = fflin.configuration(robot, {"panel_left": 0.3})
+    with pytest.raises(fflin.InputError, match="out of its rest"):
+        fflin.uncertain(robot, {"panel_left.stiffness": (80.0, 90.0)}).lft(bent)
+    joined = fflin.load("planar_detumble")
+    with pytest.raises(fflin.InputError, match="is a link of the body"):
+        fflin.uncertain(joined, {"joint_3.mass": 0.1, "hand.mass": 0.1})
