@@ -10,18 +10,13 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from fflin.base.rotation import product_matrix, rotation_matrices
 from fflin.base.validation import Array
 from fflin.batch.rows import Points
-from fflin.dynamics.chart import SMALLEST_Q0, Chart, Standing
+from fflin.dynamics.chart import SMALLEST_Q0
 from fflin.dynamics.inertia import Inertia
-from fflin.dynamics.rnea import Rates
-from fflin.kernel.accelerations import BatchAccelerations, inverse_inertias
+from fflin.kernel.accelerations import inverse_inertias
 from fflin.kernel.tree import LANES, Tree, batch_tree
-from fflin.linear.linearization import LARGEST
-from fflin.linear.prepared import Prepared
-from fflin.linear.state_equations import assemble, drift
-from fflin.robot.frames import ROOT
+from fflin.linear.prepared import LARGEST, Prepared
 
 # Up to this angle the kernel's sines and cosines are exact to rounding [rad].
 _FARTHEST = 1e6
@@ -93,66 +88,28 @@ class RestEquations(BatchEquations):
 class PointEquations(BatchEquations):
     """A, B and f0 about any points."""
 
-    BLOCK = 256  # what is computed on the way stays in the cache
+    BLOCK = 4096
 
     def __init__(self, prepared: Prepared, tree: Tree) -> None:
         super().__init__(prepared, tree)
-        self._accelerations = BatchAccelerations(prepared.map, prepared.actuation, tree)
-        self._root = prepared.robot.model.jointPlacements[ROOT].rotation
+        self._kernel = prepared.kernel(tree)
 
     def _write_block(self, points: Points, out: Mapping[str, Array]) -> Mask:
-        prepared, state, actuation = self._prepared, self._prepared.map, self._prepared.actuation
+        state, inputs = self._prepared.map, self._prepared.actuation.names
         q, v, u = points
-        count, nv, groups = len(q), state.nx // 2, state.groups
-        nu: Array = np.zeros((count, nv)) if v is None else state.velocities(v)
-        if u is None:
-            u = np.zeros((count, len(actuation.names)))
-        q_m = state.joint_positions(q)
-        chart, r_b, within = self._place(q)
-        u_base = actuation.in_base_axes(chart, u)
-        stiffness, damping, rest = state.robot.springs
-        forces = u_base @ actuation.fixed.T
-        forces[:, 6:] -= stiffness * (q_m - rest) + damping * nu[:, 6:]
-        A = out["A"] if "A" in out else np.empty((count, state.nx, state.nx))
-        B = out["B_lower"]
-        A[:] = prepared.rest["A"]
-        found = self._accelerations.rates(q, nu, forces, u_base, A)
-        B[:] = found.inverse if actuation.default else found.inverse @ actuation.fixed
-        if actuation.carried:
-            B[:, :, self._accelerations.carried] = found.inverse @ found.columns
-        lower = A[:, nv:]
-        rates = Rates(found.c, lower[..., groups.q_m], lower[..., nv:], B, self._gravity(q))
-        f0 = assemble(state, actuation, chart, nu, u_base, rates, A, B, moving=prepared.moving)
-        values = {"_x0": state.compose(chart, r_b, q_m, nu), "f0": f0}
-        if prepared.moving:
-            values |= {"_drift": drift(state, f0, rates.gravity), "f0": np.zeros_like(f0)}
-        for key in values.keys() & out.keys():
-            out[key][:] = values[key]
-        good = within & self._regular(q, found.couplings)
+        count, nx = len(q), state.nx
+        v = np.zeros((count, state.robot.nv)) if v is None else v
+        u = np.zeros((count, len(inputs))) if u is None else u
+        rate = "_drift" if self._prepared.moving else "f0"
+        shapes = {"A": (nx, nx), "B_lower": (nx // 2, len(inputs)), rate: (nx,), "_x0": (nx,)}
+        found = [
+            out[key] if key in out else np.empty((count, *shape)) for key, shape in shapes.items()
+        ]
+        coupling, squares, q0 = self._kernel.many(q, v, u, found).T
+        if self._prepared.moving and "f0" in out:
+            out["f0"][:] = 0.0
         # NaN compares false.
-        for array in (lower, B, values["f0"][:, None]):
-            good &= np.einsum("ijk,ijk->i", array, array) < LARGEST
-        return good
-
-    def _place(self, q: Array) -> tuple[Chart, Array, Mask]:
-        """Return the chart and the base's position, and where the chart reaches."""
-        if self._prepared.own_reference:
-            chart: Chart = Standing(len(q))
-            return chart, chart.q_b, np.ones(len(q), dtype=bool)
-        state = self._prepared.map
-        quaternions = q[:, 3:7] @ product_matrix(state.origin_quaternion).T
-        quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-        quaternions[quaternions[:, 3] < 0.0] *= -1.0
-        q0 = quaternions[:, 3:]
-        chart = Chart(quaternions[:, :3], q0, rotation_matrices(quaternions))
-        return chart, state.positions(q), q0[:, 0] >= SMALLEST_Q0
-
-    def _gravity(self, q: Array) -> Array:
-        gravity = np.array(self._prepared.robot.gravity)
-        if not gravity.any():
-            return gravity
-        components: Array = (self._root.T @ gravity) @ rotation_matrices(q[:, 3:7])
-        return components
+        return self._regular(q, coupling) & (squares < LARGEST) & (q0 >= SMALLEST_Q0)
 
 
 def _filled(rows: Array) -> Array:

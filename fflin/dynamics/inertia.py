@@ -26,7 +26,7 @@ _QUICK_COUPLING = 1e-11 / _EPS
 
 # The same for each coordinate alone, from where on it has next to no inertia of its own: of robots
 # that are described well it is below 1e6.
-_LARGEST_SHARE = 1e9
+LARGEST_SHARE = 1e9
 
 STROKE = 1.0  # [m] that a sliding joint is taken to be out at most, for those moments
 
@@ -61,9 +61,7 @@ class Inertia:
         self._inverse = data.Minv
         self._inverse_diagonal = self._inverse.diagonal()
         self._constrained = bool(robot.followers)
-        if robot not in _BOUNDS:
-            _BOUNDS[robot] = inertia_bounds(robot.model)
-        self._bounds = None if self._constrained else _BOUNDS[robot]
+        self._bounds = bounds_of(robot)
         self._in_order = np.zeros(0) if self._bounds is None else state.velocities(self._bounds)
         self._slides = [joint.idx_q for joint in robot.joints if joint.prismatic]
         # The base at the world's origin: M does not depend on where it is, but Pinocchio works in
@@ -100,7 +98,7 @@ class Inertia:
         # Written so that NaN, from a pivot that is zero, fails too.
         if not self.least_coupling < coupling < _WARNING_COUPLING:
             self._judge(coupling, self._state.project(upper.T), out)
-        elif self._bounds is not None and not self._in_order.dot(out.diagonal()) < _LARGEST_SHARE:
+        elif self._bounds is not None and not self._in_order.dot(out.diagonal()) < LARGEST_SHARE:
             self._name_the_lightest(1.0 / out.diagonal())
 
     def _name_the_lightest(self, inertias: Array) -> None:
@@ -155,6 +153,13 @@ def _invert_dense(M: Array, out: Array) -> None:
 
 # Robots do not change, so each is bounded once.
 _BOUNDS: WeakKeyDictionary[Robot, Array | None] = WeakKeyDictionary()
+
+
+def bounds_of(robot: Robot) -> Array | None:
+    """Return `inertia_bounds` of a robot; None too where joints mimic others."""
+    if robot not in _BOUNDS:
+        _BOUNDS[robot] = None if robot.followers else inertia_bounds(robot.model)
+    return _BOUNDS[robot]
 
 
 def inertia_bounds(model: pin.Model) -> Array | None:

@@ -19,6 +19,9 @@ from typing import Any
 _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
 # Fewest steps of the loop for which its kernel is: loaded and kept on disk, kept, and neither.
 _BREAK_EVEN_LOOP, _BREAK_EVEN_LOOP_UNLOADED, _BREAK_EVEN_COMPILING = 100, 4000, 20_000
+# Calls of a linearizer from which on the kernel of single points is: loaded and kept on disk, kept,
+# and neither.
+_BREAK_EVEN_POINT, _BREAK_EVEN_POINT_UNLOADED, _BREAK_EVEN_POINT_COMPILING = 10, 20_000, 200_000
 
 # Files in which Linux tells a container's quota of computing time and its period [us], of version 2
 # and of version 1 of its control groups.
@@ -62,11 +65,19 @@ def loop_pays(steps: int, name: str = "advance") -> bool:
     """Whether a compiled loop is there and beats the one in Python over so many steps."""
     if steps < _BREAK_EVEN_LOOP or not numba_is_there():
         return False
-    chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
-    folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
-    if not any(_kept(folder, "loop", name) for folder in folders):
+    if not _kept_somewhere("loop", name):
         return steps >= _BREAK_EVEN_COMPILING
     return steps >= _BREAK_EVEN_LOOP_UNLOADED or "numba" in sys.modules
+
+
+def point_pays(calls: int) -> bool:
+    """Whether the kernel of single points is there and to be taken from this call on."""
+    if calls == _BREAK_EVEN_POINT:
+        loaded = "fflin.kernel.lanes" in sys.modules
+        return loaded and _kept_somewhere("linearise", "linearise_one")
+    if calls == _BREAK_EVEN_POINT_UNLOADED:
+        return numba_is_there() and _kept_somewhere("linearise", "linearise_one")
+    return calls == _BREAK_EVEN_POINT_COMPILING and numba_is_there()
 
 
 def kernel(module: str, name: str, what: str = "the batch kernel") -> Any:
@@ -85,6 +96,12 @@ def _prepared(module: str, name: str, what: str) -> Any:
     if not kept:
         _log.warning("fflin: compiling %s, once; it is kept in %s", what, folder)
     return compiled
+
+
+def _kept_somewhere(module: str, name: str) -> bool:
+    chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
+    folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
+    return any(_kept(folder, module, name) for folder in folders)
 
 
 def _kept(folder: Path, module: str, name: str) -> list[Path]:

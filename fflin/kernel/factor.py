@@ -79,8 +79,8 @@ def invert_factor(work, tree):
 
 
 @inlined
-def multiply(work, tree, couplings, first):
-    """Write M^-1 = U D^-1 U^T lane beside lane, and sum M_ii (M^-1)_ii."""
+def multiply(work, tree, judged):
+    """Write M^-1 = U D^-1 U^T, and at `judged` the sum of M_ii (M^-1)_ii."""
     packed, scaled, square = tree.packed, tree.scaled, tree.square
     size = len(tree.row)
     coupling = splat(work, 0.0)
@@ -95,10 +95,7 @@ def multiply(work, tree, couplings, first):
             store(work, square + (j * size + i), total)
             if i == j:
                 coupling = coupling + total * load(work, tree.diagonal + i)
-    # The diagonal is not needed any more.
-    store(work, tree.diagonal, coupling)
-    for lane in range(LANES):
-        couplings[first + lane] = work[tree.diagonal, lane]
+    store(work, judged, coupling)
 
 
 @inlined
@@ -148,5 +145,8 @@ def invert(tree, q, out, couplings, lanes, work):
         keep_diagonal(work, tree)
         factorise(work, tree)
         invert_factor(work, tree)
-        multiply(work, tree, couplings, first)
+        # The diagonal is not needed any more.
+        multiply(work, tree, tree.diagonal)
         unpack(work, tree.square, entries, out, first, 0)
+        for lane in range(LANES):
+            couplings[first + lane] = work[tree.diagonal, lane]

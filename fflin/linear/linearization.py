@@ -10,23 +10,24 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError
+from fflin.base.errors import InputError, MissingPackageError
 from fflin.base.frozen import frozen
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, vector
 from fflin.dynamics.chart import Chart, Standing
 from fflin.dynamics.rnea import Accelerations, Rates
 from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap
+from fflin.kernel.compiled import numba_is_there, point_pays
+from fflin.kernel.tree import batch_tree
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
-from fflin.linear.prepared import prepare
+from fflin.linear.prepared import LARGEST, prepare
 from fflin.linear.state_equations import assemble, drift
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
-# A matrix whose squares add up to more than the first counts as not finite, since its eigenvalues
-# would overflow. With velocities and inputs below the second nothing overflows in between.
-LARGEST, _MODERATE = 1e200, 1e50
+# With velocities and inputs below this nothing overflows on the way to `LARGEST`.
+_MODERATE = 1e50
 
 
 class Linearizer:
@@ -57,6 +58,10 @@ class Linearizer:
         The error dynamics about a reference that moves through the point with the robot's own
         dynamics: the error is q_b = vec(q*^-1 q), r_b = R*^T (p - p*), the frame is "local", and
         f0 is zero. For a trajectory, and for relative equilibria such as a steady spin.
+    compiled : bool, optional
+        Whether points where something moves, pulls or pushes are done by the compiled kernel, which
+        differs in rounding alone. By default where it is loaded already, and from as many calls on
+        as pay for that. What the kernel does not know is always done without.
 
     Raises
     ------
@@ -68,6 +73,8 @@ class Linearizer:
     ModelError
         If Pinocchio's Data for the robot would pass 1 GiB, or its model was changed after the
         robot was made.
+    MissingPackageError
+        If `compiled` is asked for and numba is not installed.
 
     Attributes
     ----------
@@ -88,8 +95,13 @@ class Linearizer:
         frame: Frame | None = None,
         reference: pin.SE3 | None = None,
         moving: bool = False,
+        compiled: bool | None = None,
     ) -> None:
-        self.robot = robot
+        if compiled and not numba_is_there():
+            raise MissingPackageError(
+                "compiled=True needs numba; install it with: pip install 'fflin[fast]'"
+            )
+        self.robot, self._asked = robot, compiled
         self.prepared = ready = prepare(robot, frame=frame, reference=reference, moving=moving)
         self._data = robot.create_data()
         self._lock = Lock()  # of the work space
@@ -99,17 +111,16 @@ class Linearizer:
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
         given = hypot(*robot.gravity, *np.concatenate(robot.springs).tolist())
         self._moderate = given < _MODERATE
+        self._calls, self._kernel, self._one = 0, None, None
+        # Those that the kernel takes, which must be writable.
+        self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
         self._known = ready.free and ready.own_reference and ready.actuation.default
-        self._at_rest_fields = {
-            **ready.common,
-            **ready.rest,
-            "_when_asked": {
-                "x0": partial(_state_at_rest, ready.map),
-                "y0": partial(_state_at_rest, ready.map),
-                "_reference": partial(_own_reference, robot),
-            },
-        }
+        at_rest, own = partial(_state_at_rest, ready.map), partial(_own_reference, robot)
+        asked = {"x0": at_rest, "y0": at_rest, "_reference": own}
+        self._fields = {**ready.common, **ready.rest, "_when_asked": asked}
+        if not ready.own_reference:
+            self._fields["_reference"] = ready.reference
 
     def __call__(
         self, q: Array | None = None, v: Array | None = None, u: Array | None = None
@@ -140,17 +151,21 @@ class Linearizer:
         """
         robot = self.robot
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
-        q.setflags(write=False)
         if v is None and u is None and self._known:
+            q.setflags(write=False)
             with self._lock:
                 return self._at_rest(q)
         if v is not None:
-            v = frozen(robot.checked_velocity(v).copy())
+            v = robot.checked_velocity(v).copy()
         if u is not None:
-            u = frozen(vector("u", u, self._shape_B[1], "the robot's inputs").copy())
-        v = self.prepared.rest["v"] if v is None else v
-        u = self.prepared.rest["u0"] if u is None else u
+            u = vector("u", u, self._shape_B[1], "the robot's inputs").copy()
         with self._lock:
+            lin = None if self._one is None and not self._begins() else self._by_kernel(q, v, u)
+            if lin is not None:
+                return lin
+            q.setflags(write=False)
+            v = self.prepared.rest["v"] if v is None else frozen(v)
+            u = self.prepared.rest["u0"] if u is None else frozen(u)
             if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
                 return self._anywhere(q, v, u)
             # An overflow is refused below, so NumPy need not warn of it. Not always done, since
@@ -162,13 +177,56 @@ class Linearizer:
         # A copy, in this process or another, needs a work space of its own.
         ready = self.prepared
         reference = None if ready.own_reference else ready.map.reference
-        return _rebuilt, (self.robot, ready.map.frame, reference, ready.moving)
+        return _rebuilt, (self.robot, ready.map.frame, reference, ready.moving, self._asked)
+
+    def _begins(self) -> bool:
+        """Whether the kernel takes over at this call, which then is there."""
+        self._calls += 1
+        if self._asked is False or not (self._asked or point_pays(self._calls)):
+            return False
+        tree = batch_tree(self.robot)
+        if tree is None:
+            self._asked = False
+            return False
+        self._kernel = self.prepared.kernel(tree)
+        self._one = self._kernel.one()
+        return True
+
+    def _by_kernel(self, q: Array, v: Array | None, u: Array | None) -> LinearModel | None:
+        """Return the model by the kernel, or None where that cannot vouch for it."""
+        ready, nx = self.prepared, self._lower.stop
+        A, B = np.empty((nx, nx)), np.empty(self._shape_B)
+        f0, x0 = np.empty(nx), np.empty(nx)
+        at_v, at_u = self._still
+        at_v, at_u = at_v if v is None else v, at_u if u is None else u
+        assert self._one is not None
+        if not self._one(q, at_v, at_u, A, B, f0, x0):
+            return None
+        made = {"A": A, "B": B, "f0": f0, "x0": x0, "y0": x0, "q": q}
+        if v is not None:
+            made["v"] = v
+        if u is not None:
+            made["u0"] = u
+        if ready.sensing is not None:
+            made |= zip(("C", "D", "y0"), self._sensed(q, at_v, at_u, x0), strict=True)
+        for array in made.values():
+            array.setflags(write=False)
+        if ready.moving:
+            made |= {"f0": ready.rest["f0"], "_drift": f0}
+        return LinearModel.from_fields(self._fields | made)
+
+    def _sensed(self, q: Array, v: Array, u: Array, x0: Array) -> tuple[Array, Array, Array]:
+        state = self.prepared.map
+        chart = self._standing if self.prepared.own_reference else state.chart(q)
+        rates = self._kernel.rates(state.gravity(q))
+        u_base = self.prepared.actuation.in_base_axes(chart, u)
+        return self._seen(chart, rates, q, v, state.velocities(v), u_base, x0)
 
     def _at_rest(self, q: Array) -> LinearModel:
         B = np.zeros(self._shape_B)
         self._accelerations.invert(q, B[self._lower])
         B.setflags(write=False)
-        return LinearModel.from_fields(self._at_rest_fields | {"B": B, "q": q})
+        return LinearModel.from_fields(self._fields | {"B": B, "q": q})
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
         ready = self.prepared
@@ -268,8 +326,10 @@ def linearize(
     return Linearizer(robot, frame=frame, reference=reference, moving=moving)(q, v, u)
 
 
-def _rebuilt(robot: Robot, frame: Frame, reference: pin.SE3 | None, moving: bool) -> Linearizer:
-    return Linearizer(robot, frame=frame, reference=reference, moving=moving)
+def _rebuilt(
+    robot: Robot, frame: Frame, reference: Any, moving: bool, compiled: bool | None
+) -> Linearizer:
+    return Linearizer(robot, frame=frame, reference=reference, moving=moving, compiled=compiled)
 
 
 def _state_at_rest(state: StateMap, q: Array) -> Array:

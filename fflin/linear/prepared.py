@@ -24,8 +24,13 @@ from fflin.robot.massless import require_inertia
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
+# A model whose squares add up to more counts as not finite, since its eigenvalues would overflow.
+LARGEST = 1e200
+
 if TYPE_CHECKING:
     from fflin.dynamics.outputs import Sensing
+    from fflin.kernel.points import PointKernel
+    from fflin.kernel.tree import Tree
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +71,16 @@ class Prepared:
     free: bool
     common: Mapping[str, Any]
     rest: Mapping[str, Array]
+
+    def kernel(self, tree: Tree) -> PointKernel:
+        """Return the compiled equations, of this robot's tree."""
+        from fflin.kernel.points import PointKernel
+
+        return PointKernel(
+            *(self.map, self.actuation, tree, LARGEST),
+            own=self.own_reference,
+            moving=self.moving,
+        )
 
 
 def prepare(
