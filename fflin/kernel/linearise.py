@@ -98,11 +98,12 @@ def _solve_row_by_row(work, tree, layout, to):
     for row in range(size):
         at = to + row * width
         for column in range(6, width):
-            work[at + column] = 0.0
+            store(work, at + column, 0.0)
         for k in range(size):
-            share, slopes = work[tree.square + row * size + k], layout.lower + k * width
+            share, slopes = load(work, tree.square + row * size + k), layout.lower + k * width
             for column in range(6, width):
-                work[at + column] -= share * work[slopes + column]
+                value = load(work, at + column) - share * load(work, slopes + column)
+                store(work, at + column, value)
     copy(work, to, work, layout.lower, size * width)  # which `assemble` leaves in base axes
 
 
