@@ -66,8 +66,10 @@ class BatchEquations(ABC):
         """Return where M is far from singular, and the angles are such that their sines are."""
         # NaN, from a pivot that is zero, compares false.
         good = (self._least_coupling < couplings) & (couplings < Inertia.warning_coupling)
-        near = np.abs(q[:, 7:]) < _FARTHEST
-        return good if near.all() else good & near.all(axis=1)
+        q_m = q[:, 7:]
+        if q_m.max(initial=0.0) < _FARTHEST and q_m.min(initial=0.0) > -_FARTHEST:
+            return good
+        return good & (np.abs(q_m) < _FARTHEST).all(axis=1)
 
 
 class RestEquations(BatchEquations):
