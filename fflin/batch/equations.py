@@ -94,7 +94,9 @@ class PointEquations(BatchEquations):
 
     def __init__(self, prepared: Prepared, tree: Tree) -> None:
         super().__init__(prepared, tree)
-        self._kernel = prepared.kernel(tree)
+        kernel = prepared.kernel()
+        assert kernel is not None
+        self._kernel = kernel
 
     def _write_block(self, points: Points, out: Mapping[str, Array]) -> Mask:
         state, inputs = self._prepared.map, self._prepared.actuation.names

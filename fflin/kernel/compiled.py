@@ -19,9 +19,8 @@ from typing import Any
 _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
 # Fewest steps of the loop for which its kernel is: loaded and kept on disk, kept, and neither.
 _BREAK_EVEN_LOOP, _BREAK_EVEN_LOOP_UNLOADED, _BREAK_EVEN_COMPILING = 100, 4000, 20_000
-# Calls of a linearizer from which on the kernel of single points is: loaded and kept on disk, kept,
-# and neither.
-_BREAK_EVEN_POINT, _BREAK_EVEN_POINT_UNLOADED, _BREAK_EVEN_POINT_COMPILING = 10, 20_000, 200_000
+# Fewest points, one by one, for which their kernel is, of these three.
+POINT_BREAK_EVENS = 1, 20_000, 200_000
 
 # Files in which Linux tells a container's quota of computing time and its period [us], of version 2
 # and of version 1 of its control groups.
@@ -32,6 +31,7 @@ _QUOTAS = (
 
 _log = logging.getLogger("fflin")
 _TURN = Lock()
+_FOUND: set[str] = set()  # what was found on disk once
 
 
 def available_cores() -> int:
@@ -71,13 +71,11 @@ def loop_pays(steps: int, name: str = "advance") -> bool:
 
 
 def point_pays(calls: int) -> bool:
-    """Whether the kernel of single points is there and to be taken from this call on."""
-    if calls == _BREAK_EVEN_POINT:
-        loaded = "fflin.kernel.lanes" in sys.modules
-        return loaded and _kept_somewhere("linearise", "linearise_one")
-    if calls == _BREAK_EVEN_POINT_UNLOADED:
-        return numba_is_there() and _kept_somewhere("linearise", "linearise_one")
-    return calls == _BREAK_EVEN_POINT_COMPILING and numba_is_there()
+    """Whether the kernel of single points is there and pays for so many of them."""
+    loaded = "fflin.kernel.lanes" in sys.modules
+    if calls < POINT_BREAK_EVENS[not loaded] or not numba_is_there():
+        return False
+    return calls >= POINT_BREAK_EVENS[2] or _point_is_kept()
 
 
 def kernel(module: str, name: str, what: str = "the batch kernel") -> Any:
@@ -102,6 +100,12 @@ def _kept_somewhere(module: str, name: str) -> bool:
     chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
     folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
     return any(_kept(folder, module, name) for folder in folders)
+
+
+def _point_is_kept() -> bool:
+    if not _FOUND and _kept_somewhere("linearise", "linearise_one"):
+        _FOUND.add("linearise_one")
+    return bool(_FOUND)
 
 
 def _kept(folder: Path, module: str, name: str) -> list[Path]:

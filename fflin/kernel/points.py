@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 import math
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -45,7 +45,7 @@ class PointKernel:
         joints, bounds = robot.joints, bounds_of(robot)
         self._robot = Equations(
             *(tree, layout, loads, places),
-            state.velocities(np.arange(robot.nv)),
+            state.velocities(np.arange(float(robot.nv))).astype(np.intp),
             np.array([joint.idx_q for joint in joints], dtype=np.intp),
             np.array([joint.unbounded for joint in joints], dtype=bool),
             np.array(robot.springs.rest),

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from math import hypot
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -17,14 +18,16 @@ from fflin.base.validation import Array, vector
 from fflin.dynamics.chart import Chart, Standing
 from fflin.dynamics.rnea import Accelerations, Rates
 from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap
-from fflin.kernel.compiled import numba_is_there, point_pays
-from fflin.kernel.tree import batch_tree
+from fflin.kernel.compiled import POINT_BREAK_EVENS, numba_is_there, point_pays
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
 from fflin.linear.prepared import LARGEST, prepare
 from fflin.linear.state_equations import assemble, drift
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from fflin.kernel.points import PointKernel
 
 # With velocities and inputs below this nothing overflows on the way to `LARGEST`.
 _MODERATE = 1e50
@@ -60,8 +63,8 @@ class Linearizer:
         f0 is zero. For a trajectory, and for relative equilibria such as a steady spin.
     compiled : bool, optional
         Whether points where something moves, pulls or pushes are done by the compiled kernel, which
-        differs in rounding alone. By default where it is loaded already, and from as many calls on
-        as pay for that. What the kernel does not know is always done without.
+        differs in rounding alone. By default where its code is loaded, and else from as many calls
+        on as pay for that. What the kernel does not know is always done without.
 
     Raises
     ------
@@ -101,7 +104,7 @@ class Linearizer:
             raise MissingPackageError(
                 "compiled=True needs numba; install it with: pip install 'fflin[fast]'"
             )
-        self.robot, self._asked = robot, compiled
+        self.robot, self._given, self._asked = robot, compiled, compiled
         self.prepared = ready = prepare(robot, frame=frame, reference=reference, moving=moving)
         self._data = robot.create_data()
         self._lock = Lock()  # of the work space
@@ -111,7 +114,9 @@ class Linearizer:
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
         given = hypot(*robot.gravity, *np.concatenate(robot.springs).tolist())
         self._moderate = given < _MODERATE
-        self._calls, self._kernel, self._one = 0, None, None
+        self._calls = 0
+        self._kernel: PointKernel | None = None
+        self._one: Callable[..., bool] | None = None
         # Those that the kernel takes, which must be writable.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
@@ -177,28 +182,26 @@ class Linearizer:
         # A copy, in this process or another, needs a work space of its own.
         ready = self.prepared
         reference = None if ready.own_reference else ready.map.reference
-        return _rebuilt, (self.robot, ready.map.frame, reference, ready.moving, self._asked)
+        return _rebuilt, (self.robot, ready.map.frame, reference, ready.moving, self._given)
 
     def _begins(self) -> bool:
         """Whether the kernel takes over at this call, which then is there."""
         self._calls += 1
-        if self._asked is False or not (self._asked or point_pays(self._calls)):
-            return False
-        tree = batch_tree(self.robot)
-        if tree is None:
-            self._asked = False
-            return False
-        self._kernel = self.prepared.kernel(tree)
-        self._one = self._kernel.one()
-        return True
+        if self._asked is None and self._calls in POINT_BREAK_EVENS:
+            self._asked = point_pays(self._calls) or None
+        if self._asked:
+            self._kernel = self.prepared.kernel()
+            self._one = None if self._kernel is None else self._kernel.one()
+            self._asked = self._one is not None
+        return bool(self._asked)
 
     def _by_kernel(self, q: Array, v: Array | None, u: Array | None) -> LinearModel | None:
         """Return the model by the kernel, or None where that cannot vouch for it."""
         ready, nx = self.prepared, self._lower.stop
         A, B = np.empty((nx, nx)), np.empty(self._shape_B)
         f0, x0 = np.empty(nx), np.empty(nx)
-        at_v, at_u = self._still
-        at_v, at_u = at_v if v is None else v, at_u if u is None else u
+        at_v = self._still[0] if v is None else v
+        at_u = self._still[1] if u is None else u
         assert self._one is not None
         if not self._one(q, at_v, at_u, A, B, f0, x0):
             return None
@@ -217,6 +220,7 @@ class Linearizer:
 
     def _sensed(self, q: Array, v: Array, u: Array, x0: Array) -> tuple[Array, Array, Array]:
         state = self.prepared.map
+        assert self._kernel is not None
         chart = self._standing if self.prepared.own_reference else state.chart(q)
         rates = self._kernel.rates(state.gravity(q))
         u_base = self.prepared.actuation.in_base_axes(chart, u)
@@ -323,7 +327,9 @@ def linearize(
     --------
     Linearizer : the same, prepared once for many points; the equations stand there.
     """
-    return Linearizer(robot, frame=frame, reference=reference, moving=moving)(q, v, u)
+    return Linearizer(robot, frame=frame, reference=reference, moving=moving, compiled=False)(
+        q, v, u
+    )
 
 
 def _rebuilt(

@@ -30,7 +30,6 @@ LARGEST = 1e200
 if TYPE_CHECKING:
     from fflin.dynamics.outputs import Sensing
     from fflin.kernel.points import PointKernel
-    from fflin.kernel.tree import Tree
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,15 +71,14 @@ class Prepared:
     common: Mapping[str, Any]
     rest: Mapping[str, Array]
 
-    def kernel(self, tree: Tree) -> PointKernel:
-        """Return the compiled equations, of this robot's tree."""
+    def kernel(self) -> PointKernel | None:
+        """Return the compiled equations, or None where the kernel does not know a joint."""
         from fflin.kernel.points import PointKernel
+        from fflin.kernel.tree import batch_tree
 
-        return PointKernel(
-            *(self.map, self.actuation, tree, LARGEST),
-            own=self.own_reference,
-            moving=self.moving,
-        )
+        tree = batch_tree(self.robot)
+        options = {"own": self.own_reference, "moving": self.moving}
+        return tree and PointKernel(self.map, self.actuation, tree, LARGEST, **options)
 
 
 def prepare(
