@@ -35,12 +35,7 @@ class BatchEquations(ABC):
         self._least_coupling = 0.999 * (6 + prepared.robot.n)
 
     def write(self, points: Points, out: Mapping[str, Array]) -> RowNumbers:
-        """Write what differs from point to point, and return the rows that are left.
-
-        Left are those that the linearizer refuses or warns of: where M is singular or nearly so,
-        the chart ends, or numbers are beyond all sense. `out` has B_lower and, but at rest, A, f0,
-        _x0 and with a moving reference _drift, each with as many rows.
-        """
+        """Write what differs from point to point, and return the rows that are left."""
         count = len(points.q)
         if count < LANES:
             more = {key: np.empty((LANES, *array.shape[1:])) for key, array in out.items()}
@@ -122,11 +117,7 @@ def _filled(rows: Array) -> Array:
 
 
 def batch_equations(prepared: Prepared, *, only_inertia: bool) -> BatchEquations | None:
-    """Return the equations of a robot, or None where the kernel does not know them.
-
-    It differentiates no outputs, and knows joints that are screws about fixed axes. Where
-    `only_inertia`, all but B is known beforehand.
-    """
+    """Return the equations of a robot, or None where the kernel does not know them."""
     tree = batch_tree(prepared.robot)
     if tree is None or prepared.sensing is not None:
         return None

@@ -30,10 +30,7 @@ class Aba:
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 
     def acceleration(self, q: Array, v: Array, u: Array, tau: Array | None = None) -> Array:
-        """Return dv/dt (nv,) in Pinocchio's order; `u` (nu,) in base axes.
-
-        `tau` (nv,), in Pinocchio's order, is a force besides.
-        """
+        """Return dv/dt (nv,) in Pinocchio's order; `u` (nu,) in base axes."""
         forces = self.actuation.torques(u)
         if self._resists:
             forces += self._passive_force(q, v)
@@ -52,11 +49,7 @@ class Aba:
         return size
 
     def slopes(self, q: Array, v: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Return d(nudot)/d(tangent of q, nu, u) in state order, (6 + n, ...); `u` in base axes.
-
-        The wrenches of thrusters are constant in the frames of their links, so that the first
-        holds d(B u)/dq too. B comes from the accelerations of unit inputs at rest.
-        """
+        """Return d(nudot)/d(tangent of q, nu, u) in state order, (6 + n, ...); `u` in base axes."""
         state = self.state
         stiffness, damping, _ = state.robot.springs
         tau = state.lift(self.actuation.torques(u) + self._passive_force(q, v))
@@ -96,11 +89,7 @@ class Aba:
         return total
 
     def _turning(self, joint: int, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the slopes (3, nv) over v and q of the angular velocity of a link in its axes.
-
-        A turn of a joint l that carries it, about s in its axes, changes it by omega_p x s, with
-        omega_p the angular velocity of what carries l; a turn of the base changes nothing.
-        """
+        """Return the slopes (3, nv) over v and q of the angular velocity of a link in its axes."""
         model, data = self._model, self._data
         pin.forwardKinematics(model, data, q, v)
         pin.computeJointJacobians(model, data, q)
@@ -135,13 +124,7 @@ class Aba:
     def _constrained_slopes(
         self, q: Array, v: Array, external: pin.StdVec_Force, tau: Array, S: Array
     ) -> tuple[Array, Array, Array]:
-        """Return the slopes where joints mimic others: S^T M a = S^T (tau - b).
-
-        The forces that keep the joints in step drop out of this equation. ABA needs a regular M,
-        which it is not where one of these joints carries no mass. So each gets, as a rotor, an
-        inertia as large as the one that they share, M' = M + rotor, and what the rotors add to
-        S^T M' S is subtracted again.
-        """
+        """Return the slopes where joints mimic others: S^T M a = S^T (tau - b)."""
         state, data = self.state, self._data
         shared = S @ state.project(pin.crba(self._model, data, q)).diagonal()
         model = self._model.copy()

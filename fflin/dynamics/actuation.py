@@ -95,10 +95,7 @@ class Actuation:
         self._of_carried = [at for items in carried.values() for at, _ in items]
 
     def columns(self, data: pin.Data, q: Array) -> Array:
-        """Return B_u (6 + n, nu), the generalised force in base axes of a unit of each input (6.1).
-
-        Inputs that are held in reference axes are counted as if they were held in base axes.
-        """
+        """Return B_u (6 + n, nu) in base axes (6.1), as if none were held in reference axes."""
         if not self.carried:
             return self.fixed
         columns = self.fixed.copy()
@@ -129,10 +126,7 @@ class Actuation:
         return chart.to_reference(self._held, by_u.mT, out=None if out is None else out.mT).mT
 
     def wrenches(self, u: Array) -> pin.StdVec_Force | None:
-        """Return the wrench of thrusters and wheels on every joint, in its frame, if there is any.
-
-        It is constant there. Wheels that are joints, and stored momentum, have no part in it.
-        """
+        """Return the wrench of carried inputs on every joint, constant in its frame, if any."""
         if not self.carried:
             return None
         external = pin.StdVec_Force(self._model.njoints, pin.Force.Zero())

@@ -14,10 +14,7 @@ SMALLEST_Q0 = float(np.sqrt(np.finfo(float).eps))
 
 @dataclass(frozen=True)
 class Chart:
-    """The attitude chart at one base attitude, relative to the reference, or at many.
-
-    Numbers of equations are those of docs/derivation.md.
-    """
+    """The attitude chart at one base attitude, relative to the reference, or at many."""
 
     q_b: Array  # vector part (.., 3) of the quaternion of refMb
     q0: float | Array  # its scalar part (.., 1), positive
@@ -51,10 +48,7 @@ class Chart:
         return times(self.R, vectors)
 
     def rate_over_q_b(self, omega: Array, crossed: Array) -> Array:
-        """Return the slope (.., 3, 3) of `rate` over q_b, omega held in base axes (4.2).
-
-        `crossed` is [omega]x. From d q0 = -q_b^T d q_b / q0.
-        """
+        """Return the slope (.., 3, 3) of `rate` over q_b, omega held in base axes (4.2)."""
         return -0.5 * (crossed + self._over_q0(omega))
 
     def _over_q0(self, omega: Array) -> Array:
@@ -67,10 +61,7 @@ class Chart:
     def to_reference(
         self, parts: tuple[slice, ...], x: Array, *, out: Array | None = None
     ) -> Array:
-        """Return x (.., m, k) with some parts, three rows each, turned to reference axes by R.
-
-        With `out`, which may be x, it is written there.
-        """
+        """Return x (.., m, k) with some parts, three rows each, turned to reference axes by R."""
         return _turned(self.R, parts, x, out)
 
     def to_base(self, parts: tuple[slice, ...], x: Array) -> Array:

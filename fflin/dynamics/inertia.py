@@ -43,13 +43,7 @@ _crba, _decompose, _invert_factor, _compute_inverse = (
 
 
 class Inertia:
-    """M^-1 at a configuration, in base axes: angular, linear, joints.
-
-    By Pinocchio's articulated bodies where these are sure to lose no digit that matters, else by
-    a Cholesky factor of CRBA's M. Scaling M by its diagonal before it is factored would gain
-    nothing, since the rounding of a Cholesky factorisation is invariant under it. `data` is work
-    space, overwritten at each call.
-    """
+    """M^-1 at a configuration, in base axes: angular, linear, joints."""
 
     # Between this and `least_coupling` the sum of M_ii (M^-1)_ii lies where M^-1 is good.
     warning_coupling = _WARNING_COUPLING
@@ -70,14 +64,12 @@ class Inertia:
         self.least_coupling = 0.999 * (6 + robot.n)
 
     def invert(self, q: Array, out: Array, *, quick: bool = False) -> None:
-        """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array.
-
-        By articulated bodies only where `quick` is asked for: their rounding, small as it is,
-        takes from a slope M^-1 K the exactness of what M^-1 leaves alone. Where a joint moves no
-        mass, a `SingularInertiaError` names it.
-        """
+        """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
         still = self._still
         still[7:] = q[7:]
+        # By articulated bodies only where that is asked for: their rounding, small as it is, takes
+        # from a slope M^-1 K the exactness of what M^-1 leaves alone. Else by a Cholesky factor,
+        # whose rounding no scaling of M changes.
         bounds = self._bounds if quick else None
         if bounds is not None and all(abs(still[index]) <= STROKE for index in self._slides):
             _compute_inverse(self._model, self._data, still)
@@ -163,13 +155,9 @@ def bounds_of(robot: Robot) -> Array | None:
 
 
 def inertia_bounds(model: pin.Model) -> Array | None:
-    """Bound what each coordinate of a free flyer moves: its mass, or its moment.
-
-    A body's moment about an axis through the base's origin is at most its largest principal moment
-    and its mass times the square of the way to it, from joint to joint. M's diagonal is no larger.
-    The bounds (nv,) are in Pinocchio's order, for sliding joints within `STROKE`; None where a
-    joint neither turns nor slides alone.
-    """
+    """Bound what each coordinate of a free flyer moves: its mass, or its moment."""
+    # A body's moment about the base's origin is at most its largest principal moment and its mass
+    # times the square of the way to it, from joint to joint, sliding ones being within `STROKE`.
     joints = model.joints.tolist()
     slides = [joint.shortname().startswith("JointModelP") for joint in joints]
     if not all(joint.shortname()[:11] in ("JointModelR", "JointModelP") for joint in joints[2:]):

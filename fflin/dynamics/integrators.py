@@ -43,10 +43,7 @@ class Integrator:
 
     @classmethod
     def shares(cls, dt: float) -> tuple[Array, Array]:
-        """Return those of v and its rates l in what moves q after each stage, and in the new v.
-
-        Row by row; the last of what moves q is that of a second displacement at the end.
-        """
+        """Return those of v and its rates l in what moves q after each stage, and in the new v."""
         raise NotImplementedError
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
@@ -63,14 +60,7 @@ class Integrator:
 
 
 class CommutatorFree4(Integrator):
-    r"""CF4 of Celledoni, Marthinsen and Owren: order 4, with two exponentials at the end (11.1).
-
-    With the stages of the velocity put in, only accelerations :math:`l_i` are left to combine:
-
-    .. math:: k_2 = v + \tfrac h2 l_1,\quad k_3 = v + \tfrac h2 l_2,\quad k_4 = v + h l_3
-
-    and what moves q is :math:`\tfrac h2 v` and sums of :math:`l_i`.
-    """
+    """CF4 of Celledoni, Marthinsen and Owren: order 4, with two exponentials at the end (11.1)."""
 
     nodes = (0.0, 0.5, 0.5, 1.0)
     weights = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)

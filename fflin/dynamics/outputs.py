@@ -19,17 +19,7 @@ _STANDING: tuple[Array, Array] = (np.eye(3), np.zeros(3))
 
 
 class Sensing:
-    r"""The outputs of a robot, prepared.
-
-    Neither where the base is nor how fast it moves along changes what happens on the robot
-    (Galilei). So Pinocchio is asked about the robot with its base at the origin, in its own axes,
-    and without the velocity v_b of its origin; rotation, position and velocity of the base are
-    put on afterwards, and an orbit costs no digits. Of the base's acceleration only
-    :math:`\dot v_b + \omega_b \times v_b - g`, in base axes, is felt.
-
-    With `own_reference` the reference is the base's own placement at each point, not that of the
-    state. What is no output, or twice there, is an `InputError`.
-    """
+    """The outputs of a robot, prepared."""
 
     def __init__(
         self, state: StateMap, outputs: Sequence[Output], *, own_reference: bool = False
@@ -64,11 +54,7 @@ class Sensing:
         self.needs_acceleration = any(output.FEELS_ACCELERATION for output in outputs)
 
     def evaluate(self, data: pin.Data, q: Array, v: Array, a: Array) -> Sensed:
-        """Return the outputs and their derivatives at valid q (nq,) and v (nv,).
-
-        What `data` held is lost. The acceleration a (nv,), as pin.aba returns it with gravity's
-        part, is not looked at where `needs_acceleration` is false.
-        """
+        """Return the outputs and their derivatives at valid q (nq,) and v (nv,)."""
         ny, nv = len(self.names), len(v)
         by_a = np.zeros((ny, nv)) if self.needs_acceleration else None
         sensed = Sensed(np.zeros(ny), np.zeros((ny, nv)), np.zeros((ny, nv)), by_a)
@@ -92,6 +78,8 @@ class Sensing:
         pin.computeForwardKinematicsDerivatives(at.model, at.data, at.q, at.v, *felt)
 
     def _point(self, data: pin.Data, q: Array, v: Array) -> Point:
+        # Neither where the base is nor how fast it moves along changes what happens on the robot
+        # (Galilei): both are left out and put on afterwards, so that an orbit costs no digits.
         state, robot = self._state, self._state.robot
         still_q, still_v = q.copy(), v.copy()
         still_q[:7] = self._home
@@ -106,11 +94,7 @@ class Sensing:
 
 
 class Measuring:
-    """The outputs y of the nonlinear robot, out of elementary kinematics in the world.
-
-    The route by which C and D are checked, and nothing of the one by which they are made. Rotation
-    vectors are counted from the point q (nq,).
-    """
+    """The outputs y of the nonlinear robot, out of elementary kinematics in the world."""
 
     def __init__(self, state: StateMap, q: Array) -> None:
         self.state = state

@@ -16,10 +16,7 @@ from fflin.dynamics.state import LINEAR, PIN_ANGULAR, StateMap
 
 
 class Rates(NamedTuple):
-    """The acceleration of the base origin and the joints, in base axes, and what it depends on.
-
-    Of many points each has a leading axis of them.
-    """
+    """The acceleration of the base origin and the joints, in base axes, and what it depends on."""
 
     c: Array  # (6 + n,) of (3.1): without gravity and omega x v_b
     by_q_m: Array  # D_m (6 + n, n) of (3.3)
@@ -39,12 +36,7 @@ class Gyroscopic(NamedTuple):
 
 
 class Accelerations:
-    r"""``M nudot + b = B u`` of a robot, solved and differentiated in base axes.
-
-    The slopes of :math:`\dot\nu = M^{-1}(B u - b(q, \nu))` are those of RNEA at the acceleration,
-    :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)`. `data` is work space, overwritten
-    at each call.
-    """
+    """``M nudot + b = B u`` of a robot, solved and differentiated in base axes."""
 
     def __init__(self, state: StateMap, actuation: Actuation, data: pin.Data) -> None:
         robot = state.robot
@@ -61,10 +53,7 @@ class Accelerations:
         self._inertia.invert(q, out, quick=True)
 
     def rates(self, q: Array, v: Array, nu: Array, q_m: Array, u: Array) -> Rates:
-        """Return the accelerations and their slopes at q (nq,), v (nv,) and u (nu,) in base axes.
-
-        With nu (6 + n,), the same velocity in state order and base axes, and the joints' q_m (n,).
-        """
+        """Return the rates at q, v and u in base axes, v being `nu` and q_m in state order."""
         model, data, state = self._model, self._data, self._state
         # Without the base's position and linear velocity: nothing here depends on them, and
         # Pinocchio's derivatives lose digits to both. Nor does it depend on gravity, which
@@ -93,14 +82,9 @@ class Accelerations:
     def _bias_slopes(
         self, q: Array, v: Array, c: Array, u: Array, gyroscopic: Gyroscopic | None
     ) -> tuple[Array, Array]:
-        """Return the slopes of M a + b - B u + passive forces over q_m (.., n) and nu, a held.
-
-        They are those of (3.3), with springs and dampers (7.1).
-
-        The wrenches of thrusters are constant in the frames of their links, so that RNEA's
-        derivatives with them hold -d(B u)/dq.
-        """
+        """Return the slopes of M a + b - B u + passive forces over q_m and nu, a held (3.3), (7.1)."""
         model, data, state = self._model, self._data, self._state
+        # Constant in the frames of their links, so that RNEA's derivatives hold -d(B u)/dq.
         wrenches = gyroscopic.wrenches if gyroscopic else self._actuation.wrenches(u)
         external = () if wrenches is None else (wrenches,)
         full_q, full_v, _ = pin.computeRNEADerivatives(
@@ -115,12 +99,9 @@ class Accelerations:
         return by_q, by_v
 
     def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:
-        """Return the torques of stored momentum, their wrenches with those of the inputs.
-
-        With the angular Jacobian J of a link in its own axes, omega = J v, the torque
-        h x omega is the generalised force J^T [h]x J v (6.3).
-        """
+        """Return the torques of stored momentum, their wrenches with those of the inputs."""
         model, data, nv = self._model, self._data, len(v)
+        # With the angular Jacobian J of a link in its axes, h x omega is J^T [h]x J v (6.3).
         wrenches = self._actuation.wrenches(u)
         if wrenches is None:
             wrenches = pin.StdVec_Force(model.njoints, pin.Force.Zero())

@@ -27,10 +27,7 @@ _TURN = 2.0 * np.pi
 
 
 def states_of(state: StateMap, q: Array, nu: Array) -> Array:
-    """Return the states (N, nx) of rows of valid q (N, nq) and nu (N, 6 + n) in base axes.
-
-    Continuous joints are in (-pi, pi]; a turn of pi gives one of its two values.
-    """
+    """Return the states (N, nx) of rows of valid q (N, nq) and nu (N, 6 + n) in base axes."""
     quaternion = q[:, 3:7] @ product_matrix(state.origin_quaternion).T
     quaternion *= np.where(quaternion[:, 3:] < 0.0, -1.0, 1.0)
     chart = Chart(quaternion[:, :3], quaternion[:, 3:], rotation_matrices(quaternion))
@@ -40,12 +37,7 @@ def states_of(state: StateMap, q: Array, nu: Array) -> Array:
 def state_history(
     state: StateMap, q: Array, v: Array, near: Array | None = None, t: Array | None = None
 ) -> Array:
-    """Return the states (N, nx) of a motion, rows of valid q (N, nq) and v (N, nv).
-
-    Continuous joints go on counting turns, from the turn nearest to `near` (nx,); with the times t
-    (N,) as many as their rates make between rows, else less than half of one. A turn of pi, where
-    the chart ends, gives one of its two values.
-    """
+    """Return the states (N, nx) of a motion, rows of valid q (N, nq) and v (N, nv)."""
     rates = state.velocities(v)
     x = states_of(state, q, rates)
     q_m = x[:, state.groups.q_m]
@@ -74,12 +66,7 @@ def attitude_errors(x: Array, target: Array) -> Array:
 
 
 def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:
-    """Return f(q, v) = offset - K x(q, v) (m,), x being the state of valid q and v.
-
-    The attitude is linear in the quaternion, the place in the base's, and velocities in reference
-    axes in R v: one product with all these gives f. That takes a fifth of the time of the state.
-    The angle of each continuous joint is taken on the turn nearest to the state `near` (nx,).
-    """
+    """Return f(q, v) = offset - K x(q, v) (m,), x being the state of valid q and v."""
     robot, g = state.robot, state.groups
     idx_q = np.array([joint.idx_q for joint in robot.joints], dtype=np.intp)
     circling, cos = state.unbounded, idx_q[state.unbounded]

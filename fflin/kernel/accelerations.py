@@ -19,27 +19,11 @@ class Layout(namedtuple("Layout", "motion load bias c columns lower held size"))
 
 
 class Loads(namedtuple("Loads", "body wrench input stored_body stored stiffness damping")):
-    """What acts on the bodies and joints of a robot.
-
-    Attributes
-    ----------
-    body, wrench, input : ndarray (k,), (6 k,), (k,)
-        Of every input that is carried: its body, the moment and force of a unit about the joint's
-        origin, in the body's axes, and its number.
-    stored_body, stored : ndarray (s,), (3 s,)
-        Angular momentum that bodies store, in their axes.
-    stiffness, damping : ndarray (n,)
-    """
+    """Body, unit wrench at its joint and number of carried inputs; stored momenta; springs."""
 
 
 def inverse_inertias(tree: Tree, q: Array, out: Array) -> Array:
-    """Write M^-1 (N, 6 + n, 6 + n) at configurations (N, nq), N the number of lanes at least.
-
-    Returns
-    -------
-    ndarray (N,)
-        Sums of M_ii (M^-1)_ii, which tell how singular M is.
-    """
+    """Write M^-1 (N, 6 + n, 6 + n) at configurations (N, nq), N the number of lanes at least."""
     couplings = np.empty(len(q))
     flat = out.reshape(len(q), -1)
     spaces = work_space(q.shape[1]), work_space(tree.size)

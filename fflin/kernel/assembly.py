@@ -43,11 +43,7 @@ class Equations(
 
 
 class Places(namedtuple("Places", "A by_u B f0 x0 sums judged size")):
-    """Where results begin in the work space; its size.
-
-    A has all of its rows, `by_u` (6 + n, nu) and B the lower half; `judged` is the sum of
-    M_ii (M^-1)_ii, that of the squares of what was computed, and q0.
-    """
+    """Where A, by_u (6 + n, nu) in base axes, the lower half of B, ... begin; the size of all."""
 
 
 class Point(namedtuple("Point", "q v u nu pushing forces")):

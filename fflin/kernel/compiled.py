@@ -109,10 +109,8 @@ def _point_is_kept() -> bool:
 
 
 def _kept(folder: Path, module: str, name: str) -> list[Path]:
-    """Return what is kept of a function and not older than any source.
-
-    numba compares with the function's own file, not with those of the functions that it calls.
-    """
+    """Return what is kept of a function and not older than any source."""
+    # numba compares with the function's own file, not with those of the functions that it calls.
     source = max(file.stat().st_mtime for file in _sources())
     entries = folder.glob(f"{module}.{name}-*.nbi")
     return [entry for entry in entries if entry.stat().st_mtime >= source]

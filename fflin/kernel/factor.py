@@ -14,11 +14,7 @@ from fflin.kernel.tree import LANES
 
 @inlined
 def factorise(work, tree):
-    """Turn the packed M into L, of unit diagonal, and 1 / D where `scaled` is, M = L^T D L.
-
-    The sparse factorisation of Featherstone, from the tips to the base, which makes no entry that
-    was zero.
-    """
+    """Turn the packed M into L, of unit diagonal, and 1 / D where `scaled` is, M = L^T D L."""
     packed, scaled = tree.packed, tree.scaled
     for k in range(len(tree.row) - 1, -1, -1):
         row, depth = packed + tree.row[k], tree.depth[k]
@@ -121,20 +117,7 @@ def unpack(work, start, entries, out, first, offset):
 
 @compiled
 def invert(tree, q, out, couplings, lanes, work):
-    """Write M^-1 of each configuration.
-
-    Parameters
-    ----------
-    tree : Tree
-    q : ndarray (count, nq)
-        Configurations, as many as there are lanes at least.
-    out : ndarray (count, size * size)
-        Results.
-    couplings : ndarray (count,)
-        The sums of M_ii (M^-1)_ii, which tell how singular M is.
-    lanes, work : ndarray (nq, 8), (size, 8)
-        Work space.
-    """
+    """Write M^-1 of each configuration."""
     count, entries = out.shape
     for block in range(0, count, LANES):
         # The last block begins early enough to fill the lanes; some points are done twice.

@@ -109,20 +109,8 @@ def _solve_row_by_row(work, tree, layout, to):
 
 @compiled
 def linearise(robot, points, out, point, work):
-    """Write the models about many points, as many as there are lanes at least.
-
-    Parameters
-    ----------
-    robot : Equations
-    points : tuple of ndarray
-        q (count, nq), v (count, nv) and u (count, nu).
-    out : tuple of ndarray
-        A (count, nx * nx), lower half of B (count, (6 + n) * nu), f0 and x0 (count, nx), and what
-        the points are judged by (count, 3), see `Places`. That of a reference that moves along is
-        its own rate instead of f0.
-    point : Point
-    work : ndarray (size, 8)
-    """
+    """Write the models about many points, as many as there are lanes at least."""
+    # Of a moving reference f0 is its own rate; `judged` is as `places` says.
     q, v, u = points
     A, B, f0, x0, judged = out
     size, places = len(robot.order), robot.places
@@ -170,15 +158,7 @@ _opened = of.opener(KIND)
 
 @compiled
 def linearise_one(words, q, v, u, A, B, f0, x0):
-    """Write the model about a point, and return whether it is a sound one.
-
-    Parameters
-    ----------
-    words : ndarray of int
-        Of (Equations, Point, work (size,)), of which the point's q, v and u are not read.
-    q, v, u : ndarray (nq,), (nv,), (nu,)
-    A, B, f0, x0 : ndarray (nx, nx), (nx, nu), (nx,), (nx,)
-    """
+    """Write the model about a point, and return whether it is a sound one."""
     robot, rest, work = _opened(words)
     places, size, count = robot.places, len(robot.order), len(robot.row)
     width = 2 * size

@@ -64,13 +64,7 @@ class PointKernel:
         self._held: Any = None
 
     def many(self, q: Array, v: Array, u: Array, out: Iterable[Array]) -> Array:
-        """Write A, lower B, f0 and x0 of as many points as there are lanes at least.
-
-        Returns
-        -------
-        ndarray (N, 3)
-            The sums of M_ii (M^-1)_ii and of the squares of the model, and q0.
-        """
+        """Write A, lower B, f0 and x0 of as many points as there are lanes at least."""
         from fflin.kernel.assembly import Point
 
         judged, work = np.empty((len(q), 3)), work_space(self._robot.places.size)
@@ -85,10 +79,7 @@ class PointKernel:
         return judged
 
     def one(self) -> Callable[..., bool]:
-        """Return the function that writes the model about a point, as long as this is alive.
-
-        It takes q, v, u, A, B, f0 and x0, arrays that may be written, and says whether it is sound.
-        """
+        """Return the function that writes the model about a point, as long as this is alive."""
         from fflin.kernel.assembly import Point
         from fflin.kernel.words import words_of
 

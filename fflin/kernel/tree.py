@@ -190,11 +190,9 @@ def _armature(model: pin.Model, coordinate: list[int], factor: list[float]) -> A
 
 
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
-    """Return, for every coordinate, those that its row of the factor reaches, and itself.
-
-    Each joins the coordinates inwards of all bodies that it moves. Where joints mimic others these
-    need not be on one path, and the factor fills them up to one: the elimination tree of Liu.
-    """
+    """Return, for every coordinate, those that its row of the factor reaches, and itself."""
+    # Where joints mimic others the coordinates inwards of what one moves need not be on one path;
+    # the factor fills them up to one: the elimination tree of Liu.
     reached: list[set[int]] = [set(range(index)) if index < 6 else set() for index in range(size)]
     for body in range(1, len(parent)):
         above = body

@@ -56,19 +56,7 @@ _LOOSEST = 1e-2
 
 
 class Row(NamedTuple):
-    """One figure of a check.
-
-    Attributes
-    ----------
-    test : str
-        What was compared.
-    block : str
-        The block of A or B, or what else was compared.
-    error : float
-        Relative error.
-    tolerance : float
-        What it must not exceed.
-    """
+    """One figure of a check."""
 
     test: str
     block: str
@@ -228,10 +216,7 @@ def _point_errors(
 def _differences(
     model: Nonlinear, lin: LinearModel, M: Array, steps: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """Return A and B by central differences of the nonlinear model.
-
-    It is quadratic in the velocities, and linear in the inputs and in where the base is.
-    """
+    """Return A and B by central differences of the nonlinear model."""
     step, push = steps
     bends = np.arange(len(step)) < len(step) - len(M)
     bends[model.state.groups.r_b] = False

@@ -29,10 +29,7 @@ _NEAR = 1e-9
 
 
 class Flow:
-    """The motion between knots, q, v, u and t of N rows; the frame of `state` is that of u.
-
-    An input stays until the next knot where it is `held`, and is linear in between else.
-    """
+    """The motion between knots, q, v, u and t of N rows; the frame of `state` is that of u."""
 
     def __init__(self, state: StateMap, t: Array, q: Array, v: Array, u: Array, held: bool) -> None:
         self._model, self._aba, self._held = state.robot.model, Aba(state), held
@@ -49,12 +46,9 @@ class Flow:
         return self.missed(range(len(self._t) - 1))
 
     def missed(self, intervals: Iterable[int]) -> Array:
-        """Return how far the ends of some intervals are from the next knots.
-
-        The rates that are missing on the way, relative to the largest of the motion. An observer
-        who flies along with the base's mean velocity takes them (Galilei), and each rotor counts
-        for itself: neither an orbit nor a fast wheel hides anything.
-        """
+        """Return how far the ends of some intervals are from the next knots."""
+        # An observer who flies along with the base's mean velocity takes the rates (Galilei), and
+        # each rotor counts for itself: neither an orbit nor a fast wheel hides anything.
         t, u, state = self._t, self._u, self._aba.state
         rotations, q, v = rotation_matrices(self._q[:, 3:7]), self._q.copy(), self._v.copy()
         velocities = (rotations @ v[:, :3, None])[..., 0]
@@ -108,10 +102,7 @@ class Flow:
     def end(
         self, k: int, steps: int, q: Array, v: Array, over: tuple[float, float] = (0.0, 1.0)
     ) -> tuple[Array, Array]:
-        """Return q and v by steps of CF4 (11.1) from q and v on, over these shares of an interval.
-
-        By default from knot to knot.
-        """
+        """Return q and v by steps of CF4 (11.1) over these shares of an interval, all by default."""
         start, h = self._t[k], self._t[k + 1] - self._t[k]
         method = CommutatorFree4(self._model, (over[1] - over[0]) * h / steps)
         for step in range(steps):
@@ -169,10 +160,7 @@ class Flow:
 
 
 def placed(t: Array, time: float) -> tuple[int, float]:
-    """Return which interval of times a time is in, and the share of it that is over.
-
-    A knot belongs to the interval that begins there, as do times that only rounding keeps from it.
-    """
+    """Return which interval of times a time is in, and the share of it that is over."""
     last = len(t) - 2
     k = max(0, min(int(t.searchsorted(time, "right")) - 1, last))
     share = float((time - t[k]) / (t[k + 1] - t[k]))

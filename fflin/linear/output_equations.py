@@ -29,13 +29,7 @@ def output_equations(
     nu: Array,
     u: Array,
 ) -> tuple[Array, Array]:
-    r"""Return C (ny, nx) and D (ny, nu) of the outputs that are not states.
-
-    What is measured is a function of pose, velocity and the rate of the LOCAL velocity, whose
-    linear part is :math:`c + g - \omega \times v_b`. `nu` (6 + n,) and `u` (nu,) are in base axes.
-    A turn :math:`\delta\theta` of the base under a vector s held in reference axes changes its
-    base components by :math:`[s]_\times \delta\theta`.
-    """
+    """Return C (ny, nx) and D (ny, nu) of the outputs that are not states."""
     g = state.groups
     by_q, by_nu = state.columns(sensed.by_q), state.columns(sensed.by_v)
     turn, by_q_m = by_q[:, ANGULAR].copy(), by_q[:, 6:]

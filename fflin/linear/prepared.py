@@ -34,42 +34,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What is the same about all points that a robot is linearised about; arrays are read-only.
-
-    Attributes
-    ----------
-    robot : Robot
-    map : StateMap
-        With the reference and the frame.
-    actuation : Actuation
-    sensing : Sensing or None
-        None where the outputs are the state.
-    moving : bool
-        Whether the reference moves through the point.
-    own_reference : bool
-        Whether the reference is the base's own placement at each point, not that of `map`.
-    reference : ndarray (7,)
-        The placement of `map`: position [m] and quaternion x, y, z, w.
-    free : bool
-        Whether nothing but u acts at rest and the outputs are the state, so that there all of the
-        model but M^-1 is in `common` and `rest`.
-    common : mapping
-        Fields of a `LinearModel` that are the same about all points; C and D where the outputs
-        are the state.
-    rest : mapping
-        Its A, f0, u0 and v where nothing moves, pulls or pushes.
-    """
+    """What is the same about all points that a robot is linearised about; arrays are read-only."""
 
     robot: Robot
     map: StateMap
     actuation: Actuation
-    sensing: Sensing | None
+    sensing: Sensing | None  # None where the outputs are the state
     moving: bool
-    own_reference: bool
-    reference: Array
-    free: bool
-    common: Mapping[str, Any]
-    rest: Mapping[str, Array]
+    own_reference: bool  # the base's own placement at each point, not that of `map`
+    reference: Array  # (7,) the placement of `map`: position [m] and quaternion x, y, z, w
+    free: bool  # whether at rest all of a model but M^-1 is in `common` and `rest`
+    common: Mapping[str, Any]  # fields of a model that are the same about all points
+    rest: Mapping[str, Array]  # its A, f0, u0 and v where nothing moves, pulls or pushes
 
     def kernel(self) -> PointKernel | None:
         """Return the compiled equations, or None where the kernel does not know a joint."""
