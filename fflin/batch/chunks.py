@@ -35,8 +35,8 @@ class ChunkJob:
     def __init__(self, robot: Robot, *, at_rest: bool, count: int, **options: Any) -> None:
         self._again = partial(type(self), robot, at_rest=at_rest, count=count, **options)
         self._count = count
-        # Only outputs are for it to do; what else is left the kernel has refused.
-        compiled = robot.outputs != (FullState(),) and point_pays(count)
+        # Outputs are for it to do; what else is left the kernel has refused.
+        compiled = (robot.outputs != (FullState(),) and point_pays(count)) or None
         self.linearizer = Linearizer(robot, compiled=compiled, **options)
         prepared = self.linearizer.prepared
         # There every field of a model but B is known without computing it.

@@ -82,7 +82,7 @@ class Accelerations:
     def _bias_slopes(
         self, q: Array, v: Array, c: Array, u: Array, gyroscopic: Gyroscopic | None
     ) -> tuple[Array, Array]:
-        """Return the slopes of M a + b - B u + passive forces over q_m and nu, a held (3.3), (7.1)."""
+        """Return the slopes of M a + b - B u + passive forces over q_m and nu (3.3), (7.1)."""
         model, data, state = self._model, self._data, self._state
         # Constant in the frames of their links, so that RNEA's derivatives hold -d(B u)/dq.
         wrenches = gyroscopic.wrenches if gyroscopic else self._actuation.wrenches(u)

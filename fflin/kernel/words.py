@@ -35,7 +35,7 @@ def _words(value: Any) -> list[int]:
     if isinstance(value, tuple):
         return [word for each in value for word in _words(each)]
     if isinstance(value, np.ndarray):
-        return [value.ctypes.data, *value.shape]
+        return [value.__array_interface__["data"][0], *value.shape]
     return [int(value)]
 
 

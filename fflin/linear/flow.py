@@ -102,7 +102,7 @@ class Flow:
     def end(
         self, k: int, steps: int, q: Array, v: Array, over: tuple[float, float] = (0.0, 1.0)
     ) -> tuple[Array, Array]:
-        """Return q and v by steps of CF4 (11.1) over these shares of an interval, all by default."""
+        """Return q and v by steps of CF4 (11.1) over shares of an interval, all by default."""
         start, h = self._t[k], self._t[k + 1] - self._t[k]
         method = CommutatorFree4(self._model, (over[1] - over[0]) * h / steps)
         for step in range(steps):

@@ -327,9 +327,7 @@ def linearize(
     --------
     Linearizer : the same, prepared once for many points; the equations stand there.
     """
-    return Linearizer(robot, frame=frame, reference=reference, moving=moving, compiled=False)(
-        q, v, u
-    )
+    return Linearizer(robot, frame=frame, reference=reference, moving=moving)(q, v, u)
 
 
 def _rebuilt(
