@@ -16,9 +16,8 @@ from fflin.base.validation import Array
 from fflin.batch.dispatch import ChunkResult
 from fflin.batch.rows import Points
 from fflin.dynamics.inertia import Inertia
-from fflin.kernel.compiled import pays, point_pays
+from fflin.kernel.compiled import pays
 from fflin.linear.linearization import Linearizer
-from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -35,9 +34,7 @@ class ChunkJob:
     def __init__(self, robot: Robot, *, at_rest: bool, count: int, **options: Any) -> None:
         self._again = partial(type(self), robot, at_rest=at_rest, count=count, **options)
         self._count = count
-        # Outputs are for it to do; what else is left the kernel has refused.
-        compiled = (robot.outputs != (FullState(),) and point_pays(count)) or None
-        self.linearizer = Linearizer(robot, compiled=compiled, **options)
+        self.linearizer = Linearizer(robot, **options)
         prepared = self.linearizer.prepared
         # There every field of a model but B is known without computing it.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free

@@ -13,6 +13,8 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
+from fflin.base.errors import unknown
+
 # Fewest points for which the kernel is quicker than the loop, where numba is loaded and where it is
 # not. To load it takes half a second, which a sweep of that size does not win back but the next
 # ones do: sweeps are seldom alone.
@@ -28,6 +30,8 @@ _QUOTAS = (
     ("/sys/fs/cgroup/cpu.max",),
     ("/sys/fs/cgroup/cpu/cpu.cfs_quota_us", "/sys/fs/cgroup/cpu/cpu.cfs_period_us"),
 )
+
+ENGINES = ("python", "compiled")
 
 _log = logging.getLogger("fflin")
 _TURN = Lock()
@@ -68,6 +72,13 @@ def loop_pays(steps: int, name: str = "advance") -> bool:
     if not _kept_somewhere("loop", name):
         return steps >= _BREAK_EVEN_COMPILING
     return steps >= _BREAK_EVEN_LOOP_UNLOADED or "numba" in sys.modules
+
+
+def checked_engine(engine: Any) -> str | None:
+    """Return the name of an engine, or None, or raise `UnknownNameError`."""
+    if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
+        raise unknown("engine", str(engine), list(ENGINES))
+    return engine
 
 
 def point_pays(calls: int) -> bool:

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, MissingPackageError
+from fflin.base.errors import InputError
 from fflin.base.frozen import frozen
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, vector
 from fflin.dynamics.chart import Chart, Standing
 from fflin.dynamics.rnea import Accelerations, Rates
 from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap
-from fflin.kernel.compiled import POINT_BREAK_EVENS, numba_is_there, point_pays
+from fflin.kernel.compiled import POINT_BREAK_EVENS, checked_engine, point_pays
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
 from fflin.linear.prepared import LARGEST, prepare
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 # With velocities and inputs below this nothing overflows on the way to `LARGEST`.
 _MODERATE = 1e50
+
+# Size of M beyond which BLAS is quicker.
+_LARGEST_COMPILED = 96
 
 
 class Linearizer:
@@ -61,23 +64,24 @@ class Linearizer:
         The error dynamics about a reference that moves through the point with the robot's own
         dynamics: the error is q_b = vec(q*^-1 q), r_b = R*^T (p - p*), the frame is "local", and
         f0 is zero. For a trajectory, and for relative equilibria such as a steady spin.
-    compiled : bool, optional
-        Whether points where something moves, pulls or pushes are done by the compiled kernel, which
-        differs in rounding alone. By default where its code is loaded, and else from as many calls
-        on as pay for that. What the kernel does not know is always done without.
+    engine : {"python", "compiled"}, optional
+        What does points where something moves, pulls or pushes; both give the same to rounding. By
+        default it is the compiled kernel where its code is loaded already, and else from as many
+        calls on as pay for that.
 
     Raises
     ------
     InputError
         If the frame is unknown, the reference is not a pin.SE3, or `moving` is asked for with a
-        reference or with a frame other than "local".
+        reference or with a frame other than "local". Or the compiled engine is asked for, and
+        numba is not installed or a joint is none that it knows.
     SingularInertiaError
         If M is singular at every configuration.
     ModelError
         If Pinocchio's Data for the robot would pass 1 GiB, or its model was changed after the
         robot was made.
-    MissingPackageError
-        If `compiled` is asked for and numba is not installed.
+    UnknownNameError
+        If there is no such engine.
 
     Attributes
     ----------
@@ -98,14 +102,12 @@ class Linearizer:
         frame: Frame | None = None,
         reference: pin.SE3 | None = None,
         moving: bool = False,
-        compiled: bool | None = None,
+        engine: str | None = None,
     ) -> None:
-        if compiled and not numba_is_there():
-            raise MissingPackageError(
-                "compiled=True needs numba; install it with: pip install 'fflin[fast]'"
-            )
-        self.robot, self._given, self._asked = robot, compiled, compiled
         self.prepared = ready = prepare(robot, frame=frame, reference=reference, moving=moving)
+        self.robot, self._engine = robot, checked_engine(engine)
+        if engine == "compiled":
+            ready.require_kernel()
         self._data = robot.create_data()
         self._lock = Lock()  # of the work space
         self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
@@ -182,18 +184,19 @@ class Linearizer:
         # A copy, in this process or another, needs a work space of its own.
         ready = self.prepared
         reference = None if ready.own_reference else ready.map.reference
-        return _rebuilt, (self.robot, ready.map.frame, reference, ready.moving, self._given)
+        return _rebuilt, (self.robot, ready.map.frame, reference, ready.moving, self._engine)
 
     def _begins(self) -> bool:
         """Whether the kernel takes over at this call, which then is there."""
         self._calls += 1
-        if self._asked is None and self._calls in POINT_BREAK_EVENS:
-            self._asked = point_pays(self._calls) or None
-        if self._asked:
+        if self._engine is None:
+            small = self._lower.start <= _LARGEST_COMPILED
+            if not (self._calls in POINT_BREAK_EVENS and small and point_pays(self._calls)):
+                return False
+        if self._engine != "python":
             self._kernel = self.prepared.kernel()
             self._one = None if self._kernel is None else self._kernel.one()
-            self._asked = self._one is not None
-        return bool(self._asked)
+        return self._one is not None
 
     def _by_kernel(self, q: Array, v: Array | None, u: Array | None) -> LinearModel | None:
         """Return the model by the kernel, or None where that cannot vouch for it."""
@@ -331,9 +334,9 @@ def linearize(
 
 
 def _rebuilt(
-    robot: Robot, frame: Frame, reference: Any, moving: bool, compiled: bool | None
+    robot: Robot, frame: Frame, reference: Any, moving: bool, engine: str | None
 ) -> Linearizer:
-    return Linearizer(robot, frame=frame, reference=reference, moving=moving, compiled=compiled)
+    return Linearizer(robot, frame=frame, reference=reference, moving=moving, engine=engine)
 
 
 def _state_at_rest(state: StateMap, q: Array) -> Array:

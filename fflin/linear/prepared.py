@@ -16,6 +16,7 @@ from fflin.base.validation import Array, truth
 from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import Frame, StateMap, unknown_frame
+from fflin.kernel.compiled import numba_is_there
 from fflin.linear.certificate import certify, inertia_matrix
 from fflin.linear.ignorable import ignorable_states
 from fflin.linear.state_equations import at_rest
@@ -55,6 +56,15 @@ class Prepared:
         tree = batch_tree(self.robot)
         options = {"own": self.own_reference, "moving": self.moving}
         return tree and PointKernel(self.map, self.actuation, tree, LARGEST, **options)
+
+    def require_kernel(self) -> None:
+        """Raise `InputError` where there are no compiled equations."""
+        reason = "numba is not installed (pip install 'fflin[fast]')"
+        if numba_is_there():
+            if self.kernel() is not None:
+                return
+            reason = f"a joint of '{self.robot.name}' is of another kind"
+        raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
 
 
 def prepare(

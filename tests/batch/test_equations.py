@@ -37,8 +37,8 @@ def operating_points(robot, count, seed=0):
 
 def agreement(robot, count=11, **options):
     """Largest difference of kernel, of many and of one, and loop, over the largest and cond(M)."""
-    linearizer = fflin.Linearizer(robot, compiled=False, **options)
-    single = fflin.Linearizer(robot, compiled=True, **options)
+    linearizer = fflin.Linearizer(robot, engine="python", **options)
+    single = fflin.Linearizer(robot, engine="compiled", **options)
     q, v, u = operating_points(robot, count)
     nv, nx, nu = 6 + robot.n, 12 + 2 * robot.n, u.shape[1]
     shapes = {"A": (nx, nx), "B_lower": (nv, nu), "f0": (nx,), "_x0": (nx,)}

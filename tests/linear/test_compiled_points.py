@@ -8,7 +8,7 @@ import pytest
 
 import fflin
 from fflin.kernel import compiled
-from fflin.linear import linearization
+from fflin.linear import linearization, prepared
 from tests.batch.test_equations import TILTED, operating_points
 
 pytest.importorskip("numba")
@@ -23,7 +23,7 @@ OUTPUTS = [
 
 
 def both(robot, **options):
-    return (fflin.Linearizer(robot, compiled=each, **options) for each in (True, False))
+    return (fflin.Linearizer(robot, engine=each, **options) for each in ("compiled", "python"))
 
 
 @pytest.mark.parametrize("outputs", [None, OUTPUTS])
@@ -98,13 +98,19 @@ def test_it_takes_over_where_its_code_is_loaded_or_pays(robots, monkeypatch):
     assert not compiled.point_pays(199_999)
     assert compiled.point_pays(200_000)
     monkeypatch.setattr(linearization, "point_pays", lambda calls: True)
-    never = fflin.Linearizer(robot, compiled=False)
+    never = fflin.Linearizer(robot, engine="python")
     never(q, v, u)
     assert never._one is None
-    assert pickle.loads(pickle.dumps(never))._given is False
+    assert pickle.loads(pickle.dumps(never))._engine == "python"
 
 
-def test_to_ask_for_it_without_numba_says_what_to_install(robots, monkeypatch):
-    monkeypatch.setattr(linearization, "numba_is_there", lambda: False)
-    with pytest.raises(fflin.MissingPackageError, match=r"compiled=True needs numba.*fflin\[fast"):
-        fflin.Linearizer(robots["cubesat"], compiled=True)
+def test_an_engine_that_cannot_is_refused(robots, monkeypatch):
+    with pytest.raises(fflin.UnknownNameError, match="no engine named 'fast'"):
+        fflin.Linearizer(robots["cubesat"], engine="fast")
+    monkeypatch.setattr(prepared, "numba_is_there", lambda: False)
+    with pytest.raises(fflin.InputError, match=r"engine='compiled' cannot.*fflin\[fast"):
+        fflin.Linearizer(robots["cubesat"], engine="compiled")
+    monkeypatch.undo()
+    monkeypatch.setattr(prepared.Prepared, "kernel", lambda self: None)
+    with pytest.raises(fflin.InputError, match="a joint of 'cubesat' is of another kind"):
+        fflin.Linearizer(robots["cubesat"], engine="compiled")
