@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from operator import itemgetter
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from fflin.batch.rows import Points
 from fflin.dynamics.chart import SMALLEST_Q0
 from fflin.dynamics.inertia import Inertia
 from fflin.kernel.accelerations import inverse_inertias
+from fflin.kernel.points import PointKernel
 from fflin.kernel.tree import LANES, Tree, batch_tree
 from fflin.linear.prepared import LARGEST, Prepared
 
@@ -25,13 +25,12 @@ RowNumbers: TypeAlias = NDArray[np.integer[Any]]
 Mask: TypeAlias = NDArray[np.bool_]
 
 
-class BatchEquations(ABC):
+class BatchEquations:
     """What differs from point to point of a robot's linear models, about many points."""
 
-    BLOCK: ClassVar[int]  # points that are done at a time
-
-    def __init__(self, prepared: Prepared, tree: Tree) -> None:
-        self._prepared, self._tree = prepared, tree
+    def __init__(self, prepared: Prepared, tree: Tree, kernel: PointKernel | None) -> None:
+        self._prepared, self._tree, self._kernel = prepared, tree, kernel
+        self._block = 1024 if kernel else 2**16  # points that are done at a time
         self._least_coupling = 0.999 * (6 + prepared.robot.n)
 
     def write(self, points: Points, out: Mapping[str, Array]) -> RowNumbers:
@@ -44,18 +43,18 @@ class BatchEquations(ABC):
                 array[:] = more[key][:count]
             return left[left < count]
         good = np.zeros(count, dtype=bool)
-        for start in range(0, count, self.BLOCK):
+        for start in range(0, count, self._block):
             # The last block begins early enough to fill the lanes; some points are done twice.
-            rows = slice(min(start, count - LANES), start + self.BLOCK)
+            rows = slice(min(start, count - LANES), start + self._block)
             place = {key: array[rows] for key, array in out.items()}
             point = points.each(itemgetter(rows))
             with np.errstate(all="ignore"):
-                good[rows] = self._write_block(point, place)
+                good[rows] = (
+                    self._anywhere(self._kernel, point, place)
+                    if self._kernel
+                    else self._at_rest(point.q, place["B_lower"])
+                )
         return np.flatnonzero(~good)
-
-    @abstractmethod
-    def _write_block(self, points: Points, out: Mapping[str, Array]) -> Mask:
-        """Do the points of a block and return which of them are good."""
 
     def _regular(self, q: Array, couplings: Array) -> Mask:
         """Return where M is far from singular, and the angles are such that their sines are."""
@@ -66,45 +65,25 @@ class BatchEquations(ABC):
             return good
         return good & (np.abs(q_m) < _FARTHEST).all(axis=1)
 
-
-class RestEquations(BatchEquations):
-    """B = [0; M^-1 F] at rest, where only u acts, through columns F that do not depend on q."""
-
-    BLOCK = 2**16
-
-    def _write_block(self, points: Points, out: Mapping[str, Array]) -> Mask:
-        q, B, actuation = points.q, out["B_lower"], self._prepared.actuation
-        nv = B.shape[1]
+    def _at_rest(self, q: Array, B: Array) -> Mask:
+        """Write M^-1 F at rest, where only u acts, through columns F that do not depend on q."""
+        nv, actuation = B.shape[1], self._prepared.actuation
         inverse = B if actuation.default else np.empty((len(q), nv, nv))
         couplings = inverse_inertias(self._tree, q, inverse)
         if not actuation.default:
             np.matmul(inverse, actuation.fixed, out=B)
         return self._regular(q, couplings)
 
-
-class PointEquations(BatchEquations):
-    """A, B and f0 about any points."""
-
-    BLOCK = 4096
-
-    def __init__(self, prepared: Prepared, tree: Tree) -> None:
-        super().__init__(prepared, tree)
-        kernel = prepared.kernel()
-        assert kernel is not None
-        self._kernel = kernel
-
-    def _write_block(self, points: Points, out: Mapping[str, Array]) -> Mask:
-        state, inputs = self._prepared.map, self._prepared.actuation.names
-        q, v, u = points
-        count, nx = len(q), state.nx
-        v = np.zeros((count, state.robot.nv)) if v is None else v
-        u = np.zeros((count, len(inputs))) if u is None else u
+    def _anywhere(self, kernel: PointKernel, points: Points, out: Mapping[str, Array]) -> Mask:
+        """Write A, B and f0 about any points."""
+        state, nu = self._prepared.map, len(self._prepared.actuation.names)
+        (q, v, u), nx = points, state.nx
+        v = np.zeros((len(q), state.robot.nv)) if v is None else v
+        u = np.zeros((len(q), nu)) if u is None else u
         rate = "_drift" if self._prepared.moving else "f0"
-        shapes = {"A": (nx, nx), "B_lower": (nx // 2, len(inputs)), rate: (nx,), "_x0": (nx,)}
-        found = [
-            out[key] if key in out else np.empty((count, *shape)) for key, shape in shapes.items()
-        ]
-        coupling, squares, q0 = self._kernel.many(q, v, u, found).T
+        shapes = {"A": (nx, nx), "B_lower": (nx // 2, nu), rate: (nx,), "_x0": (nx,)}
+        found = [out[key] if key in out else np.empty((len(q), *x)) for key, x in shapes.items()]
+        coupling, squares, q0 = kernel.many(q, v, u, found).T
         if self._prepared.moving and "f0" in out:
             out["f0"][:] = 0.0
         # NaN compares false.
@@ -122,4 +101,4 @@ def batch_equations(prepared: Prepared, *, only_inertia: bool) -> BatchEquations
     if tree is None or prepared.sensing is not None:
         return None
     simple = only_inertia and not prepared.actuation.carried
-    return (RestEquations if simple else PointEquations)(prepared, tree)
+    return BatchEquations(prepared, tree, None if simple else prepared.kernel())

@@ -20,26 +20,7 @@ class Equations(
         "limits turned own moving",
     )
 ):
-    """A robot, and how its state and inputs stand.
-
-    Attributes
-    ----------
-    places : Places
-    order : ndarray (6 + n,)
-        Index in Pinocchio's v of each velocity of the state.
-    index, circling, rest, row, held, origin
-        As `forward.Mechanics` has them.
-    gravity : ndarray (3,)
-        In the axes of the base's joint, unturned.
-    bounds : ndarray (6 + n,)
-        What each coordinate moves at most, or zeros; see `dynamics.inertia`.
-    limits : ndarray (5,)
-        What makes a model sound, see `points.LIMITS`.
-    turned : ndarray (2,)
-        Whether omega_b, and v_b, stand in reference axes.
-    own, moving : int
-        Whether the reference is the base's own placement, and whether it moves along.
-    """
+    """A robot as `Mechanics` has it, the `order` of v, and which axes are `turned`."""
 
 
 class Places(namedtuple("Places", "A by_u B f0 x0 sums judged size")):

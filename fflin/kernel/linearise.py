@@ -2,39 +2,13 @@
 
 from __future__ import annotations
 
+from fflin.kernel import factor, rnea
 from fflin.kernel import words as of
 from fflin.kernel.accelerations import Layout, Loads
-from fflin.kernel.assembly import (
-    JUDGED,
-    Equations,
-    Places,
-    Point,
-    assemble,
-    enter,
-    judge,
-    push,
-)
+from fflin.kernel.assembly import JUDGED, Equations, Places, Point, assemble, enter, judge, push
 from fflin.kernel.crba import inwards, outwards
-from fflin.kernel.factor import (
-    factorise,
-    invert_factor,
-    keep_diagonal,
-    multiply,
-    pack,
-    solve,
-    unpack,
-)
+from fflin.kernel.factor import pack, unpack
 from fflin.kernel.lanes import compiled, inlined, load, splat, store
-from fflin.kernel.rnea import (
-    accelerate_bodies,
-    collect,
-    collect_momenta,
-    load_bodies,
-    load_carried,
-    load_momenta,
-    move_bodies,
-    write_columns,
-)
 from fflin.kernel.slopes import differentiate
 from fflin.kernel.tree import LANES, Tree
 from fflin.kernel.vectors import copy, get6, minus6, put6, times6
@@ -48,24 +22,24 @@ def _differentiate(work, robot, point):
     tree, layout, loads = robot.tree, robot.layout, robot.loads
     enter(work, robot, point)
     outwards(work, tree, point.q)
-    move_bodies(work, tree, layout, point.nu)
-    load_bodies(work, tree, layout, loads)
-    load_carried(work, tree, layout, loads, point.pushing)
-    load_momenta(work, tree, layout, loads)
-    write_columns(work, tree, layout, loads)
+    rnea.move_bodies(work, tree, layout, point.nu)
+    rnea.load_bodies(work, tree, layout, loads)
+    rnea.load_carried(work, tree, layout, loads, point.pushing)
+    rnea.load_momenta(work, tree, layout, loads)
+    rnea.write_columns(work, tree, layout, loads)
     inwards(work, tree)
-    collect(work, tree, layout)
-    collect_momenta(work, tree, layout)
-    keep_diagonal(work, tree)
-    factorise(work, tree)
+    rnea.collect(work, tree, layout)
+    rnea.collect_momenta(work, tree, layout)
+    factor.keep_diagonal(work, tree)
+    factor.factorise(work, tree)
     for index in range(len(tree.row)):
         value = load(point.forces, index) - load(work, layout.bias + index)
         store(work, layout.c + index, value)
-    solve(work, tree, layout.c)
-    invert_factor(work, tree)
-    multiply(work, tree, robot.places.judged)
+    factor.solve(work, tree, layout.c)
+    factor.invert_factor(work, tree)
+    factor.multiply(work, tree, robot.places.judged)
     push(work, robot)
-    accelerate_bodies(work, tree, layout)
+    rnea.accelerate_bodies(work, tree, layout)
     differentiate(work, tree, layout, loads)
 
 

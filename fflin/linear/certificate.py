@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -22,15 +22,6 @@ from fflin.robot.robot import Robot
 _ROUNDING_SHARE = 1e-3
 
 
-class Block(NamedTuple):
-    """Difference of two routes to one block of A or B."""
-
-    matrix: str
-    row: str
-    column: str
-    error: float
-
-
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
     """Compute the figures that prove a continuous-time model of this robot."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
@@ -40,8 +31,8 @@ def certify(robot: Robot, lin: LinearModel) -> Certificate:
     return Certificate(
         condition=scaled_condition(lin.M),
         inertia_residual=inertia_residual(lin.M, inverse_inertia(state, lin)),
-        route_A=max(block.error for block in blocks if block.matrix == "A"),
-        route_B=max(block.error for block in blocks if block.matrix == "B"),
+        route_A=max(error for name, error in blocks if name[0] == "A"),
+        route_B=max(error for name, error in blocks if name[0] == "B"),
         f0=float(np.abs(lin.f0).max()),
     )
 
@@ -130,8 +121,8 @@ def compare(
     *,
     steps: Array | None = None,
     rounding: float = 0.0,
-) -> list[Block]:
-    """Compare a model's A and B with those of another route, block by block."""
+) -> list[tuple[str, float]]:
+    """Return how far A and B are from those of another route, block by block: "A[q_b, q_m]"."""
     # Relative to the largest entry of its block, rows of accelerations being scaled by the mobility
     # sqrt((M^-1)_ii), so that a light joint does not hide a heavy one, and B by that of its input;
     # where large terms cancel in a block, to those, which a route by steps has there.
@@ -153,7 +144,7 @@ def compare(
         errors /= np.where(sizes > 0.0, sizes, 1.0)
     every = ("A", groups, errors.tolist()), ("B", inputs, errors_B.tolist())
     return [
-        Block(matrix, row, column, error)
+        (f"{matrix}[{row}, {column}]", error)
         for i, row in enumerate(groups)
         for matrix, columns, found in every
         for column, error in zip(columns, found[i], strict=True)

@@ -152,13 +152,12 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
     own_error = inertia_residual(_in_base_axes(state, M, q), inverse)
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
     rows = [
-        Row("ABA derivatives", f"{b.matrix}[{b.row}, {b.column}]", b.error, by_aba)
-        for b in compare(state, actuation, lin, M, A, B)
+        Row("ABA derivatives", *block, by_aba) for block in compare(state, actuation, lin, M, A, B)
     ]
     steps = difference_steps(state, lin, M)
     rows += [
-        Row("differences", f"{b.matrix}[{b.row}, {b.column}]", b.error, difference)
-        for b in compare(
+        Row("differences", *block, difference)
+        for block in compare(
             *(state, actuation, lin, M, *_differences(model, lin, M, steps)),
             steps=steps[0],
             rounding=_STEP_ULPS * _EPS / difference,

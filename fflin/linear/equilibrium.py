@@ -190,9 +190,8 @@ def _least_norm(C: Array, d: Array, one_sided: NDArray[np.bool_]) -> tuple[Array
         polished: Array = np.zeros(len(u))
         polished[pushing] = _pseudo_solve(C[:, pushing], d)
         left = C @ polished - d
-        if (polished[one_sided] < 0.0).any() or np.linalg.norm(left) > _TOLERANCE * np.linalg.norm(
-            d
-        ):
+        most = _TOLERANCE * np.linalg.norm(d)
+        if (polished[one_sided] < 0.0).any() or np.linalg.norm(left) > most:
             polished = _least_residual(C, d, one_sided)
         u = polished
     return u, C @ u - d

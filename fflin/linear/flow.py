@@ -54,9 +54,8 @@ class Flow:
         velocities = (rotations @ v[:, :3, None])[..., 0]
         mean = velocities.mean(axis=0)
         flown = np.outer(t - t[0], mean)
-        digits = np.full(
-            v.shape[1], _OF_PLACES * max(1.0, float(np.abs(q[:, 7:]).max(initial=0.0)))
-        )
+        farthest = float(np.abs(q[:, 7:]).max(initial=1.0))
+        digits = np.full(v.shape[1], _OF_PLACES * farthest)
         digits[:3] = _OF_PLACES * max(float(np.abs(x).max()) for x in (q[:, :3], flown, velocities))
         q[:, :3] -= q[0, :3] + flown
         v[:, :3] -= mean @ rotations
@@ -66,10 +65,8 @@ class Flow:
         alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
         others = sorted({*range(6, len(digits))} - {*alone})
         groups = [[0, 1, 2], [3, 4, 5], *([each] for each in alone), *([others] if others else [])]
-        speed, push = (
-            np.abs(v).max(axis=0),
-            np.abs([self.rate(*each) for each in knots]).max(axis=0),
-        )
+        speed, rates = np.abs(v).max(axis=0), [self.rate(*each) for each in knots]
+        push = np.abs(rates).max(axis=0)
         for group in groups:
             speed[group], push[group] = (x[group].max() or 1.0 for x in (speed, push))
 
@@ -87,16 +84,11 @@ class Flow:
                 while steps < _MOST_STEPS:
                     before, steps = end, 2 * steps
                     end = self.end(k, steps, q[k], v[k])
-                    if (
-                        size(
-                            pin.difference(self._model, *(before[0], end[0])), end[1] - before[1], h
-                        )
-                        <= _ACCURACY
-                    ):
+                    apart = pin.difference(self._model, before[0], end[0])
+                    if size(apart, end[1] - before[1], h) <= _ACCURACY:
                         break
-                found.append(
-                    size(pin.difference(self._model, end[0], q[k + 1]), v[k + 1] - end[1], h)
-                )
+                apart = pin.difference(self._model, end[0], q[k + 1])
+                found.append(size(apart, v[k + 1] - end[1], h))
         return np.where(np.isfinite(found), found, np.inf)
 
     def end(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from itertools import chain
 from math import hypot
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -12,18 +13,16 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.frozen import frozen
 from fflin.base.rotation import skew
 from fflin.base.validation import Array, vector
 from fflin.dynamics.chart import Chart, Standing
 from fflin.dynamics.rnea import Accelerations, Rates
-from fflin.dynamics.state import ANGULAR, LINEAR, Frame, StateMap
+from fflin.dynamics.state import ANGULAR, LINEAR, Frame
 from fflin.kernel.compiled import POINT_BREAK_EVENS, checked_engine, point_pays
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
 from fflin.linear.prepared import LARGEST, prepare
 from fflin.linear.state_equations import assemble, drift
-from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -119,15 +118,10 @@ class Linearizer:
         self._calls = 0
         self._kernel: PointKernel | None = None
         self._one: Callable[..., bool] | None = None
-        # Those that the kernel takes, which must be writable.
+        # What the kernel takes, which must be writable.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
         self._known = ready.free and ready.own_reference and ready.actuation.default
-        at_rest, own = partial(_state_at_rest, ready.map), partial(_own_reference, robot)
-        asked = {"x0": at_rest, "y0": at_rest, "_reference": own}
-        self._fields = {**ready.common, **ready.rest, "_when_asked": asked}
-        if not ready.own_reference:
-            self._fields["_reference"] = ready.reference
 
     def __call__(
         self, q: Array | None = None, v: Array | None = None, u: Array | None = None
@@ -158,22 +152,19 @@ class Linearizer:
         """
         robot = self.robot
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
-        if v is None and u is None and self._known:
-            q.setflags(write=False)
-            with self._lock:
-                return self._at_rest(q)
         if v is not None:
             v = robot.checked_velocity(v).copy()
         if u is not None:
             u = vector("u", u, self._shape_B[1], "the robot's inputs").copy()
         with self._lock:
-            lin = None if self._one is None and not self._begins() else self._by_kernel(q, v, u)
-            if lin is not None:
-                return lin
-            q.setflags(write=False)
-            v = self.prepared.rest["v"] if v is None else frozen(v)
-            u = self.prepared.rest["u0"] if u is None else frozen(u)
-            if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
+            if v is None and u is None and self._known:
+                return self._at_rest(q)
+            if self._one is not None or self._begins():
+                lin = self._by_kernel(q, v, u)
+                if lin is not None:
+                    return lin
+            given = (each.tolist() for each in (v, u) if each is not None)
+            if self._moderate and hypot(*chain.from_iterable(given)) < _MODERATE:
                 return self._anywhere(q, v, u)
             # An overflow is refused below, so NumPy need not warn of it. Not always done, since
             # every call of NumPy costs more in here.
@@ -184,7 +175,12 @@ class Linearizer:
         # A copy, in this process or another, needs a work space of its own.
         ready = self.prepared
         reference = None if ready.own_reference else ready.map.reference
-        return _rebuilt, (self.robot, ready.map.frame, reference, ready.moving, self._engine)
+        options: dict[str, Any] = {
+            "frame": ready.map.frame,
+            "reference": reference,
+            "moving": ready.moving,
+        }
+        return partial(type(self), **options, engine=self._engine), (self.robot,)
 
     def _begins(self) -> bool:
         """Whether the kernel takes over at this call, which then is there."""
@@ -202,77 +198,71 @@ class Linearizer:
         """Return the model by the kernel, or None where that cannot vouch for it."""
         ready, nx = self.prepared, self._lower.stop
         A, B = np.empty((nx, nx)), np.empty(self._shape_B)
-        f0, x0 = np.empty(nx), np.empty(nx)
+        rate, x0 = np.empty(nx), np.empty(nx)
         at_v = self._still[0] if v is None else v
         at_u = self._still[1] if u is None else u
         assert self._one is not None
-        if not self._one(q, at_v, at_u, A, B, f0, x0):
+        if not self._one(q, at_v, at_u, A, B, rate, x0):
             return None
-        made = {"A": A, "B": B, "f0": f0, "x0": x0, "y0": x0, "q": q}
-        if v is not None:
-            made["v"] = v
-        if u is not None:
-            made["u0"] = u
-        if ready.sensing is not None:
-            made |= zip(("C", "D", "y0"), self._sensed(q, at_v, at_u, x0), strict=True)
-        for array in made.values():
-            array.setflags(write=False)
-        if ready.moving:
-            made |= {"f0": ready.rest["f0"], "_drift": f0}
-        return LinearModel.from_fields(self._fields | made)
-
-    def _sensed(self, q: Array, v: Array, u: Array, x0: Array) -> tuple[Array, Array, Array]:
-        state = self.prepared.map
-        assert self._kernel is not None
-        chart = self._standing if self.prepared.own_reference else state.chart(q)
-        rates = self._kernel.rates(state.gravity(q))
-        u_base = self.prepared.actuation.in_base_axes(chart, u)
-        return self._seen(chart, rates, q, v, state.velocities(v), u_base, x0)
+        made: dict[str, Array] = {"A": A, "B": B, "x0": x0}
+        if ready.sensing is not None and self._kernel is not None:
+            state = ready.map
+            chart = self._standing if ready.own_reference else state.chart(q)
+            at_u = ready.actuation.in_base_axes(chart, at_u)
+            rates = self._kernel.rates(state.gravity(q))
+            made |= self._seen(chart, rates, x0, q, at_v, state.velocities(at_v), at_u)
+        return self._model(q, v, u, rate, made)
 
     def _at_rest(self, q: Array) -> LinearModel:
         B = np.zeros(self._shape_B)
         self._accelerations.invert(q, B[self._lower])
         B.setflags(write=False)
-        return LinearModel.from_fields(self._fields | {"B": B, "q": q})
+        q.setflags(write=False)
+        return LinearModel.from_fields(self.prepared.fields | {"B": B, "q": q})
 
-    def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
+    def _anywhere(self, q: Array, v: Array | None, u: Array | None) -> LinearModel:
         ready = self.prepared
         state = ready.map
+        at_v = self._still[0] if v is None else v
+        at_u = self._still[1] if u is None else u
         chart, r_b = self._standing, self._standing.q_b
         if not ready.own_reference:
             chart, r_b = state.chart(q), state.positions(q)
-        nu, q_m = state.velocities(v), state.joint_positions(q)
-        u_base = ready.actuation.in_base_axes(chart, u)
-        rates = self._accelerations.rates(q, v, nu, q_m, u_base)
-        A, B = ready.rest["A"].copy(), np.zeros(self._shape_B)
-        f0 = assemble(
-            *(state, ready.actuation, chart, nu, u_base, rates, A, B[self._lower]),
+        nu, q_m = state.velocities(at_v), state.joint_positions(q)
+        at_u = ready.actuation.in_base_axes(chart, at_u)
+        rates = self._accelerations.rates(q, at_v, nu, q_m, at_u)
+        A, B = ready.fields["A"].copy(), np.zeros(self._shape_B)
+        rate = assemble(
+            *(state, ready.actuation, chart, nu, at_u, rates, A, B[self._lower]),
             moving=ready.moving,
         )
         x0 = state.compose(chart, r_b, q_m, nu)
-        C, D, y0 = self._seen(chart, rates, q, v, nu, u_base, x0)
-        for array in (A, B, f0) if ready.sensing is None else (A, B, f0, C, D, y0):
+        made = {"A": A, "B": B, "x0": x0}
+        if ready.sensing is not None:
+            made |= self._seen(chart, rates, x0, q, at_v, nu, at_u)
+        for name, array in {**made, "f0": rate}.items():
             flat = array.ravel()
-            if not flat.dot(flat) < LARGEST:  # nor NaN
+            if name not in ("x0", "y0") and not flat.dot(flat) < LARGEST:  # nor NaN
                 raise InputError("q, v or u is so large that the model is not finite")
+        rate = drift(state, rate, rates.gravity) if ready.moving else rate
+        return self._model(q, v, u, rate, made)
+
+    def _model(
+        self, q: Array, v: Array | None, u: Array | None, rate: Array, made: dict[str, Array]
+    ) -> LinearModel:
+        """Put a model together, of arrays that nobody else has."""
+        given = {"q": q, "v": v, "u0": u, "_drift" if self.prepared.moving else "f0": rate}
+        made = {"y0": made["x0"], **made, **{k: x for k, x in given.items() if x is not None}}
+        for array in made.values():
             array.setflags(write=False)
-        x0.setflags(write=False)
-        values = {"A": A, "B": B, "C": C, "D": D, "f0": f0, "x0": x0, "u0": u, "y0": y0}
-        reference = _own_reference(self.robot, q) if ready.own_reference else ready.reference
-        fields = {**ready.common, **values, "q": q, "v": v, "_reference": reference}
-        if ready.moving:
-            own_rate = frozen(drift(state, f0, rates.gravity))
-            fields |= {"f0": ready.rest["f0"], "_drift": own_rate}
-        return LinearModel.from_fields(fields)
+        return LinearModel.from_fields(self.prepared.fields | made)
 
     def _seen(
-        self, chart: Chart, rates: Rates, q: Array, v: Array, nu: Array, u: Array, x0: Array
-    ) -> tuple[Array, Array, Array]:
+        self, chart: Chart, rates: Rates, x0: Array, q: Array, v: Array, nu: Array, u: Array
+    ) -> dict[str, Array]:
         """Return C, D and y0; `nu` (6 + n,) and `u` (nu,) in base axes."""
-        sensing, state = self.prepared.sensing, self.prepared.map
-        if sensing is None:
-            return self.prepared.common["C"], self.prepared.common["D"], x0
-        a = rates.c.copy()
+        sensing, state, a = self.prepared.sensing, self.prepared.map, rates.c.copy()
+        assert sensing is not None
         if sensing.needs_acceleration:
             a[LINEAR] += rates.gravity - skew(nu[ANGULAR]).dot(nu[LINEAR])  # (3.2)
         sensed = sensing.evaluate(self._data, q, v, state.spread(a))
@@ -280,7 +270,7 @@ class Linearizer:
         for row, index in sensing.states:
             C[row, index] = 1.0
             sensed.y[row] = x0[index]
-        return C, D, sensed.y
+        return {"C": C, "D": D, "y0": sensed.y}
 
 
 def linearize(
@@ -331,22 +321,3 @@ def linearize(
     Linearizer : the same, prepared once for many points; the equations stand there.
     """
     return Linearizer(robot, frame=frame, reference=reference, moving=moving)(q, v, u)
-
-
-def _rebuilt(
-    robot: Robot, frame: Frame, reference: Any, moving: bool, engine: str | None
-) -> Linearizer:
-    return Linearizer(robot, frame=frame, reference=reference, moving=moving, engine=engine)
-
-
-def _state_at_rest(state: StateMap, q: Array) -> Array:
-    x0: Array = np.zeros(state.nx)
-    x0[state.groups.q_m] = state.joint_positions(q)
-    return frozen(x0)
-
-
-def _own_reference(robot: Robot, q: Array) -> Array:
-    root = robot.model.jointPlacements[ROOT]
-    if root.isIdentity(0.0):
-        return q[:7]
-    return frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q[:7])))

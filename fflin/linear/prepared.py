@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from fflin.kernel.compiled import numba_is_there
 from fflin.linear.certificate import certify, inertia_matrix
 from fflin.linear.ignorable import ignorable_states
 from fflin.linear.state_equations import at_rest
+from fflin.robot.frames import ROOT
 from fflin.robot.limits import magnitudes_of
 from fflin.robot.massless import require_inertia
 from fflin.robot.outputs import FullState
@@ -47,6 +48,14 @@ class Prepared:
     free: bool  # whether at rest all of a model but M^-1 is in `common` and `rest`
     common: Mapping[str, Any]  # fields of a model that are the same about all points
     rest: Mapping[str, Array]  # its A, f0, u0 and v where nothing moves, pulls or pushes
+
+    @cached_property
+    def fields(self) -> dict[str, Any]:
+        """Fields of a model at rest but B and q; some take as long to make as the dynamics."""
+        at_rest = partial(_state_at_rest, self.map)
+        asked = {"x0": at_rest, "y0": at_rest, "_reference": partial(_own_reference, self.robot)}
+        other = {} if self.own_reference else {"_reference": self.reference}
+        return {**self.common, **self.rest, "_when_asked": asked, **other}
 
     def kernel(self) -> PointKernel | None:
         """Return the compiled equations, or None where the kernel does not know a joint."""
@@ -132,3 +141,16 @@ def prepare(
             "v": frozen(np.zeros(robot.nv)),
         },
     )
+
+
+def _state_at_rest(state: StateMap, q: Array) -> Array:
+    x0: Array = np.zeros(state.nx)
+    x0[state.groups.q_m] = state.joint_positions(q)
+    return frozen(x0)
+
+
+def _own_reference(robot: Robot, q: Array) -> Array:
+    root = robot.model.jointPlacements[ROOT]
+    if root.isIdentity(0.0):
+        return q[:7]
+    return frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q[:7])))
