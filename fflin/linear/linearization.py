@@ -118,6 +118,7 @@ class Linearizer:
         self._calls = 0
         self._kernel: PointKernel | None = None
         self._one: Callable[..., bool] | None = None
+        self._fields, self._rate = ready.fields, "_drift" if ready.moving else "f0"
         # What the kernel takes, which must be writable.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
@@ -218,7 +219,7 @@ class Linearizer:
         self._accelerations.invert(q, B[self._lower])
         B.setflags(write=False)
         q.setflags(write=False)
-        return LinearModel.from_fields(self.prepared.fields | {"B": B, "q": q})
+        return LinearModel.from_fields(self._fields | {"B": B, "q": q})
 
     def _anywhere(self, q: Array, v: Array | None, u: Array | None) -> LinearModel:
         ready = self.prepared
@@ -251,11 +252,15 @@ class Linearizer:
         self, q: Array, v: Array | None, u: Array | None, rate: Array, made: dict[str, Array]
     ) -> LinearModel:
         """Put a model together, of arrays that nobody else has."""
-        given = {"q": q, "v": v, "u0": u, "_drift" if self.prepared.moving else "f0": rate}
-        made = {"y0": made["x0"], **made, **{k: x for k, x in given.items() if x is not None}}
+        made["q"], made[self._rate] = q, rate
+        if v is not None:
+            made["v"] = v
+        if u is not None:
+            made["u0"] = u
         for array in made.values():
             array.setflags(write=False)
-        return LinearModel.from_fields(self.prepared.fields | made)
+        made.setdefault("y0", made["x0"])
+        return LinearModel.from_fields(self._fields | made)
 
     def _seen(
         self, chart: Chart, rates: Rates, x0: Array, q: Array, v: Array, nu: Array, u: Array
