@@ -10,8 +10,8 @@ def run() -> Table:
     return compare(
         "at_point",
         "One linearisation at an operating point",
-        "Random joint positions, velocities and inputs, by the compiled kernel; the peers' times as "
-        "multiples of fflin's.",
+        "Random joint positions, velocities and inputs, by the compiled kernel; the peers' times "
+        "as multiples of fflin's.",
         (random_point(load(name)) for name in NAMES),
         fflin_call,
         in_readme=True,

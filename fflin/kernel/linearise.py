@@ -8,7 +8,7 @@ from fflin.kernel.accelerations import Layout, Loads
 from fflin.kernel.assembly import JUDGED, Equations, Places, Point, assemble, enter, judge, push
 from fflin.kernel.crba import inwards, outwards
 from fflin.kernel.factor import pack, unpack
-from fflin.kernel.lanes import compiled, inlined, load, splat, store
+from fflin.kernel.lanes import compiled, inlined, listed, load, splat, store
 from fflin.kernel.slopes import differentiate
 from fflin.kernel.tree import LANES, Tree
 from fflin.kernel.vectors import copy, get6, minus6, put6, times6
@@ -16,7 +16,7 @@ from fflin.kernel.vectors import copy, get6, minus6, put6, times6
 FARTHEST = 1e6  # [rad], up to which sines and cosines are exact to rounding
 
 
-@inlined
+@listed
 def _differentiate(work, robot, point):
     """Write M^-1, c and its slopes over what acts but the inputs, before M^-1 is applied."""
     tree, layout, loads = robot.tree, robot.layout, robot.loads
