@@ -13,11 +13,10 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.rotation import skew
 from fflin.base.validation import Array, vector
 from fflin.dynamics.chart import Chart, Standing
-from fflin.dynamics.rnea import Accelerations, Rates
-from fflin.dynamics.state import ANGULAR, LINEAR, Frame
+from fflin.dynamics.rnea import Accelerations
+from fflin.dynamics.state import Frame
 from fflin.kernel.compiled import POINT_BREAK_EVENS, checked_engine, point_pays
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
@@ -211,7 +210,8 @@ class Linearizer:
             chart = self._standing if ready.own_reference else state.chart(q)
             at_u = ready.actuation.in_base_axes(chart, at_u)
             rates = self._kernel.rates(state.gravity(q))
-            made |= self._seen(chart, rates, x0, q, at_v, state.velocities(at_v), at_u)
+            point = q, at_v, state.velocities(at_v), at_u
+            made |= output_equations(ready, self._data, chart, rates, x0, point)
         return self._model(q, v, u, rate, made)
 
     def _at_rest(self, q: Array) -> LinearModel:
@@ -240,10 +240,10 @@ class Linearizer:
         x0 = state.compose(chart, r_b, q_m, nu)
         made = {"A": A, "B": B, "x0": x0}
         if ready.sensing is not None:
-            made |= self._seen(chart, rates, x0, q, at_v, nu, at_u)
+            made |= output_equations(ready, self._data, chart, rates, x0, (q, at_v, nu, at_u))
         for name, array in {**made, "f0": rate}.items():
             flat = array.ravel()
-            if name not in ("x0", "y0") and not flat.dot(flat) < LARGEST:  # nor NaN
+            if name != "x0" and not flat.dot(flat) < LARGEST:  # nor NaN
                 raise InputError("q, v or u is so large that the model is not finite")
         rate = drift(state, rate, rates.gravity) if ready.moving else rate
         return self._model(q, v, u, rate, made)
@@ -261,21 +261,6 @@ class Linearizer:
             array.setflags(write=False)
         made.setdefault("y0", made["x0"])
         return LinearModel.from_fields(self._fields | made)
-
-    def _seen(
-        self, chart: Chart, rates: Rates, x0: Array, q: Array, v: Array, nu: Array, u: Array
-    ) -> dict[str, Array]:
-        """Return C, D and y0; `nu` (6 + n,) and `u` (nu,) in base axes."""
-        sensing, state, a = self.prepared.sensing, self.prepared.map, rates.c.copy()
-        assert sensing is not None
-        if sensing.needs_acceleration:
-            a[LINEAR] += rates.gravity - skew(nu[ANGULAR]).dot(nu[LINEAR])  # (3.2)
-        sensed = sensing.evaluate(self._data, q, v, state.spread(a))
-        C, D = output_equations(state, self.prepared.actuation, chart, sensed, rates, nu, u)
-        for row, index in sensing.states:
-            C[row, index] = 1.0
-            sensed.y[row] = x0[index]
-        return {"C": C, "D": D, "y0": sensed.y}
 
 
 def linearize(
