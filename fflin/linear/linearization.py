@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from itertools import chain
 from math import hypot
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -118,7 +117,7 @@ class Linearizer:
         self._kernel: PointKernel | None = None
         self._one: Callable[..., bool] | None = None
         self._fields, self._rate = ready.fields, "_drift" if ready.moving else "f0"
-        # What the kernel takes, which must be writable.
+        # What stands for rest and no input; the kernel takes nothing that may not be written.
         self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
         self._known = ready.free and ready.own_reference and ready.actuation.default
@@ -152,19 +151,20 @@ class Linearizer:
         """
         robot = self.robot
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
-        if v is not None:
-            v = robot.checked_velocity(v).copy()
-        if u is not None:
+        known = v is None and u is None and self._known
+        v = self._still[0] if v is None else robot.checked_velocity(v).copy()
+        if u is None:
+            u = self._still[1]
+        else:
             u = vector("u", u, self._shape_B[1], "the robot's inputs").copy()
         with self._lock:
-            if v is None and u is None and self._known:
+            if known:
                 return self._at_rest(q)
             if self._one is not None or self._begins():
                 lin = self._by_kernel(q, v, u)
                 if lin is not None:
                     return lin
-            given = (each.tolist() for each in (v, u) if each is not None)
-            if self._moderate and hypot(*chain.from_iterable(given)) < _MODERATE:
+            if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
                 return self._anywhere(q, v, u)
             # An overflow is refused below, so NumPy need not warn of it. Not always done, since
             # every call of NumPy costs more in here.
@@ -194,23 +194,21 @@ class Linearizer:
             self._one = None if self._kernel is None else self._kernel.one()
         return self._one is not None
 
-    def _by_kernel(self, q: Array, v: Array | None, u: Array | None) -> LinearModel | None:
+    def _by_kernel(self, q: Array, v: Array, u: Array) -> LinearModel | None:
         """Return the model by the kernel, or None where that cannot vouch for it."""
         ready, nx = self.prepared, self._lower.stop
         A, B = np.empty((nx, nx)), np.empty(self._shape_B)
         rate, x0 = np.empty(nx), np.empty(nx)
-        at_v = self._still[0] if v is None else v
-        at_u = self._still[1] if u is None else u
         assert self._one is not None
-        if not self._one(q, at_v, at_u, A, B, rate, x0):
+        if not self._one(q, v, u, A, B, rate, x0):
             return None
         made: dict[str, Array] = {"A": A, "B": B, "x0": x0}
         if ready.sensing is not None and self._kernel is not None:
             state = ready.map
             chart = self._standing if ready.own_reference else state.chart(q)
-            at_u = ready.actuation.in_base_axes(chart, at_u)
+            u_base = ready.actuation.in_base_axes(chart, u)
             rates = self._kernel.rates(state.gravity(q))
-            point = q, at_v, state.velocities(at_v), at_u
+            point = q, v, state.velocities(v), u_base
             made |= output_equations(ready, self._data, chart, rates, x0, point)
         return self._model(q, v, u, rate, made)
 
@@ -221,26 +219,24 @@ class Linearizer:
         q.setflags(write=False)
         return LinearModel.from_fields(self._fields | {"B": B, "q": q})
 
-    def _anywhere(self, q: Array, v: Array | None, u: Array | None) -> LinearModel:
+    def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
         ready = self.prepared
         state = ready.map
-        at_v = self._still[0] if v is None else v
-        at_u = self._still[1] if u is None else u
         chart, r_b = self._standing, self._standing.q_b
         if not ready.own_reference:
             chart, r_b = state.chart(q), state.positions(q)
-        nu, q_m = state.velocities(at_v), state.joint_positions(q)
-        at_u = ready.actuation.in_base_axes(chart, at_u)
-        rates = self._accelerations.rates(q, at_v, nu, q_m, at_u)
+        nu, q_m = state.velocities(v), state.joint_positions(q)
+        u_base = ready.actuation.in_base_axes(chart, u)
+        rates = self._accelerations.rates(q, v, nu, q_m, u_base)
         A, B = ready.fields["A"].copy(), np.zeros(self._shape_B)
         rate = assemble(
-            *(state, ready.actuation, chart, nu, at_u, rates, A, B[self._lower]),
+            *(state, ready.actuation, chart, nu, u_base, rates, A, B[self._lower]),
             moving=ready.moving,
         )
         x0 = state.compose(chart, r_b, q_m, nu)
         made = {"A": A, "B": B, "x0": x0}
         if ready.sensing is not None:
-            made |= output_equations(ready, self._data, chart, rates, x0, (q, at_v, nu, at_u))
+            made |= output_equations(ready, self._data, chart, rates, x0, (q, v, nu, u_base))
         for name, array in {**made, "f0": rate}.items():
             flat = array.ravel()
             if name != "x0" and not flat.dot(flat) < LARGEST:  # nor NaN
@@ -249,13 +245,13 @@ class Linearizer:
         return self._model(q, v, u, rate, made)
 
     def _model(
-        self, q: Array, v: Array | None, u: Array | None, rate: Array, made: dict[str, Array]
+        self, q: Array, v: Array, u: Array, rate: Array, made: dict[str, Array]
     ) -> LinearModel:
         """Put a model together, of arrays that nobody else has."""
         made["q"], made[self._rate] = q, rate
-        if v is not None:
+        if v is not self._still[0]:
             made["v"] = v
-        if u is not None:
+        if u is not self._still[1]:
             made["u0"] = u
         for array in made.values():
             array.setflags(write=False)
