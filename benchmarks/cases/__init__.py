@@ -3,6 +3,7 @@
 ORDER = (
     "at_rest",
     "at_point",
+    "at_point_compiled",
     "equipped",
     "growth",
     "number",

@@ -115,10 +115,7 @@ def whole_seal(
 def read_rows(
     path: Path, *, verify: bool
 ) -> tuple[dict[str, Array], list[str], dict[str, str], bool]:
-    """Return arrays, which of them are of one row for all, texts, and whether they are verified.
-
-    Arrays of HDF5 are read as they are used. See `reading` for what is raised.
-    """
+    """Return arrays, which of them are of one row for all, texts, and whether they are verified."""
     with path.open("rb") as file:
         zipped = file.read(2) == b"PK"
     if not zipped and path.suffix == ".npz":

@@ -12,10 +12,7 @@ _ODD = 1e-12
 
 
 def gains_at_rest(rates: Array, L: Array, Q: Array, R: Array) -> tuple[Array, Array, Array]:
-    """Return K, residuals and margins of a block; what it cannot do has a NaN residual.
-
-    `rates` (m,) is the diagonal of N with dx1/dt = N x2, `L` (count, m, nu) drives x2.
-    """
+    """Return K, residuals and margins of a block; what it cannot do has a NaN residual."""
     count, m, nu = L.shape
     nothing = np.full((count, nu, 2 * m), np.nan), *np.full((2, count), np.nan)
     factor = np.linalg.cholesky(R)
@@ -58,11 +55,7 @@ def gains_at_rest(rates: Array, L: Array, Q: Array, R: Array) -> tuple[Array, Ar
 
 
 def _cost_to_go(rates: Array, L: Array, Q: Array, R: Array, K: Array) -> Array:
-    """Return the P (count, nx, nx) of optimal gains.
-
-    Its lower half is told by R K = B'P, its upper left block by the mixed block of the Riccati
-    equation.
-    """
+    """Return the P (count, nx, nx) of optimal gains."""
     m = len(rates)
     lower = np.linalg.pinv(np.swapaxes(L, 1, 2)) @ (R @ K)
     spent = np.swapaxes(K, 1, 2) @ R @ K

@@ -98,8 +98,7 @@ def checked_velocities(robot: Robot, v: Any, count: int) -> Array:
     if dimension("v", v) == 1:
         return np.broadcast_to(robot.checked_velocity(v).copy(), (count, robot.nv))
     rows = _rows("v", v, robot.nv, "a velocity in Pinocchio's order each", count)
-    doubtful = ~np.isfinite(rows).all(axis=1) | bool(robot.followers)
-    for row in np.flatnonzero(doubtful).tolist():
+    for row in range(count) if robot.followers else _not_finite(rows):
         _checked(robot.checked_velocity, "velocity", row, rows[row])
     rows.setflags(write=False)
     return rows
@@ -111,10 +110,20 @@ def checked_inputs(names: tuple[str, ...], u: Any, count: int) -> Array:
     if dimension("u", u) == 1:
         return np.broadcast_to(vector("u", u, nu, "the robot's inputs").copy(), (count, nu))
     rows = _rows("u", u, nu, "the robot's inputs each", count)
-    for row, index in np.argwhere(~np.isfinite(rows)).tolist():
+    for row in _not_finite(rows):
+        index = int(np.isfinite(rows[row]).argmin())
         raise InputError(f"u[{row}, {index}] is {rows[row, index]}; every entry must be finite")
     rows.setflags(write=False)
     return rows
+
+
+def _not_finite(rows: Array) -> list[int]:
+    """Return the rows with an entry that is not finite; a finite sum tells that there is none."""
+    with np.errstate(all="ignore"):
+        if np.isfinite(rows.sum()):
+            return []
+    rows_left: list[int] = np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist()
+    return rows_left
 
 
 def _rows(name: str, value: Any, size: int, of_what: str, count: int | None = None) -> Array:

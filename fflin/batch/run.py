@@ -46,13 +46,9 @@ def run_chunks(
     progress: Progress | None = None,
     upto: int | None = None,
 ) -> list[Done]:
-    """Do the chunks that a store has not yet, keep what comes of them, return those that failed.
-
-    Only those that begin before row `upto`, where it is given.
-
-    ``rows(start, stop)`` is a named tuple; what the store has a name for is kept of it too. Threads
-    are of this process, where there is no executor. Warnings of a job are said once.
-    """
+    """Do the chunks that a store has not yet, keep what comes of them, return those that failed."""
+    # `rows(start, stop)` is a named tuple, which the store keeps of what it has a name for. Only
+    # chunks that begin before `upto` are done; threads are of this process, without an executor.
     size = store.chunk
     spans = [Span(at, min(at + size, store.count)) for at in range(0, store.count, size)]
     left = [span for span in spans if not store.finished(*span)]
@@ -87,11 +83,7 @@ def failure(
     of_what: str,
     made: Callable[[Any], Any],
 ) -> SweepError:
-    """Return the error that names the chunks that failed.
-
-    It holds what is ``made`` of the rows (mask) that are there, where these are in memory. A file
-    without any is not left behind.
-    """
+    """Return the error that names the chunks that failed."""
     kept = np.ones(store.count, dtype=bool)
     for (start, stop), *_ in failed:
         kept[start:stop] = False

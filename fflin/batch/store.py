@@ -57,16 +57,7 @@ class MemoryStore:
 
 
 class FileStore:
-    """Arrays of `count` rows in an HDF5 file, NAME.part until it is whole.
-
-    Their place in the file is fixed and reserved from the start, so that a crash in the middle of
-    a chunk harms no other, and the disk does not fill up under it; a chunk counts as finished once
-    its hash stands beside it. A file that is there goes on, in chunks of its own size (`resumed`),
-    if `request`, a hash of all that the result depends on, is the same.
-
-    A path that is not .h5 is for the caller to make of the unfinished file. Beside the rows stand
-    `constants`, arrays that are the same for all of them, and `texts`, as attributes.
-    """
+    """Arrays of `count` rows in an HDF5 file, NAME.part until it is whole."""
 
     def __init__(
         self,

@@ -29,13 +29,7 @@ class NoWorkers(BrokenExecutor):
 
 
 class OwnWorkers(Executor):
-    """Processes of our own; one that dies is replaced and harms no task but its own.
-
-    Those of `concurrent.futures.ProcessPoolExecutor` share one pipe for their results: where one
-    is killed in the middle of a large result, all wait for the rest of it for ever. They also
-    outlive a caller that is killed; these end with it. Of more than there are cores it warns, and
-    takes one for each.
-    """
+    """Processes of our own; one that dies is replaced and harms no task but its own."""
 
     def __init__(self, count: int) -> None:
         cores = available_cores()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.figures import COLORS, saved, styled, target_of
+from fflin.base.figures import COLORS, drawing
 from fflin.base.names import group_of, input_keys
 from fflin.base.validation import Array, whole
 from fflin.campaign.campaign import Campaign
@@ -57,7 +57,7 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
     if not isinstance(campaign, Campaign):
         said = f"campaign is a {type(campaign).__name__}, expected a Campaign"
         raise InputError(f"{said}, as fflin.monte_carlo returns it")
-    target, top = target_of(path), whole("worst", worst, 0, len(_WORST))
+    top = whole("worst", worst, 0, len(_WORST))
     runs, groups = campaign.worst(top) if top else [], dict[str, list[int]]()
     for at, key in enumerate(input_keys(campaign) if campaign.times else ()):
         groups.setdefault(group_of(key), []).append(at)
@@ -67,8 +67,7 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
     last = [*((_inputs, *each, runs) for each in groups.items()), (_whence,)]
     across = math.ceil(len(last) / math.ceil(len(last) / 3))
     rows += [last[at : at + across] for at in range(0, len(last), across)]
-    with styled() as figure_class:
-        figure = figure_class(figsize=(11.0, 0.8 + 2.6 * len(rows)), layout="constrained")
+    with drawing(path, 11.0, 0.8 + 2.6 * len(rows)) as figure:
         keys: dict[str, Any] = {}
         for place, row in zip(figure.add_gridspec(len(rows), 1), rows, strict=True):
             for cell, (panel, *given) in zip(place.subgridspec(1, len(row)), row, strict=True):
@@ -79,7 +78,7 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
         title = f"{campaign.robot}: {len(campaign):,} runs of {campaign.duration:g} s; "
         goals = [goal_met(campaign, goal) for goal in campaign.goals]
         figure.suptitle("\n".join([title + ended_of(campaign), *goals]), fontsize=11)
-        return saved(figure, target)
+    return figure
 
 
 def _bands(

@@ -96,7 +96,6 @@ def _leave_earlier(arguments: argparse.Namespace) -> list[str]:
 def simulated(robot: Robot, arguments: argparse.Namespace) -> Motion:
     """Return the motion that the arguments ask for."""
     from fflin.simulation.simulate import simulate
-    from fflin.simulation.times import SHORTEST, time_to_settle
 
     loop = loop_of(robot, arguments)
     # At every row, where a sampled model has the samples alone.

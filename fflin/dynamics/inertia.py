@@ -26,7 +26,7 @@ _QUICK_COUPLING = 1e-11 / _EPS
 
 # The same for each coordinate alone, from where on it has next to no inertia of its own: of robots
 # that are described well it is below 1e6.
-_LARGEST_SHARE = 1e9
+LARGEST_SHARE = 1e9
 
 STROKE = 1.0  # [m] that a sliding joint is taken to be out at most, for those moments
 
@@ -43,10 +43,7 @@ _crba, _decompose, _invert_factor, _compute_inverse = (
 
 
 class Inertia:
-    """M^-1 at a configuration, in base axes: angular, linear, joints; `data` is work space."""
-
-    # Scaling M by its diagonal before it is factored would gain nothing: the rounding of a Cholesky
-    # factorisation is invariant under it.
+    """M^-1 at a configuration, in base axes: angular, linear, joints."""
 
     # Between this and `least_coupling` the sum of M_ii (M^-1)_ii lies where M^-1 is good.
     warning_coupling = _WARNING_COUPLING
@@ -58,9 +55,7 @@ class Inertia:
         self._inverse = data.Minv
         self._inverse_diagonal = self._inverse.diagonal()
         self._constrained = bool(robot.followers)
-        if robot not in _BOUNDS:
-            _BOUNDS[robot] = inertia_bounds(robot.model)
-        self._bounds = None if self._constrained else _BOUNDS[robot]
+        self._bounds = bounds_of(robot)
         self._in_order = np.zeros(0) if self._bounds is None else state.velocities(self._bounds)
         self._slides = [joint.idx_q for joint in robot.joints if joint.prismatic]
         # The base at the world's origin: M does not depend on where it is, but Pinocchio works in
@@ -69,11 +64,12 @@ class Inertia:
         self.least_coupling = 0.999 * (6 + robot.n)
 
     def invert(self, q: Array, out: Array, *, quick: bool = False) -> None:
-        """Write M^-1 at a valid configuration into a C-contiguous array."""
-        # By articulated bodies only where `quick` is asked for: their rounding, small as it is,
-        # takes from a slope M^-1 K the exactness of what M^-1 leaves alone.
+        """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
         still = self._still
         still[7:] = q[7:]
+        # By articulated bodies only where that is asked for: their rounding, small as it is, takes
+        # from a slope M^-1 K the exactness of what M^-1 leaves alone. Else by a Cholesky factor,
+        # whose rounding no scaling of M changes.
         bounds = self._bounds if quick else None
         if bounds is not None and all(abs(still[index]) <= STROKE for index in self._slides):
             _compute_inverse(self._model, self._data, still)
@@ -94,7 +90,7 @@ class Inertia:
         # Written so that NaN, from a pivot that is zero, fails too.
         if not self.least_coupling < coupling < _WARNING_COUPLING:
             self._judge(coupling, self._state.project(upper.T), out)
-        elif self._bounds is not None and not self._in_order.dot(out.diagonal()) < _LARGEST_SHARE:
+        elif self._bounds is not None and not self._in_order.dot(out.diagonal()) < LARGEST_SHARE:
             self._name_the_lightest(1.0 / out.diagonal())
 
     def _name_the_lightest(self, inertias: Array) -> None:
@@ -151,12 +147,17 @@ def _invert_dense(M: Array, out: Array) -> None:
 _BOUNDS: WeakKeyDictionary[Robot, Array | None] = WeakKeyDictionary()
 
 
+def bounds_of(robot: Robot) -> Array | None:
+    """Return `inertia_bounds` of a robot; None too where joints mimic others."""
+    if robot not in _BOUNDS:
+        _BOUNDS[robot] = None if robot.followers else inertia_bounds(robot.model)
+    return _BOUNDS[robot]
+
+
 def inertia_bounds(model: pin.Model) -> Array | None:
-    """Bound what each coordinate of a free flyer moves (nv,), in Pinocchio's order; or None."""
-    # A body's moment about an axis through the base's origin is at most its largest principal
-    # moment and its mass times the square of the way to it, from joint to joint. M's diagonal is no
-    # larger.
-    # Of joints that turn or slide alone, and these within `STROKE`.
+    """Bound what each coordinate of a free flyer moves: its mass, or its moment."""
+    # A body's moment about the base's origin is at most its largest principal moment and its mass
+    # times the square of the way to it, from joint to joint, sliding ones being within `STROKE`.
     joints = model.joints.tolist()
     slides = [joint.shortname().startswith("JointModelP") for joint in joints]
     if not all(joint.shortname()[:11] in ("JointModelR", "JointModelP") for joint in joints[2:]):

@@ -85,6 +85,8 @@ class Sensing:
         pin.computeForwardKinematicsDerivatives(at.model, at.data, at.q, at.v, *felt)
 
     def _point(self, data: pin.Data, q: Array, v: Array) -> Point:
+        # Neither where the base is nor how fast it moves along changes what happens on the robot
+        # (Galilei): both are left out and put on afterwards, so that an orbit costs no digits.
         state, robot = self._state, self._state.robot
         still_q, still_v = q.copy(), v.copy()
         still_q[:7] = self._home

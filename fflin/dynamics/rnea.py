@@ -14,7 +14,7 @@ from fflin.dynamics.state import StateMap
 
 
 class Rates(NamedTuple):
-    """The acceleration of the base origin and the joints, in base axes, at a point or at many."""
+    """The acceleration of the base origin and the joints, in base axes, and what it depends on."""
 
     c: Array  # (6 + n,) of (3.1): without gravity and omega x v_b
     by_q_m: Array  # D_m (6 + n, n) of (3.3)
@@ -51,7 +51,7 @@ class Accelerations:
         self._inertia.invert(q, out, quick=True)
 
     def rates(self, q: Array, v: Array, nu: Array, q_m: Array, u: Array) -> Rates:
-        """Return the accelerations and their slopes, of nu and u (nu,) in base axes."""
+        """Return the rates at q, v and u in base axes, v being `nu` and q_m in state order."""
         model, data, state = self._model, self._data, self._state
         # Without the base's position and linear velocity: nothing here depends on them, and
         # Pinocchio's derivatives lose digits to both. Nor does it depend on gravity, which
@@ -81,9 +81,8 @@ class Accelerations:
         self, q: Array, v: Array, c: Array, u: Array, gyroscopic: Gyroscopic | None
     ) -> tuple[Array, Array]:
         """Return the slopes of M a + b - B u + passive forces over q_m and nu (3.3), (7.1)."""
-        # The wrenches of thrusters are constant in the frames of their links, so that RNEA's
-        # derivatives with them hold -d(B u)/dq.
         model, data, state = self._model, self._data, self._state
+        # Constant in the frames of their links, so that RNEA's derivatives hold -d(B u)/dq.
         wrenches = gyroscopic.wrenches if gyroscopic else self._actuation.wrenches(u)
         external = () if wrenches is None else (wrenches,)
         full_q, full_v, _ = pin.computeRNEADerivatives(
@@ -98,8 +97,9 @@ class Accelerations:
         return by_q, by_v
 
     def _gyroscopic(self, q: Array, v: Array, u: Array) -> Gyroscopic:
-        """Return the torques J^T [h]x J v of stored momentum (6.3), added to the inputs'."""
+        """Return the torques of stored momentum, their wrenches with those of the inputs."""
         model, data, nv = self._model, self._data, len(v)
+        # With the angular Jacobian J of a link in its axes, h x omega is J^T [h]x J v (6.3).
         wrenches = self._actuation.wrenches(u)
         if wrenches is None:
             wrenches = pin.StdVec_Force(model.njoints, pin.Force.Zero())

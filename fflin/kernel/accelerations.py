@@ -1,4 +1,4 @@
-"""Accelerations and their slopes at many points, by the compiled kernel."""
+"""What acts on a robot as the kernel reads it, its work space, and M^-1 at many points."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.state import StateMap
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES, PIN_ANGULAR, PIN_LINEAR, Tree
 from fflin.robot.frames import ROOT
@@ -20,98 +19,21 @@ class Layout(namedtuple("Layout", "motion load bias c columns lower held size"))
 
 
 class Loads(namedtuple("Loads", "body wrench input stored_body stored stiffness damping")):
-    """What acts on the bodies and joints of a robot.
-
-    Attributes
-    ----------
-    body, wrench, input : ndarray (k,), (6 k,), (k,)
-        Of every input that is carried: its body, the moment and force of a unit about the joint's
-        origin, in the body's axes, and its number.
-    stored_body, stored : ndarray (s,), (3 s,)
-        Angular momentum that bodies store, in their axes.
-    stiffness, damping : ndarray (n,)
-    """
-
-
-class BatchRates(namedtuple("BatchRates", "inverse c columns couplings")):
-    """What the kernel finds about N points, all in base axes.
-
-    Attributes
-    ----------
-    inverse : ndarray (N, 6 + n, 6 + n)
-        M^-1.
-    c : ndarray (N, 6 + n)
-        Acceleration of the base origin and the joints, without gravity and omega x v_b.
-    columns : ndarray (N, 6 + n, k)
-        Generalised force of a unit of each of the k inputs that are carried.
-    couplings : ndarray (N,)
-        Sums of M_ii (M^-1)_ii, which tell how singular M is.
-    """
-
-
-class BatchAccelerations:
-    """The accelerations of a robot and their slopes, about eight points at a time.
-
-    Parameters
-    ----------
-    state : StateMap
-    actuation : Actuation
-    tree : Tree
-        Of the same robot.
-
-    Attributes
-    ----------
-    carried : ndarray (k,)
-        Numbers of the inputs whose generalised force depends on the configuration.
-    """
-
-    def __init__(self, state: StateMap, actuation: Actuation, tree: Tree) -> None:
-        self._tree, self._loads = tree, loads_of(state.robot, actuation, tree)
-        self.carried = self._loads.input
-        self._layout = layout_of(tree, len(self.carried))
-
-    def rates(self, q: Array, nu: Array, forces: Array, u: Array, A: Array) -> BatchRates:
-        """Return the rates and write their slopes; N is the number of lanes at least.
-
-        Parameters
-        ----------
-        q : ndarray (N, nq)
-            Configurations.
-        nu : ndarray (N, 6 + n)
-            Velocities in state order and base axes.
-        forces : ndarray (N, 6 + n)
-            Those of inputs that are fixed to base and joints, of springs and of dampers.
-        u : ndarray (N, nu)
-            Inputs, in base axes.
-        A : ndarray (N, 12 + 2 n, 12 + 2 n)
-            Its lower half is written, the slopes of c.
-        """
-        (count, nv), carried = nu.shape, len(self.carried)
-        inverse, c, couplings = np.empty((count, nv * nv)), np.empty((count, nv)), np.empty(count)
-        columns, points = np.empty((count, nv * carried)), (q, nu, forces, u)
-        kernel("linearise", "linearise")(
-            *(self._tree, self._layout, self._loads, points),
-            (inverse, c, A.reshape(count, -1), columns, couplings),
-            tuple(work_space(each.shape[1]) for each in points),
-            work_space(self._layout.size),
-        )
-        inverse, columns = inverse.reshape(count, nv, nv), columns.reshape(count, nv, carried)
-        return BatchRates(inverse, c, columns, couplings)
+    """Body, unit wrench at its joint and number of carried inputs; stored momenta; springs."""
 
 
 def inverse_inertias(tree: Tree, q: Array, out: Array) -> Array:
-    """Write M^-1 (N, 6 + n, 6 + n) at configurations (N, nq), N the number of lanes at least.
-
-    Returns
-    -------
-    ndarray (N,)
-        Sums of M_ii (M^-1)_ii, which tell how singular M is.
-    """
+    """Write M^-1 (N, 6 + n, 6 + n) at configurations (N, nq), N the number of lanes at least."""
     couplings = np.empty(len(q))
     flat = out.reshape(len(q), -1)
     spaces = work_space(q.shape[1]), work_space(tree.size)
-    kernel("factor", "invert")(tree, q, flat, couplings, *spaces)
+    kernel("factor", "invert")(tree, writable(q), flat, couplings, *spaces)
     return couplings
+
+
+def writable(rows: Array) -> Array:
+    """Return rows that may be written, copied if need be: numba compiles for either kind."""
+    return np.require(rows, np.float64, ("C", "W"))
 
 
 def work_space(size: int) -> Array:

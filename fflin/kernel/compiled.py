@@ -13,12 +13,16 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
+from fflin.base.errors import unknown
+
 # Fewest points for which the kernel is quicker than the loop, where numba is loaded and where it is
 # not. To load it takes half a second, which a sweep of that size does not win back but the next
 # ones do: sweeps are seldom alone.
 _BREAK_EVEN, _BREAK_EVEN_UNLOADED = 16, 2000
 # Fewest steps of the loop for which its kernel is: loaded and kept on disk, kept, and neither.
 _BREAK_EVEN_LOOP, _BREAK_EVEN_LOOP_UNLOADED, _BREAK_EVEN_COMPILING = 100, 4000, 20_000
+# Fewest points, one by one, for which their kernel is, of these three.
+POINT_BREAK_EVENS = 1, 20_000, 200_000
 
 # Files in which Linux tells a container's quota of computing time and its period [us], of version 2
 # and of version 1 of its control groups.
@@ -27,8 +31,11 @@ _QUOTAS = (
     ("/sys/fs/cgroup/cpu/cpu.cfs_quota_us", "/sys/fs/cgroup/cpu/cpu.cfs_period_us"),
 )
 
+ENGINES = ("python", "compiled")
+
 _log = logging.getLogger("fflin")
 _TURN = Lock()
+_FOUND: set[str] = set()  # what was found on disk once
 
 
 def available_cores() -> int:
@@ -62,11 +69,24 @@ def loop_pays(steps: int, name: str = "advance") -> bool:
     """Whether a compiled loop is there and beats the one in Python over so many steps."""
     if steps < _BREAK_EVEN_LOOP or not numba_is_there():
         return False
-    chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
-    folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
-    if not any(_kept(folder, "loop", name) for folder in folders):
+    if not _kept_somewhere("loop", name):
         return steps >= _BREAK_EVEN_COMPILING
     return steps >= _BREAK_EVEN_LOOP_UNLOADED or "numba" in sys.modules
+
+
+def checked_engine(engine: Any) -> str | None:
+    """Return the name of an engine, or None, or raise `UnknownNameError`."""
+    if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
+        raise unknown("engine", str(engine), list(ENGINES))
+    return engine
+
+
+def point_pays(calls: int) -> bool:
+    """Whether the kernel of single points is there and pays for so many of them."""
+    loaded = "fflin.kernel.lanes" in sys.modules
+    if calls < POINT_BREAK_EVENS[not loaded] or not numba_is_there():
+        return False
+    return calls >= POINT_BREAK_EVENS[2] or _point_is_kept()
 
 
 def kernel(module: str, name: str, what: str = "the batch kernel") -> Any:
@@ -87,11 +107,21 @@ def _prepared(module: str, name: str, what: str) -> Any:
     return compiled
 
 
-def _kept(folder: Path, module: str, name: str) -> list[Path]:
-    """Return what is kept of a function and not older than any source.
+def _kept_somewhere(module: str, name: str) -> bool:
+    chosen, own = os.environ.get("NUMBA_CACHE_DIR"), Path(__file__).parent
+    folders = Path(chosen).glob(f"{own.name}_*") if chosen else [own / "__pycache__"]
+    return any(_kept(folder, module, name) for folder in folders)
 
-    numba compares with the function's own file, not with those of the functions that it calls.
-    """
+
+def _point_is_kept() -> bool:
+    if not _FOUND and _kept_somewhere("linearise", "linearise_one"):
+        _FOUND.add("linearise_one")
+    return bool(_FOUND)
+
+
+def _kept(folder: Path, module: str, name: str) -> list[Path]:
+    """Return what is kept of a function and not older than any source."""
+    # numba compares with the function's own file, not with those of the functions that it calls.
     source = max(file.stat().st_mtime for file in _sources())
     entries = folder.glob(f"{module}.{name}-*.nbi")
     return [entry for entry in entries if entry.stat().st_mtime >= source]

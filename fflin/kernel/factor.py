@@ -14,11 +14,7 @@ from fflin.kernel.tree import LANES
 
 @inlined
 def factorise(work, tree):
-    """Turn the packed M into L, of unit diagonal, and 1 / D where `scaled` is, M = L^T D L.
-
-    The sparse factorisation of Featherstone, from the tips to the base, which makes no entry that
-    was zero.
-    """
+    """Turn the packed M into L, of unit diagonal, and 1 / D where `scaled` is, M = L^T D L."""
     packed, scaled = tree.packed, tree.scaled
     for k in range(len(tree.row) - 1, -1, -1):
         row, depth = packed + tree.row[k], tree.depth[k]
@@ -79,8 +75,8 @@ def invert_factor(work, tree):
 
 
 @inlined
-def multiply(work, tree, couplings, first):
-    """Write M^-1 = U D^-1 U^T lane beside lane, and sum M_ii (M^-1)_ii."""
+def multiply(work, tree, judged):
+    """Write M^-1 = U D^-1 U^T, and at `judged` the sum of M_ii (M^-1)_ii."""
     packed, scaled, square = tree.packed, tree.scaled, tree.square
     size = len(tree.row)
     coupling = splat(work, 0.0)
@@ -95,10 +91,7 @@ def multiply(work, tree, couplings, first):
             store(work, square + (j * size + i), total)
             if i == j:
                 coupling = coupling + total * load(work, tree.diagonal + i)
-    # The diagonal is not needed any more.
-    store(work, tree.diagonal, coupling)
-    for lane in range(LANES):
-        couplings[first + lane] = work[tree.diagonal, lane]
+    store(work, judged, coupling)
 
 
 @inlined
@@ -124,20 +117,7 @@ def unpack(work, start, entries, out, first, offset):
 
 @compiled
 def invert(tree, q, out, couplings, lanes, work):
-    """Write M^-1 of each configuration.
-
-    Parameters
-    ----------
-    tree : Tree
-    q : ndarray (count, nq)
-        Configurations, as many as there are lanes at least.
-    out : ndarray (count, size * size)
-        Results.
-    couplings : ndarray (count,)
-        The sums of M_ii (M^-1)_ii, which tell how singular M is.
-    lanes, work : ndarray (nq, 8), (size, 8)
-        Work space.
-    """
+    """Write M^-1 of each configuration."""
     count, entries = out.shape
     for block in range(0, count, LANES):
         # The last block begins early enough to fill the lanes; some points are done twice.
@@ -148,5 +128,8 @@ def invert(tree, q, out, couplings, lanes, work):
         keep_diagonal(work, tree)
         factorise(work, tree)
         invert_factor(work, tree)
-        multiply(work, tree, couplings, first)
+        # The diagonal is not needed any more.
+        multiply(work, tree, tree.diagonal)
         unpack(work, tree.square, entries, out, first, 0)
+        for lane in range(LANES):
+            couplings[first + lane] = work[tree.diagonal, lane]

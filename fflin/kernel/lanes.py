@@ -38,6 +38,8 @@ _BYTES = 8  # alignment of a double
 # and makes no function able to allocate.
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
 inlined = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
+# For what is a list of calls: compiled with its caller, and not for itself before.
+listed = numba.njit(inline="always", **_OPTIONS)
 compiled = numba.njit(nogil=True, cache=True, boundscheck=False, **_OPTIONS)
 
 

@@ -155,10 +155,7 @@ def _base_slopes(work, tree, layout):
 
 @inlined
 def differentiate(work, tree, layout, loads):
-    """Write the slopes of M c + bias less the forces over the state, rows of 12 + 2 n.
-
-    Those over q_b, r_b and v_b are zero.
-    """
+    """Write the slopes of M c + bias less the forces over the state, rows of 12 + 2 n."""
     _passive_slopes(work, tree, layout, loads)
     _joint_slopes(work, tree, layout)
     _base_slopes(work, tree, layout)

@@ -34,37 +34,19 @@ class Tree(
 ):
     """Bodies in Pinocchio's order, 0 the base; coordinates in state order, 0 to 5 the base's.
 
-    Attributes
-    ----------
-    parent : ndarray (bodies,)
-        Body that carries each.
-    fixed : ndarray (12 bodies,)
-        Columns of the rotation, and origin, of each joint in its parent, z along the joint's axis.
-    index : ndarray (bodies,)
-        Entry of q of each joint: its angle, length or cosine.
-    unbounded : ndarray (bodies,) of bool
-        Whether it is stored as (cos, sin).
-    turns, slides : ndarray (bodies,)
-        Turn and displacement along z for a unit of the joint's coordinate.
-    bodies : ndarray (10 bodies,), or (10 bodies, 8) of others in each lane
-        Mass, times centre, and inertia about the joint's origin (xx xy xz yy yz zz).
-    axes : ndarray (bodies, 3, 3)
-        Rotation of the frame in which all this stands, z along the joint's axis, in Pinocchio's.
-    coordinate, factor : ndarray (bodies,)
-        The coordinate that moves each, and how far it moves for a unit of it.
-    armature : ndarray (6 + n,)
-        Inertia of rotors, which the diagonal of M has besides.
-    target, share : ndarray (pairs,)
-        For every body, and for every body from it inwards: the entry of the packed M that it adds
-        to, and how often; last, of the base, the first of six entries.
-    row, depth : ndarray (6 + n,)
-        Where a row of the packed M begins, and how many coordinates are before its own.
-    path : ndarray (entries,)
-        The coordinate of every packed entry.
-    common : ndarray (6 + n, 6 + n)
-        How many coordinates two rows have in common.
-    entries, places, own, inertias, packed, scaled, diagonal, square, size : int
-        Entries of the packed M; where the parts of the work space begin; its size.
+    Of each body what carries it (`parent`); its joint's rotation columns and origin there, z along
+    the axis (`fixed`, 12 each); its joint's entry of q, an angle, a length or a cosine (`index`,
+    `unbounded`); turn and shift along z for a unit of the joint's coordinate (`turns`, `slides`);
+    mass, m c and inertia about the joint's origin, xx xy xz yy yz zz (`bodies`, 10 each, with a
+    second axis of 8 where lanes differ); the rotation of these axes in Pinocchio's (`axes`); and
+    what coordinate moves it, by how much (`coordinate`, `factor`). `armature` is what rotors add to
+    the diagonal of M.
+
+    Of the packed M where a row begins, and how many coordinates are before its own (`row`,
+    `depth`); the coordinate of each entry (`path`); how many of them two rows have in `common`; and
+    for every body, and every one from it inwards, the entry that it adds to and how often
+    (`target`, `share`), last the first of the base's six. Then the number of entries, and where
+    the parts of the work space begin; its size.
     """
 
 
@@ -190,11 +172,9 @@ def _armature(model: pin.Model, coordinate: list[int], factor: list[float]) -> A
 
 
 def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
-    """Return, for every coordinate, those that its row of the factor reaches, and itself.
-
-    Each joins the coordinates inwards of all bodies that it moves. Where joints mimic others these
-    need not be on one path, and the factor fills them up to one: the elimination tree of Liu.
-    """
+    """Return, for every coordinate, those that its row of the factor reaches, and itself."""
+    # Where joints mimic others the coordinates inwards of what one moves need not be on one path;
+    # the factor fills them up to one: the elimination tree of Liu.
     reached: list[set[int]] = [set(range(index)) if index < 6 else set() for index in range(size)]
     for body in range(1, len(parent)):
         above = body

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -23,25 +23,6 @@ from fflin.robot.robot import Robot
 _ROUNDING_SHARE = 1e-3
 
 
-class Block(NamedTuple):
-    """Difference of two routes to one block of A or B.
-
-    Attributes
-    ----------
-    matrix : str
-        "A" or "B".
-    row, column : str
-        Groups of the state or input, such as "omega_b" and "q_m".
-    error : float
-        Largest difference relative to the block.
-    """
-
-    matrix: str
-    row: str
-    column: str
-    error: float
-
-
 def certify(robot: Robot, lin: LinearModel) -> Certificate:
     """Compute the figures that prove a continuous-time model of this robot."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
@@ -51,8 +32,8 @@ def certify(robot: Robot, lin: LinearModel) -> Certificate:
     return Certificate(
         condition=scaled_condition(lin.M),
         inertia_residual=inertia_residual(lin.M, inverse_inertia(state, lin)),
-        route_A=max(block.error for block in blocks if block.matrix == "A"),
-        route_B=max(block.error for block in blocks if block.matrix == "B"),
+        route_A=max(error for name, error in blocks if name[0] == "A"),
+        route_B=max(error for name, error in blocks if name[0] == "B"),
         f0=float(np.abs(lin.f0).max()),
     )
 
@@ -73,19 +54,7 @@ def inertia_residual(M: Array, inverse: Array) -> float:
 def aba_route(
     state: StateMap, aba: Aba, q: Array, v: Array, u: Array, *, moving: bool = False
 ) -> tuple[Array, Array, Array]:
-    r"""Build A and B from the derivatives of ABA.
-
-    They are built in base axes and carried to the frame by the change of coordinates
-    :math:`x_f = T x_l`: :math:`A_f = (T A_l + \dot T) T^{-1}`, :math:`B_f = T B_l`, to which the
-    turning of a force held in reference axes is added: (4.9) and (4.10) of docs/derivation.md.
-
-    Returns
-    -------
-    A : ndarray (nx, nx)
-    B : ndarray (nx, nu)
-    inverse : ndarray (6 + n, 6 + n)
-        M^-1 in base axes as ABA has it, which tells how much its route is worth.
-    """
+    """Build A and B from the derivatives of ABA, (4.9) and (4.10), and return its M^-1 too."""
     chart, g, nv = state.chart(q), state.groups, 6 + state.robot.n
     nu, u = state.velocities(v), aba.actuation.in_base_axes(chart, u)
     # Pinocchio differentiates in world axes at the world's origin, where a distant base costs
@@ -153,17 +122,11 @@ def compare(
     *,
     steps: Array | None = None,
     rounding: float = 0.0,
-) -> list[Block]:
-    """Compare a model's A and B with those of another route, block by block.
-
-    `M` is the robot's, for the scales. A route that takes steps (nx,) has the terms of the motion
-    there, and their `rounding`, relative to what is asked of it.
-
-    A difference is relative to the largest entry of its block, rows of accelerations being
-    scaled by the mobility sqrt((M^-1)_ii), so that a light joint does not hide a heavy one.
-    Where a block vanishes because large terms cancel in it, it is relative to those terms.
-    An entry of B is relative to the mobilities of its row and of its input, which bound it.
-    """
+) -> list[tuple[str, float]]:
+    """Return how far A and B are from those of another route, block by block: "A[q_b, q_m]"."""
+    # Relative to the largest entry of its block, rows of accelerations being scaled by the mobility
+    # sqrt((M^-1)_ii), so that a light joint does not hide a heavy one, and B by that of its input;
+    # where large terms cancel in a block, to those, which a route by steps has there.
     nv = len(M)
     mobility, input_mobility = mobilities(M, B)
     row_scale = np.concatenate((np.ones(state.nx - nv), mobility))[:, None]
@@ -182,7 +145,7 @@ def compare(
         errors /= np.where(sizes > 0.0, sizes, 1.0)
     every = ("A", groups, errors.tolist()), ("B", inputs, errors_B.tolist())
     return [
-        Block(matrix, row, column, error)
+        (f"{matrix}[{row}, {column}]", error)
         for i, row in enumerate(groups)
         for matrix, columns, found in every
         for column, error in zip(columns, found[i], strict=True)
@@ -207,11 +170,8 @@ def mobilities(M: Array, B: Array) -> tuple[Array, Array]:
 def _cancelling_terms(
     state: StateMap, lin: LinearModel, v: Array, mobility: Array, input_mobility: Array
 ) -> Array:
-    """Size (6, 6) of the terms that may cancel in a block of A, in its scaled units.
-
-    The base's own velocity has no influence but in its own axes, and counts for what its
-    rounding can do to Pinocchio's derivatives only.
-    """
+    """Size (6, 6) of the terms that may cancel in a block of A, in its scaled units."""
+    # The base's own velocity counts for what its rounding can do to Pinocchio's derivatives only.
     speed, rate, momentum = speeds(state, v)
     # What the momentum of wheels does to a turning link, in the units of the rows.
     spin = momentum * max(_largest(mobility[ANGULAR]), _largest(mobility[6:]))
@@ -232,10 +192,7 @@ def _cancelling_terms(
 
 
 def speeds(state: StateMap, v: Array) -> tuple[Array, float, float]:
-    """Return speeds (6 + n,) without those of wheels, the largest rate, and wheels' momentum.
-
-    A wheel's speed matters as the momentum [N m s] that it carries, however fast it is.
-    """
+    """Return speeds (6 + n,) without those of wheels, the largest rate, and wheels' momentum."""
     speed, robot = np.abs(state.velocities(v)), state.robot
     inertia = np.array([robot.wheels.get(name, 0.0) for name in robot.joint_names])
     momentum = float(inertia @ speed[6:])

@@ -1,14 +1,11 @@
 """Whether A and B hold: against ABA derivatives and against differences of the nonlinear model."""
 
-import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.tables import grid, width
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.outputs import Measuring, Sensing
@@ -23,6 +20,7 @@ from fflin.linear.certificate import (
     scaled_condition,
     speeds,
 )
+from fflin.linear.check_report import Row, check_report
 from fflin.linear.fit import require_same
 from fflin.linear.model import LinearModel
 from fflin.linear.nonlinear import (
@@ -53,32 +51,6 @@ _ROUTE_SAFETY = 10.0
 
 # A tolerance beyond this would confirm less than two digits, however badly M is conditioned.
 _LOOSEST = 1e-2
-
-
-class Row(NamedTuple):
-    """One figure of a check.
-
-    Attributes
-    ----------
-    test : str
-        What was compared.
-    block : str
-        The block of A or B, or what else was compared.
-    error : float
-        Relative error.
-    tolerance : float
-        What it must not exceed.
-    """
-
-    test: str
-    block: str
-    error: float
-    tolerance: float
-
-    @property
-    def ok(self) -> bool:
-        """Whether the error, which must be a number, is within the tolerance."""
-        return self.error <= self.tolerance
 
 
 @dataclass(frozen=True)
@@ -112,7 +84,7 @@ class Check:
         return tuple(row for row in self.rows if not row.ok)
 
     def __str__(self) -> str:
-        return check_report(self)
+        return check_report(self.rows, self.title)
 
 
 def check(robot: Robot, lin: LinearModel) -> Check:
@@ -164,13 +136,12 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
     own_error = inertia_residual(_in_base_axes(state, M, q), inverse)
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
     rows = [
-        Row("ABA derivatives", f"{b.matrix}[{b.row}, {b.column}]", b.error, by_aba)
-        for b in compare(state, actuation, lin, M, A, B)
+        Row("ABA derivatives", *block, by_aba) for block in compare(state, actuation, lin, M, A, B)
     ]
     steps = difference_steps(state, lin, M)
     rows += [
-        Row("differences", f"{b.matrix}[{b.row}, {b.column}]", b.error, difference)
-        for b in compare(
+        Row("differences", *block, difference)
+        for block in compare(
             *(state, actuation, lin, M, *_differences(model, lin, M, steps)),
             steps=steps[0],
             rounding=_STEP_ULPS * _EPS / difference,
@@ -228,10 +199,7 @@ def _point_errors(
 def _differences(
     model: Nonlinear, lin: LinearModel, M: Array, steps: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """Return A and B by central differences of the nonlinear model.
-
-    It is quadratic in the velocities, and linear in the inputs and in where the base is.
-    """
+    """Return A and B by central differences of the nonlinear model."""
     step, push = steps
     bends = np.arange(len(step)) < len(step) - len(M)
     bends[model.state.groups.r_b] = False
@@ -293,44 +261,3 @@ def _positive_definite(inverse: Array) -> list[tuple[str, float]]:
     asymmetry = float(np.abs(scaled - scaled.T).max())
     least = float(np.linalg.eigvalsh((scaled + scaled.T) / 2.0)[0])
     return [("M^-1 symmetric", asymmetry), ("M^-1 positive", max(0.0, -least))]
-
-
-def check_report(check: Check) -> str:
-    """Show what a check found: a table a route, the single figures, the verdict."""
-    states = ("q_b", "r_b", "q_m", "omega_b", "v_b", "qdot_m")
-    blocks = [row.block for row in check.rows]
-    inputs = dict.fromkeys(b[:-1].split(", ")[1] for b in blocks if b.startswith("B["))
-    parts = [f"check of {check.title}\na dot is an error of exactly zero"]
-    for test in ("ABA derivatives", "differences"):
-        rows = {row.block: row for row in check.rows if row.test == test}
-        tolerance = next(iter(rows.values())).tolerance
-        title = f"A and B against {test}: "
-        if not any(row.error for row in rows.values()):
-            parts.append(f"{title}no difference in any of {len(rows)} blocks")
-            continue
-        body = [
-            [
-                state,
-                *(_error(rows[f"A[{state}, {column}]"]) for column in states),
-                *(_error(rows[f"B[{state}, {column}]"]) for column in inputs),
-            ]
-            for state in states
-        ]
-        parts.append(f"{title}relative error of each block, at most {tolerance:.1e}")
-        parts.append(grid([["", *states, *inputs], *body]))
-    single = [r for r in check.rows if r.test not in ("ABA derivatives", "differences")]
-    rest = [[f"{r.test}: {r.block}", _error(r), f"at most {r.tolerance:.1e}"] for r in single]
-    parts.append(grid(rest, "lrl"))
-    if check.ok:
-        verdict = f"OK: {len(check.rows)} figures hold; the largest error is {check.max_error:.1e}"
-    else:
-        names = [f"{row.block} ({row.test})" for row in check.failures[:6]]
-        names += ["..."] * (len(check.failures) > 6)
-        verdict = f"FAILED: {len(check.failures)} of {len(check.rows)} figures: {', '.join(names)}"
-    parts.append(textwrap.fill(verdict, width()))
-    return "\n\n".join(parts)
-
-
-def _error(row: Row) -> str:
-    text = "." if row.error == 0.0 else f"{row.error:.0e}"
-    return text if row.ok else f"{text}!"

@@ -181,10 +181,7 @@ def _rounding(robot: Robot, lin: LinearModel) -> Array:
 
 
 def _least_norm(C: Array, d: Array, one_sided: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return the least u with ``C u = d``, ``u[one_sided] >= 0``, and ``C u - d``.
-
-    Where there is none, the u that leaves least.
-    """
+    """Return the least u with ``C u = d``, ``u[one_sided] >= 0``, and ``C u - d``."""
     u = _pseudo_solve(C, d)
     if (u[one_sided] < 0.0).any():
         u = _least_distance(C, u, one_sided)
@@ -193,9 +190,8 @@ def _least_norm(C: Array, d: Array, one_sided: NDArray[np.bool_]) -> tuple[Array
         polished: Array = np.zeros(len(u))
         polished[pushing] = _pseudo_solve(C[:, pushing], d)
         left = C @ polished - d
-        if (polished[one_sided] < 0.0).any() or np.linalg.norm(left) > _TOLERANCE * np.linalg.norm(
-            d
-        ):
+        most = _TOLERANCE * np.linalg.norm(d)
+        if (polished[one_sided] < 0.0).any() or np.linalg.norm(left) > most:
             polished = _least_residual(C, d, one_sided)
         u = polished
     return u, C @ u - d
@@ -211,14 +207,12 @@ def _pseudo_solve(C: Array, d: Array) -> Array:
 
 
 def _least_distance(C: Array, start: Array, one_sided: NDArray[np.bool_]) -> Array:
-    """Return the least u = start + Z z with u[one_sided] >= 0, where C Z = 0.
-
-    Least distance programming: min |z| subject to G z >= h is solved by the residual
-    r = E y - e of min |E y - e|, y >= 0, E = [G^T; h^T], e = (0, ..., 0, 1): z = -r_z / r_e.
-    """
+    """Return the least u = start + Z z with u[one_sided] >= 0, where C Z = 0."""
     from scipy.linalg import null_space
     from scipy.optimize import nnls
 
+    # min |z| subject to G z >= h is solved by the residual r = E y - e of min |E y - e|, y >= 0,
+    # with E = [G^T; h^T] and e = (0, ..., 0, 1): z = -r_z / r_e.
     Z = null_space(C)
     size = float(np.linalg.norm(start))
     E = np.vstack((Z[one_sided].T, -start[one_sided] / size))

@@ -71,13 +71,7 @@ def write_model(path: Path, entries: Record, *, sealed: bool) -> None:
 
 
 def read_model(path: Path) -> tuple[dict[str, Any], dict[str, float]]:
-    """Return the fields of a model, and its certificate; see `LinearModel.load`.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read, is damaged or is no model.
-    """
+    """Return the fields of a model, and its certificate; see `LinearModel.load`."""
     check_ending(path, FORMATS)
     with record.reading(path, "linear model"):
         entries, verified = _from_csv(path) if path.suffix == ".csv" else record.read_record(path)

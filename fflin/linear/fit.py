@@ -19,10 +19,7 @@ _SHOWN = 4
 
 
 def require_fit(lin: LinearModel, robot: Robot, state: StateMap) -> None:
-    """Raise `InputError` where a model's states or inputs are not those of a robot.
-
-    Its masses may be others: a controller meets a robot that is not quite its model.
-    """
+    """Raise `InputError` where a model's states or inputs are not those of a robot."""
     made, actuation = f"the model is one of '{lin.robot}'", Actuation(state)
     inputs = (lin.input_names, lin.input_units)
     require_same(made, robot, "input", inputs, (actuation.names, actuation.units))

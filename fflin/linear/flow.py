@@ -29,10 +29,7 @@ _NEAR = 1e-9
 
 
 class Flow:
-    """The motion between knots, q, v, u and t of N rows; the frame of `state` is that of u.
-
-    An input stays until the next knot where it is `held`, and is linear in between else.
-    """
+    """The motion between knots, q, v, u and t of N rows; the frame of `state` is that of u."""
 
     def __init__(self, state: StateMap, t: Array, q: Array, v: Array, u: Array, held: bool) -> None:
         self._model, self._aba, self._held = state.robot.model, Aba(state), held
@@ -49,20 +46,16 @@ class Flow:
         return self.missed(range(len(self._t) - 1))
 
     def missed(self, intervals: Iterable[int]) -> Array:
-        """Return how far the ends of some intervals are from the next knots.
-
-        The rates that are missing on the way, relative to the largest of the motion. An observer
-        who flies along with the base's mean velocity takes them (Galilei), and each rotor counts
-        for itself: neither an orbit nor a fast wheel hides anything.
-        """
+        """Return how far the ends of some intervals are from the next knots."""
+        # An observer who flies along with the base's mean velocity takes the rates (Galilei), and
+        # each rotor counts for itself: neither an orbit nor a fast wheel hides anything.
         t, u, state = self._t, self._u, self._aba.state
         rotations, q, v = rotation_matrices(self._q[:, 3:7]), self._q.copy(), self._v.copy()
         velocities = (rotations @ v[:, :3, None])[..., 0]
         mean = velocities.mean(axis=0)
         flown = np.outer(t - t[0], mean)
-        digits = np.full(
-            v.shape[1], _OF_PLACES * max(1.0, float(np.abs(q[:, 7:]).max(initial=0.0)))
-        )
+        farthest = float(np.abs(q[:, 7:]).max(initial=1.0))
+        digits = np.full(v.shape[1], _OF_PLACES * farthest)
         digits[:3] = _OF_PLACES * max(float(np.abs(x).max()) for x in (q[:, :3], flown, velocities))
         q[:, :3] -= q[0, :3] + flown
         v[:, :3] -= mean @ rotations
@@ -72,10 +65,8 @@ class Flow:
         alone = [joint.idx_v for joint in state.robot.joints if joint.name in rotors]
         others = sorted({*range(6, len(digits))} - {*alone})
         groups = [[0, 1, 2], [3, 4, 5], *([each] for each in alone), *([others] if others else [])]
-        speed, push = (
-            np.abs(v).max(axis=0),
-            np.abs([self.rate(*each) for each in knots]).max(axis=0),
-        )
+        speed, rates = np.abs(v).max(axis=0), [self.rate(*each) for each in knots]
+        push = np.abs(rates).max(axis=0)
         for group in groups:
             speed[group], push[group] = (x[group].max() or 1.0 for x in (speed, push))
 
@@ -93,25 +84,17 @@ class Flow:
                 while steps < _MOST_STEPS:
                     before, steps = end, 2 * steps
                     end = self.end(k, steps, q[k], v[k])
-                    if (
-                        size(
-                            pin.difference(self._model, *(before[0], end[0])), end[1] - before[1], h
-                        )
-                        <= _ACCURACY
-                    ):
+                    apart = pin.difference(self._model, before[0], end[0])
+                    if size(apart, end[1] - before[1], h) <= _ACCURACY:
                         break
-                found.append(
-                    size(pin.difference(self._model, end[0], q[k + 1]), v[k + 1] - end[1], h)
-                )
+                apart = pin.difference(self._model, end[0], q[k + 1])
+                found.append(size(apart, v[k + 1] - end[1], h))
         return np.where(np.isfinite(found), found, np.inf)
 
     def end(
         self, k: int, steps: int, q: Array, v: Array, over: tuple[float, float] = (0.0, 1.0)
     ) -> tuple[Array, Array]:
-        """Return q and v by steps of CF4 (11.1) from q and v on, over these shares of an interval.
-
-        By default from knot to knot.
-        """
+        """Return q and v by steps of CF4 (11.1) over shares of an interval, all by default."""
         start, h = self._t[k], self._t[k + 1] - self._t[k]
         method = CommutatorFree4(self._model, (over[1] - over[0]) * h / steps)
         for step in range(steps):
@@ -169,10 +152,7 @@ class Flow:
 
 
 def placed(t: Array, time: float) -> tuple[int, float]:
-    """Return which interval of times a time is in, and the share of it that is over.
-
-    A knot belongs to the interval that begins there, as do times that only rounding keeps from it.
-    """
+    """Return which interval of times a time is in, and the share of it that is over."""
     last = len(t) - 2
     k = max(0, min(int(t.searchsorted(time, "right")) - 1, last))
     share = float((time - t[k]) / (t[k + 1] - t[k]))

@@ -12,13 +12,9 @@ _ROUNDING = 1e-12
 
 
 def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
-    """Return the names of the ignorable coordinates of a linear model of this robot.
-
-    They are found on the robot and not at a point: where the base is (uniform gravity is the same
-    everywhere); of error dynamics, without gravity, how it is turned too; and the angle of each
-    rotor: a revolute joint at the end of its branch whose body is symmetric about its axis, and
-    that has no spring, no mimic joint, and no input or output fixed on its body.
-    """
+    """Return the names of the ignorable coordinates of a linear model of this robot."""
+    # Found on the robot and not at a point: uniform gravity is the same everywhere, and without it
+    # error dynamics do not depend on the attitude either.
     groups = ["r_b"] if any(robot.gravity) or not lin.moving else ["q_b", "r_b"]
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
     return (*base, *(f"q_m.{name}" for name in rotor_names(robot)))

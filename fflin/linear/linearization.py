@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from math import hypot
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.frozen import frozen
-from fflin.base.rotation import skew
 from fflin.base.validation import Array, vector
 from fflin.dynamics.chart import Chart, Standing
-from fflin.dynamics.names import ANGULAR, LINEAR
-from fflin.dynamics.rnea import Accelerations, Rates
-from fflin.dynamics.state import Frame, StateMap
+from fflin.dynamics.rnea import Accelerations
+from fflin.dynamics.state import Frame
+from fflin.kernel.compiled import POINT_BREAK_EVENS, checked_engine, point_pays
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
-from fflin.linear.prepared import prepare
+from fflin.linear.prepared import LARGEST, prepare
 from fflin.linear.state_equations import assemble, drift
-from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
-# A matrix whose squares add up to more than the first counts as not finite, since its eigenvalues
-# would overflow. With velocities and inputs below the second nothing overflows in between.
-LARGEST, _MODERATE = 1e200, 1e50
+if TYPE_CHECKING:
+    from fflin.kernel.points import PointKernel
+
+# With velocities and inputs below this nothing overflows on the way to `LARGEST`.
+_MODERATE = 1e50
+
+# Size of M beyond which BLAS is quicker.
+_LARGEST_COMPILED = 96
 
 
 class Linearizer:
@@ -58,17 +61,24 @@ class Linearizer:
         The error dynamics about a reference that moves through the point with the robot's own
         dynamics: the error is q_b = vec(q*^-1 q), r_b = R*^T (p - p*), the frame is "local", and
         f0 is zero. For a trajectory, and for relative equilibria such as a steady spin.
+    engine : {"python", "compiled"}, optional
+        What does points where something moves, pulls or pushes; both give the same to rounding. By
+        default it is the compiled kernel where its code is loaded already, and else from as many
+        calls on as pay for that.
 
     Raises
     ------
     InputError
         If the frame is unknown, the reference is not a pin.SE3, or `moving` is asked for with a
-        reference or with a frame other than "local".
+        reference or with a frame other than "local". Or the compiled engine is asked for, and
+        numba is not installed or a joint is none that it knows.
     SingularInertiaError
         If M is singular at every configuration.
     ModelError
         If Pinocchio's Data for the robot would pass 1 GiB, or its model was changed after the
         robot was made.
+    UnknownNameError
+        If there is no such engine.
 
     Attributes
     ----------
@@ -89,9 +99,12 @@ class Linearizer:
         frame: Frame | None = None,
         reference: pin.SE3 | None = None,
         moving: bool = False,
+        engine: str | None = None,
     ) -> None:
-        self.robot = robot
         self.prepared = ready = prepare(robot, frame=frame, reference=reference, moving=moving)
+        self.robot, self._engine = robot, checked_engine(engine)
+        if engine == "compiled":
+            ready.require_kernel()
         self._data = robot.create_data()
         self._lock = Lock()  # of the work space
         self._accelerations = Accelerations(ready.map, ready.actuation, self._data)
@@ -100,17 +113,14 @@ class Linearizer:
         self._shape_B, self._lower = (nx, len(ready.actuation.names)), slice(nv, nx)
         given = hypot(*robot.gravity, *np.concatenate(robot.springs).tolist())
         self._moderate = given < _MODERATE
+        self._calls = 0
+        self._kernel: PointKernel | None = None
+        self._one: Callable[..., bool] | None = None
+        self._fields, self._rate = ready.fields, "_drift" if ready.moving else "f0"
+        # What stands for rest and no input; the kernel takes nothing that may not be written.
+        self._still = np.zeros(robot.nv), np.zeros(self._shape_B[1])
         # Where nothing acts at rest but u, A and all of B but M^-1 are known beforehand.
         self._known = ready.free and ready.own_reference and ready.actuation.default
-        self._at_rest_fields = {
-            **ready.common,
-            **ready.rest,
-            "_when_asked": {
-                "x0": partial(_state_at_rest, ready.map),
-                "y0": partial(_state_at_rest, ready.map),
-                "_reference": partial(own_reference, robot),
-            },
-        }
 
     def __call__(
         self, q: Array | None = None, v: Array | None = None, u: Array | None = None
@@ -141,17 +151,19 @@ class Linearizer:
         """
         robot = self.robot
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
-        q.setflags(write=False)
-        if v is None and u is None and self._known:
-            with self._lock:
-                return self._at_rest(q)
-        if v is not None:
-            v = frozen(robot.checked_velocity(v).copy())
-        if u is not None:
-            u = frozen(vector("u", u, self._shape_B[1], "the robot's inputs").copy())
-        v = self.prepared.rest["v"] if v is None else v
-        u = self.prepared.rest["u0"] if u is None else u
+        known = v is None and u is None and self._known
+        v = self._still[0] if v is None else robot.checked_velocity(v).copy()
+        if u is None:
+            u = self._still[1]
+        else:
+            u = vector("u", u, self._shape_B[1], "the robot's inputs").copy()
         with self._lock:
+            if known:
+                return self._at_rest(q)
+            if self._one is not None or self._begins():
+                lin = self._by_kernel(q, v, u)
+                if lin is not None:
+                    return lin
             if self._moderate and hypot(*v.tolist(), *u.tolist()) < _MODERATE:
                 return self._anywhere(q, v, u)
             # An overflow is refused below, so NumPy need not warn of it. Not always done, since
@@ -163,13 +175,49 @@ class Linearizer:
         # A copy, in this process or another, needs a work space of its own.
         ready = self.prepared
         reference = None if ready.own_reference else ready.map.reference
-        return _rebuilt, (self.robot, ready.map.frame, reference, ready.moving)
+        options: dict[str, Any] = {
+            "frame": ready.map.frame,
+            "reference": reference,
+            "moving": ready.moving,
+        }
+        return partial(type(self), **options, engine=self._engine), (self.robot,)
+
+    def _begins(self) -> bool:
+        """Whether the kernel takes over at this call, which then is there."""
+        self._calls += 1
+        if self._engine is None:
+            small = self._lower.start <= _LARGEST_COMPILED
+            if not (self._calls in POINT_BREAK_EVENS and small and point_pays(self._calls)):
+                return False
+        if self._engine != "python":
+            self._kernel = self.prepared.kernel()
+            self._one = None if self._kernel is None else self._kernel.one()
+        return self._one is not None
+
+    def _by_kernel(self, q: Array, v: Array, u: Array) -> LinearModel | None:
+        """Return the model by the kernel, or None where that cannot vouch for it."""
+        ready, nx = self.prepared, self._lower.stop
+        A, B = np.empty((nx, nx)), np.empty(self._shape_B)
+        rate, x0 = np.empty(nx), np.empty(nx)
+        assert self._one is not None
+        if not self._one(q, v, u, A, B, rate, x0):
+            return None
+        made: dict[str, Array] = {"A": A, "B": B, "x0": x0}
+        if ready.sensing is not None and self._kernel is not None:
+            state = ready.map
+            chart = self._standing if ready.own_reference else state.chart(q)
+            u_base = ready.actuation.in_base_axes(chart, u)
+            rates = self._kernel.rates(state.gravity(q))
+            point = q, v, state.velocities(v), u_base
+            made |= output_equations(ready, self._data, chart, rates, x0, point)
+        return self._model(q, v, u, rate, made)
 
     def _at_rest(self, q: Array) -> LinearModel:
         B = np.zeros(self._shape_B)
         self._accelerations.invert(q, B[self._lower])
         B.setflags(write=False)
-        return LinearModel.from_fields(self._at_rest_fields | {"B": B, "q": q})
+        q.setflags(write=False)
+        return LinearModel.from_fields(self._fields | {"B": B, "q": q})
 
     def _anywhere(self, q: Array, v: Array, u: Array) -> LinearModel:
         ready = self.prepared
@@ -180,43 +228,35 @@ class Linearizer:
         nu, q_m = state.velocities(v), state.joint_positions(q)
         u_base = ready.actuation.in_base_axes(chart, u)
         rates = self._accelerations.rates(q, v, nu, q_m, u_base)
-        A, B = ready.rest["A"].copy(), np.zeros(self._shape_B)
-        f0 = assemble(
+        A, B = ready.fields["A"].copy(), np.zeros(self._shape_B)
+        rate = assemble(
             *(state, ready.actuation, chart, nu, u_base, rates, A, B[self._lower]),
             moving=ready.moving,
         )
         x0 = state.compose(chart, r_b, q_m, nu)
-        C, D, y0 = self._seen(chart, rates, q, v, nu, u_base, x0)
-        for array in (A, B, f0) if ready.sensing is None else (A, B, f0, C, D, y0):
+        made = {"A": A, "B": B, "x0": x0}
+        if ready.sensing is not None:
+            made |= output_equations(ready, self._data, chart, rates, x0, (q, v, nu, u_base))
+        for name, array in {**made, "f0": rate}.items():
             flat = array.ravel()
-            if not flat.dot(flat) < LARGEST:  # nor NaN
+            if name != "x0" and not flat.dot(flat) < LARGEST:  # nor NaN
                 raise InputError("q, v or u is so large that the model is not finite")
-            array.setflags(write=False)
-        x0.setflags(write=False)
-        values = {"A": A, "B": B, "C": C, "D": D, "f0": f0, "x0": x0, "u0": u, "y0": y0}
-        reference = own_reference(self.robot, q) if ready.own_reference else ready.reference
-        fields = {**ready.common, **values, "q": q, "v": v, "_reference": reference}
-        if ready.moving:
-            own_rate = frozen(drift(state, f0, rates.gravity))
-            fields |= {"f0": ready.rest["f0"], "_drift": own_rate}
-        return LinearModel.from_fields(fields)
+        rate = drift(state, rate, rates.gravity) if ready.moving else rate
+        return self._model(q, v, u, rate, made)
 
-    def _seen(
-        self, chart: Chart, rates: Rates, q: Array, v: Array, nu: Array, u: Array, x0: Array
-    ) -> tuple[Array, Array, Array]:
-        """Return C, D and y0; `nu` (6 + n,) and `u` (nu,) in base axes."""
-        sensing, state = self.prepared.sensing, self.prepared.map
-        if sensing is None:
-            return self.prepared.common["C"], self.prepared.common["D"], x0
-        a = rates.c.copy()
-        if sensing.needs_acceleration:
-            a[LINEAR] += rates.gravity - skew(nu[ANGULAR]).dot(nu[LINEAR])  # (3.2)
-        sensed = sensing.evaluate(self._data, q, v, state.spread(a))
-        C, D = output_equations(state, self.prepared.actuation, chart, sensed, rates, nu, u)
-        for row, index in sensing.states:
-            C[row, index] = 1.0
-            sensed.y[row] = x0[index]
-        return C, D, sensed.y
+    def _model(
+        self, q: Array, v: Array, u: Array, rate: Array, made: dict[str, Array]
+    ) -> LinearModel:
+        """Put a model together, of arrays that nobody else has."""
+        made["q"], made[self._rate] = q, rate
+        if v is not self._still[0]:
+            made["v"] = v
+        if u is not self._still[1]:
+            made["u0"] = u
+        for array in made.values():
+            array.setflags(write=False)
+        made.setdefault("y0", made["x0"])
+        return LinearModel.from_fields(self._fields | made)
 
 
 def linearize(
@@ -267,21 +307,3 @@ def linearize(
     Linearizer : the same, prepared once for many points; the equations stand there.
     """
     return Linearizer(robot, frame=frame, reference=reference, moving=moving)(q, v, u)
-
-
-def _rebuilt(robot: Robot, frame: Frame, reference: pin.SE3 | None, moving: bool) -> Linearizer:
-    return Linearizer(robot, frame=frame, reference=reference, moving=moving)
-
-
-def _state_at_rest(state: StateMap, q: Array) -> Array:
-    x0: Array = np.zeros(state.nx)
-    x0[state.groups.q_m] = state.joint_positions(q)
-    return frozen(x0)
-
-
-def own_reference(robot: Robot, q: Array) -> Array:
-    """Return where the base of a configuration is (7,), which a model is about by default."""
-    root = robot.model.jointPlacements[ROOT]
-    if root.isIdentity(0.0):
-        return q[:7]
-    return frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q[:7])))

@@ -26,11 +26,7 @@ _WEIGHTS = (45.0 / 60.0, -9.0 / 60.0, 1.0 / 60.0)
 
 
 class Nonlinear:
-    """The nonlinear model in the chart, by ABA: ``xdot = f(x, u)``.
-
-    Where the base is fast, accelerations are taken by an observer who flies with the point at
-    constant velocity: they are the same, v_b's rate but for the turning of the base's axes.
-    """
+    """The nonlinear model in the chart, by ABA: ``xdot = f(x, u)``."""
 
     def __init__(self, state: StateMap, lin: LinearModel, aba: Aba | None = None) -> None:
         self.state = state
@@ -83,11 +79,7 @@ class Nonlinear:
 
 
 class ErrorDynamics(Nonlinear):
-    """The dynamics of the error from a reference that moves through the point: ``f(x0, u0) = 0``.
-
-    With the error quaternion (e, e0) = q*^-1 q: edot = (e0 (w - w*) + e x (w + w*)) / 2, and
-    with r = R*^T (p - p*): rdot = R_e v - v* - w* x r.
-    """
+    """The dynamics of the error from a reference that moves through the point; f is 0 there."""
 
     def __init__(self, state: StateMap, lin: LinearModel, aba: Aba | None = None) -> None:
         super().__init__(state, lin, aba)
@@ -107,6 +99,7 @@ class ErrorDynamics(Nonlinear):
         state = self.state
         linear, angular = v[:, PIN_LINEAR], v[:, PIN_ANGULAR]
         at_linear, at_angular = self._v[PIN_LINEAR], self._v[PIN_ANGULAR]
+        # edot = (e0 (w - w*) + e x (w + w*)) / 2 and rdot = R_e v - v* - w* x r.
         turning = chart.q0 * (angular - at_angular)
         turning += times(skew(chart.q_b), angular + at_angular)
         flying = times(chart.R, linear) - at_linear - x[:, state.groups.r_b] @ skew(at_angular).T
@@ -115,10 +108,7 @@ class ErrorDynamics(Nonlinear):
 
 
 def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, bends: Any) -> Array:
-    """Return the slopes of f, of rows, at a point by central differences of the given steps.
-
-    Of sixth order where f `bends`; it is at most quadratic in the others, so that one is exact.
-    """
+    """Return the slopes of f, of rows, at a point by central differences of the given steps."""
     curved, straight = np.diag(steps)[bends], np.diag(steps)[~bends]
     ways = np.concatenate((*(k * curved for k in (1, 2, 3)), straight))
     first, last = np.split(f(np.concatenate((point + ways, point - ways))), 2)
@@ -146,11 +136,7 @@ def difference_steps(state: StateMap, lin: LinearModel, M: Array) -> tuple[Array
 
 
 def flow_error(model: Nonlinear, lin: LinearModel) -> float:
-    """How far f is from the rate of the state along motions of the robot.
-
-    The motions pass the point with its own velocity and with a unit of each base velocity added.
-    They pass it at the origin, since a step would drown in the digits of a distant place.
-    """
+    """How far f is from the rate of the state along motions of the robot."""
     model = copy(model)
     model.state = state = model.state.about(pin.SE3(lin.reference.rotation, np.zeros(3)))
     x = np.tile(lin.x0, (7, 1))

@@ -5,38 +5,29 @@ Numbers of equations are those of docs/derivation.md.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
+import pinocchio as pin
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.names import ANGULAR, LINEAR
 from fflin.dynamics.rnea import Rates
-from fflin.dynamics.state import StateMap
-
-if TYPE_CHECKING:
-    from fflin.dynamics.output_kinds import Sensed
+from fflin.linear.prepared import Prepared
 
 
 def output_equations(
-    state: StateMap,
-    actuation: Actuation,
-    chart: Chart,
-    sensed: Sensed,
-    rates: Rates,
-    nu: Array,
-    u: Array,
-) -> tuple[Array, Array]:
-    r"""Return C (ny, nx) and D (ny, nu) of the outputs that are not states.
-
-    What is measured is a function of pose, velocity and the rate of the LOCAL velocity, whose
-    linear part is :math:`c + g - \omega \times v_b`. `nu` (6 + n,) and `u` (nu,) are in base axes.
-    A turn :math:`\delta\theta` of the base under a vector s held in reference axes changes its
-    base components by :math:`[s]_\times \delta\theta`.
-    """
+    ready: Prepared, data: pin.Data, chart: Chart, rates: Rates, x0: Array, point: Sequence[Array]
+) -> dict[str, Array]:
+    """Return C, D and y0 at a point: q, v, and nu (6 + n,) and u (nu,) in base axes."""
+    sensing, state, actuation, a = ready.sensing, ready.map, ready.actuation, rates.c.copy()
+    q, v, nu, u = point
+    assert sensing is not None
+    if sensing.needs_acceleration:
+        a[LINEAR] += rates.gravity - skew(nu[ANGULAR]).dot(nu[LINEAR])  # (3.2)
+    sensed = sensing.evaluate(data, q, v, state.spread(a))
     g = state.groups
     by_q, by_nu = state.columns(sensed.by_q), state.columns(sensed.by_v)
     turn, by_q_m = by_q[:, ANGULAR].copy(), by_q[:, 6:]
@@ -62,4 +53,7 @@ def output_equations(
     C[:, g.r_b] = by_q[:, LINEAR].dot(chart.R.T)
     C[:, g.q_m] = by_q_m  # (8.3)
     C[:, -len(nu) :] = state.to_frame(chart, by_nu.T).T
-    return C, D
+    for row, index in sensing.states:
+        C[row, index] = 1.0
+        sensed.y[row] = x0[index]
+    return {"C": C, "D": D, "y0": sensed.y}

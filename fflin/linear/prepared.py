@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,56 +17,64 @@ from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.names import unknown_frame
 from fflin.dynamics.state import Frame, StateMap
+from fflin.kernel.compiled import numba_is_there
 from fflin.linear.certificate import certify, inertia_matrix
 from fflin.linear.ignorable import ignorable_states
 from fflin.linear.state_equations import at_rest
+from fflin.robot.frames import ROOT
 from fflin.robot.limits import magnitudes_of
 from fflin.robot.massless import require_inertia
 from fflin.robot.outputs import FullState
 from fflin.robot.robot import Robot
 
+# A model whose squares add up to more counts as not finite, since its eigenvalues would overflow.
+LARGEST = 1e200
+
 if TYPE_CHECKING:
     from fflin.dynamics.outputs import Sensing
+    from fflin.kernel.points import PointKernel
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What is the same about all points that a robot is linearised about; arrays are read-only.
-
-    Attributes
-    ----------
-    robot : Robot
-    map : StateMap
-        With the reference and the frame.
-    actuation : Actuation
-    sensing : Sensing or None
-        None where the outputs are the state.
-    moving : bool
-        Whether the reference moves through the point.
-    own_reference : bool
-        Whether the reference is the base's own placement at each point, not that of `map`.
-    reference : ndarray (7,)
-        The placement of `map`: position [m] and quaternion x, y, z, w.
-    free : bool
-        Whether nothing but u acts at rest and the outputs are the state, so that there all of the
-        model but M^-1 is in `common` and `rest`.
-    common : mapping
-        Fields of a `LinearModel` that are the same about all points; C and D where the outputs
-        are the state.
-    rest : mapping
-        Its A, f0, u0 and v where nothing moves, pulls or pushes.
-    """
+    """What is the same about all points that a robot is linearised about; arrays are read-only."""
 
     robot: Robot
     map: StateMap
     actuation: Actuation
-    sensing: Sensing | None
+    sensing: Sensing | None  # None where the outputs are the state
     moving: bool
-    own_reference: bool
-    reference: Array
-    free: bool
-    common: Mapping[str, Any]
-    rest: Mapping[str, Array]
+    own_reference: bool  # the base's own placement at each point, not that of `map`
+    reference: Array  # (7,) the placement of `map`: position [m] and quaternion x, y, z, w
+    free: bool  # whether at rest all of a model but M^-1 is in `common` and `rest`
+    common: Mapping[str, Any]  # fields of a model that are the same about all points
+    rest: Mapping[str, Array]  # its A, f0, u0 and v where nothing moves, pulls or pushes
+
+    @cached_property
+    def fields(self) -> dict[str, Any]:
+        """Fields of a model at rest but B and q; some take as long to make as the dynamics."""
+        at_rest = partial(_state_at_rest, self.map)
+        asked = {"x0": at_rest, "y0": at_rest, "_reference": partial(own_reference, self.robot)}
+        other = {} if self.own_reference else {"_reference": self.reference}
+        return {**self.common, **self.rest, "_when_asked": asked, **other}
+
+    def kernel(self) -> PointKernel | None:
+        """Return the compiled equations, or None where the kernel does not know a joint."""
+        from fflin.kernel.points import PointKernel
+        from fflin.kernel.tree import batch_tree
+
+        tree = batch_tree(self.robot)
+        options = {"own": self.own_reference, "moving": self.moving}
+        return tree and PointKernel(self.map, self.actuation, tree, LARGEST, **options)
+
+    def require_kernel(self) -> None:
+        """Raise `InputError` where there are no compiled equations."""
+        reason = "numba is not installed (pip install 'fflin[fast]')"
+        if numba_is_there():
+            if self.kernel() is not None:
+                return
+            reason = f"a joint of '{self.robot.name}' is of another kind"
+        raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
 
 
 def prepare(
@@ -134,3 +142,17 @@ def prepare(
             "v": frozen(np.zeros(robot.nv)),
         },
     )
+
+
+def _state_at_rest(state: StateMap, q: Array) -> Array:
+    x0: Array = np.zeros(state.nx)
+    x0[state.groups.q_m] = state.joint_positions(q)
+    return frozen(x0)
+
+
+def own_reference(robot: Robot, q: Array) -> Array:
+    """Return where the base of a configuration is (7,), which a model is about by default."""
+    root = robot.model.jointPlacements[ROOT]
+    if root.isIdentity(0.0):
+        return q[:7]
+    return frozen(pin.SE3ToXYZQUAT(root * pin.XYZQUATToSE3(q[:7])))

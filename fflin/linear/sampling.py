@@ -11,10 +11,7 @@ HEAVY, LIGHT = 0.5 + 3.0**0.5 / 3.0, 0.5 - 3.0**0.5 / 3.0
 
 
 def held_exponential(A: Array, driven: Array, h: float) -> tuple[Array, Array]:
-    r"""Return :math:`e^{A h}` (n, n) and :math:`\int_0^h e^{A s}\,ds\,B` (n, k) of B = `driven`.
-
-    Where A^2 = 0 the series ends and the result is exact. What overflows is not finite.
-    """
+    r"""Return :math:`e^{A h}` (n, n) and :math:`\int_0^h e^{A s}\,ds\,B` (n, k) of B = `driven`."""
     n, k = driven.shape
     with np.errstate(over="ignore", invalid="ignore"):
         if not (A @ A).any():

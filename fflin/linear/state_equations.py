@@ -36,27 +36,7 @@ def assemble(
     *,
     moving: bool,
 ) -> Array:
-    """Write A and the lower half of B, and return f0 (.., nx).
-
-    All arrays may be of many points, each with a leading axis of them.
-
-    Parameters
-    ----------
-    state : StateMap
-    actuation : Actuation
-    chart : Chart
-    nu : ndarray (.., 6 + n)
-        Velocity in base axes.
-    u : ndarray (.., nu)
-        Input in base axes.
-    rates : Rates
-        The slopes may be views of where they belong in A and B.
-    A : ndarray (.., nx, nx)
-        A at rest; what is not written here stays.
-    B_lower : ndarray (.., 6 + n, nu)
-    moving : bool
-        Whether the reference moves along, with its base where the robot's is.
-    """
+    """Write A and the lower half of B, and return f0 (.., nx)."""
     g, dot = state.groups, slice(state.nx // 2, state.nx)
     omega_in_reference, v_in_reference = state.axes
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
@@ -96,12 +76,7 @@ def assemble(
 
 
 def _over_turns(state: StateMap, actuation: Actuation, nu: Array, u: Array, rates: Rates) -> Array:
-    r"""Return the slopes of the rates over turns of the base, Theta (.., 6 + n, 3) of (4.4).
-
-    A turn :math:`\delta\theta` of the base under a vector s held in reference axes
-    changes its base components by :math:`[s]_\times \delta\theta`: so the velocities,
-    inputs and gravity that are held in reference axes change, and the rates turn back.
-    """
+    """Return the slopes of the rates over turns of the base, Theta (.., 6 + n, 3) of (4.4)."""
     omega_in_reference, v_in_reference = state.axes
     by_turn = np.zeros((*nu.shape, 3))
     for columns, _ in actuation.held:
@@ -117,10 +92,7 @@ def _over_turns(state: StateMap, actuation: Actuation, nu: Array, u: Array, rate
 
 
 def drift(state: StateMap, f0: Array, gravity: Array) -> Array:
-    """Return the own rate (.., nx) of a reference that moves along, after (5.3).
-
-    That of its attitude is without turns about gravity, which change nothing.
-    """
+    """Return the own rate (.., nx) of a reference that moves along, after (5.3)."""
     rate: Array = f0.copy()
     weight = (gravity * gravity).sum(axis=-1, keepdims=True)
     if weight.any():

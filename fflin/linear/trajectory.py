@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,21 +14,14 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import FflinError, FflinWarning, InputError
 from fflin.base.frozen import frozen
 from fflin.base.record import Design
-from fflin.base.rotation import rotation_matrices
 from fflin.base.tables import folded
 from fflin.base.validation import Array, as_double, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.linear.flow import Flow
+from fflin.linear.trajectory_doubt import doubt
 from fflin.robot.robot import Robot
-
-# A residual from which on the knots are in doubt as a motion of the robot, and how many of the
-# intervals that miss most are tried with what else may have been meant.
-_IN_DOUBT, _TRIED = 1e-2, 5
-
-# Between two knots the base goes the shorter way, of less than half a turn [rad].
-_FARTHEST_TURN = 2.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -119,8 +111,8 @@ class Trajectory(Design):
 
     def __str__(self) -> str:
         """Show how good a motion of the robot it is."""
-        doubt = self._doubt() or f"residual {self.residual.max():.1e}"
-        return f"{folded(super().__str__().splitlines())}\n{folded([doubt])}"
+        said = doubt(self) or f"residual {self.residual.max():.1e}"
+        return f"{folded(super().__str__().splitlines())}\n{folded([said])}"
 
     @property
     def _state(self) -> StateMap:
@@ -189,11 +181,11 @@ class Trajectory(Design):
 
         It is said when they miss it and by how much, and what would mend it.
         """
-        doubt = self._doubt()
-        if doubt and strict:
-            raise InputError(doubt)
-        if doubt:
-            warnings.warn(doubt, FflinWarning, stacklevel=3)
+        said = doubt(self)
+        if said and strict:
+            raise InputError(said)
+        if said:
+            warnings.warn(said, FflinWarning, stacklevel=3)
 
     def save(self, path: str | Path) -> None:
         """Write it to a .npz, .mat, .json or .csv file, whole or not at all; see `load`."""
@@ -247,75 +239,13 @@ class Trajectory(Design):
             raise InputError(f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s")
         return t
 
-    def _doubt(self) -> str:
-        """Say when the knots are no motion of the robot, and what would mend it."""
-        found = self.flow.residual
-        worst = int(found.argmax())
-        rates = np.linalg.norm(self.v[:, 3:6], axis=1)
-        turns = np.diff(self.t) * np.maximum(rates[1:], rates[:-1])
-        if found[worst] <= _IN_DOUBT and turns.max() > _FARTHEST_TURN:
-            k = int(turns.argmax())
-            return (
-                f"the base turns by {turns[k]:.2g} rad from t = {self.t[k]:g} to {self.t[k + 1]:g} "
-                f"s, more than its ends can tell; give knots at most {_FARTHEST_TURN:g} rad apart"
-            )
-        if found[worst] <= _IN_DOUBT:
-            return ""
-        said = (
-            f"t, q, v, u are no motion of '{self.robot.name}': from t = {self.t[worst]:g} to "
-            f"{self.t[worst + 1]:g} s they miss it by {found[worst]:.2g} of its largest rate"
-        )
-        plain, few = Trajectory(**self._given), found.argsort()[-_TRIED:].tolist()
-        once = dict(_others(plain))
-        # Two things may be meant otherwise, neither of which mends it alone.
-        twice = (
-            {f"{first}, {words}": each for words, each in _others(other) if words != first}
-            for first, other in once.items()
-        )
-        for tried in (once, *twice):
-            sizes = {words: float(each.flow.missed(few).max()) for words, each in tried.items()}
-            words = min(sizes, key=sizes.__getitem__)
-            size = sizes[words]
-            if size <= _IN_DOUBT and (size := float(tried[words].flow.residual.max())) <= _IN_DOUBT:
-                return f"{said}; {words} they hold to {size:.0e}"
-        return f"{said}; give those of one motion under the robot's own inputs, springs and gravity"
+    @property
+    def _plain(self) -> Trajectory:
+        return Trajectory(**self._given)
 
     @property
     def _given(self) -> dict[str, Any]:
         return {item.name: getattr(self, item.name) for item in fields(Trajectory)}
-
-
-def _others(traj: Trajectory) -> Iterator[tuple[str, Trajectory]]:
-    """Yield what else a trajectory may have been meant to be, and how to say it."""
-    robot, R = traj.robot, rotation_matrices(traj.q[:, 3:7])
-    yield "with the input of the knot before (hold='previous')", replace(traj, hold="previous")
-    yield "with the input of the knot after", replace(traj, u=traj.u[1:], hold="previous")
-    yield "with inputs linear between the knots (hold='linear')", replace(traj, hold="linear")
-    yield "with t in milliseconds", replace(traj, t=1e-3 * traj.t)
-    turning = [joint for joint in robot.joints if not (joint.prismatic or joint.unbounded)]
-    q, v = traj.q.copy(), traj.v.copy()
-    for rows, at in ((q, [x.idx_q for x in turning]), (v, [x.idx_v for x in turning])):
-        rows[:, at] = np.radians(rows[:, at])
-    if turning and not robot.followers:
-        yield "with joints in degrees", replace(traj, q=q, v=v)
-    for frame in ("local", "hybrid", "world"):
-        yield f"with u in frame {frame}", replace(traj, frame=frame)
-    v = traj.v.copy()
-    for words, part, frame in (
-        ("linear velocity", slice(0, 3), "hybrid"),
-        ("velocities", slice(3, 6), "world"),
-    ):
-        v[:, part] = (traj.v[:, None, part] @ R)[:, 0]
-        yield f"with the {words} of the base in reference axes", replace(traj, v=v)
-        yield f"with u and v in frame {frame}", replace(traj, v=v, frame=frame)
-    for words, has, fields_ in (
-        ("without damping", any(robot.damping.values()), {"damping": {}}),
-        ("without springs", any(robot.stiffness.values()), {"stiffness": {}}),
-        ("without gravity", any(robot.gravity), {"gravity": (0.0, 0.0, 0.0)}),
-        ('with damping="urdf"', any(robot.urdf_damping.values()), {"damping": "urdf"}),
-    ):
-        if has:
-            yield words, replace(traj, robot=robot.replace(**fields_))
 
 
 def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:

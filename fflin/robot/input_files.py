@@ -18,20 +18,20 @@ _TYPES = {kind.KEY: kind for kind in KINDS}
 ROBOT_KEYS = ("urdf", "package_dirs", "lock", "input", *(x for x in FIELDS if x != "inputs"))
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
     # The limit keeps lengths finite, and integers that are no floats out.
     return type(value) in (int, float) and abs(value) < 1e100
 
 
 def _is_vector(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))
+    return isinstance(value, list) and len(value) == 3 and all(map(is_number, value))
 
 
 # What a value is to be, and how an error says so.
 NAME = (lambda x: isinstance(x, str) and x != "", "a name in quotes")
-NUMBER = (_is_number, "a finite number")
+NUMBER = (is_number, "a finite number")
 _VECTOR = (_is_vector, "three finite numbers, [x, y, z]")
-_EITHER = (lambda x: _is_number(x) or _is_vector(x), "a finite number or three of them")
+_EITHER = (lambda x: is_number(x) or _is_vector(x), "a finite number or three of them")
 _EXPECTED: dict[str, tuple[Callable[[Any], bool], str]] = {
     **dict.fromkeys(("position", "direction", "axis"), _VECTOR),
     **dict.fromkeys(("inertia", "momentum", "max", "min", "max_speed", "least_impulse"), NUMBER),

@@ -13,8 +13,8 @@ import pinocchio as pin
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
+from fflin.dynamics.names import LINEAR
 from fflin.dynamics.rnea import Rates
-from fflin.dynamics.state import LINEAR
 from fflin.linear.prepared import Prepared
 from fflin.robot.frames import ROOT
 from fflin.uncertainty.parameters import Parameter

@@ -20,10 +20,9 @@ from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.rnea import Accelerations, Rates
 from fflin.dynamics.state import StateMap
 from fflin.linear.certificate import aba_route
-from fflin.linear.linearization import own_reference
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
-from fflin.linear.prepared import Prepared, prepare
+from fflin.linear.prepared import Prepared, own_reference, prepare
 from fflin.linear.state_equations import assemble
 from fflin.robot.outputs import CenterOfMass, Momentum
 from fflin.robot.robot import Robot
@@ -248,12 +247,12 @@ class Sensitivity:
         y, sensing, state = np.zeros((count, len(lin.C))), ready.sensing, ready.map
         if sensing is None or not sensing.needs_acceleration:
             return C, D, y
-        nu, data = state.velocities(lin.v), ready.robot.create_data()
+        point = lin.q, lin.v, state.velocities(lin.v), self._u
+        data = ready.robot.create_data()
 
-        def seen(one: Rates) -> tuple[Array, Array, Array]:
-            sensed = sensing.evaluate(data, lin.q, lin.v, state.spread(one.c))
-            made = output_equations(state, ready.actuation, chart, sensed, one, nu, self._u)
-            return *made, sensed.y
+        def seen(one: Rates) -> list[Array]:
+            made = output_equations(ready, data, chart, one, lin.x0, point)
+            return [made[key] for key in ("C", "D", "y0")]
 
         # Affine in the rates, as all else.
         none = seen(Rates(*(np.zeros_like(part[0]) for part in rates)))

@@ -89,7 +89,7 @@ def sound(folder):
         "linearize": found | place,
         "linearize_trajectory": dict(zip("tqvu", (t, *rows), strict=True))
         | {"robot": robot, "strict": False, "hold": "previous", "frame": "world"},
-        "Linearizer": {"robot": robot} | place,
+        "Linearizer": {"robot": robot, "engine": None} | place,
         "list_robots": {},
         "load": {
             **{"robot": "planar_detumble", "lock": [joint], "package_dirs": (), "inputs": None},

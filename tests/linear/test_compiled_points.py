@@ -1,0 +1,116 @@
+"""A linearizer whose points the compiled kernel does, against one whose points it does not."""
+
+import pickle
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from fflin.kernel import compiled
+from fflin.linear import linearization, prepared
+from tests.batch.test_equations import TILTED, operating_points
+
+pytest.importorskip("numba")
+
+FIELDS = ("A", "B", "C", "D", "f0", "x0", "u0", "y0", "q", "v", "placement")
+OUTPUTS = [
+    fflin.FramePose("tool"),
+    fflin.Accelerometer("tool"),
+    fflin.JointPositions(),
+    fflin.Momentum(),
+]
+
+
+def both(robot, **options):
+    return (fflin.Linearizer(robot, engine=each, **options) for each in ("compiled", "python"))
+
+
+@pytest.mark.parametrize("outputs", [None, OUTPUTS])
+@pytest.mark.parametrize(
+    "options", [{}, {"moving": True}, {"frame": "world", "reference": TILTED}], ids=str
+)
+def test_every_field_is_that_of_the_other_route_to_rounding(robots, outputs, options):
+    robot = robots["servicer_7dof"].replace(gravity=(0.3, -1.0, 2.0), stiffness=0.5)
+    if outputs:
+        robot = robot.replace(outputs=outputs)
+    quick, slow = both(robot, **options)
+    (q,), (v,), (u,) = operating_points(robot, 1)
+    for point in ((q, v, u), (q, v), (q, None, u), (q,), (list(q), list(v), list(u))):
+        lin, expected = quick(*point), slow(*point)
+        assert quick._one is not None and slow._one is None
+        for key in FIELDS:
+            found, true = getattr(lin, key), getattr(expected, key)
+            assert not found.flags.writeable, key
+            assert found.shape == true.shape, key
+            scale = max(1.0, np.abs(true).max(initial=0.0))
+            assert np.abs(found - true).max(initial=0.0) < 1e-11 * scale, key
+        assert (lin.drift is None) is (expected.drift is None)
+        assert lin.state_names == expected.state_names
+        assert fflin.check(robot, lin).ok
+
+
+def test_a_model_keeps_its_numbers_when_the_next_one_is_made(robots):
+    robot = robots["ets_vii"].replace(outputs=[fflin.CenterOfMass()])
+    quick, _ = both(robot)
+    q, v, u = operating_points(robot, 2)
+    before = quick(q[0], v[0], u[0])
+    kept = {key: getattr(before, key).copy() for key in FIELDS}
+    given = q[0].copy(), v[0].copy(), u[0].copy()
+    quick(q[1], v[1], u[1])
+    for key in FIELDS:
+        assert (getattr(before, key) == kept[key]).all(), key
+    for argument, original in zip((q[0], v[0], u[0]), given, strict=True):
+        assert argument.flags.writeable
+        assert (argument == original).all()
+
+
+def test_what_the_kernel_cannot_vouch_for_is_refused_in_the_same_words(robots):
+    robot = robots["servicer_7dof"]
+    quick, slow = both(robot, reference=pin.SE3.Identity())
+    (q,), (v,), (u,) = operating_points(robot, 1)
+    turned, far = q.copy(), v.copy()
+    turned[3:7], far[2] = (1.0, 0.0, 0.0, 0.0), 1e160
+    for point in ((turned, v, u), (q, far, u), (q, v, np.full_like(u, np.nan)), (q[:-1], v, u)):
+        said = []
+        for linearizer in (quick, slow):
+            with pytest.raises(fflin.FflinError) as caught:
+                linearizer(*point)
+            said.append((type(caught.value), str(caught.value)))
+        assert said[0] == said[1]
+    # Beyond the kernel's sines the other route takes over.
+    q[7] = 2e6
+    assert (quick(q, v, u).A == slow(q, v, u).A).all()
+
+
+def test_it_takes_over_where_its_code_is_loaded_or_pays(robots, monkeypatch):
+    robot = robots["planar_detumble"]
+    (q,), (v,), (u,) = operating_points(robot, 1)
+    for quick in both(robot):
+        quick(q, v, u)  # so that it is kept on disk
+    linearizer = fflin.Linearizer(robot)
+    linearizer(q, v, u)
+    assert linearizer._one is not None
+    monkeypatch.setattr(compiled.sys, "modules", {"numba": None})
+    assert not compiled.point_pays(19_999)
+    assert compiled.point_pays(20_000)
+    monkeypatch.setattr(compiled, "_point_is_kept", lambda: False)
+    assert not compiled.point_pays(199_999)
+    assert compiled.point_pays(200_000)
+    monkeypatch.setattr(linearization, "point_pays", lambda calls: True)
+    never = fflin.Linearizer(robot, engine="python")
+    never(q, v, u)
+    assert never._one is None
+    assert pickle.loads(pickle.dumps(never))._engine == "python"
+
+
+def test_an_engine_that_cannot_is_refused(robots, monkeypatch):
+    with pytest.raises(fflin.UnknownNameError, match="no engine named 'fast'"):
+        fflin.Linearizer(robots["cubesat"], engine="fast")
+    monkeypatch.setattr(prepared, "numba_is_there", lambda: False)
+    with pytest.raises(fflin.InputError, match=r"engine='compiled' cannot.*fflin\[fast"):
+        fflin.Linearizer(robots["cubesat"], engine="compiled")
+    monkeypatch.undo()
+    monkeypatch.setattr(prepared.Prepared, "kernel", lambda self: None)
+    with pytest.raises(fflin.InputError, match="a joint of 'cubesat' is of another kind"):
+        fflin.Linearizer(robots["cubesat"], engine="compiled")
