@@ -19,6 +19,7 @@ ROBOT_KEYS = ("urdf", "package_dirs", "lock", "input", *(x for x in FIELDS if x 
 
 
 def is_number(value: Any) -> bool:
+    """Whether a value of TOML is a finite number."""
     # The limit keeps lengths finite, and integers that are no floats out.
     return type(value) in (int, float) and abs(value) < 1e100
 

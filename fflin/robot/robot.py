@@ -18,7 +18,6 @@ from fflin.robot.fields import Range, checked_fields, checked_passive
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import Follower, Joint
-from fflin.robot.link_masses import LinkMass
 from fflin.robot.outputs import FullState, Output
 from fflin.robot.wheels import stored_momentum, with_inputs
 
@@ -79,7 +78,7 @@ class Robot(Coordinates):
     limits : mapping
         {name of an input or state: (least, largest)} in place of what the URDF and the inputs say.
     links : mapping
-        {link: its mass, centre of mass and inertia} as the URDF has them.
+        {link: LinkMass} of those that weigh something, as the URDF has them.
     """
 
     model: pin.Model
@@ -102,7 +101,7 @@ class Robot(Coordinates):
     weights: Mapping[str, Any] = field(default_factory=dict)
     start: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, Range] = field(default_factory=dict)
-    links: Mapping[str, LinkMass] = field(default_factory=dict)
+    links: Mapping[str, Any] = field(default_factory=dict)
     # Where some of its joints are wheels: the same robot without them.
     _wheelless: Robot | None = None
     # The model, and what it was when the first robot of it was made.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +13,7 @@ from fflin.base.errors import InputError
 from fflin.base.tables import folded
 from fflin.base.validation import Array, as_double
 from fflin.control.margins import input_margins, largest_gain
-
-if TYPE_CHECKING:
-    from fflin.uncertainty.lft import LFT
-    from fflin.uncertainty.uncertain import Uncertain
+from fflin.uncertainty.lft import LFT
 
 # Ends of a search, evaluations of each, corners that are tried, and frequencies of the bound.
 _STARTS, _STEPS, _CORNERS, _FREQUENCIES = 3, 150, 256, 80
@@ -81,7 +78,7 @@ class Worst:
         return folded(lines)
 
 
-def searched(of: Uncertain, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
+def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
     """Do what `Uncertain.worst` does."""
     K = as_double("gain", getattr(gain, "K", gain))
     if K.shape != lft.B2.T.shape:
