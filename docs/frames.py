@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 import fflin
-from fflin.analysis.closed_loop import checked_loop
+from fflin.campaign.flights import Flights
+from fflin.campaign.settling import OUTCOMES, Settling, Trial, checked_loop
 
 FRAMES = ("hybrid", "local", "world")
 ROBOTS, TURNS, POSTURES = ("canadarm2", "ur5", "panda", "servicer_7dof"), (20, 60, 90, 120, 150), 10
@@ -30,7 +31,13 @@ def settled(robot: fflin.Robot, design: str, degrees: float) -> str:
         x = loop.displaced(np.random.default_rng(k), degrees, 0.5 * degrees / 90.0, 0.0)
         for frame in FRAMES:
             there = replace(loop, lin=replace(lin, frame=frame))
-            counts[frame] += there.outcome(x) == "settled"
+            trial = Trial.of(there, foresees=False, limits=None, joint=0.0)
+            outcome = 0
+            while trial and OUTCOMES[outcome] != "settled":
+                job = Flights(trial.make, trial.judge, Settling.SHAPES, "compiled")
+                outcome = int(job.run(there.starts([x])).arrays["outcome"][0])
+                trial = trial.finer() if OUTCOMES[outcome] == "diverged" else None
+            counts[frame] += OUTCOMES[outcome] == "settled"
     return "/".join(map(str, counts.values()))
 
 

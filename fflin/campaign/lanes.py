@@ -10,7 +10,8 @@ import numpy as np
 
 from fflin.base.rotation import product_matrix
 from fflin.base.validation import Array
-from fflin.campaign.tally import STOPS, Tally, stop_of
+from fflin.campaign.flights import Judge
+from fflin.campaign.tally import STOPS, stop_of
 from fflin.kernel.accelerations import work_space
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES, batch_tree
@@ -75,7 +76,7 @@ class Lanes:
     def fly(
         self,
         runs: Mapping[str, Array],
-        tally: Tally,
+        tally: Judge,
         out: Mapping[str, Array],
         watcher: Watcher | None = None,
     ) -> list[str]:
@@ -107,7 +108,7 @@ class Lanes:
             for lane in np.flatnonzero(lost[:count] & going).tolist():
                 told[lane] = self._said(runs["q"][lane], lane, done)
             stop = np.array(list(map(stop_of, told)), dtype=float)
-            ending = going & ((stop > 0.0) | (done == steps))
+            ending = going & ((stop > 0.0) | (done == steps) | tally.over[:count])
             if not ending.any():
                 continue
             stop = stop[of_lane]

@@ -132,7 +132,7 @@ def _momentum(lin: LinearModel) -> str:
 
 
 def _validity(arguments: argparse.Namespace) -> int:
-    from fflin.analysis.validity import validity
+    from fflin.campaign.validity import validity
     from fflin.base.progress import Progress
     from fflin.batch.workers import OwnWorkers
 

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, as_completed
+from collections.abc import Iterable
+from concurrent.futures import Executor
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from fflin.analysis.closed_loop import Loop, checked_loop
 from fflin.analysis.displacement import checked_displacement, joint_unit, scaled, shown
-from fflin.base.errors import FflinError, InputError
+from fflin.base.errors import InputError
 from fflin.base.intervals import clopper_pearson
 from fflin.base.tables import folded
 from fflin.base.validation import Array, share, whole
-from fflin.dynamics.state import Frame, StateMap
+from fflin.batch.run import Progress, check_workers
+from fflin.batch.workers import OwnWorkers
+from fflin.campaign.flights import Crew, Flights, Starts
+from fflin.campaign.settling import OUTCOMES, Loop, Settling, Trial, checked_loop
+from fflin.dynamics.state import Frame
+from fflin.kernel.tree import LANES
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -154,15 +159,20 @@ def validity(
     seed: int = 0,
     confidence: float = 0.95,
     frames: Iterable[Frame] = (),
+    limits: Any = None,
     executor: Executor | None = None,
-    progress: Callable[[int, int], object] | None = None,
+    workers: int | None = None,
+    threads: int | None = None,
+    progress: Progress | None = None,
+    engine: str | None = None,
 ) -> Validity:
     """Measure how far from its point a linear model can be trusted, and its loop holds.
 
     The nonlinear robot under ``u = u0 - K (x - x0)``, held between samples where the model is
     sampled, is followed from displacements at the point's velocity: from growing ones beside the
     linear prediction, and from random ones until the error is a thousandth of the first. A run
-    that takes three times as long as the slowest pole needs has not settled.
+    that takes three times as long as the slowest pole needs has not settled. With numba eight runs
+    go at a time.
 
     Parameters
     ----------
@@ -179,14 +189,17 @@ def validity(
     samples : int
         Number of random runs.
     seed : int
-        The same seed gives the same result whatever the executor.
+        The same seed gives the same result whoever does the runs.
     confidence : float
         Of the intervals.
     frames : sequence of {"hybrid", "local", "world"}
         In whose axes the same linear loop is to be tried too, from the same displacements; the
         base of the point must not be turned against the reference.
-    executor : concurrent.futures.Executor, optional
-        Runs them in parallel, such as a ProcessPoolExecutor.
+    limits : optional
+        What cuts the inputs, as of `simulate`, where thrusters never pull; by default the loop is
+        free of any.
+    executor, workers, threads, engine : optional
+        As of `monte_carlo`.
     progress : callable, optional
         ``progress(done, total)`` is called with the number of runs, random or not, as they end.
 
@@ -197,8 +210,8 @@ def validity(
     Raises
     ------
     InputError
-        If the linear loop is unstable, the point is no fixed point, or an argument has a wrong
-        size or value.
+        If the linear loop is unstable, the point is no fixed point, the loop's poles are so far
+        apart that a run takes a million steps, or an argument has a wrong size or value.
     FflinError
         If a process of the executor died.
 
@@ -213,52 +226,83 @@ def validity(
     confidence = share("confidence", confidence)
     if isinstance(frames, str) or not isinstance(frames, Iterable):
         raise InputError(f"frames is {frames!r}, expected several, such as ('hybrid', 'local')")
-    loops = {loop.lin.frame: loop} | {each: _in_frame(loop, each) for each in frames}
-    # Each run has its own random stream, so that results do not depend on the order.
-    streams = np.random.SeedSequence(seed).spawn(samples + _DIRECTIONS)
+    loops = {loop.lin.frame: loop} | {each: loop.fed_back_in(each) for each in frames}
+    check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
-    if executor is not None and not isinstance(executor, Executor):
-        raise InputError(
-            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
-        )
-    if progress is not None and not callable(progress):
-        raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
-    runs: list[Callable[[], Any]] = []
-    for each in loops.values():
-        runs += (partial(_foreseen, each, largest, stream) for stream in streams[:_DIRECTIONS])
-        runs += map(partial(partial, _outcome, each, largest), levels, streams[_DIRECTIONS:])
-    found: list[Any] = [None] * len(runs)
-    for done, (index, result) in enumerate(_each(runs, executor), 1):
-        found[index] = result
-        if progress:
-            progress(done, len(runs))
-    one = len(streams)
-    own, *others = (
-        _judged(each, largest, levels, found[k * one : (k + 1) * one], confidence)
-        for k, each in enumerate(loops.values())
-    )
-    return replace(own, frames={each.frame: each for each in others})
+    foreseen = len(_LEVELS) * _DIRECTIONS
+    total, done = len(loops) * (foreseen + samples), 0
+    found = []
+    with OwnWorkers(workers) if workers else nullcontext(executor) as others:
+        crew = Crew(others, workers or 0, threads, engine)
+        chosen = ""
+        for each in loops.values():
+            trials = [
+                Trial.of(each, foresees=of, limits=limits, joint=largest["joint"])
+                for of in (True, False)
+            ]
+            chosen = chosen or crew.engine_for(trials[1].make, total)
+            arrays = []
+            for trial, count in zip(trials, (foreseen, samples), strict=True):
+                told = progress and partial(_tell, progress, done, total)
+                of = partial(_starts, each, largest, seed, levels, trial.foresees)
+                arrays.append(_flown(crew, trial, of, np.arange(count), chosen, told))
+                done += count
+            worst = arrays[0]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
+            outcomes = tuple(OUTCOMES[int(code)] for code in arrays[1]["outcome"])
+            found.append(_judged(each, largest, levels, worst, outcomes, confidence))
+    own, *more = found
+    return replace(own, frames={each.frame: each for each in more})
 
 
-def _in_frame(loop: Loop, frame: Frame) -> Loop:
-    """Return the same linear loop, fed back in other axes."""
-    state = StateMap(loop.robot, reference=loop.lin.reference, frame=frame)
-    if not np.allclose(state.to_state(loop.lin.q, loop.lin.v)[:3], 0.0, atol=1e-9):
-        raise InputError(
-            "the base of the point is turned against the reference, where frames have different "
-            "models; compare them on a model made without a reference"
-        )
-    return replace(loop, lin=replace(loop.lin, frame=state.frame))
+def _flown(
+    crew: Crew, trial: Trial, rows: Any, runs: Array, engine: str, told: Progress | None
+) -> dict[str, Array]:
+    """Return how runs ended; what diverges is flown again in steps that follow it further."""
+    job = Flights(trial.make, trial.judge, Settling.SHAPES, engine)
+    arrays = crew.do(job, partial(rows, runs), len(runs), engine == "compiled", LANES, told)
+    lost = np.flatnonzero(arrays["outcome"] == OUTCOMES.index("diverged"))
+    if len(lost) and (finer := trial.finer()):
+        again = _flown(crew, finer, rows, runs[lost], engine, None)
+        for key, values in again.items():
+            arrays[key][lost] = values
+    return arrays
+
+
+def _tell(progress: Progress, before: int, total: int, done: int, _: int) -> None:
+    progress(before + done, total)
+
+
+def _starts(
+    loop: Loop,
+    largest: dict[str, float],
+    seed: int,
+    levels: Array,
+    foresees: bool,
+    runs: Array,
+    start: int,
+    stop: int,
+) -> Starts:
+    """Return where some runs begin, each by a random stream of its own."""
+    states = []
+    for run in runs[start:stop].tolist():
+        stream, level = run // len(_LEVELS), _LEVELS[run % len(_LEVELS)]
+        if not foresees:
+            stream, level = _DIRECTIONS + run, levels[run]
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
+        states.append(loop.displaced(rng, **scaled(largest, float(level))))
+    return loop.starts(states)
 
 
 def _judged(
-    loop: Loop, largest: dict[str, float], levels: Array, found: list[Any], confidence: float
+    loop: Loop,
+    largest: dict[str, float],
+    levels: Array,
+    worst: Array,
+    outcomes: tuple[str, ...],
+    confidence: float,
 ) -> Validity:
-    worst = np.array(found[:_DIRECTIONS]).max(axis=0)
-    outcomes, samples = tuple(found[_DIRECTIONS:]), len(levels)
-    failed = [i for i, outcome in enumerate(outcomes) if outcome != "settled"]
-    inside = failed[0] if failed else samples
-    settled = outcomes.count("settled")
+    samples = len(levels)
+    inside = next((i for i, outcome in enumerate(outcomes) if outcome != "settled"), samples)
     reach = float(levels[inside - 1]) if inside else 0.0
     return Validity(
         levels=_LEVELS,
@@ -270,44 +314,13 @@ def _judged(
         holds=scaled(largest, reach),
         inside=inside,
         inside_rate=(1.0 - confidence) ** (1.0 / inside) if inside else 0.0,
-        rate=clopper_pearson(settled, samples, confidence)[1:],
+        rate=clopper_pearson(outcomes.count("settled"), samples, confidence)[1:],
         confidence=confidence,
         largest=largest,
         joint_unit=joint_unit(loop.lin),
         robot=loop.lin.robot,
         frame=loop.lin.frame,
     )
-
-
-def _each(runs: list[Callable[[], Any]], executor: Executor | None) -> Iterator[tuple[int, Any]]:
-    """Yield the number and the result of each run as it ends."""
-    if executor is None:
-        yield from ((index, run()) for index, run in enumerate(runs))
-        return
-    futures = {executor.submit(run): index for index, run in enumerate(runs)}
-    try:
-        for future in as_completed(futures):
-            yield futures.pop(future), future.result()
-    except BrokenExecutor as error:
-        raise FflinError(f"a process that did the runs died: {error}") from None
-    finally:
-        for future in futures:
-            future.cancel()
-
-
-def _foreseen(loop: Loop, largest: dict[str, float], stream: np.random.SeedSequence) -> Array:
-    """Return the relative prediction error at each level along one direction."""
-    starts = (
-        loop.displaced(np.random.default_rng(stream), **scaled(largest, float(level)))
-        for level in _LEVELS
-    )
-    return np.array([loop.prediction_error(x) for x in starts])
-
-
-def _outcome(
-    loop: Loop, largest: dict[str, float], level: float, stream: np.random.SeedSequence
-) -> str:
-    return loop.outcome(loop.displaced(np.random.default_rng(stream), **scaled(largest, level)))
 
 
 def _slope(errors: Array) -> float:
