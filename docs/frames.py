@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 import fflin
-from fflin.campaign.flights import Flights
-from fflin.campaign.settling import OUTCOMES, Settling, Trial, checked_loop
+from fflin.campaign.dispersions import Draws
+from fflin.campaign.settling import OUTCOMES, SettlingJob, checked_loop, flown
 
 FRAMES = ("hybrid", "local", "world")
 ROBOTS, TURNS, POSTURES = ("canadarm2", "ur5", "panda", "servicer_7dof"), (20, 60, 90, 120, 150), 10
@@ -29,15 +29,12 @@ def settled(robot: fflin.Robot, design: str, degrees: float) -> str:
         lin = fflin.linearize(robot, q)
         loop = checked_loop(robot, lin, GAINS[design](lin))
         x = loop.displaced(np.random.default_rng(k), degrees, 0.5 * degrees / 90.0, 0.0)
+        x = (x - loop.state.to_state(lin.q, lin.v))[None]
         for frame in FRAMES:
             there = replace(loop, lin=replace(lin, frame=frame))
-            trial = Trial.of(there, foresees=False, limits=None, joint=0.0)
-            outcome = 0
-            while trial and OUTCOMES[outcome] != "settled":
-                job = Flights(trial.make, trial.judge, Settling.SHAPES, "compiled")
-                outcome = int(job.run(there.starts([x])).arrays["outcome"][0])
-                trial = trial.finer() if OUTCOMES[outcome] == "diverged" else None
-            counts[frame] += OUTCOMES[outcome] == "settled"
+            job = SettlingJob(there, False, None, 0.0, engine="python")
+            arrays = flown(job, lambda runs, *_, x=x: Draws(x, runs), np.arange(1), {})
+            counts[frame] += OUTCOMES[int(arrays["outcome"][0])] == "settled"
     return "/".join(map(str, counts.values()))
 
 

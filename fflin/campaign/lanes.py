@@ -10,8 +10,7 @@ import numpy as np
 
 from fflin.base.rotation import product_matrix
 from fflin.base.validation import Array
-from fflin.campaign.flights import Judge
-from fflin.campaign.tally import STOPS, stop_of
+from fflin.campaign.tally import STOPS, Tally, stop_of
 from fflin.kernel.accelerations import work_space
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES, batch_tree
@@ -76,7 +75,7 @@ class Lanes:
     def fly(
         self,
         runs: Mapping[str, Array],
-        tally: Judge,
+        tally: Tally,
         out: Mapping[str, Array],
         watcher: Watcher | None = None,
     ) -> list[str]:

@@ -1,13 +1,14 @@
-"""A regulated robot: the Lyapunov norm of its linear loop, its displacements, and whether it settles.
+"""A regulated robot: a norm of its errors, its displacements, and runs that tell if it settles.
 
-The norm decays in the linear loop as the robot's energy does.
+The norm is of the linear loop's Lyapunov function that decays as the robot's energy does.
 """
 
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from fflin.analysis.wheels import picked, regulated_part, wheel_inputs
 from fflin.base.errors import InputError
 from fflin.base.rotation import quaternion_product
 from fflin.base.validation import Array, as_double
-from fflin.campaign.flights import Starts
+from fflin.campaign.runs import CampaignJob, done_by
 from fflin.control.policies import StateFeedback
 from fflin.control.saturation import Saturation
 from fflin.dynamics.state import Frame, StateMap
@@ -26,9 +27,8 @@ from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
-from fflin.simulation.plan import Plan, law_of
+from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
-from fflin.simulation.simulate import planned
 
 # A run has settled where its error is this share of the first, in the norm of its Lyapunov
 # function, and has diverged where it is this many times as large.
@@ -43,7 +43,7 @@ _FORESIGHT, _PATIENCE = 3.0, 3.0
 
 _STEP = 0.25  # over the fastest pole
 _WIDEST = 10.0  # displacement of a joint [rad] up to which steps are as much shorter
-_FINER = 8  # times as many steps are taken where a run diverges
+_FINER, _FINEST = 8, 2  # times as many steps where a run diverges, and how often so
 _MOST_STEPS = 1_000_000
 _LOOKS = 60  # at the prediction
 
@@ -122,9 +122,12 @@ class Loop:
         x[self.watched] = moved[self.watched]
         return x
 
-    def starts(self, states: Any) -> Starts:
-        """Return where runs from states begin."""
-        return Starts(*self.state.points(np.array(states))[1:])
+    def errors(self, q: Array, nu: Array) -> tuple[Array, Array]:
+        """Return q0^2 (N,) of the chart, and deviations (N, nz) of the model's states, of rows."""
+        x = states_of(self.state, q, nu)
+        e, turns = x[:, self.watched] - self.lin.x0, np.isin(self.watched, 6 + self.state.unbounded)
+        e[:, turns] -= 2.0 * np.pi * np.round(e[:, turns] / (2.0 * np.pi))
+        return 1.0 - (x[:, :3] ** 2).sum(axis=1), e
 
     def fed_back_in(self, frame: Frame) -> Loop:
         """Return the same linear loop, fed back in other axes."""
@@ -137,68 +140,77 @@ class Loop:
         return replace(self, lin=replace(self.lin, frame=state.frame))
 
 
-class Trial(NamedTuple):
-    """Runs of a loop: steps of dt [s], looked at every so many of them; see `Settling`."""
+class SettlingJob(CampaignJob):
+    """Runs of a loop from displaced states, looked at by `Settling` every so many steps."""
 
-    loop: Loop
-    foresees: bool
-    limits: Any
-    dt: float
-    steps: int
-    every: int
-    fine: int = 0  # how often they have been made shorter
-
-    @classmethod
-    def of(cls, loop: Loop, *, foresees: bool, limits: Any, joint: float) -> Trial:
-        """Make one long enough to settle, or to measure what the linear loop foresees."""
+    def __init__(
+        self, loop: Loop, foresees: bool, limits: Any, joint: float, fine: int = 0, engine: str = ""
+    ) -> None:
         lin, decay = loop.lin, loop.decay
+        self.loop, self.foresees, self.fine = loop, foresees, fine
         # Between samples, and where it is cut, the robot is without its loop.
         free = linearize(loop.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
         fastest = float(np.abs(np.linalg.eigvals(free.A)).max()) * (1.0 + bool(lin.dt))
         if not lin.dt:
             fastest = max(fastest, float(np.abs(np.linalg.eigvals(loop.rate)).max()))
         horizon = (_FORESIGHT if foresees else _PATIENCE * math.log(1.0 / SETTLED)) / decay
-        dt = _STEP / (max(fastest, 4.0 * decay) * min(max(joint, 1.0), _WIDEST))
-        every = 1
-        if lin.dt:
-            every = math.ceil(lin.dt / dt)
-            dt, horizon = lin.dt / every, lin.dt * math.ceil(horizon / lin.dt)
-        if horizon / dt > _MOST_STEPS:
+        pace = max(fastest, 4.0 * decay) * min(max(joint, 1.0), _WIDEST)
+        self.every = math.ceil(lin.dt * pace / _STEP) if lin.dt else 1
+        dt = lin.dt / self.every if lin.dt else _STEP / pace
+        if not horizon / dt <= _MOST_STEPS:
             raise InputError(
                 f"the loop's fastest pole is at {fastest:.3g} 1/s and its slowest at {decay:.3g} "
                 f"1/s: a run would take {horizon / dt:.3g} steps, expected at most "
                 f"{_MOST_STEPS:,}; give a gain whose poles are less apart, or damp what swings"
             )
-        steps = math.ceil(horizon / dt * (1.0 - 1e-9))
         if not lin.dt:
-            every = max(1, steps // _LOOKS) if foresees else 4
-            steps = every * math.ceil(steps / every)
-        return cls(loop, foresees, limits, dt, steps, every)
-
-    def finer(self) -> Trial | None:
-        """Return it in shorter steps; None where they are the shortest."""
-        if self.fine == 2:
-            return None
-        steps, every = self.steps * _FINER, self.every * _FINER
-        return self._replace(dt=self.dt / _FINER, steps=steps, every=every, fine=self.fine + 1)
-
-    def make(self) -> tuple[Plan, Plant]:
-        """Return its plan; nothing cuts the inputs unless limits are given."""
-        loop, lin = self.loop, self.loop.lin
-        times = {"duration": self.dt * self.steps, "dt": self.dt, "every": self.steps}
-        options = {"q0": lin.q, "v0": lin.v, "linear": False, "project": not self.foresees}
+            self.every = max(1, int(horizon / dt / _LOOKS)) if foresees else 4
+        looks, finer = math.ceil(horizon / (dt * self.every) - 1e-9), _FINER**fine
+        dt, self.every = dt / finer, self.every * finer
+        options = {"q0": lin.q, "v0": lin.v, "dt": dt, "duration": dt * self.every * looks}
+        options |= {"limits": limits, "project": not foresees, "every": self.every}
         policy = StateFeedback(lin, loop.K)
-        plan, plant = planned(loop.robot, policy, limits=self.limits, **times, **options)
-        if self.limits is None:
-            free = np.full(len(plan.initial), np.inf)
-            open_ = Saturation(-free, free, None, None)
-            law = law_of(plan.policy, plant, open_, plan.times)
-            plan = replace(plan, limits=open_, law=law)
-        return plan, plant
+        none = dict.fromkeys(loop.state.names, 0.0)
+        super().__init__(loop.robot, policy, none, 0, engine, options)
+        if limits is None:  # nothing cuts, not even thrusts that pull
+            most = np.full(len(self.plan.initial), np.inf)
+            self.plan = replace(self.plan, limits=Saturation(-most, most, None, None))
+        self._again = partial(SettlingJob, loop, foresees, limits, joint, fine)
+        self.finer = partial(SettlingJob, loop, foresees, limits, joint, fine + 1)
+        self.step = self._foreseen(dt)
 
-    def judge(self, _: Plan, __: Plant, count: int) -> Settling:
-        """Return what watches its runs."""
+    def _foreseen(self, dt: float) -> Array | None:
+        """Return what takes the linear loop from look to look, by the method of the nonlinear one.
+
+        Of a linear system CF4 is the classical method of order four, whose steps are those of its
+        stability polynomial: so the difference of the two loops is that of what is not linear.
+        """
+        if not self.foresees:
+            return None
+        if self.loop.lin.dt:
+            return self.loop.rate
+        one, Z = np.eye(len(self.loop.rate)), self.loop.rate * dt
+        step = one + Z @ (one + Z / 2.0 @ (one + Z / 3.0 @ (one + Z / 4.0)))
+        return np.linalg.matrix_power(step, self.every)
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of each array of a run's outcome."""
+        return dict.fromkeys(Judged._fields, ())
+
+    def _tally(self, count: int) -> Any:
         return Settling(self, count)
+
+    def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:
+        """Return the plan of a run, which ends once it has settled."""
+        plan, plant = super().plan_of(drawn)
+        loop, first = self.loop, self.loop.size(drawn[self.loop.watched])
+
+        def settled(_: float, q: Array, v: Array) -> float:
+            e = loop.errors(q[None], loop.state.velocities(v)[None])[1]
+            return float(loop.size(e[0]) - SETTLED * first)
+
+        return replace(plan, events=() if self.foresees else (settled,)), plant
 
 
 class Judged(NamedTuple):
@@ -211,71 +223,58 @@ class Judged(NamedTuple):
 class Settling:
     """Runs of a loop: whether they have settled, and how far they are from the linear loop's."""
 
-    SHAPES = dict.fromkeys(Judged._fields, ())
-
-    def __init__(self, trial: Trial, count: int) -> None:
-        self._trial, self._loop = trial, trial.loop
+    def __init__(self, job: SettlingJob, count: int) -> None:
+        self._job, self._loop = job, job.loop
         self._code, self._worst = np.zeros(count, dtype=int), np.zeros(count)
-        self._step = _foreseen(trial) if trial.foresees else None
 
     @property
     def over(self) -> Any:
         """Which runs (count,) need not go on."""
-        return (self._code > 0) & (self._step is None)
+        return (self._code > 0) & (self._job.step is None)
 
     def copy(self) -> Settling:
         """Return one that goes its own way from here on."""
-        other = object.__new__(Settling)
-        other.__dict__ |= {
-            k: x.copy() if isinstance(x, np.ndarray) else x for k, x in vars(self).items()
-        }
-        return other
+        return copy(self)
 
     def add(self, first: int, q: Array, nu: Array, _: Array) -> Settling:
         """Take rows (steps, count, ..) from a step on into account."""
-        loop, rows = self._loop, slice(-first % self._trial.every, None, self._trial.every)
+        loop, rows = self._loop, slice(-first % self._job.every, None, self._job.every)
         q, nu = q[rows], nu[rows]
         shape = q.shape[:2]
         if not shape[0]:
             return self
-        x = states_of(loop.state, *(each.reshape(-1, each.shape[-1]) for each in (q, nu)))
-        e = x[:, loop.watched] - loop.lin.x0
-        turns = np.isin(loop.watched, 6 + loop.state.unbounded)
-        e[:, turns] -= 2.0 * np.pi * np.round(e[:, turns] / (2.0 * np.pi))
+        square, e = loop.errors(*(each.reshape(-1, each.shape[-1]) for each in (q, nu)))
         e = e.reshape(*shape, -1)
         size = loop.size(e)
         if first == 0:
             self._first, self._ahead = size[0], e[0]
-        edge = 1.0 - (x[:, :3] ** 2).sum(axis=1).reshape(shape) < EDGE
+        edge = square.reshape(shape) < EDGE
         ends = [size <= SETTLED * self._first, edge, ~(size < DIVERGED * self._first)]
         code = np.select(ends, [1, 2, 3], 0)
         code = np.take_along_axis(code, (code > 0).argmax(axis=0)[None], axis=0)[0]
         self._code = np.where(self._code > 0, self._code, code)
-        if self._step is not None:
+        if self._job.step is not None:
             for each in e:
                 self._worst = np.maximum(self._worst, loop.size(each - self._ahead))
-                self._ahead = self._ahead @ self._step.T
+                self._ahead = self._ahead @ self._job.step.T
         return self
 
     def outcome(self, _: int, stop: Array) -> Judged:
         """Return how they ended, by which of STOPS."""
-        code = np.where(self._code > 0, self._code, np.array([0, 3, 2, 3])[stop.astype(int)])
+        code = np.where(self._code > 0, self._code, np.array([0, 3, 2, 1])[stop.astype(int)])
         error = self._worst / np.maximum(self._first, 1e-300)
         return Judged(code.astype(float), np.where((stop > 0.0) | (code > 1), np.nan, error))
 
 
-def _foreseen(trial: Trial) -> Array:
-    """Return what takes the linear loop from look to look, by the method of the nonlinear one.
-
-    Of a linear system CF4 is the classical method of order four, whose steps are those of its
-    stability polynomial: so the difference of the two loops is that of what is not linear.
-    """
-    Z = trial.loop.rate
-    if trial.loop.lin.dt:
-        return Z
-    one, Z = np.eye(len(Z)), Z * trial.dt
-    step = one + Z @ (one + Z / 2.0 @ (one + Z / 3.0 @ (one + Z / 4.0)))
-    return np.linalg.matrix_power(step, trial.every)
+def flown(job: SettlingJob, rows: Any, runs: Any, how: dict[str, Any]) -> dict[str, Array]:
+    """Return how runs ended; what diverges is flown again in shorter steps, which follow it."""
+    arrays = done_by(job, lru_cache(64)(partial(rows, runs)), len(runs), **how)
+    lost = np.flatnonzero(arrays["outcome"] == OUTCOMES.index("diverged"))
+    if len(lost) and job.fine < _FINEST:
+        again = flown(job.finer(engine=job.engine), rows, runs[lost], how | {"progress": None})
+        for key, values in again.items():
+            arrays[key][lost] = values
+    return arrays
 
 
 def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:

@@ -19,10 +19,9 @@ from fflin.base.tables import folded
 from fflin.base.validation import Array, share, whole
 from fflin.batch.run import Progress, check_workers
 from fflin.batch.workers import OwnWorkers
-from fflin.campaign.flights import Crew, Flights, Starts
-from fflin.campaign.settling import OUTCOMES, Loop, Settling, Trial, checked_loop
+from fflin.campaign.dispersions import Draws
+from fflin.campaign.settling import OUTCOMES, Loop, SettlingJob, checked_loop, flown
 from fflin.dynamics.state import Frame
-from fflin.kernel.tree import LANES
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -233,19 +232,15 @@ def validity(
     total, done = len(loops) * (foreseen + samples), 0
     found = []
     with OwnWorkers(workers) if workers else nullcontext(executor) as others:
-        crew = Crew(others, workers or 0, threads, engine)
-        chosen = ""
         for each in loops.values():
-            trials = [
-                Trial.of(each, foresees=of, limits=limits, joint=largest["joint"])
-                for of in (True, False)
-            ]
-            chosen = chosen or crew.engine_for(trials[1].make, total)
             arrays = []
-            for trial, count in zip(trials, (foreseen, samples), strict=True):
+            for foresees, count in ((True, foreseen), (False, samples)):
+                job = SettlingJob(each, foresees, limits, largest["joint"])
+                job.choose(engine, max(1, total // 3))
+                rows = partial(_displaced, each, largest, seed, None if foresees else levels)
                 told = progress and partial(_tell, progress, done, total)
-                of = partial(_starts, each, largest, seed, levels, trial.foresees)
-                arrays.append(_flown(crew, trial, of, np.arange(count), chosen, told))
+                how = {"executor": others, "workers": workers, "threads": threads, "progress": told}
+                arrays.append(flown(job, rows, np.arange(count), how))
                 done += count
             worst = arrays[0]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
             outcomes = tuple(OUTCOMES[int(code)] for code in arrays[1]["outcome"])
@@ -254,43 +249,28 @@ def validity(
     return replace(own, frames={each.frame: each for each in more})
 
 
-def _flown(
-    crew: Crew, trial: Trial, rows: Any, runs: Array, engine: str, told: Progress | None
-) -> dict[str, Array]:
-    """Return how runs ended; what diverges is flown again in steps that follow it further."""
-    job = Flights(trial.make, trial.judge, Settling.SHAPES, engine)
-    arrays = crew.do(job, partial(rows, runs), len(runs), engine == "compiled", LANES, told)
-    lost = np.flatnonzero(arrays["outcome"] == OUTCOMES.index("diverged"))
-    if len(lost) and (finer := trial.finer()):
-        again = _flown(crew, finer, rows, runs[lost], engine, None)
-        for key, values in again.items():
-            arrays[key][lost] = values
-    return arrays
-
-
 def _tell(progress: Progress, before: int, total: int, done: int, _: int) -> None:
     progress(before + done, total)
 
 
-def _starts(
+def _displaced(
     loop: Loop,
     largest: dict[str, float],
     seed: int,
-    levels: Array,
-    foresees: bool,
-    runs: Array,
+    levels: Array | None,
+    runs: Any,
     start: int,
     stop: int,
-) -> Starts:
-    """Return where some runs begin, each by a random stream of its own."""
-    states = []
+) -> Draws:
+    """Return where some runs begin, beside the point, each by a random stream of its own."""
+    drawn = []
     for run in runs[start:stop].tolist():
         stream, level = run // len(_LEVELS), _LEVELS[run % len(_LEVELS)]
-        if not foresees:
+        if levels is not None:
             stream, level = _DIRECTIONS + run, levels[run]
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
-        states.append(loop.displaced(rng, **scaled(largest, float(level))))
-    return loop.starts(states)
+        drawn.append(loop.displaced(rng, **scaled(largest, float(level))))
+    return Draws(np.array(drawn) - loop.state.to_state(loop.lin.q, loop.lin.v), runs[start:stop])
 
 
 def _judged(

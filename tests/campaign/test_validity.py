@@ -21,8 +21,8 @@ from scipy.stats import binomtest
 import fflin
 from fflin.base.intervals import clopper_pearson
 from fflin.batch.workers import OwnWorkers
-from fflin.campaign.flights import Flights
-from fflin.campaign.settling import Loop, Settling, Trial
+from fflin.campaign.dispersions import Draws
+from fflin.campaign.settling import Loop, SettlingJob
 from fflin.campaign.validity import _LEVELS, _crossing, _slope
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.run import go
@@ -74,10 +74,10 @@ def test_the_loop_is_that_of_aba_in_world_coordinates(robots):
     lin, gain = held(robot)
     loop = Loop(robot, lin, gain.K)
     x = loop.displaced(np.random.default_rng(1), 40.0, 0.3, 0.5)
-    trial = Trial(loop, foresees=False, limits=None, dt=0.02, steps=200, every=1)
-    plan, plant = trial.make()
-    (q,), (v,) = loop.starts([x])
-    run = go(replace(plan, q=q, v=v), plant, Conserved(robot, plan.q))
+    job = SettlingJob(loop, False, None, 1.0)
+    plan, plant = job.plan_of(x - lin.x0)
+    times = plan.times._replace(dt=0.02, steps=200, every=1)
+    run = go(replace(plan, times=times), plant, Conserved(robot, plan.q))
     end = loop.state.to_state(run.q[-1], run.v[-1], near=x)
     data = robot.create_data()
     q, v = loop.state.to_pinocchio(x)
@@ -179,17 +179,16 @@ def test_a_linear_loop_is_foreseen_to_rounding_and_settles_when_it_says(robots):
     lin, gain = held(robot)
     loop = Loop(robot, lin, gain.K)
     x = loop.displaced(np.random.default_rng(3), 0.0, 0.4, 0.0)
-    long = Trial.of(loop, foresees=False, limits=None, joint=0.0)
-    e, step = x - lin.x0, expm(loop.rate * long.dt)
-    sizes = []
-    for _ in range(long.steps + 1):
+    job = SettlingJob(loop, False, None, 0.0, engine="python")
+    times, e = job.plan.times, x - lin.x0
+    step, sizes = expm(loop.rate * times.dt), []
+    for _ in range(times.steps):
         sizes.append(loop.size(e))
         e = step @ e
     settles = next(k for k, size in enumerate(sizes) if size <= 1e-3 * sizes[0])
-    for steps, outcome in ((settles + 3, 1.0), (settles - 1, 0.0)):
-        trial = long._replace(steps=steps, every=1)
-        job = Flights(trial.make, trial.judge, Settling.SHAPES, "python")
-        assert job.run(loop.starts([x])).arrays["outcome"] == [outcome]
+    for steps, outcome in ((settles, 1.0), (settles - 1, 0.0)):
+        job.plan = replace(job.plan, times=times._replace(steps=steps))
+        assert job.run(Draws((x - lin.x0)[None], np.zeros(1)), 0).arrays["outcome"] == [outcome]
 
 
 def test_limits_are_those_that_are_given(robots):
