@@ -113,6 +113,7 @@ from fflin.analysis.plots import plot_matrices as plot_matrices
 from fflin.analysis.plots import plot_check as plot_check
 from fflin.analysis.plots import plot_modes as plot_modes
 from fflin.campaign.plots import plot_validity as plot_validity
+from fflin.campaign.plots import plot_funnel as plot_funnel
 from fflin.control.plots import plot_poles as plot_poles
 from fflin.control.plots import plot_loops as plot_loops
 from fflin.simulation.motion import plot_motion as plot_motion

@@ -159,9 +159,13 @@ class Funnel(Design):
         P: Array = (1.0 - part) * self.P[k] + part * self.P[k + 1]
         return P
 
-    def root(self, t: float) -> Array:
-        """Return W (nx, r): the ellipsoid at a time is of all W z with z of length 1 or less."""
-        return np.sqrt(self.level(t)) * _spread(self.cost(t))
+    def root(self, t: float, *, smooth: bool = False) -> Array:
+        """Return W (nx, r): the ellipsoid at a time is of all W z with z of length 1 or less.
+
+        Smooth ones go over from knot to knot, as they are drawn.
+        """
+        size = np.interp(t, self.t, np.sqrt(self.rho)) if smooth else np.sqrt(self.level(t))
+        return size * _spread(self.cost(t))
 
     def contains(self, t: float, x: Any = None, *, q: Any = None, v: Any = None) -> bool:
         """Whether a state is inside at a time.
@@ -180,7 +184,7 @@ class Funnel(Design):
         rho, state = self.level(t), StateMap(self.robot, frame="local")
         if x is None and q is None:
             raise InputError("give x, or q and v")
-        q, v = point_of(state, x, q, v, tuple)
+        q, v = point_of(state, x, q, v, lambda: (q, v))
         e = moving_error(state, *self.trajectory.flow.at(float(t))[:2], q, v)
         return bool(e @ self.cost(t) @ e <= rho)
 
@@ -192,8 +196,11 @@ class Funnel(Design):
         count, sure = self.outcomes.shape[1], f"{100.0 * self.confidence:g} %"
         head = f"{self.robot.name}: errors from which every run ends with {self.goal}"
         head += f", {self.within} on its way" * bool(self.within) + f"; {count} runs a knot"
-        tail = f"reach: largest half axis; sure: share of starts up to it, of all: up to "
-        tail += f"{(1.0):g} of what was tried; {sure} confidence"
+        tail = (
+            "base, joint: largest half axes; runs: those inside, all of which succeeded (+: of all "
+            "that were tried); sure: at least so many of the starts inside succeed, of all: of "
+            f"those up to the largest level that was tried ({sure} confidence)"
+        )
         rows = [["t [s]", "rho", "base [deg]", "base [m]", "joint", "runs", "sure", "of all"]]
         wide = (self.attitude, self.position, self.joints)
         for k, (low, high) in enumerate(100.0 * self.rate):
@@ -244,7 +251,7 @@ class FunnelJob:
         """Return what flies from a knot to the end."""
         k, first = self._places[knot]
         motion, schedule = self._feedback.trajectory, self._feedback.schedule
-        kept = {"hold": motion.hold, "frame": motion.frame, "verified": motion.verified}
+        kept: Any = {name: getattr(motion, name) for name in ("hold", "frame", "verified")}
         rest: Any = [getattr(motion, name)[k:] for name in ("t", "q", "v", "u")]
         cut = {name: getattr(schedule, name)[first:] for name in ("t", "K", "P", "A", "B")}
         policy = replace(
@@ -274,7 +281,7 @@ class FunnelJob:
             z = rng.normal(size=(len(sizes), spread.shape[1]))
             e = (sizes / np.linalg.norm(z, axis=1))[:, None] * z @ spread.T
             x = moved_by("local", np.tile(job.x0, (len(e), 1)), e)
-            return self._judged(job, job.run(Draws(x - job.x0, np.arange(len(e))), 0).arrays)
+            return self._judged(job, job.run(Draws(x - job.x0, np.zeros(len(e))), 0).arrays)
 
         widest = _widest(spread, self._robot)
         size, count = widest, self.shapes["outcomes"][0]
@@ -328,8 +335,8 @@ def funnel(
     At each knot errors are drawn from an ellipsoid :math:`e^T P(t)\,e \le \rho` of the schedule's
     cost to go, uniform in direction and evenly spread over the root of the level, and the nonlinear
     robot is flown from there to the trajectory's end. The largest level that is tried is where one
-    in about sixteen starts fails, or where the attitude is 170 deg off. No more is claimed than what
-    the counts say: a region of attraction has no proof here.
+    in about sixteen starts fails, or where the attitude is 170 deg off. What is found is counted,
+    not proved.
 
     Parameters
     ----------
@@ -343,7 +350,7 @@ def funnel(
     within : mapping, optional
         Largest errors on the way, as of `goal`.
     knots : int or sequence of float
-        How many of the trajectory's knots, or the times [s] of some, the nearest of which are taken.
+        How many of the trajectory's knots, or times [s], to which the nearest are taken.
     samples : int
         Runs from each knot.
     seed : int

@@ -10,6 +10,7 @@ import numpy as np
 from fflin.analysis.displacement import shown
 from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, drawing
+from fflin.campaign.funnel import Funnel
 from fflin.campaign.validity import TRUSTED, Validity
 
 if TYPE_CHECKING:
@@ -68,6 +69,45 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
             f"{validity.robot}, up to {shown(validity.largest, validity.joint_unit)}; "
             f"{percent * low:.1f} to {percent * high:.1f} % settle "
             f"({percent * validity.confidence:g} % confidence)",
+            fontsize=10,
+        )
+    return figure
+
+
+def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
+    """Draw how far a funnel reaches at each knot, and the share of starts that succeeds.
+
+    Parameters
+    ----------
+    funnel : Funnel
+    path : str or Path, optional
+        .png, .pdf or .svg to save to; errors as in `plot_motion`.
+    """
+    if not isinstance(funnel, Funnel):
+        raise InputError(f"funnel is a {type(funnel).__name__}, expected what fflin.funnel returns")
+    t, percent = funnel.t, 100.0
+    reach = {
+        "attitude [deg]": funnel.attitude,
+        "position [m]": funnel.position,
+        "joints [rad|m]": funnel.joints,
+    }
+    reach = {name: axes for name, axes in reach.items() if axes.any()}
+    with drawing(path, 9.0, 1.6 + 1.5 * (len(reach) + 1)) as figure:
+        axes = figure.subplots(len(reach) + 1, sharex=True)
+        for ax, (name, half), color in zip(axes, reach.items(), COLORS, strict=False):
+            for row in half.T:
+                ax.plot(t, row, "o-", color=color, ms=3, lw=0.7)
+            ax.fill_between(t, half.max(axis=1), color=color, alpha=0.15)
+            ax.set(ylabel=name, ylim=(0.0, None))
+        low, high = percent * funnel.rate.T
+        axes[-1].fill_between(t, low, high, color="#888888", alpha=0.3, label="of all tried")
+        inside = percent * funnel.inside_rate
+        axes[-1].plot(t, inside, "o-", color="#000000", ms=3, label="of those inside, at least")
+        axes[-1].set(xlabel="t [s]", ylabel="succeed [%]", ylim=(0.0, 102.0))
+        figure.legend(loc="outside lower center", ncols=2)
+        figure.suptitle(
+            f"{funnel.robot.name}: errors from which every run ends with {funnel.goal}\n"
+            f"half axes; {percent * funnel.confidence:g} % confidence",
             fontsize=10,
         )
     return figure

@@ -18,8 +18,10 @@ from fflin.view.panel import panel
 from fflin.view.playback import Playback, body_poses, frame_indices, play_back, thrusters
 from fflin.view.recorder import Recorder
 from fflin.view.scene import Animation, Drawing, Visualizer, body_paths
+from fflin.view.tube import tubes
 
 if TYPE_CHECKING:
+    from fflin.campaign.funnel import Funnel
     from fflin.dynamics.state import Frame
     from fflin.simulation.motion import Motion
 
@@ -45,6 +47,7 @@ def motion_page(
     follow: bool | None,
     target: Array | None,
     tool: str | None,
+    funnel: Funnel | None = None,
 ) -> tuple[str, tuple[str, ...]]:
     """Return the page of a motion, and what could not be drawn; see `visualize`."""
     shown = frame_indices(motion.t, fps, speed)
@@ -87,7 +90,9 @@ def motion_page(
         shown_points = frame_points(drawing, film, info["size"], follow=True)
     info |= panel(robot, motion, shown, goal)
     info |= marks(robot, film, tool, info["size"], goals)
+    colors = (TOOL_COLOR, COM_COLOR)
     info |= {
+        "tubes": tubes(robot, funnel, tool, info["size"], colors) if funnel is not None else [],
         "mode": "motion",
         "t": packed(t),
         "speed": speed,

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from os import PathLike
 
     from fflin.analysis.modes import Modes
+    from fflin.campaign.funnel import Funnel
     from fflin.simulation.motion import Motion
     from fflin.view.live import Live
 
@@ -49,6 +50,7 @@ def visualize(
     follow: bool | None = None,
     target: Array | None = None,
     tool: str | None = None,
+    funnel: Funnel | None = None,
     q: Array | None = None,
     port: int = 0,
 ) -> Live | Path | None:
@@ -93,6 +95,8 @@ def visualize(
         to. Where there is none the change from the start is shown instead, and no ghost.
     tool : str, optional
         Frame whose trail is drawn; "tool" or the last link of the longest chain by default.
+    funnel : Funnel, optional
+        Of the trajectory that the motion follows: where base and tool may be is drawn as a tube.
     q : array_like (nq,), optional
         Where a live robot stands first; by default at its `start`, or neutral.
     port : int
@@ -165,9 +169,8 @@ def visualize(
         from fflin.view.motion_page import motion_page
 
         goal = None if target is None else _configuration(robot, "target", target)
-        page, notes = motion_page(
-            robot, motion, scene=scene, fps=fps, speed=speed, follow=follow, target=goal, tool=tool
-        )
+        how: Any = {"scene": scene, "fps": fps, "speed": speed, "follow": follow, "target": goal}
+        page, notes = motion_page(robot, motion, **how, tool=tool, funnel=funnel)
         contents = _pictures(page, outputs, motion, speed, times)
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)
