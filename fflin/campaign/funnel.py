@@ -17,7 +17,7 @@ from fflin.base.errors import InputError, unknown
 from fflin.base.intervals import clopper_pearson
 from fflin.base.record import Design
 from fflin.base.tables import folded, grid
-from fflin.base.validation import Array, number, numbers, share, whole
+from fflin.base.validation import Array, by_name, number, numbers, share, whole
 from fflin.base.writing import as_path
 from fflin.batch.dispatch import ChunkResult
 from fflin.batch.run import Progress, check_workers
@@ -399,7 +399,7 @@ def funnel(
     samples, seed = whole("samples", samples, 1, _MOST), whole("seed", seed, 0)
     confidence, level = share("confidence", confidence), not isinstance(goal, Mapping)
     aim: Any = _positive("goal", {"level": goal})["level"] if level else _bounds("goal", goal)
-    bounds = _bounds("within", within or {})
+    bounds = _bounds("within", {} if within is None else within)
     check_workers(executor, workers, threads, None, progress)
     motion, by = feedback.trajectory, feedback.schedule
     places = _places(motion, by, knots)
@@ -430,7 +430,7 @@ def _rows(start: int, stop: int) -> Knots:
 
 def _bounds(name: str, given: Any) -> dict[str, float]:
     """Return {kind: largest error}, checked."""
-    for key in given:
+    for key in by_name(name, given, "kind"):
         if key not in KINDS:
             raise unknown(f"kind of error in {name}", str(key), list(KINDS))
     if name == "goal" and not given:
