@@ -48,7 +48,7 @@ RESULTS = {
         "Equilibrium",
         "Estimator",
     ),
-    "FilterSchedule",
+    *("FilterSchedule", "Funnel"),
     *("Gain", "GainSchedule", "Gramians", "Grid", "LinearModel", "LinearTrajectory", "Mode"),
     *("Modes", "Motion", "Observability", "RandomConfigurations", "ReducedModel", "Robot"),
     "Validity",

@@ -17,7 +17,17 @@ from fflin.base.errors import InputError, unknown
 from fflin.base.intervals import clopper_pearson
 from fflin.base.record import Design
 from fflin.base.tables import folded, grid
-from fflin.base.validation import Array, by_name, number, numbers, share, whole
+from fflin.base.validation import (
+    Array,
+    as_double,
+    by_name,
+    dimension,
+    number,
+    numbers,
+    share,
+    vector,
+    whole,
+)
 from fflin.base.writing import as_path
 from fflin.batch.dispatch import ChunkResult
 from fflin.batch.run import Progress, check_workers
@@ -458,11 +468,12 @@ def _places(motion: Trajectory, by: GainSchedule, knots: Any) -> list[tuple[int,
     both = both[both < len(t) - 1]
     if not len(both):
         raise InputError("the schedule is of other times than the trajectory")
-    if np.ndim(knots) == 0:
+    if dimension("knots", knots) == 0:
         chosen = both[np.linspace(0, len(both) - 1, whole("knots", knots, 1)).round().astype(int)]
     else:
-        times = [number("a knot", each) for each in knots]
-        chosen = both[[int(np.abs(motion.t[both] - each).argmin()) for each in times]]
+        times = as_double("knots", knots).ravel()
+        times = vector("knots", times, times.size, "times of knots")
+        chosen = both[np.abs(motion.t[both] - times[:, None]).argmin(axis=1)]
     if not len(chosen):
         raise InputError("knots is empty; give how many, or times [s]")
     return [(k, int(at[k])) for k in sorted({*chosen.tolist()})]

@@ -234,7 +234,8 @@ def test_the_tube_is_where_base_and_tool_may_be(arm, found):
     x = moved_by("local", np.tile(chart.to_state(q, v), (400, 1)), small * z @ root.T)
     for each in shown:
         centres, axes = (
-            np.frombuffer(b64decode(each[key]), "<f4").reshape(160, -1) for key in ("centres", "axes")
+            np.frombuffer(b64decode(each[key]), "<f4").reshape(160, -1)
+            for key in ("centres", "axes")
         )
         A = axes[0].reshape(3, 3).T.astype(float)
         sizes = []
