@@ -94,7 +94,7 @@ from fflin.view.visualize import visualize as visualize
 from fflin.campaign.monte_carlo import monte_carlo as monte_carlo
 from fflin.campaign.campaign import Campaign as Campaign
 from fflin.campaign.funnel import funnel as funnel
-from fflin.campaign.funnel import Funnel as Funnel
+from fflin.campaign.reach import Funnel as Funnel
 from fflin.campaign.validity import validity as validity
 from fflin.campaign.validity import Validity as Validity
 

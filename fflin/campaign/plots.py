@@ -10,7 +10,7 @@ import numpy as np
 from fflin.analysis.displacement import shown
 from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, drawing
-from fflin.campaign.funnel import Funnel
+from fflin.campaign.reach import Funnel
 from fflin.campaign.validity import TRUSTED, Validity
 
 if TYPE_CHECKING:

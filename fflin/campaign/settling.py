@@ -30,17 +30,13 @@ from fflin.robot.robot import Robot
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
 
-# A run has settled where its error is this share of the first, in the norm of its Lyapunov
-# function, and has diverged where it is this many times as large.
+# A run has settled where its error is this share of the first, and has diverged where it is this
+# many times as large.
 SETTLED, DIVERGED = 1e-3, 1e3
-
-# A run has left the chart where 1 - |q_b|^2 is less: within 4 degrees of a turn of 180.
-EDGE = 1e-3
-
+EDGE = 1e-3  # of 1 - |q_b|^2, within 4 degrees of a turn of 180, where a run leaves the chart
 # The prediction is measured over so many time constants of the slowest pole; a random run may take
 # as many times what the slowest pole needs to settle.
 _FORESIGHT, _PATIENCE = 3.0, 3.0
-
 _STEP = 0.25  # over the fastest pole
 _WIDEST = 10.0  # displacement of a joint [rad] up to which steps are as much shorter
 _FINER, _FINEST = 8, 2  # times as many steps where a run diverges, and how often so
@@ -109,7 +105,7 @@ class Loop:
         state, lin = self.state, self.lin
         g = state.groups
         x = state.to_state(lin.q, lin.v)
-        axis, along = _direction(rng), _direction(rng)
+        axis, along = (each / np.linalg.norm(each) for each in rng.normal(size=(2, 3)))
         turn = np.radians(attitude) / 2.0
         q0 = np.sqrt(1.0 - float(x[g.q_b] @ x[g.q_b]))
         relative = np.array((*(np.sin(turn) * axis), np.cos(turn)))
@@ -281,11 +277,7 @@ def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
     """Return the loop of a gain, or raise `InputError` where it cannot settle at the point."""
     if not isinstance(robot, Robot) or not isinstance(lin, LinearModel):
         raise InputError("expected a fflin.Robot, its fflin.LinearModel and a gain")
-    K = as_double("gain", getattr(gain, "K", gain))
-    if K.shape != lin.B.T.shape:
-        raise InputError(f"K has shape {K.shape}, expected {lin.B.T.shape}")
-    if not np.isfinite(K).all():
-        raise InputError("K has entries that are NaN or infinite, expected finite numbers")
+    K = StateFeedback(lin, as_double("gain", getattr(gain, "K", gain))).K
     kept = getattr(gain, "regulated", ())
     part = regulated_part(lin, any(f"qdot_m.{name}" in kept for name in wheel_inputs(lin)))
     if part.state_names == kept:  # the others, which are left to themselves, do not settle
@@ -302,8 +294,3 @@ def checked_loop(robot: Robot, lin: LinearModel, gain: Any) -> Loop:
             "design the gain with fflin.lqr"
         )
     return loop
-
-
-def _direction(rng: np.random.Generator) -> Array:
-    vector = rng.normal(size=3)
-    return vector / np.linalg.norm(vector)

@@ -14,6 +14,7 @@ import numpy as np
 
 from fflin.analysis.displacement import checked_displacement, joint_unit, scaled, shown
 from fflin.base.errors import InputError
+from fflin.base.frozen import FrozenArrays
 from fflin.base.intervals import clopper_pearson
 from fflin.base.tables import folded
 from fflin.base.validation import Array, share, whole
@@ -29,18 +30,13 @@ from fflin.robot.robot import Robot
 _LEVELS = 2.0 ** np.arange(-6.0, 1.0)
 _DIRECTIONS = 4
 
-# Random runs at most.
-_MOST = 1_000_000
-
-# Smaller prediction errors are those of the integration.
-_ROUNDING = 1e-7
-
-# Relative prediction error up to which the linear model is called trusted.
-TRUSTED = 0.1
+_MOST = 1_000_000  # random runs
+_ROUNDING = 1e-7  # prediction errors below it are those of the integration
+TRUSTED = 0.1  # relative prediction error up to which the linear model is called so
 
 
 @dataclass(frozen=True, eq=False)
-class Validity:
+class Validity(FrozenArrays):
     """How far a linear model and its loop reach; prints in words.
 
     A level is a share of the largest displacement: base attitude, base position and joints
@@ -65,10 +61,9 @@ class Validity:
         Of each: "settled", "slow", "chart" or "diverged".
     holds : dict
         The displacement like `trusted` below which every run settled.
-    inside : int
-        Runs up to there.
-    inside_rate : float
-        At least this share of displacements up to there settles, with `confidence`.
+    inside, inside_rate : int, float
+        Runs up to there; at least this share of displacements up to there settles, with
+        `confidence`.
     rate : tuple of float
         Interval (Clopper and Pearson) of the share of all displacements that settles.
     confidence : float
@@ -96,10 +91,6 @@ class Validity:
     robot: str
     frame: str
     frames: dict[str, Validity] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for array in (self.levels, self.prediction_error, self.sampled):
-            array.setflags(write=False)
 
     @property
     def settled(self) -> int:
@@ -185,10 +176,8 @@ def validity(
         Largest displacement of the base [deg], [m], and of the joint displaced most [rad|m]. What
         is not among the states of a reduced model, or not regulated, is not displaced, and given
         as 0.
-    samples : int
-        Number of random runs.
-    seed : int
-        The same seed gives the same result whoever does the runs.
+    samples, seed : int
+        Number of random runs; the same seed gives the same result whoever does them.
     confidence : float
         Of the intervals.
     frames : sequence of {"hybrid", "local", "world"}
@@ -197,10 +186,8 @@ def validity(
     limits : optional
         What cuts the inputs, as of `simulate`, where thrusters never pull; by default the loop is
         free of any.
-    executor, workers, threads, engine : optional
-        As of `monte_carlo`.
-    progress : callable, optional
-        ``progress(done, total)`` is called with the number of runs, random or not, as they end.
+    executor, workers, threads, engine, progress : optional
+        As of `monte_carlo`; ``progress(done, total)`` counts all runs, random or not.
 
     Returns
     -------
@@ -242,46 +229,34 @@ def validity(
                 how = {"executor": others, "workers": workers, "threads": threads, "progress": told}
                 arrays.append(flown(job, rows, np.arange(count), how))
                 done += count
-            worst = arrays[0]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
-            outcomes = tuple(OUTCOMES[int(code)] for code in arrays[1]["outcome"])
-            found.append(_judged(each, largest, levels, worst, outcomes, confidence))
+            found.append(_judged(each, largest, levels, arrays, confidence))
     own, *more = found
     return replace(own, frames={each.frame: each for each in more})
+
+
+def _displaced(
+    loop: Loop, largest: dict[str, float], seed: int, levels: Array | None, runs: Any, *at: int
+) -> Draws:
+    """Return where some runs begin, beside the point, each by a random stream of its own."""
+    drawn, runs = [], runs[slice(*at)]
+    for run in runs.tolist():
+        stream, level = run // len(_LEVELS), _LEVELS[run % len(_LEVELS)]
+        if levels is not None:
+            stream, level = _DIRECTIONS + run, levels[run]
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
+        drawn.append(loop.displaced(rng, **scaled(largest, float(level))))
+    return Draws(np.array(drawn) - loop.state.to_state(loop.lin.q, loop.lin.v), runs)
 
 
 def _tell(progress: Progress, before: int, total: int, done: int, _: int) -> None:
     progress(before + done, total)
 
 
-def _displaced(
-    loop: Loop,
-    largest: dict[str, float],
-    seed: int,
-    levels: Array | None,
-    runs: Any,
-    start: int,
-    stop: int,
-) -> Draws:
-    """Return where some runs begin, beside the point, each by a random stream of its own."""
-    drawn = []
-    for run in runs[start:stop].tolist():
-        stream, level = run // len(_LEVELS), _LEVELS[run % len(_LEVELS)]
-        if levels is not None:
-            stream, level = _DIRECTIONS + run, levels[run]
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
-        drawn.append(loop.displaced(rng, **scaled(largest, float(level))))
-    return Draws(np.array(drawn) - loop.state.to_state(loop.lin.q, loop.lin.v), runs[start:stop])
-
-
 def _judged(
-    loop: Loop,
-    largest: dict[str, float],
-    levels: Array,
-    worst: Array,
-    outcomes: tuple[str, ...],
-    confidence: float,
+    loop: Loop, largest: dict[str, float], levels: Array, runs: list[Any], confidence: float
 ) -> Validity:
-    samples = len(levels)
+    worst = runs[0]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
+    samples, outcomes = len(levels), tuple(OUTCOMES[int(code)] for code in runs[1]["outcome"])
     inside = next((i for i, outcome in enumerate(outcomes) if outcome != "settled"), samples)
     reach = float(levels[inside - 1]) if inside else 0.0
     return Validity(

@@ -21,7 +21,7 @@ from fflin.view.scene import Animation, Drawing, Visualizer, body_paths
 from fflin.view.tube import tubes
 
 if TYPE_CHECKING:
-    from fflin.campaign.funnel import Funnel
+    from fflin.campaign.reach import Funnel
     from fflin.dynamics.state import Frame
     from fflin.simulation.motion import Motion
 

@@ -26,7 +26,7 @@ def tubes(
     InputError
         If the funnel is none of the robot.
     """
-    from fflin.campaign.funnel import Funnel
+    from fflin.campaign.reach import Funnel
 
     if not isinstance(funnel, Funnel):
         raise InputError(f"funnel is a {type(funnel).__name__}, expected what fflin.funnel returns")

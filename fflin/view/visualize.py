@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from os import PathLike
 
     from fflin.analysis.modes import Modes
-    from fflin.campaign.funnel import Funnel
+    from fflin.campaign.reach import Funnel
     from fflin.simulation.motion import Motion
     from fflin.view.live import Live
 
