@@ -148,9 +148,8 @@ class SettlingJob(CampaignJob):
         self.loop, self.foresees, self.fine = loop, foresees, fine
         # Between samples, and where it is cut, the robot is without its loop.
         free = linearize(loop.robot, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
-        fastest = float(np.abs(np.linalg.eigvals(free.A)).max()) * (1.0 + bool(lin.dt))
-        if not lin.dt:
-            fastest = max(fastest, float(np.abs(np.linalg.eigvals(loop.rate)).max()))
+        rates = [2.0 * free.A] if lin.dt else [free.A, loop.rate]
+        fastest = max(float(np.abs(np.linalg.eigvals(each)).max()) for each in rates)
         horizon = (_FORESIGHT if foresees else _PATIENCE * math.log(1.0 / SETTLED)) / decay
         pace = max(fastest, 4.0 * decay) * min(max(joint, 1.0), _WIDEST)
         self.every = math.ceil(lin.dt * pace / _STEP) if lin.dt else 1
@@ -187,10 +186,8 @@ class SettlingJob(CampaignJob):
         Of a linear system CF4 is the classical method of order four, whose steps are those of its
         stability polynomial: so the difference of the two loops is that of what is not linear.
         """
-        if not self.foresees:
-            return None
-        if self.loop.lin.dt:
-            return self.loop.rate
+        if not self.foresees or self.loop.lin.dt:
+            return self.loop.rate if self.foresees else None
         one, Z = np.eye(len(self.loop.rate)), self.loop.rate * dt
         step = one + Z @ (one + Z / 2.0 @ (one + Z / 3.0 @ (one + Z / 4.0)))
         return np.linalg.matrix_power(step, self.every)

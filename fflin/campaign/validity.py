@@ -216,8 +216,7 @@ def validity(
     check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
     foreseen = len(_LEVELS) * _DIRECTIONS
-    total, done = len(loops) * (foreseen + samples), 0
-    found = []
+    total, done, found = len(loops) * (foreseen + samples), 0, list[Validity]()
     with OwnWorkers(workers) if workers else nullcontext(executor) as others:
         for each in loops.values():
             arrays = []
