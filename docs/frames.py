@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 import fflin
-from fflin.analysis.closed_loop import checked_loop
+from fflin.campaign.dispersions import Draws
+from fflin.campaign.settling import OUTCOMES, SettlingJob, checked_loop, flown
 
 FRAMES = ("hybrid", "local", "world")
 ROBOTS, TURNS, POSTURES = ("canadarm2", "ur5", "panda", "servicer_7dof"), (20, 60, 90, 120, 150), 10
@@ -28,9 +29,12 @@ def settled(robot: fflin.Robot, design: str, degrees: float) -> str:
         lin = fflin.linearize(robot, q)
         loop = checked_loop(robot, lin, GAINS[design](lin))
         x = loop.displaced(np.random.default_rng(k), degrees, 0.5 * degrees / 90.0, 0.0)
+        x = (x - loop.state.to_state(lin.q, lin.v))[None]
         for frame in FRAMES:
             there = replace(loop, lin=replace(lin, frame=frame))
-            counts[frame] += there.outcome(x) == "settled"
+            job = SettlingJob(there, False, None, 0.0, engine="python")
+            arrays = flown(job, lambda runs, *_, x=x: Draws(x, runs), np.arange(1), {})
+            counts[frame] += OUTCOMES[int(arrays["outcome"][0])] == "settled"
     return "/".join(map(str, counts.values()))
 
 

@@ -62,8 +62,6 @@ from fflin.analysis.momentum import momentum_reduction as momentum_reduction
 from fflin.analysis.momentum import ReducedModel as ReducedModel
 from fflin.analysis.momentum import generalized_inertia as generalized_inertia
 from fflin.analysis.momentum import generalized_jacobian as generalized_jacobian
-from fflin.analysis.validity import validity as validity
-from fflin.analysis.validity import Validity as Validity
 
 # Control
 from fflin.control.lqr import lqr as lqr
@@ -105,6 +103,10 @@ from fflin.view.visualize import visualize as visualize
 from fflin.campaign.monte_carlo import monte_carlo as monte_carlo
 from fflin.campaign.campaign import Campaign as Campaign
 from fflin.campaign.dispersion_files import load_dispersions as load_dispersions
+from fflin.campaign.funnel import funnel as funnel
+from fflin.campaign.reach import Funnel as Funnel
+from fflin.campaign.validity import validity as validity
+from fflin.campaign.validity import Validity as Validity
 
 # Sweeps
 from fflin.batch.sweep import sweep as sweep
@@ -120,7 +122,8 @@ from fflin.batch.configurations import RandomConfigurations as RandomConfigurati
 from fflin.analysis.plots import plot_matrices as plot_matrices
 from fflin.analysis.plots import plot_check as plot_check
 from fflin.analysis.plots import plot_modes as plot_modes
-from fflin.analysis.plots import plot_validity as plot_validity
+from fflin.campaign.region_plots import plot_validity as plot_validity
+from fflin.campaign.region_plots import plot_funnel as plot_funnel
 from fflin.control.plots import plot_poles as plot_poles
 from fflin.control.plots import plot_loops as plot_loops
 from fflin.simulation.motion import plot_motion as plot_motion

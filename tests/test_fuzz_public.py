@@ -49,7 +49,7 @@ RESULTS = {
         "Equilibrium",
         "Estimator",
     ),
-    "FilterSchedule",
+    *("FilterSchedule", "Funnel"),
     *("Gain", "GainSchedule", "Gramians", "Grid", "LinearModel", "LinearTrajectory", "Mode"),
     *("LFT", "Sensitivity", "Uncertain"),
     *("Modes", "Motion", "Observability", "RandomConfigurations", "ReducedModel", "Robot"),
@@ -109,7 +109,7 @@ OPTIONS = {
 NAMED = {"--limit": "tau_m=", "--q": "q_b=", "--r": "tau_b=", "--range": "joint_1=0:"}
 NAMED |= {"--grid": "joint_1=0:1:"}
 SOUND = {"simulate": ["--duration", "0.02"], "sweep": ["--random", "2"]}
-SOUND["montecarlo"] = ["--runs", "2", "--duration", "0.02", "--dispersions", "uncertain.toml"]
+SOUND["montecarlo"] = ["--runs", "2", "--duration", "0.02", "uncertain.toml"]
 
 
 def arguments_of(command, option, value):

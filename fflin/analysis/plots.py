@@ -1,4 +1,4 @@
-"""Figures of linear models: A and B, modes, what a check found, and how far they reach."""
+"""Figures of linear models: A and B, modes, and what a check found."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fflin.analysis.displacement import shown
 from fflin.analysis.modes import Mode, Modes
-from fflin.analysis.validity import TRUSTED, Validity
 from fflin.base.errors import InputError
 from fflin.base.figures import COLORS, drawing, letters_of
 from fflin.base.names import input_keys, runs
@@ -201,60 +199,3 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
 def _place(row: Any) -> str:
     both = ("ABA derivatives", "differences")
     return row.block if row.test in both else f"{row.test}: {row.block}"
-
-
-def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
-    """Draw how far a linear model foresees the nonlinear loop, and which random runs settled.
-
-    Parameters
-    ----------
-    validity : Validity
-    path : str or Path, optional
-        .png, .pdf or .svg to save to; errors as in `plot_motion`.
-    """
-    if not isinstance(validity, Validity):
-        raise InputError(
-            f"validity is a {type(validity).__name__}, expected what fflin.validity returns"
-        )
-    percent = 100.0
-    with drawing(path, 9.0, 4.3) as figure:
-        left, right = figure.subplots(1, 2)
-        measured = np.isfinite(validity.prediction_error)
-        levels, errors = (each[measured] for each in (validity.levels, validity.prediction_error))
-        # Drawn is the error relative to the displacement, of an order less than the error's own.
-        order = "relative error"
-        if np.isfinite(validity.slope):
-            order += f", ~ displacement^{validity.slope - 1.0:.2f}"
-        left.loglog(percent * levels, percent * errors, "o-", color=COLORS[0], ms=3, label=order)
-        trust = f"trusted up to {percent * TRUSTED:g} %"
-        left.axhline(percent * TRUSTED, color="#888888", lw=0.8, label=trust)
-        left.set_xticks(percent * validity.levels, [f"{percent * x:.3g}" for x in validity.levels])
-        left.minorticks_off()
-        left.set(
-            title="prediction error of the linear loop",
-            xlabel="displacement [% of the largest]",
-            ylabel="error [% of the displacement]",
-        )
-
-        settled = np.array([outcome == "settled" for outcome in validity.outcomes])
-        edges = np.linspace(0.0, 1.0, 11)
-        counts = [np.histogram(validity.sampled[at], edges)[0] for at in (settled, ~settled)]
-        middles, wide = percent * (edges[1:] + edges[:-1]) / 2.0, percent * 0.09
-        right.bar(middles, counts[0], wide, color=COLORS[2], label="settled")
-        right.bar(middles, counts[1], wide, bottom=counts[0], color=COLORS[1], label="not settled")
-        low, high = validity.rate
-        right.set(
-            title=f"{validity.settled} of {len(settled)} runs settled",
-            xlabel="displacement [% of the largest]",
-            ylabel="runs",
-        )
-        right.yaxis.get_major_locator().set_params(integer=True)
-        right.set_ylim(0.0, 1.05 * float(np.add(*counts).max()))
-        figure.legend(loc="outside lower center", ncols=4)
-        figure.suptitle(
-            f"{validity.robot}, up to {shown(validity.largest, validity.joint_unit)}; "
-            f"{percent * low:.1f} to {percent * high:.1f} % settle "
-            f"({percent * validity.confidence:g} % confidence)",
-            fontsize=10,
-        )
-    return figure

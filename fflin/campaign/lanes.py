@@ -107,7 +107,7 @@ class Lanes:
             for lane in np.flatnonzero(lost[:count] & going).tolist():
                 told[lane] = self._said(runs["q"][lane], lane, done)
             stop = np.array(list(map(stop_of, told)), dtype=float)
-            ending = going & ((stop > 0.0) | (done == steps))
+            ending = going & ((stop > 0.0) | (done == steps) | tally.over[:count])
             if not ending.any():
                 continue
             stop = stop[of_lane]

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from fflin.base.errors import FflinError
 from fflin.base.validation import Array
-from fflin.batch.dispatch import ChunkResult
+from fflin.batch.dispatch import ChunkResult, Rows
+from fflin.batch.run import Progress, run_chunks
+from fflin.batch.store import MemoryStore
 from fflin.campaign.dispersion_files import placed
 from fflin.campaign.dispersions import Dispersions, Draws
 from fflin.campaign.tally import KINDS, Outcome, Tally, stop_of
 from fflin.dynamics.state_rows import states_of
+from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
 from fflin.simulation.compiled import engine_of
@@ -35,7 +40,7 @@ class CampaignJob:
     def __init__(
         self, robot: Robot, policy: Any, given: Any, seed: int, engine: str, options: Any
     ) -> None:
-        self._again = partial(_made, robot, policy, given, seed, options=options)
+        self._again: Any = partial(_made, robot, policy, given, seed, options=options)
         histories = (options := dict(options)).pop("histories", 0)
         self.plan, self.plant = planned(robot, policy, linear=False, progress=False, **options)
         self.engine, state = engine, self.plant.state
@@ -172,3 +177,24 @@ def _made(*arguments: Any, **more: Any) -> CampaignJob:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return CampaignJob(*arguments, **more)
+
+
+def done_by(
+    job: Any,
+    rows: Rows,
+    count: int,
+    executor: Executor | None = None,
+    workers: int | None = None,
+    threads: int | None = None,
+    progress: Progress | None = None,
+    least: int = LANES,
+) -> dict[str, Any]:
+    """Return the arrays of all rows of a job, in chunks of `least` or some more."""
+    threads = (threads or available_cores()) if job.engine == "compiled" else 1
+    share = -(-count // (4 * (workers or threads) * least))
+    store = MemoryStore(count, least * min(max(share, 1), 32), job.shapes)
+    failed = run_chunks(job, rows, store, executor=executor, threads=threads, progress=progress)
+    if failed:
+        died = "a process that did the runs died: " if executor else ""
+        raise FflinError(f"{died}{failed[0].reason}")
+    return dict(store.arrays)

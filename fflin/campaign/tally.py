@@ -69,6 +69,7 @@ class Tally:
         ]
         self._parts.append(g.qdot_m.start + np.array(joints, dtype=int))
         self._circling = 6 + state.unbounded
+        self.over = np.zeros(count, dtype=bool)  # none ends before its time
         self.largest_x = np.zeros((count, state.nx))
         self.largest_u = np.zeros((count, len(plan.initial)))
         self.largest = np.zeros((count, len(KINDS)))

@@ -132,9 +132,9 @@ def _momentum(lin: LinearModel) -> str:
 
 
 def _validity(arguments: argparse.Namespace) -> int:
-    from fflin.analysis.validity import validity
     from fflin.base.progress import Progress
     from fflin.batch.workers import OwnWorkers
+    from fflin.campaign.validity import validity
 
     if arguments.jobs < 1:
         raise InputError(f"--jobs is {arguments.jobs}, expected at least 1")

@@ -20,7 +20,10 @@ from fflin.commands import BAD_INPUT, DONE
 TASKS = {
     "look at robots": {"robots": "models", "info": "models", "init": "init", "view": "visual"},
     "make and check a linear model": {"linearize": "models", "check": "models"},
-    "judge it": {"analyze": "analysis", "modes": "analysis", "validity": "analysis"},
+    "judge it": {
+        **dict.fromkeys(("analyze", "modes", "validity"), "analysis"),
+        "funnel": "funnels",
+    },
     "close the loop": {"lqr": "regulator", "tvlqr": "tracking", "simulate": "simulation"},
     "go through many": {"sweep": "sweeps", "montecarlo": "montecarlo"},
 }

@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, add_options, add_output_file, command
+from fflin.commands.arguments import Commands, add_options, add_output_file, command, file_name
 from fflin.commands.loops import add_loop, loop_of
 from fflin.commands.points import load_robot
 from fflin.commands.sweeps import executor_of, going_on
@@ -24,14 +24,19 @@ def add_commands(commands: Commands) -> None:
         *(commands, "montecarlo", _montecarlo),
         "simulate a loop many times with what is uncertain drawn at random: quantiles, shares, "
         "the worst runs and what they come from",
-        "fflin montecarlo ets_vii --dispersions uncertain.toml --runs 1000 --plot runs.png",
+        "fflin montecarlo ets_vii uncertain.toml --runs 1000 --plot runs.png",
     )
     add_loop(montecarlo)
+    montecarlo.add_argument(
+        "dispersions",
+        metavar="DISPERSIONS",
+        type=file_name,
+        help="what is drawn at random, a table [dispersions] in TOML as fflin.load_dispersions "
+        "reads it",
+    )
     add_options(
         montecarlo.add_argument_group("the runs, and who does them"),
         """
-        --dispersions FILE!: what is drawn at random, a table [dispersions] in TOML as
-            fflin.load_dispersions reads it
         --runs N!: how many
         --seed S = 0: of the draws; 0 by default
         --until CONDITION: make no more runs once the share that meets it, 'attitude < 1 deg', is

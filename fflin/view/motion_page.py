@@ -18,9 +18,11 @@ from fflin.view.panel import panel
 from fflin.view.playback import Playback, body_poses, frame_indices, play_back, thrusters
 from fflin.view.recorder import Recorder
 from fflin.view.scene import Animation, Drawing, Visualizer, body_paths
+from fflin.view.tube import tubes
 
 if TYPE_CHECKING:
     from fflin.campaign.campaign import Campaign
+    from fflin.campaign.reach import Funnel
     from fflin.dynamics.state import Frame
     from fflin.simulation.motion import Motion
 
@@ -47,6 +49,7 @@ def motion_page(
     target: Array | None,
     tool: str | None,
     cloud: Campaign | None = None,
+    funnel: Funnel | None = None,
 ) -> tuple[str, tuple[str, ...]]:
     """Return the page of a motion, and what could not be drawn; see `visualize`."""
     shown = frame_indices(motion.t, fps, speed)
@@ -93,7 +96,9 @@ def motion_page(
         from fflin.view.cloud import cloud_of
 
         info["cloud"] = cloud_of(robot, cloud, tool)
+    colors = (TOOL_COLOR, COM_COLOR)
     info |= {
+        "tubes": tubes(robot, funnel, tool, info["size"], colors) if funnel is not None else [],
         "mode": "motion",
         "t": packed(t),
         "speed": speed,

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from fflin.analysis.modes import Modes
     from fflin.campaign.campaign import Campaign
+    from fflin.campaign.reach import Funnel
     from fflin.simulation.motion import Motion
     from fflin.view.live import Live
 
@@ -51,6 +52,7 @@ def visualize(
     target: Array | None = None,
     tool: str | None = None,
     cloud: Campaign | None = None,
+    funnel: Funnel | None = None,
     q: Array | None = None,
     port: int = 0,
 ) -> Live | Path | None:
@@ -98,6 +100,8 @@ def visualize(
     cloud : Campaign, optional
         Of `monte_carlo`: the paths of base and tool in up to 240 of its runs, as thin lines. The
         motion may be a run of it, `Campaign.replay`, which is shown with the bodies that it drew.
+    funnel : Funnel, optional
+        Of the trajectory that the motion follows: where base and tool may be is drawn as a tube.
     q : array_like (nq,), optional
         Where a live robot stands first; by default at its `start`, or neutral.
     port : int
@@ -170,8 +174,8 @@ def visualize(
         from fflin.view.motion_page import motion_page
 
         goal = None if target is None else _configuration(robot, "target", target)
-        how: Any = {"scene": scene, "fps": fps, "speed": speed, "follow": follow}
-        page, notes = motion_page(robot, motion, **how, target=goal, tool=tool, cloud=cloud)
+        how: Any = {"scene": scene, "fps": fps, "speed": speed, "follow": follow, "target": goal}
+        page, notes = motion_page(robot, motion, **how, tool=tool, cloud=cloud, funnel=funnel)
         contents = _pictures(page, outputs, motion, speed, times)
     for note in notes:
         warn(note, FflinWarning, stacklevel=2)

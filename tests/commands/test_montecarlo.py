@@ -15,7 +15,7 @@ from tests.support.commands import refused, run
 from tests.support.patience import PATIENCE
 
 TOML = '[dispersions]\nq_b = 0.05\n"*.mass" = 0.1\nq_m = {uniform = [-0.2, 0.2]}\n'
-SHORT = ("--dispersions", "u.toml", "--duration", "0.4", "--step", "0.02")
+SHORT = ("u.toml", "--duration", "0.4", "--step", "0.02")
 
 
 @pytest.fixture
@@ -64,8 +64,8 @@ def test_it_flies_what_python_flies_and_says_it_as_text_and_json(folder, robots)
         (("--runs", "3", "-o", "x.csv"), "x.csv.*expected one of .npz, .h5"),
         (("--runs", "3", "--goal", "attitude < 1 m"), "in m, expected deg"),
         (("--runs", "3", "--until", "nosuch < 1"), "no figure named 'nosuch'"),
-        (("--runs", "3", "--dispersions", "none.toml"), "none.toml: cannot be read"),
-        (("--runs", "3", "--dispersions", "bad.toml"), "bad.toml:2: no state to .* 'nosuch'"),
+        (("--runs", "3", "none.toml"), "none.toml: cannot be read"),
+        (("--runs", "3", "bad.toml"), "bad.toml:2: no state to .* 'nosuch'"),
         (("--runs", "3", "--workers", "2", "--dask", "x"), "give either"),
         (("--runs", "3", "--plot", "x.gif"), "x.gif"),
         (("--runs", "3", "-o", "x.h5", "--plot", "x.h5"), "x.h5"),

@@ -103,6 +103,12 @@ def sound(folder):
         "lqr_batch": {"batch": batch} | weights,
         "modes": {"lin": lin},
         "Momentum": {},
+        "funnel": {
+            **{"robot": robot, "schedule": schedule, "goal": {"attitude": 1.0}, "within": None},
+            **{"knots": 1, "samples": 1, "seed": 0, "confidence": 0.9, "dt": 0.01, "engine": None},
+            **dict.fromkeys(("executor", "workers", "threads", "progress", "limits", "sample")),
+        },
+        "plot_funnel": {"funnel": None, "path": None},
         "momentum_reduction": {"lin": fflin.linearize(robot.replace(inputs=robot.inputs[2:]))},
         "monte_carlo": {
             **{"robot": robot, "policy": None, "dispersions": {"q_b": 0.01}, "runs": 2, "seed": 0},
@@ -176,12 +182,13 @@ def sound(folder):
         "validity": {
             **{"robot": robot, "lin": lin, "gain": None, "attitude": 5.0, "position": 0.1},
             **{"joint": 0.1, "samples": 1, "seed": 0, "confidence": 0.9, "executor": None},
-            "frames": (),
+            **{"frames": (), "limits": None, "workers": None, "threads": 1, "engine": None},
         },
         "velocity": {"robot": robot, "values": {}},
         "visualize": {
             **{"robot": robot, "motion": motion, "html": folder / "a.html", "open": False},
             **{"tool": None, "fps": 10.0, "speed": 1.0, "scene": "space", "cloud": None},
+            "funnel": None,
         },
         "Sensitivity.along": {"self": sensitive, "direction": {"base.mass": 1.0}},
         "Sensitivity.check": {"self": sensitive, "names": ["base.mass"]},

@@ -185,6 +185,42 @@ function plume({ position, direction, values, most, size, colour }) {
   return group;
 }
 
+// All ellipsoids of a path as one translucent body: first its depth, then the surface that is seen.
+function tube({ name, colour, centres, axes }) {
+  const group = new THREE.Group(), count = centres.length / 3;
+  const at = (k) => new THREE.Matrix4().set(
+    ...[0, 1, 2].flatMap((row) => [0, 3, 6].map((c) => axes[9 * k + c + row]).concat(centres[3 * k + row])), 0, 0, 0, 1);
+  for (const seen of [false, true]) {
+    const material = new THREE.ShaderMaterial({
+      transparent: true, colorWrite: seen, depthWrite: !seen, depthFunc: seen ? THREE.EqualDepth : THREE.LessEqualDepth,
+      uniforms: { tint: { value: new THREE.Color(colour) } },
+      vertexShader: `
+        varying vec3 n; varying vec3 eye;
+        void main() {
+          mat3 M = mat3(instanceMatrix);
+          vec3 squares = vec3(dot(M[0], M[0]), dot(M[1], M[1]), dot(M[2], M[2]));
+          vec4 p = modelViewMatrix * (instanceMatrix * vec4(position, 1.0));
+          n = normalMatrix * (M * (normal / squares)); eye = -p.xyz;
+          gl_Position = projectionMatrix * p;
+        }`,
+      fragmentShader: `
+        varying vec3 n; varying vec3 eye; uniform vec3 tint;
+        void main() {
+          float rim = 1.0 - abs(dot(normalize(n), normalize(eye)));
+          gl_FragColor = vec4(mix(tint, vec3(1.0), 0.15 + 0.25 * rim), 0.14 + 0.56 * rim * rim);
+        }`,
+    });
+    const bodies = new THREE.InstancedMesh(new THREE.SphereGeometry(1, 28, 18), material, count);
+    for (let k = 0; k < count; k++) bodies.setMatrixAt(k, at(k));
+    bodies.frustumCulled = false;
+    const inside = name === "base"; // the body
+    bodies.renderOrder = 10 + 2 * inside + seen; // after all that is seen through it
+    if (inside && !seen) bodies.onBeforeRender = (renderer) => { renderer.state.buffers.depth.setMask(true); renderer.clearDepth(); };
+    group.add(bodies);
+  }
+  return group;
+}
+
 // Put all marks into the scene. Returns what shows frame i of them.
 function makeMarks(viewer, info) {
   const shows = [];
@@ -196,6 +232,7 @@ function makeMarks(viewer, info) {
   info.trails.forEach((each) => add(["meshcat", "trails", each.name], trail(each)));
   info.followed.forEach((each, k) => add(["meshcat", "target", `path ${k}`], trail({ ...each, colour: GHOST, dashed: true })));
   (info.cloud ?? []).forEach((each) => add(["meshcat", "cloud", each.name], cloud(each)));
+  info.tubes.forEach((each) => add(["meshcat", "funnel", each.name], tube(each)));
   const wrench = viewer.scene_tree.find(["meshcat", "wrench"]).object;
   const base = viewer.scene_tree.find(info.base).object;
   for (const each of info.arrows) {

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, as_completed
+from collections.abc import Iterable
+from concurrent.futures import Executor
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from fflin.analysis.closed_loop import Loop, checked_loop
 from fflin.analysis.displacement import checked_displacement, joint_unit, scaled, shown
-from fflin.base.errors import FflinError, InputError
+from fflin.base.errors import InputError
+from fflin.base.frozen import FrozenArrays
 from fflin.base.intervals import clopper_pearson
 from fflin.base.tables import folded
 from fflin.base.validation import Array, share, whole
-from fflin.dynamics.state import Frame, StateMap
+from fflin.batch.run import Progress, check_workers
+from fflin.batch.workers import OwnWorkers
+from fflin.campaign.dispersions import Draws
+from fflin.campaign.settling import OUTCOMES, Loop, SettlingJob, checked_loop, flown
+from fflin.dynamics.state import Frame
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -25,18 +30,13 @@ from fflin.robot.robot import Robot
 _LEVELS = 2.0 ** np.arange(-6.0, 1.0)
 _DIRECTIONS = 4
 
-# Random runs at most.
-_MOST = 1_000_000
-
-# Smaller prediction errors are those of the integration.
-_ROUNDING = 1e-7
-
-# Relative prediction error up to which the linear model is called trusted.
-TRUSTED = 0.1
+_MOST = 1_000_000  # random runs
+_ROUNDING = 1e-7  # prediction errors below it are those of the integration
+TRUSTED = 0.1  # relative prediction error up to which the linear model is called so
 
 
 @dataclass(frozen=True, eq=False)
-class Validity:
+class Validity(FrozenArrays):
     """How far a linear model and its loop reach; prints in words.
 
     A level is a share of the largest displacement: base attitude, base position and joints
@@ -61,10 +61,9 @@ class Validity:
         Of each: "settled", "slow", "chart" or "diverged".
     holds : dict
         The displacement like `trusted` below which every run settled.
-    inside : int
-        Runs up to there.
-    inside_rate : float
-        At least this share of displacements up to there settles, with `confidence`.
+    inside, inside_rate : int, float
+        Runs up to there; at least this share of displacements up to there settles, with
+        `confidence`.
     rate : tuple of float
         Interval (Clopper and Pearson) of the share of all displacements that settles.
     confidence : float
@@ -92,10 +91,6 @@ class Validity:
     robot: str
     frame: str
     frames: dict[str, Validity] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for array in (self.levels, self.prediction_error, self.sampled):
-            array.setflags(write=False)
 
     @property
     def settled(self) -> int:
@@ -154,15 +149,20 @@ def validity(
     seed: int = 0,
     confidence: float = 0.95,
     frames: Iterable[Frame] = (),
+    limits: Any = None,
     executor: Executor | None = None,
-    progress: Callable[[int, int], object] | None = None,
+    workers: int | None = None,
+    threads: int | None = None,
+    progress: Progress | None = None,
+    engine: str | None = None,
 ) -> Validity:
     """Measure how far from its point a linear model can be trusted, and its loop holds.
 
     The nonlinear robot under ``u = u0 - K (x - x0)``, held between samples where the model is
     sampled, is followed from displacements at the point's velocity: from growing ones beside the
     linear prediction, and from random ones until the error is a thousandth of the first. A run
-    that takes three times as long as the slowest pole needs has not settled.
+    that takes three times as long as the slowest pole needs has not settled. With numba eight runs
+    go at a time.
 
     Parameters
     ----------
@@ -176,19 +176,18 @@ def validity(
         Largest displacement of the base [deg], [m], and of the joint displaced most [rad|m]. What
         is not among the states of a reduced model, or not regulated, is not displaced, and given
         as 0.
-    samples : int
-        Number of random runs.
-    seed : int
-        The same seed gives the same result whatever the executor.
+    samples, seed : int
+        Number of random runs; the same seed gives the same result whoever does them.
     confidence : float
         Of the intervals.
     frames : sequence of {"hybrid", "local", "world"}
         In whose axes the same linear loop is to be tried too, from the same displacements; the
         base of the point must not be turned against the reference.
-    executor : concurrent.futures.Executor, optional
-        Runs them in parallel, such as a ProcessPoolExecutor.
-    progress : callable, optional
-        ``progress(done, total)`` is called with the number of runs, random or not, as they end.
+    limits : optional
+        What cuts the inputs, as of `simulate`, where thrusters never pull; by default the loop is
+        free of any.
+    executor, workers, threads, engine, progress : optional
+        As of `monte_carlo`; ``progress(done, total)`` counts all runs, random or not.
 
     Returns
     -------
@@ -197,8 +196,8 @@ def validity(
     Raises
     ------
     InputError
-        If the linear loop is unstable, the point is no fixed point, or an argument has a wrong
-        size or value.
+        If the linear loop is unstable, the point is no fixed point, the loop's poles are so far
+        apart that a run takes a million steps, or an argument has a wrong size or value.
     FflinError
         If a process of the executor died.
 
@@ -213,52 +212,51 @@ def validity(
     confidence = share("confidence", confidence)
     if isinstance(frames, str) or not isinstance(frames, Iterable):
         raise InputError(f"frames is {frames!r}, expected several, such as ('hybrid', 'local')")
-    loops = {loop.lin.frame: loop} | {each: _in_frame(loop, each) for each in frames}
-    # Each run has its own random stream, so that results do not depend on the order.
-    streams = np.random.SeedSequence(seed).spawn(samples + _DIRECTIONS)
+    loops = {loop.lin.frame: loop} | {each: loop.fed_back_in(each) for each in frames}
+    check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
-    if executor is not None and not isinstance(executor, Executor):
-        raise InputError(
-            f"executor is a {type(executor).__name__}, expected a concurrent.futures.Executor"
-        )
-    if progress is not None and not callable(progress):
-        raise InputError(f"progress is {progress!r}, expected a function progress(done, total)")
-    runs: list[Callable[[], Any]] = []
-    for each in loops.values():
-        runs += (partial(_foreseen, each, largest, stream) for stream in streams[:_DIRECTIONS])
-        runs += map(partial(partial, _outcome, each, largest), levels, streams[_DIRECTIONS:])
-    found: list[Any] = [None] * len(runs)
-    for done, (index, result) in enumerate(_each(runs, executor), 1):
-        found[index] = result
-        if progress:
-            progress(done, len(runs))
-    one = len(streams)
-    own, *others = (
-        _judged(each, largest, levels, found[k * one : (k + 1) * one], confidence)
-        for k, each in enumerate(loops.values())
-    )
-    return replace(own, frames={each.frame: each for each in others})
+    foreseen = len(_LEVELS) * _DIRECTIONS
+    total, done, found = len(loops) * (foreseen + samples), 0, list[Validity]()
+    with OwnWorkers(workers) if workers else nullcontext(executor) as others:
+        for each in loops.values():
+            arrays = []
+            for foresees, count in ((True, foreseen), (False, samples)):
+                job = SettlingJob(each, foresees, limits, largest["joint"])
+                job.choose(engine, max(1, total // 3))
+                rows = partial(_displaced, each, largest, seed, None if foresees else levels)
+                told = progress and partial(_tell, progress, done, total)
+                how = {"executor": others, "workers": workers, "threads": threads, "progress": told}
+                arrays.append(flown(job, rows, np.arange(count), how))
+                done += count
+            found.append(_judged(each, largest, levels, arrays, confidence))
+    own, *more = found
+    return replace(own, frames={each.frame: each for each in more})
 
 
-def _in_frame(loop: Loop, frame: Frame) -> Loop:
-    """Return the same linear loop, fed back in other axes."""
-    state = StateMap(loop.robot, reference=loop.lin.reference, frame=frame)
-    if not np.allclose(state.to_state(loop.lin.q, loop.lin.v)[:3], 0.0, atol=1e-9):
-        raise InputError(
-            "the base of the point is turned against the reference, where frames have different "
-            "models; compare them on a model made without a reference"
-        )
-    return replace(loop, lin=replace(loop.lin, frame=state.frame))
+def _displaced(
+    loop: Loop, largest: dict[str, float], seed: int, levels: Array | None, runs: Any, *at: int
+) -> Draws:
+    """Return where some runs begin, beside the point, each by a random stream of its own."""
+    drawn, runs = [], runs[slice(*at)]
+    for run in runs.tolist():
+        stream, level = run // len(_LEVELS), _LEVELS[run % len(_LEVELS)]
+        if levels is not None:
+            stream, level = _DIRECTIONS + run, levels[run]
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
+        drawn.append(loop.displaced(rng, **scaled(largest, float(level))))
+    return Draws(np.array(drawn) - loop.state.to_state(loop.lin.q, loop.lin.v), runs)
+
+
+def _tell(progress: Progress, before: int, total: int, done: int, _: int) -> None:
+    progress(before + done, total)
 
 
 def _judged(
-    loop: Loop, largest: dict[str, float], levels: Array, found: list[Any], confidence: float
+    loop: Loop, largest: dict[str, float], levels: Array, runs: list[Any], confidence: float
 ) -> Validity:
-    worst = np.array(found[:_DIRECTIONS]).max(axis=0)
-    outcomes, samples = tuple(found[_DIRECTIONS:]), len(levels)
-    failed = [i for i, outcome in enumerate(outcomes) if outcome != "settled"]
-    inside = failed[0] if failed else samples
-    settled = outcomes.count("settled")
+    worst = runs[0]["error"].reshape(_DIRECTIONS, -1).max(axis=0)
+    samples, outcomes = len(levels), tuple(OUTCOMES[int(code)] for code in runs[1]["outcome"])
+    inside = next((i for i, outcome in enumerate(outcomes) if outcome != "settled"), samples)
     reach = float(levels[inside - 1]) if inside else 0.0
     return Validity(
         levels=_LEVELS,
@@ -270,44 +268,13 @@ def _judged(
         holds=scaled(largest, reach),
         inside=inside,
         inside_rate=(1.0 - confidence) ** (1.0 / inside) if inside else 0.0,
-        rate=clopper_pearson(settled, samples, confidence)[1:],
+        rate=clopper_pearson(outcomes.count("settled"), samples, confidence)[1:],
         confidence=confidence,
         largest=largest,
         joint_unit=joint_unit(loop.lin),
         robot=loop.lin.robot,
         frame=loop.lin.frame,
     )
-
-
-def _each(runs: list[Callable[[], Any]], executor: Executor | None) -> Iterator[tuple[int, Any]]:
-    """Yield the number and the result of each run as it ends."""
-    if executor is None:
-        yield from ((index, run()) for index, run in enumerate(runs))
-        return
-    futures = {executor.submit(run): index for index, run in enumerate(runs)}
-    try:
-        for future in as_completed(futures):
-            yield futures.pop(future), future.result()
-    except BrokenExecutor as error:
-        raise FflinError(f"a process that did the runs died: {error}") from None
-    finally:
-        for future in futures:
-            future.cancel()
-
-
-def _foreseen(loop: Loop, largest: dict[str, float], stream: np.random.SeedSequence) -> Array:
-    """Return the relative prediction error at each level along one direction."""
-    starts = (
-        loop.displaced(np.random.default_rng(stream), **scaled(largest, float(level)))
-        for level in _LEVELS
-    )
-    return np.array([loop.prediction_error(x) for x in starts])
-
-
-def _outcome(
-    loop: Loop, largest: dict[str, float], level: float, stream: np.random.SeedSequence
-) -> str:
-    return loop.outcome(loop.displaced(np.random.default_rng(stream), **scaled(largest, level)))
 
 
 def _slope(errors: Array) -> float:

@@ -1,0 +1,189 @@
+"""A funnel: ellipsoids of errors along a trajectory, with the runs that tell of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from fflin.base.errors import InputError
+from fflin.base.intervals import clopper_pearson
+from fflin.base.record import Design
+from fflin.base.tables import folded, grid
+from fflin.base.validation import Array, number
+from fflin.base.writing import as_path
+from fflin.dynamics.points import point_of
+from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import moving_error
+from fflin.linear.trajectory import Trajectory
+from fflin.robot.robot import Robot
+
+_ROUNDING = 1e-12  # of P, below which a direction has no weight
+
+
+def spread(P: Array) -> Array:
+    """Return W (nx, r) whose W W' is the pseudoinverse of P, each error in its own scale."""
+    scale = np.sqrt(P.diagonal().clip(min=0.0))
+    unit = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
+    values, axes = np.linalg.eigh(unit[:, None] * P * unit)
+    kept = values > _ROUNDING * values.max()
+    found: Array = unit[:, None] * axes[:, kept] / np.sqrt(values[kept])
+    return found
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Funnel(Design):
+    """Ellipsoids ``e' P(t) e <= rho`` of errors from a trajectory; prints as a table.
+
+    The errors are those of `linearize_trajectory`, P is the schedule's cost to go. A direction that
+    P gives no weight is not tried.
+
+    Attributes
+    ----------
+    t : ndarray (m,)
+        Knots [s].
+    tried : ndarray (m,)
+        The largest level rho at which runs began, evenly spread over its root.
+    outcomes : ndarray (m, N)
+        Of each run, by its level: 0 it ended inside the goal, 1 it was lost, 2 it went beyond
+        `within`, 3 it missed the goal.
+    rho, inside, inside_rate : ndarray (m,)
+        The largest level up to which every run succeeded, how many these are, and the share of
+        starts up to there that succeeds at least, with `confidence`.
+    rate : ndarray (m, 2)
+        Interval (Clopper and Pearson) of the share of all starts up to `tried` that succeeds.
+    attitude, position, joints : ndarray (m, 3), (m, 3), (m, n)
+        Half axes in the base's attitude [deg] and position [m], and of each joint [rad|m].
+    goal, within : str
+        What a run had to keep to at its end, and on its way.
+    confidence : float
+    at, P : ndarray (M,), (M, nx, nx)
+        Of the schedule.
+    knots, q, v, u, hold, frame
+        The trajectory, see `trajectory`.
+    """
+
+    VECTORS: ClassVar = ("t", "tried", "at", "knots")
+
+    robot: Robot
+    t: Array
+    tried: Array
+    outcomes: Array
+    goal: str
+    within: str
+    confidence: float
+    at: Array
+    P: Array
+    knots: Array
+    q: Array
+    v: Array
+    u: Array
+    hold: str
+    frame: str
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        count, sure = self.outcomes.shape[1], self.confidence
+        failed = self.outcomes != 0.0
+        inside = np.where(failed.any(axis=1), failed.argmax(axis=1), count)
+        kept = count - failed.sum(axis=1)
+        values: dict[str, Any] = {
+            "inside": inside,
+            "rho": self.tried * ((inside - 0.5).clip(min=0.0) / count) ** 2,
+            "inside_rate": (inside > 0) * (1.0 - sure) ** (1.0 / inside.clip(min=1)),
+            "rate": np.array([clopper_pearson(int(x), count, sure)[1:] for x in kept]),
+        }
+        self.__dict__.update(values)
+        roots = [self.root(t) for t in self.t.tolist()]
+        turn, place = (np.array([_axes(W[part]) for W in roots]) for part in _BASE)
+        joints = [np.linalg.norm(W[6 : 6 + self.robot.n], axis=1) for W in roots]
+        self.__dict__["attitude"] = np.degrees(2.0 * np.arcsin(np.minimum(turn, 1.0)))
+        self.__dict__.update(position=place, joints=np.array(joints))
+
+    def __getattr__(self, name: str) -> Any:  # what `__post_init__` adds
+        raise AttributeError(name)
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """What is followed."""
+        values: Any = (self.robot, self.knots, self.q, self.v, self.u)
+        return Trajectory(*values, hold=self.hold, frame=self.frame)
+
+    def level(self, t: float) -> float:
+        """Return rho at a time; between two knots the lesser of theirs."""
+        t = number("t", t)
+        if not self.t[0] <= t <= self.t[-1]:
+            raise InputError(f"t is {t:g} s, expected {self.t[0]:g} to {self.t[-1]:g} s")
+        near = [self.t.searchsorted(t, side) - (side == "right") for side in ("right", "left")]
+        return float(self.rho[near].min())
+
+    def cost(self, t: float) -> Array:
+        """Return P (nx, nx) at a time, linear between the schedule's."""
+        k = int(np.clip(self.at.searchsorted(t, "right") - 1, 0, len(self.at) - 2))
+        part = float(np.clip((t - self.at[k]) / (self.at[k + 1] - self.at[k]), 0.0, 1.0))
+        P: Array = (1.0 - part) * self.P[k] + part * self.P[k + 1]
+        return P
+
+    def root(self, t: float, *, smooth: bool = False) -> Array:
+        """Return W (nx, r): the ellipsoid at a time is of all W z with z of length 1 or less.
+
+        Smooth ones go over from knot to knot, as they are drawn.
+        """
+        size = np.interp(t, self.t, np.sqrt(self.rho)) if smooth else np.sqrt(self.level(t))
+        return size * spread(self.cost(t))
+
+    def contains(self, t: float, x: Any = None, *, q: Any = None, v: Any = None) -> bool:
+        """Whether a state is inside at a time.
+
+        Parameters
+        ----------
+        t : float
+            [s], within the knots `t`.
+        x : array_like (nx,), optional
+            State of ``StateMap(robot, frame="local")``.
+        q, v : array_like (nq,), (nv,), optional
+            Instead of x, in Pinocchio's order; at rest where v is left out.
+        """
+        rho, state = self.level(t), StateMap(self.robot, frame="local")
+        if x is None and q is None:
+            raise InputError("give x, or q and v")
+        q, v = point_of(state, x, q, v, lambda: (q, v))
+        e = moving_error(state, *self.trajectory.flow.at(float(t))[:2], q, v)
+        return bool(e @ self.cost(t) @ e <= rho)
+
+    def __repr__(self) -> str:
+        m, count = self.outcomes.shape
+        return f"Funnel('{self.robot.name}', {m} knots of {count} runs, goal '{self.goal}')"
+
+    def __str__(self) -> str:
+        count, sure = self.outcomes.shape[1], f"{100.0 * self.confidence:g} %"
+        head = f"{self.robot.name}: errors from which every run ends with {self.goal}"
+        head += f", {self.within} on its way" * bool(self.within) + f"; {count} runs a knot"
+        tail = (
+            "base, joint: largest half axes; runs: those inside, all of which succeeded (+: of all "
+            "that were tried); sure: at least so many of the starts inside succeed, of all: of "
+            f"those up to the largest level that was tried ({sure} confidence)"
+        )
+        rows = [["t [s]", "rho", "base [deg]", "base [m]", "joint", "runs", "sure", "of all"]]
+        wide = (self.attitude, self.position, self.joints)
+        for k, (low, high) in enumerate(100.0 * self.rate):
+            reach = [f"{each[k].max(initial=0.0):.3g}" for each in wide]
+            many = f"{self.inside[k]}{' +' if self.inside[k] == count else ''}"
+            shares = [f"{100.0 * self.inside_rate[k]:.1f} %", f"{low:.0f}-{high:.0f} %"]
+            rows.append([f"{self.t[k]:.4g}", f"{self.rho[k]:.3g}", *reach, many, *shares])
+        return "\n".join([folded([head]), "", grid(rows, "r"), "", folded([tail])])
+
+    @classmethod
+    def load(cls, path: str | Path, robot: Robot) -> Funnel:  # type: ignore[override]
+        """Read what `save` wrote, of a robot; errors as of `Gain.load`."""
+        return cls._read(as_path(path), robot=robot)
+
+
+_BASE = slice(0, 3), slice(3, 6)
+
+
+def _axes(W: Array) -> Array:
+    return np.linalg.svd(np.hstack((W, np.zeros((3, 3)))))[1]

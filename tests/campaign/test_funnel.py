@@ -1,0 +1,297 @@
+"""The region around a trajectory: against a loop that is linear, its counts, and its record."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.integrate import solve_ivp
+
+import fflin
+from fflin.campaign.funnel import FunnelJob
+from fflin.campaign.reach import spread
+from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import moved_by, moving_error
+from fflin.view.playback import default_tool
+from fflin.view.tube import tubes
+from tests.support.commands import refused, run
+
+OUTCOME, DURATION = {"within": 0, "lost": 1, "beyond": 2, "missed": 3}, 12.0
+
+
+@pytest.fixture(scope="module")
+def still():
+    """A body that is to stay where it is: tiny errors of it are those of a linear loop."""
+    robot = fflin.load("cubesat")
+    t = np.linspace(0.0, DURATION, 7)
+    q = np.tile(fflin.configuration(robot), (7, 1))
+    motion = fflin.Trajectory(robot, t, q, np.zeros((7, 6)), np.zeros((7, 6)))
+    return robot, fflin.linearize_trajectory(robot, motion)
+
+
+@pytest.fixture(scope="module")
+def schedule(still):
+    return fflin.tvlqr(still[1], 1.0, {"tau_b": 1e4, "F_b": 10.0}, 4.0)
+
+
+@pytest.fixture(scope="module")
+def arm(robots):
+    """A planar arm on its way, its base turned far from the world's axes."""
+    robot = robots["planar_detumble"]
+    base = pin.SE3(pin.exp3(np.array([0.0, 3.1, 0.0])), np.zeros(3))
+    q0, v0 = (
+        fflin.configuration(robot, {"joint_1": 0.3}, base),
+        fflin.velocity(robot, {"joint_2": 0.2}),
+    )
+    motion = fflin.simulate(robot, None, q0=q0, v0=v0, duration=2.0, dt=0.05, every=4)
+    along = fflin.linearize_trajectory(robot, motion.trajectory())
+    return robot, fflin.tvlqr(along, 1.0, 1.0, 4.0, sample=0.1)
+
+
+@pytest.fixture(scope="module")
+def found(arm):
+    return fflin.funnel(*arm, {"attitude": 5.0, "joints": 0.1}, knots=3, samples=16, dt=0.05)
+
+
+def passage(still, schedule, t):
+    """What takes an error at a time to the end, of the linear loop."""
+    along = still[1]
+
+    def rate(time, e):
+        A, B = along.matrices(min(time, DURATION))
+        return ((A - B @ schedule.gain(min(time, DURATION))) @ e.reshape(12, 12)).ravel()
+
+    way = solve_ivp(rate, (t, DURATION), np.eye(12).ravel(), rtol=1e-9, atol=1e-12)
+    return way.y[:, -1].reshape(12, 12)
+
+
+def ends(still, schedule, t):
+    """M (12, 12) such that a start of root level s, direction z, ends at level s^2 |M z|^2."""
+    root = np.linalg.cholesky(schedule.P[-1])
+    k = int(np.abs(schedule.t - t).argmin())
+    return root.T @ passage(still, schedule, t) @ spread(schedule.P[k])
+
+
+def successes(M, goal, size, rng, count=4000):
+    """The share of starts up to a root level that end within a level."""
+    z = rng.normal(size=(count, 12))
+    z *= (rng.uniform(size=count) / np.linalg.norm(z, axis=1))[:, None]
+    return ((size * z @ M.T) ** 2).sum(axis=1) <= goal
+
+
+def test_of_a_linear_loop_it_is_known(still, schedule):
+    """No run fails below the level that the worst direction bears, and as many as should above."""
+    goal, rng = 1e-8, np.random.default_rng(0)
+    found = fflin.funnel(still[0], schedule, goal, knots=3, samples=120, dt=0.1)
+    assert len(found.t) == 3 and found.t[0] == 0.0
+    for k, t in enumerate(found.t):
+        M = ends(still, schedule, t)
+        bears = goal / np.linalg.norm(M, 2) ** 2
+        assert found.rho[k] >= bears * (1.0 - 1.0 / 120.0) ** 2
+        assert found.rho[k] < found.tried[k]
+        good = (found.outcomes[k] == OUTCOME["within"]).sum()
+        share = successes(M, goal, np.sqrt(found.tried[k]), rng).mean()
+        assert abs(good - 120 * share) < 4.0 * np.sqrt(120 * share * (1.0 - share)) + 1.0
+    # What is left to lose grows on the way: the linear loop's cost falls.
+    assert (np.diff(found.rho) < 0.0).all() and (found.rho > goal).all()
+
+
+def test_a_narrower_goal_is_a_narrower_funnel(still, schedule):
+    wide, narrow = (
+        fflin.funnel(still[0], schedule, goal, knots=2, samples=40, dt=0.1)
+        for goal in ({"attitude": 1.0, "position": 0.02}, {"attitude": 0.25, "position": 0.005})
+    )
+    ratio = np.sqrt(wide.rho / narrow.rho)
+    assert ((ratio > 2.5) & (ratio < 6.5)).all()  # 4 in a linear loop, but for chance
+    kept = fflin.funnel(
+        still[0], schedule, {"attitude": 1.0, "position": 0.02}, within={"turning": 1e-4}, knots=2
+    )
+    assert (kept.rho < wide.rho).all() and OUTCOME["beyond"] in kept.outcomes
+    # No motion of its own keeps an arm to a goal that it never comes near.
+    weak = fflin.funnel(still[0], schedule, {"attitude": 1.0}, knots=1, limits=1e-12, samples=8)
+    strong = fflin.funnel(still[0], schedule, {"attitude": 1.0}, knots=1, samples=8)
+    assert weak.rho[0] < strong.rho[0]
+
+
+def test_what_is_sure_is_so_in_as_many_cases_as_it_says(still, schedule):
+    """The share inside that succeeds at least, over many funnels of the linear loop."""
+    goal, rng = 1e-8, np.random.default_rng(1)
+    M, count, held = ends(still, schedule, 0.0), 40, 0
+    size = 2.0 * np.sqrt(goal) / np.linalg.norm(M, 2)
+    for _ in range(200):
+        z = rng.normal(size=(count, 12))
+        z *= (size * (np.arange(count) + 0.5) / count / np.linalg.norm(z, axis=1))[:, None]
+        failed = ((z @ M.T) ** 2).sum(axis=1) > goal
+        inside = int(failed.argmax()) if failed.any() else count
+        reach = size * (inside - 0.5) / count
+        held += successes(M, goal, reach, rng).mean() >= 0.05 ** (1.0 / inside)
+    assert held >= 0.95 * 200
+
+
+def test_it_is_the_same_whoever_does_it(arm, found):
+    robot, schedule = arm
+    goal = {"attitude": 5.0, "joints": 0.1}
+    options = {"knots": 3, "samples": 16, "dt": 0.05}
+    pytest.importorskip("numba")
+    told = []
+    compiled = fflin.funnel(*arm, goal, **options, engine="compiled")
+    for more in (
+        {"threads": 3, "engine": "compiled", "progress": lambda *each: told.append(each)},
+        {"workers": 2, "engine": "compiled"},
+        {"engine": "compiled", "threads": 1},
+    ):
+        again = fflin.funnel(*arm, goal, **options, **more)
+        assert np.array_equal(again.outcomes, compiled.outcomes)
+        assert np.array_equal(again.tried, compiled.tried)
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    slow = fflin.funnel(*arm, goal, **options, engine="python")
+    assert np.array_equal(slow.outcomes, compiled.outcomes)
+    policy = fflin.TrajectoryFeedback(schedule.trajectory(robot), schedule)
+    same = fflin.funnel(robot, policy, goal, **options)
+    assert np.array_equal(same.outcomes, found.outcomes)
+    other = fflin.funnel(*arm, goal, **options, seed=1)
+    assert not np.array_equal(other.rho, found.rho)
+
+
+def test_a_run_from_a_knot_is_one_of_simulate(arm):
+    """What is flown from a knot is the motion that `simulate` flies from there."""
+    robot, schedule = arm
+    motion = schedule.trajectory(robot)
+    policy = fflin.TrajectoryFeedback(motion, schedule)
+    job = FunnelJob(robot, policy, {}, {}, [(5, 10)], 1, 0, {"dt": 0.05}, "python")
+    campaign = job.campaign(0)
+    e = 0.01 * np.random.default_rng(0).normal(size=campaign.x0.size)
+    x = moved_by("local", campaign.x0[None], e[None])[0]
+    end = campaign.replay(x - campaign.x0)
+    q, v = StateMap(robot, reference=end.reference, frame="local").to_pinocchio(x)
+    error = moving_error(StateMap(robot, frame="local"), *motion.point(motion.t[5])[:2], q, v)
+    assert error == pytest.approx(e, abs=1e-12)
+    whole = fflin.simulate(robot, policy, dt=0.05)
+    rest = campaign.replay(np.zeros(campaign.x0.size))
+    apart = pin.difference(robot.model, rest.q[-1], whole.q[-1])
+    assert np.abs(apart).max() < 1e-6 and rest.v[-1] == pytest.approx(whole.v[-1], abs=1e-6)
+
+
+def test_sizes_and_contains(arm, found):
+    robot, schedule = arm
+    state, rng = StateMap(robot, frame="local"), np.random.default_rng(2)
+    for k, t in enumerate(found.t):
+        P = schedule.cost_to_go(t)
+        z = rng.normal(size=(20000, len(P)))
+        z /= np.linalg.norm(z, axis=1)[:, None]
+        e = np.sqrt(found.rho[k]) * z @ np.linalg.inv(np.linalg.cholesky(P))
+        assert (e @ P * e).sum(axis=1) == pytest.approx(found.rho[k])
+        sines = np.sin(np.radians(found.attitude[k] / 2.0))
+        for reach, part in ((sines.max(), e[:, :3]), (found.position[k].max(), e[:, 3:6])):
+            assert 0.6 * reach < np.linalg.norm(part, axis=1).max() <= reach * (1.0 + 1e-9)
+        assert (np.abs(e[:, 6:9]).max(axis=0) <= found.joints[k] * (1.0 + 1e-9)).all()
+        q, v, _ = found.trajectory.point(t)
+        chart = StateMap(robot, reference=pin.XYZQUATToSE3(q[:7]), frame="local")
+        for share, inside in ((0.99, True), (1.01, False)):
+            x = moved_by("local", chart.to_state(q, v)[None], share * e[:1])[0]
+            there = chart.to_pinocchio(x)
+            assert found.contains(t, q=there[0], v=there[1]) is inside
+            assert found.contains(t, state.to_state(*there)) is inside
+    assert found.level(found.t[0] + 1e-3) == min(found.rho[:2])
+    for arguments, words in (
+        ((9.0,), "t is 9 s, expected 0 to"),
+        ((0.0,), "give x, or q and v"),
+        ((0.0, np.zeros(3)), "x has shape"),
+    ):
+        with pytest.raises(fflin.InputError, match=words):
+            found.contains(*arguments)
+
+
+def test_it_prints_saves_and_is_drawn(arm, found, tmp_path):
+    assert max(map(len, str(found).splitlines())) <= 80 and "95 % confidence" in str(found)
+    assert len(found.rate) == 3 and (found.rate[:, 0] <= found.rate[:, 1]).all()
+    for ending in ("npz", "json", "mat"):
+        found.save(tmp_path / f"a.{ending}")
+        again = fflin.Funnel.load(tmp_path / f"a.{ending}", arm[0])
+        assert str(again) == str(found) and np.array_equal(again.P, found.P)
+    with pytest.raises(fflin.FileError, match="not a Funnel"):
+        arm[1].save(tmp_path / "s.npz")
+        fflin.Funnel.load(tmp_path / "s.npz", arm[0])
+    pytest.importorskip("matplotlib")
+    fflin.plot_funnel(found, tmp_path / "a.png")
+    with pytest.raises(fflin.InputError, match=r"expected what fflin\.funnel returns"):
+        fflin.plot_funnel(3)
+
+
+def test_the_tube_is_where_base_and_tool_may_be(arm, found):
+    robot = arm[0]
+    tool = default_tool(robot)
+    shown = tubes(robot, found, tool, 1.0, ("red", "green"))
+    assert [each["name"] for each in shown] == ["tool", "base"][-len(shown) :]
+    from base64 import b64decode
+
+    data, frame = robot.model.createData(), robot.model.getFrameId(tool)
+    q, v, _ = found.trajectory.point(found.t[0])
+    chart = StateMap(robot, reference=pin.XYZQUATToSE3(q[:7]), frame="local")
+    rng, root = np.random.default_rng(4), found.root(found.t[0])
+    small = 1e-4  # of the ellipsoid, where what is displaced is linear
+    z = rng.normal(size=(400, root.shape[1]))
+    z /= np.linalg.norm(z, axis=1)[:, None]
+    x = moved_by("local", np.tile(chart.to_state(q, v), (400, 1)), small * z @ root.T)
+    for each in shown:
+        centres, axes = (
+            np.frombuffer(b64decode(each[key]), "<f4").reshape(160, -1)
+            for key in ("centres", "axes")
+        )
+        A = axes[0].reshape(3, 3).T.astype(float)
+        sizes = []
+        for state in x:
+            there = chart.to_pinocchio(state)[0]
+            pin.framesForwardKinematics(robot.model, data, there)
+            at = data.oMf[frame].translation if each["name"] == "tool" else there[:3]
+            sizes.append(np.linalg.norm(np.linalg.solve(A, at - centres[0])) / small)
+        # Centres are in single precision.
+        assert max(sizes) < 1.02 and max(sizes) > 0.6
+
+
+def test_page_and_command(arm, found, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    robot, schedule = arm
+    motion = fflin.simulate(robot, schedule, dt=0.05)
+    page = fflin.visualize(robot, motion, html="a.html", funnel=found).read_text()
+    assert '"tubes":[{"name":' in page
+    assert '"tubes":[]' in fflin.visualize(robot, motion, html="b.html").read_text()
+    with pytest.raises(fflin.InputError, match="funnel is a int, expected what"):
+        fflin.visualize(robot, motion, html="c.html", funnel=3)
+    schedule.trajectory(robot).save("plan.csv")
+    schedule.save("gains.npz")
+    given = ("funnel", "planar_detumble", "--schedule", "gains.npz", "--knots", "2", "--samples")
+    kept = ("-o", "f.npz", "--html", "f.html", "--plot", "f.png", "--seed", "3")
+    goal = ("--goal", "attitude=5", "--goal", "joints=0.1", "--limits", "none")
+    code, out, err = run(
+        *given, "8", "--trajectory", "plan.csv", *goal, "--step", "0.05", *kept, "--threads", "2"
+    )
+    assert code == 0 and not err and out.count("wrote") == 3
+    made = fflin.funnel(
+        robot, schedule, {"attitude": 5.0, "joints": 0.1}, knots=2, samples=8, seed=3, dt=0.05
+    )
+    assert np.array_equal(fflin.Funnel.load("f.npz", robot).outcomes, made.outcomes)
+    assert "goal is empty" in refused(*given, "8")
+    assert "no kind of error in goal named 'attitud'" in refused(*given, "8", "--goal", "attitud=1")
+    assert "--trajectory and --schedule are missing" in refused("funnel", "cubesat", *goal)
+    assert "expected one of .html" in refused(*given, "8", *goal, "--html", "f.txt")
+
+
+def test_bad_input(arm):
+    robot, schedule = arm
+    good = {"attitude": 1.0}
+    for arguments, options, words in (
+        ((3, schedule, good), {}, "robot is a int"),
+        ((robot, 3, good), {}, "schedule is a int, expected a GainSchedule"),
+        ((robot, schedule, {}), {}, "goal is empty"),
+        ((robot, schedule, {"attitude": -1.0}), {}, "'attitude' is -1, expected more than 0"),
+        ((robot, schedule, 0.0), {}, "'level' is 0, expected more than 0"),
+        ((robot, schedule, "near"), {}, "goal 'level' is 'near', expected a number"),
+        ((robot, schedule, good), {"within": 3}, "within is a int"),
+        ((robot, schedule, good), {"knots": 0}, "knots is 0"),
+        ((robot, schedule, good), {"knots": []}, "knots is empty"),
+        ((robot, schedule, good), {"samples": 0}, "samples is 0"),
+        ((robot, schedule, good), {"confidence": 1}, "between 0 and 1"),
+        ((robot, schedule, good), {"duration": 3.0}, "no option of funnel named 'duration'"),
+        ((robot, schedule, good), {"workers": 0}, "workers is 0"),
+    ):
+        with pytest.raises(fflin.FflinError, match=words):
+            fflin.funnel(*arguments, **options)
