@@ -15,7 +15,7 @@ from fflin.commands.tracking import add_trajectory
 from fflin.commands.visual import add_figure, check_figure, draw
 
 _KINDS = "attitude [deg], position [m], joints, turning, moving or rates"
-_RUNS = "knots samples seed confidence threads".split()
+_RUNS = ["knots", "samples", "seed", "confidence", "threads"]
 
 # What `along` refuses of others' options.
 _NONE = "free gain target_joint target_velocity effort equilibrium joint rpy position velocity"
