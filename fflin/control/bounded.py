@@ -16,8 +16,6 @@ _LEAST = 1e-7
 
 def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
     """Return u (k,) within its bounds (k,) that makes A u nearest to b, the least of these."""
-    from scipy.optimize import lsq_linear, nnls
-
     size, unit = float(np.linalg.norm(b)), float(np.linalg.norm(A))
     if size == 0.0 or unit == 0.0:
         return np.clip(np.zeros(len(least)), least, most)
@@ -26,8 +24,19 @@ def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
     wanted = np.concatenate((b / size, np.zeros(len(least))))
     low, high = least * (unit / size), most * (unit / size)
     high = np.maximum(high, low + 1e-15)  # the solver takes no bounds that are equal
-    pushing = least == 0.0
-    free, given = rows[:, ~pushing], np.zeros(len(least))
+    # The rounding of what cannot be given would drown the added rows: the second time it is gone.
+    for _ in range(2):
+        given = _solved(rows, wanted, low, high, least == 0.0)
+        wanted[: len(b)] = rows[: len(b)] @ given
+    return np.clip(given * (size / unit), least, most)
+
+
+def _solved(
+    rows: Array, wanted: Array, low: Array, high: Array, pushing: NDArray[np.bool_]
+) -> Array:
+    from scipy.optimize import lsq_linear, nnls
+
+    free, given = rows[:, ~pushing], np.zeros(len(low))
     # Most often no other bound is met: thrusts without a largest one, the others without any.
     Q, R = np.linalg.qr(free)
     apart = rows[:, pushing] - Q @ (Q.T @ rows[:, pushing])
@@ -35,8 +44,9 @@ def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
         given[pushing] = nnls(apart, wanted - Q @ (Q.T @ wanted))[0]
     given[~pushing] = np.linalg.solve(R, Q.T @ (wanted - rows[:, pushing] @ given[pushing]))
     if (given < low).any() or (given > high).any():
-        given = lsq_linear(rows, wanted, (low, high), method="bvls", tol=1e-14).x
-    return np.clip(given * (size / unit), least, most)
+        solved: Array = lsq_linear(rows, wanted, (low, high), method="bvls", tol=1e-20).x
+        return solved
+    return given
 
 
 def pushes_every_way(W: Array, pushing: NDArray[np.bool_]) -> bool:

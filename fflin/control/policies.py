@@ -34,6 +34,17 @@ class Bindable(Protocol):
         ...
 
 
+@runtime_checkable
+class Gridded(Protocol):
+    """A state feedback whose gain is that between the points of a grid."""
+
+    lin: LinearModel
+
+    def table(self) -> tuple[dict[str, Array], Array]:
+        """Return the joints of the grid and their values, and the gains (N, nu, nx) in order."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class StateFeedback:
     """The feedback ``u = u0 - K (x - x0)`` of a linear model's state.

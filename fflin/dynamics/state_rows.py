@@ -178,7 +178,6 @@ def moving_error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Arr
     turned = quaternion_product(conjugate(q_star[3:7]), q[3:7])
     e[g.q_b] = turned[:3] if turned[3] >= 0.0 else -turned[:3]
     e[g.r_b] = rotation_matrix(q_star[3:7]).T @ (q[:3] - q_star[:3])
-    apart = pin.difference(state.robot.model, q_star, q)
-    e[g.q_m] = state.velocities(apart)[6:]
+    e[g.q_m] = state.joints_apart(q_star, q)
     e[-6 - state.robot.n :] = state.velocities(v - v_star)
     return e

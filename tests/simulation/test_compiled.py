@@ -19,7 +19,7 @@ from tests.support.weights import unit_weights
 
 pytest.importorskip("numba")
 
-from fflin.kernel import tracking
+from fflin.kernel import sharing, tracking
 from fflin.kernel.loop import advance
 
 WHEEL = fflin.ReactionWheel((0, 0, 1), name="spin", inertia=0.02, max_speed=300.0, max=0.5)
@@ -67,7 +67,7 @@ def test_a_tree_that_flies_free(seed):
     rng = np.random.default_rng(seed)
     robot = random_tree(rng, 5)
     q, v, _ = random_point(robot, rng, speed=0.3)
-    for method in ("cf4", "semi_implicit_euler"):
+    for method in ("cf4", "rkmk4", "semi_implicit_euler"):
         both(robot, q0=q, v0=v, duration=3.0, method=method)
     both(robot, q0=q, v0=v, duration=1.0, project=False)
 
@@ -242,7 +242,6 @@ def test_what_cannot_be_compiled_says_why(robots):
         ({"callback": print}, "callbacks"),
         ({"events": [lambda t, q, v: 1.0]}, "events"),
         ({"disturbance": lambda t, q, v: np.zeros(robot.nv)}, "disturbances"),
-        ({"method": "rkmk4"}, "RungeKuttaMuntheKaas4"),
     )
     for more, words in cases:
         with pytest.raises(fflin.InputError, match=words):
@@ -271,6 +270,10 @@ def test_the_quicker_loop_is_taken_and_the_motion_says_which(robots, monkeypatch
 
 # What is the same for all lanes.
 SHARED = {"turns", "slides", "factor", "axes", "armature", "share", "weights", "moments", "nodes"}
+SHARED |= {"values"}
+
+
+WIDE = ("point", "work", "columns")
 
 
 def in_lanes(runs):
@@ -280,6 +283,9 @@ def in_lanes(runs):
         return np.column_stack(runs).copy() if first.dtype == float else first
     if isinstance(first, tracking.Path):
         return first._replace(e=in_lanes([each.e for each in runs]))
+    if isinstance(first, sharing.Sharing):
+        own = {key: in_lanes([getattr(each, key) for each in runs]) for key in WIDE}
+        return first._replace(**own)
     if not isinstance(first, tuple):
         return first
     names = getattr(first, "_fields", range(len(first)))
