@@ -43,7 +43,9 @@ class CampaignJob:
             t = self.plan.times.dt * np.arange(self.plan.times.steps + 1)
             q, v, _ = map(np.array, zip(*map(follows, t.tolist()), strict=True))
             self.home = states_of(state, q, state.velocities(v))
-        self.dispersions = Dispersions(given, self.plant, self.plan.policy, self.x0, seed)
+        self.dispersions = Dispersions(
+            given, self.plant, self.plan.policy, self.x0, seed, self.plan.times
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         # What is bound to the robot is made anew by a worker.
@@ -81,7 +83,8 @@ class CampaignJob:
 
         tree = batch_tree(self.plant.robot)
         assert tree is not None
-        lanes, runs = Lanes(self.plan, self.plant), self.dispersions.in_lanes(drawn, tree)
+        runs = self.dispersions.in_lanes(drawn, tree)
+        lanes = Lanes(self.plan, self.plant, runs)
         for first in range(0, len(drawn), LANES):
             eight, own = (
                 {key: each[first : first + LANES] for key, each in of.items()} for of in (runs, out)
@@ -95,7 +98,8 @@ class CampaignJob:
         """Return the plan of a run (k,), and its robot."""
         plan, (plant, policy, q, v) = self.plan, self.dispersions.one(drawn)
         law = law_of(policy, plant, plan.limits, plan.times)
-        return replace(plan, q=q, v=v, policy=policy, law=law), plant
+        times = plan.times._replace(delay=int(self.dispersions.delays(drawn[None])[0]))
+        return replace(plan, q=q, v=v, policy=policy, law=law, times=times), plant
 
     @np.errstate(over="ignore", invalid="ignore")  # of what diverges
     def _one(self, drawn: Array) -> Outcome:
@@ -125,12 +129,12 @@ class CampaignJob:
 
         tree, every, kept = batch_tree(self.plant.robot), plan.times.every, list[list[Array]]()
         assert tree is not None
-        lanes = Lanes(self.plan, self.plant)
+        runs = self.dispersions.in_lanes(np.tile(drawn, (LANES, 1)), tree)
+        lanes = Lanes(self.plan, self.plant, runs)
 
         def watch(first: int, rows: list[Array]) -> None:
             kept.append([each[-first % every :: every, 0].copy() for each in rows])
 
-        runs = self.dispersions.in_lanes(np.tile(drawn, (LANES, 1)), tree)
         out = {key: np.empty((LANES, *shape)) for key, shape in self.shapes.items()}
         said = lanes.fly(runs, self._tally(LANES), out, watch)[0]
         t = every * plan.times.dt * np.arange(sum(len(each[0]) for each in kept))
