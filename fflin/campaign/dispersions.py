@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fflin.base.errors import ChartError, InputError, UnknownNameError
 from fflin.base.names import by_name, input_keys
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array
 from fflin.base.validation import by_name as mapping
 from fflin.campaign.pointing import columns_of, in_lanes, misaligned, require_direction
+from fflin.campaign.sensing import Designed, Misled, noise_of
+from fflin.campaign.spreads import deviation_of, inverse_of, whole_number
 from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
-from fflin.control.policies import Allocation, StateFeedback, bound
+from fflin.control.policies import Allocation, StateFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.accelerations import loads_of
 from fflin.kernel.tree import Tree
 from fflin.robot.frames import ROOT
 from fflin.robot.mass_properties import stretched, with_inertias
-from fflin.robot.robot import Robot
 from fflin.simulation.plant import Drives, Plant
 from fflin.simulation.times import Times
 
@@ -81,13 +81,10 @@ class Dispersions:
             kind, head = (kind, head) if kind in known and head else ("state", str(key))
             if key == "delay":
                 kind, known["delay"] = "delay", ("delay",)
-            inverse = _inverse(str(key), spread)
-            # The normal distribution is that of the noise, not of how large it is.
-            if kind == "noise" and getattr(inverse, "func", None) is _normal:
-                inverse = partial(_choice, np.array([float(spread)]))
-            by_kind.setdefault(kind, {})[head] = inverse
+            inverse = deviation_of if kind == "noise" else inverse_of
+            by_kind.setdefault(kind, {})[head] = inverse(str(key), spread)
         if "noise" in by_kind:
-            self.columns.append(Column("noise", "seed", (0, 0), _whole_number))
+            self.columns.append(Column("noise", "seed", (0, 0), whole_number))
         for kind, spreads in by_kind.items():
             self._add(kind, spreads, list(known[kind]), " | ".join([*known][1:]))
         if not self.columns:
@@ -253,11 +250,11 @@ class Dispersions:
         if "misalignment" in self._kinds:
             robot = misaligned(robot, self._angles(rows)[0])
             if isinstance(policy, Allocation):  # which does not know of it
-                policy = _Designed(policy, plant.robot)
+                policy = Designed(policy, plant.robot)
         if self._kinds & {*_OF_SENSORS}:
             error = noise_of(*(each[0] for each in self._sensing(rows)))
             if isinstance(policy, StateFeedback):
-                policy = _Misled(policy, error)
+                policy = Misled(policy, error)
             else:
                 noise = policy.noise or np.zeros_like
                 policy = replace(policy, noise=lambda t: error(t) + np.asarray(noise(t)))
@@ -267,91 +264,9 @@ class Dispersions:
         return Plant(state, plant.disturbance, faulty), policy, q[0], v[0]
 
 
-@dataclass(frozen=True)
-class _Misled:
-    """A state feedback that reads states with an error."""
-
-    policy: StateFeedback
-    error: Callable[[float], Array]
-
-    def bind(self, robot: Robot) -> Callable[[float, Array, Array], Array]:
-        inner, K = bound(self.policy, robot), self.policy.K
-        return lambda t, q, v: np.asarray(inner(t, q, v)) - K @ self.error(t)
-
-
-@dataclass(frozen=True)
-class _Designed:
-    """A policy for a robot as it should be."""
-
-    policy: Any
-    robot: Robot
-
-    def bind(self, _: Robot) -> Any:
-        return bound(self.policy, self.robot)
-
-
-def noise_of(bias: Array, deviation: Array, seed: float) -> Callable[[float], Array]:
-    """Return the error (ny,) of what is sensed, sample after sample."""
-    normal = normals(seed)
-    return lambda _: bias + deviation * normal.standard_normal(len(bias))
-
-
-def normals(seed: float) -> np.random.Generator:
-    """Return what draws the noise of a run."""
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(int(seed))))
-
-
-def _whole_number(u: Array) -> Array:
-    """Return seeds: the uniform numbers that a double tells from one another."""
-    return np.floor(u * 2.0**53)
-
-
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
     """Return m, m c, and I about the origin (xx xy xz yy yz zz) of bodies in axes (N, 10)."""
     square = (com * com).sum(axis=1)[:, None, None] * np.eye(3) - com[:, :, None] * com[:, None]
     about = axes.T @ (inertia + mass[:, None, None] * square) @ axes
     rows, columns = np.triu_indices(3)
     return np.column_stack((mass, mass[:, None] * (com @ axes), about[:, rows, columns]))
-
-
-def _inverse(name: str, spread: Any) -> Callable[[Array], Array]:
-    """Return the inverse distribution function of a spread."""
-    if hasattr(spread, "ppf"):
-        try:
-            middle = float(spread.ppf(0.5))
-        except Exception:  # of what may call itself a distribution
-            middle = np.nan
-        if not np.isfinite(middle):
-            raise InputError(f"the distribution of '{name}' has no median; freeze it first")
-        return spread.ppf
-    if isinstance(spread, tuple):
-        if len(spread) != 2:
-            raise InputError(f"'{name}' is {spread!r}, expected (least, largest)")
-        least, largest = (number(f"'{name}'", each) for each in spread)
-        if not least <= largest:
-            raise InputError(f"'{name}' is ({least:g}, {largest:g}), expected (least, largest)")
-        return partial(_uniform, least, largest)
-    if isinstance(spread, list | np.ndarray):
-        values = [number(f"'{name}'", each) for each in np.ravel(spread).tolist()]
-        if not values:
-            raise InputError(f"'{name}' has no values to choose from")
-        return partial(_choice, np.array(values))
-    deviation = number(f"'{name}'", spread)
-    if deviation < 0.0:
-        raise InputError(f"'{name}' is {deviation:g}, expected a standard deviation of 0 or more")
-    return partial(_normal, deviation)
-
-
-def _uniform(least: float, largest: float, u: Array) -> Array:
-    return least + (largest - least) * u
-
-
-def _choice(values: Array, u: Array) -> Array:
-    return values[(u * len(values)).astype(int)]
-
-
-def _normal(deviation: float, u: Array) -> Array:
-    from scipy.special import ndtri
-
-    normal: Array = deviation * ndtri(u)
-    return normal

@@ -10,7 +10,7 @@ import numpy as np
 
 from fflin.base.rotation import product_matrix
 from fflin.base.validation import Array
-from fflin.campaign.dispersions import normals
+from fflin.campaign.sensing import normals
 from fflin.campaign.tally import STOPS, Tally, stop_of
 from fflin.kernel.accelerations import work_space
 from fflin.kernel.compiled import kernel

@@ -38,6 +38,8 @@ _BYTES = 8  # alignment of a double
 # and makes no function able to allocate.
 _OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "_nrt": False}
 inlined = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
+# Called where it is seldom needed: what is inlined takes longest to compile.
+called = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
 compiled = numba.njit(nogil=True, cache=True, boundscheck=False, **_OPTIONS)
 
 

@@ -7,7 +7,7 @@ from collections import namedtuple
 import numpy as np
 
 from fflin.kernel.forward import joint_position
-from fflin.kernel.lanes import chosen, inlined, load, peek, poke, splat, store, whole, width
+from fflin.kernel.lanes import called, chosen, inlined, load, peek, poke, splat, store, whole, width
 from fflin.kernel.places import columns_of, quaternion_times
 from fflin.kernel.rnea import MOTION, move_bodies
 from fflin.kernel.tracking import track
@@ -79,16 +79,22 @@ def read_state(robot, law, point, row):
 
 
 @inlined
-def _measure(work, robot, law, point, count):
-    """Write the outputs, with what is added to those of a sample."""
-    gyros, first, outputs = law.gyros, 2 * len(point.nu), len(law.measured)
-    if len(gyros.body) > 0:
-        move_bodies(work, robot.tree, robot.layout, point.nu)
+def _turn_gyros(work, robot, gyros, nu, x, first):
+    """Write what gyroscopes measure from an entry on."""
+    move_bodies(work, robot.tree, robot.layout, nu)
     for index in range(len(gyros.body)):
         body = gyros.body[index]
         rate = get3(work, robot.layout.motion + body * MOTION)
         rate = across(get_columns(work, robot.tree.places + body * PLACE), rate)
-        put3(law.x, first + 3 * index, across(get_columns(gyros.axes, 9 * index), rate))
+        put3(x, first + 3 * index, across(get_columns(gyros.axes, 9 * index), rate))
+
+
+@inlined
+def _measure(work, robot, law, point, count):
+    """Write the outputs, with what is added to those of a sample."""
+    outputs = len(law.measured)
+    if len(law.gyros.body) > 0:
+        _turn_gyros(work, robot, law.gyros, point.nu, law.x, 2 * len(point.nu))
     added = count % max(len(law.added) // max(outputs, 1), 1) * outputs
     for index in range(outputs):
         store(law.y, index, load(law.x, law.measured[index]) + load(law.added, added + index))
@@ -158,7 +164,7 @@ def _corner(grid, corner, lane):
     return share, cell
 
 
-@inlined
+@called
 def _filter(by, y, u, row):
     """Write what the estimate asks for, and bring it up to the next sample."""
     size, outputs, inputs = len(by.z), len(y), len(u)

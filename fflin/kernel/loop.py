@@ -7,7 +7,7 @@ from collections import namedtuple
 from fflin.kernel.channel import arrive, limit, send, spare_wheels
 from fflin.kernel.course import add_wrench, begin_step, end_step, impose, kept_at, start_at
 from fflin.kernel.forward import accelerate, configure, seen, turn_inputs
-from fflin.kernel.lanes import below, compiled, inlined, load, store
+from fflin.kernel.lanes import below, called, compiled, inlined, load, store
 from fflin.kernel.laws import NOTHING, command
 from fflin.kernel.places import displace, turn_back
 from fflin.kernel.sharing import share
@@ -91,7 +91,7 @@ def _act(work, channel, law, robot, point, step, stage, t):
     turn_inputs(robot, point, t)
 
 
-@inlined
+@called
 def _turn_way(method, stages, nu, stage, last):
     """Write the way of a method in the tangent, from that of the last stage."""
     along, total = stages.along, stages.total

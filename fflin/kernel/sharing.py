@@ -17,7 +17,7 @@ import numpy as np
 from fflin.kernel.crba import inwards, outwards
 from fflin.kernel.factor import factorise
 from fflin.kernel.forward import push, seen, turn_held
-from fflin.kernel.lanes import inlined, load, peek, poke, root, store, width
+from fflin.kernel.lanes import called, inlined, load, peek, poke, root, store, width
 from fflin.kernel.places import columns_of
 from fflin.kernel.rnea import write_columns
 from fflin.kernel.vectors import copy, put3
@@ -48,7 +48,7 @@ def half_solve(work, tree, x, first):
         store(x, first + k, value * root(load(work, tree.scaled + row + tree.depth[k])))
 
 
-@inlined
+@called
 def share(sharing, point, asked):
     """Write the inputs that come nearest to what is asked for."""
     work, columns, asking, giving = sharing.work, sharing.columns, sharing.asking, sharing.giving
@@ -93,7 +93,7 @@ def _write_all(work, giving, own, columns):
             store(columns, first + row, load(work, layout.columns + row * carried + index))
 
 
-@inlined
+@called
 def _nearest(sharing, size, lane):
     """Write the solution of a lane into x."""
     x, low, high, state, wanted = (
@@ -167,7 +167,7 @@ def _solve(sharing, size, lane, unit):
         state[newest] = _FREE
 
 
-@inlined
+@called
 def _fit(sharing, size, lane, unit):
     """Write the least squares of what is free into s, and what is left of the force into b.
 
@@ -232,7 +232,7 @@ def _orthogonalise(sharing, size, lane, unit, j):
     sharing.s[j] = share
 
 
-@inlined
+@called
 def _steepest(sharing, size, lane, unit):
     """Return what is at a bound, untried, and best leaves it; -1 where nothing does."""
     best, found, columns, b = 0.0, -1, sharing.columns, sharing.b
