@@ -174,3 +174,24 @@ def test_what_cannot_be_dispersed_is_told(robots, given, words):
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
     with pytest.raises(fflin.FflinError, match=words):
         CampaignJob(robot, policy, given, 0, "python", {"duration": 1.0})
+
+
+def test_dask_flies_the_same(robots):
+    distributed = pytest.importorskip("distributed")
+    robot = robots["planar_detumble"]
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    given = {"q_b": 0.05, "*.mass": 0.1, "q_b.noise": 1e-3, "delay": [0.0, 0.02]}
+    case = {"runs": 20, "duration": 0.2, "dt": 0.02, "sample": 0.04, "engine": "python"}
+    here = fflin.monte_carlo(robot, policy, given, **case)
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        there = fflin.monte_carlo(
+            robot, policy, given, executor=client.get_executor(), chunk=8, **case
+        )
+    assert all(np.array_equal(getattr(here, name), getattr(there, name)) for name in ARRAYS)
+    assert np.array_equal(there.replay(19).q[-1], here.q[19])
