@@ -62,15 +62,15 @@ def state_history(
 def attitude_errors(x: Array, target: Array) -> Array:
     """Return the angles (N,) [deg] between the attitudes of states and of a target, or of rows."""
     at, to = x[:, :3], target[..., :3]
-    scalar, target_scalar = (
-        np.sqrt(np.maximum(0.0, 1.0 - (each * each).sum(axis=-1, keepdims=True)))
-        for each in (at, to)
-    )
+    # By columns, which are long.
+    (x, y, z), (a, b, c) = at.T, to.T
+    w, d = (np.sqrt(np.maximum(0.0, 1.0 - (i * i + j * j + k * k))) for i, j, k in (at.T, to.T))
     # The vector part of target^-1 at, whose length is that of half the angle's sine.
-    vector = target_scalar * at - scalar * to - np.cross(to, at)
-    sines: Array = np.minimum(1.0, np.linalg.norm(vector, axis=1))
-    cosines = np.abs(target_scalar * scalar + (at * to).sum(axis=1, keepdims=True))[:, 0]
-    return np.degrees(2.0 * np.arctan2(sines, cosines))
+    p = d * x - w * a - (b * z - c * y)
+    q = d * y - w * b - (c * x - a * z)
+    r = d * z - w * c - (a * y - b * x)
+    sines: Array = np.minimum(1.0, np.sqrt(p * p + q * q + r * r))
+    return np.degrees(2.0 * np.arctan2(sines, np.abs(d * w + a * x + b * y + c * z)))
 
 
 def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:
