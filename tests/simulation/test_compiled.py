@@ -149,8 +149,12 @@ def test_thrusters_that_fire_in_pulses(on_off, least):
     robot = free_body((2.0, 3.0, 4.0)).replace(inputs=[*jets, fflin.BaseTorque()])
     lin = fflin.linearize(robot)
     K = np.random.default_rng(3).normal(size=lin.B.shape[::-1])
-    policy = fflin.StateFeedback(lin.discretize(0.1), 0.3 * K)
-    both(robot, policy, x0=displaced(lin), dt=0.02, delay=0.04, duration=4.0)
+    # What acts until the first command arrives is fired too.
+    held = replace(lin.discretize(0.1), u0=0.1 + 0.0 * lin.u0)
+    policy = fflin.StateFeedback(held, 0.3 * K)
+    for delay in (0.04, 0.24):
+        motion = both(robot, policy, x0=displaced(lin), dt=0.02, delay=delay, duration=4.0)
+        assert (motion.u[: round(delay / 0.02), :4] > 0.0).any(axis=0).all()
 
 
 def test_output_feedback():
