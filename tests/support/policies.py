@@ -77,9 +77,16 @@ def outputs(robot):
 
 
 def path(robot):
-    """A slew that others follow, turned and moved from where they begin."""
+    """A slew that others follow, turned and moved from where they begin.
+
+    A joint that goes round turns by more than half a turn.
+    """
     _, policy, _ = state(robot)
     x0 = displaced(policy.lin, degrees=50.0)
+    if robot.n and robot.joints[0].unbounded:
+        q = fflin.configuration(robot, {robot.joint_names[0]: -0.4})
+        lin = fflin.linearize(robot, q)
+        policy, x0[6] = fflin.StateFeedback(lin, fflin.lqr(lin).K), 2.9
     flown = fflin.simulate(robot, policy, x0=x0, duration=8.0, dt=SAMPLE, engine="python")
     along = fflin.Trajectory(robot, flown.t, flown.q, flown.v, flown.u, frame="hybrid")
     start = {"x0": None, "q0": flown.q[3], "v0": flown.v[0], "linear": False}
