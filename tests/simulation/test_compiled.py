@@ -157,6 +157,15 @@ def test_thrusters_that_fire_in_pulses(on_off, least):
         assert (motion.u[: round(delay / 0.02), :4] > 0.0).any(axis=0).all()
 
 
+def test_joints_that_go_round_are_read_on_the_turn_of_the_target(robots):
+    robot = robots["ets_vii"]
+    for angle in (3.0, -3.0):
+        lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_1": angle}))
+        x0 = lin.x0.copy()
+        x0[6] += np.copysign(0.5, angle)
+        both(robot, fflin.StateFeedback(lin, fflin.lqr(lin).K), x0=x0, duration=0.5)
+
+
 def test_output_feedback():
     robot, lin, compensator = designed(POSITIONS)
     policy = fflin.OutputFeedback(lin, compensator)
