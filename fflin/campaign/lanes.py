@@ -51,10 +51,11 @@ class Lanes:
             path=self._wide(law.path, "e"),
             grid=self._wide(law.grid, "at"),
             filter=self._wide(law.filter, "z", "next"),
-            sharing=self._wide(law.sharing, "work", "columns")._replace(
-                point=self._wide(law.sharing.point, "q", "pushing")
-            ),
         )
+        if law.sharing:
+            own = self._wide(law.sharing.point, "q", "pushing")
+            wide = self._wide(law.sharing, "work", "columns")._replace(point=own)
+            law = law._replace(sharing=wide)
         pulses = self._wide(channel.pulses, "left", "level", "end")
         channel = self._wide(channel, "held", "pending", "delay", "fresh")._replace(pulses=pulses)
         kept, point, stages = (self._wide(x, *x._fields) for x in (kept, point, stages))

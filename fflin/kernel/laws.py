@@ -31,7 +31,7 @@ class Law(
     `turned` says whether omega_b and v_b of the state stand in reference axes; row by row, sample
     by sample and the last to the end, `origin` (7,) is the world's origin seen from where x is 0
     and `near` (n,) which turn is taken of joints that go round. `u` is what is commanded, to be
-    shared out where there is anything in `sharing`.
+    shared out where `sharing` is not None.
     """
 
 

@@ -10,7 +10,7 @@ from fflin.kernel.forward import accelerate, configure, seen, turn_inputs
 from fflin.kernel.lanes import below, called, compiled, inlined, load, store
 from fflin.kernel.laws import NOTHING, command
 from fflin.kernel.places import displace, turn_back
-from fflin.kernel.sharing import share
+from fflin.kernel.sharing import share_out
 from fflin.kernel.vectors import copy, put3, put6
 
 
@@ -78,10 +78,7 @@ def _act(work, channel, law, robot, point, step, stage, t):
     if law.kind != NOTHING and (sample == 0 or stage == 0):
         if sample == 0 or step % sample == 0:
             command(work, robot, law, point, t, step // max(sample, 1))
-            if len(law.sharing.least) > 0:
-                share(law.sharing, point, law.u)
-            else:
-                copy(law.u, 0, point.u, 0, len(point.u))
+            share_out(law.sharing, point, law.u)
             limit(channel, point.u)
             if sample > 0:
                 send(channel, step, point.u)

@@ -31,7 +31,7 @@ class Sharing(
         "Sharing", "asking giving point least most work columns Q R b wanted x s low high state"
     )
 ):
-    """Whose inputs ask, and whose give, (k,) within `least` and `most`; nothing where these are.
+    """Whose inputs ask, and whose give, (k,) within `least` and `most`.
 
     The `point` has q and the inputs of either; `work` and what follows are work space.
     """
@@ -46,6 +46,15 @@ def half_solve(work, tree, x, first):
             at = first + tree.path[row + t]
             store(x, at, load(x, at) - load(work, tree.packed + row + t) * value)
         store(x, first + k, value * root(load(work, tree.scaled + row + tree.depth[k])))
+
+
+@inlined
+def share_out(sharing, point, asked):
+    """Write what is asked for, or shared out where there is a way to; compiled where there is."""
+    if sharing is None:
+        copy(asked, 0, point.u, 0, len(point.u))
+    else:
+        share(sharing, point, asked)
 
 
 @called

@@ -108,7 +108,7 @@ def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
         *(nowhere, laws.Gyros(nowhere, none), np.zeros(state.nx), none, none),
         np.zeros(len(asking.actuation.names)),
         _path(plan, policy, asking),
-        _sharing(plant, asking, mechanics, shared),
+        _sharing(plant, asking, mechanics) if shared else None,
     )
     if isinstance(policy, StateFeedback):
         K, offset, near = policy.terms(state)
@@ -187,25 +187,19 @@ def _filtered(law: laws.Law, plan: Plan, policy: Any, asking: Plant, tree: Tree)
     )
 
 
-def _sharing(plant: Plant, asking: Plant, own: forward.Mechanics, shared: bool) -> sharing.Sharing:
-    """Return how the inputs of one are shared out to those of the other, if they are."""
-    state, none = plant.state, np.zeros(0)
-    k, size = len(plant.actuation.names) if shared else 0, state.nx // 2
-    limits = [limits_of(plant.robot).get(key, (-np.inf, np.inf)) for key in plant.actuation.names]
-    least, most = np.array(limits).reshape(-1, 2)[:k].T
-    asks = own
-    if shared:
-        tree = batch_tree(asking.robot)
-        assert tree is not None
-        asks = _mechanics(asking, tree)
-    point = forward.Point(
-        np.zeros(plant.robot.nq if k else 0),
-        *(none, none, np.zeros(len(asking.actuation.names) if k else 0), none),
-    )
-    work = np.zeros(max(asks.layout.size, own.layout.size) if k else 0)
-    spaces = ((k + 1) * size * bool(k), k * (size + k), k * k, size + k, size, *(k,) * 4)
-    free = (*(np.zeros(count) for count in spaces), np.zeros(k, dtype=np.intp))
-    return sharing.Sharing._make((asks, own, point, least.copy(), most.copy(), work, *free))
+def _sharing(plant: Plant, asking: Plant, giving: forward.Mechanics) -> sharing.Sharing:
+    """Return how what the inputs of one ask for is shared out to those of the other."""
+    none, names, tree = np.zeros(0), plant.actuation.names, batch_tree(asking.robot)
+    assert tree is not None
+    k, size, asks = len(names), plant.state.nx // 2, _mechanics(asking, tree)
+    limits = [limits_of(plant.robot).get(key, (-np.inf, np.inf)) for key in names]
+    least, most = (np.array(each) for each in zip(*limits, strict=True))
+    asked = np.zeros(len(asking.actuation.names))
+    point = forward.Point(np.zeros(plant.robot.nq), none, none, asked, none)
+    work = np.zeros(max(asks.layout.size, giving.layout.size))
+    sizes = ((k + 1) * size, k * (size + k), k * k, size + k, size, *(k,) * 4)
+    free = (*(np.zeros(count) for count in sizes), np.zeros(k, dtype=np.intp))
+    return sharing.Sharing._make((asks, giving, point, least, most, work, *free))
 
 
 def _path(plan: Plan, policy: Any, asking: Plant) -> tracking.Path:

@@ -19,7 +19,7 @@ from tests.support.weights import unit_weights
 
 pytest.importorskip("numba")
 
-from fflin.kernel import sharing, tracking
+from fflin.kernel import tracking
 from fflin.kernel.loop import advance
 
 WHEEL = fflin.ReactionWheel((0, 0, 1), name="spin", inertia=0.02, max_speed=300.0, max=0.5)
@@ -286,9 +286,6 @@ SHARED = {"turns", "slides", "factor", "axes", "armature", "share", "weights", "
 SHARED |= {"values"}
 
 
-WIDE = ("point", "work", "columns")
-
-
 def in_lanes(runs):
     """The parts of eight runs side by side."""
     first = runs[0]
@@ -296,9 +293,6 @@ def in_lanes(runs):
         return np.column_stack(runs).copy() if first.dtype == float else first
     if isinstance(first, tracking.Path):
         return first._replace(e=in_lanes([each.e for each in runs]))
-    if isinstance(first, sharing.Sharing):
-        own = {key: in_lanes([getattr(each, key) for each in runs]) for key in WIDE}
-        return first._replace(**own)
     if not isinstance(first, tuple):
         return first
     names = getattr(first, "_fields", range(len(first)))
