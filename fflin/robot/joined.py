@@ -53,6 +53,7 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         urdf_sha256=sha256(told.encode() + weighed).hexdigest(),
         joints=tuple(sorted((*own, *theirs), key=lambda each: each.idx_v)),
         followers=tuple(followers),
+        attached=(*robot.attached, (prefix, other)),
         **both,
     )
     fields = {name: getattr(robot, name) for name in ("outputs", "passive", "limits", "weights")}
