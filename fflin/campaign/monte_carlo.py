@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import FileError, InputError, unknown
 from fflin.base.record import content_digest
 from fflin.base.validation import share, whole
 from fflin.base.version import __version__
+from fflin.batch.files import hdf5
 from fflin.batch.run import Progress, check_workers, failure, run_chunks
 from fflin.batch.store import FileStore, MemoryStore, check_room, output_path
 from fflin.batch.workers import OwnWorkers
@@ -123,7 +124,8 @@ def monte_carlo(
         as bands over time need them.
     out : str or Path, optional
         .h5 or .npz file to write. It grows as NAME.part; the same call made again after a crash
-        goes on from the chunks that are there and intact.
+        goes on from the chunks that are there and intact. A .h5 file that has all of these runs
+        already is read, whatever goals it was made with.
     engine : {"python", "compiled"}, optional
         As of `simulate`.
     **options
@@ -169,6 +171,8 @@ def monte_carlo(
     header["goals"] = _goals(goals, until, shapes, header)
     with placed(dispersions):
         job.dispersions.require_possible(runs)
+    if until is None and (flown := _found(job, path, header)):
+        return flown
     threads = threads or available_cores()
     size = _chunk(runs, chunk, workers or threads, until is not None)
     store = _store(job, path, header, size, shapes)
@@ -228,6 +232,22 @@ def _store(
     return FileStore(path, request, header["asked"], size, shapes, {}, texts, what="campaign")
 
 
+def _found(job: CampaignJob, path: Path | None, header: dict[str, Any]) -> Campaign | None:
+    """Return what a file has of the same runs, all of them, whatever its goals."""
+    if path is None or path.suffix != ".h5" or not path.is_file():
+        return None
+    try:
+        with hdf5().File(path, "r") as file:
+            if file.attrs.get("request") != _request(job, header):
+                return None
+        found = Campaign.load(path)
+    except (OSError, FileError):
+        return None  # it is written anew
+    goals = tuple(header["goals"])
+    whole = len(found) == header["asked"]
+    return replace(found, goals=goals, confidence=header["confidence"], _job=job) if whole else None
+
+
 def _require_sendable(job: CampaignJob) -> None:
     try:
         pickle.dumps(job)
@@ -280,5 +300,6 @@ def _request(job: CampaignJob, header: dict[str, Any]) -> str:
     """Return a hash of what the result depends on, of which the first run tells most."""
     draws = job.dispersions.rows(0, min(header["asked"], _STAGE))
     first = job.run(Draws(draws.drawn[:1], draws.run[:1]), 0).arrays
-    told = repr((header, __version__, pin.__version__))
+    kept = {key: value for key, value in header.items() if key not in ("goals", "confidence")}
+    told = repr((kept, __version__, pin.__version__))
     return content_digest({"told": told, "drawn": draws.drawn, **first})

@@ -597,3 +597,19 @@ def test_a_mean_with_what_never_settled_is_refused(robots):
     assert "noise" in found.names and {key.strip("|") for key in found.sensitivity()} == {
         *("q_b.x", "q_b.y", "q_b.z", "q_b.x.noise")
     }
+
+
+def test_runs_that_a_file_has_are_not_flown_again(robots, tmp_path, monkeypatch):
+    robot = robots["cubesat"]
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    options = {"duration": 1.0, "dt": 0.05, "out": tmp_path / "c.h5"}
+    before = fflin.monte_carlo(robot, policy, {"q_b": 0.05}, runs=16, **options)
+    with monkeypatch.context() as patch:
+        patch.setattr("fflin.campaign.monte_carlo.run_chunks", None)
+        goals = ["attitude < 1 deg"]
+        after = fflin.monte_carlo(robot, policy, {"q_b": 0.05}, runs=16, goals=goals, **options)
+        assert after.goals == tuple(goals) and (after.x == before.x).all()
+        assert (after.replay(3).x[-1] == before.x[3]).all()
+    again = fflin.monte_carlo(robot, policy, {"q_b": 0.06}, runs=16, **options)
+    assert not (again.x == before.x).any(axis=1).all()

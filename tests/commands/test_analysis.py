@@ -39,7 +39,7 @@ def test_bad_input_is_one_line():
     assert "did you mean joint_1" in refused("analyze", "ets_vii", "--stiffness", "joint1=3")
 
 
-def test_validity_with_inputs_that_are_cut_holds_less_far():
+def test_validity_says_whether_inputs_were_cut():
     asked = (
         "validity",
         "servicer_7dof",
