@@ -172,3 +172,20 @@ def test_what_is_wrong_is_one_line():
         with pytest.raises(fflin.FflinError) as error:
             call()
         assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_robot_grasps_its_twin():
+    robot = fflin.load("ets_vii")
+    q, v, _ = random_point(robot, np.random.default_rng(1), speed=0.1)
+    others = [fflin.load("ets_vii"), robot, robot.replace(damping=0.0)]
+    first, *same = (
+        fflin.capture(robot, "tool", each, q=q, payload_q=q, payload_v=v) for each in others
+    )
+    for found in same:
+        assert (found.v == first.v).all() and (found.momentum == first.momentum).all()
+
+
+def test_momentum_that_a_payload_stores_is_not_lost_in_silence():
+    wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), momentum=2.0)
+    with pytest.raises(fflin.InputError, match=r"stores momentum .* give it an inertia"):
+        fflin.capture(fflin.load("ets_vii"), "tool", fflin.load("cubesat", inputs=[wheel]))

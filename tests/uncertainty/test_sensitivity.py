@@ -255,3 +255,17 @@ def test_what_is_wrong_is_one_line():
     with pytest.raises(fflin.InputError, match="empty"):
         S.along({})
     assert all(len(line) <= 80 for line in str(S).splitlines())
+
+
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_its_check_takes_wheels_whose_bodies_have_no_mass():
+    robot = fflin.load("robots/inspector.toml")
+    found = fflin.sensitivity(fflin.linearize(robot)).check(["wheel_x.inertia", "wheel_z.inertia"])
+    assert len(found) == 2 and max(found.values()) < 1e-8
+
+
+def test_a_body_whose_joint_has_a_dot_in_its_name_is_found_by_it():
+    held = fflin.load("ets_vii")
+    robot = fflin.capture(fflin.load("servicer_7dof"), "tool", held, prefix="client").robot
+    S = fflin.sensitivity(fflin.linearize(robot))
+    assert S["client.joint_3.mass"].name == "client.link_3.mass"
