@@ -228,3 +228,22 @@ def test_of_many_parameters_some_corners_are_tried(monkeypatch):
     parts = ["mass", "inertia.xx", "inertia.yy"]
     of = fflin.uncertain(robot, {f"base.{part}": 0.01 for part in parts})
     assert of.worst(fflin.lqr(fflin.linearize(robot)), samples=2).tried == 2 + 4 + 1
+
+
+def test_rotors_count_in_the_fraction():
+    model = fflin.load("ets_vii").model.copy()
+    model.armature = np.linspace(0.1, 2.0, model.nv)
+    of = fflin.uncertain(fflin.from_model(model), {"base.mass": 0.3, "joint_2.density": 0.3})
+    delta = np.array([0.6, -0.8])
+    lin, (A, B, *_) = fflin.linearize(of.at(of.values(delta))), of.lft().at(delta)
+    assert np.abs(A - lin.A).max() <= 1e-11 and np.abs(B - lin.B).max() < 1e-11 * np.abs(B).max()
+
+
+def test_a_wheel_too_large_for_its_carrier_is_no_robot():
+    wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), inertia=1e-3)
+    robot = fflin.load("cubesat", inputs=[wheel])
+    largest = robot._bare.model.inertias[1].inertia[2, 2]
+    of = fflin.uncertain(robot, {"wheel_1.inertia": (1e-4, 1.5 * largest)})
+    assert of.makes(np.array([-0.9])) and not of.makes(np.array([0.9]))
+    with pytest.raises(fflin.InputError, match="the density of 'base' is -1"):
+        of.at({"base.density": -1.0})
