@@ -218,10 +218,12 @@ class Dispersions:
         if self._kinds & {*_OF_BODIES}:
             parameters = np.tile(tree.bodies.reshape(1, -1, 10), (len(drawn), 1, 1))
             for at, body in self.bodies(drawn).items():
-                old, axes = self._model.inertias[at], tree.axes[at - ROOT]
+                # In the tree wheels stand between the joints.
+                body_at = plant.robot.model.getJointId(self._model.names[at]) - ROOT
+                old, axes = self._model.inertias[at], tree.axes[body_at]
                 before = (np.array([x]) for x in (old.mass, old.lever, old.inertia))
                 # Linear in these, so that wheels in the body stay as they are.
-                parameters[:, at - ROOT] += _parameters(axes, *body) - _parameters(axes, *before)
+                parameters[:, body_at] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(len(drawn), -1)
         runs |= {kind: self._springs(kind, drawn) for kind in _OF_SPRINGS if kind in self._kinds}
         if "misalignment" in self._kinds:

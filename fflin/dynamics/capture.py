@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -109,8 +109,8 @@ def capture(
     UnknownNameError
         If there is no such frame.
     InputError
-        If a size or value is wrong, the payload is no body, its names are taken, or its gravity is
-        another.
+        If a size or value is wrong, the payload is no body, its names are taken, its gravity is
+        another, or a wheel of it stores momentum without an inertia.
     ModelError
         If a robot was changed after it was made.
 
@@ -126,14 +126,19 @@ def capture(
         other = body_alone(inertia_of(payload), prefix)
     elif isinstance(payload, Robot):
         payload.require_unchanged()
-        other = payload
+        other = replace(payload)  # which may be the robot's twin, the same object
     else:
         raise InputError(
             f"payload is a {type(payload).__name__}, expected a pin.Inertia or a fflin.Robot"
         )
-    if other is payload and robot.gravity != other.gravity:
+    if isinstance(payload, Robot) and robot.gravity != other.gravity:
         raise InputError(
             f"the robot's gravity is {robot.gravity}, the payload's {other.gravity}; give both one"
+        )
+    if other.stored_momentum:
+        raise InputError(
+            "a wheel of the payload stores momentum and has no inertia, so that it is no joint and "
+            "would be lost; give it an inertia, and its speed in payload_v"
         )
     at = pin.SE3.Identity() if placement is None else checked_placement("placement", placement)
     q = robot.neutral() if q is None else robot.checked_configuration(q)

@@ -189,8 +189,9 @@ def _paths(size: int, parent: Array, coordinate: list[int]) -> list[list[int]]:
         if reached[index]:
             nearest = max(reached[index])
             reached[nearest] |= reached[index] - {nearest}
+    # What the inverse of the factor has of a coordinate reaches all the way inwards.
     for index in range(size):
-        paths[index] = [*sorted(reached[index]), index]
+        paths[index] = [*(paths[max(reached[index])] if reached[index] else ()), index]
     return paths
 
 

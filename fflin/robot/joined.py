@@ -27,7 +27,7 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     bare = robot._bare
     joint, at = find_frame(bare.model, frame)
     _require_new_names(robot, prefix)
-    model = _joined(bare.model, joint, other.model, at * placement, prefix)
+    model = _joined(bare.model, joint, other.model.copy(), at * placement, prefix)
 
     def renamed(joint: Joint) -> Joint:
         return joint._replace(name=f"{prefix}.{joint.name}").within(model)

@@ -68,9 +68,10 @@ class Parameters(dict[str, Parameter]):
 
     def find(self, key: str) -> list[str]:
         """Return the names that a name or pattern stands for."""
-        body, dot, rest = str(key).partition(".")
-        if key not in self and body in self._also:
-            key = f"{self._also[body]}{dot}{rest}"
+        bodies = [body for body in self._also if str(key).startswith(f"{body}.")]
+        if key not in self and bodies:
+            body = max(bodies, key=len)
+            key = self._also[body] + key[len(body) :]
         return matched(key, list(self))
 
 

@@ -332,7 +332,11 @@ def _difference(found: Sensitivity, name: str) -> float:
         model = robot.model.copy()
         for joint, d in one.bodies.items():
             changed = model.inertias[joint].toDynamicParameters() + times * step * d
-            model.inertias[joint] = pin.Inertia.FromDynamicParameters(changed)
+            body = pin.Inertia.FromDynamicParameters(changed)
+            if not changed[0]:  # a wheel, whose centre of mass Pinocchio takes for 0 / 0
+                about = changed[4:][[[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
+                body = pin.Inertia(0.0, np.zeros(3), about)
+            model.inertias[joint] = body
         state = StateMap(replace(robot, model=model), reference=lin.reference, frame=lin.frame)
         return aba_route(state, Aba(state), lin.q, lin.v, lin.u0, moving=lin.moving)[:2]
 

@@ -12,7 +12,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.robot.frames import ROOT
-from fflin.robot.inputs import named_inputs
+from fflin.robot.inputs import Thruster, named_inputs
 from fflin.robot.link_masses import Piece, as_inertia, pieces_of
 from fflin.robot.mass_properties import with_inertias
 from fflin.robot.robot import Robot
@@ -123,7 +123,7 @@ def _input(item: Any, parts: Mapping[str, float]) -> Any:
     """Return a thruster that sits elsewhere or a wheel of another inertia, or the same."""
     if "inertia" in parts:
         return replace(item, inertia=parts["inertia"])
-    if not parts:
+    if not isinstance(item, Thruster):
         return item
     position = [parts.get(f"position.{a}", x) for a, x in zip(AXES, item.position, strict=True)]
     return replace(item, position=position)

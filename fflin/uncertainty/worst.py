@@ -88,10 +88,11 @@ def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
     if np.linalg.eigvals(middle[0] - middle[1] @ K).real.max() >= 0.0:
         raise InputError("the loop in the middle of the ranges is unstable; give another gain")
     draws, excluded = of.draws(samples, seed=seed)
-    corners = np.array(list(product((-1.0, 1.0), repeat=min(len(lft.repeats), 30)))[:_CORNERS])
     if len(lft.repeats) > np.log2(_CORNERS):
         signs = np.random.default_rng(seed).integers(0, 2, (_CORNERS, len(lft.repeats)))
         corners = 2.0 * signs - 1.0
+    else:
+        corners = np.array(list(product((-1.0, 1.0), repeat=len(lft.repeats))))
     physical = np.array([of.makes(corner) for corner in corners])
     excluded += int((~physical).sum())
     tried = np.vstack((draws, corners[physical], np.zeros((1, len(lft.repeats)))))

@@ -115,6 +115,25 @@ def test_kernel_knows_joints_that_turn_against_others_with_rotors_of_their_own(t
     assert agreement(replace(robot, model=model)) < 1e-13
 
 
+def test_kernel_knows_what_mimics_a_joint_of_another_branch_beside_one_that_does_not(tmp_path):
+    """c on b mimics a; d, on b too, is not moved by a, and yet its row of the inverse is."""
+    more = "".join(
+        f"""<link name="l{name}"><inertial><origin xyz=".1 .2 .3"/><mass value="0.9"/>
+        <inertia ixx=".2" ixy="0" ixz="0" iyy=".3" iyz="0" izz=".4"/></inertial></link>
+        <joint name="{name}" type="continuous"><parent link="lb"/><child link="l{name}"/>
+        <origin xyz=".3 -.2 .1"/><axis xyz="{axis}"/>{mimic}</joint>"""
+        for name, axis, mimic in (
+            ("c", "1 0 0", '<mimic joint="a" multiplier="-0.7"/>'),
+            ("d", "0 1 0", ""),
+        )
+    )
+    document = MIMIC.format(links=LINKS, a="revolute", b="revolute", parent="base", mimic="")
+    (tmp_path / "r.urdf").write_text(document.replace("</robot>", f"{more}</robot>"))
+    robot = fflin.load(tmp_path / "r.urdf")
+    assert robot.joint_names == ("a", "b", "d")
+    assert agreement(robot) < 1e-13
+
+
 @pytest.mark.parametrize("name", ["panda", "tiago"])
 def test_kernel_agrees_where_joints_mimic_others_and_turn_without_end(name):
     pytest.importorskip("example_robot_data")

@@ -95,6 +95,19 @@ def test_mimic_joints(tmp_path):
         both(robot, feedback(robot), {"q_m": 0.3, "*.mass": 0.1}, duration=1.0)
 
 
+def test_bodies_are_their_own_beside_wheels_on_another_branch(robots):
+    """The wheel's joint stands before the joints of the arm's other branch."""
+    robot = robots["dual_arm"]
+    first, last = robot.joint_names[0], robot.joint_names[-1]
+    wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), first, inertia=1e-4, name="w")
+    robot = robot.replace(inputs=[*robot.inputs, wheel])
+    assert robot.joint_names[-1] == last and robot.joint_names.index("w") < robot.n - 1
+    lin = fflin.linearize(robot)
+    K = np.random.default_rng(1).normal(size=lin.B.T.shape) * 1e-3
+    given = {"qdot_m.*": 0.1, f"{last}.mass": 0.3, f"{last}.com": 0.3, f"{first}.inertia": 0.2}
+    both(robot, fflin.StateFeedback(lin, K), given, duration=0.5)
+
+
 def test_outputs_samples_delay_and_limits(robots):
     robot, lin, compensator = designed(POSITIONS)
     policy = fflin.OutputFeedback(lin, compensator)

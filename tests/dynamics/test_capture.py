@@ -1,11 +1,13 @@
 """A rigid grasp: momentum, the weld, the energy lost, and the limit of a stiff one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
 
 import fflin
-from tests.support.robots import random_point, random_pose
+from tests.support.robots import LINKS, MIMIC, random_point, random_pose
 
 DEBRIS = pin.Inertia(500.0, np.array([0.1, 0.2, 0.3]), np.diag([100.0, 120.0, 90.0]))
 CASES = {
@@ -185,3 +187,55 @@ def test_what_is_wrong_is_one_line():
         with pytest.raises(fflin.FflinError) as error:
             call()
         assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_robot_grasps_its_twin():
+    robot = fflin.load("ets_vii")
+    q, v, _ = random_point(robot, np.random.default_rng(1), speed=0.1)
+    others = [fflin.load("ets_vii"), robot, robot.replace(damping=0.0)]
+    first, *same = (
+        fflin.capture(robot, "tool", each, q=q, payload_q=q, payload_v=v) for each in others
+    )
+    for found in same:
+        assert (found.v == first.v).all() and (found.momentum == first.momentum).all()
+
+
+def test_momentum_that_a_payload_stores_is_not_lost_in_silence():
+    wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), momentum=2.0)
+    with pytest.raises(fflin.InputError, match=r"stores momentum .* give it an inertia"):
+        fflin.capture(fflin.load("ets_vii"), "tool", fflin.load("cubesat", inputs=[wheel]))
+
+
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_all_of_a_payload_hangs_where_it_was_on_its_base(tmp_path):
+    """Its frames, rotors and mimic joints, and a root that is not at its base's origin."""
+    mimic = '<mimic joint="b" multiplier="-2" offset="0.3"/>'
+    document = MIMIC.format(links=LINKS, a="revolute", b="revolute", parent="base", mimic=mimic)
+    (tmp_path / "r.urdf").write_text(document)
+    held = fflin.load(tmp_path / "r.urdf")
+    model = held.model.copy()
+    model.armature = np.r_[np.zeros(6), 0.3, 0.4]
+    model.jointPlacements[1] = random_pose(np.random.default_rng(2), 50.0)
+    held = replace(held, model=model)
+    robot = fflin.load("ets_vii", limits={"joint_1": (-1.0, 1.0)})
+    at, q = random_pose(np.random.default_rng(1), 70.0), fflin.configuration(held, {"b": 0.4})
+    found = fflin.capture(robot, "tool", held, placement=at, payload_q=q)
+    whole = found.robot
+    assert whole.limits == robot.limits
+    assert [(f.joint.name, f.multiplier, f.offset) for f in whole.followers] == [
+        ("payload.a", -2.0, 0.3)
+    ]
+    assert (np.sort(whole.model.armature)[-2:] == (0.3, 0.4)).all()
+    placed = []
+    for each, point, start in ((held, q, "base"), (whole, found.q, "payload")):
+        data = each.create_data()
+        pin.framesForwardKinematics(each.model, data, point)
+        names = [start, *(f"{start}.{x}" if each is whole else x for x in ("base", "la", "lb"))]
+        first, *rest = (data.oMf[each.model.getFrameId(name)] for name in names)
+        placed.append([first.actInv(one) for one in rest])
+    for one, other in zip(*placed, strict=True):
+        assert one.isApprox(other, 1e-12)
+    v = np.random.default_rng(3).normal(size=6)
+    moving = fflin.capture(robot, "tool", held, placement=at, payload_v=v)
+    size = np.abs(moving.momentum).max()
+    assert np.abs(moving.momentum - moving.momentum_after).max() < 1e-13 * size

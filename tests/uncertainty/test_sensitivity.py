@@ -255,3 +255,47 @@ def test_what_is_wrong_is_one_line():
     with pytest.raises(fflin.InputError, match="empty"):
         S.along({})
     assert all(len(line) <= 80 for line in str(S).splitlines())
+
+
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_its_check_takes_wheels_whose_bodies_have_no_mass():
+    robot = fflin.load("robots/inspector.toml")
+    found = fflin.sensitivity(fflin.linearize(robot)).check(["wheel_x.inertia", "wheel_z.inertia"])
+    assert len(found) == 2 and max(found.values()) < 1e-8
+
+
+def test_a_body_whose_joint_has_a_dot_in_its_name_is_found_by_it():
+    held = fflin.load("ets_vii")
+    robot = fflin.capture(fflin.load("servicer_7dof"), "tool", held, prefix="client").robot
+    S = fflin.sensitivity(fflin.linearize(robot))
+    assert S["client.joint_3.mass"].name == "client.link_3.mass"
+
+
+def test_a_thruster_that_burns_on_a_link_and_a_spring_out_of_rest():
+    robot = fflin.load("ets_vii")
+    q, v, _ = random_point(robot, np.random.default_rng(2), degrees=60.0)
+    jet = fflin.Thruster("tool", (0.1, 0.2, -0.1), (0.0, 0.6, 0.8), name="jet")
+    robot = robot.replace(inputs=[jet], stiffness={"joint_3": 5.0}, rest={"joint_3": 0.7})
+
+    def moved(step):
+        return robot.replace(inputs=[replace(jet, position=(0.1 + step, 0.2, -0.1))])
+
+    def stiffer(step):
+        return robot.replace(stiffness={"joint_3": 5.0 + step})
+
+    S = fflin.sensitivity(fflin.linearize(robot, q, v, [3.0]))
+    for name, of in (("jet.position.x", moved), ("joint_3.stiffness", stiffer)):
+        # In both all is linear.
+        ends = [everything(fflin.linearize(of(step), q, v, [3.0])) for step in (0.5, -0.5)]
+        for high, low, got in zip(*ends, derived(S[name]), strict=True):
+            expected = high - low
+            assert np.abs(got - expected).max() <= 1e-10 * np.abs(expected).max(), name
+
+
+def test_rotors_are_no_parameters_of_bodies():
+    model = fflin.load("ets_vii").model.copy()
+    model.armature = np.r_[np.zeros(6), np.linspace(0.1, 2.0, model.nv - 6)]
+    robot = fflin.from_model(model)
+    q, v, u = random_point(robot, np.random.default_rng(2))
+    found = fflin.sensitivity(fflin.linearize(robot, q, v, u)).check(["base.mass", "joint_3.com.x"])
+    assert max(found.values()) < 1e-8

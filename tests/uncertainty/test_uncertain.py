@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import fflin
+from fflin.uncertainty import worst
 
 CASES = {
     "cubesat": {
@@ -206,3 +207,43 @@ def test_what_is_wrong_is_one_line():
     joined = fflin.load("planar_detumble")
     with pytest.raises(fflin.InputError, match="is a link of the body"):
         fflin.uncertain(joined, {"joint_3.mass": 0.1, "hand.mass": 0.1})
+
+
+def test_a_wheel_with_friction_is_no_thruster():
+    wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), inertia=1e-3, name="w")
+    robot = fflin.load("servicer_7dof", inputs=[wheel])
+    of = fflin.uncertain(robot, {"w.damping": (0.1, 0.3)})
+    for delta, made in zip(of.draws(3)[0], of.samples(3), strict=True):
+        lin, values = fflin.linearize(made), of.values(delta)
+        assert made.damping["w"] == values["w.damping"]
+        assert np.abs(of.lft().at(values)[0] - lin.A).max() < 1e-11 * np.abs(lin.A).max()
+
+
+def test_of_many_parameters_some_corners_are_tried(monkeypatch):
+    """2^30 of them would not go into memory."""
+    monkeypatch.setattr(worst, "product", None)
+    monkeypatch.setattr(worst, "_CORNERS", 4)
+    monkeypatch.setattr(worst, "_STEPS", 2)
+    robot = fflin.load("cubesat")
+    parts = ["mass", "inertia.xx", "inertia.yy"]
+    of = fflin.uncertain(robot, {f"base.{part}": 0.01 for part in parts})
+    assert of.worst(fflin.lqr(fflin.linearize(robot)), samples=2).tried == 2 + 4 + 1
+
+
+def test_rotors_count_in_the_fraction():
+    model = fflin.load("ets_vii").model.copy()
+    model.armature = np.linspace(0.1, 2.0, model.nv)
+    of = fflin.uncertain(fflin.from_model(model), {"base.mass": 0.3, "joint_2.density": 0.3})
+    delta = np.array([0.6, -0.8])
+    lin, (A, B, *_) = fflin.linearize(of.at(of.values(delta))), of.lft().at(delta)
+    assert np.abs(A - lin.A).max() <= 1e-11 and np.abs(B - lin.B).max() < 1e-11 * np.abs(B).max()
+
+
+def test_a_wheel_too_large_for_its_carrier_is_no_robot():
+    wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), inertia=1e-3)
+    robot = fflin.load("cubesat", inputs=[wheel])
+    largest = robot._bare.model.inertias[1].inertia[2, 2]
+    of = fflin.uncertain(robot, {"wheel_1.inertia": (1e-4, 1.5 * largest)})
+    assert of.makes(np.array([-0.9])) and not of.makes(np.array([0.9]))
+    with pytest.raises(fflin.InputError, match="the density of 'base' is -1"):
+        of.at({"base.density": -1.0})
