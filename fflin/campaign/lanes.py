@@ -98,8 +98,9 @@ class Lanes:
             first = int(clock[0])
             advance(*parts, clock, min(steps, (first // _SLICE + 1) * _SLICE), 1, rows, self._work)
             done = int(clock[0])
-            seen = self._split(rows[: (done - first) * width])
-            tally.add(first, *seen[:3])
+            taken = rows[: (done - first) * width]
+            seen = self._split(taken)
+            tally.add(first, *seen[:3], taken)
             if watcher:
                 watcher(first, seen)
             lost = ~(point.nu**2 < watch.squares[:, None]).all(axis=0)
@@ -111,10 +112,11 @@ class Lanes:
             if not ending.any():
                 continue
             stop = stop[of_lane]
-            end = [x.T[None] for x in (point.q, point.nu, stages.u)]
+            last = np.vstack((point.q, point.nu, stages.u, kept.sums[:9]))
+            end = self._split(last)[:3]
             # Of what diverged the end is no number.
             away = (stop == _DIVERGED)[:count]
-            for some, each in ((away, tally), (~away, tally.copy().add(done, *end))):
+            for some, each in ((away, tally), (~away, tally.copy().add(done, *end, last))):
                 if (some & ending).any():
                     for name, values in each.outcome(done, stop)._asdict().items():
                         out[name][some & ending] = values[:count][some & ending]

@@ -237,7 +237,7 @@ class Settling:
         """Return one that goes its own way from here on."""
         return copy(self)
 
-    def add(self, first: int, q: Array, nu: Array, _: Array) -> Settling:
+    def add(self, first: int, q: Array, nu: Array, *_: Array) -> Settling:
         """Take rows (steps, count, ..) from a step on into account."""
         loop, rows = self._loop, slice(-first % self._job.every, None, self._job.every)
         q, nu = q[rows], nu[rows]

@@ -5,7 +5,7 @@ Its size does not depend on how long the run is.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -86,7 +86,7 @@ class Tally:
         }
         return other
 
-    def add(self, first: int, q: Array, nu: Array, u: Array) -> Tally:
+    def add(self, first: int, q: Array, nu: Array, u: Array, _: Any = None) -> Tally:
         """Take rows (steps, count, ..) from a step on into account."""
         x, e, sizes = self._errors(first, *(np.ascontiguousarray(each) for each in (q, nu)))
         self._last = q[-1], nu[-1], u[-1], x[-1], sizes[-1]

@@ -176,9 +176,9 @@ def splat(typing: Any, array: Any, value: Any) -> Any:
     return _held(array)(array, double), generate
 
 
-def _rounding(name: str) -> Any:
+def _of_one(name: str) -> Any:
     @intrinsic
-    def rounded(typing: Any, value: Any) -> Any:
+    def calculated(typing: Any, value: Any) -> Any:
         def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
             kind = arguments[0].type
             of = f"v{LANES}f64" if kind == _VECTOR else "f64"
@@ -189,10 +189,10 @@ def _rounding(name: str) -> Any:
 
         return value(value), generate
 
-    return rounded
+    return calculated
 
 
-floor, whole = _rounding("floor"), _rounding("rint")
+floor, whole, root = (_of_one(name) for name in ("floor", "rint", "sqrt"))
 
 
 @intrinsic
