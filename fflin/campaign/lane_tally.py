@@ -62,7 +62,9 @@ class LaneTally(Tally):
         space[:] = values
         q, nu, *marks = np.split(space, np.cumsum(self._sizes)[:-1])
         at = Point(q, nu, *[self._marks.home] * 3)
-        self._marks = self._marks._replace(at=at, **dict(zip(Marks._fields[-9:], marks)))
+        self._marks = self._marks._replace(
+            at=at, **dict(zip(Marks._fields[-9:], marks, strict=True))
+        )
         self.largest_x, self.largest_u, self.largest, self.outside = (x.T for x in marks[3:7])
         self.error_history, self.input_history = (
             x.reshape(len(self.steps), each, LANES).transpose(2, 0, 1)
