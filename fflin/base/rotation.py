@@ -1,6 +1,7 @@
 """Rotations: cross-product matrices and Hamilton quaternions stored x, y, z, w."""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -45,17 +46,17 @@ def conjugate(a: Array) -> Array:
 
 def rotation_matrix(a: Array) -> Array:
     """Return the rotation (3, 3) of a unit quaternion."""
-    x, y, z, w = a.tolist()
-    return np.array(
-        (
-            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-            (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-            (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-        )
-    )
+    return np.array(_rotation(*a.tolist()))
 
 
 def rotation_matrices(a: Array) -> Array:
     """Return the rotations (N, 3, 3) of unit quaternions (N, 4)."""
-    crossed = skew(a[:, :3])
-    return np.eye(3) + 2.0 * (a[:, 3, None, None] * crossed + crossed @ crossed)
+    return np.ascontiguousarray(np.array(_rotation(*a.T)).transpose(2, 0, 1))
+
+
+def _rotation(x: Any, y: Any, z: Any, w: Any) -> Any:
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )

@@ -230,6 +230,11 @@ class ScheduledFeedback:
                 raise InputError(f"the {key} of the model and of the gains differ")
         _ = self.gains.grid
 
+    def table(self) -> tuple[dict[str, Array], Array]:
+        """Return the joints of the grid and their values, and the gains (N, nu, nx) in order."""
+        by = self.gains
+        return by.grid, by._interpolator.values.reshape(by.K.shape)
+
     def bind(self, robot: Robot) -> Any:
         """Return policy(t, q, v) -> u for a robot; errors are those of `StateFeedback.bind`."""
         lin, gains = self.lin, self.gains

@@ -4,28 +4,33 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fflin.base.errors import ChartError, InputError, UnknownNameError
 from fflin.base.names import by_name, input_keys
-from fflin.base.validation import Array, number
+from fflin.base.validation import Array
 from fflin.base.validation import by_name as mapping
-from fflin.control.output_feedback import OutputFeedback
-from fflin.control.policies import StateFeedback, bound
+from fflin.campaign.pointing import columns_of, in_lanes, misaligned, require_direction
+from fflin.campaign.sensing import Designed, Misled, noise_of
+from fflin.campaign.spreads import deviation_of, inverse_of, whole_number
+from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
+from fflin.control.policies import Allocation, StateFeedback
 from fflin.dynamics.state import StateMap
+from fflin.kernel.accelerations import loads_of
 from fflin.kernel.tree import Tree
 from fflin.robot.frames import ROOT
 from fflin.robot.mass_properties import stretched, with_inertias
-from fflin.robot.robot import Robot
 from fflin.simulation.plant import Drives, Plant
+from fflin.simulation.times import Times
 
 _BLOCK = 1024  # runs whose draws are made together, whatever the chunks are
 _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz"}  # with their axes
+_AXES = _OF_BODIES | {"misalignment": "12"}
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
+_OF_SENSORS = ("sensor", "noise")
 _FACTORS = ("mass", "inertia", *_OF_SPRINGS)
 
 
@@ -33,7 +38,7 @@ class Column(NamedTuple):
     """A number that is drawn for each run, what it changes and of whom."""
 
     name: str
-    kind: str  # "state", or what a name ends with
+    kind: str  # "state", "delay", "seed" of noise, or what a name ends with
     at: tuple[int, int]  # which state, body, joint, input or sensor, and which of its axes
     inverse: Callable[[Array], Array]  # of the distribution function
 
@@ -48,8 +53,11 @@ class Draws(NamedTuple):
 class Dispersions:
     """What is drawn, see `monte_carlo`, and what draws make of a robot and its start x0 (nx,)."""
 
-    def __init__(self, given: Any, plant: Plant, policy: Any, x0: Array, seed: int) -> None:
+    def __init__(
+        self, given: Any, plant: Plant, policy: Any, x0: Array, seed: int, times: Times
+    ) -> None:
         self._plant, self._policy, self._x0, self._seed = plant, policy, x0, seed
+        self._times = times
         self._model = plant.robot._bare.model
         bodies = ["base", *list(self._model.names)[ROOT + 1 :]]
         self._sensors: tuple[str, ...] = ()
@@ -57,19 +65,26 @@ class Dispersions:
             lin = policy.lin
             of_states = isinstance(policy, StateFeedback)
             self._sensors = lin.state_names if of_states else lin.output_names
+        if isinstance(policy, TrajectoryOutputFeedback):
+            self._sensors = policy.filter.output_names
         known = {
             "state": plant.state.names,
-            "sensor": self._sensors,
+            **dict.fromkeys(_OF_SENSORS, self._sensors),
             **dict.fromkeys(_OF_BODIES, bodies),
-            **dict.fromkeys(_OF_INPUTS, input_keys(plant.actuation)),
+            **dict.fromkeys((*_OF_INPUTS, "misalignment"), input_keys(plant.actuation)),
             **dict.fromkeys(_OF_SPRINGS, plant.robot.joint_names),
         }
         by_kind: dict[str, dict[str, Any]] = {}
+        self.columns: list[Column] = []
         for key, spread in mapping("dispersions", given, "name").items():
             head, _, kind = str(key).rpartition(".")
             kind, head = (kind, head) if kind in known and head else ("state", str(key))
-            by_kind.setdefault(kind, {})[head] = _inverse(str(key), spread)
-        self.columns: list[Column] = []
+            if key == "delay":
+                kind, known["delay"] = "delay", ("delay",)
+            inverse = deviation_of if kind == "noise" else inverse_of
+            by_kind.setdefault(kind, {})[head] = inverse(str(key), spread)
+        if "noise" in by_kind:
+            self.columns.append(Column("noise", "seed", (0, 0), whole_number))
         for kind, spreads in by_kind.items():
             self._add(kind, spreads, list(known[kind]), " | ".join([*known][1:]))
         if not self.columns:
@@ -77,10 +92,15 @@ class Dispersions:
         self._kinds = {column.kind for column in self.columns}
 
     def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
-        if kind == "sensor" and not names:
+        if kind in _OF_SENSORS and not names:
             raise InputError(
-                f"'{next(iter(spreads))}.sensor' is dispersed, and a "
+                f"'{next(iter(spreads))}.{kind}' is dispersed, and a "
                 f"{type(self._policy).__name__} has no sensors; StateFeedback and OutputFeedback do"
+            )
+        if kind in ("noise", "delay") and not self._times.sample:
+            raise InputError(
+                f"{kind} is dispersed, which is of samples, and the policy is asked at every "
+                "stage; give sample=, a multiple of dt"
             )
         try:
             found = by_name(f"{kind} to disperse", spreads, names)
@@ -89,10 +109,12 @@ class Dispersions:
                 f"{error}" + f"; or NAME.({kinds})" * (kind == "state")
             ) from None
         for at, inverse in sorted(found.items()):
-            own = names[at] if kind == "state" else f"{names[at]}.{kind}"
+            own = names[at] if kind in ("state", "delay") else f"{names[at]}.{kind}"
             if kind in _OF_SPRINGS and not getattr(self._plant.robot.springs, kind)[at]:
                 raise InputError(f"'{own}' is dispersed, and is 0, which stays 0 times a factor")
-            for axis, letter in enumerate(_OF_BODIES.get(kind, " ")):
+            if kind == "misalignment":
+                require_direction(self._plant.robot, at)
+            for axis, letter in enumerate(_AXES.get(kind, " ")):
                 name = f"{own}.{letter}".rstrip(". ")
                 self.columns.append(Column(name, kind, (at, axis), inverse))
 
@@ -168,7 +190,21 @@ class Dispersions:
         safe = np.ones(until.shape[1], dtype=bool)
         safe[[each.at[0] for each in self.columns if each.kind == "fails"]] = False
         until[:, safe] = np.inf
-        return Drives(1.0 + gain, bias, until)
+        turn = columns_of(self._plant.robot, self._angles(drawn))
+        return Drives(1.0 + gain, bias, until, turn)
+
+    def _angles(self, drawn: Array) -> Array:
+        return self._of("misalignment", drawn, len(self._plant.drives.gain), 2)
+
+    def _sensing(self, drawn: Array) -> tuple[Array, Array, Array]:
+        """Return bias and deviation (N, ny) of what is sensed, and the seed (N,) of its noise."""
+        bias, noise = (self._of(key, drawn, len(self._sensors))[..., 0] for key in _OF_SENSORS)
+        return bias, noise, self._of("seed", drawn, 1)[:, 0, 0]
+
+    def delays(self, drawn: Array) -> Array:
+        """Return the steps (N,) from a sample to its effect."""
+        late = self._of("delay", drawn, 1)[:, 0, 0] / self._times.dt
+        return np.maximum(0.0, np.rint(self._times.delay + late))
 
     def in_lanes(self, drawn: Array, tree: Tree) -> dict[str, Array]:
         """Return what differs from run to run, as the compiled loop takes it."""
@@ -183,12 +219,22 @@ class Dispersions:
                 parameters[:, at - ROOT] += _parameters(axes, *body) - _parameters(axes, *before)
             runs["bodies"] = parameters.reshape(len(drawn), -1)
         runs |= {kind: self._springs(kind, drawn) for kind in _OF_SPRINGS if kind in self._kinds}
-        if "sensor" in self._kinds:
-            bias = self._of("sensor", drawn, len(self._sensors))[..., 0]
-            if isinstance(self._policy, OutputFeedback):
-                runs["y0"] = self._policy.compensator.y0 - bias
-            else:
-                runs["offset"] = self._policy.terms(plant.state)[1] - bias @ self._policy.K.T
+        if "misalignment" in self._kinds:
+            loads = loads_of(plant.robot, plant.actuation, tree)
+            turned = in_lanes(plant.robot, tree, loads, self._angles(drawn))
+            turned["bodies"] += runs.get("bodies", tree.bodies)
+            runs |= turned
+        if self._kinds & {*_OF_SENSORS}:
+            names = plant.state.names if isinstance(self._policy, StateFeedback) else self._sensors
+            fed = [names.index(name) for name in self._sensors]
+            *errors, seed = self._sensing(drawn)
+            for key, values in zip(("sensed", "noise"), errors, strict=True):
+                runs[key] = np.zeros((len(drawn), len(names)))
+                runs[key][:, fed] = values
+            if "noise" in self._kinds:
+                runs["seed"] = seed
+        if "delay" in self._kinds:
+            runs["delay"] = self.delays(drawn)[:, None]
         return runs
 
     def one(self, drawn: Array) -> tuple[Plant, Any, Array, Array]:
@@ -201,31 +247,21 @@ class Dispersions:
             values = self._springs(kind, rows)[0].tolist()
             of: Any = {kind: dict(zip(robot.joint_names, values, strict=True))}
             robot = replace(robot, **of)
-        if "sensor" in self._kinds:
-            bias = self._of("sensor", rows, len(self._sensors))[0, :, 0]
-            if isinstance(policy, OutputFeedback):
-                noise = policy.noise
-                policy = replace(
-                    policy, noise=lambda t: bias + np.asarray(noise(t) if noise else 0.0)
-                )
+        if "misalignment" in self._kinds:
+            robot = misaligned(robot, self._angles(rows)[0])
+            if isinstance(policy, Allocation):  # which does not know of it
+                policy = Designed(policy, plant.robot)
+        if self._kinds & {*_OF_SENSORS}:
+            error = noise_of(*(each[0] for each in self._sensing(rows)))
+            if isinstance(policy, StateFeedback):
+                policy = Misled(policy, error)
             else:
-                policy = _Shifted(policy, -policy.K @ bias)
+                noise = policy.noise or np.zeros_like
+                policy = replace(policy, noise=lambda t: error(t) + np.asarray(noise(t)))
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
         drives = Drives(*(x[0] for x in self._drives(rows)))
-        faulty = drives if self._kinds & {*_OF_INPUTS} else None
+        faulty = drives if self._kinds & {*_OF_INPUTS, "misalignment"} else None
         return Plant(state, plant.disturbance, faulty), policy, q[0], v[0]
-
-
-@dataclass(frozen=True)
-class _Shifted:
-    """A policy whose commands are shifted (nu,)."""
-
-    policy: Any
-    shift: Array
-
-    def bind(self, robot: Robot) -> Callable[[float, Array, Array], Array]:
-        inner = bound(self.policy, robot)
-        return lambda t, q, v: np.asarray(inner(t, q, v)) + self.shift
 
 
 def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
@@ -234,46 +270,3 @@ def _parameters(axes: Array, mass: Array, com: Array, inertia: Array) -> Array:
     about = axes.T @ (inertia + mass[:, None, None] * square) @ axes
     rows, columns = np.triu_indices(3)
     return np.column_stack((mass, mass[:, None] * (com @ axes), about[:, rows, columns]))
-
-
-def _inverse(name: str, spread: Any) -> Callable[[Array], Array]:
-    """Return the inverse distribution function of a spread."""
-    if hasattr(spread, "ppf"):
-        try:
-            middle = float(spread.ppf(0.5))
-        except Exception:  # of what may call itself a distribution
-            middle = np.nan
-        if not np.isfinite(middle):
-            raise InputError(f"the distribution of '{name}' has no median; freeze it first")
-        return spread.ppf
-    if isinstance(spread, tuple):
-        if len(spread) != 2:
-            raise InputError(f"'{name}' is {spread!r}, expected (least, largest)")
-        least, largest = (number(f"'{name}'", each) for each in spread)
-        if not least <= largest:
-            raise InputError(f"'{name}' is ({least:g}, {largest:g}), expected (least, largest)")
-        return partial(_uniform, least, largest)
-    if isinstance(spread, list | np.ndarray):
-        values = [number(f"'{name}'", each) for each in np.ravel(spread).tolist()]
-        if not values:
-            raise InputError(f"'{name}' has no values to choose from")
-        return partial(_choice, np.array(values))
-    deviation = number(f"'{name}'", spread)
-    if deviation < 0.0:
-        raise InputError(f"'{name}' is {deviation:g}, expected a standard deviation of 0 or more")
-    return partial(_normal, deviation)
-
-
-def _uniform(least: float, largest: float, u: Array) -> Array:
-    return least + (largest - least) * u
-
-
-def _choice(values: Array, u: Array) -> Array:
-    return values[(u * len(values)).astype(int)]
-
-
-def _normal(deviation: float, u: Array) -> Array:
-    from scipy.special import ndtri
-
-    normal: Array = deviation * ndtri(u)
-    return normal

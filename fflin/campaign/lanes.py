@@ -10,17 +10,17 @@ import numpy as np
 
 from fflin.base.rotation import product_matrix
 from fflin.base.validation import Array
+from fflin.campaign.sensing import normals
 from fflin.campaign.tally import STOPS, Tally, stop_of
 from fflin.kernel.accelerations import work_space
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.simulation.conservation import Conserved
-from fflin.simulation.packing import packed
+from fflin.simulation.packing import SLOTS, noise_of, noises, packed
 from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
 from fflin.simulation.run import ending_of
 
-_SLICE = 128  # steps whose rows are there at a time
 _DIVERGED = float(STOPS.index("diverged"))
 
 # Takes the first step of some, and their rows (steps, LANES, ..) of q, nu, u, momentum and centre.
@@ -30,33 +30,45 @@ Watcher = Callable[[int, list[Array]], None]
 class Lanes:
     """The compiled loop over a plan, with arrays of its own: not to be shared by threads."""
 
-    def __init__(self, plan: Plan, plant: Plant) -> None:
+    def __init__(self, plan: Plan, plant: Plant, runs: Mapping[str, Array]) -> None:
         tree = batch_tree(plant.robot)
         assert tree is not None
+        if "delay" in runs:  # so that there is room for the latest
+            latest = int(runs["delay"].max())
+            plan = replace(plan, times=plan.times._replace(delay=latest))
         parts = packed(plan, plant, Conserved(plant.robot, plan.q), tree)
         self._plan, self._state = plan, plant.state
         mechanics, method, law, channel, (kept, *flags), watch, point, stages = parts
         self._fresh: list[tuple[Array, Array]] = []
         mechanics = mechanics._replace(
-            tree=self._wide(mechanics.tree, "bodies"),
-            loads=self._wide(mechanics.loads, "wrench", "stiffness", "damping"),
+            tree=self._wide(mechanics.tree, "bodies", "fixed"),
+            loads=self._wide(mechanics.loads, "wrench", "stored", "stiffness", "damping"),
             drives=self._wide(mechanics.drives, *mechanics.drives._fields),
         )
-        path = self._wide(law.path, "e")
-        law = self._wide(law, "offset", "y0", "x", "z", "next")._replace(path=path)
+        if "seed" in runs and len(law.added) == len(law.y):
+            law = law._replace(added=np.zeros(SLOTS * len(law.y)))
+        law = self._wide(law, "x", "y", "added", "u")._replace(
+            path=self._wide(law.path, "e"),
+            grid=self._wide(law.grid, "at"),
+            filter=self._wide(law.filter, "z", "next"),
+        )
+        if law.sharing:
+            own = self._wide(law.sharing.point, "q", "pushing")
+            wide = self._wide(law.sharing, "work", "columns")._replace(point=own)
+            law = law._replace(sharing=wide)
         pulses = self._wide(channel.pulses, "left", "level", "end")
-        channel = self._wide(channel, "held", "pending")._replace(pulses=pulses)
+        channel = self._wide(channel, "held", "pending", "delay", "fresh")._replace(pulses=pulses)
         kept, point, stages = (self._wide(x, *x._fields) for x in (kept, point, stages))
         # All starts are given with the base on the side of the chart where this is positive.
         watch = watch._replace(sign=np.abs(watch.sign))
         self._parts = mechanics, method, law, channel, (kept, *flags), watch, point, stages
         self._work = work_space(mechanics.layout.size)
         self._sizes = [len(each) for each in (point.q, point.nu, point.u)] + [6, 3]
-        self._rows = work_space(_SLICE * sum(self._sizes))
+        self._rows = work_space(SLOTS * sum(self._sizes))
         self._of = {
-            **{"q": point.q, "nu": point.nu, "bodies": mechanics.tree.bodies},
-            **{"y0": law.y0, "offset": law.offset},
-            **{"stiffness": mechanics.loads.stiffness, "damping": mechanics.loads.damping},
+            **{"q": point.q, "nu": point.nu, "delay": channel.delay},
+            **{key: getattr(mechanics.tree, key) for key in ("bodies", "fixed")},
+            **{key: getattr(mechanics.loads, key) for key in mechanics.loads._fields},
             **mechanics.drives._asdict(),
         }
         self._turn = product_matrix(plant.state.origin_quaternion)[3]
@@ -87,7 +99,9 @@ class Lanes:
             array[:] = fresh
         of_lane = np.minimum(np.arange(LANES), count - 1)
         for name, values in runs.items():
-            self._of[name][:] = values[of_lane].T
+            if name in self._of:
+                self._of[name][:] = values[of_lane].T
+        sense = self._sensors(runs, of_lane)
         mass = mechanics.tree.bodies[::10].sum(axis=0)
         kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * mechanics.gravity[:, None]
         kept.start[9:] = point.q[:3]
@@ -96,7 +110,9 @@ class Lanes:
         clock, going, told = np.zeros(1, dtype=np.intp), np.ones(count, dtype=bool), [""] * count
         while clock[0] < steps and going.any():
             first = int(clock[0])
-            advance(*parts, clock, min(steps, (first // _SLICE + 1) * _SLICE), 1, rows, self._work)
+            last = min(steps, (first // SLOTS + 1) * SLOTS)
+            sense(first, last)
+            advance(*parts, clock, last, 1, rows, self._work)
             done = int(clock[0])
             taken = rows[: (done - first) * width]
             seen = self._split(taken)
@@ -112,11 +128,11 @@ class Lanes:
             if not ending.any():
                 continue
             stop = stop[of_lane]
-            last = np.vstack((point.q, point.nu, stages.u, kept.sums[:9]))
-            end = self._split(last)[:3]
+            ended = np.vstack((point.q, point.nu, stages.u, kept.sums[:9]))
+            end = self._split(ended)[:3]
             # Of what diverged the end is no number.
             away = (stop == _DIVERGED)[:count]
-            for some, each in ((away, tally), (~away, tally.copy().add(done, *end, last))):
+            for some, each in ((away, tally), (~away, tally.copy().add(done, *end, ended))):
                 if (some & ending).any():
                     for name, values in each.outcome(done, stop)._asdict().items():
                         out[name][some & ending] = values[:count][some & ending]
@@ -127,6 +143,31 @@ class Lanes:
                 for array, _ in self._fresh:
                     array[:, over] = array[:, [going.argmax()]]
         return told
+
+    def _sensors(self, runs: Mapping[str, Array], of_lane: Array) -> Callable[[int, int], None]:
+        """Return what writes the errors of all that is sensed from a step up to another."""
+        law, times, noise = self._parts[2], self._plan.times, noise_of(self._plan)
+        size = len(law.y)
+        rows = law.added.reshape(len(law.added) // max(size, 1), size, LANES)
+        nothing = np.zeros((len(of_lane), size))
+        bias, deviation = (runs.get(key, nothing)[of_lane].T for key in ("sensed", "noise"))
+        rows[:] = bias
+        draws = [normals(seed) for seed in runs["seed"][of_lane]] if "seed" in runs else []
+
+        drawn = 0
+
+        def sense(step: int, last: int) -> None:
+            nonlocal drawn
+            if drawn == last:  # some of the others ended on the way
+                return
+            drawn = last
+            k, values = noises(noise, times, size, step, last)
+            rows[k % SLOTS] = values[..., None] + bias
+            for lane, normal in enumerate(draws):
+                random = normal.standard_normal(values.shape)
+                rows[k % SLOTS, :, lane] += deviation[:, lane] * random
+
+        return sense if len(rows) == SLOTS else lambda *_: None
 
     def kept(self, t: float) -> tuple[Array, Array]:
         """Return the momentum (6,) and the centre of mass (3,) that the first is to have."""

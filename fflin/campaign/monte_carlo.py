@@ -74,7 +74,7 @@ def monte_carlo(
     Parameters
     ----------
     robot : Robot
-    policy : callable, StateFeedback, OutputFeedback, TrajectoryFeedback, GainSchedule or None
+    policy : policy, GainSchedule or None
         As of `simulate`.
     dispersions : mapping
         {name, group or pattern: spread}, or what `load_dispersions` read. A name is one of
@@ -86,8 +86,13 @@ def monte_carlo(
           shifted by d times the radius of gyration. The pseudo-inertia stays positive;
         - ``INPUT.gain``, relative, and ``INPUT.bias`` [N m|N]: (1 + d) u + b acts of a command u;
           ``INPUT.fails`` [s]: nothing acts of it from that time on;
+        - ``INPUT.misalignment`` [rad]: the direction of a thruster, the axis of a wheel or one of
+          tau_b or F_b is turned about two axes across it, by an angle drawn for each;
         - ``NAME.sensor``: added to a state that a `StateFeedback` reads, or to an output that an
-          `OutputFeedback` measures;
+          `OutputFeedback` or `TrajectoryOutputFeedback` measures; ``NAME.noise``: white noise
+          added to it at each sample, a number its standard deviation, and of another spread each
+          run has one of its own;
+        - ``delay`` [s]: added to that of `simulate`, to the next whole step and 0 or more;
         - ``JOINT.stiffness`` and ``JOINT.damping``, relative.
 
         A spread is a number, the standard deviation of a normal distribution about 0; a tuple

@@ -52,7 +52,9 @@ class CampaignJob:
             self.home = states_of(state, q, nu := state.velocities(v))
             self._way = [q.ravel(), nu.ravel()]
         with placed(given):
-            self.dispersions = Dispersions(given, self.plant, self.plan.policy, self.x0, seed)
+            self.dispersions = Dispersions(
+                given, self.plant, self.plan.policy, self.x0, seed, self.plan.times
+            )
         spread = np.linspace(0.0, self.plan.times.steps, histories)
         self.steps = np.unique(spread.round().astype(int))
 
@@ -90,8 +92,8 @@ class CampaignJob:
 
         tree = batch_tree(self.plant.robot)
         assert tree is not None
-        lanes, runs = Lanes(self.plan, self.plant), self.dispersions.in_lanes(drawn, tree)
-        tally = self._tally(LANES)
+        runs = self.dispersions.in_lanes(drawn, tree)
+        lanes, tally = Lanes(self.plan, self.plant, runs), self._tally(LANES)
         for first in range(0, len(drawn), LANES):
             eight, own = (
                 {key: each[first : first + LANES] for key, each in of.items()} for of in (runs, out)
@@ -109,7 +111,8 @@ class CampaignJob:
         """Return the plan of a run (k,), and its robot."""
         plan, (plant, policy, q, v) = self.plan, self.dispersions.one(drawn)
         law = law_of(policy, plant, plan.limits, plan.times)
-        return replace(plan, q=q, v=v, policy=policy, law=law), plant
+        times = plan.times._replace(delay=int(self.dispersions.delays(drawn[None])[0]))
+        return replace(plan, q=q, v=v, policy=policy, law=law, times=times), plant
 
     @np.errstate(over="ignore", invalid="ignore")  # of what diverges
     def _one(self, drawn: Array) -> Outcome:
@@ -155,13 +158,14 @@ class CampaignJob:
 
         tree, kept = batch_tree(self.plant.robot), list[list[Array]]()
         assert tree is not None
-        lanes = Lanes(self.plan, self.plant)
+        runs = self.dispersions.in_lanes(drawn, tree)
+        lanes = Lanes(self.plan, self.plant, runs)
 
         def watch(first: int, rows: list[Array]) -> None:
             kept.append([each[-first % every :: every].copy() for each in rows])
 
         out = {key: np.empty((len(drawn), *shape)) for key, shape in self.shapes.items()}
-        said = lanes.fly(self.dispersions.in_lanes(drawn, tree), self._tally(LANES), out, watch)
+        said = lanes.fly(runs, self._tally(LANES), out, watch)
         return list(map(np.concatenate, zip(*kept, strict=True))), out, said[0], lanes
 
     def _recorded(self, drawn: Array, plan: Plan, plant: Plant) -> Recording:

@@ -18,21 +18,34 @@ from fflin.control.policies import Policy
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvkalman import FilterSchedule
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.outputs import Measuring, Sensing
+from fflin.dynamics.output_kinds import KINDS
+from fflin.dynamics.outputs import Measuring, Sensing, state_indices
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import Signals, require_fit, require_same
 from fflin.linear.model import LinearModel
-from fflin.robot.outputs import FullState
+from fflin.robot.outputs import FullState, Gyroscope
 from fflin.robot.robot import Robot
 
 
-def measured_states(state: StateMap) -> list[int] | None:
-    """Return which states the outputs of a robot are, or None where one is no state."""
-    if state.robot.outputs == (FullState(),):
-        return list(range(state.nx))
-    sensing = Sensing(state, state.robot.outputs)
-    whole = len(sensing.states) == len(sensing.names)
-    return [index for _, index in sorted(sensing.states)] if whole else None
+def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
+    """Return which states the outputs of a robot are, its gyroscopes counting after them.
+
+    Raises
+    ------
+    InputError
+        If one is another sensor.
+    """
+    found, gyros = list[int](), list[Gyroscope]()
+    for output in state.robot.outputs:
+        if isinstance(output, Gyroscope):
+            first = state.nx + 3 * len(gyros)
+            found += range(first, first + 3)
+            gyros.append(output)
+        elif type(output) in KINDS:
+            raise InputError(f"a {type(output).__name__} is measured in Python")
+        else:
+            found += state_indices(state, output)
+    return found, gyros
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,12 +225,12 @@ class _Law:
     """What a compensator does from sample to sample; its estimate begins at zero."""
 
     def __init__(self, size: int, at: Callable[[float], _Sample]) -> None:
-        self._at = at
+        self.at = at
         self.estimate: Array = np.zeros(size)  # of the state at the sample to come
 
     def step(self, t: float, measure: Callable[[_Sample, Array], Array]) -> Array:
         """Return the command of a sample, at which y is measured then."""
-        by = self._at(t)
+        by = self.at(t)
         z = self.estimate + by.jump
         u: Array = by.u0 + by.C @ z
         self.estimate = by.A @ z + by.B @ (measure(by, u) - by.y0)
@@ -235,6 +248,11 @@ class _Loop(_Law):
         self._still: Array = np.zeros(state.robot.nv)
         felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
         self._aba, self._asked = Aba(state) if felt else None, -np.inf
+
+    def sample(self, t: float) -> tuple[_Sample, StateMap, Array]:
+        """Return what it does at a sample, and the chart and the state that y is relative to."""
+        measure, near = self._there(t)
+        return self.at(t), measure.state, near
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         apart = t - self._asked

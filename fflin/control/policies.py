@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import pinocchio as pin
@@ -23,6 +23,17 @@ from fflin.robot.robot import Robot
 _LEAST = 1e-7
 
 Policy: TypeAlias = Callable[[float, Array, Array], ArrayLike]
+
+
+@runtime_checkable
+class Gridded(Protocol):
+    """A state feedback whose gain is that between the points of a grid."""
+
+    lin: LinearModel
+
+    def table(self) -> tuple[dict[str, Array], Array]:
+        """Return the joints of the grid and their values, and the gains (N, nu, nx) in order."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,8 +209,6 @@ def fed_back(policy: Any) -> tuple[str, ...]:
 
 def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
     """Return u (k,) within its bounds (k,) that makes A u nearest to b, the least of these."""
-    from scipy.optimize import lsq_linear, nnls
-
     size, unit = float(np.linalg.norm(b)), float(np.linalg.norm(A))
     if size == 0.0 or unit == 0.0:
         return np.clip(np.zeros(len(least)), least, most)
@@ -208,8 +217,19 @@ def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
     wanted = np.concatenate((b / size, np.zeros(len(least))))
     low, high = least * (unit / size), most * (unit / size)
     high = np.maximum(high, low + 1e-15)  # the solver takes no bounds that are equal
-    pushing = least == 0.0
-    free, given = rows[:, ~pushing], np.zeros(len(least))
+    # The rounding of what cannot be given would drown the added rows: the second time it is gone.
+    for _ in range(2):
+        given = _solved(rows, wanted, low, high, least == 0.0)
+        wanted[: len(b)] = rows[: len(b)] @ given
+    return np.clip(given * (size / unit), least, most)
+
+
+def _solved(
+    rows: Array, wanted: Array, low: Array, high: Array, pushing: NDArray[np.bool_]
+) -> Array:
+    from scipy.optimize import lsq_linear, nnls
+
+    free, given = rows[:, ~pushing], np.zeros(len(low))
     # Most often no other bound is met: thrusts without a largest one, the others without any.
     Q, R = np.linalg.qr(free)
     apart = rows[:, pushing] - Q @ (Q.T @ rows[:, pushing])
@@ -217,8 +237,9 @@ def nearest(A: Array, b: Array, least: Array, most: Array) -> Array:
         given[pushing] = nnls(apart, wanted - Q @ (Q.T @ wanted))[0]
     given[~pushing] = np.linalg.solve(R, Q.T @ (wanted - rows[:, pushing] @ given[pushing]))
     if (given < low).any() or (given > high).any():
-        given = lsq_linear(rows, wanted, (low, high), method="bvls", tol=1e-14).x
-    return np.clip(given * (size / unit), least, most)
+        solved: Array = lsq_linear(rows, wanted, (low, high), method="bvls", tol=1e-20).x
+        return solved
+    return given
 
 
 def pushes_every_way(W: Array, pushing: NDArray[np.bool_]) -> bool:

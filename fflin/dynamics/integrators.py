@@ -26,14 +26,15 @@ class Integrator:
     # Largest pole times step with which it is stable on the negative real axis.
     reach: ClassVar[float]
     # After each stage: 0 where the way to the next begins at the step's first place, 1 where at the
-    # second stage's. Empty where a step is no such combination.
-    origins: ClassVar[tuple[int, ...]] = ()
+    # second stage's.
+    origins: ClassVar[tuple[int, ...]]
+    # Whether each stage's velocity counts by its rate in the tangent at the step's first place.
+    tangent: ClassVar[bool] = False
 
     def __init__(self, model: pin.Model, dt: float) -> None:
         self.model, self.dt = model, dt
-        if self.origins:
-            self._way, self._speed = self.shares(dt)
-            self._stages = np.zeros((1 + len(self.nodes), model.nv))  # v, l1, l2, ...
+        self._way, self._speed = self.shares(dt)
+        self._stages = np.zeros((1 + len(self.nodes), model.nv))  # v, l1, l2, ...
 
     @classmethod
     def shares(cls, dt: float) -> tuple[Array, Array]:
@@ -88,6 +89,12 @@ class RungeKuttaMuntheKaas4(Integrator):
     nodes = CommutatorFree4.nodes
     weights, moments = CommutatorFree4.weights, CommutatorFree4.moments
     reach = 2.78
+    origins, tangent = (0, 0, 0, 0), True
+
+    @classmethod
+    def shares(cls, dt: float) -> tuple[Array, Array]:
+        """Return those of a stage's rate in what moves q to the next, and of CF4 in the new v."""
+        return np.array([[0.5 * dt], [0.5 * dt], [dt]]), CommutatorFree4.shares(dt)[1]
 
     def step(self, f: Acceleration, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and v one step later."""

@@ -294,6 +294,14 @@ class StateMap:
             angles[..., self.unbounded] = np.arctan2(sines, cosines)
         return angles
 
+    def joints_apart(self, before: Array, q: Array) -> Array:
+        """Return by how much q_m (n,) is more at one valid configuration (nq,) than at another."""
+        apart = q.take(self._idx_q) - before.take(self._idx_q)
+        if self._cos.size:
+            s, c, s_0, c_0 = (x.take(at) for x in (q, before) for at in (self._sin, self._cos))
+            apart[self.unbounded] = np.arctan2(s * c_0 - c * s_0, c * c_0 + s * s_0)
+        return apart
+
     def positions(self, q: Array) -> Array:
         """Return r_b (.., 3) at valid configurations (.., nq)."""
         return self._position + q[..., :3] @ self._rotation.T

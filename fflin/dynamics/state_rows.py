@@ -49,15 +49,15 @@ def state_history(
 def attitude_errors(x: Array, target: Array) -> Array:
     """Return the angles (N,) [deg] between the attitudes of states and of a target, or of rows."""
     at, to = x[:, :3], target[..., :3]
-    scalar, target_scalar = (
-        np.sqrt(np.maximum(0.0, 1.0 - (each * each).sum(axis=-1, keepdims=True)))
-        for each in (at, to)
-    )
+    # By columns, which are long.
+    (x, y, z), (a, b, c) = at.T, to.T
+    w, d = (np.sqrt(np.maximum(0.0, 1.0 - (i * i + j * j + k * k))) for i, j, k in (at.T, to.T))
     # The vector part of target^-1 at, whose length is that of half the angle's sine.
-    vector = target_scalar * at - scalar * to - np.cross(to, at)
-    sines: Array = np.minimum(1.0, np.linalg.norm(vector, axis=1))
-    cosines = np.abs(target_scalar * scalar + (at * to).sum(axis=1, keepdims=True))[:, 0]
-    return np.degrees(2.0 * np.arctan2(sines, cosines))
+    p = d * x - w * a - (b * z - c * y)
+    q = d * y - w * b - (c * x - a * z)
+    r = d * z - w * c - (a * y - b * x)
+    sines: Array = np.minimum(1.0, np.sqrt(p * p + q * q + r * r))
+    return np.degrees(2.0 * np.arctan2(sines, np.abs(d * w + a * x + b * y + c * z)))
 
 
 def readout(state: StateMap, K: Array, offset: Array, near: Array) -> Readout:
@@ -161,7 +161,6 @@ def moving_error(state: StateMap, q_star: Array, v_star: Array, q: Array, v: Arr
     turned = turning.quaternion_product(turning.conjugate(q_star[3:7]), q[3:7])
     e[g.q_b] = turned[:3] if turned[3] >= 0.0 else -turned[:3]
     e[g.r_b] = turning.rotation_matrix(q_star[3:7]).T @ (q[:3] - q_star[:3])
-    apart = pin.difference(state.robot.model, q_star, q)
-    e[g.q_m] = state.velocities(apart)[6:]
+    e[g.q_m] = state.joints_apart(q_star, q)
     e[-6 - state.robot.n :] = state.velocities(v - v_star)
     return e

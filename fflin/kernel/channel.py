@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import namedtuple
 
-from fflin.kernel.lanes import chosen, inlined, load, store, whole
+from fflin.kernel.lanes import chosen, inlined, load, peek, poke, store, whole, width
 from fflin.kernel.vectors import copy
 
 
@@ -21,8 +21,13 @@ class Pulses(namedtuple("Pulses", "at on_off most least quantum left level end t
     """
 
 
-class Channel(namedtuple("Channel", "low high held pending slots sample delay wheels pulses")):
-    """Limits (nu,) of commands, and those on their way: `pending` has (slots, nu) of samples."""
+class Channel(
+    namedtuple("Channel", "low high held pending slots sample delay fresh wheels pulses")
+):
+    """Limits (nu,) of commands, and those on their way: `pending` has (slots, nu) of samples.
+
+    `delay` (1,) is in steps; `fresh` (1,) says whether a command begins to act.
+    """
 
 
 @inlined
@@ -50,13 +55,20 @@ def send(channel, step, u):
 @inlined
 def arrive(channel, step, u):
     """Write what acts in a step of what has arrived."""
-    count, since = len(channel.low), step - channel.delay
-    arrives = since >= 0 and since % channel.sample == 0
-    if arrives:
-        first = (since // channel.sample) % channel.slots * count
-        copy(channel.pending, first, channel.held, 0, count)
-    if arrives or (since < 0 and step % channel.sample == 0):
-        _begin_pulses(channel.pulses, step, channel.sample, channel.held)
+    count, any_fresh = len(channel.low), False
+    for lane in range(width(channel.delay)):
+        since = step - int(peek(channel.delay, 0, lane))
+        arrives = since >= 0 and since % channel.sample == 0
+        if arrives:
+            first = (since // channel.sample) % channel.slots * count
+            for index in range(count):
+                value = peek(channel.pending, first + index, lane)
+                poke(channel.held, index, lane, value)
+        fresh = arrives or (since < 0 and step % channel.sample == 0)
+        poke(channel.fresh, 0, lane, 1.0 if fresh else 0.0)
+        any_fresh = any_fresh or fresh
+    if any_fresh:
+        _begin_pulses(channel, step, channel.held)
     copy(channel.held, 0, u, 0, count)
     pulses = channel.pulses
     for index in range(len(pulses.at)):
@@ -65,8 +77,9 @@ def arrive(channel, step, u):
 
 
 @inlined
-def _begin_pulses(pulses, step, sample, u):
+def _begin_pulses(channel, step, u):
     """Take the command of a sample, and carry on what is not fired of it."""
+    pulses, sample, fresh = channel.pulses, channel.sample, load(channel.fresh, 0)
     for index in range(len(pulses.at)):
         most, least = load(pulses.most, index), load(pulses.least, index)
         command = load(u, pulses.at[index])
@@ -80,9 +93,10 @@ def _begin_pulses(pulses, step, sample, u):
             length, fired = float(sample) + 0.0 * wanted, level * pulses.time
         # An impulse that misses the least one by rounding is the least one.
         fires = chosen(0.0, fired, chosen(fired, (1.0 - 1e-9) * least, 0.0, 1.0), 0.0)
-        store(pulses.left, index, wanted - fires * fired)
-        store(pulses.end, index, float(step) + fires * length)
-        store(pulses.level, index, level)
+        left, end = wanted - fires * fired, float(step) + fires * length
+        store(pulses.left, index, chosen(0.5, fresh, left, load(pulses.left, index)))
+        store(pulses.end, index, chosen(0.5, fresh, end, load(pulses.end, index)))
+        store(pulses.level, index, chosen(0.5, fresh, level, load(pulses.level, index)))
 
 
 @inlined

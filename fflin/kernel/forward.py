@@ -18,7 +18,8 @@ from fflin.kernel.rnea import collect, load_bodies, move_bodies, write_columns
 
 class Mechanics(
     namedtuple(
-        "Mechanics", "tree layout loads gravity index circling springy rest row held origin drives"
+        "Mechanics",
+        "tree layout loads gravity index circling springy rest row held triads origin drives",
     )
 ):
     """A robot as the loop reads it; each array of doubles may have a second axis of eight lanes.
@@ -26,13 +27,16 @@ class Mechanics(
     Gravity (3,); of each joint its entry of q (`index`), whether that is the cosine of an angle,
     whether it has a spring or damper, and where the spring is at rest; the coordinate that each
     input drives (`row`), -1 for one that is carried; the first of three inputs each that are a
-    vector on the base in reference axes (`held`); the placement (7,) of the world's origin seen
-    from the reference; and the errors of the inputs.
+    vector on the base in reference axes (`held`), and in any (`triads`); the placement (7,) of
+    the world's origin seen from the reference; and the errors of the inputs.
     """
 
 
-class Drives(namedtuple("Drives", "gain bias until")):
-    """What inputs (nu,) give of what is commanded: gain u + bias, and nothing from `until` [s]."""
+class Drives(namedtuple("Drives", "gain bias until turn")):
+    """What inputs (nu,) give of what is commanded: gain u + bias, and nothing from `until` [s].
+
+    Of each triad the columns (9,) say along what its three act.
+    """
 
 
 class Point(namedtuple("Point", "q nu u pushing wrench")):
@@ -73,10 +77,37 @@ def turn_inputs(robot, point, t):
     for index in range(len(robot.row)):
         given = load(drives.gain, index) * load(point.u, index) + load(drives.bias, index)
         store(pushing, index, chosen(t, load(drives.until, index), given, 0.0))
+    for index in range(len(robot.triads)):
+        at, columns = robot.triads[index], vec.get_columns(drives.turn, 9 * index)
+        vec.put3(pushing, at, vec.product(columns, vec.get3(pushing, at)))
+    turn_held(robot, point)
+
+
+@inlined
+def turn_held(robot, point):
+    """Turn inputs that are held in reference axes to base axes."""
+    pushing = point.pushing
     for index in range(len(robot.held)):
         at = robot.held[index]
         axes = columns_of(seen(robot, point.q))
         vec.put3(pushing, at, vec.across(axes, vec.get3(pushing, at)))
+
+
+@inlined
+def push(work, robot, pushing):
+    """Write the generalised force of inputs in base axes where c will be."""
+    tree, layout, loads = robot.tree, robot.layout, robot.loads
+    force, size, count = layout.c, len(tree.row), len(loads.body)
+    for index in range(size):
+        store(work, force + index, 0.0)
+    for index in range(len(robot.row)):
+        if robot.row[index] >= 0:
+            vec.add(work, force + robot.row[index], load(pushing, index))
+    write_columns(work, tree, layout, loads)
+    for index in range(count):
+        u = load(pushing, loads.input[index])
+        for row in range(size):
+            vec.add(work, force + row, load(work, layout.columns + row * count + index) * u)
 
 
 @inlined
@@ -86,17 +117,8 @@ def accelerate(work, robot, point, rates, to):
     Its M is overwritten by its factor.
     """
     tree, layout, loads, nu = robot.tree, robot.layout, robot.loads, point.nu
-    force, size, count = layout.c, len(tree.row), len(loads.body)
-    for index in range(size):
-        store(work, force + index, 0.0)
-    for index in range(len(robot.row)):
-        if robot.row[index] >= 0:
-            vec.add(work, force + robot.row[index], load(point.pushing, index))
-    write_columns(work, tree, layout, loads)
-    for index in range(count):
-        u = load(point.pushing, loads.input[index])
-        for row in range(size):
-            vec.add(work, force + row, load(work, layout.columns + row * count + index) * u)
+    force, size = layout.c, len(tree.row)
+    push(work, robot, point.pushing)
     vec.copy(work, force, point.wrench, 0, 6)
     move_bodies(work, tree, layout, nu)
     load_bodies(work, tree, layout, loads)

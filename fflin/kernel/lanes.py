@@ -40,6 +40,8 @@ _OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "_
 inlined = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
 # For what is a list of calls: compiled with its caller, and not for itself before.
 listed = numba.njit(inline="always", **_OPTIONS)
+# Called where it is seldom needed: what is inlined takes longest to compile.
+called = numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)
 compiled = numba.njit(nogil=True, cache=True, boundscheck=False, **_OPTIONS)
 
 
@@ -176,9 +178,9 @@ def splat(typing: Any, array: Any, value: Any) -> Any:
     return _held(array)(array, double), generate
 
 
-def _of_one(name: str) -> Any:
+def _rounding(name: str) -> Any:
     @intrinsic
-    def calculated(typing: Any, value: Any) -> Any:
+    def rounded(typing: Any, value: Any) -> Any:
         def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
             kind = arguments[0].type
             of = f"v{LANES}f64" if kind == _VECTOR else "f64"
@@ -189,10 +191,48 @@ def _of_one(name: str) -> Any:
 
         return value(value), generate
 
-    return calculated
+    return rounded
 
 
-floor, whole, root = (_of_one(name) for name in ("floor", "rint", "sqrt"))
+floor, whole, root = _rounding("floor"), _rounding("rint"), _rounding("sqrt")
+
+
+def _one(builder: Any, kind: Any, index: Any, lane: Any) -> Any:
+    """Return which double of all a lane at an index is; a number is its only one."""
+    if _held(kind) == double:
+        return index
+    return builder.add(builder.mul(index, ir.Constant(index.type, LANES)), lane)
+
+
+@intrinsic
+def peek(typing: Any, array: Any, index: Any, lane: Any) -> Any:
+    """Read a lane at an index of a contiguous array."""
+
+    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
+        values, *at = arguments
+        place = _flat_place(context, builder, array, values, _one(builder, array, *at))
+        return builder.load(place)
+
+    return double(array, numba.types.intp, numba.types.intp), generate
+
+
+@intrinsic
+def poke(typing: Any, array: Any, index: Any, lane: Any, value: Any) -> Any:
+    """Write a double to a lane at an index of a contiguous array."""
+
+    def generate(context: Any, builder: Any, _: Any, arguments: Any) -> Any:
+        values, *at, written = arguments
+        place = _flat_place(context, builder, array, values, _one(builder, array, *at))
+        builder.store(written, place)
+        return context.get_dummy_value()
+
+    return numba.types.void(array, numba.types.intp, numba.types.intp, double), generate
+
+
+@inlined
+def width(array: Any) -> Any:
+    """Return how many lanes an array has; none where it is empty."""
+    return array.size // max(len(array), 1)
 
 
 @intrinsic

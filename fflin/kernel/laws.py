@@ -6,37 +6,67 @@ from collections import namedtuple
 
 import numpy as np
 
-from fflin.kernel.forward import joint_position, seen
-from fflin.kernel.lanes import chosen, inlined, load, splat, store, whole
-from fflin.kernel.places import axes_of, columns_of
+from fflin.kernel.forward import joint_position
+from fflin.kernel.lanes import called, chosen, inlined, load, peek, poke, splat, store, whole, width
+from fflin.kernel.places import columns_of, quaternion_times
+from fflin.kernel.rnea import MOTION, move_bodies
 from fflin.kernel.tracking import track
-from fflin.kernel.vectors import copy, get3, plus, product, put3, times
+from fflin.kernel.tree import PLACE
+from fflin.kernel.vectors import across, copy, get3, get_columns, plus, product, put3, times
 
 NOTHING, STATE, OUTPUT, TRACK = range(4)
 
 
-class Law(namedtuple("Law", "kind turned near K offset A B C y0 measured x z next path")):
+class Law(
+    namedtuple(
+        "Law",
+        "kind turned origin near K offset grid filter measured gyros x y added u path sharing",
+    )
+):
     """A policy; each array of doubles may have a second axis of eight lanes.
 
-    By its kind NOTHING, STATE: u = offset - K x, OUTPUT: u = offset + C z and z' = A z + B (y - y0)
-    with y the states that are `measured`, or TRACK: u = u* - K e along `path`. `turned` says
-    whether omega_b and v_b of the state stand in reference axes, `near` (n,) which turn is taken
-    of joints that go round. x (nx,) and `next` (nz,) are work space, z (nz,) is the filter's state.
+    By its kind NOTHING, STATE: u = offset - K y, OUTPUT: u by a `filter` of y, or TRACK:
+    u = u* - K e along `path`. y (ny,) is what is `measured` of the state and the gyroscopes after
+    it, x, and of rows (slots, ny) what is `added` to it, sample by sample and round.
+    `turned` says whether omega_b and v_b of the state stand in reference axes; row by row, sample
+    by sample and the last to the end, `origin` (7,) is the world's origin seen from where x is 0
+    and `near` (n,) which turn is taken of joints that go round. `u` is what is commanded, to be
+    shared out where `sharing` is not None.
+    """
+
+
+class Grid(namedtuple("Grid", "joint first values stride at")):
+    """Joints (k,) between whose `values` from `first` (k + 1,) on K and offset are interpolated.
+
+    A step along each of them goes on by `stride` of the gains. `at` (k,) is work space.
+    """
+
+
+class Gyros(namedtuple("Gyros", "body axes")):
+    """Bodies with a gyroscope (k,), and the columns (9 k,) of its axes in the body's."""
+
+
+class Filter(namedtuple("Filter", "A B C u0 y0 jump z next")):
+    """Row by row as `Law.origin`: u = u0 + C z, then z' = A z + B (y - y0), z having jumped before.
+
+    z (nz,) is the state, `next` (nz,) work space.
     """
 
 
 @inlined
-def read_state(robot, law, point):
+def read_state(robot, law, point, row):
     """Write the state in the chart."""
     x, q, nu, n = law.x, point.q, point.nu, len(robot.index)
-    vector, scalar = seen(robot, q)
+    place, turn = get3(law.origin, 7 * row), get3(law.origin, 7 * row + 3)
+    turn = turn, load(law.origin, 7 * row + 6)
+    vector, scalar = quaternion_times(turn, (get3(q, 3), load(q, 6)))
     sign = chosen(scalar, 0.0, -1.0, 1.0)
     put3(x, 0, times(vector, sign))
-    put3(x, 3, plus(get3(robot.origin, 0), product(axes_of(robot.origin), get3(q, 0))))
+    put3(x, 3, plus(place, product(columns_of(turn), get3(q, 0))))
     for joint in range(n):
         value = joint_position(robot, q, joint)
         if robot.circling[joint]:
-            turns = whole((load(law.near, joint) - value) * (0.5 / np.pi))
+            turns = whole((load(law.near, row * n + joint) - value) * (0.5 / np.pi))
             value = value + 2.0 * np.pi * turns
         store(x, 6 + joint, value)
     axes = columns_of((vector, scalar))
@@ -49,6 +79,28 @@ def read_state(robot, law, point):
 
 
 @inlined
+def _turn_gyros(work, robot, gyros, nu, x, first):
+    """Write what gyroscopes measure from an entry on."""
+    move_bodies(work, robot.tree, robot.layout, nu)
+    for index in range(len(gyros.body)):
+        body = gyros.body[index]
+        rate = get3(work, robot.layout.motion + body * MOTION)
+        rate = across(get_columns(work, robot.tree.places + body * PLACE), rate)
+        put3(x, first + 3 * index, across(get_columns(gyros.axes, 9 * index), rate))
+
+
+@inlined
+def _measure(work, robot, law, point, count):
+    """Write the outputs, with what is added to those of a sample."""
+    outputs = len(law.measured)
+    if len(law.gyros.body) > 0:
+        _turn_gyros(work, robot, law.gyros, point.nu, law.x, 2 * len(point.nu))
+    added = count % max(len(law.added) // max(outputs, 1), 1) * outputs
+    for index in range(outputs):
+        store(law.y, index, load(law.x, law.measured[index]) + load(law.added, added + index))
+
+
+@inlined
 def _times(matrix, row, x):
     """Return a row of a matrix times a vector."""
     total, width = load(matrix, row * len(x)) * load(x, 0), len(x)
@@ -58,29 +110,73 @@ def _times(matrix, row, x):
 
 
 @inlined
-def command(robot, law, point, t):
-    """Write the inputs that a policy asks for."""
+def command(work, robot, law, point, t, count):
+    """Write the inputs that a policy asks for, at a sample of that count."""
     if law.kind == TRACK:
-        track(robot, law.path, point, t)
+        track(robot, law.path, point, law.u, t)
         return
-    read_state(robot, law, point)
-    if law.kind == STATE:
-        for index in range(len(law.offset)):
-            store(point.u, index, load(law.offset, index) - _times(law.K, index, law.x))
+    row = min(count, len(law.origin) // 7 - 1)
+    read_state(robot, law, point, row)
+    _measure(work, robot, law, point, count)
+    if law.kind == OUTPUT:
+        _filter(law.filter, law.y, law.u, row)
+    elif len(law.grid.joint) > 0:
+        _feed_back_between(robot, law, point)
     else:
-        _filter(law, point.u)
+        for index in range(len(law.u)):
+            store(law.u, index, load(law.offset, index) - _times(law.K, index, law.y))
 
 
 @inlined
-def _filter(law, u):
+def _feed_back_between(robot, law, point):
+    """Write what the gains between the points of a grid make of the state, lane by lane."""
+    grid, y, u = law.grid, law.y, law.u
+    inputs, size = len(u), len(y)
+    for axis in range(len(grid.joint)):
+        store(grid.at, axis, joint_position(robot, point.q, grid.joint[axis]))
+    for index in range(inputs):
+        store(u, index, 0.0)
+    for lane in range(width(u)):
+        for corner in range(1 << len(grid.joint)):
+            share, cell = _corner(grid, corner, lane)
+            for row in range(inputs if share > 0.0 else 0):
+                at = cell * inputs + row
+                total = peek(law.offset, at, lane)
+                for column in range(size):
+                    total -= peek(law.K, at * size + column, lane) * peek(y, column, lane)
+                poke(u, row, lane, peek(u, row, lane) + share * total)
+
+
+@inlined
+def _corner(grid, corner, lane):
+    """Return the share of a corner of the cell that a lane is in, and which gain is there."""
+    share, cell = 1.0, 0
+    for axis in range(len(grid.joint)):
+        first, last = grid.first[axis], grid.first[axis + 1] - 1
+        value = min(max(peek(grid.at, axis, lane), grid.values[first]), grid.values[last])
+        k = first
+        while k < last - 1 and value >= grid.values[k + 1]:
+            k += 1
+        over = (value - grid.values[k]) / (grid.values[k + 1] - grid.values[k])
+        beyond = corner >> axis & 1
+        share *= over if beyond else 1.0 - over
+        cell += (k - first + beyond) * grid.stride[axis]
+    return share, cell
+
+
+@called
+def _filter(by, y, u, row):
     """Write what the estimate asks for, and bring it up to the next sample."""
-    for index in range(len(law.offset)):
-        store(u, index, load(law.offset, index) + _times(law.C, index, law.z))
-    outputs = len(law.measured)
-    for row in range(len(law.z)):
-        total = splat(law.z, 0.0) + _times(law.A, row, law.z)
-        for index in range(outputs):
-            y = load(law.x, law.measured[index]) - load(law.y0, index)
-            total = total + load(law.B, row * outputs + index) * y
-        store(law.next, row, total)
-    copy(law.next, 0, law.z, 0, len(law.z))
+    size, outputs, inputs = len(by.z), len(y), len(u)
+    for index in range(size):
+        store(by.z, index, load(by.z, index) + load(by.jump, row * size + index))
+    for index in range(inputs):
+        at = row * inputs + index
+        store(u, index, load(by.u0, at) + _times(by.C, at, by.z))
+    for index in range(outputs):
+        store(y, index, load(y, index) - load(by.y0, row * outputs + index))
+    for index in range(size):
+        at = row * size + index
+        total = splat(by.z, 0.0) + _times(by.A, at, by.z)
+        store(by.next, index, total + _times(by.B, at, y))
+    copy(by.next, 0, by.z, 0, size)

@@ -7,19 +7,21 @@ from collections import namedtuple
 from fflin.kernel.channel import arrive, limit, send, spare_wheels
 from fflin.kernel.course import add_wrench, begin_step, end_step, impose, kept_at, start_at
 from fflin.kernel.forward import accelerate, configure, seen, turn_inputs
-from fflin.kernel.lanes import below, compiled, inlined, load, store
+from fflin.kernel.lanes import below, called, compiled, inlined, load, store
 from fflin.kernel.laws import NOTHING, command
-from fflin.kernel.places import displace
+from fflin.kernel.places import displace, turn_back
+from fflin.kernel.sharing import share_out
 from fflin.kernel.vectors import copy, put3, put6
 
 
-class Method(namedtuple("Method", "h origin way speed nodes weights moments")):
+class Method(namedtuple("Method", "h origin way speed nodes weights moments tangent")):
     """Steps of h [s], s stages each, by what its displacements and velocities are made of.
 
     Row by row: shares of v and the stages' accelerations in the displacement after each stage, and
     the second one after the last (`way`), and in the velocity there (`speed`). A way begins at the
     step's first place, or at its second stage's where `origin` says 1. `nodes` [s] are the stages'
-    times, `weights` and `moments` their shares in sums along, with h and h^2.
+    times, `weights` and `moments` their shares in sums along, with h and h^2. With `tangent` a way
+    is a share of the rate in the tangent at the first place, the last the sum of all by `weights`.
     """
 
 
@@ -27,8 +29,8 @@ class Watch(namedtuple("Watch", "squares sign")):
     """When to stop: squares of speeds (6 + n,), and the sign (1,) of q0 in the chart, or 0."""
 
 
-class Stages(namedtuple("Stages", "rates along first second u")):
-    """Work space: v and the accelerations of the stages, a displacement, and two stages' q.
+class Stages(namedtuple("Stages", "rates along total first second u")):
+    """Work space: v and the accelerations of the stages, displacements, and two stages' q.
 
     `u` (nu,) is what acted as the last step began.
     """
@@ -70,12 +72,13 @@ def _goes_on(robot, watch, point):
 
 
 @inlined
-def _act(channel, law, robot, point, step, stage, t):
+def _act(work, channel, law, robot, point, step, stage, t):
     """Write the inputs at a stage, as they are commanded and in base axes."""
     sample = channel.sample
     if law.kind != NOTHING and (sample == 0 or stage == 0):
         if sample == 0 or step % sample == 0:
-            command(robot, law, point, t)
+            command(work, robot, law, point, t, step // max(sample, 1))
+            share_out(law.sharing, point, law.u)
             limit(channel, point.u)
             if sample > 0:
                 send(channel, step, point.u)
@@ -85,17 +88,36 @@ def _act(channel, law, robot, point, step, stage, t):
     turn_inputs(robot, point, t)
 
 
+@called
+def _turn_way(method, stages, nu, stage, last):
+    """Write the way of a method in the tangent, from that of the last stage."""
+    along, total = stages.along, stages.total
+    for index in range(len(along)):
+        if stage == 0:
+            store(along, index, 0.0)
+            store(total, index, 0.0)
+    turn_back(along, nu)
+    for index in range(len(along)):
+        rate = load(along, index)
+        store(total, index, load(total, index) + method.weights[stage] * rate)
+        store(along, index, load(total, index) if last else load(method.way, stage) * rate)
+
+
 @inlined
 def _move(robot, method, stages, point, stage):
     """Go from a stage, whose acceleration is there, to the next one, or to the end of the step."""
     rates, along = stages.rates, stages.along
     if stage == 1:
         copy(point.q, 0, stages.second, 0, len(point.q))
-    _combine(method.way, stage, rates, along)
+    last = stage == len(method.origin) - 1
+    if method.tangent:
+        _turn_way(method, stages, point.nu, stage, last)
+    else:
+        _combine(method.way, stage, rates, along)
     _combine(method.speed, stage, rates, point.nu)
     begin = stages.first if method.origin[stage] == 0 else stages.second
     displace(robot.tree, begin, along, point.q)
-    if stage == len(method.origin) - 1:
+    if last and not method.tangent:
         _combine(method.way, stage + 1, rates, along)
         displace(robot.tree, point.q, along, point.q)
 
@@ -130,7 +152,8 @@ def advance(
         copy(point.q, 0, stages.first, 0, len(point.q))
         copy(point.nu, 0, stages.rates, 0, len(point.nu))
         for stage in range(len(method.origin)):
-            _act(channel, law, robot, point, step, stage, step * h + method.nodes[stage])
+            t = step * h + method.nodes[stage]
+            _act(work, channel, law, robot, point, step, stage, t)
             if stage == 0:
                 copy(point.u, 0, stages.u, 0, len(point.u))
                 if every > 0 and step % every == 0:

@@ -5,39 +5,62 @@ A displacement has the order of the state: the base's turn and way in base axes,
 
 from __future__ import annotations
 
+from fractions import Fraction
 from math import factorial
 
 from fflin.kernel.crba import cosine_and_sine
 from fflin.kernel.lanes import inlined, load, store
+from fflin.kernel.rnea import motion_cross
 from fflin.kernel.vectors import (
+    copy,
     cross,
     dot,
     get3,
+    get6,
     plus,
+    plus6,
     product,
     put3,
+    put6,
     times,
+    times6,
 )
 
 _TERMS = 10  # exact to rounding up to half a turn, and the turn of a step is less than a radian
 
 
-def _series(first):
-    """Return the function sum_k (-x)^k first! / (first + 2 k)!."""
-    shares = [factorial(first) / factorial(first + 2 * k) for k in range(_TERMS)]
+def _polynomial(shares):
+    """Return the function sum_k shares_k x^k."""
     last, rest = shares[-1], tuple(shares[-2::-1])
 
     @inlined
-    def series(x):
-        total = rest[0] - x * last
+    def polynomial(x):
+        total = rest[0] + x * last
         for share in rest[1:]:
-            total = share - x * total
+            total = share + x * total
         return total
 
-    return series
+    return polynomial
+
+
+def _series(first):
+    """Return the function sum_k (-x)^k first! / (first + 2 k)!."""
+    return _polynomial(
+        [(-1) ** k * factorial(first) / factorial(first + 2 * k) for k in range(_TERMS)]
+    )
+
+
+def _signed_bernoulli():
+    """Return (-1)^k B_2k / (2k)! of Bernoulli's numbers."""
+    ratios = [Fraction(1)]
+    for m in range(1, 2 * _TERMS + 3):
+        ratios.append(-sum(ratios[j] / factorial(m + 1 - j) for j in range(m)))
+    return [float((-1) ** k * ratio) for k, ratio in enumerate(ratios[::2])]
 
 
 _cosine, _sine, _sixth = _series(0), _series(1), _series(3)
+_second = _polynomial([(k - 2) * b for k, b in enumerate(_signed_bernoulli())][1:])
+_fourth = _polynomial([(k - 1) * b for k, b in enumerate(_signed_bernoulli())][2:])
 
 
 @inlined
@@ -73,6 +96,24 @@ def attitude(q):
 def axes_of(q):
     """Return the base's axes in the world."""
     return columns_of(attitude(q))
+
+
+@inlined
+def turn_back(along, nu):
+    """Turn the base's velocity at a displacement into the rate of that displacement.
+
+    The inverse of dexp, sum_k B_2k / (2k)! ad^2k + ad / 2, whose series ends by
+    (ad^2 + |w|^2)^2 ad = 0.
+    """
+    x, y = get6(along, 0), get6(nu, 0)
+    square = dot(x[0], x[0])
+    once = motion_cross(x, y)
+    twice = motion_cross(x, once)
+    fourth = motion_cross(x, motion_cross(x, twice))
+    total = plus6(y, times6(once, 0.5))
+    total = plus6(total, times6(twice, _second(square)))
+    put6(along, 0, plus6(total, times6(fourth, _fourth(square))))
+    copy(nu, 6, along, 6, len(along) - 6)
 
 
 @inlined

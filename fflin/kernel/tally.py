@@ -50,7 +50,7 @@ def _compare(marks, step):
         copy(marks.speed, step * len(there.nu), there.nu, 0, len(there.nu))
         error(marks, marks, at)
     else:
-        read_state(marks, marks, at)
+        read_state(marks, marks, at, 0)
         for index in range(len(marks.e)):
             store(marks.e, index, load(marks.x, index) - load(marks.home, index))
     for kind in range(len(sizes)):
@@ -102,4 +102,4 @@ def take(marks, rows, first, count):
             copy(rows, begin + width, marks.inputs, kept * inputs, inputs)
             kept += 1
     if count > 0:
-        read_state(marks, marks, at)
+        read_state(marks, marks, at, 0)

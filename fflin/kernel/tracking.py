@@ -100,7 +100,7 @@ def error(robot, path, point):
 
 
 @inlined
-def track(robot, path, point, t):
+def track(robot, path, point, u, t):
     """Write the inputs u* - K e at a time of the run."""
     after = _follow(robot, path, t)
     error(robot, path, point)
@@ -111,10 +111,10 @@ def track(robot, path, point, t):
     k = len(starts) if after else k
     first, size = k * path.order * count * width, count * width
     for row in range(count):
-        total = splat(point.u, path.point.u[row])
+        total = splat(u, path.point.u[row])
         for column in range(width):
             at, gain = first + row * width + column, 0.0
             for power in range(path.order - 1, -1, -1):
                 gain = gain * since + path.K[at + power * size]
             total = total - gain * load(path.e, column)
-        store(point.u, row, total)
+        store(u, row, total)

@@ -127,7 +127,7 @@ def _rebuilt(
             new.appendBodyToJoint(moved[item], bodies[item], pin.SE3.Identity())
             continue
         parent, (name, axis, inertia) = item
-        placement = pin.SE3(_turned_to(axis), np.zeros(3))
+        placement = pin.SE3(turned_to(axis), np.zeros(3))
         index = new.addJoint(moved[parent], pin.JointModelRUBZ(), placement, name)
         spinning = pin.Inertia(0.0, np.zeros(3), inertia * np.outer(_Z, _Z))
         new.appendBodyToJoint(index, spinning, pin.SE3.Identity())
@@ -142,7 +142,7 @@ def _rebuilt(
     return new
 
 
-def _turned_to(axis: Array) -> Array:
+def turned_to(axis: Array) -> Array:
     """Return a rotation (3, 3) that takes z to an axis, without rounding if it is x, y or z."""
     beside = np.cross(np.eye(3)[np.abs(axis).argmin()], axis)
     beside /= np.linalg.norm(beside)

@@ -9,8 +9,12 @@ import numpy as np
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.progress import Progress
-from fflin.control.output_feedback import OutputFeedback, measured_states
-from fflin.control.policies import StateFeedback
+from fflin.control.output_feedback import (
+    OutputFeedback,
+    TrajectoryOutputFeedback,
+    measured_at,
+)
+from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.kernel.compiled import kernel, loop_pays, numba_is_there
 from fflin.kernel.tree import batch_tree
@@ -22,7 +26,7 @@ from fflin.simulation.run import Recording, ending_of, go
 
 ENGINES = ("python", "compiled")
 
-_KNOWN = (StateFeedback, OutputFeedback, TrajectoryFeedback)
+_KNOWN = (StateFeedback, OutputFeedback, TrajectoryFeedback, TrajectoryOutputFeedback)
 _SLICE, _FIRST_SLICE = 0.05, 16  # [s] and steps between looks at the clock and at Ctrl-C
 # Multiplications in the factor of M, beyond which ABA in the loop in Python is quicker.
 _LARGEST_FACTOR = 200_000
@@ -54,20 +58,37 @@ def engine_of(engine: Any, plan: Plan, plant: Plant, runs: int = 0) -> str:
 
 def _reason(plan: Plan, plant: Plant) -> str:
     """Say what keeps a plan from the compiled loop; nothing where it can run it."""
-    policy, robot = plan.policy, plant.robot
+    policy, robots = plan.policy, [plant.robot]
     if not numba_is_there():
         return "numba is not installed (pip install 'fflin[fast]')"
     if plan.events or plan.callback or plant.disturbance:
         return "events, callbacks and disturbances are functions in Python"
-    if policy is not None and type(policy) not in _KNOWN:
+    if isinstance(policy, Allocation):
+        robots.append(policy.design)
+        policy = policy.policy
+    known = type(policy) in _KNOWN or isinstance(policy, Gridded)
+    if policy is not None and not known:
         return f"a {type(policy).__name__} decides in Python"
-    if isinstance(policy, OutputFeedback):
-        late = abs(plan.times.sample * plan.times.dt - policy.lin.dt) > 1e-6 * policy.lin.dt
-        if policy.noise is not None or late or measured_states(plant.state) is None:
-            return "noise, outputs that are no states, and other samples than the compensator's"
-    at_home = robot.model.jointPlacements[ROOT].isIdentity(0.0)
-    if not plan.method.origins or batch_tree(robot) is None or not at_home:
-        return f"the method {plan.method.__name__} or a joint of '{robot.name}' is of another kind"
+    if reason := _unmeasured(plan, plant, policy):
+        return reason
+    for robot in robots:
+        at_home = robot.model.jointPlacements[ROOT].isIdentity(0.0)
+        if batch_tree(robot) is None or not at_home:
+            return f"a joint of '{robot.name}' is no screw about a fixed axis"
+    return ""
+
+
+def _unmeasured(plan: Plan, plant: Plant, policy: Any) -> str:
+    """Say why a plan's compensator, if it has one, cannot have its samples."""
+    if not isinstance(policy, OutputFeedback | TrajectoryOutputFeedback):
+        return ""
+    dt = policy.lin.dt if isinstance(policy, OutputFeedback) else policy.filter.dt
+    if abs(plan.times.sample * plan.times.dt - dt) > 1e-6 * dt:
+        return "it is sampled otherwise than the compensator"
+    try:
+        measured_at(plant.state)
+    except InputError as error:
+        return str(error)
     return ""
 
 
@@ -88,13 +109,13 @@ def carried_out(plan: Plan, plant: Plant, conserved: Conserved, engine: str) -> 
 
 def _fly(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
     """Run a plan by the compiled loop, slice by slice."""
-    from fflin.simulation.packing import packed
+    from fflin.simulation.packing import SLOTS, noise_of, noises, packed
 
     tree, state, times = batch_tree(plant.robot), plant.state, plan.times
     assert tree is not None
     advance = kernel("loop", "advance", "the loop of `simulate`")
     parts = packed(plan, plant, conserved, tree)
-    (mechanics, *_, (kept, *_), _, point, stages) = parts
+    (mechanics, _, law, _, (kept, *_), _, point, stages), noise = parts, noise_of(plan)
     ends = np.cumsum([len(each) for each in (point.q, point.nu, point.u, kept.start[:6])])
     rows, clock = np.empty((times.rows, ends[-1] + 3)), np.zeros(1, dtype=np.intp)
     flat, work = rows.reshape(-1), np.empty(mechanics.layout.size)
@@ -104,6 +125,10 @@ def _fly(plan: Plan, plant: Plant, conserved: Conserved) -> Recording:
         while not stopped and clock[0] < times.steps:
             began, first = time.perf_counter(), -(-int(clock[0]) // times.every)
             last = min(times.steps, int(clock[0]) + length)
+            if noise:
+                last = min(last, (int(clock[0]) // times.sample + SLOTS) * times.sample)
+                at, values = noises(noise, times, len(law.y), int(clock[0]), last)
+                law.added.reshape(SLOTS, -1)[at % SLOTS] = values
             advance(*parts, clock, last, times.every, flat[first * rows.shape[1] :], work)
             stopped = ending(clock[0] * times.dt, point.q, state.spread(point.nu))
             bar.update(int(clock[0]), times.steps)

@@ -8,18 +8,27 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrix
-from fflin.base.validation import Array
-from fflin.control.output_feedback import OutputFeedback, measured_states
-from fflin.control.policies import StateFeedback
+from fflin.base.validation import Array, vector
+from fflin.control.output_feedback import (
+    OutputFeedback,
+    TrajectoryOutputFeedback,
+    measured_at,
+)
+from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.saturation import Pulses, Wheels
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
-from fflin.kernel import channel, course, forward, laws, loop, tracking
+from fflin.dynamics.state import StateMap
+from fflin.kernel import channel, course, forward, laws, loop, sharing, tracking
 from fflin.kernel.accelerations import layout_of, loads_of
-from fflin.kernel.tree import Tree
+from fflin.kernel.tree import Tree, batch_tree
+from fflin.robot.frames import ROOT, find_frame
+from fflin.robot.limits import limits_of
 from fflin.simulation.conservation import Conserved, Course
 from fflin.simulation.plan import LARGEST_SPEED, Plan
-from fflin.simulation.plant import Plant
-from fflin.simulation.times import LARGEST_TURN
+from fflin.simulation.plant import Plant, triads
+from fflin.simulation.times import LARGEST_TURN, Times
+
+SLOTS = 128  # samples whose noise is there at a time, and steps of a campaign
 
 
 def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> tuple[Any, ...]:
@@ -41,16 +50,22 @@ def packed(plan: Plan, plant: Plant, conserved: Conserved, tree: Tree) -> tuple[
     squares = np.full(state.robot.nv, LARGEST_SPEED**2)
     squares[plan.turning] = (LARGEST_TURN / h) ** 2
     sign = np.sign(plan.chart.scalar(plan.q)) if plan.chart else 0.0
-    q, second = plan.q.copy(), plan.q.copy()
+    q, second, mechanics = plan.q.copy(), plan.q.copy(), _mechanics(plant, tree)
     return (
-        _mechanics(plant, tree),
-        loop.Method(h, origins, way.ravel(), speed.ravel(), nodes, weights, h * moments),
-        _law(plan, plant),
+        mechanics,
+        loop.Method(
+            *(h, origins, way.ravel(), speed.ravel(), nodes, weights, h * moments),
+            plan.method.tangent,
+        ),
+        _law(plan, plant, mechanics),
         _channel(plan, plant),
         (kept, plan.project, not plant.isolated(driven=plan.law is not None)),
         loop.Watch(state.velocities(squares), np.array([float(sign)])),
         forward.Point(plan.q.copy(), state.velocities(plan.v), u.copy(), u.copy(), np.zeros(6)),
-        loop.Stages(np.zeros(speed.shape[1] * size), np.zeros(size), q, second, u.copy()),
+        loop.Stages(
+            *(np.zeros(speed.shape[1] * size), np.zeros(size), np.zeros(size)),
+            *(q, second, u.copy()),
+        ),
     )
 
 
@@ -63,65 +78,147 @@ def _mechanics(plant: Plant, tree: Tree) -> forward.Mechanics:
         layout_of(tree, len(loads.input)),
         loads,
         np.array(robot.gravity),
-        np.array([joint.idx_q for joint in robot.joints], dtype=np.intp),
+        _places([joint.idx_q for joint in robot.joints]),
         np.array([joint.unbounded for joint in robot.joints], dtype=bool),
         np.array((springs.stiffness != 0.0) | (springs.damping != 0.0), dtype=bool),
         np.array(springs.rest),
-        np.where(fixed.any(axis=0), np.abs(fixed).argmax(axis=0), -1).astype(np.intp),
-        np.array([held.columns.start for held in actuation.held], dtype=np.intp),
+        _places(np.where(fixed.any(axis=0), np.abs(fixed).argmax(axis=0), -1)),
+        _places([held.columns.start for held in actuation.held]),
+        _places(triads(actuation)),
         pin.SE3ToXYZQUAT(plant.state.origin),
         forward.Drives(*plant.drives),
     )
 
 
-def _law(plan: Plan, plant: Plant) -> laws.Law:
-    state, policy = plant.state, plan.policy
-    none, nowhere, joints = np.zeros(0), np.zeros(0, dtype=np.intp), state.groups.q_m
+def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
+    state, policy, asking = plant.state, plan.policy, plant
+    none, nowhere = np.zeros(0), _places([])
+    shared = isinstance(policy, Allocation)
+    if shared:
+        asking = Plant(StateMap(policy.design, reference=state.reference, frame=state.frame))
+        policy = policy.policy
     law = laws.Law(
-        *(laws.NOTHING, np.array(state.axes), np.zeros(state.robot.n), none, none),
-        *(none, none, none, none, nowhere, np.zeros(state.nx), none, none),
-        _path(plan, plant),
+        laws.NOTHING,
+        np.array(state.axes),
+        pin.SE3ToXYZQUAT(state.origin),
+        np.zeros(state.robot.n),
+        *(none, none, laws.Grid(nowhere, _places([0]), none, nowhere, none)),
+        laws.Filter(*(none,) * 8),
+        *(nowhere, laws.Gyros(nowhere, none), np.zeros(state.nx), none, none),
+        np.zeros(len(asking.actuation.names)),
+        _path(plan, policy, asking),
+        _sharing(plant, asking, mechanics) if shared else None,
     )
     if isinstance(policy, StateFeedback):
         K, offset, near = policy.terms(state)
-        law = law._replace(kind=laws.STATE, near=near[joints].copy(), K=K.ravel(), offset=offset)
-    if isinstance(policy, OutputFeedback):
-        by, lin, count = policy.compensator, policy.lin, len(policy.compensator.A)
-        law = law._replace(
-            kind=laws.OUTPUT,
-            near=state.read(lin.q, lin.v)[joints].copy(),
-            offset=np.array(by.u0),
-            A=np.array(by.A).ravel(),
-            B=np.array(by.B).ravel(),
-            C=np.array(by.C).ravel(),
-            y0=np.array(by.y0),
-            measured=np.array(measured_states(state), dtype=np.intp),
-            z=np.zeros(count),
-            next=np.zeros(count),
-        )
-    if isinstance(policy, TrajectoryFeedback):
+        law = law._replace(near=near[state.groups.q_m].copy(), K=K.ravel(), offset=offset)
+    elif isinstance(policy, Gridded):
+        law = _between(law, policy, state)
+    elif isinstance(policy, OutputFeedback | TrajectoryOutputFeedback):
+        law = _filtered(law, plan, policy, asking, mechanics.tree)
+    elif isinstance(policy, TrajectoryFeedback):
         law = law._replace(kind=laws.TRACK)
-    return law
+    if len(law.K):
+        law = law._replace(kind=laws.STATE, measured=np.arange(state.nx))
+    size, slots = len(law.measured), SLOTS if noise_of(plan) else 1
+    return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
 
 
-def _path(plan: Plan, plant: Plant) -> tracking.Path:
-    policy, state = plan.policy, plant.state
-    none, nowhere, size, nu = np.zeros(0), np.zeros(0, dtype=np.intp), state.nx // 2, plan.initial
-    point = forward.Point(plan.q.copy(), np.zeros(size), nu.copy(), none, none)
+def noise_of(plan: Plan) -> Any:
+    """Return noise(t) of what a plan's policy measures, or None."""
+    policy = plan.policy.policy if isinstance(plan.policy, Allocation) else plan.policy
+    known = isinstance(policy, OutputFeedback | TrajectoryOutputFeedback)
+    return policy.noise if known else None
+
+
+def noises(noise: Any, times: Times, size: int, step: int, last: int) -> tuple[Any, Array]:
+    """Return the samples (k,) from a step up to another, and noise(t) (k, size) at each."""
+    at = np.arange(-(-step // times.sample), -(-last // times.sample))
+    rows = np.zeros((len(at), size))
+    for row, t in zip(rows, (at * times.sample * times.dt).tolist(), strict=True):
+        if noise:
+            row[:] = vector("noise(t)", noise(t), size, "one value for each output")
+    return at, rows
+
+
+def _between(law: laws.Law, policy: Gridded, state: StateMap) -> laws.Law:
+    axes, gains = policy.table()
+    x0, joints = policy.lin.x0, state.robot.joint_names
+    sizes = [len(values) for values in axes.values()]
+    grid = laws.Grid(
+        _places([joints.index(name) for name in axes]),
+        _places(np.cumsum([0, *sizes])),
+        np.concatenate(list(axes.values())),
+        _places([np.prod(sizes[axis + 1 :]) for axis in range(len(sizes))]),
+        np.zeros(len(sizes)),
+    )
+    offset = (policy.lin.u0 + gains @ x0).ravel()
+    near = x0[state.groups.q_m].copy()
+    return law._replace(near=near, K=gains.ravel(), offset=offset, grid=grid)
+
+
+def _filtered(law: laws.Law, plan: Plan, policy: Any, asking: Plant, tree: Tree) -> laws.Law:
+    state, joints, times = asking.state, asking.state.groups.q_m, plan.times
+    loop, rows = policy.bind(asking.robot), 1
+    if isinstance(policy, TrajectoryOutputFeedback):
+        rows = min(len(policy.filter.A) + 2, -(-times.steps // times.sample))
+    samples = [loop.sample(k * times.sample * times.dt) for k in range(rows)]
+    nz = len(samples[0][0].A)
+    compensator = (
+        np.concatenate([np.broadcast_to(getattr(by, key), shape).ravel() for by, *_ in samples])
+        for key in ("A", "B", "C", "u0", "y0", "jump")
+        for shape in [np.shape(getattr(samples[0][0], key)) or nz]
+    )
+    measured, gyros = measured_at(state)
+    frames = [find_frame(asking.robot.model, gyro.frame) for gyro in gyros]
+    turns = [tree.axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
+    return law._replace(
+        kind=laws.OUTPUT,
+        origin=np.concatenate([pin.SE3ToXYZQUAT(chart.origin) for _, chart, _ in samples]),
+        near=np.concatenate([x[joints] for *_, x in samples]),
+        filter=laws.Filter._make((*compensator, np.zeros(nz), np.zeros(nz))),
+        measured=_places(measured),
+        gyros=laws.Gyros(
+            _places([frame.joint - ROOT for frame in frames]),
+            np.array([turn.ravel("F") for turn in turns]).ravel(),
+        ),
+        x=np.zeros(state.nx + 3 * len(gyros)),
+    )
+
+
+def _sharing(plant: Plant, asking: Plant, giving: forward.Mechanics) -> sharing.Sharing:
+    """Return how what the inputs of one ask for is shared out to those of the other."""
+    none, names, tree = np.zeros(0), plant.actuation.names, batch_tree(asking.robot)
+    assert tree is not None
+    k, size, asks = len(names), plant.state.nx // 2, _mechanics(asking, tree)
+    limits = [limits_of(plant.robot).get(key, (-np.inf, np.inf)) for key in names]
+    least, most = (np.array(each) for each in zip(*limits, strict=True))
+    asked = np.zeros(len(asking.actuation.names))
+    point = forward.Point(np.zeros(plant.robot.nq), none, none, asked, none)
+    work = np.zeros(max(asks.layout.size, giving.layout.size))
+    sizes = ((k + 1) * size, k * (size + k), k * k, size + k, size, *(k,) * 4)
+    free = (*(np.zeros(count) for count in sizes), np.zeros(k, dtype=np.intp))
+    return sharing.Sharing._make((asks, giving, point, least, most, work, *free))
+
+
+def _path(plan: Plan, policy: Any, asking: Plant) -> tracking.Path:
+    state, none, nowhere = asking.state, np.zeros(0), _places([])
+    size, count = state.nx // 2, len(asking.actuation.names)
+    point = forward.Point(plan.q.copy(), np.zeros(size), np.zeros(count), none, none)
     path = tracking.Path(
         *(none, none, none, none, none, False, 0.0, False, nowhere, 0.0, 0.0, none, none, 1),
         *(np.zeros(size), np.zeros(state.nx), point),
     )
-    if not isinstance(policy, TrajectoryFeedback):
+    if type(policy) is not TrajectoryFeedback:
         return path
     motion, schedule = policy.trajectory, policy.schedule
     way, speed = (state.velocities(each).ravel() for each in motion.flow.cubics)
     q, u = list(motion.q), list(motion.u)
     ends = plan.times.steps * plan.times.dt > policy.duration * AT_THE_END
-    held = np.array([each.columns.start for each in motion.flow.held], dtype=np.intp)
+    held = _places([each.columns.start for each in motion.flow.held])
     nx, gains = state.nx, schedule.passed
     pieces = (schedule.K if schedule.dt else gains.pieces).reshape(
-        len(gains.starts), -1, len(nu) * nx
+        len(gains.starts), -1, count * nx
     )
     if ends:
         last = np.zeros_like(pieces[:1])
@@ -148,6 +245,10 @@ def _path(plan: Plan, plant: Plant) -> tracking.Path:
         K=np.array(pieces).ravel(),
         order=pieces.shape[1],
     )
+
+
+def _places(indices: Any) -> Any:
+    return np.array(indices, dtype=np.intp)
 
 
 def _channel(plan: Plan, plant: Plant) -> channel.Channel:
@@ -178,7 +279,7 @@ def _channel(plan: Plan, plant: Plant) -> channel.Channel:
         np.zeros(slots * len(held)),
         slots,
         times.sample,
-        times.delay,
+        *(np.array([float(times.delay)]), np.zeros(1)),
         wheels,
         pulses,
     )

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, as_double
 from fflin.dynamics.aba import Aba
+from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.state import StateMap
 from fflin.robot.massless import require_inertia
 
@@ -24,11 +25,21 @@ _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
 
 class Drives(NamedTuple):
-    """What inputs (nu,) give of a command u: gain u + bias, and nothing from `until` [s] on."""
+    """What inputs (nu,) give of a command u: gain u + bias, and nothing from `until` [s] on.
+
+    Of each vector on the base, see `triads`, `turn` (9,) has the columns along which its three act.
+    """
 
     gain: Array
     bias: Array
     until: Array
+    turn: Array
+
+
+def triads(actuation: Actuation) -> list[int]:
+    """Return the first of the three inputs of each vector on the base."""
+    found = [actuation.groups[key] for key in ("tau_b", "F_b") if key in actuation.groups]
+    return sorted(int(entries[0]) for entries in found)
 
 
 class Plant:
@@ -49,7 +60,8 @@ class Plant:
         self.disturbance = disturbance
         self._model, self._data = robot.model, robot.create_data()
         nu = len(self.actuation.names)
-        self.drives = drives or Drives(np.ones(nu), np.zeros(nu), np.full(nu, np.inf))
+        straight = np.tile(np.eye(3).ravel(), len(triads(self.actuation)))
+        self.drives = drives or Drives(np.ones(nu), np.zeros(nu), np.full(nu, np.inf), straight)
         self._faulty = drives is not None
         self._columns = np.column_stack(
             [state.lift(self.actuation.torques(unit)) for unit in np.eye(nu)]
@@ -66,8 +78,10 @@ class Plant:
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
         """Return dv/dt (nv,), and the wrench (6,) on the base but gravity's, in base axes."""
         if self._faulty:
-            gain, bias, until = self.drives
+            gain, bias, until, turn = self.drives
             u = np.where(t < until, gain * u + bias, 0.0)
+            for at, columns in zip(triads(self.actuation), turn.reshape(-1, 3, 3), strict=True):
+                u[at : at + 3] = u[at : at + 3] @ columns
         if self.actuation.held:  # in reference axes: in base axes at any turn
             R, u = self.state.rotation(q), u.copy()
             for held in self.actuation.held:

@@ -18,6 +18,7 @@ from scipy.linalg import expm
 import fflin
 from fflin.campaign.runs import ARRAYS, CampaignJob
 from fflin.simulation.report import courses
+from tests.support.campaigns import both
 from tests.support.measured import FELT, POSITIONS, designed
 from tests.support.robots import BUNDLED, LINKS, MIMIC, free_body
 from tests.support.weights import unit_weights
@@ -37,22 +38,6 @@ def _numba(request):
 def feedback(robot, frame="hybrid"):
     lin = fflin.linearize(robot, frame=frame)
     return fflin.StateFeedback(lin, fflin.lqr(lin).K)
-
-
-def both(robot, policy, given, runs=3, tolerance=1e-10, **options):
-    """Hold the runs of eight lanes against those in Python; return those of the lanes."""
-    pytest.importorskip("numba")
-    options = {"duration": 3.0, "dt": 0.01} | options
-    jobs = [CampaignJob(robot, policy, given, 5, name, options) for name in ("python", "compiled")]
-    rows = jobs[0].dispersions.rows(0, runs)
-    python, lanes = (job.run(rows, 0).arrays for job in jobs)
-    for name in ARRAYS:
-        size = np.maximum(1.0, np.where(np.isfinite(python[name]), np.abs(python[name]), 1.0))
-        assert np.array_equal(np.isinf(python[name]), np.isinf(lanes[name])), name
-        with np.errstate(invalid="ignore"):
-            apart = np.nan_to_num(lanes[name] - python[name], nan=0.0)
-        assert (np.abs(apart) <= tolerance * size).all(), name
-    return lanes
 
 
 @pytest.mark.parametrize("name", BUNDLED)

@@ -6,7 +6,7 @@ import pytest
 
 import fflin
 from fflin.dynamics.integrators import integrator
-from fflin.dynamics.state_rows import readout, state_history
+from fflin.dynamics.state_rows import moving_error, readout, state_history
 from tests.support.robots import BUNDLED, FRAMES, random_pose
 from tests.support.weights import unit_weights
 
@@ -32,6 +32,19 @@ def test_readout_is_the_feedback_of_the_state(name, frame):
         q, v = anywhere(robot, rng)
         expected = offset - K @ state.to_state(q, v, near=near)
         np.testing.assert_allclose(read(q, v), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["ets_vii", "servicer_7dof", "tiago_dual"])
+def test_a_small_error_of_a_joint_keeps_its_digits(name):
+    robot, rng = fflin.load(name), np.random.default_rng(2)
+    state, at = fflin.StateMap(robot, frame="local"), slice(6, 6 + robot.n)
+    for size in (1e-9, 1e-8, 1e-3, 2.0):
+        q, v = anywhere(robot, rng)
+        apart = size * rng.uniform(-1.0, 1.0, size=robot.n)
+        turned = dict(zip(robot.joint_names, state.joint_positions(q) + apart, strict=True))
+        other = fflin.configuration(robot, turned)
+        e = moving_error(state, q, v, other, v)[at]
+        np.testing.assert_allclose(e, apart, rtol=0, atol=2e-15)
 
 
 @pytest.mark.parametrize("frame", FRAMES)

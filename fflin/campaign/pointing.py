@@ -1,0 +1,109 @@
+"""Inputs that push along other directions than they should: those of a run, and of many."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import InputError
+from fflin.base.validation import Array
+from fflin.kernel.accelerations import Loads
+from fflin.kernel.tree import PIN_ANGULAR, PIN_LINEAR, Tree
+from fflin.robot.frames import ROOT, find_frame
+from fflin.robot.inputs import Input, JointTorque, ReactionWheel, Thruster, named_inputs
+from fflin.robot.robot import Robot
+from fflin.robot.wheels import turned_to
+
+_ALONG: dict[type[Any], str] = {Thruster: "direction", ReactionWheel: "axis"}
+
+
+def turned(direction: Any, angles: Array) -> Array:
+    """Return a direction (3,) turned by angles (N, 2) [rad] about two axes across it, (N, 3)."""
+    first, second, along = turned_to(np.array(direction, dtype=float)).T
+    size = np.linalg.norm(angles, axis=1)[:, None]
+    side = angles[:, 1:] * first - angles[:, :1] * second
+    found: Array = np.cos(size) * along + np.sinc(size / np.pi) * side
+    return found
+
+
+def require_direction(robot: Robot, at: int) -> None:
+    """Raise `InputError` where an input has no direction of its own."""
+    for item, names, first in _placed(robot):
+        if first <= at < first + len(names) and isinstance(item, JointTorque):
+            raise InputError(
+                f"'{names[0]}.misalignment' is dispersed, and a motor turns its joint about the "
+                "joint's axis; thrusters, wheels, tau_b and F_b have directions"
+            )
+
+
+def columns_of(robot: Robot, angles: Array) -> Array:
+    """Return along what the inputs of each vector on the base act (N, 9 vectors), see `Drives`."""
+    found: list[Array] = [np.zeros((len(angles), 0))]
+    for item, names, first in _placed(robot):
+        if len(item.ENTRIES) == len(names) == 3:
+            found += [turned(axis, angles[:, first + k]) for k, axis in enumerate(np.eye(3))]
+    return np.concatenate(found, axis=1)
+
+
+def misaligned(robot: Robot, angles: Array) -> Robot:
+    """Return a robot whose thrusters and wheels are turned by angles (nu, 2)."""
+    inputs = []
+    for item, _, at in _placed(robot):
+        key = _ALONG.get(type(item))
+        other = {key: turned(getattr(item, key), angles[at : at + 1])[0]} if key else {}
+        inputs.append(replace(item, **other) if key else item)
+    return robot.replace(inputs=inputs)
+
+
+def in_lanes(robot: Robot, tree: Tree, loads: Loads, angles: Array) -> dict[str, Array]:
+    """Return the wrenches, stored momenta and joints of runs (N,) as the kernel has them.
+
+    And what is to be added to the `bodies` of the tree: J a a^T of wheels is no more in them.
+    """
+    model, count, names = robot._bare.model, len(angles), list(robot.model.names)
+    wrench, stored, fixed, bodies = (
+        np.tile(each, (count, 1)).reshape(count, -1, size)
+        for each, size in (
+            *((loads.wrench, 6), (loads.stored, 3), (tree.fixed, 12)),
+            (np.zeros(tree.bodies.size), 10),
+        )
+    )
+    inputs, storing = loads.input.tolist(), loads.stored_body.tolist()
+    for item, own, at in _placed(robot):
+        if not (key := _ALONG.get(type(item))):
+            continue
+        any_item: Any = item
+        joint, placement = find_frame(model, any_item.frame)
+        body = names.index(model.names[joint]) - ROOT
+        axes = tree.axes[body].T @ placement.rotation
+        before, after = np.array(getattr(item, key)), turned(getattr(item, key), angles[:, at])
+        if at in inputs:
+            units = [replace(any_item, **{key: axis}).wrench for axis in np.eye(3)]
+            columns = np.column_stack([placement.act(pin.Force(unit)).vector for unit in units])
+            parts = [tree.axes[body].T @ columns[rows] for rows in (PIN_ANGULAR, PIN_LINEAR)]
+            wrench[:, inputs.index(at)] += (after - before) @ np.concatenate(parts).T
+        if getattr(item, "momentum", 0.0):
+            change = any_item.momentum * (after - before) @ axes.T
+            stored[:, storing.index(body)] += change
+        if inertia := getattr(item, "inertia", None):
+            wheel = names.index(own[0]) - ROOT
+            turns = [axes @ turned_to(each) for each in after]
+            fixed[:, wheel, :9] = np.array([turn.ravel("F") for turn in turns])
+            a, b = after @ axes.T, axes @ before
+            change = np.outer(b, b) - a[:, :, None] * a[:, None]
+            row, column = np.triu_indices(3)
+            bodies[:, body, 4:] += inertia * change[:, row, column]
+    of = {"wrench": wrench, "stored": stored, "fixed": fixed, "bodies": bodies}
+    return {name: each.reshape(count, -1) for name, each in of.items()}
+
+
+def _placed(robot: Robot) -> Iterator[tuple[Input, tuple[str, ...], int]]:
+    """Yield the inputs with the names of their entries and the first of these in u."""
+    first = 0
+    for item, names in named_inputs(robot.inputs):
+        yield item, names, first
+        first += len(names)

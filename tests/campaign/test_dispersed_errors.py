@@ -1,0 +1,197 @@
+"""Inputs that are misaligned, noise of what is sensed, and delays that are drawn."""
+
+from itertools import product
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from fflin.campaign.pointing import turned
+from fflin.campaign.runs import ARRAYS, CampaignJob
+from fflin.robot.wheels import turned_to
+from tests.support import policies
+from tests.support.campaigns import both
+from tests.support.robots import BUNDLED, free_body
+
+pytestmark = pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+
+ENGINES = ["python", "compiled"]
+DRAWN = {
+    policies.state: {"q_b": 0.05, "*.noise": 1e-3, "delay": (0.0, 0.15)},
+    policies.outputs: {"q_b": 0.05, "*.noise": 1e-3, "*.sensor": 1e-3, "delay": [0.0, 0.07]},
+    policies.followed: {"q_b": 0.05},
+    policies.followed_outputs: {"q_b": 0.05, "*.noise": (1e-4, 1e-3), "*.sensor": 1e-3},
+    policies.between_gains: {"q_m.*": 0.2},
+    policies.shared: {"q_b": 0.05, "jet_*.misalignment": 0.1, "delay": 0.05},
+}
+
+
+@pytest.mark.parametrize("make", DRAWN, ids=lambda make: make.__name__)
+@pytest.mark.parametrize("name", BUNDLED[::3])
+def test_lanes_fly_every_policy(robots, name, make):
+    if make is policies.between_gains and not robots[name].n:
+        pytest.skip("there are no joints to lay a grid over")
+    robot, policy, options = make(policies.plain(robots[name]))
+    options = {key: value for key, value in options.items() if key not in ("linear", "x0")}
+    sample = {"sample": 0.1} if make is policies.state else {}
+    case = {"dt": 0.02, "duration": 1.0, "method": "rkmk4"} | options | sample
+    drawn = DRAWN[make] | {"base.mass": 0.1}
+    tolerance = 1e-8 if make is policies.shared else 1e-10
+    both(robot, policy, drawn, tolerance=tolerance, **case)
+
+
+def equipped():
+    """A robot with inputs of all kinds, two of its wheels not on the base."""
+    motors = [fflin.JointTorque(f"joint_{k}") for k in range(1, 8)]
+    jet = fflin.Thruster("link_3", (0.2, 0.1, 0.0), (1.0, 0.5, 0.2), "jet", max=5.0)
+    storing = fflin.ReactionWheel((1, 2, 2), "link_2", name="storing", momentum=3.0)
+    spin = fflin.ReactionWheel((1, -2, 1), "link_3", name="spin", inertia=1e-3)
+    inputs = [fflin.BaseForce(), *motors, jet, storing, fflin.BaseTorque(), spin]
+    return fflin.load("canadarm2", inputs=inputs)
+
+
+def test_lanes_turn_inputs_of_all_kinds():
+    robot = equipped()
+    lin = fflin.linearize(robot)
+    K = 0.1 * np.random.default_rng(1).normal(size=lin.B.shape[::-1])
+    names = ("jet", "storing", "spin", "F_b", "tau_b.y")
+    given = {f"{name}.misalignment": 0.2 for name in names} | {"joint_3.mass": 0.1}
+    rates = {"omega_b": 0.3, "qdot_m.spin": 30.0}
+    for frame in ("hybrid", "local"):
+        lin = fflin.linearize(robot, frame=frame)
+        both(robot, fflin.StateFeedback(lin, K), given | rates, duration=1.0)
+
+
+def test_a_direction_is_turned_about_two_axes_across_it():
+    rng = np.random.default_rng(0)
+    for direction in (*np.eye(3), *rng.normal(size=(3, 3))):
+        along = direction / np.linalg.norm(direction)
+        axes, angles = turned_to(along), rng.normal(size=(5, 2))
+        for found, (a, b) in zip(turned(along, angles), angles, strict=True):
+            expected = pin.exp3(a * axes[:, 0] + b * axes[:, 1]) @ along
+            np.testing.assert_allclose(found, expected, atol=1e-15)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_body_goes_where_its_jet_points(engine):
+    if engine == "compiled":
+        pytest.importorskip("numba")
+    jet = fflin.Thruster("base", (0.0, 0.0, 0.0), (0.0, 2.0, 0.0), "jet", max=3.0)
+    robot = free_body((2.0, 3.0, 4.0)).replace(inputs=[jet, fflin.BaseForce()])
+    for name, u, along in (
+        ("thrust.jet", [2.0, 0.0, 0.0, 0.0], (0.0, 1.0, 0.0)),
+        ("F_b.x", [0.0, 2.0, 0.0, 0.0], (1.0, 0.0, 0.0)),
+        ("F_b.z", [0.0, 0.0, 0.0, 2.0], (0.0, 0.0, 1.0)),
+    ):
+        policy = fflin.StateFeedback(fflin.linearize(robot), np.zeros((4, 12)))
+        policy.lin.__dict__["u0"] = np.array(u)
+        given = {f"{name}.misalignment": 0.3}
+        campaign = fflin.monte_carlo(
+            *(robot, policy, given),
+            **{"runs": 3, "duration": 1.0, "dt": 0.1, "engine": engine},
+        )
+        assert campaign.names == (f"{name}.misalignment.1", f"{name}.misalignment.2")
+        expected = 2.0 / robot.mass * turned(np.array(along), np.array(campaign.drawn))
+        np.testing.assert_allclose(campaign.v[:, :3], expected, rtol=0, atol=1e-12)
+
+
+def turned_by_noise(engine, size=0.05, **more):
+    """A body whose torque about x is the noise of its rate."""
+    robot = free_body((2.0, 3.0, 4.0)).replace(inputs=[fflin.BaseTorque()])
+    K = np.zeros((3, 12))
+    K[0, 6] = 1.0
+    policy = fflin.StateFeedback(fflin.linearize(robot), K)
+    options = {"duration": 40.0, "dt": 0.1, "sample": 0.2, "engine": engine, "runs": 20}
+    return fflin.monte_carlo(robot, policy, {"omega_b.x.noise": size}, **(options | more))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_noise_is_white_and_each_run_has_its_own(engine):
+    if engine == "compiled":
+        pytest.importorskip("numba")
+    campaign = turned_by_noise(engine)
+    heard = []
+    for run in range(20):
+        motion = campaign.replay(run)
+        assert np.array_equal(motion.q[-1], campaign.q[run])
+        heard.append((-motion.u[:-1, 0] - motion.v[:-1, 3])[::2])
+        assert np.array_equal(motion.u[:-1:2], motion.u[1::2])
+    heard = np.array(heard)
+    assert heard.shape == (20, 200)
+    count = heard.size
+    assert heard.mean() == pytest.approx(0.0, abs=4.0 * 0.05 / count**0.5)
+    assert heard.std() == pytest.approx(0.05, rel=4.0 / (2.0 * count) ** 0.5)
+    for a, b in ((heard[:, 1:], heard[:, :-1]), (heard[1:], heard[:-1])):
+        assert (a * b).mean() == pytest.approx(0.0, abs=4.0 * 0.05**2 / a.size**0.5)
+    assert campaign.names == ("noise", "omega_b.x.noise")
+    assert set(campaign.values("drawn omega_b.x.noise")) == {0.05}
+
+
+def test_noise_is_the_same_for_any_chunks_and_threads_and_whatever_else_ends():
+    pytest.importorskip("numba")
+    whole = turned_by_noise("compiled", 1.5)
+    parts = turned_by_noise("compiled", 1.5, chunk=8, threads=2, runs=9)
+    assert len({*whole.end}) > 5
+    for name in ("drawn", *ARRAYS):
+        assert np.array_equal(getattr(whole, name)[:9], getattr(parts, name)), name
+    for run in range(20):
+        assert np.array_equal(whole.replay(run).q[-1], whole.q[run])
+
+
+def test_a_delay_that_is_drawn_is_that_of_a_run(robots):
+    robot = robots["planar_detumble"]
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    case = {"dt": 0.01, "sample": 0.04, "duration": 1.0, "x0": lin.x0 + 0.01}
+    given = {"delay": [-0.03, 0.0, 0.016, 0.1]}
+    for engine, delay in product(ENGINES, (0.0, 0.02)):
+        if engine == "compiled":
+            pytest.importorskip("numba")
+        options = {**case, "delay": delay, "engine": engine}
+        campaign = fflin.monte_carlo(robot, policy, given, runs=12, **options)
+        for run, late in enumerate(campaign.values("drawn delay").tolist()):
+            options["delay"] = max(0.0, round((delay + late) / 0.01) * 0.01)
+            motion = fflin.simulate(robot, policy, **options)
+            np.testing.assert_allclose(campaign.q[run], motion.q[-1], rtol=0, atol=1e-12)
+        assert len({*campaign.values("drawn delay")}) == 4
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"q_b.noise": 0.1}, "noise is dispersed, .* give sample="),
+        ({"delay": 0.1}, "delay is dispersed, .* give sample="),
+        ({"q_b.noise": -0.1}, "expected a standard deviation of 0 or more"),
+        ({"joint_7.misalignment": 0.1}, "no misalignment to disperse"),
+        ({"tau_m.joint_2.misalignment": 0.1}, "a motor turns its joint about"),
+        ({"delay.x": 0.1}, "delay.x"),
+    ],
+)
+def test_what_cannot_be_dispersed_is_told(robots, given, words):
+    robot = robots["planar_detumble"]
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    with pytest.raises(fflin.FflinError, match=words):
+        CampaignJob(robot, policy, given, 0, "python", {"duration": 1.0})
+
+
+def test_dask_flies_the_same(robots):
+    distributed = pytest.importorskip("distributed")
+    robot = robots["planar_detumble"]
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    given = {"q_b": 0.05, "*.mass": 0.1, "q_b.noise": 1e-3, "delay": [0.0, 0.02]}
+    case = {"runs": 20, "duration": 0.2, "dt": 0.02, "sample": 0.04, "engine": "python"}
+    here = fflin.monte_carlo(robot, policy, given, **case)
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        there = fflin.monte_carlo(
+            robot, policy, given, executor=client.get_executor(), chunk=8, **case
+        )
+    assert all(np.array_equal(getattr(here, name), getattr(there, name)) for name in ARRAYS)
+    assert np.array_equal(there.replay(19).q[-1], here.q[19])

@@ -1,0 +1,116 @@
+"""Policies of all kinds for any robot, as (robot, policy, options of simulate)."""
+
+from dataclasses import replace
+
+import numpy as np
+
+import fflin
+from tests.support.motions import displaced
+
+SAMPLE = 0.1
+MEASURED = (
+    *(fflin.Gyroscope("base"), fflin.BasePose()),
+    *(fflin.JointPositions(), fflin.JointVelocities()),
+)
+JETS = [
+    fflin.Thruster("base", place, way, f"jet_{k}", max=most)
+    for k, (place, way, most) in enumerate(
+        (np.roll(place, axis), np.roll(way, axis), most)
+        for axis in range(3)
+        for place, way, most in (
+            *(((0.0, side, 0.0), (way, 0.0, 0.0), 0.5) for side in (-1.0, 1.0) for way in (-1, 1)),
+            # The same again, and one that there is enough of.
+            ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), None),
+        )
+    )
+]
+
+
+def motors(robot):
+    return [fflin.JointTorque(name) for name in robot.joint_names if name not in robot.passive]
+
+
+def plain(robot):
+    robot = robot.replace(inputs=[fflin.BaseForce()])
+    return robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce(), *motors(robot)])
+
+
+def seen(robot):
+    """With gyroscopes on the base and on the last link."""
+    more = [fflin.Gyroscope(name) for name in robot.joint_names[-1:]]
+    return robot.replace(outputs=(*more, *MEASURED) if robot.n else MEASURED[:2])
+
+
+def noise(t):
+    return 1e-3 * np.sin(np.arange(100.0) * (1.0 + t))
+
+
+def state(robot):
+    lin = fflin.linearize(robot)
+    return robot, fflin.StateFeedback(lin, fflin.lqr(lin).K), {}
+
+
+def between_gains(robot):
+    """Over two joints where there are, of which one may go round."""
+    names = [joint.name for joint in robot.joints][:2]
+    axes = {names[0]: [-0.3, 0.1, 0.2, 0.4]} | {name: [-0.2, 0.3] for name in names[1:]}
+    batch = fflin.sweep(robot, fflin.grid(robot, axes))
+    lin = fflin.linearize(robot)
+    by = fflin.lqr(lin)
+    gains = fflin.lqr_batch(batch, by.Q, by.R)
+    # So that they differ more.
+    sizes = 1.0 + 0.1 * np.arange(len(gains))[:, None, None]
+    return robot, fflin.ScheduledFeedback(lin, replace(gains, K=sizes * gains.K)), {}
+
+
+def compensated(robot, dt=SAMPLE):
+    robot = seen(robot)
+    lin = fflin.linearize(robot).discretize(dt)
+    gain = fflin.lqr(lin)
+    return robot, lin, fflin.lqg(gain, fflin.kalman(lin, 1e-3, 1e-4))
+
+
+def outputs(robot):
+    robot, lin, by = compensated(robot)
+    size = len(lin.output_names)
+    return robot, fflin.OutputFeedback(lin, by, lambda t: noise(t)[:size]), {"dt": 0.01}
+
+
+def path(robot):
+    """A slew that others follow, turned and moved from where they begin.
+
+    A joint that goes round turns by more than half a turn.
+    """
+    _, policy, _ = state(robot)
+    x0 = displaced(policy.lin, degrees=50.0)
+    if robot.n and robot.joints[0].unbounded:
+        q = fflin.configuration(robot, {robot.joint_names[0]: -0.4})
+        lin = fflin.linearize(robot, q)
+        policy, x0[6] = fflin.StateFeedback(lin, fflin.lqr(lin).K), 2.9
+    flown = fflin.simulate(robot, policy, x0=x0, duration=8.0, dt=SAMPLE, engine="python")
+    along = fflin.Trajectory(robot, flown.t, flown.q, flown.v, flown.u, frame="hybrid")
+    start = {"x0": None, "q0": flown.q[3], "v0": flown.v[0], "linear": False}
+    return fflin.linearize_trajectory(robot, along), start
+
+
+def followed(robot):
+    along, start = path(robot)
+    return robot, fflin.tvlqr(along), start
+
+
+def followed_outputs(robot):
+    robot = seen(robot)
+    along, start = path(robot)
+    gains = fflin.tvlqr(along, sample=SAMPLE)
+    by = fflin.tvkalman(along, 1e-3, 1e-4, P0=1e-4, sample=SAMPLE)
+    size = len(by.output_names)
+    return robot, fflin.TrajectoryOutputFeedback(along, gains, by, lambda t: noise(t)[:size]), start
+
+
+def shared(robot):
+    design, policy, _ = state(robot)
+    robot = design.replace(inputs=[*JETS, *motors(robot)])
+    return robot, fflin.Allocation(policy, design), {"sample": SAMPLE, "dt": 0.01}
+
+
+POLICIES = (state, between_gains, outputs, followed, followed_outputs, shared)
