@@ -37,10 +37,8 @@ class LaneTally(Tally):
         attitude = np.array((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
         attitude = quaternion_product(conjugate(state.origin_quaternion), attitude)
         there = np.concatenate((np.zeros(3), attitude, np.zeros(robot.nq - 7)))
-        self._sizes = [robot.nq, nx // 2, nx, nx, len(KINDS), nx, len(plan.initial)]
-        self._sizes += [len(KINDS)] * 2 + [
-            len(steps) * of for of in (len(KINDS), len(plan.initial))
-        ]
+        sizes = [robot.nq, nx // 2, nx, nx, len(KINDS), nx, len(plan.initial)]
+        sizes += [len(KINDS)] * 2 + [len(steps) * of for of in (len(KINDS), len(plan.initial))]
         self._marks = Marks(
             np.array([joint.idx_q for joint in joints], dtype=np.intp),
             np.array([joint.unbounded for joint in joints], dtype=bool),
@@ -53,14 +51,16 @@ class LaneTally(Tally):
             Point(there, np.zeros(nx // 2), none, none, none),
             *[None] * 10,
         )
-        self._keep(np.zeros((sum(self._sizes), LANES)))
+        ends = np.cumsum(sizes).tolist()
+        self._rows = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+        self._keep(np.zeros((sum(sizes), LANES)))
         self.outside[:], self.error_history[:] = -1.0, np.inf
 
     def _keep(self, values: Array) -> None:
         """Keep the marks in a space of their own, with these values."""
         self._space = space = work_space(len(values))
         space[:] = values
-        q, nu, *marks = np.split(space, np.cumsum(self._sizes)[:-1])
+        q, nu, *marks = (space[part] for part in self._rows)
         at = Point(q, nu, *[self._marks.home] * 3)
         self._marks = self._marks._replace(
             at=at, **dict(zip(Marks._fields[-9:], marks, strict=True))

@@ -224,6 +224,8 @@ class Judged(NamedTuple):
 class Settling:
     """Runs of a loop: whether they have settled, and how far they are from the linear loop's."""
 
+    span = 128  # steps between looks at what is over
+
     def __init__(self, job: SettlingJob, count: int) -> None:
         self._job, self._loop = job, job.loop
         self._code, self._worst = np.zeros(count, dtype=int), np.zeros(count)

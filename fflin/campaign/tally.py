@@ -57,6 +57,8 @@ class Tally:
     Errors are from `home` (nx,), or from its rows (steps + 1, nx). Those at some `steps` are kept.
     """
 
+    span = 2**20  # steps between looks at what is over
+
     def __init__(self, plan: Plan, state: StateMap, home: Array, count: int, steps: Array) -> None:
         self._plan, self._state, self._homes = plan, state, home
         self._home = home if home.ndim == 1 else home[0]
