@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import copy
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -39,7 +41,7 @@ class LaneTally(Tally):
         there = np.concatenate((np.zeros(3), attitude, np.zeros(robot.nq - 7)))
         sizes = [robot.nq, nx // 2, nx, nx, len(KINDS), nx, len(plan.initial)]
         sizes += [len(KINDS)] * 2 + [len(steps) * of for of in (len(KINDS), len(plan.initial))]
-        self._marks = Marks(
+        fields: list[Any] = [
             np.array([joint.idx_q for joint in joints], dtype=np.intp),
             np.array([joint.unbounded for joint in joints], dtype=bool),
             pin.SE3ToXYZQUAT(state.origin),
@@ -50,7 +52,8 @@ class LaneTally(Tally):
             *(kind, SETTLED, np.full(len(KINDS), THERE), steps.astype(np.intp)),
             Point(there, np.zeros(nx // 2), none, none, none),
             *[None] * 10,
-        )
+        ]
+        self._marks = Marks._make(fields)
         ends = np.cumsum(sizes).tolist()
         self._rows = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
         self._keep(np.zeros((sum(sizes), LANES)))
@@ -77,8 +80,8 @@ class LaneTally(Tally):
         other._keep(self._space)
         return other
 
-    def add(self, first: int, q: Array, nu: Array, u: Array, rows: Array) -> LaneTally:
-        """Take rows from a step on into account, which are (steps, LANES, ..), and as they came."""
-        kernel("tally", "take", "what is kept of eight runs")(self._marks, rows, first, len(q))
-        self._last = q[-1], nu[-1], u[-1], self._marks.x.T, self._marks.sizes.T
+    def add(self, first: int, rows: Sequence[Array], raw: Any = None) -> LaneTally:
+        """Take rows (steps, LANES, ..) from a step on into account, and `raw` as they came."""
+        kernel("tally", "take", "what is kept of eight runs")(self._marks, raw, first, len(rows[0]))
+        self._last = *(each[-1] for each in rows[:3]), self._marks.x.T, self._marks.sizes.T
         return self

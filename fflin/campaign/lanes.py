@@ -11,7 +11,7 @@ import numpy as np
 from fflin.base.rotation import product_matrix
 from fflin.base.validation import Array
 from fflin.campaign.sensing import normals
-from fflin.campaign.tally import STOPS, Tally, stop_of
+from fflin.campaign.tally import STOPS, stop_of
 from fflin.kernel.accelerations import work_space
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES, batch_tree
@@ -22,7 +22,6 @@ from fflin.simulation.plant import Plant
 from fflin.simulation.run import ending_of
 
 _MEMORY = 2**22  # [bytes] of rows that are there at a time
-_SHARED = 512  # rows of a space
 _DIVERGED = float(STOPS.index("diverged"))
 
 # Takes the first step of some, and their rows (steps, LANES, ..) of q, nu, u, momentum and centre.
@@ -41,8 +40,7 @@ class Lanes:
         parts = packed(plan, plant, Conserved(plant.robot, plan.q), tree)
         self._plan, self._state = plan, plant.state
         mechanics, method, law, channel, (kept, *flags), watch, point, stages = parts
-        self._fresh = [(work_space(_SHARED), np.zeros((_SHARED, 1)))]
-        self._used = 0  # of the last of these
+        self._fresh: list[tuple[Array, Array]] = []
         mechanics = mechanics._replace(
             tree=self._wide(mechanics.tree, "bodies", "fixed"),
             loads=self._wide(mechanics.loads, "wrench", "stored", "stiffness", "damping"),
@@ -72,9 +70,8 @@ class Lanes:
             slice(end - size, end) for end, size in zip(ends, self._sizes, strict=True)
         ]
         # Noise has room for so many samples alone.
-        most = max(1, _MEMORY // (8 * LANES * ends[-1]))
-        self._most = min(most, SLOTS) if len(law.added) > len(law.y) else most
-        self._most = min(self._most, plan.times.steps)
+        most = SLOTS if len(law.added) > len(law.y) else plan.times.steps
+        self._most = max(1, min(most, _MEMORY // (8 * LANES * ends[-1])))
         self._rows = work_space(self._most * ends[-1])
         self._begin = kernel("loop", "begin", "the start of eight runs")
         self._advance = kernel("loop", "advance_eight", "the loop of eight runs at a time")
@@ -91,13 +88,8 @@ class Lanes:
         wide = {}
         for name in names:
             array = getattr(part, name)
-            if self._used + len(array) > _SHARED:  # several share a space, which is filled at once
-                size, self._used = max(len(array), _SHARED), 0
-                self._fresh.append((work_space(size), np.zeros((size, 1))))
-            to = slice(self._used, self._used + len(array))
-            self._used = to.stop
-            space, before = self._fresh[-1]
-            wide[name], before[to, 0] = space[to], array
+            wide[name] = work_space(len(array))
+            self._fresh.append((wide[name], array[:, None].copy()))
         return part._replace(**wide)
 
     # A motion that diverges overflows before it is stopped: that is no reason to warn.
@@ -105,7 +97,7 @@ class Lanes:
     def fly(
         self,
         runs: Mapping[str, Array],
-        tally: Tally,
+        tally: Any,
         out: Mapping[str, Array],
         watcher: Watcher | None = None,
     ) -> list[str]:
@@ -134,7 +126,7 @@ class Lanes:
             done = int(clock[0])
             taken = rows[: (done - first) * width]
             seen = self._split(taken)
-            tally.add(first, *seen[:3], taken)
+            tally.add(first, seen, taken)
             if watcher:
                 watcher(first, seen)
             lost = ~(point.nu**2 < watch.squares[:, None]).all(axis=0)
@@ -155,7 +147,7 @@ class Lanes:
                     array[:, over] = array[:, [going.argmax()]]
         return told
 
-    def _end(self, tally: Tally, ending: Any, last: bool, done: int, stop: Array, out: Any) -> None:
+    def _end(self, tally: Any, ending: Any, last: bool, done: int, stop: Array, out: Any) -> None:
         """Write how some of the runs ended, which may be the last."""
         *_, (kept, *_), _, point, stages = self._parts
         rows = np.vstack((point.q, point.nu, stages.u, kept.sums[:9]))
@@ -165,7 +157,7 @@ class Lanes:
             if not some.any():
                 continue
             if whole:
-                tally = (tally if last else tally.copy()).add(done, *self._split(rows)[:3], rows)
+                tally = (tally if last else tally.copy()).add(done, self._split(rows), rows)
             where = slice(None) if some.all() else some
             for name, values in tally.outcome(done, stop)._asdict().items():
                 out[name][where] = values[:count][where]

@@ -100,7 +100,7 @@ class CampaignJob:
             )
             lanes.fly(eight, tally.copy(), own)
 
-    def _tally(self, count: int) -> Tally:
+    def _tally(self, count: int) -> Any:
         if count == LANES:
             from fflin.campaign.lane_tally import LaneTally
 
@@ -119,7 +119,7 @@ class CampaignJob:
         plan, plant = self.plan_of(drawn)
         run = self._gone(replace(plan, times=plan.times._replace(every=1)), plant)
         nu = plant.state.velocities(run.v)
-        tally = self._tally(1).add(0, *(each[:, None] for each in (run.q, nu, run.u)))
+        tally = self._tally(1).add(0, [each[:, None] for each in (run.q, nu, run.u)])
         stop = np.array([float(stop_of(run.stopped))])
         return tally.outcome(run.steps, stop)
 

@@ -239,10 +239,10 @@ class Settling:
         """Return one that goes its own way from here on."""
         return copy(self)
 
-    def add(self, first: int, q: Array, nu: Array, *_: Array) -> Settling:
+    def add(self, first: int, rows: list[Array], _: Any = None) -> Settling:
         """Take rows (steps, count, ..) from a step on into account."""
-        loop, rows = self._loop, slice(-first % self._job.every, None, self._job.every)
-        q, nu = q[rows], nu[rows]
+        looks = slice(-first % self._job.every, None, self._job.every)
+        loop, (q, nu) = self._loop, (each[looks] for each in rows[:2])
         if not (shape := q.shape[:2])[0]:
             return self
         square, e = loop.errors(*(each.reshape(-1, each.shape[-1]) for each in (q, nu)))

@@ -69,15 +69,7 @@ def _compare(marks, step):
 
 @compiled
 def take(marks, rows, first, count):
-    """Take so many rows, the first of which is of a step, into account.
-
-    Parameters
-    ----------
-    marks : Marks
-    rows : ndarray (count * width, 8)
-        As `loop.advance` writes them.
-    first, count : int
-    """
+    """Take so many rows as `loop.advance` writes, the first of which is of a step, into account."""
     at, sizes, kept = marks.at, marks.sizes, 0
     width, inputs = len(at.q) + len(at.nu), len(marks.largest_u)
     while kept < len(marks.steps) and marks.steps[kept] < first:

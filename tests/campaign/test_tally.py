@@ -73,8 +73,8 @@ def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follo
         lanes = LaneTally(job.plan, state, home, job.steps, way)
         for first, last in itertools.pairwise(cuts):
             some = [each[first:last] for each in (q, nu, u)]
-            plain.add(first, *some)
-            lanes = lanes.copy().add(first, *some, rows[first:last].copy().reshape(-1, LANES))
+            plain.add(first, some)
+            lanes = lanes.copy().add(first, some, rows[first:last].copy().reshape(-1, LANES))
         ends.append(lanes.outcome(STEPS - 1, stop))
         for name, expected in plain.outcome(STEPS - 1, stop)._asdict().items():
             found = getattr(ends[-1], name)
