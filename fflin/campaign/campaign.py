@@ -20,6 +20,7 @@ from fflin.base.writing import as_path
 from fflin.batch.files import read_rows, write_rows
 from fflin.campaign.conditions import Bound, bounds_of
 from fflin.campaign.report import campaign_report
+from fflin.campaign.spreads import SEED
 from fflin.campaign.tally import KINDS
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ class Campaign(FrozenArrays):
     times : tuple of float
         [s], when the histories have their rows; none unless they were asked for.
     error_history, input_history : ndarray (N, M, 6), (N, M, nu)
-        Errors of each kind, and what acted, at each of these times; of a run that was stopped
+        Errors of each kind, and commands, at each of these times; of a run that was stopped
         infinite, and zero, from then on.
     stop, end : ndarray (N,)
         0 where a run came to its end, 1 where it diverged, 2 where it left the chart, 3 else; and
@@ -202,9 +203,19 @@ class Campaign(FrozenArrays):
         return intervals.quantile(values, share("p", p), share("confidence", confidence))
 
     def mean(self, name: str, *, confidence: float = 0.95) -> Estimate:
-        """Return the mean of a figure over runs that came to their end, with Student's interval."""
-        values = self.values(name)
-        values = values[~self.stopped & np.isfinite(values)]
+        """Return the mean of a figure over runs that came to their end, with Student's interval.
+
+        Raises
+        ------
+        InputError
+            If it is infinite in some of these, as is the settling of what did not settle.
+        """
+        values = self.values(name)[~self.stopped]
+        if endless := int(np.isinf(values).sum()):
+            raise InputError(
+                f"{name!r} is infinite in {endless} of {len(values)} runs that came to their end; "
+                "ask for a fraction or a quantile"
+            )
         return intervals.mean(values, share("confidence", confidence))
 
     def worst(self, k: int = 5, name: str | None = None) -> list[int]:
@@ -229,6 +240,7 @@ class Campaign(FrozenArrays):
         found = {
             f"|{key}|" if abs(size) > abs(value) else key: max(value, size, key=abs)
             for key, value, size in zip(self.names, signed.tolist(), sized.tolist(), strict=True)
+            if key != SEED
         }
         return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
 

@@ -15,7 +15,7 @@ from fflin.base.validation import Array
 from fflin.base.validation import by_name as mapping
 from fflin.campaign.pointing import columns_of, in_lanes, misaligned, require_direction
 from fflin.campaign.sensing import Designed, Misled, noise_of
-from fflin.campaign.spreads import deviation_of, inverse_of, whole_number
+from fflin.campaign.spreads import SEED, deviation_of, inverse_of, whole_number
 from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, StateFeedback
 from fflin.dynamics.state import StateMap
@@ -81,10 +81,15 @@ class Dispersions:
             kind, head = (kind, head) if kind in known and head else ("state", str(key))
             if key == "delay":
                 kind, known["delay"] = "delay", ("delay",)
+            if kind == "fails" and isinstance(spread, int | float):
+                raise InputError(
+                    f"'{key}' is {spread:g}, the deviation about 0 of a time; give (least, "
+                    "largest), a list of times or a distribution"
+                )
             inverse = deviation_of if kind == "noise" else inverse_of
             by_kind.setdefault(kind, {})[head] = inverse(str(key), spread)
         if "noise" in by_kind:
-            self.columns.append(Column("noise", "seed", (0, 0), whole_number))
+            self.columns.append(Column(SEED, "seed", (0, 0), whole_number))
         for kind, spreads in by_kind.items():
             self._add(kind, spreads, list(known[kind]), " | ".join([*known][1:]))
         if not self.columns:
@@ -100,7 +105,7 @@ class Dispersions:
         if kind in ("noise", "delay") and not self._times.sample:
             raise InputError(
                 f"{kind} is dispersed, which is of samples, and the policy is asked at every "
-                "stage; give sample=, a multiple of dt"
+                "stage; give sample=, a multiple of dt (--dt of a command)"
             )
         try:
             found = by_name(f"{kind} to disperse", spreads, names)

@@ -85,7 +85,8 @@ def monte_carlo(
           second moment per mass along the axes of its frame by 1 + d, and the centre of mass is
           shifted by d times the radius of gyration. The pseudo-inertia stays positive;
         - ``INPUT.gain``, relative, and ``INPUT.bias`` [N m|N]: (1 + d) u + b acts of a command u;
-          ``INPUT.fails`` [s]: nothing acts of it from that time on;
+          ``INPUT.fails`` [s]: nothing acts of it from that time on. Inputs that are recorded are
+          the commands, also of what has failed;
         - ``INPUT.misalignment`` [rad]: the direction of a thruster, the axis of a wheel or one of
           tau_b or F_b is turned about two axes across it, by an angle drawn for each;
         - ``NAME.sensor``: added to a state that a `StateFeedback` reads, or to an output that an

@@ -11,6 +11,8 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, number
 
+SEED = "noise"  # what is drawn of a run's noise, which says nothing of how it ends
+
 
 def inverse_of(name: str, spread: Any) -> Callable[[Array], Array]:
     """Return the inverse distribution function of a spread."""

@@ -60,6 +60,12 @@ def add_commands(commands: Commands) -> None:
         help = f"{what}; {default:g} by default"
         validity.add_argument(f"--{name}", metavar=metavar, type=read, default=default, help=help)
     validity.add_argument(
+        "--limits",
+        choices=("urdf", "none"),
+        default="none",
+        help="cut the inputs to the limits of the robot, or not (default)",
+    )
+    validity.add_argument(
         "--frames",
         nargs="+",
         choices=("hybrid", "local", "world"),
@@ -131,6 +137,9 @@ def _momentum(lin: LinearModel) -> str:
     return folded(text.splitlines())
 
 
+_FREE = "as large as it takes; --limits urdf cuts them"
+
+
 def _validity(arguments: argparse.Namespace) -> int:
     from fflin.base.progress import Progress
     from fflin.batch.workers import OwnWorkers
@@ -143,7 +152,7 @@ def _validity(arguments: argparse.Namespace) -> int:
     lin = regulated_part(lin, arguments)
     gain = gain_of(lin, arguments)
     judged = lin.discretize(arguments.dt) if arguments.dt else lin
-    bar = Progress()
+    bar, cut = Progress(), arguments.limits == "urdf"
     try:
         with OwnWorkers(arguments.jobs) if arguments.jobs > 1 else nullcontext() as executor:
             found = validity(
@@ -156,11 +165,14 @@ def _validity(arguments: argparse.Namespace) -> int:
                 samples=arguments.samples,
                 seed=arguments.seed,
                 frames=arguments.frames,
+                limits="urdf" if cut else None,
                 executor=executor,
                 progress=bar.update,
             )
     finally:
         bar.close()
     print(found)
+    if cut or any(name in lin.limits for name in lin.input_names):
+        print("inputs were " + ("cut to the limits of the robot" if cut else _FREE))
     draw(arguments.plot, "plot_validity", found)
     return DONE

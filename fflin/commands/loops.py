@@ -106,7 +106,7 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
 
 def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
     """Return the loop that the options of `add_loop` say."""
-    from fflin.simulation.settling import SHORTEST, time_to_settle
+    from fflin.simulation.times import SHORTEST, time_to_settle
 
     given = once("--limit", arguments.limit)
     options: dict[str, Any] = {

@@ -13,6 +13,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.joints import Follower, Joint
+from fflin.robot.link_masses import LinkMass
 from fflin.robot.robot import Robot
 from fflin.robot.wheels import carry_over, with_inputs
 
@@ -44,6 +45,10 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         name: {**getattr(robot, name), **_prefixed(getattr(other, name), prefix)}
         for name in ("stiffness", "damping", "rest", "urdf_damping", "links")
     }
+    if not other.links:  # a body alone: its own parameters have its name
+        body = other.model.inertias[ROOT]
+        at_center = pin.SE3(np.eye(3), body.lever)
+        both["links"][prefix] = LinkMass(body.mass, body.inertia, at_center)
     told = f"{robot.urdf_sha256} {other.urdf_sha256} {frame} {placement} {prefix}"
     weighed = b"".join(each.toDynamicParameters().tobytes() for each in model.inertias.tolist())
     whole = replace(
@@ -53,6 +58,7 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         urdf_sha256=sha256(told.encode() + weighed).hexdigest(),
         joints=tuple(sorted((*own, *theirs), key=lambda each: each.idx_v)),
         followers=tuple(followers),
+        attached=(*robot.attached, (prefix, other)),
         **both,
     )
     fields = {name: getattr(robot, name) for name in ("outputs", "passive", "limits", "weights")}

@@ -79,6 +79,8 @@ class Robot(Coordinates):
         {name of an input or state: (least, largest)} in place of what the URDF and the inputs say.
     links : mapping
         {link: LinkMass} of those that weigh something, as the URDF has them.
+    attached : tuple of (str, Robot)
+        What it has grasped, each with the prefix of its names.
     """
 
     model: pin.Model
@@ -102,6 +104,7 @@ class Robot(Coordinates):
     start: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, Range] = field(default_factory=dict)
     links: Mapping[str, Any] = field(default_factory=dict)
+    attached: tuple[tuple[str, Robot], ...] = ()
     # Where some of its joints are wheels: the same robot without them.
     _wheelless: Robot | None = None
     # The model, and what it was when the first robot of it was made.

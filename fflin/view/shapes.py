@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,8 @@ import pinocchio as pin
 from fflin.base.errors import FflinError
 from fflin.base.writing import shown
 from fflin.robot.catalog import find_mesh
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.frames import ROOT, find_frame
+from fflin.robot.robot import Robot
 from fflin.robot.urdf.links import read_pose
 from fflin.robot.urdf.reader import read_document
 from fflin.robot.urdf.xacro import expand, first_xacro
@@ -73,8 +74,21 @@ def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
     found = list(_visuals(robot, notes)) if robot.urdf else []
     if not found:
         notes.append(f"{robot.name}: no visual geometry; drawn as boxes of the links' inertias")
-        found = list(_inertia_boxes(robot))
+        return tuple(_inertia_boxes(robot)), tuple(notes)
+    for prefix, other in robot.attached:
+        theirs, said = shapes(other)
+        found += (_carried(robot, prefix, other, shape) for shape in theirs)
+        notes += said
     return tuple(found), tuple(notes)
+
+
+def _carried(robot: Robot, prefix: str, other: Robot, shape: Shape) -> Shape:
+    """Return a shape of what a robot has grasped as one of that robot."""
+    if shape.joint > ROOT:
+        name = f"{prefix}.{other.model.names[shape.joint]}"
+        return replace(shape, joint=robot.model.getJointId(name))
+    joint, held = find_frame(robot.model, prefix)
+    return replace(shape, joint=joint, placement=held * shape.placement)
 
 
 def _visuals(robot: Robot, notes: list[str]) -> Iterator[Shape]:

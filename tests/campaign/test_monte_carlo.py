@@ -580,3 +580,20 @@ def test_warnings_are_given_once(robots):
         warnings.simplefilter("always")
         fflin.monte_carlo(robot, feedback(robot), START, runs=20, duration=0.1, limits=1e-9)
     assert len([str(each.message) for each in caught]) <= 1
+
+
+def test_a_mean_with_what_never_settled_is_refused(robots):
+    robot = robots["cubesat"]
+    lin = fflin.linearize(robot)
+    policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    drawn = {"q_b": 0.05, "tau_b.x.fails": (1.0, 2.0)}
+    found = fflin.monte_carlo(robot, policy, drawn, runs=8, duration=4.0, dt=0.05)
+    with pytest.raises(fflin.InputError, match=r"'settle' is infinite in \d of 8 runs"):
+        found.mean("settle")
+    with pytest.raises(fflin.InputError, match="a list of times or a distribution"):
+        fflin.monte_carlo(robot, policy, {"tau_b.x.fails": 3.0}, runs=1, duration=1.0)
+    noisy = {"q_b": 0.05, "q_b.x.noise": 1e-4}
+    found = fflin.monte_carlo(robot, policy, noisy, runs=8, duration=1.0, dt=0.05, sample=0.05)
+    assert "noise" in found.names and {key.strip("|") for key in found.sensitivity()} == {
+        *("q_b.x", "q_b.y", "q_b.z", "q_b.x.noise")
+    }

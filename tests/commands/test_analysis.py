@@ -37,3 +37,20 @@ def test_points_off_rest_are_told():
 
 def test_bad_input_is_one_line():
     assert "did you mean joint_1" in refused("analyze", "ets_vii", "--stiffness", "joint1=3")
+
+
+def test_validity_with_inputs_that_are_cut_holds_less_far():
+    asked = (
+        "validity",
+        "servicer_7dof",
+        "--samples",
+        "8",
+        "--bryson",
+        "q_b=0.001",
+        "--r",
+        "tau_b=1",
+    )
+    _, free, _ = run(*asked)
+    _, cut, _ = run(*asked, "--limits", "urdf")
+    assert free.splitlines()[-1].endswith("--limits urdf cuts them")
+    assert cut.splitlines()[-1] == "inputs were cut to the limits of the robot"

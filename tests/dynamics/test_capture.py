@@ -154,6 +154,19 @@ def test_the_names_of_the_payload_have_its_prefix():
     assert again.robot.mass == pytest.approx(robot.mass + payload.mass + 500.0)
 
 
+def test_a_body_that_was_caught_has_parameters_of_its_own():
+    robot = fflin.load("servicer_7dof")
+    found = fflin.capture(robot, "tool", DEBRIS)
+    S = fflin.sensitivity(fflin.linearize(found.robot))
+    assert S.parameters["payload.mass"].value == 500.0
+    assert S.parameters["link_7.mass"].value == pytest.approx(6.0)
+    of = fflin.uncertain(found.robot, {"payload.density": 0.1})
+    heavier = of.at({"payload.density": 1.1})
+    again = fflin.capture(robot, "tool", pin.Inertia(550.0, DEBRIS.lever, 1.1 * DEBRIS.inertia))
+    B, wanted = (fflin.linearize(each).B for each in (heavier, again.robot))
+    assert np.abs(B - wanted).max() < 1e-12 * np.abs(wanted).max()
+
+
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_what_is_wrong_is_one_line():
     robot, other = fflin.load("ets_vii"), fflin.load("cubesat")

@@ -23,5 +23,5 @@ def assert_same(one, other, tolerance=0.0):
             assert not left.flags.writeable, field.name
             scale = np.abs(right).max(initial=0.0)
             assert np.abs(left - right).max(initial=0.0) <= tolerance * scale, field.name
-        elif not (callable(left) or callable(right)):
+        elif field.name != "_robot" and not (callable(left) or callable(right)):
             assert left == right, field.name

@@ -180,3 +180,21 @@ def test_a_mesh_is_scaled_and_mirrored_and_then_placed(tmp_path):
     ours = vertices @ matrix[:3, :3].T + matrix[:3, 3]
     np.testing.assert_allclose(cKDTree(ours).query(theirs)[0], 0.0, atol=1e-6)
     np.testing.assert_allclose(cKDTree(theirs).query(ours)[0], 0.0, atol=1e-6)
+
+
+def test_what_was_grasped_is_drawn_where_it_is_held():
+    robot, other = fflin.load("servicer_7dof"), fflin.load("ets_vii")
+    at = pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.array([0.0, 0.1, 0.5]))
+    whole = fflin.capture(robot, "tool", other, placement=at).robot
+    own, theirs = len(shapes(robot)[0]), shapes(other)[0]
+    found = shapes(whole)[0]
+    assert len(found) == own + len(theirs)
+    data, alone = whole.create_data(), other.create_data()
+    pin.framesForwardKinematics(whole.model, data, whole.neutral())
+    pin.forwardKinematics(other.model, alone, other.neutral())
+    held = data.oMf[whole.model.getFrameId("tool")] * at
+    for shape, before in zip(found[own:], theirs, strict=True):
+        there = data.oMi[shape.joint] * shape.placement
+        assert there.isApprox(held * alone.oMi[before.joint] * before.placement, 1e-9)
+    body = pin.Inertia(5.0, np.zeros(3), np.eye(3))
+    assert shapes(fflin.capture(robot, "tool", body).robot)[0][own].finish == "inertia"
