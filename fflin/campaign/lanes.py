@@ -11,7 +11,7 @@ import numpy as np
 from fflin.base.rotation import product_matrix
 from fflin.base.validation import Array
 from fflin.campaign.sensing import normals
-from fflin.campaign.tally import STOPS, Tally, stop_of
+from fflin.campaign.tally import STOPS, stop_of
 from fflin.kernel.accelerations import work_space
 from fflin.kernel.compiled import kernel
 from fflin.kernel.tree import LANES, batch_tree
@@ -21,6 +21,7 @@ from fflin.simulation.plan import Plan
 from fflin.simulation.plant import Plant
 from fflin.simulation.run import ending_of
 
+_MEMORY = 2**22  # [bytes] of rows that are there at a time
 _DIVERGED = float(STOPS.index("diverged"))
 
 # Takes the first step of some, and their rows (steps, LANES, ..) of q, nu, u, momentum and centre.
@@ -64,7 +65,16 @@ class Lanes:
         self._parts = mechanics, method, law, channel, (kept, *flags), watch, point, stages
         self._work = work_space(mechanics.layout.size)
         self._sizes = [len(each) for each in (point.q, point.nu, point.u)] + [6, 3]
-        self._rows = work_space(SLOTS * sum(self._sizes))
+        ends = np.cumsum(self._sizes).tolist()
+        self._columns = [
+            slice(end - size, end) for end, size in zip(ends, self._sizes, strict=True)
+        ]
+        # Noise has room for so many samples alone.
+        most = SLOTS if len(law.added) > len(law.y) else plan.times.steps
+        self._most = max(1, min(most, _MEMORY // (8 * LANES * ends[-1])))
+        self._rows = work_space(self._most * ends[-1])
+        self._begin = kernel("loop", "begin", "the start of eight runs")
+        self._advance = kernel("loop", "advance_eight", "the loop of eight runs at a time")
         self._of = {
             **{"q": point.q, "nu": point.nu, "delay": channel.delay},
             **{key: getattr(mechanics.tree, key) for key in ("bodies", "fixed")},
@@ -87,17 +97,17 @@ class Lanes:
     def fly(
         self,
         runs: Mapping[str, Array],
-        tally: Tally,
+        tally: Any,
         out: Mapping[str, Array],
         watcher: Watcher | None = None,
     ) -> list[str]:
         """Do up to eight, whose rows differ from the plan, into `out`; say why each was stopped."""
         plan, steps, count = self._plan, self._plan.times.steps, len(runs["q"])
         parts, rows, width = self._parts, self._rows, sum(self._sizes)
-        mechanics, *_, (kept, *_), watch, point, stages = parts
+        mechanics, *_, (kept, *_), watch, point, _ = parts
         for array, fresh in self._fresh:
             array[:] = fresh
-        of_lane = np.minimum(np.arange(LANES), count - 1)
+        of_lane = slice(None) if count == LANES else np.minimum(np.arange(LANES), count - 1)
         for name, values in runs.items():
             if name in self._of:
                 self._of[name][:] = values[of_lane].T
@@ -105,35 +115,30 @@ class Lanes:
         mass = mechanics.tree.bodies[::10].sum(axis=0)
         kept.per_mass[0], kept.weight[:] = 1.0 / mass, mass * mechanics.gravity[:, None]
         kept.start[9:] = point.q[:3]
-        kernel("loop", "begin", "the start of eight runs")(mechanics, kept, point, self._work)
-        advance = kernel("loop", "advance_eight", "the loop of eight runs at a time")
+        self._begin(mechanics, kept, point, self._work)
+        span = min(self._most, tally.span)
         clock, going, told = np.zeros(1, dtype=np.intp), np.ones(count, dtype=bool), [""] * count
         while clock[0] < steps and going.any():
             first = int(clock[0])
-            last = min(steps, (first // SLOTS + 1) * SLOTS)
+            last = min(steps, (first // span + 1) * span)
             sense(first, last)
-            advance(*parts, clock, last, 1, rows, self._work)
+            self._advance(*parts, clock, last, 1, rows, self._work)
             done = int(clock[0])
-            seen = self._split(rows[: (done - first) * width])
-            tally.add(first, *seen[:3])
+            taken = rows[: (done - first) * width]
+            seen = self._split(taken)
+            tally.add(first, seen, taken)
             if watcher:
                 watcher(first, seen)
             lost = ~(point.nu**2 < watch.squares[:, None]).all(axis=0)
-            lost |= (self._turn @ point.q[3:7] < 0.0) & bool(plan.chart)
-            for lane in np.flatnonzero(lost[:count] & going).tolist():
+            if plan.chart:
+                lost |= self._turn @ point.q[3:7] < 0.0
+            for lane in (lost[:count] & going).nonzero()[0]:
                 told[lane] = self._said(runs["q"][lane], lane, done)
-            stop = np.array(list(map(stop_of, told)), dtype=float)
+            stop = np.array([float(stop_of(each)) if each else 0.0 for each in told])
             ending = going & ((stop > 0.0) | (done == steps) | tally.over[:count])
             if not ending.any():
                 continue
-            stop = stop[of_lane]
-            end = [x.T[None] for x in (point.q, point.nu, stages.u)]
-            # Of what diverged the end is no number.
-            away = (stop == _DIVERGED)[:count]
-            for some, each in ((away, tally), (~away, tally.copy().add(done, *end))):
-                if (some & ending).any():
-                    for name, values in each.outcome(done, stop)._asdict().items():
-                        out[name][some & ending] = values[:count][some & ending]
+            self._end(tally, ending, bool((ending == going).all()), done, stop[of_lane], out)
             going &= ~ending
             # What has ended would stop the others: it goes on as one of them.
             if going.any():
@@ -142,12 +147,27 @@ class Lanes:
                     array[:, over] = array[:, [going.argmax()]]
         return told
 
-    def _sensors(self, runs: Mapping[str, Array], of_lane: Array) -> Callable[[int, int], None]:
+    def _end(self, tally: Any, ending: Any, last: bool, done: int, stop: Array, out: Any) -> None:
+        """Write how some of the runs ended, which may be the last."""
+        *_, (kept, *_), _, point, stages = self._parts
+        rows = np.vstack((point.q, point.nu, stages.u, kept.sums[:9]))
+        away, count = (stop == _DIVERGED)[: len(ending)], len(ending)
+        # Of what diverged the end is no number.
+        for some, whole in ((ending & away, False), (ending & ~away, True)):
+            if not some.any():
+                continue
+            if whole:
+                tally = (tally if last else tally.copy()).add(done, self._split(rows), rows)
+            where = slice(None) if some.all() else some
+            for name, values in tally.outcome(done, stop)._asdict().items():
+                out[name][where] = values[:count][where]
+
+    def _sensors(self, runs: Mapping[str, Array], of_lane: Any) -> Callable[[int, int], None]:
         """Return what writes the errors of all that is sensed from a step up to another."""
         law, times, noise = self._parts[2], self._plan.times, noise_of(self._plan)
         size = len(law.y)
         rows = law.added.reshape(len(law.added) // max(size, 1), size, LANES)
-        nothing = np.zeros((len(of_lane), size))
+        nothing = np.zeros((LANES, size))
         bias, deviation = (runs.get(key, nothing)[of_lane].T for key in ("sensed", "noise"))
         rows[:] = bias
         draws = [normals(seed) for seed in runs["seed"][of_lane]] if "seed" in runs else []
@@ -183,8 +203,5 @@ class Lanes:
 
     def _split(self, rows: Array) -> list[Array]:
         """Return what rows hold, each (steps, LANES, size)."""
-        by_step = rows.reshape(-1, sum(self._sizes), LANES)
-        return [
-            each.transpose(0, 2, 1)
-            for each in np.split(by_step, np.cumsum(self._sizes)[:-1], axis=1)
-        ]
+        by_step = rows.reshape(-1, sum(self._sizes), LANES).transpose(0, 2, 1)
+        return [by_step[..., part] for part in self._columns]

@@ -45,11 +45,12 @@ class CampaignJob:
         self.plan, self.plant = planned(robot, policy, linear=False, progress=False, **options)
         self.engine, state = engine, self.plant.state
         self.x0 = state.read(self.plan.q, self.plan.v, near=self.plan.near)
-        self.home = self.x0 if self.plan.target is None else self.plan.target
+        self.home, self._way = self.x0 if self.plan.target is None else self.plan.target, []
         if follows := self.plan.reference:
             t = self.plan.times.dt * np.arange(self.plan.times.steps + 1)
             q, v, _ = map(np.array, zip(*map(follows, t.tolist()), strict=True))
-            self.home = states_of(state, q, state.velocities(v))
+            self.home = states_of(state, q, nu := state.velocities(v))
+            self._way = [q.ravel(), nu.ravel()]
         with placed(given):
             self.dispersions = Dispersions(
                 given, self.plant, self.plan.policy, self.x0, seed, self.plan.times
@@ -92,14 +93,18 @@ class CampaignJob:
         tree = batch_tree(self.plant.robot)
         assert tree is not None
         runs = self.dispersions.in_lanes(drawn, tree)
-        lanes = Lanes(self.plan, self.plant, runs)
+        lanes, tally = Lanes(self.plan, self.plant, runs), self._tally(LANES)
         for first in range(0, len(drawn), LANES):
             eight, own = (
                 {key: each[first : first + LANES] for key, each in of.items()} for of in (runs, out)
             )
-            lanes.fly(eight, self._tally(LANES), own)
+            lanes.fly(eight, tally.copy(), own)
 
-    def _tally(self, count: int) -> Tally:
+    def _tally(self, count: int) -> Any:
+        if count == LANES:
+            from fflin.campaign.lane_tally import LaneTally
+
+            return LaneTally(self.plan, self.plant.state, self.home, self.steps, self._way)
         return Tally(self.plan, self.plant.state, self.home, count, self.steps)
 
     def plan_of(self, drawn: Array) -> tuple[Plan, Plant]:
@@ -114,7 +119,7 @@ class CampaignJob:
         plan, plant = self.plan_of(drawn)
         run = self._gone(replace(plan, times=plan.times._replace(every=1)), plant)
         nu = plant.state.velocities(run.v)
-        tally = self._tally(1).add(0, *(each[:, None] for each in (run.q, nu, run.u)))
+        tally = self._tally(1).add(0, [each[:, None] for each in (run.q, nu, run.u)])
         stop = np.array([float(stop_of(run.stopped))])
         return tally.outcome(run.steps, stop)
 

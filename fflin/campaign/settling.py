@@ -224,6 +224,8 @@ class Judged(NamedTuple):
 class Settling:
     """Runs of a loop: whether they have settled, and how far they are from the linear loop's."""
 
+    span = 128  # steps between looks at what is over
+
     def __init__(self, job: SettlingJob, count: int) -> None:
         self._job, self._loop = job, job.loop
         self._code, self._worst = np.zeros(count, dtype=int), np.zeros(count)
@@ -237,10 +239,10 @@ class Settling:
         """Return one that goes its own way from here on."""
         return copy(self)
 
-    def add(self, first: int, q: Array, nu: Array, _: Array) -> Settling:
+    def add(self, first: int, rows: list[Array], _: Any = None) -> Settling:
         """Take rows (steps, count, ..) from a step on into account."""
-        loop, rows = self._loop, slice(-first % self._job.every, None, self._job.every)
-        q, nu = q[rows], nu[rows]
+        looks = slice(-first % self._job.every, None, self._job.every)
+        loop, (q, nu) = self._loop, (each[looks] for each in rows[:2])
         if not (shape := q.shape[:2])[0]:
             return self
         square, e = loop.errors(*(each.reshape(-1, each.shape[-1]) for each in (q, nu)))

@@ -5,7 +5,8 @@ Its size does not depend on how long the run is.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -57,6 +58,8 @@ class Tally:
     Errors are from `home` (nx,), or from its rows (steps + 1, nx). Those at some `steps` are kept.
     """
 
+    span = 2**20  # steps between looks at what is over
+
     def __init__(self, plan: Plan, state: StateMap, home: Array, count: int, steps: Array) -> None:
         self._plan, self._state, self._homes = plan, state, home
         self._home = home if home.ndim == 1 else home[0]
@@ -70,25 +73,18 @@ class Tally:
         self._parts.append(g.qdot_m.start + np.array(joints, dtype=int))
         self._circling = 6 + state.unbounded
         self.over = np.zeros(count, dtype=bool)  # none ends before its time
-        self.largest_x = np.zeros((count, state.nx))
-        self.largest_u = np.zeros((count, len(plan.initial)))
-        self.largest = np.zeros((count, len(KINDS)))
-        self.outside = np.full((count, len(KINDS)), -1)
+        self.largest_x: Array = np.zeros((count, state.nx))
+        self.largest_u: Array = np.zeros((count, len(plan.initial)))
+        self.largest: Array = np.zeros((count, len(KINDS)))
+        self.outside: Array = np.full((count, len(KINDS)), -1)
         self.steps = steps
-        self.error_history = np.full((count, len(steps), len(KINDS)), np.inf)
-        self.input_history = np.zeros((count, len(steps), len(plan.initial)))
+        self.error_history: Array = np.full((count, len(steps), len(KINDS)), np.inf)
+        self.input_history: Array = np.zeros((count, len(steps), len(plan.initial)))
 
-    def copy(self) -> Tally:
-        """Return one that goes its own way from here on."""
-        other = object.__new__(Tally)
-        other.__dict__ |= {
-            key: value if key[0] == "_" else value.copy() for key, value in vars(self).items()
-        }
-        return other
-
-    def add(self, first: int, q: Array, nu: Array, u: Array) -> Tally:
-        """Take rows (steps, count, ..) from a step on into account."""
-        x, e, sizes = self._errors(first, *(np.ascontiguousarray(each) for each in (q, nu)))
+    def add(self, first: int, rows: Sequence[Array], _: Any = None) -> Tally:
+        """Take rows (steps, count, ..) of q, nu and u from a step on into account."""
+        q, nu, u = map(np.ascontiguousarray, rows)
+        x, e, sizes = self._errors(first, q, nu)
         self._last = q[-1], nu[-1], u[-1], x[-1], sizes[-1]
         np.maximum(self.largest_x, np.abs(e).max(axis=0), out=self.largest_x)
         np.maximum(self.largest_u, np.abs(u).max(axis=0), out=self.largest_u)

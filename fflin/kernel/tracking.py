@@ -79,7 +79,7 @@ def _follow(robot, path, t):
 
 
 @inlined
-def _error(robot, path, point):
+def error(robot, path, point):
     """Write the error from what is followed, in its axes."""
     e, q, there, n = path.e, point.q, path.point, len(robot.index)
     (x, y, z), w = attitude(there.q)
@@ -103,7 +103,7 @@ def _error(robot, path, point):
 def track(robot, path, point, u, t):
     """Write the inputs u* - K e at a time of the run."""
     after = _follow(robot, path, t)
-    _error(robot, path, point)
+    error(robot, path, point)
     starts, count, width = path.starts, len(path.point.u), len(path.e)
     since = path.starts[0] + min(max(t, 0.0), path.last)
     k = max(0, np.searchsorted(starts, since, side="right") - 1)

@@ -1,0 +1,85 @@
+"""The marks of runs: those that compiled code keeps are those of the definition."""
+
+import itertools
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from fflin.campaign.runs import CampaignJob
+from fflin.campaign.tally import Tally
+from fflin.dynamics.state_rows import states_of
+from fflin.kernel.tree import LANES
+from tests.support.robots import LINKS, MIMIC, free_body
+
+STEPS = 90
+FRAMES = ["hybrid", "local", "world"]
+
+
+def turning(tmp_path):
+    path = tmp_path / "turning.urdf"
+    mimic = '<mimic joint="b" multiplier="-0.7" offset="0.2"/>'
+    text = MIMIC.format(links=LINKS, a="prismatic", b="continuous", parent="base", mimic=mimic)
+    path.write_text(text)
+    return fflin.load(path)
+
+
+def wheeled(_):
+    wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), name="w", inertia=0.02)
+    return free_body((20.0, 30.0, 40.0)).replace(inputs=[wheel])
+
+
+def arm(_):
+    return fflin.load("ets_vii")
+
+
+def rows_of(state, rng, inputs):
+    """Return rows (steps, lanes, ..) of q, nu and u that turn far and come to rest, each so far."""
+    robot = state.robot
+    fade = np.exp(-rng.uniform(1.0, 90.0, LANES) * np.linspace(0.0, 1.0, STEPS)[:, None])
+    nu = fade[..., None] * rng.normal(size=(STEPS, LANES, 6 + robot.n))
+    v = state.spread(nu).reshape(-1, robot.nv)
+    q = np.array([pin.integrate(robot.model, robot.neutral(), 2.0 * each) for each in v])
+    for row in q:
+        robot.follow(row)
+    return q.reshape(STEPS, LANES, -1), nu, rng.normal(size=(STEPS, LANES, inputs))
+
+
+@pytest.mark.parametrize("follows", [False, True])
+@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("made", [turning, wheeled, arm])
+def test_marks_of_lanes_are_those_of_the_definition(tmp_path, made, frame, follows):
+    pytest.importorskip("numba")
+    from fflin.campaign.lane_tally import LaneTally
+
+    robot, rng = made(tmp_path), np.random.default_rng(7)
+    turn = pin.Quaternion(0.5, -0.1, 0.7, 0.3).normalized()
+    options = {"duration": 0.01 * (STEPS - 1), "dt": 0.01, "frame": frame, "histories": 11}
+    options["reference"] = pin.SE3(turn, np.array((1.0, -2.0, 0.5)))
+    q0 = pin.integrate(robot.model, robot.neutral(), 0.3 * rng.normal(size=robot.nv))
+    robot.follow(q0)
+    options["q0"] = q0
+    job = CampaignJob(robot, None, {"q_b.x": 0.01}, 0, "compiled", options)
+    state, home, way = job.plant.state, job.home, []
+    q, nu, u = rows_of(state, rng, len(job.plan.initial))
+    if follows:
+        star = [each[:, 0] for each in rows_of(state, rng, 0)[:2]]
+        home, way = states_of(state, *star), [each.ravel() for each in star]
+    rows = np.concatenate((q, nu, u, np.zeros((STEPS, LANES, 9))), axis=2).transpose(0, 2, 1)
+    stop, ends = np.arange(LANES) % 3.0, []
+    for cuts in ([0, STEPS], [0, 1, 33, STEPS]):
+        plain = Tally(job.plan, state, home, LANES, job.steps)
+        lanes = LaneTally(job.plan, state, home, job.steps, way)
+        for first, last in itertools.pairwise(cuts):
+            some = [each[first:last] for each in (q, nu, u)]
+            plain.add(first, some)
+            lanes = lanes.copy().add(first, some, rows[first:last].copy().reshape(-1, LANES))
+        ends.append(lanes.outcome(STEPS - 1, stop))
+        for name, expected in plain.outcome(STEPS - 1, stop)._asdict().items():
+            found = getattr(ends[-1], name)
+            assert found.shape == expected.shape
+            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-10, err_msg=name)
+    assert np.isfinite(ends[0].settle).any() and (ends[0].largest[:, :2] > 0.1).all()
+    for one, other in zip(*ends, strict=True):
+        assert np.array_equal(one, other)
