@@ -44,8 +44,9 @@ class Worst:
     tried, excluded : int
         Loops tried, and draws and corners left out because they make no rigid bodies.
     safe : float or None
-        The loop is stable for all ranges widened about their middles by this factor, by an upper bound of the structured singular value over a grid of frequencies; 1 or more is
-        all of the set. None without slycot.
+        The loop is stable for all ranges widened about their middles by this factor, by an upper
+        bound of the structured singular value over a grid of frequencies; 1 or more is all of the
+        set. None without slycot.
     """
 
     damping: Found
