@@ -24,7 +24,8 @@ class Shooting:
 
     def __init__(self, robot: Robot, t: Array, held: bool) -> None:
         self.state, self.t, self.held, self.steps = StateMap(robot, frame="local"), t, held, 4
-        self._linearizer = Linearizer(robot, moving=True)
+        # Of one engine, so that a plan is the same to the last bit whatever ran before.
+        self._linearizer = Linearizer(robot, moving=True, engine="python")
         self.wheels = [self.state.names.index(f"q_m.{name}") for name in robot.wheels]
         self._size = np.where(np.arange(self.state.nx) < 3, 2.0, 1.0)
 
