@@ -34,7 +34,7 @@ class ChunkJob:
     def __init__(self, robot: Robot, *, at_rest: bool, count: int, **options: Any) -> None:
         self._again = partial(type(self), robot, at_rest=at_rest, count=count, **options)
         self._count = count
-        self.linearizer = Linearizer(robot, **options)
+        self.linearizer = Linearizer(robot, **options, engine="python")
         prepared = self.linearizer.prepared
         # There every field of a model but B is known without computing it.
         self.only_inertia = at_rest and prepared.own_reference and prepared.free

@@ -118,7 +118,7 @@ def equilibrium(
     The bounds make it a least distance problem, which non-negative least squares solve exactly
     (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974, chapter 23).
     """
-    lin = Linearizer(robot, moving=True)(q, v)
+    lin = Linearizer(robot, moving=True, engine="python")(q, v)
     drift = lin.drift
     assert drift is not None
     _require_steady(lin, drift)

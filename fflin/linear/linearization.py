@@ -306,4 +306,6 @@ def linearize(
     --------
     Linearizer : the same, prepared once for many points; the equations stand there.
     """
-    return Linearizer(robot, frame=frame, reference=reference, moving=moving)(q, v, u)
+    # Preparing the kernel for one point does not pay; so the last bits are the same everywhere.
+    options: Any = {"reference": reference, "moving": moving, "engine": "python"}
+    return Linearizer(robot, frame=frame, **options)(q, v, u)
