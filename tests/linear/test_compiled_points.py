@@ -10,6 +10,7 @@ import fflin
 from fflin.kernel import compiled
 from fflin.linear import linearization, prepared
 from tests.batch.test_equations import TILTED, operating_points
+from tests.support.robots import random_point
 
 pytest.importorskip("numba")
 
@@ -114,3 +115,11 @@ def test_an_engine_that_cannot_is_refused(robots, monkeypatch):
     monkeypatch.setattr(prepared.Prepared, "kernel", lambda self: None)
     with pytest.raises(fflin.InputError, match="a joint of 'cubesat' is of another kind"):
         fflin.Linearizer(robots["cubesat"], engine="compiled")
+
+
+def test_one_model_is_the_same_to_the_last_bit_where_the_kernel_is_loaded(robots):
+    robot = robots["canadarm2"]
+    q, v, u = random_point(robot, np.random.default_rng(7))
+    fflin.Linearizer(robot, engine="compiled")(q, v, u)
+    one, plain = fflin.linearize(robot, q, v, u), fflin.Linearizer(robot, engine="python")(q, v, u)
+    assert (one.A == plain.A).all() and (one.B == plain.B).all() and (one.f0 == plain.f0).all()
