@@ -1,0 +1,20 @@
+"""For the tutorials: a page of fflin among their results."""
+
+import os
+import shutil
+from pathlib import Path
+
+from IPython.display import HTML
+
+
+def embed(page: str, height: int = 480) -> HTML:
+    """Show a page that `fflin.visualize` wrote, and keep it beside the site's."""
+    folder = Path(os.environ["FFLIN_DOCS_PAGES"])
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(page, folder / Path(page).name)
+    address = f"../pages/{Path(page).name}"
+    return HTML(
+        f'<iframe class="fflin-page" src="{address}" height="{height}" loading="lazy" '
+        f'title="{page}"></iframe>'
+        f'<p class="fflin-page-link"><a href="{address}">{page} by itself</a></p>'
+    )
