@@ -20,7 +20,7 @@ import fflin  # noqa: E402
 
 project = "fflin"
 author = "The fflin developers"
-copyright = "the fflin developers, BSD-2-Clause"  # noqa: A001
+copyright = "the fflin developers, BSD-2-Clause"
 version = release = fflin.__version__
 
 extensions = [
@@ -46,6 +46,7 @@ nb_execution_raise_on_error = True
 nb_merge_streams = True
 
 # The reference, from the docstrings.
+default_role = "py:obj"
 add_module_names = False
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"

@@ -61,7 +61,9 @@ class CommandHelp(SphinxDirective):
         """Return a section for each command."""
         os.environ["COLUMNS"] = "88"
         parser = cli._parser("")
-        (action,) = (each for each in parser._actions if each.dest == "==SUPPRESS==" or each.choices)
+        (action,) = (
+            each for each in parser._actions if each.dest == "==SUPPRESS==" or each.choices
+        )
         made: list[nodes.Node] = [_help(parser.format_help())]
         for task, names in cli.TASKS.items():
             for name in names:
@@ -86,10 +88,17 @@ def keep_tags(app: Sphinx, doctree: nodes.document) -> None:
             node["no-wrap"] = node["nowrap"] = True
 
 
+def link_pages(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Let docstrings that name a page of the documents lead to it."""
+    for at, line in enumerate(lines):
+        lines[at] = re.sub(r"docs/(\w+)\.md", r":doc:`/\1`", line)
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register with Sphinx."""
     os.environ["FFLIN_DOCS_PAGES"] = str(Path(app.outdir) / "pages")
     reference(app)  # here, since autosummary looks for its tables before anything is read
     app.connect("doctree-read", keep_tags)
+    app.connect("autodoc-process-docstring", link_pages)
     app.add_directive("command-help", CommandHelp)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

@@ -48,6 +48,14 @@ class GainBatch(Design):
         The points [rad|m].
     joint_names, state_names, input_names : tuple of str
     frame, robot : str
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> batch = fflin.sweep(robot, fflin.grid(robot, {"joint_1": [-0.5, 0.0, 0.5]}))
+    >>> gains = fflin.lqr_batch(batch, 1.0, 1.0)
+    >>> gains.gain([0.25, 0.0, 0.0]).shape, bool(gains.margin.min() > 0)
+    ((9, 18), True)
     """
 
     VECTORS: ClassVar = ("residual", "margin")
@@ -160,6 +168,13 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
         If a weight is of a wrong size or sign.
     EquilibriumError, StabilizabilityError
         If there is no regulator about a point; it is named.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> batch = fflin.sweep(robot, fflin.grid(robot, {"joint_1": [-0.5, 0.0, 0.5]}))
+    >>> fflin.lqr_batch(batch, 1.0, 1.0).K.shape
+    (3, 9, 18)
     """
     if not isinstance(batch, LinearBatch):
         raise InputError(f"batch is a {type(batch).__name__}, expected a LinearBatch of sweep")
@@ -216,6 +231,15 @@ class ScheduledFeedback:
     ------
     InputError
         If they are of different states, inputs or frames, or the gains are not on a grid.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> batch = fflin.sweep(robot, fflin.grid(robot, {"joint_1": [-0.5, 0.0, 0.5]}))
+    >>> policy = fflin.ScheduledFeedback(lin, fflin.lqr_batch(batch, 1.0, 1.0))
+    >>> fflin.simulate(robot, policy, duration=0.5).u.shape[1]
+    9
     """
 
     lin: LinearModel

@@ -94,6 +94,15 @@ def tvlqr(
     W.-W. Lin and E. K.-W. Chu (with others), structure-preserving doubling algorithms, 2018.
     E. Celledoni, A. Marthinsen and B. Owren, Commutator-free Lie group methods, Future Generation
     Computer Systems 19(3), 2003.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> fflin.tvlqr(along, sample=0.1).K.shape
+    (21, 9, 18)
     """
     require_continuous(traj)
     names, dt = traj.state_names, 0.0 if sample is None else number("sample", sample)

@@ -37,6 +37,15 @@ class Capture(FrozenArrays):
         Linear [N s], and angular [N m s] about the world's origin, of both together before.
     momentum_after : ndarray (6,)
         The same of the one after: they differ by rounding.
+
+    Examples
+    --------
+    >>> import pinocchio as pin
+    >>> robot = fflin.load("planar_detumble")
+    >>> ballast = pin.Inertia.FromSphere(5.0, 0.1)
+    >>> caught = fflin.capture(robot, "hand", ballast, payload_v=[0.1, 0, 0, 0, 0, 0])
+    >>> bool(abs(caught.momentum_after - caught.momentum).max() < 1e-9)
+    True
     """
 
     robot: Robot
@@ -118,6 +127,15 @@ def capture(
     ----------
     Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989, for free joints; the
     impact is that of two bodies that stay together.
+
+    Examples
+    --------
+    >>> import pinocchio as pin
+    >>> robot = fflin.load("planar_detumble")
+    >>> ball = pin.Inertia.FromSphere(5.0, 0.1)
+    >>> caught = fflin.capture(robot, "hand", ball, payload_v=[0.01, 0, 0, 0, 0, 0.02])
+    >>> caught.robot.n, caught.energy_lost > 0
+    (3, True)
     """
     if not isinstance(robot, Robot):
         raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")

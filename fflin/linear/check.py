@@ -63,6 +63,13 @@ class Check:
         Every figure.
     title : str
         What was checked.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> [row.block for row in fflin.check(robot, lin).rows][:3]
+    ['A[q_b, q_b]', 'A[q_b, r_b]', 'A[q_b, q_m]']
     """
 
     rows: tuple[Row, ...]
@@ -111,6 +118,14 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     ------
     InputError
         If the model is sampled or has other states and inputs than this robot's.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> found = fflin.check(robot, lin)
+    >>> found.ok, found.max_error < 1e-6
+    (True, True)
     """
     if not isinstance(lin, LinearModel):
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")

@@ -90,6 +90,14 @@ class Linearizer:
     ----------
     Y. Yang, J. Aerospace Engineering 25(3), 2012. J. Carpentier and N. Mansard, Analytical
     derivatives of rigid body dynamics algorithms, Robotics: Science and Systems, 2018.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> linearizer = fflin.Linearizer(robot, frame="local")
+    >>> models = [linearizer(fflin.configuration(robot, {"joint_2": x})) for x in (0.0, 0.4)]
+    >>> len(models), models[1].frame
+    (2, 'local')
     """
 
     def __init__(
@@ -305,6 +313,15 @@ def linearize(
     See Also
     --------
     Linearizer : the same, prepared once for many points; the equations stand there.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}))
+    >>> lin.A.shape, lin.B.shape
+    ((18, 18), (18, 9))
+    >>> lin.is_equilibrium(1e-9)
+    True
     """
     # Preparing the kernel for one point does not pay; so the last bits are the same everywhere.
     options: Any = {"reference": reference, "moving": moving, "engine": "python"}

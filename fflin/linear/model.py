@@ -40,6 +40,13 @@ class Certificate:
         block it stands in.
     f0 : float
         Largest entry of the state derivative at the point; 0 at a fixed point.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> figures = lin.certificate
+    >>> figures.route_A < 1e-12, figures.inertia_residual < 1e-12
+    (True, True)
     """
 
     condition: float
@@ -91,6 +98,16 @@ class LinearModel(FrozenArrays):
         what is made of it.
     weights : mapping
         What `lqr` weighs where it is given nothing, as `Robot.replace` takes it.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> lin.state_names[:3], lin.input_units[0]
+    (('q_b.x', 'q_b.y', 'q_b.z'), 'N m')
+    >>> sampled = lin.discretize(0.1)
+    >>> lin.save("model.mat")
+    >>> fflin.LinearModel.load("model.mat").dt, sampled.dt
+    (0.0, 0.1)
     """
 
     A: Array

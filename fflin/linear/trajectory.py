@@ -53,6 +53,17 @@ class Trajectory(Design):
     ------
     InputError
         If a size is wrong, the times do not increase, or a row is no configuration or velocity.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> flown = motion.trajectory()
+    >>> flown.save("flown.csv")
+    >>> back = fflin.Trajectory.load("flown.csv", robot)
+    >>> back.q.shape, back.hold, bool(back.residual.max() < 1e-6)
+    ((11, 13), 'previous', True)
     """
 
     VECTORS: ClassVar = ("t",)

@@ -73,6 +73,14 @@ def load(
     -----
     FflinWarning
         Of what the file holds and the model does not, and of what cannot be quite right in it.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> robot.joint_names
+    ('joint_1', 'joint_2', 'joint_3')
+    >>> fflin.load("servicer_7dof", lock={"panel_left": 0.1}, gravity=(0, 0, -9.81)).n
+    8
     """
     found = find_robot(robot)
     if found.path.suffix.lower() != ".toml":
@@ -167,6 +175,13 @@ def from_model(
         If the root is not one free-flyer, a joint has more than one degree of freedom, the
         joints are not in depth-first order, in which CRBA would be silently wrong, or a
         placement, a body or an armature is not physical.
+
+    Examples
+    --------
+    >>> import pinocchio as pin
+    >>> model = pin.buildSampleModelHumanoidRandom()  # on a free-flyer
+    >>> fflin.from_model(model, name="random").n
+    26
     """
     if not isinstance(model, pin.Model):
         raise ModelError(f"the model is a {type(model).__name__}, expected a pin.Model")

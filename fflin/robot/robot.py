@@ -81,6 +81,14 @@ class Robot(Coordinates):
         {link: LinkMass} of those that weigh something, as the URDF has them.
     attached : tuple of (str, Robot)
         What it has grasped, each with the prefix of its names.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> heavy = robot.with_mass_properties({"base": {"mass": 900.0}})
+    >>> stiff = robot.replace(stiffness={"joint_1": 50.0}, gravity=(0, 0, -1.62))
+    >>> robot.n, stiff.stiffness["joint_1"], round(heavy.mass)
+    (3, 50.0, 972)
     """
 
     model: pin.Model

@@ -79,6 +79,15 @@ class Motion(Design):
     limits : ndarray (k, 2)
         Their least and largest values, infinite where there is none, whether or not the run was
         kept within.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> spin = fflin.velocity(robot, {"omega_b.z": 0.1})
+    >>> motion = fflin.simulate(robot, v0=spin, duration=2.0)
+    >>> motion.save("motion.npz")
+    >>> fflin.Motion.load("motion.npz").x.shape == motion.x.shape
+    True
     """
 
     OPEN: ClassVar = ("limits",)
@@ -278,6 +287,13 @@ def plot_motion(
         If the ending is another or the file cannot be written.
     UnknownNameError
         If there is nothing of a name in `show`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> figure = fflin.plot_motion(motion, "motion.png", show=["q_b", "*.joint_1"])
     """
     from fflin.simulation.motion_plot import draw_motion
 

@@ -147,6 +147,16 @@ def simulate(
     References
     ----------
     E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> q0 = fflin.configuration(robot, {"joint_1": 0.3})
+    >>> policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    >>> motion = fflin.simulate(robot, policy, q0=q0, duration=5.0, limits="urdf")
+    >>> motion.u.shape[1], float(motion.t[-1])
+    (9, 5.0)
     """
     plan, plant = planned(
         robot,

@@ -128,6 +128,13 @@ def visualize(
     -----
     FflinWarning
         Of what could not be drawn: missing meshes; boxes where there is no visual geometry.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> motion = fflin.simulate(robot, v0=fflin.velocity(robot, {"joint_1": 0.1}), duration=2.0)
+    >>> fflin.visualize(robot, motion, html="motion.html").name
+    'motion.html'
     """
     if not isinstance(robot, Robot):
         raise InputError(
