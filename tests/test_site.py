@@ -15,7 +15,14 @@ DOCS = Path(__file__).parents[1] / "docs"
 BEFORE = """robot = fflin.load("planar_detumble")
 lin = fflin.linearize(robot)
 arm = fflin.load("planar_detumble", inputs=[fflin.JointTorque("joint_1")])
-falling = fflin.load("planar_detumble", gravity=(0, 0, -9.81))"""
+falling = fflin.load("planar_detumble", gravity=(0, 0, -9.81))
+origin = pin.SE3.Identity()
+turned = pin.SE3(pin.rpy.rpyToMatrix(np.pi, 0, 0), np.zeros(3))
+K = fflin.lqr(lin).K
+def edited(name):
+    lin.save(name)
+    Path(name).write_text(Path(name).read_text().replace("18", "19", 1))
+    return name"""
 ERRORS = [
     'fflin.load("ets_vi")',
     'fflin.configuration(robot, {"joint_9": 0.1})',
@@ -25,7 +32,7 @@ ERRORS = [
     'Path("a.urdf").write_text("<robot name=\'a\'/>"); fflin.load("a.urdf")',
     'Path("b.urdf").write_text("<robot name=\'b\'><link name=\'l\'>"); fflin.load("b.urdf")',
     'lin.save("model.txt")',
-    'lin.save("c.json"); Path("c.json").write_text(Path("c.json").read_text().replace("18", "19", 1)); fflin.LinearModel.load("c.json")',
+    'fflin.LinearModel.load(edited("c.json"))',
     'fflin.Gain.load("none.npz")',
     "fflin.from_model(pin.buildSampleModelManipulator())",
     'fflin.linearize(fflin.load("romeo"))',
@@ -33,17 +40,17 @@ ERRORS = [
     "fflin.ReactionWheel((0, 0, 0))",
     "fflin.linearize(robot, q=[0.0])",
     "fflin.linearize(robot, q=np.zeros(robot.nq))",
-    "fflin.linearize(robot, fflin.configuration(robot, base=pin.SE3(pin.rpy.rpyToMatrix(np.pi, 0, 0), np.zeros(3))), reference=pin.SE3.Identity())",
+    "fflin.linearize(robot, fflin.configuration(robot, base=turned), reference=origin)",
     "fflin.equilibrium(falling, robot.neutral()); fflin.lqr(fflin.linearize(falling))",
     "fflin.lqr(fflin.linearize(arm))",
-    'fflin.kalman(fflin.linearize(robot.replace(outputs=[fflin.Gyroscope("base")])), 1e-3, 1e-4)',
+    "fflin.kalman(fflin.linearize(robot.replace(outputs=[fflin.Momentum()])), 1e-3, 1e-4)",
     "fflin.lqr(lin, -1.0, 1.0)",
     "fflin.StateFeedback(lin, np.zeros((3, 3)))",
     "fflin.acceleration_lqr(fflin.linearize(robot.replace(stiffness=10.0)), 1.0, 1.0, 1.0)",
     "fflin.simulate(robot, lambda t, q, v: np.zeros(3), duration=1.0)",
-    "fflin.simulate(robot, fflin.StateFeedback(lin, fflin.lqr(lin).K), duration=1.0, dt=0.1, sample=0.25)",
-    "fflin.simulate(robot, fflin.StateFeedback(lin, 1e6 * fflin.lqr(lin).K), q0=robot.neutral(), duration=1.0, dt=0.5)",
-    'fflin.simulate(fflin.load("ets_vii"), fflin.StateFeedback(lin, fflin.lqr(lin).K), duration=1.0)',
+    "fflin.simulate(robot, fflin.StateFeedback(lin, K), duration=1.0, dt=0.1, sample=0.25)",
+    "fflin.simulate(robot, fflin.StateFeedback(lin, 1e6 * K), duration=1.0, dt=0.5)",
+    'fflin.simulate(fflin.load("ets_vii"), fflin.StateFeedback(lin, K), duration=1.0)',
     'fflin.monte_carlo(robot, None, {"tau_m": 0.1}, runs=2, duration=1.0)',
     'sys.modules["control"] = None; lin.to_control()',
 ]

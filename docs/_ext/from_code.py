@@ -65,7 +65,7 @@ class CommandHelp(SphinxDirective):
             each for each in parser._actions if each.dest == "==SUPPRESS==" or each.choices
         )
         made: list[nodes.Node] = [_help(parser.format_help())]
-        for task, names in cli.TASKS.items():
+        for names in cli.TASKS.values():
             for name in names:
                 section = nodes.section(ids=[f"fflin-{name}"], names=[f"fflin {name}"])
                 section += nodes.title("", f"fflin {name}")
@@ -94,10 +94,17 @@ def link_pages(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines:
         lines[at] = re.sub(r"docs/(\w+)\.md", r":doc:`/\1`", line)
 
 
+def results_within(app: Sphinx) -> None:
+    """Keep what the tutorials drew within the site's own folder, not beside it."""
+    folder = str(Path(app.doctreedir) / "executed")
+    app.env.mystnb_config = app.env.mystnb_config.copy(output_folder=folder)
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register with Sphinx."""
     os.environ["FFLIN_DOCS_PAGES"] = str(Path(app.outdir) / "pages")
     reference(app)  # here, since autosummary looks for its tables before anything is read
+    app.connect("builder-inited", results_within, priority=900)  # after myst_nb has chosen
     app.connect("doctree-read", keep_tags)
     app.connect("autodoc-process-docstring", link_pages)
     app.add_directive("command-help", CommandHelp)

@@ -7,12 +7,15 @@ from pathlib import Path
 from IPython.display import HTML
 
 
-def embed(page: str, height: int = 480) -> HTML:
-    """Show a page that `fflin.visualize` wrote, and keep it beside the site's."""
+def embed(page: str, height: int = 480, place: str = "../") -> HTML:
+    """Show a page that `fflin.visualize` wrote, and keep it beside the site's.
+
+    `place` leads from the page that shows it to the top of the site.
+    """
     folder = Path(os.environ["FFLIN_DOCS_PAGES"])
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(page, folder / Path(page).name)
-    address = f"../pages/{Path(page).name}"
+    address = f"{place}pages/{Path(page).name}"
     return HTML(
         f'<iframe class="fflin-page" src="{address}" height="{height}" loading="lazy" '
         f'title="{page}"></iframe>'
