@@ -1,10 +1,16 @@
-"""For the tutorials: a page of fflin among their results."""
+"""For the pages that are run: figures and warnings as a reader sees them, and pages that play."""
 
 import os
 import shutil
+import warnings
 from pathlib import Path
 
+from IPython import get_ipython
 from IPython.display import HTML
+
+get_ipython().run_line_magic("matplotlib", "inline")
+# As the command line shows them, without the place in a notebook that nobody sees.
+warnings.showwarning = lambda message, category, *_: print(f"{category.__name__}: {message}")
 
 
 def embed(page: str, height: int = 480, place: str = "../") -> HTML:
