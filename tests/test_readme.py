@@ -17,10 +17,12 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def code_blocks(language, text=README):
-    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/guide.md", "docs/uncertainty.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "docs/index.md", "docs/guide.md", "docs/uncertainty.md", "docs/peers.md"]
+)
 def test_python_examples_run(tmp_path, page):
     text = (ROOT / page).read_text(encoding="utf-8")
     (tmp_path / "example.py").write_text("\n".join(code_blocks("python", text)))
@@ -105,7 +107,7 @@ def test_octave_reads_the_model_as_the_guide_says(tmp_path):
 
 
 def test_links_lead_somewhere():
-    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("**/*.md")):
         for link in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):
             assert (page.parent / link).exists(), f"{page.name}: {link}"
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 import os
 import re
 from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
@@ -88,6 +91,30 @@ def keep_tags(app: Sphinx, doctree: nodes.document) -> None:
             node["no-wrap"] = node["nowrap"] = True
 
 
+def link_names(app: Sphinx, doctree: nodes.document) -> None:
+    """Let the public names that pages write as code, ``lqr`` or ``fflin.lqr(lin)``, lead to theirs."""
+    page = app.env.current_document.docname
+    if page.startswith("reference/"):
+        return
+    for node in list(doctree.findall(nodes.literal)):
+        named = re.fullmatch(r"(?:fflin\.)?(\w+)(\(.*\))?", node.astext())
+        inside = (nodes.reference, nodes.title, addnodes.pending_xref)
+        if named and named[1] in fflin.__all__ and not isinstance(node.parent, inside):
+            link = addnodes.pending_xref(
+                "", refdomain="py", reftype="obj", reftarget=f"fflin.{named[1]}", refdoc=page
+            )
+            node.replace_self(link)
+            link += node
+
+
+def short_signature(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, result: str
+) -> tuple[str, str] | None:
+    """Leave out what a record is made of: its attributes are told, and a function makes it."""
+    made = what == "class" and "\nParameters\n---" not in (inspect.getdoc(obj) or "")
+    return ("", result) if made and dataclasses.is_dataclass(obj) else None
+
+
 def link_pages(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
     """Let docstrings that name a page of the documents lead to it."""
     for at, line in enumerate(lines):
@@ -106,6 +133,8 @@ def setup(app: Sphinx) -> dict[str, Any]:
     reference(app)  # here, since autosummary looks for its tables before anything is read
     app.connect("builder-inited", results_within, priority=900)  # after myst_nb has chosen
     app.connect("doctree-read", keep_tags)
+    app.connect("doctree-read", link_names)
     app.connect("autodoc-process-docstring", link_pages)
+    app.connect("autodoc-process-signature", short_signature)
     app.add_directive("command-help", CommandHelp)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}
