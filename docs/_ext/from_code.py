@@ -92,7 +92,7 @@ def keep_tags(app: Sphinx, doctree: nodes.document) -> None:
 
 
 def link_names(app: Sphinx, doctree: nodes.document) -> None:
-    """Let the public names that pages write as code, ``lqr`` or ``fflin.lqr(lin)``, lead to theirs."""
+    """Let public names that stand as code, ``lqr`` or ``fflin.lqr(lin)``, lead to their pages."""
     page = app.env.current_document.docname
     if page.startswith("reference/"):
         return
