@@ -7,6 +7,7 @@ from fflin.robot.loading import load as load
 from fflin.robot.loading import from_model as from_model
 from fflin.robot.catalog import list_robots as list_robots
 from fflin.robot.robot import Robot as Robot
+from fflin.robot.orbit import CircularOrbit as CircularOrbit
 from fflin.dynamics.points import configuration as configuration
 from fflin.dynamics.points import velocity as velocity
 from fflin.dynamics.points import effort as effort

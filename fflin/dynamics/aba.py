@@ -7,6 +7,7 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.names import PIN_ANGULAR
+from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT
 
@@ -24,6 +25,7 @@ class Aba:
         self._model.gravity.linear = np.array(robot.gravity)
         # M^-1 in base axes as ABA has it, of the last slopes.
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
+        self.field = field_of(robot, state.frame)
         self._resists = any(values.any() for values in robot.springs)
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 
@@ -34,7 +36,15 @@ class Aba:
             forces += self._passive_force(q, v)
         if tau is not None:
             forces += self.state.forces(tau)
-        return self._accelerate(self._model, q, v, forces, self._wrenches(q, v, u))
+        if self.field is None:
+            return self._accelerate(self._model, q, v, forces, self._wrenches(q, v, u))
+        absolute = self.field.absolute(q, v)
+        external = pin.StdVec_Force(self._wrenches(q, absolute, u))
+        pin.forwardKinematics(self._model, self._data, q)
+        for joint, pull in enumerate(self.field.wrenches(self._data)):
+            external[joint] = external[joint] + pull
+        rate = self._accelerate(self._model, q, absolute, forces, external)
+        return self.field.relative(q, v, rate)
 
     def terms(self, q: Array, v: Array, u: Array) -> Array:
         """Return the size (6 + n,) of the terms that add up to the accelerations; `u` as above."""

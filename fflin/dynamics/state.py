@@ -2,7 +2,6 @@
 
 from copy import copy
 from itertools import compress
-from typing import get_args
 
 import numpy as np
 import pinocchio as pin
@@ -29,9 +28,10 @@ class StateMap:
     robot : Robot
     reference : pin.SE3, optional
         Placement oMref that the attitude and position are relative to; identity by default.
-    frame : {"hybrid", "local", "world"}
+    frame : {"hybrid", "local", "world", "lvlh", "hill"}
         Axes of the velocities. hybrid: omega_b in base axes, v_b = d r_b/dt in reference axes.
-        local: both in base axes. world: both in reference axes. All at the base origin.
+        local: both in base axes. world: both in reference axes. All at the base origin. Of a robot
+        in orbit lvlh (default) or hill, the frame that Pinocchio's world is, with axes as hybrid.
 
     Attributes
     ----------
@@ -64,18 +64,16 @@ class StateMap:
         return f"StateMap('{self.robot.name}', nx={self.nx}, frame='{self.frame}')"
 
     def __init__(
-        self, robot: Robot, *, reference: pin.SE3 | None = None, frame: Frame = "hybrid"
+        self, robot: Robot, *, reference: pin.SE3 | None = None, frame: Frame | None = None
     ) -> None:
         if not isinstance(robot, Robot):
             raise InputError(
                 f"robot is a {type(robot).__name__}, expected a fflin.Robot; fflin.load makes one"
             )
-        if not isinstance(frame, str) or frame not in get_args(Frame):
-            raise names.unknown_frame(frame)
         robot.require_unchanged()
         n, self.robot = robot.n, robot
-        self.frame: Frame = frame
-        self.axes = IN_REFERENCE_AXES[frame]
+        self.frame = names.frame_of(robot, frame)
+        self.axes = IN_REFERENCE_AXES[self.frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
         self.nx = 12 + 2 * n
         self.groups = names.groups_of(n)

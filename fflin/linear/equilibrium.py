@@ -67,7 +67,7 @@ def equilibrium(
     q: Array | None = None,
     *,
     v: Array | None = None,
-    frame: Frame = "hybrid",
+    frame: Frame | None = None,
     reference: pin.SE3 | None = None,
 ) -> Equilibrium:
     r"""Find the inputs of least norm that balance all that acts on a robot at a point.
@@ -92,7 +92,7 @@ def equilibrium(
         A steady motion, whose velocities in base axes do not change; at rest by default. Joints
         may move if they are rotors, see `LinearModel.ignorable`, and under gravity the base may
         turn about the vertical only.
-    frame : {"hybrid", "local", "world"}
+    frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
         Axes of the inputs on the base, as in `linearize`.
     reference : pin.SE3, optional
         Placement whose axes are the reference axes, as in `linearize`; by default the base's

@@ -15,7 +15,7 @@ from fflin.base.frozen import frozen
 from fflin.base.validation import Array, truth
 from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.names import unknown_frame
+from fflin.dynamics.names import frame_of, unknown_frame
 from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.compiled import numba_is_there
 from fflin.linear.certificate import certify, inertia_matrix
@@ -83,7 +83,7 @@ def prepare(
     """Prepare a robot; arguments and errors are those of `Linearizer`."""
     moving = truth("moving", moving)
     if frame is None:
-        frame = "local" if moving else "hybrid"
+        frame = frame_of(robot, None) if not moving else "local"
     elif not isinstance(frame, str):  # nor one whose comparison below is an array
         raise unknown_frame(frame)
     if moving and (reference is not None or frame != "local"):

@@ -68,6 +68,10 @@ def sound(folder):
             **{"placement": pin.SE3.Identity(), "payload_q": None, "payload_v": np.zeros(6)},
             "prefix": "caught",
         },
+        "CircularOrbit": {
+            **{"altitude": 7e5, "mean_motion": None, "body": "earth", "mu": None},
+            "body_radius": None,
+        },
         "check": {"robot": robot, "lin": lin},
         "configuration": {"robot": robot, "joints": {joint: 0.1}, "base": pin.SE3.Identity()},
         "controllability": {"lin": lin},
