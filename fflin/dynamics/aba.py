@@ -44,7 +44,7 @@ class Aba:
         for joint, pull in enumerate(self.field.wrenches(self._data)):
             external[joint] = external[joint] + pull
         rate = self._accelerate(self._model, q, absolute, forces, external)
-        return self.field.relative(q, v, rate)
+        return self.field.relative(v, absolute, rate)
 
     def terms(self, q: Array, v: Array, u: Array) -> Array:
         """Return the size (6 + n,) of the terms that add up to the accelerations; `u` as above."""
