@@ -20,8 +20,8 @@ class OrbitField:
     """What an orbit does to a robot whose world is the orbit's frame.
 
     The frame turns with `rate` (3,) [rad/s], and pulls with `tide` x per mass at the place x; what
-    is at rest in it feels `pull` x, n^2 (3 r r^T - z z^T) x. `axes` (3, 3) are the unit vectors away
-    from the body, along the orbit and along its normal.
+    is at rest in it feels `pull` x, n^2 (3 r r^T - z z^T) x. `axes` (3, 3) are the unit vectors
+    away from the body, along the orbit and along its normal.
     """
 
     def __init__(self, robot: Robot, frame: str) -> None:
