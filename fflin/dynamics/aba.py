@@ -7,7 +7,7 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.names import PIN_ANGULAR
-from fflin.dynamics.orbital import field_of
+from fflin.dynamics.orbital import OrbitField, field_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT
 
@@ -39,10 +39,7 @@ class Aba:
         if self.field is None:
             return self._accelerate(self._model, q, v, forces, self._wrenches(q, v, u))
         absolute = self.field.absolute(q, v)
-        external = pin.StdVec_Force(self._wrenches(q, absolute, u))
-        pin.forwardKinematics(self._model, self._data, q)
-        for joint, pull in enumerate(self.field.wrenches(self._data)):
-            external[joint] = external[joint] + pull
+        external = self._with_tide(self.field, q, self._wrenches(q, absolute, u))
         rate = self._accelerate(self._model, q, absolute, forces, external)
         return self.field.relative(v, absolute, rate)
 
@@ -61,8 +58,13 @@ class Aba:
         # d(B u)/dq too. B comes from the accelerations of unit inputs at rest.
         state = self.state
         stiffness, damping, _ = state.robot.springs
-        tau = state.lift(self.actuation.torques(u) + self._passive_force(q, v))
+        tau, field = state.lift(self.actuation.torques(u) + self._passive_force(q, v)), self.field
+        here = q, v
+        if field:
+            q, v = field.near(q, v)
         external = self._wrenches(q, v, u)
+        if field:
+            external = self._with_tide(field, q, external)
         if state.S is None:
             slopes = pin.computeABADerivatives(self._model, self._data, q, v, tau, external)
             by_q, by_v, by_force = (state.project(slope) for slope in slopes)
@@ -76,6 +78,10 @@ class Aba:
             by_v += torque @ state.columns(jacobian)
         by_q[:, 6:] -= by_force[:, 6:] * stiffness
         by_v[:, 6:] -= by_force[:, 6:] * damping
+        if field:
+            pin.computeJointJacobians(self._model, self._data, q)
+            by_q += by_force @ state.forces(state.columns(field.slopes(self._data)))
+            field.add_turning(*here, by_q, by_v)
         at_rest = np.zeros_like(v)
         by_u = []
         for unit in np.eye(len(u)):
@@ -83,6 +89,15 @@ class Aba:
             rate = self._accelerate(self._weightless, q, at_rest, forces, wrenches)
             by_u.append(state.velocities(rate))
         return by_q, by_v, np.column_stack(by_u)
+
+    def _with_tide(
+        self, field: OrbitField, q: Array, wrenches: pin.StdVec_Force
+    ) -> pin.StdVec_Force:
+        total = pin.StdVec_Force(wrenches)
+        pin.forwardKinematics(self._model, self._data, q)
+        for joint, pull in enumerate(field.wrenches(self._data)):
+            total[joint] = total[joint] + pull
+        return total
 
     def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
         """Return what acts on the links, stored momentum turned with them included."""

@@ -5,7 +5,7 @@ import pinocchio as pin
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.names import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.names import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
@@ -28,6 +28,7 @@ class OrbitField:
         r, z = (np.array(axis) for axis in _AXES[frame])
         n = float(robot.orbit.mean_motion or 0.0) if robot.orbit else 0.0
         bodies = robot.model.inertias.tolist()[ROOT:]
+        self.robot = robot
         self._root, self._stored = robot.model.jointPlacements[ROOT], robot.stored_momentum
         self.rate: Array = n * z
         self.tide: Array = n * n * (3.0 * np.outer(r, r) - np.eye(3))
@@ -70,6 +71,48 @@ class OrbitField:
         turn -= turn.swapaxes(1, 2)
         torque = turn[:, (2, 0, 1), (1, 2, 0)] + (self._levers @ force[..., None])[..., 0]
         return [self._none, *map(pin.Force, force, torque)]
+
+    def slopes(self, data: pin.Data) -> Array:
+        """Return the slopes (nv, nv) over q of the forces of `wrenches`, the base not shifted."""
+        # Of a joint that turns by t, in its axes: those of R^T tide R are T [t]x - [t]x T.
+        model = self.robot.model
+        total = np.zeros((model.nv, model.nv))
+        for joint in range(ROOT, model.njoints):
+            inertia, place = model.inertias[joint], data.oMi[joint]
+            lever, R = inertia.lever, place.rotation
+            T, center = R.T @ self.tide @ R, R.T @ place.act(lever)
+            jacobian = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL)
+            moved = jacobian.copy()
+            moved[:, PIN_LINEAR] = 0.0
+            turned = moved[PIN_ANGULAR]
+            shift = moved[PIN_LINEAR] + (skew(center) - skew(lever)) @ turned
+            force = inertia.mass * (T @ shift + (skew(T @ center) - T @ skew(center)) @ turned)
+            changes = [T @ skew(t) - skew(t) @ T for t in np.eye(3)]
+            turns = [inertia.inertia @ change for change in changes]
+            torque = np.column_stack([pin.unSkew(turn - turn.T) for turn in turns]) @ turned
+            total += jacobian.T @ np.vstack((force, torque + skew(lever) @ force))
+        return total
+
+    def near(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return q and the absolute v of a base that is not displaced, which falls as any other."""
+        q, v = q.copy(), self.absolute(q, v)
+        q[:3] = v[PIN_LINEAR] = 0.0
+        return q, v
+
+    def add_turning(self, q: Array, v: Array, by_q: Array, by_v: Array) -> None:
+        """Make slopes in state order at `near` those of the relative rates at q and v."""
+        R, place = self.base(q)
+        fall = R.T @ (self.pull @ place - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1])
+        spin, W, V = (skew(x) for x in (R.T @ self.rate, v[PIN_ANGULAR], v[PIN_LINEAR]))
+        # Of dw/dt + w x spin, and of dv/dt = c + fall - 2 spin x v - w x v.
+        by_q[:, ANGULAR] += by_v[:, ANGULAR] @ spin
+        by_q[ANGULAR, ANGULAR] += W @ spin
+        by_v[ANGULAR, ANGULAR] -= spin
+        by_v[:, LINEAR] = 0.0
+        by_q[LINEAR, ANGULAR] += skew(fall) + 2.0 * V @ spin
+        by_q[LINEAR, LINEAR] += R.T @ self.pull @ R
+        by_v[LINEAR, ANGULAR] += V
+        by_v[LINEAR, LINEAR] -= 2.0 * spin + W
 
     def potential(self, data: pin.Data) -> float:
         """Return what the tide and the frame's turning have of energy [J], as `wrenches` does."""

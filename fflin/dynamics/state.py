@@ -12,6 +12,7 @@ from fflin.base.validation import Array, placement, vector
 from fflin.dynamics import names
 from fflin.dynamics.chart import SMALLEST_Q0, Chart
 from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR, Frame
+from fflin.dynamics.orbital import field_of
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
@@ -51,6 +52,9 @@ class StateMap:
         Which of the n joints turn without end.
     origin_quaternion : ndarray (4,)
         Attitude of `origin`.
+    orbit : tuple of ndarray (3,), (3, 3), or None
+        Of a robot in orbit the rate at which the reference turns and the field that is felt at
+        rest in it, in its axes.
 
     Raises
     ------
@@ -111,6 +115,8 @@ class StateMap:
         self._position, self.origin_quaternion = offset[:3], offset[3:]
         self._rotation = turning.rotation_matrix(self.origin_quaternion)
         self._aligned = bool((self._rotation == np.eye(3)).all())
+        field, R = field_of(self.robot, self.frame), oMref.rotation
+        self.orbit = (R.T @ field.rate, R.T @ field.pull @ R) if field else None
 
     @property
     def reference(self) -> pin.SE3:

@@ -92,14 +92,16 @@ def prepare(
             "reference, and the frame or make it 'local'"
         )
     state = StateMap(robot, reference=reference, frame=frame)
+    own = reference is None and robot.orbit is None  # in orbit it is the orbit's frame
     require_inertia(robot)
     actuation = Actuation(state)
     sensing = None
     if robot.outputs != (FullState(),):
         from fflin.dynamics.outputs import Sensing
 
-        sensing = Sensing(state, robot.outputs, own_reference=reference is None)
+        sensing = Sensing(state, robot.outputs, own_reference=own)
     acts = any(robot.gravity) or robot.stored_momentum or any(x.any() for x in robot.springs)
+    acts = acts or robot.orbit
     nu = len(actuation.names)
     seen = sensing or state
     return Prepared(
@@ -108,7 +110,7 @@ def prepare(
         actuation=actuation,
         sensing=sensing,
         moving=moving,
-        own_reference=reference is None,
+        own_reference=own,
         reference=frozen(pin.SE3ToXYZQUAT(state.reference)),
         free=sensing is None and not moving and not acts,
         common={
