@@ -26,7 +26,7 @@ class OrbitField:
 
     def __init__(self, robot: Robot, frame: str) -> None:
         r, z = (np.array(axis) for axis in _AXES[frame])
-        n = float(robot.orbit.mean_motion or 0.0) if robot.orbit else 0.0
+        n = robot.orbit.mean_motion if robot.orbit else 0.0
         bodies = robot.model.inertias.tolist()[ROOT:]
         self.robot = robot
         self._root, self._stored = robot.model.jointPlacements[ROOT], robot.stored_momentum
