@@ -41,7 +41,7 @@ class Aba:
         absolute = self.field.absolute(q, v)
         external = self._with_tide(self.field, q, self._wrenches(q, absolute, u))
         rate = self._accelerate(self._model, q, absolute, forces, external)
-        return self.field.relative(q, v, rate)
+        return self.field.relative(v, absolute, rate)
 
     def terms(self, q: Array, v: Array, u: Array) -> Array:
         """Return the size (6 + n,) of the terms that add up to the accelerations; `u` as above."""

@@ -1,7 +1,5 @@
 """A circular orbit's frame: rates relative to it, and the field that is felt in it (14.1)."""
 
-from typing import NamedTuple
-
 import numpy as np
 import pinocchio as pin
 
@@ -18,63 +16,61 @@ _AXES = {
 }
 
 
-class OrbitField(NamedTuple):
+class OrbitField:
     """What an orbit does to a robot whose world is the orbit's frame.
 
-    The frame turns with `rate`; the field per mass at x is `tide` x.
+    The frame turns with `rate` (3,) [rad/s], and pulls with `tide` x per mass at the place x; what
+    is at rest in it feels `pull` x, n^2 (3 r r^T - z z^T) x. `axes` (3, 3) are the unit vectors
+    away from the body, along the orbit and along its normal.
     """
 
-    robot: Robot
-    frame: str
-    rate: Array  # (3,) [rad/s]
-    tide: Array  # (3, 3) [1/s^2]: n^2 (3 r r^T - E)
-
-    @property
-    def axes(self) -> Array:
-        """Unit vectors (3, 3) away from the body, along the orbit and along its normal."""
-        r, z = (np.array(axis) for axis in _AXES[self.frame])
-        return np.column_stack((r, np.cross(z, r), z))
-
-    @property
-    def pull(self) -> Array:
-        """The field (3, 3) that is felt at rest in the frame: n^2 (3 r r^T - z z^T) [1/s^2]."""
-        return self.tide - skew(self.rate) @ skew(self.rate)
+    def __init__(self, robot: Robot, frame: str) -> None:
+        r, z = (np.array(axis) for axis in _AXES[frame])
+        n = float(robot.orbit.mean_motion or 0.0) if robot.orbit else 0.0
+        bodies = robot.model.inertias.tolist()[ROOT:]
+        self.robot = robot
+        self._root, self._stored = robot.model.jointPlacements[ROOT], robot.stored_momentum
+        self.rate: Array = n * z
+        self.tide: Array = n * n * (3.0 * np.outer(r, r) - np.eye(3))
+        self.axes: Array = np.column_stack((r, np.cross(z, r), z))
+        self._turning = skew(self.rate)
+        self.pull: Array = self.tide - self._turning @ self._turning
+        self._mass = np.array([[body.mass] for body in bodies])
+        self._lever = np.array([body.lever for body in bodies])[..., None]
+        self._levers = np.array([skew(body.lever) for body in bodies])
+        self._inertia = np.array([body.inertia for body in bodies])
+        self._none = pin.Force.Zero()
 
     def base(self, q: Array) -> tuple[Array, Array]:
         """Return attitude (3, 3) and place (3,) of the base."""
-        base = self.robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(q[:7])
+        base = self._root * pin.XYZQUATToSE3(q[:7])
         return base.rotation, base.translation
 
     def absolute(self, q: Array, v: Array) -> Array:
-        """Return the velocity (nv,) in the frame that stands still of one relative to the orbit."""
+        """Return the velocity (nv,) in axes that stand still of one relative to the orbit's."""
         R, place = self.base(q)
         found = v.copy()
-        found[PIN_LINEAR] += R.T @ np.cross(self.rate, place)
+        found[PIN_LINEAR] += R.T @ (self._turning @ place)
         found[PIN_ANGULAR] += R.T @ self.rate
         return found
 
-    def relative(self, q: Array, v: Array, rate: Array) -> Array:
-        """Return dv/dt (nv,) of a relative velocity where the absolute one changes by `rate`."""
-        R, place = self.base(q)
-        own, found = v[PIN_ANGULAR], rate.copy()
-        spin, sweep = R.T @ self.rate, R.T @ np.cross(self.rate, place)
-        found[PIN_LINEAR] += np.cross(own, sweep) - np.cross(spin, v[PIN_LINEAR])
-        found[PIN_ANGULAR] += np.cross(own, spin)
+    def relative(self, v: Array, absolute: Array, rate: Array) -> Array:
+        """Return dv/dt (nv,) where the absolute velocity changes by `rate`: (14.2)."""
+        frame, own, found = absolute - v, skew(v[PIN_ANGULAR]), rate.copy()
+        found[PIN_LINEAR] += own @ frame[PIN_LINEAR] - skew(frame[PIN_ANGULAR]) @ v[PIN_LINEAR]
+        found[PIN_ANGULAR] += own @ frame[PIN_ANGULAR]
         return found
 
     def wrenches(self, data: pin.Data) -> list[pin.Force]:
         """Return what pulls on each body, in its joint's frame; `data` says where joints are."""
-        found = [pin.Force.Zero()]
-        for inertia, place in zip(
-            self.robot.model.inertias.tolist()[ROOT:], data.oMi.tolist()[ROOT:], strict=True
-        ):
-            R, lever = place.rotation, inertia.lever
-            force = inertia.mass * (R.T @ (self.tide @ place.act(lever)))
-            # 3 n^2 r x (I r) is the axial vector of I tide - tide I.
-            turn = inertia.inertia @ (R.T @ self.tide @ R)
-            torque = pin.unSkew(turn - turn.T)
-            found.append(pin.Force(force, torque + np.cross(lever, force)))
-        return found
+        R, center = self._places(data)
+        back = R.swapaxes(1, 2)
+        force = self._mass * (back @ (self.tide @ center))[..., 0]
+        # 3 n^2 r x (I r) is the axial vector of I tide - tide I.
+        turn = self._inertia @ (back @ self.tide @ R)
+        turn -= turn.swapaxes(1, 2)
+        torque = turn[:, (2, 0, 1), (1, 2, 0)] + (self._levers @ force[..., None])[..., 0]
+        return [self._none, *map(pin.Force, force, torque)]
 
     def slopes(self, data: pin.Data) -> Array:
         """Return the slopes (nv, nv) over q of the forces of `wrenches`, the base not shifted."""
@@ -119,24 +115,24 @@ class OrbitField(NamedTuple):
         by_v[LINEAR, LINEAR] -= 2.0 * spin + W
 
     def potential(self, data: pin.Data) -> float:
-        """Return the energy (J) that the tide and the frame's turning have, after `wrenches`."""
-        # -1/2 the integral of x^T G x, G = tide + n^2 (E - z z^T), over the masses.
-        G, energy = self.pull, 0.0
-        for inertia, place in zip(
-            self.robot.model.inertias.tolist()[ROOT:], data.oMi.tolist()[ROOT:], strict=True
-        ):
-            R, center = place.rotation, place.act(inertia.lever)
-            second = 0.5 * np.trace(inertia.inertia) * np.eye(3) - inertia.inertia
-            energy -= 0.5 * (inertia.mass * center @ G @ center + np.sum(R.T @ G @ R * second))
-        for joint, momentum in self.robot.stored_momentum:
+        """Return what the tide and the frame's turning have of energy [J], as `wrenches` does."""
+        # -1/2 the integral of x^T G x over the masses.
+        R, center = self._places(data)
+        G, inertia = self.pull, self._inertia
+        second = 0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3) - inertia
+        flying = (self._mass[..., None] * center.swapaxes(1, 2) @ G @ center).sum()
+        energy = -0.5 * float(flying + (R.swapaxes(1, 2) @ G @ R * second).sum())
+        for joint, momentum in self._stored:
             energy -= float(self.rate @ data.oMi[joint].rotation @ momentum)
         return energy
+
+    def _places(self, data: pin.Data) -> tuple[Array, Array]:
+        """Return attitude (k, 3, 3) and centre of mass (k, 3, 1) of each body."""
+        places = data.oMi.tolist()[ROOT:]
+        R = np.array([place.rotation for place in places])
+        return R, np.array([place.translation for place in places])[..., None] + R @ self._lever
 
 
 def field_of(robot: Robot, frame: str) -> OrbitField | None:
     """Return the field of a robot's orbit in a frame, if it has one."""
-    if robot.orbit is None:
-        return None
-    n = float(robot.orbit.mean_motion or 0.0)
-    r, z = (np.array(axis) for axis in _AXES[frame])
-    return OrbitField(robot, frame, n * z, n * n * (3.0 * np.outer(r, r) - np.eye(3)))
+    return None if robot.orbit is None else OrbitField(robot, frame)

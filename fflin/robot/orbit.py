@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass
@@ -120,6 +121,11 @@ class CircularOrbit:
     def period(self) -> float:
         """Time of one revolution [s]."""
         return 2.0 * math.pi / float(self.mean_motion or math.nan)
+
+    def to_json(self) -> str:
+        """Return it as text, of which `checked_orbit` makes it again."""
+        names = ("altitude", "body", "mu", "body_radius")
+        return json.dumps({name: getattr(self, name) for name in names})
 
     def __str__(self) -> str:
         return (

@@ -56,7 +56,7 @@ class Plan:
     limits: Saturation  # what acts of a command
     known: dict[str, Range]  # limits of states and inputs, whether they cut or not
     method: type[Integrator]
-    project: bool  # whether momentum and centre of mass are kept
+    project: bool  # whether momentum and centre of mass are kept, which they are in no orbit
     turning: Array  # the velocities whose turn within a step has a bound
     chart: StateMap | None  # that ends the run where the base leaves it
     events: tuple[Event, ...]
@@ -216,7 +216,7 @@ def planned(
         limits=within,
         known=known,
         method=integrates,
-        project=truth("project", project),
+        project=truth("project", project) and robot.orbit is None,
         turning=np.array([3, 4, 5, *(joint.idx_v for joint in joints)]),
         chart=None if lin is None else state,
         events=called,
