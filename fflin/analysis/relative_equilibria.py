@@ -14,7 +14,7 @@ from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import grid
 from fflin.base.validation import Array
 from fflin.dynamics.names import frame_of
-from fflin.dynamics.orbital import field_of
+from fflin.dynamics.orbital import field_of, mean_motion
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
@@ -125,7 +125,7 @@ def relative_equilibria(
     pin.ccrba(robot.model, data, q, np.zeros(robot.nv))
     center = root.actInv(data.com[0])
     sizes, axes = np.linalg.eigh(root.rotation.T @ data.Ig.inertia @ root.rotation)
-    n, found = float(np.linalg.norm(field.rate)), []
+    n, found = mean_motion(robot), []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         own = axes[:, order] * signs
         if np.linalg.det(own) < 0.0:
