@@ -16,6 +16,11 @@ _AXES = {
 }
 
 
+def mean_motion(robot: Robot) -> float:
+    """Return that of a robot's orbit [rad/s], 0 where it has none."""
+    return robot.orbit.mean_motion if robot.orbit else 0.0
+
+
 class OrbitField:
     """What an orbit does to a robot whose world is the orbit's frame.
 
@@ -26,7 +31,7 @@ class OrbitField:
 
     def __init__(self, robot: Robot, frame: str) -> None:
         r, z = (np.array(axis) for axis in _AXES[frame])
-        n = robot.orbit.mean_motion if robot.orbit else 0.0
+        n = mean_motion(robot)
         bodies = robot.model.inertias.tolist()[ROOT:]
         self.robot = robot
         self._root, self._stored = robot.model.jointPlacements[ROOT], robot.stored_momentum

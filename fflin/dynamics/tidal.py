@@ -8,7 +8,7 @@ import pinocchio as pin
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.names import PIN_ANGULAR
-from fflin.dynamics.orbital import OrbitField
+from fflin.dynamics.orbital import OrbitField, mean_motion
 
 # What turns about the radial direction, the one along the orbit and the normal count.
 _SHARES = (2.0, -1.0, -1.0)
@@ -29,7 +29,7 @@ class Tide(NamedTuple):
     def at(cls, field: OrbitField, q: Array) -> "Tide":
         """Return that at a configuration (nq,)."""
         R, place = field.base(q)
-        n = float(np.linalg.norm(field.rate))
+        n = mean_motion(field.robot)
         axes = R.T @ field.axes
         turns = zip((share * n * n for share in _SHARES), axes.T, strict=True)
         return cls(tuple(turns), R.T @ field.rate, R.T @ (field.pull @ place))

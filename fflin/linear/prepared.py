@@ -16,6 +16,7 @@ from fflin.base.validation import Array, truth
 from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.names import frame_of, unknown_frame
+from fflin.dynamics.orbital import mean_motion
 from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.compiled import numba_is_there
 from fflin.linear.certificate import certify, inertia_matrix
@@ -74,6 +75,8 @@ class Prepared:
             if self.kernel() is not None:
                 return
             reason = f"a joint of '{self.robot.name}' is of another kind"
+            if self.robot.orbit:
+                reason = f"'{self.robot.name}' is in orbit"
         raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
 
 
@@ -82,6 +85,11 @@ def prepare(
 ) -> Prepared:
     """Prepare a robot; arguments and errors are those of `Linearizer`."""
     moving = truth("moving", moving)
+    if moving and getattr(robot, "orbit", None):
+        raise InputError(
+            f"moving=True is the error from a motion of its own, and '{robot.name}' is in orbit, "
+            "whose frame is what it moves with; leave it out, or take robot.replace(orbit=None)"
+        )
     if frame is None:
         frame = frame_of(robot, None) if not moving else "local"
     elif not isinstance(frame, str):  # nor one whose comparison below is an array
@@ -135,6 +143,7 @@ def prepare(
             "_ignorable": partial(ignorable_states, robot),
             "_limits": partial(magnitudes_of, robot),
             "weights": robot.weights,
+            "mean_motion": mean_motion(robot),
             "_robot": robot,
         },
         rest={

@@ -77,6 +77,11 @@ class Uncertain:
         lin = linearize(robot, q)
         rest = robot.springs.rest - StateMap(robot).joint_positions(lin.q)
         pulled = [rest[each.parameter.spring] for each in self.ranges if each.parameter.spring >= 0]
+        if robot.orbit:
+            raise InputError(
+                f"'{robot.name}' is in orbit, where A depends on its masses as B does, and is no "
+                "such fraction; take samples(n), or the model without: robot.replace(orbit=None)"
+            )
         if lin.f0.any() or any(pulled) or any(robot.gravity) or robot.stored_momentum:
             pulls = "gravity" if any(robot.gravity) else "a spring out of its rest"
             raise InputError(

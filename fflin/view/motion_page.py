@@ -130,7 +130,7 @@ def subtitle(robot: Robot) -> str:
     """Return what the page says of a robot below its name."""
     wheels = len(robot.wheels)
     parts = [counted(robot.n - wheels, "joint"), *[counted(wheels, "wheel")] * bool(wheels)]
-    orbit = [f"{robot.orbit.altitude / 1e3:.4g} km over {robot.orbit.body}"] if robot.orbit else []
+    orbit = [f"{robot.orbit.altitude / 1e3:.6g} km over {robot.orbit.body}"] if robot.orbit else []
     return ", ".join([*parts, f"{robot.mass:.4g} kg", *orbit])
 
 
