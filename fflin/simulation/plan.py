@@ -24,6 +24,7 @@ from fflin.control.tracking import (
 )
 from fflin.dynamics import points
 from fflin.dynamics.integrators import Integrator, integrator
+from fflin.dynamics.names import ORBITAL, refuse_orbit
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.ignorable import rotor_names
 from fflin.linear.model import LinearModel
@@ -168,6 +169,14 @@ def planned(
         raise InputError(
             f"frame is {frame!r}, expected '{own_frame}' along a trajectory, whose inputs are in "
             "base axes; leave it out"
+        )
+    if along:
+        refuse_orbit(robot, "trajectories to follow")
+    if own_frame and (own_frame in ORBITAL) != bool(robot.orbit):
+        made, flown = ("in orbit", "no") if own_frame in ORBITAL else ("without an orbit", "an")
+        raise InputError(
+            f"the policy was made {made}, frame '{own_frame}', and '{robot.name}' is in {flown} "
+            "orbit; make it for the robot as it flies"
         )
     axes = {"reference": own_reference if reference is None else reference}
     state = StateMap(robot, **axes, frame=own_frame if frame is None else frame)
