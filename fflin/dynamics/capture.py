@@ -134,9 +134,7 @@ def capture(
     for field in ("gravity", "orbit") if isinstance(payload, Robot) else ():
         own, theirs = (getattr(each, field) for each in (robot, other))
         if own != theirs:
-            raise InputError(
-                f"the robot's {field} is {own}, the payload's {theirs}; give both one"
-            )
+            raise InputError(f"the robot's {field} is {own}, the payload's {theirs}; give both one")
     if other.stored_momentum:
         raise InputError(
             "a wheel of the payload stores momentum and has no inertia, so that it is no joint and "
