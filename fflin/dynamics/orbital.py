@@ -18,7 +18,7 @@ _AXES = {
 
 def mean_motion(robot: Robot) -> float:
     """Return that of a robot's orbit [rad/s], 0 where it has none."""
-    return float(robot.orbit.mean_motion or 0.0) if robot.orbit else 0.0
+    return robot.orbit.mean_motion if robot.orbit else 0.0
 
 
 class OrbitField:

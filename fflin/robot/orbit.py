@@ -26,6 +26,8 @@ BODIES = {
 # Errors of the linear field that are worth a warning, and beyond which it is of no use.
 _COARSE, _USELESS = 0.01, 0.5
 
+_FOLLOWS: Any = None  # from the others
+
 
 @dataclass(frozen=True)
 class CircularOrbit:
@@ -72,12 +74,12 @@ class CircularOrbit:
     >>> robot = fflin.load("cubesat", orbit=fflin.CircularOrbit(altitude=700e3))
     """
 
-    altitude: float | None = None
+    altitude: float = _FOLLOWS
     _: KW_ONLY
-    mean_motion: float | None = None
+    mean_motion: float = _FOLLOWS
     body: str = "earth"
-    mu: float | None = None
-    body_radius: float | None = None
+    mu: float = _FOLLOWS
+    body_radius: float = _FOLLOWS
 
     def __post_init__(self) -> None:
         if not isinstance(self.body, str):
@@ -99,10 +101,11 @@ class CircularOrbit:
             if self.mu is None
             else (_positive(name, x) for name, x in zip(("mu", "body_radius"), size, strict=True))
         )
+        n = self.mean_motion
         if self.altitude is not None:
             altitude = number("altitude", self.altitude)
         else:
-            n = _positive("mean_motion", self.mean_motion)
+            n = _positive("mean_motion", n)
             altitude = (mu / n) ** (1.0 / 3.0) / n ** (1.0 / 3.0) - ground
         if not 0.0 < altitude < 1e15:
             raise InputError(
@@ -110,7 +113,7 @@ class CircularOrbit:
                 f"{'no orbit about it' if altitude > 0.0 else 'at or below the surface'}; expected "
                 f"more than 0 and a mean motion below {math.sqrt(mu / ground) / ground:.4g} rad/s"
             )
-        if self.mean_motion is None:
+        if self.altitude is not None:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
         known = {"altitude": altitude, "mean_motion": n, "mu": mu, "body_radius": ground}
         for name, value in known.items():
@@ -119,12 +122,12 @@ class CircularOrbit:
     @property
     def radius(self) -> float:
         """Of the orbit [m]."""
-        return float(self.body_radius or 0.0) + float(self.altitude or 0.0)
+        return self.body_radius + self.altitude
 
     @property
     def period(self) -> float:
         """Time of one revolution [s]."""
-        return 2.0 * math.pi / float(self.mean_motion or math.nan)
+        return 2.0 * math.pi / self.mean_motion
 
     def to_json(self) -> str:
         """Return it as text, of which `checked_orbit` makes it again."""
@@ -145,7 +148,7 @@ class CircularOrbit:
 
     def __str__(self) -> str:
         return (
-            f"circular orbit {(self.altitude or 0.0) / 1e3:.6g} km over {self.body}, mean motion "
+            f"circular orbit {self.altitude / 1e3:.6g} km over {self.body}, mean motion "
             f"{self.mean_motion:.6g} rad/s, period {self.period / 60.0:.5g} min"
         )
 
