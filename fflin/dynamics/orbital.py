@@ -45,11 +45,20 @@ class OrbitField:
         self._levers = np.array([skew(body.lever) for body in bodies])
         self._inertia = np.array([body.inertia for body in bodies])
         self._none = pin.Force.Zero()
+        places = [*robot.model.jointPlacements.tolist()[ROOT + 1 :]]
+        lengths = [np.linalg.norm(place.translation) for place in places]
+        self._reach = float(np.sum(lengths) + np.linalg.norm(self._lever, axis=1).max())
 
     def base(self, q: Array) -> tuple[Array, Array]:
         """Return attitude (3, 3) and place (3,) of the base."""
         base = self._root * pin.XYZQUATToSE3(q[:7])
         return base.rotation, base.translation
+
+    def require_near(self, q: Array) -> None:
+        """Warn or refuse where the robot, its joints anyhow, is far from the orbit's point."""
+        if orbit := self.robot.orbit:
+            distance = float(np.linalg.norm(self.base(q)[1])) + self._reach
+            orbit.require_near(self.robot.name, distance)
 
     def absolute(self, q: Array, v: Array) -> Array:
         """Return the velocity (nv,) in axes that stand still of one relative to the orbit's."""

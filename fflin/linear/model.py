@@ -233,7 +233,7 @@ class LinearModel(FrozenArrays):
         """The states that nothing in the model depends on, found on the robot.
 
         Where the base is, and the angles of rotors; with `moving`, without gravity, the attitude
-        too; in orbit rotors' alone. A rotor is symmetric about its axis and has nothing fixed on it.
+        too; in orbit the latter alone. A rotor is symmetric about its axis and carries nothing.
         """
         return () if self._ignorable is None else self._ignorable(self)
 

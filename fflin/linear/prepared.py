@@ -108,8 +108,12 @@ def prepare(
         from fflin.dynamics.outputs import Sensing
 
         sensing = Sensing(state, robot.outputs, own_reference=own)
-    acts = any(robot.gravity) or robot.stored_momentum or any(x.any() for x in robot.springs)
-    acts = acts or robot.orbit
+    acts = (
+        robot.orbit
+        or any(robot.gravity)
+        or robot.stored_momentum
+        or any(x.any() for x in robot.springs)
+    )
     nu = len(actuation.names)
     seen = sensing or state
     return Prepared(

@@ -62,8 +62,9 @@ class BodySlopes:
         # Nothing depends on where the base is and how fast it moves along, see `Accelerations`.
         self.q[:3] = self.v[:3] = 0.0
         field = field_of(ready.robot, self.state.frame)
-        self._tide = field and Tide.at(field, q)
-        if self._tide:
+        self._tide = None
+        if field:
+            self._tide = Tide.at(field, q)
             self.v[PIN_ANGULAR] += self._tide.spin
         self.data, self.rates = ready.robot.create_data(), rates
         self.joints = range(ROOT, self.model.njoints)
@@ -131,7 +132,7 @@ class BodySlopes:
     ) -> tuple[Array, ...]:
         """Return RNEA and its slopes over q_m, nu and turns, without springs and inputs."""
         state, data, q = self.state, self.data, self.q
-        by_turn = np.zeros((len(v), 3))
+        by_turn: Array = np.zeros((len(v), 3))
         if tide:  # first, as what Pinocchio returns is overwritten
             pull = tide.force(model, data, q)
             pull_by_q, by_turn = tide.slopes(model, data, q)

@@ -106,6 +106,7 @@ def sound(folder):
         "lqr": {"lin": lin} | weights | {"N": None},
         "lqr_batch": {"batch": batch} | weights,
         "modes": {"lin": lin},
+        "relative_equilibria": {"robot": robot.replace(orbit=7e5), "q": q, "frame": "hill"},
         "Momentum": {},
         "funnel": {
             **{"robot": robot, "schedule": schedule, "goal": {"attitude": 1.0}, "within": None},
