@@ -41,7 +41,7 @@ def frame_of(robot: Robot, frame: object) -> Frame:
         suits = " or ".join(ORBITAL) if robot.orbit else "hybrid, local or world"
         raise InputError(
             f"frame is '{frame}', and '{robot.name}' is in {'an' if robot.orbit else 'no'} orbit; "
-            f"take {suits}{'' if robot.orbit else ', or give it one: robot.replace(orbit=...)'}"
+            f"take {suits}{'' if robot.orbit else ', or give it one (orbit=, --orbit)'}"
         )
     return cast("Frame", frame)
 

@@ -183,6 +183,8 @@ def planned(
     plant = Plant(state, disturbance)
     foresees = predictor(plant, policy, linear)
     q, v = start_of(state, x0, q0, v0, follows)
+    if plant.field:
+        plant.field.require_near(q)
     times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=dt is None)
     acting, known = chosen_limits(robot, limits)
     within = saturation(robot, acting, q, times.dt, times.sample)
