@@ -176,7 +176,7 @@ def test_an_equilibrium_holds_against_the_gradient():
             lambda robot: fflin.linearize(robot.replace(outputs=[fflin.Accelerometer("base")])),
             "leave it out",
         ),
-        (lambda robot: fflin.uncertain(robot, {"base.mass": 0.1}).lft(), "is in orbit"),
+        (lambda robot: fflin.uncertain(robot, {"base.mass": 0.1}).lft(), "field of an orbit"),
         (lambda robot: fflin.capture(robot, "base", fflin.load("ets_vii")), "orbit"),
         (lambda robot: fflin.acceleration_lqr(fflin.linearize(robot), 1, 1, 1), "fixed point|lqr"),
         (lambda robot: fflin.relative_equilibria(robot.replace(orbit=None)), "in no orbit"),
