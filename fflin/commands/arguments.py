@@ -186,8 +186,19 @@ def add_inputs_there(command: Container) -> None:
     )
 
 
+def add_orbit(command: Container) -> None:
+    """Add --orbit."""
+    add_options(
+        command,
+        """
+        --orbit ALTITUDE[:BODY]: a circular orbit at so many metres over the earth (default), moon,
+            mars ...: the world is then the frame of the orbit""",
+    )
+
+
 def add_system(command: Container) -> None:
     """Add what acts on the robot, what is watched of it, and in which axes."""
+    add_orbit(command)
     add_options(
         command,
         """
@@ -203,8 +214,6 @@ def add_system(command: Container) -> None:
             rates:NAME (a joint or a pattern), com, momentum, frame:NAME (pose and velocity),
             pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME; relative:NAME:TO, as
             another frame sees it
-        --orbit ALTITUDE[:BODY]: a circular orbit at so many metres over the earth, moon, mars ...:
-            the world is then the orbit's frame, see --frame
         --frame hybrid|local|world|lvlh|hill: axes of velocities and wrenches: angular in base axes
             and linear in reference axes (hybrid, default), both in base axes (local), both in
             reference axes (world); in orbit the world is along, minus normal, to the body (lvlh,

@@ -1,6 +1,6 @@
 """Names, units and axes of the state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m) and its forces."""
 
-from typing import Literal, NamedTuple, cast, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 from fflin.base.errors import InputError
 from fflin.robot.inputs import BaseForce, BaseTorque
@@ -31,19 +31,28 @@ def unknown_frame(frame: object) -> InputError:
     return InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
 
 
-def frame_of(robot: Robot, frame: object, default: Frame = "hybrid") -> Frame:
+def frame_of(robot: Robot, frame: object) -> Frame:
     """Return the frame that is asked for, or a robot's default one; it has to suit an orbit."""
     if frame is None:
-        return ORBITAL[0] if robot.orbit else default
+        return ORBITAL[0] if robot.orbit else "hybrid"
     if not isinstance(frame, str) or frame not in get_args(Frame):
         raise unknown_frame(frame)
     if (frame in ORBITAL) != bool(robot.orbit):
         suits = " or ".join(ORBITAL) if robot.orbit else "hybrid, local or world"
         raise InputError(
             f"frame is '{frame}', and '{robot.name}' is in {'an' if robot.orbit else 'no'} orbit; "
-            f"take {suits}{'' if robot.orbit else ', or give it one: robot.replace(orbit=...)'}"
+            f"take {suits}{'' if robot.orbit else ', or give it one (orbit=, --orbit)'}"
         )
     return cast("Frame", frame)
+
+
+def refuse_orbit(robot: Any, what: str) -> None:
+    """Raise `InputError` where a robot is in orbit, of which something is not."""
+    if getattr(robot, "orbit", None):
+        raise InputError(
+            f"{what} are of robots that float free, and '{robot.name}' is in orbit; take "
+            "robot.replace(orbit=None)"
+        )
 
 
 class Groups(NamedTuple):

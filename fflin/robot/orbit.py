@@ -6,7 +6,7 @@ import json
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass
 from typing import Any
 
 from fflin.base.errors import FflinWarning, InputError, unknown
@@ -130,9 +130,17 @@ class CircularOrbit:
         return 2.0 * math.pi / self.mean_motion
 
     def to_json(self) -> str:
-        """Return it as text, of which `checked_orbit` makes it again."""
-        names = ("altitude", "body", "mu", "body_radius")
-        return json.dumps({name: getattr(self, name) for name in names})
+        """Return it as text."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> CircularOrbit:
+        """Return the same one, to the last bit, of its text."""
+        parts = json.loads(text)
+        n = parts.pop("mean_motion")
+        orbit = cls(**parts)
+        object.__setattr__(orbit, "mean_motion", _positive("mean_motion", n))
+        return orbit
 
     def require_near(self, name: str, distance: float) -> None:
         """Warn where the field, linear in the distance [m] from the point, is coarse, or refuse."""

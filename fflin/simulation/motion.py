@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +18,7 @@ from fflin.base.record import Design
 from fflin.base.validation import Array, instance
 from fflin.base.writing import as_path, check_ending, write_whole
 from fflin.dynamics.state_rows import attitude_errors, moving_errors
-from fflin.robot.orbit import CircularOrbit, checked_orbit
+from fflin.robot.orbit import CircularOrbit
 from fflin.simulation.report import Limited, Passed, Saturated, passed, saturated
 
 FORMATS = (*record.FORMATS, ".csv")
@@ -59,16 +58,13 @@ class Motion(Design):
         of the motion relative to the frame.
     momentum_drift : ndarray (N,)
         How far the momentum is from its initial value and the impulse since, relative to the
-        largest sum of the momenta of base and joints. In orbit, where no momentum is kept, how
-        far `energy` is from its initial value and the work since, relative to the largest sum of
-        kinetic and potential.
+        largest sum of the momenta of base and joints. In orbit, where none is kept, how far
+        `energy` is from its initial value and the work since, relative to its largest terms.
     com_drift : ndarray (N,)
         How far the centre of mass is from where its initial velocity and the impulse since take
         it [m]; no rows in orbit, and where a file does not tell.
     state_names, input_names, state_units, input_units : tuple of str
     frame : {"hybrid", "local", "world", "lvlh", "hill"}
-    orbit : CircularOrbit or None
-        What it circles; the world is then the frame of the orbit that `frame` says.
     robot, urdf_sha256 : str
     stopped : str
         Why it ended before its time; empty where it did not.
@@ -139,11 +135,10 @@ class Motion(Design):
 
     def __repr__(self) -> str:
         stopped = f", stopped: {self.stopped}" if self.stopped else ""
-        com = f", com drift {self.com_drift.max():.1e} m" if len(self.com_drift) else ""
         return (
             f"Motion('{self.robot}', {len(self.t)} rows, {self.t[0]:g} to {self.t[-1]:g} s, "
-            f"{self.kept} drift {self.momentum_drift.max():.1e}"
-            f"{com}{stopped})"
+            f"{self.kept} drift {self.momentum_drift.max():.1e}, "
+            f"com drift {self.com_drift.max(initial=0.0):.1e} m{stopped})"
         )
 
     def __str__(self) -> str:
@@ -159,8 +154,8 @@ class Motion(Design):
 
     @property
     def orbit(self) -> CircularOrbit | None:
-        """What it circles."""
-        return checked_orbit(json.loads(self.circles)) if self.circles else None
+        """What it circles, if anything; the world is then the frame of it that `frame` says."""
+        return CircularOrbit.from_json(self.circles) if self.circles else None
 
     @property
     def kept(self) -> str:

@@ -173,6 +173,8 @@ def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = Non
     state, robot = plant.state, plant.robot
     conserved = conserved_by(robot, plan.q, plant.field)
     run = run or carried_out(plan, plant, conserved, engine)
+    if plant.field and not run.stopped:
+        plant.field.require_near(run.q[np.linalg.norm(run.q[:, :3], axis=1).argmax()])
     x = state_history(state, run.q, run.v, plan.near, run.t)
     target = np.zeros(0) if plan.target is None else plan.target
     if plan.reference is not None:

@@ -19,6 +19,7 @@ def test_altitude_and_mean_motion_say_the_same():
     same = fflin.CircularOrbit(mean_motion=high.mean_motion)
     assert same.altitude == pytest.approx(high.altitude, rel=1e-12)
     assert pickle.loads(pickle.dumps(high)) == high
+    assert all(type(each).from_json(each.to_json()) == each for each in (high, same))
     assert "35786 km over earth" in str(high)
 
 
