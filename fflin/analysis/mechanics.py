@@ -111,7 +111,7 @@ def second_order(lin: LinearModel) -> SecondOrder:
     noise = np.abs(M) @ spread
     # What balances in a spin leaves rounding, and may leave nothing else to compare it with.
     turns = [x for x, unit in zip(lin.x0, lin.state_units, strict=True) if unit == "rad/s"]
-    spin = max(float(np.abs(turns).max(initial=0.0)), lin.mean_motion)
+    spin = float(np.abs(turns).max(initial=0.0))
     noise[:, :nv] += _OF_SPIN * np.outer(size, size) * spin**2
     noise[:, nv : 2 * nv] += _OF_SPIN * np.outer(size, size) * spin
     forces = Noisy(M @ rates, noise)

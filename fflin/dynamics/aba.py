@@ -7,7 +7,7 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.names import PIN_ANGULAR
-from fflin.dynamics.orbital import OrbitField, field_of
+from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT
 
@@ -36,12 +36,9 @@ class Aba:
             forces += self._passive_force(q, v)
         if tau is not None:
             forces += self.state.forces(tau)
-        if self.field is None:
-            return self._accelerate(self._model, q, v, forces, self._wrenches(q, v, u))
-        absolute = self.field.absolute(q, v)
-        external = self._with_tide(self.field, q, self._wrenches(q, absolute, u))
-        rate = self._accelerate(self._model, q, absolute, forces, external)
-        return self.field.relative(v, absolute, rate)
+        absolute = self.field.absolute(q, v) if self.field else v
+        rate = self._accelerate(self._model, q, absolute, forces, self._pulls(q, absolute, u))
+        return self.field.relative(v, absolute, rate) if self.field else rate
 
     def terms(self, q: Array, v: Array, u: Array) -> Array:
         """Return the size (6 + n,) of the terms that add up to the accelerations; `u` as above."""
@@ -62,9 +59,7 @@ class Aba:
         here = q, v
         if field:
             q, v = field.near(q, v)
-        external = self._wrenches(q, v, u)
-        if field:
-            external = self._with_tide(field, q, external)
+        external = self._pulls(q, v, u)
         if state.S is None:
             slopes = pin.computeABADerivatives(self._model, self._data, q, v, tau, external)
             by_q, by_v, by_force = (state.project(slope) for slope in slopes)
@@ -90,14 +85,15 @@ class Aba:
             by_u.append(state.velocities(rate))
         return by_q, by_v, np.column_stack(by_u)
 
-    def _with_tide(
-        self, field: OrbitField, q: Array, wrenches: pin.StdVec_Force
-    ) -> pin.StdVec_Force:
-        total = pin.StdVec_Force(wrenches)
-        pin.forwardKinematics(self._model, self._data, q)
-        for joint, pull in enumerate(field.wrenches(self._data)):
-            total[joint] = total[joint] + pull
-        return total
+    def _pulls(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
+        """Return `_wrenches` with the pull of an orbit's field."""
+        wrenches = self._wrenches(q, v, u)
+        if self.field:
+            wrenches = pin.StdVec_Force(wrenches)
+            pin.forwardKinematics(self._model, self._data, q)
+            for joint, pull in enumerate(self.field.wrenches(self._data)):
+                wrenches[joint] = wrenches[joint] + pull
+        return wrenches
 
     def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
         """Return what acts on the links, stored momentum turned with them included."""

@@ -14,15 +14,7 @@ from fflin.dynamics.output_kinds import KINDS, Point, Sensed, Slopes, World
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT, Carried, find_frame
 from fflin.robot.joints import by_joint
-from fflin.robot.outputs import (
-    Accelerometer,
-    BasePose,
-    FullState,
-    JointOutput,
-    JointPositions,
-    Momentum,
-    Output,
-)
+from fflin.robot.outputs import BasePose, FullState, JointOutput, JointPositions, Output
 
 # Rotation and position of the base relative to itself.
 _STANDING: tuple[Array, Array] = (np.eye(3), np.zeros(3))
@@ -65,10 +57,10 @@ class Sensing:
         twice = [name for index, name in enumerate(self.names) if name in self.names[:index]]
         if twice:
             raise InputError(f"output '{twice[0]}' is asked for twice; leave one of them out")
-        inertial = [x for x in outputs if isinstance(x, Accelerometer | Momentum)]
+        inertial = [x.WORD for x in outputs if x.WORD in ("accelerometer", "momentum")]
         if robot.orbit and inertial:
             raise InputError(
-                f"output {inertial[0].WORD} is of axes that do not turn, and the world of "
+                f"output {inertial[0]} is of axes that do not turn, and the world of "
                 f"'{robot.name}' turns with its orbit; leave it out"
             )
         # Where one does, D is not zero.

@@ -57,8 +57,6 @@ class Accelerations:
     def rates(self, q: Array, v: Array, nu: Array, q_m: Array, u: Array) -> Rates:
         """Return the rates at q, v and u in base axes, v being `nu` and q_m in state order."""
         model, data, state = self._model, self._data, self._state
-        if self._field:
-            self._field.require_near(q)
         tide = self._field and Tide.at(self._field, q)
         # Without the base's position and linear velocity: nothing here depends on them, and
         # Pinocchio's derivatives lose digits to both. Nor does it depend on gravity, which

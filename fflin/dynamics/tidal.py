@@ -27,7 +27,8 @@ class Tide(NamedTuple):
 
     @classmethod
     def at(cls, field: OrbitField, q: Array) -> "Tide":
-        """Return that at a configuration (nq,)."""
+        """Return that at a configuration (nq,), which must be near to the orbit's point."""
+        field.require_near(q)
         R, place = field.base(q)
         n = mean_motion(field.robot)
         axes = R.T @ field.axes

@@ -152,7 +152,7 @@ class CircularOrbit:
         if error > _USELESS:
             raise InputError(f"{said}; give it an orbit nearer to it")
         if error > _COARSE:
-            warnings.warn(said, FflinWarning, stacklevel=7)
+            warnings.warn(said, FflinWarning, stacklevel=8)
 
     def __str__(self) -> str:
         return (

@@ -118,6 +118,26 @@ def test_the_orbit_of_the_earth_stands_beside_what_is_large():
         assert not fflin.check(other, lin).ok
 
 
+def test_a_base_that_flies_fast_is_seen_from_the_frame_that_turns():
+    robot = in_orbit(fflin.load("cubesat"))
+    v = fflin.velocity(robot, {"v_b.x": 150.0, "omega_b.y": 0.1})
+    found = fflin.check(robot, fflin.linearize(robot, v=v))
+    assert found.ok, found
+
+
+def test_a_weak_field_is_one_too():
+    """The gradient of a geostationary orbit is no rounding, though it is below 1e-9 rad/s^2."""
+    robot = fflin.load("cubesat", orbit=35786e3)
+    turned = fflin.configuration(robot, base=random_pose(np.random.default_rng(7), 0.5))
+    turned[:3] = 0.0
+    lin = fflin.linearize(robot, turned)
+    assert 1e-13 < np.abs(lin.f0).max() < 1e-9
+    assert not lin.is_equilibrium()
+    assert lin.ignorable == ()
+    held = fflin.linearize(robot, turned, u=fflin.equilibrium(robot, turned).u)
+    assert held.is_equilibrium()
+
+
 @pytest.mark.parametrize("ending", ["npz", "mat", "json", "csv"])
 def test_files_carry_the_orbit(tmp_path, ending):
     robot = in_orbit(fflin.load("cubesat"))
@@ -176,7 +196,7 @@ def test_an_equilibrium_holds_against_the_gradient():
             lambda robot: fflin.linearize(robot.replace(outputs=[fflin.Accelerometer("base")])),
             "leave it out",
         ),
-        (lambda robot: fflin.uncertain(robot, {"base.mass": 0.1}).lft(), "is in orbit"),
+        (lambda robot: fflin.uncertain(robot, {"base.mass": 0.1}).lft(), "field of an orbit"),
         (lambda robot: fflin.capture(robot, "base", fflin.load("ets_vii")), "orbit"),
         (lambda robot: fflin.acceleration_lqr(fflin.linearize(robot), 1, 1, 1), "fixed point|lqr"),
         (lambda robot: fflin.relative_equilibria(robot.replace(orbit=None)), "in no orbit"),
