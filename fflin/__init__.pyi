@@ -91,6 +91,7 @@ from fflin.control.policies import StateFeedback as StateFeedback
 from fflin.control.tracking import TrajectoryFeedback as TrajectoryFeedback
 from fflin.control.policies import Allocation as Allocation
 from fflin.control.output_feedback import OutputFeedback as OutputFeedback
+from fflin.control.linear_controller import LinearController as LinearController
 from fflin.control.output_feedback import TrajectoryOutputFeedback as TrajectoryOutputFeedback
 from fflin.batch.gains import ScheduledFeedback as ScheduledFeedback
 

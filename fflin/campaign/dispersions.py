@@ -16,7 +16,8 @@ from fflin.base.validation import by_name as mapping
 from fflin.campaign.pointing import columns_of, in_lanes, misaligned, require_direction
 from fflin.campaign.sensing import Designed, Misled, noise_of
 from fflin.campaign.spreads import SEED, deviation_of, inverse_of, whole_number
-from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
+from fflin.control.linear_controller import OfOutputs
+from fflin.control.output_feedback import TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, StateFeedback
 from fflin.dynamics.state import StateMap
 from fflin.kernel.accelerations import loads_of
@@ -61,7 +62,7 @@ class Dispersions:
         self._model = plant.robot._bare.model
         bodies = ["base", *list(self._model.names)[ROOT + 1 :]]
         self._sensors: tuple[str, ...] = ()
-        if isinstance(policy, StateFeedback | OutputFeedback):
+        if isinstance(policy, StateFeedback | OfOutputs):
             lin = policy.lin
             of_states = isinstance(policy, StateFeedback)
             self._sensors = lin.state_names if of_states else lin.output_names
@@ -100,7 +101,8 @@ class Dispersions:
         if kind in _OF_SENSORS and not names:
             raise InputError(
                 f"'{next(iter(spreads))}.{kind}' is dispersed, and a "
-                f"{type(self._policy).__name__} has no sensors; StateFeedback and OutputFeedback do"
+                f"{type(self._policy).__name__} has no sensors; StateFeedback, OutputFeedback and "
+                "LinearController do"
             )
         if kind in ("noise", "delay") and not self._times.sample:
             raise InputError(

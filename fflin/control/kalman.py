@@ -83,6 +83,19 @@ class Estimator(Design):
     def __repr__(self) -> str:
         return titled(self, nx=len(self.L), ny=self.L.shape[1])
 
+    def to_control(self) -> Any:
+        """Return a `control.StateSpace` from u - u0 and y - y0 to xh, with signal names.
+
+        Raises
+        ------
+        MissingPackageError
+            If python-control is not installed.
+        """
+        B, nx = np.hstack((self.B - self.L @ self.D, self.L)), len(self.L)
+        matrices = (self.A - self.L @ self.C, B, np.eye(nx), np.zeros((nx, B.shape[1])))
+        inputs = (*self.input_names, *self.output_names)
+        return state_space(matrices, self.dt, self.state_names, inputs, self.state_names)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Compensator(Design):
@@ -129,7 +142,8 @@ class Compensator(Design):
         MissingPackageError
             If python-control is not installed.
         """
-        return state_space(self, np.zeros((len(self.C), self.B.shape[1])))
+        matrices = (self.A, self.B, self.C, np.zeros((len(self.C), self.B.shape[1])))
+        return state_space(matrices, self.dt, self.state_names, self.input_names, self.output_names)
 
 
 def kalman(

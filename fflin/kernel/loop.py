@@ -77,7 +77,7 @@ def _act(work, channel, law, robot, point, step, stage, t):
     sample = channel.sample
     if law.kind != NOTHING and (sample == 0 or stage == 0):
         if sample == 0 or step % sample == 0:
-            command(work, robot, law, point, t, step // max(sample, 1))
+            command(work, robot, law, point, t, step // max(sample, 1), stage)
             share_out(law.sharing, point, law.u)
             limit(channel, point.u)
             if sample > 0:
@@ -164,6 +164,8 @@ def advance(
                 weight, moment = method.weights[stage], method.moments[stage]
                 add_wrench(work, robot, kept, point, weight, moment)
             _move(robot, method, stages, point, stage)
+            if len(law.filter.rates) > len(law.filter.z):
+                _combine(method.speed, stage, law.filter.rates, law.filter.z)
             configure(work, robot, point.q)
         if pushed:
             end_step(kept, h)

@@ -158,7 +158,7 @@ def planned(
     """Return what `simulate` does of its arguments, checked, and the robot that moves."""
     policy = followed(policy, robot)
     times = times_of(policy, duration, dt, every, sample, delay)
-    policy = followed(policy, robot, held=times.sample > 0)
+    policy = followed(policy, robot, held=times.sample * times.dt)
     lin, _ = feedback_of(policy)
     follows, along = reference_of(policy), tracking_of(policy)
     own_frame, own_reference = axes_of(policy)
