@@ -11,10 +11,9 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array, vector
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.output_kinds import KINDS
-from fflin.dynamics.outputs import Sensing, state_indices
+from fflin.dynamics.outputs import state_indices
 from fflin.dynamics.state import StateMap
-from fflin.linear.fit import Signals
-from fflin.robot.outputs import FullState, Gyroscope
+from fflin.robot.outputs import Gyroscope
 
 
 def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
@@ -136,10 +135,3 @@ class Loop(Compensation):
         self.estimate, self._stages = shares @ np.array(self._rates), self._stages + 1
         if last:
             self._rates, self._stages = [self.estimate], 0
-
-
-def sensed(state: StateMap) -> Signals:
-    """Return names and units of what a robot measures."""
-    outputs = state.robot.outputs
-    found = state if outputs == (FullState(),) else Sensing(state, outputs)
-    return found.names, found.units

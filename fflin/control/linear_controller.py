@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array, instance, number
-from fflin.control.compensation import Loop, Sample, sensed
+from fflin.control.compensation import Loop, Sample
 from fflin.control.gain import titled
 from fflin.control.policies import Policy
 from fflin.control.systems import System, fitted, system_of
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
-from fflin.linear.fit import require_fit, require_same
+from fflin.linear.fit import require_sensed
 from fflin.linear.model import LinearModel, state_space
 from fflin.linear.sampling import held_exponential
 from fflin.robot.robot import Robot
@@ -60,9 +60,7 @@ class OfOutputs:
         """
         lin, stays = self.lin, self.terms
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-        require_fit(lin, robot, state)
-        own = (lin.output_names, lin.output_units)
-        require_same(f"the model is one of '{lin.robot}'", robot, "output", own, sensed(state))
+        require_sensed(lin, robot, state)
         there = Measuring(state, lin.q), state.read(lin.q, lin.v)
         return Loop(state, self.dt, self.noise, len(stays.A), lambda _: stays, lambda _: there)
 

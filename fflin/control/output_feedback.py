@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
-from fflin.control.compensation import Compensation, Loop, Sample, sensed
+from fflin.control.compensation import Compensation, Loop, Sample
 from fflin.control.kalman import Compensator, kalman
 from fflin.control.linear_controller import OfOutputs
 from fflin.control.policies import Policy
@@ -21,7 +21,7 @@ from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvkalman import FilterSchedule
 from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
-from fflin.linear.fit import require_same
+from fflin.linear.fit import require_same, sensed
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
