@@ -5,26 +5,145 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError, listed
-from fflin.base.validation import Array, instance, number
-from fflin.control.compensation import Loop, Sample
+from fflin.base.validation import Array, instance, number, vector
 from fflin.control.gain import titled
-from fflin.control.policies import Policy
+from fflin.control.policies import Policy, decider, feedback_of
 from fflin.control.systems import System, fitted, system_of
-from fflin.dynamics.outputs import Measuring
+from fflin.dynamics.aba import Aba
+from fflin.dynamics.output_kinds import KINDS
+from fflin.dynamics.outputs import Measuring, state_indices
 from fflin.dynamics.state import StateMap
 from fflin.linear.fit import require_sensed
-from fflin.linear.model import LinearModel, state_space
+from fflin.linear.model import LinearModel
 from fflin.linear.sampling import held_exponential
+from fflin.robot.outputs import Gyroscope
 from fflin.robot.robot import Robot
 
 # A pole beyond this share of the fastest is one that grows, and no rounding.
 _ROUNDING = 1e-6
+
+
+def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
+    """Return which states the outputs are, gyroscopes after them; InputError of other sensors."""
+    found, gyros = list[int](), list[Gyroscope]()
+    for output in state.robot.outputs:
+        if isinstance(output, Gyroscope):
+            first = state.nx + 3 * len(gyros)
+            found += range(first, first + 3)
+            gyros.append(output)
+        elif type(output) in KINDS:
+            raise InputError(f"a {type(output).__name__} is measured in Python")
+        else:
+            found += state_indices(state, output)
+    return found, gyros
+
+
+class Sample(NamedTuple):
+    """u = u0 + C (z + jump) + D dy, then z, or dz/dt, is A (z + jump) + B dy of dy = y - y0."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    u0: Array
+    y0: Array
+    seen: Array  # by which, and `through`, a linear model measures y
+    through: Array
+    jump: Array | float = 0.0
+
+
+class Compensation:
+    """What a law does from sample to sample; its state begins at zero."""
+
+    def __init__(self, size: int, at: Callable[[float], Sample]) -> None:
+        self.at = at
+        self.estimate: Array = np.zeros(size)  # at the sample to come
+
+    def step(self, t: float, measure: Callable[[Sample, Array], Array]) -> Array:
+        """Return the command of a sample, at which y is measured then."""
+        by = self.at(t)
+        z = self.estimate + by.jump
+        u: Array = by.u0 + by.C @ z
+        if by.D.any():  # of what does not feel u
+            u = u + by.D @ (measure(by, u) - by.y0)
+        self._move(by.A @ z + by.B @ (measure(by, u) - by.y0))
+        return u
+
+    def _move(self, after: Array) -> None:
+        self.estimate = after
+
+
+class Loop(Compensation):
+    """The policy of a law on what the robot measures, relative to where it is to be.
+
+    Without dt the state is integrated along: `advance` takes it from stage to stage.
+    """
+
+    def __init__(
+        self, state: StateMap, dt: float, noise: Any, size: int, at: Any, there: Any
+    ) -> None:
+        super().__init__(size, at)
+        self._dt, self._noise, self._there = dt, noise, there
+        self._still: Array = np.zeros(state.robot.nv)
+        felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
+        self._aba, self._asked = Aba(state) if felt else None, -np.inf
+        self._rates, self._stages = [self.estimate], 0
+
+    def sample(self, t: float) -> tuple[Sample, StateMap, Array]:
+        """Return what it does at a sample, and the chart and the state that y is relative to."""
+        measure, near = self._there(t)
+        return self.at(t), measure.state, near
+
+    def __call__(self, t: float, q: Array, v: Array) -> Array:
+        """Return the command at a sample or a stage."""
+        apart = t - self._asked
+        if self._dt and self._asked >= 0.0 and abs(apart - self._dt) > 1e-6 * self._dt:
+            raise InputError(
+                f"the controller is asked {apart:g} s after its last sample, expected "
+                f"{self._dt:g} s; leave `sample` out"
+            )
+        if not self._dt and len(self.estimate) and len(self._rates) != self._stages + 1:
+            raise InputError(
+                "the states of a continuous controller are integrated along by fflin.simulate, "
+                "which must be given itself as the policy; or sample it"
+            )
+        self._asked = t
+        measure, near = self._there(t)
+        state, x = measure.state, measure.state.read(q, v, near=near)
+        y: Any = None
+        noise: Any = 0.0 if self._noise is None else None  # one, however often y is asked for
+
+        def measured(_: Sample, u: Array) -> Array:
+            nonlocal y, noise
+            if y is None or self._aba:
+                a = self._still
+                if aba := self._aba:
+                    a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
+                y = measure(x, q, v, a)
+            if noise is None:
+                noise = vector("noise(t)", self._noise(t), len(y), "one value for each output")
+            return np.asarray(y + noise)
+
+        return self.step(t, measured)
+
+    def _move(self, after: Array) -> None:
+        if self._dt:
+            self.estimate = after
+        else:
+            self._rates.append(after)
+
+    def advance(self, shares: Array, last: bool) -> None:
+        """Go on to the next stage, by shares of the state as the step began and of its rates."""
+        if not self._dt:
+            self.estimate, self._stages = shares @ np.array(self._rates), self._stages + 1
+            if last:
+                self._rates, self._stages = [self.estimate], 0
 
 
 class OfOutputs:
@@ -40,15 +159,10 @@ class OfOutputs:
         return float(self.system.dt)
 
     @property
-    def at(self) -> tuple[Array, Array]:
-        """Inputs u0 and outputs y0 that it is about."""
-        return self.lin.u0, self.lin.y0
-
-    @property
     def terms(self) -> Sample:
         """What it does at each sample or stage."""
-        A, B, C, D, *_ = self.system
-        return Sample(A, B, C, D, *self.at, self.lin.C, self.lin.D)
+        (A, B, C, D, *_), lin = self.system, self.lin
+        return Sample(A, B, C, D, lin.u0, lin.y0, lin.C, lin.D)
 
     def bind(self, robot: Robot) -> Policy:
         """Return policy(t, q, v) -> u for a robot, with a state of its own.
@@ -65,9 +179,9 @@ class OfOutputs:
         return Loop(state, self.dt, self.noise, len(stays.A), lambda _: stays, lambda _: there)
 
     def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
-        """Return a model with the system's states besides, and u = offset + K e of the two."""
-        (A, B, C, D, u0, y0, *_), nx = self.terms, len(lin.A)
-        apart, none = lin.y0 - y0, np.zeros((nx, len(A)))
+        """Return a model with the system's states besides, and K and u of u + K e of the two."""
+        A, B, C, D, u0, y0, *_ = self.terms
+        apart, none = lin.y0 - y0, np.zeros((len(lin.A), len(A)))
         both = replace(
             lin,
             A=np.block([[lin.A, none], [B @ lin.C, A]]),
@@ -91,35 +205,34 @@ class LinearController(OfOutputs):
 
     .. math:: \dot z = A z + B (y - y_0),\qquad u - u_0 = C z + D (y - y_0),\qquad z(0) = 0
 
-    y is what the robot's outputs measure, in the chart of the model, and what the system gives is
-    added to u0: positive feedback, as python-control's `hinfsyn` and `h2syn` and MATLAB's
-    ``hinfsyn`` have it. A system that was designed for negative feedback takes ``sign=-1``.
+    y is what the robot's outputs measure in the chart of the model, as `outputs` returns it. What
+    the system gives is added to u0: that is positive feedback, as of ``hinfsyn`` and ``h2syn``.
 
-    In continuous time z is integrated along with the robot, stage by stage of the same method;
-    where `simulate` is given `sample` or `delay`, y is held over each sample, and z exact. A
-    sampled system is asked at its own times, a multiple of the step, and u is held between them.
+    In continuous time z is integrated along with the robot, by the same stages; where `simulate`
+    is given `sample` or `delay`, y is held from sample to sample and z follows exactly. A sampled
+    system is asked at its own times, multiples of the step, and u is held between them.
 
     Parameters
     ----------
-    system : control.StateSpace or TransferFunction, scipy.signal system, array_like, tuple or path
-        A gain D (nu, ny), (A, B, C, D) or (A, B, C, D, dt), a `Compensator`, or a .mat, .npz or
-        .json file with A, B, C, D, and dt or Ts where it is sampled, or with D alone. Where it has
-        names (``input_names``, ``InputName``), they are outputs and inputs of the model, with dots
-        or underscores, and need not be all of them; without names all are there, in order. Where
-        no dt is said, it is the model's.
+    system : python-control or SciPy system, array_like, tuple, `Compensator` or path
+        A state space or transfer function, a gain D (nu, ny), (A, B, C, D) or (A, B, C, D, dt), or
+        a .mat, .npz or .json file with A, B, C, D, and dt or Ts where it is sampled, or D alone.
+        Where it names its inputs and outputs (in a file ``input_names`` or ``InputName``, ...),
+        they are outputs and inputs of the model, dots or underscores, and need not be all of
+        them; else all are there, in order. A dt that is not said is the model's.
     lin : LinearModel
         The model about whose point it acts, continuous or sampled.
     sign : {1, -1}
-        Of what the system gives.
+        -1 of a system that was designed for negative feedback.
     noise : callable, optional
         noise(t) -> (ny,), added to y.
 
     Attributes
     ----------
     system : tuple of A, B, C, D, dt, inputs, outputs
-        Over all outputs and inputs of the model, its sign included.
+        Over all outputs and inputs of the model, with its sign.
     loop : ndarray (nx + nz, nx + nz)
-        The matrix of the linear loop, of the model's state and z.
+        Matrix of the linear loop, of the model's state and z.
 
     Raises
     ------
@@ -137,12 +250,9 @@ class LinearController(OfOutputs):
 
     def __post_init__(self) -> None:
         lin = instance("lin", self.lin, LinearModel, "a fflin.LinearModel")
-        if lin.moving:
-            raise InputError("the model is about a moving reference, expected one that stays")
-        if number("sign", self.sign) not in (1.0, -1.0):
-            raise InputError(f"sign is {self.sign:g}, expected 1 or -1")
+        if lin.moving or number("sign", self.sign) not in (1.0, -1.0):
+            raise InputError("expected a model about a point that stays, and sign 1 or -1")
         by = fitted(system_of(self.system), lin)
-        dt = self._time(by)
         felt = lin.D.any(axis=1) & by.D.any(axis=0)
         if felt.any():
             names = [name for name, each in zip(lin.output_names, felt, strict=True) if each]
@@ -150,26 +260,8 @@ class LinearController(OfOutputs):
                 f"D of the controller acts on {listed(names)}, which feels the input at once: an "
                 "algebraic loop; take D = 0 there, such as behind a low-pass filter"
             )
-        of = by._replace(C=self.sign * by.C, D=self.sign * by.D, dt=dt)
-        for array in of[:4]:
-            array.setflags(write=False)
-        object.__setattr__(self, "system", of)
-        object.__setattr__(self, "sign", 1.0)
-
-    def _time(self, by: System) -> float:
-        lin, dt = self.lin, by.dt
-        if dt is None or (dt == 0.0 and not len(by.A)):
-            return lin.dt
-        if dt < 0.0 and not lin.dt:
-            raise InputError("the controller is sampled and does not say its dt; give it one")
-        dt = lin.dt if dt < 0.0 else dt
-        if lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt:
-            time = f"sampled at dt = {dt:g} s" if dt else "continuous"
-            raise InputError(
-                f"the controller is {time}, the model sampled at dt = {lin.dt:g} s; give the "
-                "continuous model, or sample both alike"
-            )
-        return dt
+        by = by._replace(C=self.sign * by.C, D=self.sign * by.D, dt=_time(by, lin))
+        vars(self).update(system=by, sign=1.0)
 
     def __repr__(self) -> str:
         return titled(self, nz=len(self.system.A), ny=len(self.lin.y0), nu=len(self.lin.u0))
@@ -179,21 +271,6 @@ class LinearController(OfOutputs):
         """Name of the model's robot."""
         return self.lin.robot
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What is to be said of poles that grow, of the loop and of the system by itself."""
-        said = []
-        for what, A in (
-            ("the linear loop", self.loop),
-            ("the controller by itself", self.system.A),
-        ):
-            poles = np.linalg.eigvals(A)
-            growth = np.abs(poles) - 1.0 if self.dt else poles.real
-            if (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
-                pole, unit = complex(poles[growth.argmax()]), "" if self.dt else " 1/s"
-                said.append(f"{what} is unstable, with a pole at {pole:.4g}{unit}")
-        return tuple(said)
-
     def sampled(self, dt: float) -> LinearController:
         """Return it in samples of dt [s], y held between them; itself where it is sampled."""
         by = self.system
@@ -202,14 +279,36 @@ class LinearController(OfOutputs):
         A, B = held_exponential(by.A, by.B, dt)
         return replace(self, system=by._replace(A=A, B=B, dt=dt))
 
-    def to_control(self) -> Any:
-        """Return it as a `control.StateSpace` from y - y0 to u - u0, with signal names.
 
-        Raises
-        ------
-        MissingPackageError
-            If python-control is not installed.
-        """
-        *matrices, dt, inputs, outputs = self.system
-        names = [f"z_{k + 1}" for k in range(len(self.system.A))]
-        return state_space(matrices, dt, names, inputs, outputs)
+def _time(by: System, lin: LinearModel) -> float:
+    """Return the sampling time [s] of a controller of a model."""
+    dt = lin.dt if by.dt is None or not (by.dt or len(by.A)) or (by.dt < 0.0 < lin.dt) else by.dt
+    if dt < 0.0:
+        raise InputError("the controller is sampled and does not say its dt; give it one")
+    if lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt:
+        raise InputError(
+            f"the controller {f'is sampled at dt = {dt:g} s' if dt else 'is continuous'}, the "
+            f"model sampled at dt = {lin.dt:g} s; give the continuous model, or sample both alike"
+        )
+    return dt
+
+
+def growing(policy: Any) -> tuple[str, ...]:
+    """Say which poles grow, of the loop of a linear controller and of itself."""
+    said, by = [], decider(policy)
+    for what in ("the linear loop", "the controller by itself") * isinstance(by, LinearController):
+        poles = np.linalg.eigvals(by.loop if what == "the linear loop" else by.system.A)
+        growth = np.abs(poles) - 1.0 if by.dt else poles.real
+        if (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
+            pole, unit = complex(poles[growth.argmax()]), "" if by.dt else " 1/s"
+            said.append(f"{what} is unstable, with a pole at {pole:.4g}{unit}")
+    return tuple(said)
+
+
+def closed_loop(policy: Any) -> tuple[Array, float, tuple[str, ...]] | None:
+    """Return the matrix of a policy's linear loop, where it has one, its dt [s] and its states."""
+    (lin, K), by = feedback_of(policy), decider(policy)
+    if isinstance(by, OfOutputs):
+        own = (f"z_{k + 1} of the controller" for k in range(len(by.system.A)))
+        return by.loop, by.dt, (*by.lin.state_names, *own)
+    return None if lin is None or K is None else (lin.A - lin.B @ K, lin.dt, lin.state_names)

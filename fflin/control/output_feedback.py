@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
-from fflin.control.compensation import Compensation, Loop, Sample
 from fflin.control.kalman import Compensator, kalman
-from fflin.control.linear_controller import OfOutputs
+from fflin.control.linear_controller import Compensation, Loop, OfOutputs, Sample
 from fflin.control.policies import Policy
 from fflin.control.systems import System, system_of
 from fflin.control.tracking import TrajectoryFeedback
@@ -74,11 +73,6 @@ class OutputFeedback(OfOutputs):
     def system(self) -> System:
         """What acts between y - y0 and u - u0."""
         return system_of(self.compensator)
-
-    @property
-    def at(self) -> tuple[Array, Array]:
-        """The u0 and y0 of the compensator."""
-        return self.compensator.u0, self.compensator.y0
 
 
 @dataclass(frozen=True, eq=False)

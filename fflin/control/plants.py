@@ -5,8 +5,6 @@ from typing import Any
 import numpy as np
 
 from fflin.base.validation import Array
-from fflin.control.linear_controller import LinearController
-from fflin.control.policies import decider
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
 from fflin.robot.inputs import ReactionWheel
@@ -17,13 +15,7 @@ _ROUNDING = 1e-9
 
 
 def notes_of(policy: Any, robot: Robot) -> tuple[str, ...]:
-    """Say how far a robot is from the one that a policy was made for, and which poles grow."""
-    by = decider(policy)
-    own_notes = by.notes if isinstance(by, LinearController) else ()
-    return (*own_notes, *_apart_from(policy, robot))
-
-
-def _apart_from(policy: Any, robot: Robot) -> tuple[str, ...]:
+    """Say how far a robot is from the one that a policy was made for; nothing for the same."""
     design = getattr(policy, "design", None)  # of an allocation
     along = getattr(policy, "trajectory", None)
     # An allocation asks its design for wrenches, and the robot's own wheels for torques.

@@ -14,12 +14,11 @@ from fflin.base.validation import Array, as_double, number
 from fflin.base.writing import as_path, check_ending, reason
 from fflin.linear.model import LinearModel
 
-_HOW = "in MATLAB [A, B, C, D] = ssdata(K); Ts = K.Ts; save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
 _NUMBERED = re.compile(r"([a-z]\[\d+\])?")  # the names that signals have of themselves
 
 
 class System(NamedTuple):
-    """A, B, C, D; dt [s], 0 of continuous time, None where it is not said; names, where known."""
+    """A, B, C, D; dt [s], 0 in continuous time, -1 not known, None not said; names or none."""
 
     A: Array
     B: Array
@@ -38,27 +37,28 @@ def system_of(given: Any) -> System:
         return _read(as_path(given))
     if isinstance(given, tuple):
         if len(given) not in (4, 5):
-            raise InputError(
-                f"system is a tuple of {len(given)}, expected (A, B, C, D) or (A, B, C, D, dt)"
-            )
+            raise InputError(f"system has {len(given)} parts, expected (A, B, C, D) and perhaps dt")
         return _checked(*given)
-    scipys = type(given).__module__.startswith("scipy.signal")
-    if not hasattr(given, "A") and (scipys or hasattr(given, "ninputs")):
-        given = _realised(given, scipys)
+    if not hasattr(given, "A") and (hasattr(given, "to_ss") or hasattr(given, "ninputs")):
+        given = _realised(given)
     if not all(hasattr(given, key) for key in "ABC"):
         return _checked((), (), (), as_double("system", given))
-    dt = getattr(given, "dt", None)
-    names = (
-        tuple(getattr(given, f"{kind}_names", getattr(given, f"{kind}_labels", None)) or ())
-        for kind in ("input", "output")
+    signals = (
+        (getattr(given, f"{kind}_{x}", None) for x in ("names", "labels")) for kind in _KINDS
     )
-    D = getattr(given, "D", None)
-    return _checked(given.A, given.B, given.C, D, 0 if scipys and dt is None else dt, *names)
+    names = [next(filter(None, each), ()) for each in signals]
+    # SciPy's continuous systems have no names, and None for dt.
+    dt = getattr(given, "dt", None)
+    dt = 0.0 if dt is None and not names[0] else dt
+    return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, *names)
 
 
-def _realised(given: Any, scipys: bool) -> Any:
+_KINDS = ("input", "output")
+
+
+def _realised(given: Any) -> Any:
     try:
-        if scipys:
+        if hasattr(given, "to_ss"):
             return given.to_ss()
         import control
 
@@ -75,38 +75,29 @@ def _checked(
 ) -> System:
     """Return a system whose sizes belong together; of D alone where A is empty."""
     of = dict(zip("ABCD", (A, B, C, 0.0 if D is None else D), strict=True))
-    A, B, C, D = (_matrix(f"{key} of the controller", each) for key, each in of.items())
+    A, B, C, D = (np.atleast_2d(as_double(f"controller's {x}", of[x])) for x in of)
     nz = len(A) if A.size else 0
-    (nu, ny) = (len(C), B.shape[1]) if nz else D.shape
+    ny, nu = (B.shape[-1], len(C)) if nz else (D.shape[-1], len(D))
     if not nz:
         A, B, C = np.zeros((0, 0)), np.zeros((0, ny)), np.zeros((nu, 0))
     elif D.size == 1 and not D.any():
         D = np.zeros((nu, ny))
     shapes = (nz, nz), (nz, ny), (nu, nz), (nu, ny)
     for key, each, shape in zip("ABCD", (A, B, C, D), shapes, strict=True):
-        if each.shape != shape:
+        if each.shape != shape or not np.isfinite(each).all():
             raise InputError(
-                f"{key} of the controller has shape {each.shape}, expected {shape}: {nz} states, "
-                f"{ny} inputs (the model's outputs) and {nu} outputs (the model's inputs)"
+                f"{key} of the controller has shape {each.shape}, expected {shape} finite numbers, "
+                f"with {nz} states, {ny} inputs (outputs of the model) and {nu} outputs"
             )
     for names, size in ((inputs, ny), (outputs, nu)):
         if names and len(names) != size:
-            raise InputError(f"the controller has {size} signals and {len(names)} names for them")
-    # -1 is MATLAB's, True everyone else's sampling time that is not known.
-    if dt is True or (dt is not None and number("dt of the controller", dt) == -1.0):
-        dt = -1.0
-    elif dt is not None and not 0.0 <= (dt := number("dt of the controller", dt)):
-        raise InputError(f"dt of the controller is {dt:g} s, expected 0 or a sampling time")
+            raise InputError(f"the controller has {len(names)} names for {size} signals")
+    if dt is not None:
+        # True is of a system that is sampled nobody knows how, -1 MATLAB's word for it.
+        dt = -1.0 if dt is True else number("controller's dt", dt)
+        if dt < 0.0 and dt != -1.0:
+            raise InputError(f"dt of the controller is {dt:g} s, expected 0 or a sampling time")
     return System(A, B, C, D, dt, tuple(map(str, inputs)), tuple(map(str, outputs)))
-
-
-def _matrix(name: str, value: Any) -> Array:
-    matrix = np.atleast_2d(as_double(name, value))
-    if matrix.ndim > 2:
-        raise InputError(f"{name} has shape {matrix.shape}, expected a matrix")
-    if not np.isfinite(matrix).all():
-        raise InputError(f"{name} has entries that are NaN or infinite")
-    return matrix
 
 
 def _read(path: Path) -> System:
@@ -116,20 +107,18 @@ def _read(path: Path) -> System:
         if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
             entries = struct  # of MATLAB
         dt = entries.get("dt", entries.get("Ts"))
-        names = (
-            texts(entries.get(f"{kind}_names", entries.get(f"{kind.title()}Name", ())))
-            for kind in ("input", "output")
-        )
-        rest = None if dt is None else float(np.asarray(dt).item()), *names
-    keys = {*entries} & {*"ABCD"}
-    if not (keys >= {*"ABC"} or keys == {"D"}):
-        hint = "; a gain of fflin goes by --gain, or fflin.StateFeedback" * ("K" in entries)
+        dt = None if dt is None else float(np.asarray(dt).item())
+        keys = ((f"{kind}_names", f"{kind.title()}Name") for kind in _KINDS)
+        names = [texts(next((entries[x] for x in each if x in entries), ())) for each in keys]
+    if not {*"ABC"} <= {*entries} and {*entries} & {*"ABCD"} != {"D"}:
         raise FileError(
             f"{path}: it has {listed(sorted(entries)) or 'no arrays'}, expected A, B, C, D, and Ts "
-            f"where it is sampled, or D alone: {_HOW}{hint}"
+            "where it is sampled, or D alone: in MATLAB [A, B, C, D] = ssdata(K); Ts = K.Ts; "
+            "save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
         )
     try:
-        return _checked(*(entries.get(key, None if key == "D" else ()) for key in "ABCD"), *rest)
+        A, B, C, D = (entries.get(key, None if key == "D" else ()) for key in "ABCD")
+        return _checked(A, B, C, D, dt, *names)
     except FflinError as error:
         raise type(error)(f"{path}: {error}") from None
 
@@ -144,9 +133,7 @@ def fitted(system: System, lin: LinearModel) -> System:
     return System(system.A, B, C, D, system.dt, lin.output_names, lin.input_names)
 
 
-def _places(
-    kind: str, names: tuple[str, ...], size: int, of: str, known: tuple[str, ...]
-) -> list[int]:
+def _places(kind: str, names: tuple[str, ...], size: int, of: str, known: Any) -> list[int]:
     """Return which signals of a model those of a controller are."""
     if all(map(_NUMBERED.fullmatch, names)):
         if size != len(known):
@@ -155,11 +142,9 @@ def _places(
                 f"the model: {listed(known)}; or name those that it has"
             )
         return list(range(size))
-    # python-control has no dots in names.
-    both = (names, known)
-    own, there = (
-        ([each.replace(".", "_") for each in of] for of in both) if ({*names} - {*known}) else both
-    )
+    own, there = list(names), list(known)
+    if not {*own} <= {*there}:  # python-control has no dots in names
+        own, there = ([name.replace(".", "_") for name in each] for each in (own, there))
     for name, key in zip(names, own, strict=True):
         if key not in there:
             text = unknown(f"{of} of the model", name, known)

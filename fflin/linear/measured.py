@@ -16,7 +16,7 @@ from fflin.robot.robot import Robot
 
 
 def outputs(
-    robot: Robot, lin: LinearModel, q: ArrayLike, v: ArrayLike | None = None, u: Any = None
+    robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: ArrayLike | None = None
 ) -> Array:
     """Return what the outputs of a robot measure, as y0 of a linear model is at its point.
 
@@ -48,8 +48,8 @@ def outputs(
         raise InputError("the model is about a moving reference, expected one that stays")
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     require_sensed(lin, robot, state)
-    at, moving = robot.checked_configuration(q), np.zeros(robot.nv)
-    moving = moving if v is None else robot.checked_velocity(v)
+    at = robot.checked_configuration(q)
+    moving = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
     u = lin.u0 if u is None else vector("u", u, len(lin.u0), "one for each input")
     a: Array = np.zeros(robot.nv)
     if any(output.FEELS_ACCELERATION for output in robot.outputs):

@@ -9,8 +9,7 @@ import numpy as np
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.progress import Progress
-from fflin.control.compensation import measured_at
-from fflin.control.linear_controller import LinearController, OfOutputs
+from fflin.control.linear_controller import LinearController, OfOutputs, measured_at
 from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.tracking import TrajectoryFeedback

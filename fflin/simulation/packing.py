@@ -9,8 +9,7 @@ import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array, vector
-from fflin.control.compensation import measured_at
-from fflin.control.linear_controller import OfOutputs
+from fflin.control.linear_controller import OfOutputs, measured_at
 from fflin.control.output_feedback import TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.saturation import Pulses, Wheels

@@ -9,8 +9,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, instance
 from fflin.control.channel import Channel
-from fflin.control.compensation import Compensation
-from fflin.control.linear_controller import OfOutputs
+from fflin.control.linear_controller import Compensation, OfOutputs
 from fflin.control.policies import Allocation
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.state import StateMap

@@ -8,8 +8,8 @@ import numpy as np
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array, number, whole
-from fflin.control.linear_controller import OfOutputs
-from fflin.control.policies import StateFeedback, decider, fed_back, feedback_of
+from fflin.control.linear_controller import OfOutputs, closed_loop
+from fflin.control.policies import StateFeedback, decider, fed_back
 from fflin.control.tracking import TrajectoryFeedback, largest_rate, tracking_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.sampling import held_exponential
@@ -146,15 +146,10 @@ def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> tuple[floa
     """Return the largest magnitude [1/s] of a continuous loop's poles, and the state that moves."""
     if follows is not None:
         return largest_rate(follows.schedule), ""
-    (lin, K), by = feedback_of(policy), decider(policy)
-    if isinstance(by, OfOutputs):
-        loop = by.loop
-    elif lin is None or K is None:
+    closed = closed_loop(policy)
+    if closed is None or closed[1]:
         return 0.0, ""
-    else:
-        loop = lin.A - lin.B @ K
-    if lin is None or lin.dt:
-        return 0.0, ""
+    loop, _, names = closed
     fastest = float(np.abs(np.linalg.eigvals(loop)).max())
     if fastest * _STEP <= 1.0:
         return fastest, ""
@@ -162,8 +157,7 @@ def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> tuple[floa
 
     poles, left, right = eig(loop, left=True, right=True)
     parts = np.abs(left * right)[:, np.abs(poles).argmax()]
-    most = int(np.argmax(parts > (1.0 - _ALIKE) * parts.max()))
-    return fastest, (*lin.state_names, *["a state of the controller"] * len(loop))[most]
+    return fastest, names[int(np.argmax(parts > (1.0 - _ALIKE) * parts.max()))]
 
 
 def _whole(dt: float, **times: float) -> list[int]:
@@ -202,9 +196,10 @@ def time_to_settle(
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     start = state.read(q, np.zeros(robot.nv) if v is None else v, near=state.read(lin.q, lin.v))
     e = start[[state.names.index(name) for name in lin.state_names]] - lin.x0
-    dt = policy.dt if isinstance(policy, OfOutputs) else lin.dt
+    closed = closed_loop(policy)
+    assert closed is not None
+    loop, dt, _ = closed
     step = dt or _LOOK
-    loop = policy.loop if isinstance(policy, OfOutputs) else lin.A - lin.B @ policy.K
     if not dt:
         loop = held_exponential(loop, np.zeros((len(loop), 0)), step)[0]
     e = np.concatenate((e, np.zeros(len(loop) - len(e))))
