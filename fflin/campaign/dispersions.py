@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from fflin.base.validation import by_name as mapping
 from fflin.campaign.pointing import columns_of, in_lanes, misaligned, require_direction
 from fflin.campaign.sensing import Designed, Misled, noise_of
 from fflin.campaign.spreads import SEED, deviation_of, inverse_of, whole_number
-from fflin.control.linear_controller import OfOutputs
+from fflin.control.linear_controller import LinearController
 from fflin.control.output_feedback import TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, StateFeedback
 from fflin.dynamics.state import StateMap
@@ -62,7 +63,7 @@ class Dispersions:
         self._model = plant.robot._bare.model
         bodies = ["base", *list(self._model.names)[ROOT + 1 :]]
         self._sensors: tuple[str, ...] = ()
-        if isinstance(policy, StateFeedback | OfOutputs):
+        if isinstance(policy, StateFeedback | LinearController):
             lin = policy.lin
             of_states = isinstance(policy, StateFeedback)
             self._sensors = lin.state_names if of_states else lin.output_names
@@ -266,7 +267,8 @@ class Dispersions:
                 policy = Misled(policy, error)
             else:
                 noise = policy.noise or np.zeros_like
-                policy = replace(policy, noise=lambda t: error(t) + np.asarray(noise(t)))
+                policy = copy(policy)
+                vars(policy)["noise"] = lambda t: error(t) + np.asarray(noise(t))
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
         drives = Drives(*(x[0] for x in self._drives(rows)))
         faulty = drives if self._kinds & {*_OF_INPUTS, "misalignment"} else None

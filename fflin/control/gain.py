@@ -117,13 +117,7 @@ class Gain(Design):
         return self.A - self.B @ self.K
 
     def to_control(self) -> Any:
-        """Return -K as a `control.StateSpace` from x - x0 to u - u0, with signal names.
-
-        Raises
-        ------
-        MissingPackageError
-            If python-control is not installed.
-        """
+        """Return -K as a `control.StateSpace` from x - x0 to u - u0, if that is installed."""
         return state_space(([], [], [], -self.K), self.dt, (), self.state_names, self.input_names)
 
     @cached_property

@@ -84,13 +84,7 @@ class Estimator(Design):
         return titled(self, nx=len(self.L), ny=self.L.shape[1])
 
     def to_control(self) -> Any:
-        """Return a `control.StateSpace` from u - u0 and y - y0 to xh, with signal names.
-
-        Raises
-        ------
-        MissingPackageError
-            If python-control is not installed.
-        """
+        """Return a `control.StateSpace` from u - u0 and y - y0 to xh, if that is installed."""
         B, nx = np.hstack((self.B - self.L @ self.D, self.L)), len(self.L)
         matrices = (self.A - self.L @ self.C, B, np.eye(nx), np.zeros((nx, B.shape[1])))
         inputs = (*self.input_names, *self.output_names)

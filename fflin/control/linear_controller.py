@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,9 +13,8 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array, instance, number, vector
-from fflin.control.gain import titled
 from fflin.control.policies import Policy, decider, feedback_of
-from fflin.control.systems import System, fitted, system_of
+from fflin.control.systems import fitted, system_of
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.output_kinds import KINDS
 from fflin.dynamics.outputs import Measuring, state_indices
@@ -59,11 +59,13 @@ class Sample(NamedTuple):
 
 
 class Compensation:
-    """What a law does from sample to sample; its state begins at zero."""
+    """What a law does from sample to sample or, where dt is 0, stage to stage, from z = 0 on."""
 
-    def __init__(self, size: int, at: Callable[[float], Sample]) -> None:
-        self.at = at
-        self.estimate: Array = np.zeros(size)  # at the sample to come
+    def __init__(self, size: int, at: Callable[[float], Sample], dt: float = 1.0) -> None:
+        self.at, self.dt = at, dt
+        self.estimate: Array = np.zeros(size)  # z of the sample or stage to come
+        self.rates: list[Array] = [self.estimate]
+        self.stages = 0
 
     def step(self, t: float, measure: Callable[[Sample, Array], Array]) -> Array:
         """Return the command of a sample, at which y is measured then."""
@@ -72,28 +74,32 @@ class Compensation:
         u: Array = by.u0 + by.C @ z
         if by.D.any():  # of what does not feel u
             u = u + by.D @ (measure(by, u) - by.y0)
-        self._move(by.A @ z + by.B @ (measure(by, u) - by.y0))
+        after = by.A @ z + by.B @ (measure(by, u) - by.y0)
+        if self.dt:
+            self.estimate = after
+        else:
+            self.rates.append(after)
         return u
 
-    def _move(self, after: Array) -> None:
-        self.estimate = after
+    def advance(self, shares: Array, last: bool) -> None:
+        """Integrate z to the next stage, by shares of it as the step began and of its rates."""
+        if not self.dt:
+            self.estimate, self.stages = shares @ np.array(self.rates), self.stages + 1
+            if last:
+                self.rates, self.stages = [self.estimate], 0
 
 
 class Loop(Compensation):
-    """The policy of a law on what the robot measures, relative to where it is to be.
-
-    Without dt the state is integrated along: `advance` takes it from stage to stage.
-    """
+    """The policy of a law on what the robot measures, relative to where it is to be."""
 
     def __init__(
         self, state: StateMap, dt: float, noise: Any, size: int, at: Any, there: Any
     ) -> None:
-        super().__init__(size, at)
-        self._dt, self._noise, self._there = dt, noise, there
+        super().__init__(size, at, dt)
+        self._noise, self._there = noise, there
         self._still: Array = np.zeros(state.robot.nv)
         felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
         self._aba, self._asked = Aba(state) if felt else None, -np.inf
-        self._rates, self._stages = [self.estimate], 0
 
     def sample(self, t: float) -> tuple[Sample, StateMap, Array]:
         """Return what it does at a sample, and the chart and the state that y is relative to."""
@@ -102,13 +108,13 @@ class Loop(Compensation):
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command at a sample or a stage."""
-        apart = t - self._asked
-        if self._dt and self._asked >= 0.0 and abs(apart - self._dt) > 1e-6 * self._dt:
+        apart, dt = t - self._asked, self.dt
+        if dt and self._asked >= 0.0 and abs(apart - dt) > 1e-6 * dt:
             raise InputError(
-                f"the controller is asked {apart:g} s after its last sample, expected "
-                f"{self._dt:g} s; leave `sample` out"
+                f"the controller is asked {apart:g} s after its last sample, expected {dt:g} s; "
+                "leave `sample` out"
             )
-        if not self._dt and len(self.estimate) and len(self._rates) != self._stages + 1:
+        if not dt and len(self.estimate) and len(self.rates) != self.stages + 1:
             raise InputError(
                 "the states of a continuous controller are integrated along by fflin.simulate, "
                 "which must be given itself as the policy; or sample it"
@@ -132,75 +138,9 @@ class Loop(Compensation):
 
         return self.step(t, measured)
 
-    def _move(self, after: Array) -> None:
-        if self._dt:
-            self.estimate = after
-        else:
-            self._rates.append(after)
-
-    def advance(self, shares: Array, last: bool) -> None:
-        """Go on to the next stage, by shares of the state as the step began and of its rates."""
-        if not self._dt:
-            self.estimate, self._stages = shares @ np.array(self._rates), self._stages + 1
-            if last:
-                self._rates, self._stages = [self.estimate], 0
-
-
-class OfOutputs:
-    """A policy u - u0 = system (y - y0), about the point of a model that its outputs are of."""
-
-    lin: LinearModel
-    system: Any
-    noise: Callable[[float], ArrayLike] | None
-
-    @property
-    def dt(self) -> float:
-        """Sampling time [s]; 0 in continuous time."""
-        return float(self.system.dt)
-
-    @property
-    def terms(self) -> Sample:
-        """What it does at each sample or stage."""
-        (A, B, C, D, *_), lin = self.system, self.lin
-        return Sample(A, B, C, D, lin.u0, lin.y0, lin.C, lin.D)
-
-    def bind(self, robot: Robot) -> Policy:
-        """Return policy(t, q, v) -> u for a robot, with a state of its own.
-
-        Raises
-        ------
-        InputError
-            If the robot has not the model's states, inputs and outputs; its masses may be others.
-        """
-        lin, stays = self.lin, self.terms
-        state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-        require_sensed(lin, robot, state)
-        there = Measuring(state, lin.q), state.read(lin.q, lin.v)
-        return Loop(state, self.dt, self.noise, len(stays.A), lambda _: stays, lambda _: there)
-
-    def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
-        """Return a model with the system's states besides, and K and u of u + K e of the two."""
-        A, B, C, D, u0, y0, *_ = self.terms
-        apart, none = lin.y0 - y0, np.zeros((len(lin.A), len(A)))
-        both = replace(
-            lin,
-            A=np.block([[lin.A, none], [B @ lin.C, A]]),
-            B=np.vstack((lin.B, B @ lin.D)),
-            f0=np.concatenate((lin.f0, B @ apart)),
-            x0=np.concatenate((lin.x0, np.zeros(len(A)))),
-        )
-        return both, np.hstack((D @ lin.C, C)), u0 + D @ apart
-
-    @cached_property
-    def loop(self) -> Array:
-        """The closed loop's matrix (nx + nz, nx + nz): of the model's state and the system's."""
-        lin = self.lin.discretize(self.dt) if self.dt and not self.lin.dt else self.lin
-        both, K, _ = self.around(lin)
-        return both.A + both.B @ K
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearController(OfOutputs):
+class LinearController:
     r"""The feedback ``u - u0 = system (y - y0)`` of the robot's outputs by any linear system.
 
     .. math:: \dot z = A z + B (y - y_0),\qquad u - u_0 = C z + D (y - y_0),\qquad z(0) = 0
@@ -255,21 +195,75 @@ class LinearController(OfOutputs):
         by = fitted(system_of(self.system), lin)
         felt = lin.D.any(axis=1) & by.D.any(axis=0)
         if felt.any():
-            names = [name for name, each in zip(lin.output_names, felt, strict=True) if each]
             raise InputError(
-                f"D of the controller acts on {listed(names)}, which feels the input at once: an "
-                "algebraic loop; take D = 0 there, such as behind a low-pass filter"
+                f"D of the controller acts on {listed(compress(lin.output_names, felt))}, which "
+                "feels the input at once: an algebraic loop; take D = 0 there, such as behind a "
+                "low-pass filter"
             )
-        by = by._replace(C=self.sign * by.C, D=self.sign * by.D, dt=_time(by, lin))
+        dt = lin.dt if by.dt is None or not (by.dt or len(by.A)) else by.dt
+        dt = lin.dt or dt if dt < 0.0 else dt
+        if dt < 0.0:
+            raise InputError("the controller is sampled and does not say its dt; give it one")
+        if lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt:
+            times = (
+                f"sampled at dt = {each:g} s" if each else "continuous" for each in (dt, lin.dt)
+            )
+            raise InputError(
+                "the controller is {}, the model {}; give the continuous model, or sample both "
+                "alike".format(*times)
+            )
+        by = by._replace(C=self.sign * by.C, D=self.sign * by.D, dt=dt)
         vars(self).update(system=by, sign=1.0)
 
     def __repr__(self) -> str:
-        return titled(self, nz=len(self.system.A), ny=len(self.lin.y0), nu=len(self.lin.u0))
+        (nu, ny), dt = self.system.D.shape, self.dt
+        time, nz = f"dt={dt:g} s" if dt else "continuous", len(self.system.A)
+        return f"{type(self).__name__}('{self.lin.robot}', nz={nz}, ny={ny}, nu={nu}, {time})"
 
     @property
-    def robot(self) -> str:
-        """Name of the model's robot."""
-        return self.lin.robot
+    def dt(self) -> float:
+        """Sampling time [s]; 0 in continuous time."""
+        return float(self.system.dt)
+
+    @property
+    def terms(self) -> Sample:
+        """What it does at each sample or stage."""
+        (A, B, C, D, *_), lin = self.system, self.lin
+        return Sample(A, B, C, D, lin.u0, lin.y0, lin.C, lin.D)
+
+    def bind(self, robot: Robot) -> Policy:
+        """Return policy(t, q, v) -> u for a robot, with a state of its own.
+
+        Raises
+        ------
+        InputError
+            If the robot has not the model's states, inputs and outputs; its masses may be others.
+        """
+        lin, stays = self.lin, self.terms
+        state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+        require_sensed(lin, robot, state)
+        there = Measuring(state, lin.q), state.read(lin.q, lin.v)
+        return Loop(state, self.dt, self.noise, len(stays.A), lambda _: stays, lambda _: there)
+
+    def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
+        """Return a model with the system's states besides, and K and u of u + K e of the two."""
+        A, B, C, D, u0, y0, *_ = self.terms
+        apart, none = lin.y0 - y0, np.zeros((len(lin.A), len(A)))
+        both = replace(
+            lin,
+            A=np.block([[lin.A, none], [B @ lin.C, A]]),
+            B=np.vstack((lin.B, B @ lin.D)),
+            f0=np.concatenate((lin.f0, B @ apart)),
+            x0=np.concatenate((lin.x0, np.zeros(len(A)))),
+        )
+        return both, np.hstack((D @ lin.C, C)), u0 + D @ apart
+
+    @cached_property
+    def loop(self) -> Array:
+        """The closed loop's matrix (nx + nz, nx + nz): of the model's state and the system's."""
+        lin = self.lin.discretize(self.dt) if self.dt and not self.lin.dt else self.lin
+        both, K, _ = self.around(lin)
+        return both.A + both.B @ K
 
     def sampled(self, dt: float) -> LinearController:
         """Return it in samples of dt [s], y held between them; itself where it is sampled."""
@@ -280,35 +274,23 @@ class LinearController(OfOutputs):
         return replace(self, system=by._replace(A=A, B=B, dt=dt))
 
 
-def _time(by: System, lin: LinearModel) -> float:
-    """Return the sampling time [s] of a controller of a model."""
-    dt = lin.dt if by.dt is None or not (by.dt or len(by.A)) or (by.dt < 0.0 < lin.dt) else by.dt
-    if dt < 0.0:
-        raise InputError("the controller is sampled and does not say its dt; give it one")
-    if lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt:
-        raise InputError(
-            f"the controller {f'is sampled at dt = {dt:g} s' if dt else 'is continuous'}, the "
-            f"model sampled at dt = {lin.dt:g} s; give the continuous model, or sample both alike"
-        )
-    return dt
-
-
 def growing(policy: Any) -> tuple[str, ...]:
     """Say which poles grow, of the loop of a linear controller and of itself."""
     said, by = [], decider(policy)
-    for what in ("the linear loop", "the controller by itself") * isinstance(by, LinearController):
-        poles = np.linalg.eigvals(by.loop if what == "the linear loop" else by.system.A)
+    of = ("linear loop", "controller by itself") if isinstance(by, LinearController) else ()
+    for what in of:
+        poles = np.linalg.eigvals(by.loop if what == "linear loop" else by.system.A)
         growth = np.abs(poles) - 1.0 if by.dt else poles.real
         if (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
             pole, unit = complex(poles[growth.argmax()]), "" if by.dt else " 1/s"
-            said.append(f"{what} is unstable, with a pole at {pole:.4g}{unit}")
+            said.append(f"the {what} is unstable, with a pole at {pole:.4g}{unit}")
     return tuple(said)
 
 
 def closed_loop(policy: Any) -> tuple[Array, float, tuple[str, ...]] | None:
     """Return the matrix of a policy's linear loop, where it has one, its dt [s] and its states."""
     (lin, K), by = feedback_of(policy), decider(policy)
-    if isinstance(by, OfOutputs):
+    if isinstance(by, LinearController):
         own = (f"z_{k + 1} of the controller" for k in range(len(by.system.A)))
         return by.loop, by.dt, (*by.lin.state_names, *own)
     return None if lin is None or K is None else (lin.A - lin.B @ K, lin.dt, lin.state_names)

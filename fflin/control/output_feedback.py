@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.control.kalman import Compensator, kalman
-from fflin.control.linear_controller import Compensation, Loop, OfOutputs, Sample
+from fflin.control.linear_controller import Compensation, LinearController, Loop, Sample
 from fflin.control.policies import Policy
-from fflin.control.systems import System, system_of
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvkalman import FilterSchedule
 from fflin.dynamics.outputs import Measuring
@@ -25,8 +24,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
 
-@dataclass(frozen=True, eq=False)
-class OutputFeedback(OfOutputs):
+class OutputFeedback(LinearController):
     """The feedback of a sampled compensator, such as `lqg` makes, on the robot's outputs.
 
     At each sample u - u0 = C z acts, then y is measured and z brought up to the next sample. An
@@ -47,16 +45,16 @@ class OutputFeedback(OfOutputs):
         If the compensator is of another model or not sampled.
     """
 
-    lin: LinearModel
-    compensator: Compensator
-    noise: Callable[[float], ArrayLike] | None = None
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.lin, LinearModel) or not isinstance(self.compensator, Compensator):
+    def __init__(
+        self,
+        lin: LinearModel,
+        compensator: Compensator,
+        noise: Callable[[float], ArrayLike] | None = None,
+    ) -> None:
+        if not isinstance(lin, LinearModel) or not isinstance(compensator, Compensator):
             raise InputError(
                 "OutputFeedback takes a LinearModel and a Compensator, as fflin.lqg returns it"
             )
-        lin, compensator = self.lin, self.compensator
         if not lin.dt or lin.moving:
             raise InputError(
                 "the model must be sampled and about a point that stays; take "
@@ -68,11 +66,8 @@ class OutputFeedback(OfOutputs):
                 f"the compensator is of another model than '{lin.robot}' with its "
                 f"{len(lin.output_names)} outputs at dt = {lin.dt:g} s; use one for both"
             )
-
-    @property
-    def system(self) -> System:
-        """What acts between y - y0 and u - u0."""
-        return system_of(self.compensator)
+        super().__init__(compensator, lin, noise=noise)
+        vars(self)["compensator"] = compensator
 
 
 @dataclass(frozen=True, eq=False)

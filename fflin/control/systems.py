@@ -43,17 +43,13 @@ def system_of(given: Any) -> System:
         given = _realised(given)
     if not all(hasattr(given, key) for key in "ABC"):
         return _checked((), (), (), as_double("system", given))
-    signals = (
-        (getattr(given, f"{kind}_{x}", None) for x in ("names", "labels")) for kind in _KINDS
-    )
-    names = [next(filter(None, each), ()) for each in signals]
-    # SciPy's continuous systems have no names, and None for dt.
+    names = [getattr(given, f"{kind}_labels", ()) for kind in ("input", "output")]
+    if hasattr(given, "input_names"):
+        names = [given.input_names, given.output_names]
     dt = getattr(given, "dt", None)
+    # SciPy's continuous systems have no names, and None for dt.
     dt = 0.0 if dt is None and not names[0] else dt
     return _checked(given.A, given.B, given.C, getattr(given, "D", None), dt, *names)
-
-
-_KINDS = ("input", "output")
 
 
 def _realised(given: Any) -> Any:
@@ -89,9 +85,11 @@ def _checked(
                 f"{key} of the controller has shape {each.shape}, expected {shape} finite numbers, "
                 f"with {nz} states, {ny} inputs (outputs of the model) and {nu} outputs"
             )
-    for names, size in ((inputs, ny), (outputs, nu)):
-        if names and len(names) != size:
-            raise InputError(f"the controller has {len(names)} names for {size} signals")
+    if (inputs and len(inputs) != ny) or (outputs and len(outputs) != nu):
+        raise InputError(
+            f"the controller has {len(inputs)} and {len(outputs)} names for {ny} inputs and {nu} "
+            "outputs"
+        )
     if dt is not None:
         # True is of a system that is sampled nobody knows how, -1 MATLAB's word for it.
         dt = -1.0 if dt is True else number("controller's dt", dt)
@@ -103,22 +101,27 @@ def _checked(
 def _read(path: Path) -> System:
     check_ending(path, FORMATS)
     with reading(path, "controller"):
-        entries, _ = read_record(path)
-        if len(entries) == 1 and isinstance(struct := next(iter(entries.values())), dict):
-            entries = struct  # of MATLAB
-        dt = entries.get("dt", entries.get("Ts"))
+        found, _ = read_record(path)
+        if len(found) == 1 and isinstance(struct := next(iter(found.values())), dict):
+            found = struct  # of MATLAB
+        dt = found.get("dt", found.get("Ts"))
         dt = None if dt is None else float(np.asarray(dt).item())
-        keys = ((f"{kind}_names", f"{kind.title()}Name") for kind in _KINDS)
-        names = [texts(next((entries[x] for x in each if x in entries), ())) for each in keys]
-    if not {*"ABC"} <= {*entries} and {*entries} & {*"ABCD"} != {"D"}:
-        raise FileError(
-            f"{path}: it has {listed(sorted(entries)) or 'no arrays'}, expected A, B, C, D, and Ts "
-            "where it is sampled, or D alone: in MATLAB [A, B, C, D] = ssdata(K); Ts = K.Ts; "
-            "save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
+        names = (
+            texts(found.get(f"{kind}_names", found.get(f"{kind.title()}Name", ())))
+            for kind in ("input", "output")
         )
+        said = (dt, *names)
+    A, B, C, D = (found.get(key) for key in "ABCD")
+    if any(each is None for each in (A, B, C)):
+        if D is None or A is not None:
+            raise FileError(
+                f"{path}: it has {listed(sorted(found)) or 'no arrays'}, expected A, B, C, D, and "
+                "Ts where it is sampled, or D alone: in MATLAB [A, B, C, D] = ssdata(K); "
+                "Ts = K.Ts; save('K.mat', 'A', 'B', 'C', 'D', 'Ts')"
+            )
+        A = B = C = ()
     try:
-        A, B, C, D = (entries.get(key, None if key == "D" else ()) for key in "ABCD")
-        return _checked(A, B, C, D, dt, *names)
+        return _checked(A, B, C, D, *said)
     except FflinError as error:
         raise type(error)(f"{path}: {error}") from None
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.progress import Progress
-from fflin.control.linear_controller import LinearController, OfOutputs, measured_at
+from fflin.control.linear_controller import LinearController, measured_at
 from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.tracking import TrajectoryFeedback
@@ -80,9 +80,9 @@ def _reason(plan: Plan, plant: Plant) -> str:
 
 def _unmeasured(plan: Plan, plant: Plant, policy: Any) -> str:
     """Say why a plan's compensator, if it has one, cannot have its samples."""
-    if not isinstance(policy, OfOutputs | TrajectoryOutputFeedback):
+    if not isinstance(policy, LinearController | TrajectoryOutputFeedback):
         return ""
-    dt = policy.dt if isinstance(policy, OfOutputs) else policy.filter.dt
+    dt = policy.dt if isinstance(policy, LinearController) else policy.filter.dt
     if abs(plan.times.sample * plan.times.dt - dt) > 1e-6 * dt and dt:
         return "it is sampled otherwise than the compensator"
     if policy.noise is not None and not plan.times.sample:

@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array, vector
-from fflin.control.linear_controller import OfOutputs, measured_at
+from fflin.control.linear_controller import LinearController, measured_at
 from fflin.control.output_feedback import TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.saturation import Pulses, Wheels
@@ -112,7 +112,7 @@ def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
         law = law._replace(near=near[state.groups.q_m].copy(), filter=direct)
     elif isinstance(policy, Gridded):
         law = _between(law, policy, state)
-    elif isinstance(policy, OfOutputs | TrajectoryOutputFeedback):
+    elif isinstance(policy, LinearController | TrajectoryOutputFeedback):
         law = _filtered(law, plan, policy, asking, mechanics.tree)
     elif isinstance(policy, TrajectoryFeedback):
         law = law._replace(kind=laws.TRACK)
@@ -125,7 +125,7 @@ def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
 def noise_of(plan: Plan) -> Any:
     """Return noise(t) of what a plan's policy measures, or None."""
     policy = plan.policy.policy if isinstance(plan.policy, Allocation) else plan.policy
-    known = isinstance(policy, OfOutputs | TrajectoryOutputFeedback)
+    known = isinstance(policy, LinearController | TrajectoryOutputFeedback)
     return policy.noise if known else None
 
 

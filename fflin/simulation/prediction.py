@@ -9,7 +9,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, instance
 from fflin.control.channel import Channel
-from fflin.control.linear_controller import Compensation, OfOutputs
+from fflin.control.linear_controller import Compensation, LinearController
 from fflin.control.policies import Allocation
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.state import StateMap
@@ -52,7 +52,7 @@ def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryF
         own = _checked(plant, policy, linear)
     law = _law(policy, own) if isinstance(own, LinearModel) else None
     if law is not None and own.state_names == plant.state.names:
-        along = isinstance(policy, OfOutputs) and not policy.dt
+        along = isinstance(policy, LinearController) and not policy.dt
         return Predictor(policy.around(own)[0] if along else own, law)
     if linear is None:
         return None
@@ -71,7 +71,7 @@ def _checked(plant: Plant, policy: Any, linear: Any) -> LinearModel:
     state = plant.state
     names = (state.names, plant.actuation.names, state.frame)
     same = (linear.state_names, linear.input_names, linear.frame) == names and not linear.moving
-    if isinstance(policy, OfOutputs):
+    if isinstance(policy, LinearController):
         same = same and linear.output_names == policy.lin.output_names
     if not same or not linear.reference.isApprox(state.reference, 1e-9):
         raise InputError(
@@ -86,7 +86,7 @@ def _law(policy: Any, lin: LinearModel) -> Callable[[], LinearLaw] | None:
     """Return what makes a policy's law of the deviation from a model's point, if it is linear."""
     if policy is None:
         return lambda: lambda _: np.zeros(len(lin.u0))
-    if isinstance(policy, OfOutputs):
+    if isinstance(policy, LinearController):
         if not policy.dt:
             _, gains, offset = policy.around(lin)
             return lambda: lambda e: offset + gains @ e

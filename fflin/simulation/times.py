@@ -8,7 +8,7 @@ import numpy as np
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array, number, whole
-from fflin.control.linear_controller import OfOutputs, closed_loop
+from fflin.control.linear_controller import LinearController, closed_loop
 from fflin.control.policies import StateFeedback, decider, fed_back
 from fflin.control.tracking import TrajectoryFeedback, largest_rate, tracking_of
 from fflin.dynamics.state import StateMap
@@ -98,7 +98,7 @@ def times_of(
         sample = _positive("sample", sample)
     else:
         by = decider(policy)
-        made = by if isinstance(by, OfOutputs) else getattr(policy, "lin", None)
+        made = by if isinstance(by, LinearController) else getattr(policy, "lin", None)
         sample = getattr(follows.schedule if follows else made, "dt", None) or None
     fastest, mode = (0.0, "") if sample else _fastest_pole(policy, follows)
     if duration is None and follows is None:
@@ -189,7 +189,7 @@ def _positive(name: str, value: Any) -> float:
 
 
 def time_to_settle(
-    robot: Robot, policy: StateFeedback | OfOutputs, q: Array, v: Array | None
+    robot: Robot, policy: StateFeedback | LinearController, q: Array, v: Array | None
 ) -> float:
     """Return when [s] the linear loop stays within 1 % of each error; in tens of seconds."""
     lin = policy.lin
