@@ -203,7 +203,7 @@ class LinearController:
         dt = lin.dt if by.dt is None or not (by.dt or len(by.A)) else by.dt
         dt = lin.dt or dt if dt < 0.0 else dt
         if dt < 0.0:
-            raise InputError("the controller is sampled and does not say its dt; give it one")
+            raise InputError("the controller is sampled at a dt that it does not say; give it one")
         if lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt:
             times = (
                 f"sampled at dt = {each:g} s" if each else "continuous" for each in (dt, lin.dt)

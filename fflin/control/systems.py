@@ -85,16 +85,9 @@ def _checked(
                 f"{key} of the controller has shape {each.shape}, expected {shape} finite numbers, "
                 f"with {nz} states, {ny} inputs (outputs of the model) and {nu} outputs"
             )
-    if (inputs and len(inputs) != ny) or (outputs and len(outputs) != nu):
-        raise InputError(
-            f"the controller has {len(inputs)} and {len(outputs)} names for {ny} inputs and {nu} "
-            "outputs"
-        )
     if dt is not None:
         # True is of a system that is sampled nobody knows how, -1 MATLAB's word for it.
         dt = -1.0 if dt is True else number("controller's dt", dt)
-        if dt < 0.0 and dt != -1.0:
-            raise InputError(f"dt of the controller is {dt:g} s, expected 0 or a sampling time")
     return System(A, B, C, D, dt, tuple(map(str, inputs)), tuple(map(str, outputs)))
 
 
@@ -138,12 +131,13 @@ def fitted(system: System, lin: LinearModel) -> System:
 
 def _places(kind: str, names: tuple[str, ...], size: int, of: str, known: Any) -> list[int]:
     """Return which signals of a model those of a controller are."""
-    if all(map(_NUMBERED.fullmatch, names)):
-        if size != len(known):
-            raise InputError(
-                f"the controller has {size} {kind}s, expected {len(known)}, one for each {of} of "
-                f"the model: {listed(known)}; or name those that it has"
-            )
+    named = not all(map(_NUMBERED.fullmatch, names))
+    if size != len(names if named else known):
+        raise InputError(
+            f"the controller has {size} {kind}s and {len(names) if named else 'no'} names, "
+            f"expected a name for each, or one for each {of} of the model: {listed(known)}"
+        )
+    if not named:
         return list(range(size))
     own, there = list(names), list(known)
     if not {*own} <= {*there}:  # python-control has no dots in names

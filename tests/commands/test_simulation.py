@@ -375,7 +375,7 @@ def test_controllers_that_do_not_fit_are_refused(tmp_path):
     robot = ("simulate", "ets_vii", "--controller", "K.mat")
     assert "it has K, expected A, B, C, D" in refused(*robot, cwd=tmp_path)
     scipy.io.savemat(tmp_path / "K.mat", {"D": np.eye(3)})
-    assert "has 3 inputs, expected 24" in refused(*robot, cwd=tmp_path)
+    assert "has 3 inputs and no names, expected" in refused(*robot, cwd=tmp_path)
     assert "--dt: --controller is what regulates" in refused(*robot, "--dt", 1, cwd=tmp_path)
     assert "--free has no regulator" in refused(*robot, "--free", cwd=tmp_path)
     assert "none.mat: cannot be read" in refused(*robot[:3], "none.mat", cwd=tmp_path)

@@ -243,10 +243,12 @@ def test_it_may_ask_for_wrenches_that_thrusters_give(arm):
     {
         r"B of the controller has shape \(3, 9\), expected \(4, 9\)": {"B": np.zeros((3, 9))},
         r"A of the controller has shape \(4, 4\).* finite": {"A": np.full((4, 4), np.nan)},
-        "has 5 inputs, expected 9, one for each output": {"B": np.zeros((4, 5)), "D": 0},
+        "has 5 inputs and no names, expected a name for each, or one for each output": {
+            "B": np.zeros((4, 5)),
+            "D": 0,
+        },
         "D of the controller has shape": {"D": np.zeros((2, 2))},
-        "expected 0 or a sampling time": {"dt": -3.0},
-        "sampled and does not say its dt": {"dt": True},
+        "sampled at a dt that it does not say": {"dt": True},
         "complex128 values, expected real": {"C": np.zeros((6, 4)) * 1j},
     }.items(),
 )
