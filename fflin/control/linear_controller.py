@@ -200,7 +200,7 @@ class LinearController:
                 "feels the input at once: an algebraic loop; take D = 0 there, such as behind a "
                 "low-pass filter"
             )
-        dt = lin.dt if by.dt is None or not (by.dt or len(by.A)) else by.dt
+        dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not len(by.A)) else by.dt
         dt = lin.dt or dt if dt < 0.0 else dt
         if dt < 0.0:
             raise InputError("the controller is sampled at a dt that it does not say; give it one")

@@ -117,7 +117,8 @@ def test_a_gain_comes_back_as_the_state_feedback_it_was():
     lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}))
     gain, x0 = fflin.lqr(lin), lin.x0 + 0.05
     expected = fflin.simulate(robot, fflin.StateFeedback(lin, gain.K), x0=x0, duration=2.0)
-    for system in (gain.to_control(), -gain.K):
+    nothing = ((), (), ())
+    for system in (gain.to_control(), -gain.K, (*nothing, -gain.K, True), (*nothing, -gain.K, 0)):
         found = fflin.simulate(robot, fflin.LinearController(system, lin), x0=x0, duration=2.0)
         assert np.abs(found.x - expected.x).max() < 1e-13
         assert np.abs(found.prediction - expected.prediction).max() < 1e-12
