@@ -15,11 +15,11 @@ from fflin.base.names import by_name, input_keys
 from fflin.base.validation import Array
 from fflin.base.validation import by_name as mapping
 from fflin.campaign.pointing import columns_of, in_lanes, misaligned, require_direction
-from fflin.campaign.sensing import Designed, Misled, noise_of
+from fflin.campaign.sensing import Bound, misled, noise_of
 from fflin.campaign.spreads import SEED, deviation_of, inverse_of, whole_number
 from fflin.control.linear_controller import LinearController
 from fflin.control.output_feedback import TrajectoryOutputFeedback
-from fflin.control.policies import Allocation, StateFeedback
+from fflin.control.policies import Allocation, StateFeedback, bound
 from fflin.dynamics.state import StateMap
 from fflin.kernel.accelerations import loads_of
 from fflin.kernel.tree import Tree
@@ -260,11 +260,12 @@ class Dispersions:
         if "misalignment" in self._kinds:
             robot = misaligned(robot, self._angles(rows)[0])
             if isinstance(policy, Allocation):  # which does not know of it
-                policy = Designed(policy, plant.robot)
+                given = policy
+                policy = Bound(lambda _: bound(given, plant.robot))
         if self._kinds & {*_OF_SENSORS}:
             error = noise_of(*(each[0] for each in self._sensing(rows)))
             if isinstance(policy, StateFeedback):
-                policy = Misled(policy, error)
+                policy = misled(policy, error)
             else:
                 noise = policy.noise or np.zeros_like
                 policy = copy(policy)

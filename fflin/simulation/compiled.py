@@ -23,10 +23,8 @@ from fflin.simulation.run import Recording, ending_of, go
 
 ENGINES = ("python", "compiled")
 
-_KNOWN = (
-    *(StateFeedback, OutputFeedback, LinearController),
-    *(TrajectoryFeedback, TrajectoryOutputFeedback),
-)
+_OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
+_KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 _SLICE, _FIRST_SLICE = 0.05, 16  # [s] and steps between looks at the clock and at Ctrl-C
 # Multiplications in the factor of M, beyond which ABA in the loop in Python is quicker.
 _LARGEST_FACTOR = 200_000
@@ -70,7 +68,7 @@ def _reason(plan: Plan, plant: Plant) -> str:
 
 def _unmeasured(plan: Plan, plant: Plant, policy: Any) -> str:
     """Say why a plan's compensator, if it has one, cannot have its samples."""
-    if not isinstance(policy, LinearController | TrajectoryOutputFeedback):
+    if not isinstance(policy, _OF_OUTPUTS):
         return ""
     dt = policy.dt if isinstance(policy, LinearController) else policy.filter.dt
     if abs(plan.times.sample * plan.times.dt - dt) > 1e-6 * dt and dt:
