@@ -85,10 +85,9 @@ class Estimator(Design):
 
     def to_control(self) -> Any:
         """Return a `control.StateSpace` from u - u0 and y - y0 to xh, if that is installed."""
-        B, nx = np.hstack((self.B - self.L @ self.D, self.L)), len(self.L)
-        matrices = (self.A - self.L @ self.C, B, np.eye(nx), np.zeros((nx, B.shape[1])))
-        inputs = (*self.input_names, *self.output_names)
-        return state_space(matrices, self.dt, self.state_names, inputs, self.state_names)
+        L, both = self.L, (*self.input_names, *self.output_names)
+        system = self.A - L @ self.C, np.hstack((self.B - L @ self.D, L)), np.eye(len(L)), 0.0
+        return state_space(system, self.dt, self.state_names, both, self.state_names)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -136,8 +135,8 @@ class Compensator(Design):
         MissingPackageError
             If python-control is not installed.
         """
-        matrices = (self.A, self.B, self.C, np.zeros((len(self.C), self.B.shape[1])))
-        return state_space(matrices, self.dt, self.state_names, self.input_names, self.output_names)
+        names = self.state_names, self.input_names, self.output_names
+        return state_space((self.A, self.B, self.C, 0.0), self.dt, *names)
 
 
 def kalman(
@@ -216,12 +215,8 @@ def kalman(
         L_update = np.linalg.solve(C @ solution.P @ C.T + V, C @ solution.P).T
     poles, margin = solution.ordered(lin.dt)
     return Estimator(
-        S.T @ L @ seen,
-        S.T @ L_update @ seen,
-        S.T @ solution.P @ S,
-        poles,
-        solution.residual,
-        margin,
+        *(S.T @ L @ seen, S.T @ L_update @ seen, S.T @ solution.P @ S),
+        *(poles, solution.residual, margin),
         W=S.T @ W @ S,
         V=noises,
         estimated=lin.state_names,

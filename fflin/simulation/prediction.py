@@ -102,12 +102,7 @@ def _law(policy: Any, lin: LinearModel) -> Callable[[], LinearLaw] | None:
         return None
     fed = [lin.state_names.index(name) for name in own.state_names]
     apart = lin.x0[fed] - own.x0
-
-    def feedback(e: Array) -> Array:
-        u: Array = own.u0 - K @ (e[fed] + apart)
-        return u
-
-    return lambda: feedback
+    return lambda: lambda e: own.u0 - K @ (e[fed] + apart)
 
 
 def predict(plan: Any, x: Array, steps: int, target: Array) -> Array:
