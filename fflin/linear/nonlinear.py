@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError
 from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
@@ -113,9 +112,7 @@ class ErrorDynamics(Nonlinear):
         return np.concatenate((0.5 * turning, flying, rates, state.velocities(a) - self._a), axis=1)
 
 
-def outputs(
-    robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: ArrayLike | None = None
-) -> Array:
+def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None) -> Array:
     """Return what the outputs of a robot measure, as y0 of a linear model is at its point.
 
     Attitudes are in the model's chart, where q0 >= 0, rotations of frames are counted from the
