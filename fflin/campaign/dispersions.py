@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -14,10 +15,11 @@ from fflin.base.names import by_name, input_keys
 from fflin.base.validation import Array
 from fflin.base.validation import by_name as mapping
 from fflin.campaign.pointing import columns_of, in_lanes, misaligned, require_direction
-from fflin.campaign.sensing import Designed, Misled, noise_of
+from fflin.campaign.sensing import Bound, misled, noise_of
 from fflin.campaign.spreads import SEED, deviation_of, inverse_of, whole_number
-from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
-from fflin.control.policies import Allocation, StateFeedback
+from fflin.control.linear_controller import LinearController
+from fflin.control.output_feedback import TrajectoryOutputFeedback
+from fflin.control.policies import Allocation, StateFeedback, bound
 from fflin.dynamics.state import StateMap
 from fflin.kernel.accelerations import loads_of
 from fflin.kernel.tree import Tree
@@ -61,7 +63,7 @@ class Dispersions:
         self._model = plant.robot._bare.model
         bodies = ["base", *list(self._model.names)[ROOT + 1 :]]
         self._sensors: tuple[str, ...] = ()
-        if isinstance(policy, StateFeedback | OutputFeedback):
+        if isinstance(policy, StateFeedback | LinearController):
             lin = policy.lin
             of_states = isinstance(policy, StateFeedback)
             self._sensors = lin.state_names if of_states else lin.output_names
@@ -100,7 +102,8 @@ class Dispersions:
         if kind in _OF_SENSORS and not names:
             raise InputError(
                 f"'{next(iter(spreads))}.{kind}' is dispersed, and a "
-                f"{type(self._policy).__name__} has no sensors; StateFeedback and OutputFeedback do"
+                f"{type(self._policy).__name__} has no sensors; StateFeedback, OutputFeedback and "
+                "LinearController do"
             )
         if kind in ("noise", "delay") and not self._times.sample:
             raise InputError(
@@ -257,14 +260,16 @@ class Dispersions:
         if "misalignment" in self._kinds:
             robot = misaligned(robot, self._angles(rows)[0])
             if isinstance(policy, Allocation):  # which does not know of it
-                policy = Designed(policy, plant.robot)
+                given = policy
+                policy = Bound(lambda _: bound(given, plant.robot))
         if self._kinds & {*_OF_SENSORS}:
             error = noise_of(*(each[0] for each in self._sensing(rows)))
             if isinstance(policy, StateFeedback):
-                policy = Misled(policy, error)
+                policy = misled(policy, error)
             else:
                 noise = policy.noise or np.zeros_like
-                policy = replace(policy, noise=lambda t: error(t) + np.asarray(noise(t)))
+                policy = copy(policy)
+                vars(policy)["noise"] = lambda t: error(t) + np.asarray(noise(t))
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
         drives = Drives(*(x[0] for x in self._drives(rows)))
         faulty = drives if self._kinds & {*_OF_INPUTS, "misalignment"} else None

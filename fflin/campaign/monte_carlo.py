@@ -91,9 +91,9 @@ def monte_carlo(
         - ``INPUT.misalignment`` [rad]: the direction of a thruster, the axis of a wheel or one of
           tau_b or F_b is turned about two axes across it, by an angle drawn for each;
         - ``NAME.sensor``: added to a state that a `StateFeedback` reads, or to an output that an
-          `OutputFeedback` or `TrajectoryOutputFeedback` measures; ``NAME.noise``: white noise
-          added to it at each sample, a number its standard deviation, and of another spread each
-          run has one of its own;
+          `OutputFeedback`, `LinearController` or `TrajectoryOutputFeedback` measures;
+          ``NAME.noise``: white noise added to it at each sample, a number its standard deviation,
+          and of another spread each run has one of its own;
         - ``delay`` [s]: added to that of `simulate`, to the next whole step and 0 or more;
         - ``JOINT.stiffness`` and ``JOINT.damping``, relative.
 

@@ -14,7 +14,7 @@ from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import grid, matrix, width
 from fflin.base.validation import Array
 from fflin.control.margins import Margins, input_margins
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
     from fflin.control.riccati import Solution
@@ -115,6 +115,10 @@ class Gain(Design):
     def closed_loop(self) -> Array:
         """A - B K (nx, nx)."""
         return self.A - self.B @ self.K
+
+    def to_control(self) -> Any:
+        """Return -K as a `control.StateSpace` from x - x0 to u - u0, if that is installed."""
+        return state_space(([], [], [], -self.K), self.dt, (), self.state_names, self.input_names)
 
     @cached_property
     def margins(self) -> Margins:
