@@ -22,7 +22,7 @@ TASKS = {
     "make and check a linear model": {"linearize": "models", "check": "models"},
     "judge it": {
         **dict.fromkeys(("analyze", "modes", "validity"), "analysis"),
-        "funnel": "funnels",
+        **{"funnel": "funnels", "sensitivity": "parameters", "uncertain": "parameters"},
     },
     "close the loop": {"lqr": "regulator", "tvlqr": "tracking", "simulate": "simulation"},
     "go through many": {"sweep": "sweeps", "montecarlo": "montecarlo"},

@@ -276,5 +276,5 @@ def _table(found: Sensitivity, top: int) -> str:
             rows.append((max(effect), one.name, f"{one.value:.5g}", change, *effect))
     rows.sort(key=lambda row: -row[0])
     most = [(*row[1:4], *(f"{100.0 * x:.2g} %" for x in row[4:])) for row in rows[:top]]
-    title = f"{lin.robot}: what changes A and B most, of their largest entries, to first order"
+    title = f"{lin.robot}: what changes A and B most, to first order, of the largest entry"
     return f"{title}\n" + grid([("parameter", "is", "changed by", "A", "B"), *most], "lrrrr")
