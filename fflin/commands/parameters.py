@@ -43,8 +43,8 @@ def add_commands(commands: Commands) -> None:
     add_robot(uncertain)
     add_options(uncertain, "--joint NAME=VALUE*: put a joint at VALUE [rad|m]; others at neutral")
     add_system(uncertain)
-    vary = """--vary NAME=RANGE*: a parameter of `fflin sensitivity` or a pattern, and how far it may
-        be: 0.2, a share of its value, or LEAST:LARGEST"""
+    vary = """--vary NAME=RANGE*: a parameter of `fflin sensitivity` or a pattern, and its range:
+        0.2, a share of its value, or LEAST:LARGEST"""
     add_options(uncertain, vary, type=_range, required=True)
     add_output_file(uncertain, "save A, B1 .. D22 and the blocks: .npz, .mat or .json")
 
