@@ -121,8 +121,18 @@ def test_samples_are_rigid_bodies_and_corners_that_are_none_are_counted():
         body = made.model.inertias[made.model.getJointId("joint_3")]
         second = 0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia
         assert np.linalg.eigvalsh(second)[0] > -1e-9
+    # Corners by the triangle inequality of the moments; mass alone makes none impossible.
+    body = robot.model.inertias[robot.model.getJointId("joint_3")]
+    moments = np.linalg.eigvalsh(body.inertia)
+    xx = of.ranges[0].parameter.value
+    others = np.delete(moments, np.abs(moments - xx).argmin())
+    bad = 2 * sum(2.0 * max(m) > sum(m) for m in ([*others, 0.7 * xx], [*others, 1.3 * xx]))
     worst = of.worst(fflin.lqr(fflin.linearize(robot)), samples=20)
-    assert worst.excluded >= 1 and worst.tried >= 20
+    assert bad and worst.tried == 20 + 4 - bad + 1
+    assert worst.excluded == of.draws(20)[1] + bad
+    assert f"{worst.excluded} draws and corners make no rigid bodies" in " ".join(
+        str(worst).split()
+    )
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
@@ -183,3 +193,19 @@ def test_a_wheel_too_large_for_its_carrier_is_no_robot():
     assert of.makes(np.array([-0.9])) and not of.makes(np.array([0.9]))
     with pytest.raises(fflin.InputError, match="the density of 'base' is -1"):
         of.at({"base.density": -1.0})
+
+
+def test_a_range_that_leaves_hardly_any_robot_is_one_line():
+    rod = {"inertia": np.diag([1.0, 1.0, 1e-9])}
+    robot = fflin.load("cubesat").with_mass_properties({"base": rod})
+    of = fflin.uncertain(robot, {"base.inertia.xx": 0.5, "base.inertia.yy": 0.5})
+    for call in (lambda: of.samples(1), lambda: of.worst(fflin.lqr(fflin.linearize(robot)))):
+        with pytest.raises(fflin.InputError, match=r"0 were physical.*no rigid body.*narrower"):
+            call()
+
+
+def test_stored_momentum_is_no_fixed_point():
+    wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), momentum=2.0)
+    robot = fflin.load("cubesat", inputs=[wheel])
+    with pytest.raises(fflin.InputError, match="stored momentum; take a point at rest"):
+        fflin.uncertain(robot, {"base.mass": 0.1}).lft()
