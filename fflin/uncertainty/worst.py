@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from itertools import product
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice, product
+from operator import itemgetter
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -14,11 +16,17 @@ from fflin.base.progress import Progress
 from fflin.base.tables import folded
 from fflin.base.threads import in_one_thread
 from fflin.base.validation import Array, as_double
+from fflin.control.margins import largest_gain
 from fflin.uncertainty.lft import LFT
-from fflin.uncertainty.loops import Gain, Loops
 from fflin.uncertainty.singular_value import largest_bound
 
 _CORNERS = 256
+# Ends of a search, steps of each, and how far these go, relative to half a range; 1e9 to a corner.
+_STARTS, _STEPS, _LENGTHS = 3, 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
+# Loops held exactly in a step, and frequencies at which the others are judged.
+_HELD, _FREQUENCIES, _DIFFERENCE = 3, 6, 1e-6
+
+Makes: TypeAlias = Callable[[Array], bool]  # whether deltas make a robot
 
 
 @dataclass(frozen=True)
@@ -84,45 +92,126 @@ def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
     K = as_double("gain", getattr(gain, "K", gain))
     if K.shape != lft.B2.T.shape:
         raise InputError(f"gain has shape {K.shape}, expected {lft.B2.T.shape} (nu, nx)")
-    R = getattr(gain, "R", np.eye(len(K)))
     size, loops = len(lft.repeats), Loops(lft, K)
     middle = np.zeros((1, size))
     if loops.undamped(middle)[0] >= 0.0:
         raise InputError("the loop in the middle of the ranges is unstable; give another gain")
-    bar = Progress()
-    try:
-        draws, excluded = of.draws(samples, seed=seed)
-        corners = (
-            np.array(list(product((-1.0, 1.0), repeat=size)))
-            if 2**size <= _CORNERS
-            else (2.0 * np.random.default_rng(seed).integers(0, 2, (_CORNERS, size)) - 1.0)
-        )
-        physical = np.array([of.makes(corner) for corner in corners])
-        tried = np.vstack((draws, corners[physical], middle))
-        bar.update(1, 5)
-        least, at = loops.least_damped(tried, of.makes)
-        damping = Found(-least, of.values(at))
-        bar.update(2, 5)
-        # Of the disk margin, as in control.margins.
-        scale = np.sqrt(R.diagonal())
-        disk = Gain(-scale[:, None] * K, 0.5 * np.eye(len(K)), 1.0 / scale)
-        largest, at = loops.largest(disk, tried, of.makes)
-        margin = Found(min(1.0 / largest, 2.0), of.values(at))
-        bar.update(3, 5)
-        whole = Gain(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))
-        largest, at = loops.largest(whole, tried, of.makes)
-        bar.update(4, 5)
-        return Worst(
-            damping=damping,
-            margin=margin,
-            gain=Found(largest, of.values(at)),
-            unstable=int((loops.undamped(tried) >= 0.0).sum()),
-            tried=len(tried),
-            excluded=excluded + int((~physical).sum()),
-            safe=_safe(loops),
-        )
-    finally:
-        bar.close()
+    draws, excluded = of.draws(samples, seed=seed)
+    if 2**size <= _CORNERS:
+        corners = np.array(list(product((-1.0, 1.0), repeat=size)))
+    else:
+        corners = np.random.default_rng(seed).choice((-1.0, 1.0), (_CORNERS, size))
+    physical = np.array([of.makes(corner) for corner in corners])
+    tried = np.vstack((draws, corners[physical], middle))
+    # The disk margin is of (S - T)/2, each input counted in sqrt(R_ii), as in control.margins.
+    scale = np.sqrt(getattr(gain, "R", np.eye(len(K))).diagonal())
+    disk = Gain(-scale[:, None] * K, 0.5 * np.eye(len(K)), 1.0 / scale)
+    whole = Gain(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))
+    found, bar = [], Progress()
+    for search in (loops.least_damped, partial(loops.largest, disk), partial(loops.largest, whole)):
+        value, delta = search(tried, of.makes)
+        found.append(Found(value, of.values(delta)))
+        bar.update(len(found), 4)
+    safe = _safe(loops)
+    bar.close()
+    damping, margin, gained = found
+    return Worst(
+        damping=replace(damping, value=-damping.value),
+        margin=replace(margin, value=min(1.0 / margin.value, 2.0)),
+        gain=gained,
+        unstable=int((loops.undamped(tried) >= 0.0).sum()),
+        tried=len(tried),
+        excluded=excluded + int((~physical).sum()),
+        safe=safe,
+    )
+
+
+class Gain(NamedTuple):
+    """From a disturbance over `scale` at the inputs to C x, and D of the disturbance."""
+
+    C: Array
+    D: Array
+    scale: Array
+
+
+class Loops:
+    """Loops u = -K x of the robots of a fraction, deltas in rows (N, k); unstable ones are bad."""
+
+    def __init__(self, lft: LFT, K: Array) -> None:
+        self.lft, self.K = lft, K
+
+    def matrices(self, rows: Array) -> tuple[Array, Array]:
+        """Return A - B K and B."""
+        A, B, _, _ = self.lft.at(rows)
+        return A - B @ self.K, B
+
+    def undamped(self, rows: Array) -> Array:
+        """Return minus the least damping ratio (N,); 0 or more where a loop is unstable."""
+        poles = np.linalg.eigvals(self.matrices(rows)[0])
+        found: Array = (poles.real / np.maximum(np.abs(poles), 1e-300)).max(axis=-1)
+        return found
+
+    def gains(self, of: Gain, rows: Array, frequencies: Array) -> Array:
+        """Return the largest gains (N,) at these frequencies, infinite of unstable loops."""
+        F, B = self.matrices(rows)
+        found = np.zeros(len(F))
+        for w in frequencies:
+            inner = 1j * w * np.eye(F.shape[-1]) - F
+            response = of.C @ np.linalg.solve(inner, B * of.scale) + of.D
+            gram = response.conj().mT @ response
+            found = np.maximum(found, np.linalg.eigvalsh(gram)[..., -1])
+        return np.where(self.undamped(rows) >= 0.0, np.inf, np.sqrt(found))
+
+    def least_damped(self, tried: Array, makes: Makes) -> tuple[float, Array]:
+        """Return the largest `undamped` that is found from what was tried, and its deltas."""
+        return _largest(self.undamped, lambda delta: self.undamped(delta[None])[0], tried, makes)
+
+    def largest(self, of: Gain, tried: Array, makes: Makes) -> tuple[float, Array]:
+        """Return the largest gain that is found from what was tried, and its deltas."""
+        middle = np.zeros((1, tried.shape[1]))
+        sizes = np.unique(np.abs(np.linalg.eigvals(self.matrices(middle)[0])))
+        at = np.argsort([-self.gains(of, middle, np.array((w,)))[0] for w in sizes])
+        peaks = [0.0, *sizes[at[:_FREQUENCIES]]]
+
+        def exact(delta: Array) -> float:
+            F, B = self.matrices(delta)
+            if np.linalg.eigvals(F).real.max() >= 0.0:
+                return np.inf
+            value, w = largest_gain(F, B * of.scale, of.C, of.D)
+            peaks.append(min(w, 1e300))  # where others like it have theirs
+            return value
+
+        def quick(rows: Array) -> Array:
+            return self.gains(of, rows, np.unique(peaks[-_FREQUENCIES:]))
+
+        return _largest(quick, exact, tried, makes)
+
+
+def _largest(
+    quick: Callable[[Array], Array], exact: Callable[[Array], float], tried: Array, makes: Makes
+) -> tuple[float, Array]:
+    """Climb a figure from the worst that was tried, along its slope and one delta at a time."""
+    best, at, unit = -np.inf, tried[0], np.eye(tried.shape[1])
+    for start in tried[np.argsort(-quick(tried))[:_STARTS]]:
+        value, delta = exact(start), start
+        for _ in range(_STEPS if np.isfinite(value) else 0):
+            around = quick(np.vstack((delta + _DIFFERENCE * unit, delta)))
+            slope = np.nan_to_num(around[:-1] - around[-1], posinf=1.0)
+            steps = _LENGTHS[:, None] * slope / max(np.abs(slope).max(), 1e-300)
+            alone = [np.where(unit, end, delta) for end in (-1.0, 1.0)]
+            trials = np.vstack((np.clip(delta + steps, -1.0, 1.0), *alone))
+            held = islice(filter(makes, trials[np.argsort(-quick(trials))]), _HELD)
+            ahead, highest = max(
+                ((exact(x), x) for x in held), key=itemgetter(0), default=(value, delta)
+            )
+            if not ahead > value + 1e-9 * abs(value):
+                break
+            value, delta = ahead, highest
+            if not np.isfinite(value):
+                break
+        if value > best:
+            best, at = value, delta
+    return best, at
 
 
 def _safe(loops: Loops) -> float:
@@ -132,7 +221,7 @@ def _safe(loops: Loops) -> float:
 
     def response(w: Array) -> Array:
         inner = 1j * w[:, None, None] * np.eye(len(F)) - F
-        return loops.z_by_x @ np.linalg.solve(inner, lft.B1) + lft.D11
+        return (lft.C1 - lft.D12 @ loops.K) @ np.linalg.solve(inner, lft.B1) + lft.D11
 
     rates = np.concatenate((np.abs(poles), np.abs(poles.imag)))
     largest = largest_bound(response, lft.D11, rates[rates > 0.0], lft.repeats.astype(int))

@@ -5,7 +5,7 @@ import pytest
 
 import fflin
 from fflin.uncertainty import singular_value, worst
-from fflin.uncertainty.loops import Gain, Loops
+from fflin.uncertainty.worst import Gain, Loops
 
 FOUR = {
     "base.mass": 0.2,
@@ -31,25 +31,6 @@ def disk_of(gain):
 def whole_of(loops):
     C = loops.lft.C2
     return Gain(C, np.zeros((len(C), len(loops.K))), np.ones(len(loops.K)))
-
-
-@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_figures_of_a_loop_have_the_slopes_of_their_differences(servicer):
-    _, gain, loops = servicer
-    delta, step = np.array([0.3, -0.6, 0.2, 0.5]), 1e-4
-
-    def differences(of):
-        return [(of(delta + d)[0] - of(delta - d)[0]) / (2.0 * step) for d in step * np.eye(4)]
-
-    value, slope = loops.undamped_slope(delta)
-    assert value == pytest.approx(loops.undamped(delta[None])[0], rel=1e-12)
-    assert slope == pytest.approx(differences(loops.undamped_slope), rel=1e-5, abs=1e-9)
-    for figure in (disk_of(gain), whole_of(loops)):
-        value, slope, w = loops.gain_slope(figure, delta)
-        # At its peak the gain does not change with the frequency.
-        expected = differences(lambda x, f=figure, w=w: loops.gains(f, x[None], np.array([w])))
-        assert slope == pytest.approx(expected, rel=1e-4, abs=1e-11 * value / step)
-        assert loops.gains(figure, delta[None], np.array([w]))[0] == pytest.approx(value, rel=1e-9)
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
