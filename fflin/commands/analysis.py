@@ -1,16 +1,27 @@
-"""The commands that say what a linear model is worth: structure, modes, and how far it reaches."""
+"""The commands that judge a linear model: structure, modes, its reach, and what masses change."""
 
 from __future__ import annotations
 
 import argparse
 from contextlib import nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import InputError
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, add_point, command, file_name, number
-from fflin.commands.points import linear_model
+from fflin.commands.arguments import (
+    Commands,
+    add_options,
+    add_output_file,
+    add_point,
+    add_robot,
+    add_system,
+    command,
+    file_name,
+    number,
+)
+from fflin.commands.points import linear_model, load_robot, once, placed
 from fflin.commands.regulator import add_weights, gain_of, regulated_part
+from fflin.commands.tracking import say
 from fflin.commands.visual import add_figure, check_figure, draw
 
 if TYPE_CHECKING:
@@ -18,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: Commands) -> None:
-    """Add analyze, modes and validity."""
+    """Add analyze, modes, validity, sensitivity and uncertain."""
     analyze = command(
         commands,
         "analyze",
@@ -73,6 +84,36 @@ def add_commands(commands: Commands) -> None:
         help="feed rates and inputs of the base back in the axes of these frames too",
     )
     add_figure(validity, "draw it")
+    sensitivity = command(
+        *(commands, "sensitivity", _sensitivity),
+        "show or save what masses, inertias, springs and thrusters change of A and B",
+        "fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat",
+    )
+    add_point(sensitivity)
+    add_options(sensitivity, "--dt H: of the model sampled, with inputs held over H [s]")
+    add_options(sensitivity, "--top N = 15: the N that change most; 15 by default")
+    add_output_file(sensitivity, "save dA, dB, df0 over each parameter: .npz, .mat or .json")
+    uncertain = command(
+        *(commands, "uncertain", _uncertain),
+        "show or save the model at rest as an exact fraction of parameters in ranges",
+        "fflin uncertain servicer_7dof --vary base.mass=0.2 --vary panel_left.stiffness=80:120 "
+        "-o uncertain.mat",
+    )
+    add_robot(uncertain)
+    add_options(uncertain, "--joint NAME=VALUE*: put a joint at VALUE [rad|m]; others at neutral")
+    add_system(uncertain)
+    vary = """--vary NAME=RANGE*: a parameter of `fflin sensitivity` or a pattern, and its range:
+        0.2, a share of its value, or LEAST:LARGEST"""
+    add_options(uncertain, vary, type=_range, required=True)
+    add_output_file(uncertain, "save A, B1 .. D22 and the blocks: .npz, .mat or .json")
+
+
+def _range(text: str) -> tuple[str, Any]:
+    name, _, value = text.rpartition("=")
+    ends = value.split(":")
+    if not name or len(ends) > 2:
+        raise argparse.ArgumentTypeError(f"'{text}' is not NAME=SHARE or NAME=LEAST:LARGEST")
+    return name, tuple(map(number, ends)) if ends[1:] else number(value)
 
 
 def _analyze(arguments: argparse.Namespace) -> int:
@@ -175,4 +216,21 @@ def _validity(arguments: argparse.Namespace) -> int:
     if cut or any(name in lin.limits for name in lin.input_names):
         print("inputs were " + ("cut to the limits of the robot" if cut else _FREE))
     draw(arguments.plot, "plot_validity", found)
+    return DONE
+
+
+def _sensitivity(arguments: argparse.Namespace) -> int:
+    from fflin.uncertainty.sensitivity import sensitivity
+
+    _, lin = linear_model(arguments)
+    found = sensitivity(lin if arguments.dt is None else lin.discretize(arguments.dt))
+    say(found, arguments, found.table(arguments.top))
+    return DONE
+
+
+def _uncertain(arguments: argparse.Namespace) -> int:
+    from fflin.uncertainty.uncertain import uncertain
+
+    robot, ranges = load_robot(arguments), once("--vary", arguments.vary)
+    say(uncertain(robot, ranges).lft(placed(robot, "--joint", arguments.joint)), arguments)
     return DONE

@@ -21,8 +21,8 @@ TASKS = {
     "look at robots": {"robots": "models", "info": "models", "init": "init", "view": "visual"},
     "make and check a linear model": {"linearize": "models", "check": "models"},
     "judge it": {
-        **dict.fromkeys(("analyze", "modes", "validity"), "analysis"),
-        **{"funnel": "funnels", "sensitivity": "parameters", "uncertain": "parameters"},
+        **dict.fromkeys(("analyze", "modes", "validity", "sensitivity", "uncertain"), "analysis"),
+        "funnel": "funnels",
     },
     "close the loop": {"lqr": "regulator", "tvlqr": "tracking", "simulate": "simulation"},
     "go through many": {"sweep": "sweeps", "montecarlo": "montecarlo"},

@@ -84,7 +84,7 @@ def linearize_along(arguments: argparse.Namespace) -> int:
     along = models_along(arguments)
     if getattr(arguments, "dt", None) is not None:
         along = along.discretize(arguments.dt)
-    _say(along, arguments)
+    say(along, arguments)
     return DONE
 
 
@@ -100,7 +100,7 @@ def _tvlqr(arguments: argparse.Namespace) -> int:
     if arguments.reduce:
         raise InputError("--reduce: over a finite time the inputs hold what they can; leave it out")
     along = models_along(arguments)
-    _say(schedule_of(along, arguments, once("--qf", arguments.qf) or "steady"), arguments)
+    say(schedule_of(along, arguments, once("--qf", arguments.qf) or "steady"), arguments)
     return DONE
 
 
@@ -120,9 +120,10 @@ def schedule_of(
     return tvlqr(along, Qf=Qf, **options)
 
 
-def _say(made: Any, arguments: argparse.Namespace) -> None:
+def say(made: Any, arguments: argparse.Namespace, text: str = "") -> None:
+    """Save what was made where -o says so, and show it."""
     if arguments.output_file:
         made.save(arguments.output_file)
-    print(made)
+    print(text or made)
     if arguments.output_file:
         print(f"wrote {arguments.output_file}")

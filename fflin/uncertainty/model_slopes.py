@@ -9,19 +9,28 @@ from functools import cached_property
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.errors import InputError
 from fflin.base.validation import Array
+from fflin.dynamics.aba import Aba
 from fflin.dynamics.chart import Chart, Standing
 from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.rnea import Accelerations, Rates
+from fflin.dynamics.state import StateMap
+from fflin.linear.certificate import aba_route
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
 from fflin.linear.prepared import Prepared, own_reference, prepare
-from fflin.linear.sampling import held_slopes
+from fflin.linear.sampling import held_exponential, held_slopes
 from fflin.linear.state_equations import assemble
 from fflin.robot.outputs import CenterOfMass, Momentum
 from fflin.robot.robot import Robot
 from fflin.uncertainty.parameters import Parameter
 from fflin.uncertainty.rate_slopes import BodySlopes, slopes_of
+
+# Of a difference over a parameter, relative to what M has of it.
+_STEP = 2e-3
+# Smaller changes by such a step, of A or B, are in their rounding.
+_LEAST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,3 +164,29 @@ def with_bodies(robot: Robot, one: Parameter, size: float) -> dict[int, pin.Iner
             about = changed[4:][[[0, 1, 3], [1, 2, 4], [3, 4, 5]]]
             found[joint] = pin.Inertia(0.0, np.zeros(3), about)
     return found
+
+
+def difference(slopes: ModelSlopes, one: Parameter) -> float:
+    """Return how far fourth-order differences of A and B over a parameter are from its slopes."""
+    if not one.bodies:
+        raise InputError(f"'{one.name}' is no parameter of a body; only these are checked so")
+    lin, robot = slopes.lin, slopes.robot
+    step = _STEP / slopes.bodies.share(one.bodies)
+
+    def at(times: float) -> tuple[Array, Array]:
+        model = robot.model.copy()
+        for joint, body in with_bodies(robot, one, times * step).items():
+            model.inertias[joint] = body
+        state = StateMap(replace(robot, model=model), reference=lin.reference, frame=lin.frame)
+        route = aba_route(state, Aba(state), lin.q, lin.v, lin.u0, moving=lin.moving)
+        return held_exponential(*route[:2], lin.dt) if lin.dt else route[:2]
+
+    (dA, dB, *_), worst = slopes.over([one]), 0.0
+    for *stepped, now, exact in zip(
+        *map(at, (-2.0, -1.0, 1.0, 2.0, 0.0)), (dA[0], dB[0]), strict=True
+    ):
+        far, near, nearer, farther = stepped
+        by_steps = (far - 8.0 * near + 8.0 * nearer - farther) / (12.0 * step)
+        size = max(np.abs(by_steps).max(), _LEAST * np.abs(now).max() / step)
+        worst = max(worst, float(np.abs(by_steps - exact).max() / size))
+    return worst

@@ -17,9 +17,8 @@ from fflin.base.tables import grid
 from fflin.base.validation import Array, as_double, numbers, whole
 from fflin.base.writing import as_path
 from fflin.linear.model import LinearModel
-from fflin.uncertainty.model_slopes import ModelSlopes
-from fflin.uncertainty.parameters import Parameters
-from fflin.uncertainty.slopes_check import difference
+from fflin.uncertainty.model_slopes import ModelSlopes, difference
+from fflin.uncertainty.parameters import Parameter, Parameters
 
 # Poles closer than this, relative to the largest, have no derivative of their own.
 _EQUAL = 1e-6
@@ -96,11 +95,14 @@ class Sensitivity:
 
     def __getitem__(self, name: str) -> Slope:
         """Return the derivatives over one parameter."""
+        one = self._one(name)
+        return Slope(one.name, one.unit, one.value, *(x[0] for x in self._slopes.over([one])))
+
+    def _one(self, name: str) -> Parameter:
         found = self.parameters.find(name)
         if len(found) > 1:
             raise InputError(f"'{name}' stands for {len(found)} parameters; take along({{...}})")
-        one = self.parameters[found[0]]
-        return Slope(one.name, one.unit, one.value, *(x[0] for x in self._slopes.over([one])))
+        return self.parameters[found[0]]
 
     def along(self, direction: Mapping[str, float]) -> Slope:
         """Return the derivatives along a direction.
@@ -188,11 +190,7 @@ class Sensitivity:
             names = [name for name, one in self.parameters.items() if one.bodies]
         if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
             raise InputError(f"names is {names!r}, expected several, such as ['base.mass']")
-        slopes = {name: self[name] for name in names}
-        return {
-            name: difference(self._slopes, self.parameters[slope.name], slope)
-            for name, slope in slopes.items()
-        }
+        return {name: difference(self._slopes, self._one(name)) for name in names}
 
     def __str__(self) -> str:
         """Tell what 10 % of each parameter changes, the most first; 1 cm of a centre of mass."""
