@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -26,6 +26,8 @@ from fflin.robot.outputs import CenterOfMass, Momentum
 from fflin.robot.robot import Robot
 from fflin.uncertainty.parameters import Parameter
 from fflin.uncertainty.rate_slopes import BodySlopes, slopes_of
+
+_WEIGH = (CenterOfMass, Momentum)
 
 # Of a difference over a parameter, relative to what M has of it.
 _STEP = 2e-3
@@ -68,15 +70,9 @@ class ModelSlopes:
     def _of_bodies(self) -> Rates:
         return self.bodies.all()
 
-    def over(
-        self, parameters: Sequence[Parameter], weights: Array | None = None
-    ) -> tuple[Array, ...]:
-        """Return dA, dB, dC, dD, df0 and dy0 (P, ..), or of their sum with weights (P,) alone."""
+    def over(self, parameters: Sequence[Parameter]) -> tuple[Array, ...]:
+        """Return dA, dB, dC, dD, df0 and dy0 (P, ..)."""
         rates = slopes_of(parameters, self.bodies, self._of_bodies, self._u)
-        weighed = self._weighed(parameters)
-        if weights is not None:
-            rates = Rates(*(np.tensordot(weights, part, 1)[None] for part in rates))
-            weighed = np.tensordot(weights, weighed, 1)[None]
         # All is affine in the rates: what no parameter changes is that of none.
         with_none = Rates(*(np.concatenate((part, np.zeros_like(part[:1]))) for part in rates))
         ready, state, nu = self._ready, self._ready.map, self._ready.map.velocities(self.lin.v)
@@ -89,68 +85,48 @@ class ModelSlopes:
         )
         B = np.concatenate((np.zeros_like(lower), lower), axis=1)
         A, B, f0 = (each[:-1] - each[-1] for each in (A, B, f0))
-        C, D, y0 = self._felt(rates)
         if self.lin.dt:
             driven, h = np.column_stack((self._source.B, self._source.f0)), self.lin.dt
             for row in range(len(A)):
                 given = np.column_stack((B[row], f0[row]))
                 A[row], held = held_slopes(self._source.A, driven, h, A[row], given)
                 B[row], f0[row] = held[:, :-1], held[:, -1]
-        return A, B, C + weighed[..., :-1], D, f0, y0 + weighed[..., -1]
+        C, D, y0 = np.split(self._seen(parameters, rates), (state.nx, -1), axis=2)
+        return A, B, C, D, f0, y0[..., 0]
 
-    def _outputs(self, ready: Prepared, rates: Rates) -> tuple[Array, Array, Array]:
-        lin, data = self.lin, ready.robot.create_data()
-        point = lin.q, lin.v, ready.map.velocities(lin.v), self._u
-        made = output_equations(ready, data, self._chart, rates, lin.x0, point)
-        return made["C"], made["D"], made["y0"]
-
-    def _felt(self, rates: Rates) -> tuple[Array, Array, Array]:
-        """Return dC, dD and dy0 of outputs that feel accelerations."""
-        lin, count, sensing = self.lin, len(rates.c), self._ready.sensing
-        C, D = np.zeros((count, *lin.C.shape)), np.zeros((count, *lin.D.shape))
-        y = np.zeros((count, len(lin.C)))
-        if sensing is not None and sensing.needs_acceleration:
-            none = self._outputs(self._ready, Rates(*(np.zeros_like(part[0]) for part in rates)))
-            for row in range(count):
-                own = self._outputs(self._ready, Rates(*(part[row] for part in rates)))
-                C[row], D[row], y[row] = (a - b for a, b in zip(own, none, strict=True))
-        return C, D, y
-
-    def _weighed(self, parameters: Sequence[Parameter]) -> Array:
-        """Return (P, ny, nx + 1) of dC and dy0 of outputs that depend on masses themselves."""
-        # The robot's mass times a centre of mass or a momentum is quadratic in a parameter, of
-        # which three values give the slope exactly, whatever the step.
-        lin, of = self.lin, (CenterOfMass | Momentum)
-        found = np.zeros((len(parameters), len(lin.C), len(lin.A) + 1))
-        names = [
-            name for each in self.robot.outputs if isinstance(each, of) for name, _ in each.signals
-        ]
-        rows = [lin.output_names.index(name) for name in names]
+    def _seen(self, parameters: Sequence[Parameter], rates: Rates) -> Array:
+        """Return dC, dD and dy0 side by side (P, ny, ..), of outputs that feel or weigh."""
+        # The robot's mass times such an output is quadratic in a parameter, with rates that are
+        # linear in it: of three values the slope is exact, whatever the step.
+        lin, now = self.lin, self._rates
+        found = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))
+        outputs = (o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in _WEIGH)
+        rows = [lin.output_names.index(name) for o in outputs for name, _ in o.signals]
         if not rows:
             return found
         other = replace(self.robot, model=self.robot.model.copy())
         reference = None if self._ready.own_reference else lin.reference
         ready = prepare(other, frame=lin.frame, reference=reference, moving=lin.moving)
-        inertias, before = other.model.inertias, self.robot.model.inertias
+        data, point = other.create_data(), (lin.q, lin.v, ready.map.velocities(lin.v), self._u)
 
-        def seen(bodies: Mapping[int, pin.Inertia]) -> Array:
-            for joint, body in bodies.items():
-                inertias[joint] = body
-            C, _, y = self._outputs(ready, self._rates)
-            for joint in bodies:
-                inertias[joint] = before[joint]
-            return np.column_stack((C, y))[rows]
+        def weighed(one: Parameter, by: Sequence[Array], size: float) -> Array:
+            for joint, body in with_bodies(self.robot, one, size).items():
+                other.model.inertias[joint] = body
+            moved = Rates(*(a + size * b for a, b in zip(now, by, strict=True)))
+            made = output_equations(ready, data, self._chart, moved, lin.x0, point)
+            seen = np.column_stack((made["C"], made["D"], made["y0"]))[rows]
+            total = pin.computeTotalMass(other.model)
+            for joint in one.bodies:
+                other.model.inertias[joint] = self.robot.model.inertias[joint]
+            return total * seen
 
-        total, now = pin.computeTotalMass(self.robot.model), seen({})
+        total = pin.computeTotalMass(self.robot.model)
         for row, one in enumerate(parameters):
-            if share := self.bodies.share(one.bodies) if one.bodies else 0.0:
-                step, mass = 1.0 / share, sum(change[0] for change in one.bodies.values())
-                near, far = (
-                    (total + size * mass) * seen(with_bodies(self.robot, one, size))
-                    for size in (step, 2.0 * step)
-                )
-                slope = (4.0 * near - far - 3.0 * total * now) / (2.0 * step)
-                found[row, rows] = (slope - mass * now) / total
+            step = 1.0 / (self.bodies.share(one.bodies) or 1.0) if one.bodies else 1.0
+            mass = sum(change[0] for change in one.bodies.values())
+            of = [weighed(one, [part[row] for part in rates], k * step) for k in (0.0, 1.0, 2.0)]
+            slope = (4.0 * of[1] - of[2] - 3.0 * of[0]) / (2.0 * step)
+            found[row, rows] = (slope - mass * of[0] / total) / total
         return found
 
 

@@ -118,9 +118,9 @@ class Sensitivity:
         named = {name: value for key, value in given.items() for name in self.parameters.find(key)}
         if not named:
             raise InputError("direction is empty, expected {parameter: change}")
-        several = [self.parameters[name] for name in named]
-        matrices = self._slopes.over(several, np.array([*named.values()]))
-        return Slope(" + ".join(given), "1", 0.0, *(x[0] for x in matrices))
+        matrices = self._slopes.over([self.parameters[name] for name in named])
+        weights = [*named.values()]
+        return Slope(" + ".join(given), "1", 0.0, *(np.tensordot(weights, x, 1) for x in matrices))
 
     @cached_property
     def _all(self) -> tuple[Array, ...]:
@@ -198,7 +198,24 @@ class Sensitivity:
 
     def table(self, top: int = 15) -> str:
         """Return the `top` rows of what 10 % of a parameter changes, or 1 cm, the most first."""
-        return _table(self, whole("top", top, 1))
+        lin, sizes = self.lin, [max(np.abs(x).max(), 1e-300) for x in (self.lin.A, self.lin.B)]
+        rows = []
+        for one, dA, dB in zip(self.parameters.values(), self.dA, self.dB, strict=True):
+            small = one.part.partition(".")[0] in ("com", "position")
+            step = 0.01 if small else 0.1 * (abs(one.value) or float(one.part[:9] == "direction"))
+            effect = [
+                step * np.abs(d).max() / size for d, size in zip((dA, dB), sizes, strict=True)
+            ]
+            if max(effect) > 0.0:
+                change = f"{step:.3g} {one.unit}"
+                rows.append((max(effect), one.name, f"{one.value:.5g}", change, *effect))
+        rows.sort(key=lambda row: -row[0])
+        most = [
+            (*row[1:4], *(f"{100.0 * x:.2g} %" for x in row[4:]))
+            for row in rows[: whole("top", top, 1)]
+        ]
+        title = f"{lin.robot}: what changes A and B most, to first order, of the largest entry"
+        return f"{title}\n" + grid([("parameter", "is", "changed by", "A", "B"), *most], "lrrrr")
 
     def save(self, path: str | Path) -> None:
         """Write the derivatives to a .npz, .mat or .json file, whole or not at all.
@@ -260,19 +277,3 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
         raise InputError("the model is sampled from one that is not known; make it by discretize")
     lin.require_unchanged()
     return Sensitivity(lin, Parameters(robot), ModelSlopes.of(lin, robot, source))
-
-
-def _table(found: Sensitivity, top: int) -> str:
-    lin, sizes = found.lin, [max(np.abs(x).max(), 1e-300) for x in (found.lin.A, found.lin.B)]
-    rows = []
-    for one, dA, dB in zip(found.parameters.values(), found.dA, found.dB, strict=True):
-        small = one.part.partition(".")[0] in ("com", "position")
-        step = 0.01 if small else 0.1 * (abs(one.value) or float(one.part[:9] == "direction"))
-        effect = [step * np.abs(d).max() / size for d, size in zip((dA, dB), sizes, strict=True)]
-        if max(effect) > 0.0:
-            change = f"{step:.3g} {one.unit}"
-            rows.append((max(effect), one.name, f"{one.value:.5g}", change, *effect))
-    rows.sort(key=lambda row: -row[0])
-    most = [(*row[1:4], *(f"{100.0 * x:.2g} %" for x in row[4:])) for row in rows[:top]]
-    title = f"{lin.robot}: what changes A and B most, to first order, of the largest entry"
-    return f"{title}\n" + grid([("parameter", "is", "changed by", "A", "B"), *most], "lrrrr")
