@@ -16,7 +16,6 @@ from fflin.commands.arguments import (
     add_robot,
     add_system,
     command,
-    file_name,
     number,
 )
 from fflin.commands.points import linear_model, load_robot, once, placed
@@ -48,9 +47,7 @@ def add_commands(commands: Commands) -> None:
     )
     add_point(modes)
     add_figure(modes, "draw frequencies, damping and shapes")
-    modes.add_argument(
-        "--html", metavar="FILE", type=file_name, help="write a page that plays the mode shapes"
-    )
+    add_options(modes, "--html FILE: write a page that plays the mode shapes")
     validity = command(
         commands,
         "validity",
@@ -60,29 +57,19 @@ def add_commands(commands: Commands) -> None:
     )
     add_point(validity)
     add_weights(validity)
-    for name, metavar, read, default, what in (
-        ("attitude", "X", number, 90.0, "largest turn of the base [deg]"),
-        ("offset", "X", number, 0.5, "largest displacement of the base [m]"),
-        ("spread", "X", number, 1.0, "largest displacement of a joint [rad|m]"),
-        ("samples", "N", int, 100, "random runs"),
-        ("seed", "N", int, 0, "seed of the random runs"),
-        ("jobs", "N", int, 1, "processes, at most one for each core"),
-    ):
-        help = f"{what}; {default:g} by default"
-        validity.add_argument(f"--{name}", metavar=metavar, type=read, default=default, help=help)
-    validity.add_argument(
-        "--limits",
-        choices=("urdf", "none"),
-        default="none",
-        help="cut the inputs to the limits of the robot, or not (default)",
+    add_options(
+        validity,
+        """
+        --attitude X = 90: largest turn of the base [deg]; 90 by default
+        --offset X = 0.5: largest displacement of the base [m]; 0.5 by default
+        --spread X = 1: largest displacement of a joint [rad|m]; 1 by default
+        --samples N = 100: random runs; 100 by default
+        --seed S = 0: seed of the random runs; 0 by default
+        --jobs N = 1: processes, at most one for each core; 1 by default
+        --limits urdf|none = none: cut the inputs to the limits of the robot, or not (default)""",
     )
-    validity.add_argument(
-        "--frames",
-        nargs="+",
-        choices=("hybrid", "local", "world"),
-        default=(),
-        help="feed rates and inputs of the base back in the axes of these frames too",
-    )
+    frames = "--frames hybrid|local|world: feed the base's rates and inputs back in these axes too"
+    add_options(validity, frames, nargs="+", default=())
     add_figure(validity, "draw it")
     sensitivity = command(
         *(commands, "sensitivity", _sensitivity),
@@ -186,8 +173,6 @@ def _validity(arguments: argparse.Namespace) -> int:
     from fflin.batch.workers import OwnWorkers
     from fflin.campaign.validity import validity
 
-    if arguments.jobs < 1:
-        raise InputError(f"--jobs is {arguments.jobs}, expected at least 1")
     robot, lin = linear_model(arguments)
     check_figure(arguments.plot)
     lin = regulated_part(lin, arguments)

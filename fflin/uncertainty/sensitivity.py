@@ -16,14 +16,13 @@ from fflin.base.record import write_record
 from fflin.base.tables import grid
 from fflin.base.validation import Array, as_double, numbers, whole
 from fflin.base.writing import as_path
+from fflin.linear.files import record_of
 from fflin.linear.model import LinearModel
 from fflin.uncertainty.model_slopes import ModelSlopes, difference
 from fflin.uncertainty.parameters import Parameter, Parameters
 
 # Poles closer than this, relative to the largest, have no derivative of their own.
 _EQUAL = 1e-6
-
-_NAMED = [f"{of}_{what}" for of in ("state", "input", "output") for what in ("names", "units")]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -220,26 +219,22 @@ class Sensitivity:
     def save(self, path: str | Path) -> None:
         """Write the derivatives to a .npz, .mat or .json file, whole or not at all.
 
-        Keys are parameters, units and values (P,); dA (P, nx, nx), dB (P, nx, nu), dC, dD, df0 and
-        dy0; what is derived, A .. y0; and names, units and point as in files of models.
+        Besides the model's own keys parameters, units and values (P,), dA (P, nx, nx),
+        dB (P, nx, nu), dC, dD, df0 and dy0.
 
         Raises
         ------
         FileError
             If the ending is another or the file cannot be written.
         """
-        lin, every = self.lin, self.parameters.values()
-        record: dict[str, Any] = {
-            "kind": "Sensitivity",
+        every = self.parameters.values()
+        record = record_of(self.lin) | {
             "parameters": list(self.names),
             "units": [one.unit for one in every],
             "values": np.array([one.value for one in every]),
             **dict(zip(("dA", "dB", "dC", "dD", "df0", "dy0"), self._all, strict=True)),
         }
-        for key in (*"ABCD", "f0", "y0", "x0", "u0", "q", "v", *_NAMED, "frame", "robot", "dt"):
-            value = getattr(lin, key)
-            record[key] = list(value) if isinstance(value, tuple) else value
-        write_record(as_path(path), record, sealed=lin.verified)
+        write_record(as_path(path), record, sealed=self.lin.verified)
 
 
 def sensitivity(lin: LinearModel) -> Sensitivity:
