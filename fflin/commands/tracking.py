@@ -63,20 +63,16 @@ def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> L
     from fflin.linear.linear_trajectory import linearize_trajectory
     from fflin.linear.trajectory import Trajectory
 
-    for name in ("joint", "velocity", "effort", "equilibrium"):
-        if getattr(arguments, name, None):
+    for name in ("joint", "velocity", "effort", "equilibrium", "rpy", "position"):
+        given = getattr(arguments, name, None)
+        if given is True or any(given or ()):
             raise InputError(f"--{name} says a point and --trajectory a motion; give either")
-    if any(getattr(arguments, "rpy", None) or ()) or any(
-        getattr(arguments, "position", None) or ()
-    ):
-        raise InputError("--rpy and --position say a point and --trajectory a motion; give either")
     robot, options = (
         robot or load_robot(arguments),
         {"hold": arguments.hold, "frame": arguments.frame},
     )
-    return linearize_trajectory(
-        robot, Trajectory.load(arguments.trajectory, robot, **options), strict=arguments.strict
-    )
+    motion = Trajectory.load(arguments.trajectory, robot, **options)
+    return linearize_trajectory(robot, motion, strict=arguments.strict)
 
 
 def linearize_along(arguments: argparse.Namespace) -> int:

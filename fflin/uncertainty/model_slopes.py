@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -12,14 +13,14 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.chart import Chart, Standing
+from fflin.dynamics.chart import Standing
 from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.rnea import Accelerations, Rates
 from fflin.dynamics.state import StateMap
 from fflin.linear.certificate import aba_route
 from fflin.linear.model import LinearModel
 from fflin.linear.output_equations import output_equations
-from fflin.linear.prepared import Prepared, own_reference, prepare
+from fflin.linear.prepared import own_reference, prepare
 from fflin.linear.sampling import held_exponential, held_slopes
 from fflin.linear.state_equations import assemble
 from fflin.robot.outputs import CenterOfMass, Momentum
@@ -35,36 +36,27 @@ _STEP = 2e-3
 _LEAST = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
 class ModelSlopes:
-    """Derivatives of the matrices of a model that is continuous, or sampled from one."""
+    """Derivatives of the matrices of a model that is, or is sampled from, `source`."""
 
-    lin: LinearModel
-    robot: Robot
-    _source: LinearModel
-    _ready: Prepared
-    _chart: Chart
-    _rates: Rates
-    _u: Array
-    bodies: BodySlopes
-
-    @classmethod
-    def of(cls, lin: LinearModel, robot: Robot, source: LinearModel) -> ModelSlopes:
-        """Prepare the slopes of a model that is, or is sampled from, `source`."""
+    def __init__(self, lin: LinearModel, robot: Robot, source: LinearModel) -> None:
+        self.lin, self.robot, self._source = lin, robot, source
         own = lin.moving or bool(np.array_equal(lin.placement, own_reference(robot, lin.q)))
-        reference = None if own else lin.reference
-        ready = prepare(robot, frame=lin.frame, reference=reference, moving=lin.moving)
+        self._how: Any = {"frame": lin.frame, "moving": lin.moving}
+        self._how["reference"] = None if own else lin.reference
+        ready = self._ready = prepare(robot, **self._how)
         state, data = ready.map, robot.create_data()
-        chart = Standing() if ready.own_reference else state.chart(lin.q)
-        u = ready.actuation.in_base_axes(chart, lin.u0)
+        self._chart = Standing() if own else state.chart(lin.q)
+        self._u = ready.actuation.in_base_axes(self._chart, lin.u0)
         nu, q_m = state.velocities(lin.v), state.joint_positions(lin.q)
-        rates = Accelerations(state, ready.actuation, data).rates(lin.q, lin.v, nu, q_m, u)
+        self._rates = Accelerations(state, ready.actuation, data).rates(
+            lin.q, lin.v, nu, q_m, self._u
+        )
         inverse = np.empty((len(nu), len(nu)))
         still = lin.q.copy()
         still[:3] = 0.0
         Inertia(state, data).invert(still, inverse)
-        bodies = BodySlopes(ready, rates, lin.q, lin.v, inverse)
-        return cls(lin, robot, source, ready, chart, rates, u, bodies)
+        self.bodies = BodySlopes(ready, self._rates, lin.q, lin.v, inverse)
 
     @cached_property
     def _of_bodies(self) -> Rates:
@@ -105,8 +97,7 @@ class ModelSlopes:
         if not rows:
             return found
         other = replace(self.robot, model=self.robot.model.copy())
-        reference = None if self._ready.own_reference else lin.reference
-        ready = prepare(other, frame=lin.frame, reference=reference, moving=lin.moving)
+        ready = prepare(other, **self._how)
         data, point = other.create_data(), (lin.q, lin.v, ready.map.velocities(lin.v), self._u)
 
         def weighed(one: Parameter, by: Sequence[Array], size: float) -> Array:

@@ -271,4 +271,4 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
     if source is None:
         raise InputError("the model is sampled from one that is not known; make it by discretize")
     lin.require_unchanged()
-    return Sensitivity(lin, Parameters(robot), ModelSlopes.of(lin, robot, source))
+    return Sensitivity(lin, Parameters(robot), ModelSlopes(lin, robot, source))

@@ -15,10 +15,8 @@ _LOOK, _CLOSER = 120, 12
 
 
 def scaled(Z: Array) -> tuple[Array, Array]:
-    """Return d Z / d (.., n, n) of the d > 0 that are best for |Z|, and its largest gains (..).
-
-    These are bounds for any deltas, each on a signal of its own: Perron's vectors of abs(Z).
-    """
+    """Return d Z / d (.., n, n) of the d > 0 that are best for |Z|, and its largest gains (..)."""
+    # By Perron's vectors of |Z|; the gains are bounds for deltas on a signal each.
     sizes = np.abs(Z) + 1e-9 * np.abs(Z).max(axis=(-2, -1), keepdims=True) + 1e-300
     right, left = np.ones((2, *Z.shape[:-1], 1))
     for _ in range(100):
@@ -32,14 +30,9 @@ def scaled(Z: Array) -> tuple[Array, Array]:
 def largest_bound(
     response: Callable[[Array], Array], end: Array, rates: Array, blocks: Array
 ) -> float:
-    """Return the largest bound of Z (.., n, n) = response(w (..)), over a grid of frequencies.
-
-    `end` is Z at frequencies without end, the grid holds and goes beyond the rates of the loop, and
-    blocks are how often each delta stands.
-    """
+    """Return the largest bound of Z = response(w), `end` at infinity, for a loop of such rates."""
     grid = np.geomspace(0.01 * rates.min(), 100.0 * rates.max(), _LOOK)
-    grid = np.unique(np.concatenate(((0.0,), grid, rates)))
-    largest = 0.0
+    grid, largest = np.unique(np.concatenate(((0.0,), grid, rates))), 0.0
     for closer in range(3):
         Z = response(grid)
         Z, bounds = scaled(Z if closer else np.concatenate((Z, end[None])))
@@ -49,21 +42,19 @@ def largest_bound(
             bounds[at] = min(bounds[at], _by_slycot(Z[at], blocks))
             largest = max(largest, float(bounds[at]))
         at = int(bounds[: len(grid)].argmax())
-        ends = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]
-        grid = np.linspace(*ends, _CLOSER)
+        grid = np.linspace(grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)], _CLOSER)
     return largest
 
 
 def _by_slycot(Z: Array, blocks: Array) -> float:
     """Return the bound of AB13MD: a delta on one signal is real, a repeated one a full block."""
-    if len(Z) > _SIGNALS:
-        return np.inf
     try:
         from slycot import ab13md
         from slycot.exceptions import SlycotArithmeticError
     except ImportError:
         return np.inf
     try:
-        return float(ab13md(Z, blocks, np.where(blocks == 1, 1, 2))[0])
+        kinds = np.where(blocks == 1, 1, 2)
+        return float(ab13md(Z, blocks, kinds)[0]) if len(Z) <= _SIGNALS else np.inf
     except SlycotArithmeticError:
         return np.inf

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import islice, product
 from operator import itemgetter
 from typing import Any, NamedTuple, TypeAlias
@@ -26,7 +25,7 @@ _STARTS, _STEPS, _LENGTHS = 3, 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-
 # Loops held exactly in a step, and frequencies at which the others are judged.
 _HELD, _FREQUENCIES, _DIFFERENCE = 3, 6, 1e-6
 
-Makes: TypeAlias = Callable[[Array], bool]  # whether deltas make a robot
+Figure: TypeAlias = Callable[[Array], Array]  # how bad loops are, of rows of deltas
 
 
 @dataclass(frozen=True)
@@ -108,8 +107,8 @@ def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
     disk = Gain(-scale[:, None] * K, 0.5 * np.eye(len(K)), 1.0 / scale)
     whole = Gain(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))
     found, bar = [], Progress()
-    for search in (loops.least_damped, partial(loops.largest, disk), partial(loops.largest, whole)):
-        value, delta = search(tried, of.makes)
+    for figures in ((loops.undamped,) * 2, loops.figures(disk), loops.figures(whole)):
+        value, delta = _largest(*figures, tried, of.makes)
         found.append(Found(value, of.values(delta)))
         bar.update(len(found), 4)
     safe = _safe(loops)
@@ -162,53 +161,46 @@ class Loops:
             found = np.maximum(found, np.linalg.eigvalsh(gram)[..., -1])
         return np.where(self.undamped(rows) >= 0.0, np.inf, np.sqrt(found))
 
-    def least_damped(self, tried: Array, makes: Makes) -> tuple[float, Array]:
-        """Return the largest `undamped` that is found from what was tried, and its deltas."""
-        return _largest(self.undamped, lambda delta: self.undamped(delta[None])[0], tried, makes)
-
-    def largest(self, of: Gain, tried: Array, makes: Makes) -> tuple[float, Array]:
-        """Return the largest gain that is found from what was tried, and its deltas."""
-        middle = np.zeros((1, tried.shape[1]))
+    def figures(self, of: Gain) -> tuple[Figure, Figure]:
+        """Return what judges gains of many loops by a few frequencies, and of one by all."""
+        middle = np.zeros((1, len(self.lft.repeats)))
         sizes = np.unique(np.abs(np.linalg.eigvals(self.matrices(middle)[0])))
         at = np.argsort([-self.gains(of, middle, np.array((w,)))[0] for w in sizes])
         peaks = [0.0, *sizes[at[:_FREQUENCIES]]]
 
-        def exact(delta: Array) -> float:
-            F, B = self.matrices(delta)
+        def exact(row: Array) -> Array:
+            F, B = (each[0] for each in self.matrices(row))
             if np.linalg.eigvals(F).real.max() >= 0.0:
-                return np.inf
+                return np.array((np.inf,))
             value, w = largest_gain(F, B * of.scale, of.C, of.D)
             peaks.append(min(w, 1e300))  # where others like it have theirs
-            return value
+            return np.array((value,))
 
-        def quick(rows: Array) -> Array:
-            return self.gains(of, rows, np.unique(peaks[-_FREQUENCIES:]))
-
-        return _largest(quick, exact, tried, makes)
+        return lambda rows: self.gains(of, rows, np.unique(peaks[-_FREQUENCIES:])), exact
 
 
 def _largest(
-    quick: Callable[[Array], Array], exact: Callable[[Array], float], tried: Array, makes: Makes
+    quick: Figure, exact: Figure, tried: Array, makes: Callable[[Array], bool]
 ) -> tuple[float, Array]:
     """Climb a figure from the worst that was tried, along its slope and one delta at a time."""
     best, at, unit = -np.inf, tried[0], np.eye(tried.shape[1])
     for start in tried[np.argsort(-quick(tried))[:_STARTS]]:
-        value, delta = exact(start), start
-        for _ in range(_STEPS if np.isfinite(value) else 0):
+        value, delta = exact(start[None])[0], start
+        for _ in range(_STEPS):
+            if not np.isfinite(value):
+                break
             around = quick(np.vstack((delta + _DIFFERENCE * unit, delta)))
             slope = np.nan_to_num(around[:-1] - around[-1], posinf=1.0)
             steps = _LENGTHS[:, None] * slope / max(np.abs(slope).max(), 1e-300)
             alone = [np.where(unit, end, delta) for end in (-1.0, 1.0)]
             trials = np.vstack((np.clip(delta + steps, -1.0, 1.0), *alone))
             held = islice(filter(makes, trials[np.argsort(-quick(trials))]), _HELD)
-            ahead, highest = max(
-                ((exact(x), x) for x in held), key=itemgetter(0), default=(value, delta)
+            ahead = max(
+                ((exact(x[None])[0], x) for x in held), key=itemgetter(0), default=(value, delta)
             )
-            if not ahead > value + 1e-9 * abs(value):
+            if not ahead[0] > value + 1e-9 * abs(value):
                 break
-            value, delta = ahead, highest
-            if not np.isfinite(value):
-                break
+            value, delta = ahead
         if value > best:
             best, at = value, delta
     return best, at

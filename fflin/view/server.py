@@ -23,26 +23,8 @@ _HOST = "127.0.0.1"
 class Server:
     """Serves a page and keeps it up to date; it ends with its process.
 
-    Parameters
-    ----------
-    page : str
-        HTML that connects to ``/socket``.
-    scene : callable
-        Returns the messages that build the scene for a browser that has just come.
-    asked : callable
-        Given what a browser sends, a JSON value.
-    port : int
-        0 for one that is free.
-
-    Attributes
-    ----------
-    url : str
-    port : int
-
-    Raises
-    ------
-    InputError
-        If the port is taken.
+    `scene` returns the messages that build it for a browser that has just come, `asked` is given
+    what one sends. Port 0 is one that is free; `InputError` where it is taken.
     """
 
     def __init__(
