@@ -67,7 +67,7 @@ class Sensitivity:
     - ``LINK.com.x`` [m] in the link's axes, mass and inertia about it held;
     - ``LINK.inertia.xx`` .. ``.yz`` [kg m^2] about the centre of mass, in the axes of the URDF's
       <inertial>; of a body, in its joint's;
-    - ``LINK.density``, of the whole link, relative;
+    - ``LINK.density``, of the whole link, relative; ``BODY.mass`` of `monte_carlo` is one too;
 
     and ``JOINT.stiffness``, ``JOINT.damping``, ``THRUSTER.position.x`` [m],
     ``THRUSTER.direction.x`` (what of it turns the unit vector) and ``WHEEL.inertia``, which the

@@ -180,7 +180,8 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     ----------
     robot : Robot
     ranges : mapping
-        {parameter: range}, the parameters those of `sensitivity`, or patterns. A number is a
+        {parameter: range}, the parameters those of `sensitivity`, or patterns; ``BODY.mass`` of
+        `monte_carlo` is a ``density`` here. A number is a
         relative half width, 0.2 for 20 %; a pair the least and the largest value. ``{link:
         {"mass": .., "inertia.xx": ..}}`` says several of a link.
 
