@@ -28,7 +28,7 @@ from fflin.robot.robot import Robot
 from fflin.uncertainty.parameters import Parameter
 from fflin.uncertainty.rate_slopes import BodySlopes, slopes_of
 
-_WEIGH = (CenterOfMass, Momentum)
+WEIGH = (CenterOfMass, Momentum)
 
 # Of a difference over a parameter, relative to what M has of it.
 _STEP = 2e-3
@@ -42,6 +42,7 @@ class ModelSlopes:
     def __init__(self, lin: LinearModel, robot: Robot, source: LinearModel) -> None:
         self.lin, self.robot, self._source = lin, robot, source
         own = lin.moving or bool(np.array_equal(lin.placement, own_reference(robot, lin.q)))
+        own = own and robot.orbit is None
         self._how: Any = {"frame": lin.frame, "moving": lin.moving}
         self._how["reference"] = None if own else lin.reference
         ready = self._ready = prepare(robot, **self._how)
@@ -92,7 +93,7 @@ class ModelSlopes:
         # linear in it: of three values the slope is exact, whatever the step.
         lin, now = self.lin, self._rates
         found = np.zeros((len(parameters), len(lin.C), lin.C.shape[1] + lin.D.shape[1] + 1))
-        outputs = (o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in _WEIGH)
+        outputs = (o for o in self.robot.outputs if o.FEELS_ACCELERATION or type(o) in WEIGH)
         rows = [lin.output_names.index(name) for o in outputs for name, _ in o.signals]
         if not rows:
             return found

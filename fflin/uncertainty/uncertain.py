@@ -19,6 +19,7 @@ from fflin.robot.link_masses import Piece
 from fflin.robot.robot import Robot
 from fflin.uncertainty.fraction import Range, fraction
 from fflin.uncertainty.lft import LFT
+from fflin.uncertainty.model_slopes import WEIGH
 from fflin.uncertainty.parameters import Parameter
 from fflin.uncertainty.variants import Variants
 from fflin.uncertainty.worst import Worst, searched
@@ -70,15 +71,17 @@ class Uncertain:
         Raises
         ------
         InputError
-            If the point is no fixed point whatever the parameters: springs out of rest, gravity,
-            stored momentum; or if an output feels accelerations or masses.
+            If the point is no fixed point whatever the parameters: springs out of rest, gravity, an
+            orbit, stored momentum; or if an output feels accelerations or masses.
         """
         robot = self.robot
         lin = linearize(robot, q)
         rest = robot.springs.rest - StateMap(robot).joint_positions(lin.q)
         pulled = [rest[each.parameter.spring] for each in self.ranges if each.parameter.spring >= 0]
-        if lin.f0.any() or any(pulled) or any(robot.gravity) or robot.stored_momentum:
+        pulled += [lin.f0.any(), *robot.gravity, robot.orbit, robot.stored_momentum]
+        if any(pulled):
             pulls = "gravity" if any(robot.gravity) else "a spring out of its rest"
+            pulls = "the field of an orbit" if robot.orbit else pulls
             raise InputError(
                 "the point is no fixed point whatever the parameters: there is "
                 f"{'stored momentum' if robot.stored_momentum else pulls}; take a point at rest "
@@ -256,8 +259,9 @@ def _range(one: Parameter, value: Any) -> Range:
 
 def _lft(of: Uncertain, lin: Any) -> LFT:
     ready = prepare(of.robot, frame=lin.frame, reference=None, moving=False)
-    if ready.sensing is not None and (lin.D.any() or ready.sensing.needs_acceleration):
-        raise InputError("an output feels accelerations; leave it out with robot.replace(outputs=)")
+    if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in of.robot.outputs):
+        feels = "an output feels accelerations or weighs the robot"
+        raise InputError(f"{feels}; leave it out with robot.replace(outputs=)")
     form = fraction(ready.map, ready.actuation, lin.q, of._variants.pieces, of.ranges)
     nv, nw = len(lin.A) // 2, len(form.z[0])
     x, w, u = form.a

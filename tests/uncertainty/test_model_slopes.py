@@ -7,7 +7,8 @@ from scipy.linalg import expm
 
 import fflin
 from tests.support.complex_crba import motions, spatial
-from tests.support.robots import BUNDLED, random_point
+from tests.support.orbits import in_orbit
+from tests.support.robots import BUNDLED, random_point, random_pose
 from tests.uncertainty.test_sensitivity import H, changed, everything, fourth_order
 
 WEIGHED = [fflin.CenterOfMass(), fflin.FramePose("base"), fflin.Momentum()]
@@ -155,3 +156,22 @@ def test_of_a_link_without_mass_nothing_is_weighed():
     S = fflin.sensitivity(fflin.linearize(robot, q, v))
     # The wheel's spin is relative to its carrier, which has lost what the wheel has.
     assert S["w.inertia"].dy0 == pytest.approx([0.0, 0.0, 50.0, 0.0, 0.0, 0.0], rel=1e-10)
+
+
+def test_outputs_that_weigh_in_orbit_as_by_differences():
+    robot = in_orbit(fflin.load("servicer_7dof")).replace(outputs=WEIGHED[:1])
+    rng = np.random.default_rng(10)
+    q = fflin.configuration(robot, {"joint_2": 0.4, "joint_5": -0.8}, random_pose(rng, 60.0))
+    v = 0.2 * rng.normal(size=robot.nv)
+    S = fflin.sensitivity(fflin.linearize(robot, q, v, frame="lvlh"))
+    for name in ("link_3.mass", "base.com.y"):
+        one = S.parameters[name]
+        step = 2e-3 / S._slopes.bodies.share(one.bodies)
+        for at, got in ((2, S[name].dC), (5, S[name].dy0)):
+
+            def of(size, one=one, at=at):
+                other = changed(robot, one.bodies, size)
+                return everything(fflin.linearize(other, q, v, frame="lvlh"))[at]
+
+            expected = fourth_order(of, step)
+            assert np.abs(got - expected).max() < 1e-7 * np.abs(expected).max() + 1e-9

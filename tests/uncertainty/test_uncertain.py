@@ -209,3 +209,10 @@ def test_stored_momentum_is_no_fixed_point():
     robot = fflin.load("cubesat", inputs=[wheel])
     with pytest.raises(fflin.InputError, match="stored momentum; take a point at rest"):
         fflin.uncertain(robot, {"base.mass": 0.1}).lft()
+
+
+@pytest.mark.parametrize("output", [fflin.CenterOfMass(), fflin.Momentum()])
+def test_an_output_that_weighs_the_robot_is_no_fraction(output):
+    robot = fflin.load("cubesat", outputs=[output])
+    with pytest.raises(fflin.InputError, match="weighs the robot; leave it out"):
+        fflin.uncertain(robot, {"base.mass": 0.1}).lft()
