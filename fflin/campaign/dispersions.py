@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -24,6 +24,7 @@ from fflin.dynamics.state import StateMap
 from fflin.kernel.accelerations import loads_of
 from fflin.kernel.tree import Tree
 from fflin.robot.frames import ROOT
+from fflin.robot.link_masses import pieces_of, with_share
 from fflin.robot.mass_properties import stretched, with_inertias
 from fflin.simulation.plant import Drives, Plant
 from fflin.simulation.times import Times
@@ -33,7 +34,7 @@ _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz"}  # with their axes
 _AXES = _OF_BODIES | {"misalignment": "12"}
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
 _OF_SENSORS = ("sensor", "noise")
-_FACTORS = ("mass", "inertia", *_OF_SPRINGS)
+_FACTORS = ("mass", "inertia", "density", *_OF_SPRINGS)
 
 
 class Column(NamedTuple):
@@ -62,6 +63,7 @@ class Dispersions:
         self._times = times
         self._model = plant.robot._bare.model
         bodies = ["base", *list(self._model.names)[ROOT + 1 :]]
+        self._links = {n: each for n, each in pieces_of(plant.robot)[0].items() if not each.whole}
         self._sensors: tuple[str, ...] = ()
         if isinstance(policy, StateFeedback | LinearController):
             lin = policy.lin
@@ -73,6 +75,7 @@ class Dispersions:
             "state": plant.state.names,
             **dict.fromkeys(_OF_SENSORS, self._sensors),
             **dict.fromkeys(_OF_BODIES, bodies),
+            "density": tuple(self._links),
             **dict.fromkeys((*_OF_INPUTS, "misalignment"), input_keys(plant.actuation)),
             **dict.fromkeys(_OF_SPRINGS, plant.robot.joint_names),
         }
@@ -97,6 +100,10 @@ class Dispersions:
         if not self.columns:
             raise InputError("dispersions is empty; give at least one, such as {'q_b': 0.05}")
         self._kinds = {column.kind for column in self.columns}
+        heavier = {each.at[0] + ROOT: each.name for each in self.columns if each.kind == "mass"}
+        for name, at in self._densities():
+            if at in heavier:
+                raise InputError(f"'{heavier[at]}' and '{name}' both change a mass; give either")
 
     def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
         if kind in _OF_SENSORS and not names:
@@ -178,12 +185,25 @@ class Dispersions:
         x = self._x0 + self._of("state", drawn, len(self._x0))[..., 0]
         return self._plant.state.points(x)[1:]
 
+    def _densities(self) -> Iterator[tuple[str, int]]:
+        """Yield the densities that are drawn, and the joint of each without wheels."""
+        names, joints = list(self._links), self._plant.robot.model.names
+        for column in self.columns:
+            if column.kind == "density":
+                at = self._links[names[column.at[0]]].joint
+                yield column.name, self._model.getJointId(joints[at]) if at > ROOT else ROOT
+
     def bodies(self, drawn: Array) -> dict[int, tuple[Array, Array, Array]]:
         """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of bodies that are drawn."""
         size, found = self._model.njoints - ROOT, {}
         of = [self._of(kind, drawn, size, len(axes)) for kind, axes in _OF_BODIES.items()]
         for at in sorted({each.at[0] for each in self.columns if each.kind in _OF_BODIES}):
             found[ROOT + at] = stretched(self._model.inertias[ROOT + at], *(x[:, at] for x in of))
+        names = self.names
+        for name, at in self._densities():
+            one, none = self._links[name.removesuffix(".density")], np.zeros((len(drawn), 3))
+            body = found.get(at) or stretched(self._model.inertias[at], none[:, :1], none, none)
+            found[at] = with_share(body, one, drawn[:, names.index(name)])
         return found
 
     def _springs(self, kind: str, drawn: Array) -> Array:
@@ -218,7 +238,7 @@ class Dispersions:
         """Return what differs from run to run, as the compiled loop takes it."""
         plant, (q, v) = self._plant, self.starts(drawn)
         runs = {"q": q, "nu": plant.state.velocities(v), **self._drives(drawn)._asdict()}
-        if self._kinds & {*_OF_BODIES}:
+        if self._kinds & {*_OF_BODIES, "density"}:
             parameters = np.tile(tree.bodies.reshape(1, -1, 10), (len(drawn), 1, 1))
             for at, body in self.bodies(drawn).items():
                 # In the tree wheels stand between the joints.

@@ -85,6 +85,9 @@ def monte_carlo(
           as in `Robot.perturbed`: the mass is multiplied by 1 + d and the inertia with it, each
           second moment per mass along the axes of its frame by 1 + d, and the centre of mass is
           shifted by d times the radius of gyration. The pseudo-inertia stays positive;
+        - ``LINK.density``, relative, of a link by its name in the URDF, also of one fixed to
+          another: all of its mass and inertia are multiplied by 1 + d, as in `sensitivity` and
+          `uncertain`, whose ``LINK.mass`` holds the inertia;
         - ``INPUT.gain``, relative, and ``INPUT.bias`` [N m|N]: (1 + d) u + b acts of a command u;
           ``INPUT.fails`` [s]: nothing acts of it from that time on. Inputs that are recorded are
           the commands, also of what has failed;

@@ -21,7 +21,7 @@ TASKS = {
     "look at robots": {"robots": "models", "info": "models", "init": "init", "view": "visual"},
     "make and check a linear model": {"linearize": "models", "check": "models"},
     "judge it": {
-        **dict.fromkeys(("analyze", "modes", "validity"), "analysis"),
+        **dict.fromkeys(("analyze", "modes", "validity", "sensitivity", "uncertain"), "analysis"),
         "funnel": "funnels",
     },
     "close the loop": {"lqr": "regulator", "tvlqr": "tracking", "simulate": "simulation"},
