@@ -41,6 +41,7 @@ from fflin.linear.linearization import Linearizer as Linearizer
 from fflin.linear.model import LinearModel as LinearModel
 from fflin.linear.model import Certificate as Certificate
 from fflin.dynamics.state import StateMap as StateMap
+from fflin.linear.nonlinear import outputs as outputs
 from fflin.linear.equilibrium import equilibrium as equilibrium
 from fflin.linear.equilibrium import Equilibrium as Equilibrium
 from fflin.linear.trajectory import Trajectory as Trajectory
@@ -95,6 +96,7 @@ from fflin.control.policies import StateFeedback as StateFeedback
 from fflin.control.tracking import TrajectoryFeedback as TrajectoryFeedback
 from fflin.control.policies import Allocation as Allocation
 from fflin.control.output_feedback import OutputFeedback as OutputFeedback
+from fflin.control.linear_controller import LinearController as LinearController
 from fflin.control.output_feedback import TrajectoryOutputFeedback as TrajectoryOutputFeedback
 from fflin.batch.gains import ScheduledFeedback as ScheduledFeedback
 

@@ -102,12 +102,14 @@ OPTIONS = {
     "check": ("--stiffness", "--damping", "--rpy", "--position"),
     "lqr": ("--dt", "--stiffness"),
     "modes": ("--stiffness", "--damping"),
+    "sensitivity": ("--dt", "--top"),
+    "uncertain": ("--vary",),
     "simulate": ("--duration", "--step", "--delay", "--limit", "--rpy", "--q", "--dt"),
     "sweep": ("--random", "--seed", "--grid", "--range"),
     "montecarlo": ("--runs", "--seed", "--width", "--confidence", "--worst", "--duration"),
 }
 NAMED = {"--limit": "tau_m=", "--q": "q_b=", "--r": "tau_b=", "--range": "joint_1=0:"}
-NAMED |= {"--grid": "joint_1=0:1:"}
+NAMED |= {"--grid": "joint_1=0:1:", "--vary": "base.mass="}
 SOUND = {"simulate": ["--duration", "0.02"], "sweep": ["--random", "2"]}
 SOUND["montecarlo"] = ["--runs", "2", "--duration", "0.02", "uncertain.toml"]
 

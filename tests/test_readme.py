@@ -33,6 +33,21 @@ def test_python_examples_run(tmp_path, page):
     assert "undecided" not in done.stderr
 
 
+def test_the_page_on_controllers_runs(tmp_path):
+    """Its robot, its code, and the command that flies the file that this leaves."""
+    pytest.importorskip("slycot")
+    text = (ROOT / "docs" / "controllers.md").read_text(encoding="utf-8")
+    (toml,), (line,) = code_blocks("toml", text), code_blocks("sh", text)
+    (tmp_path / "stowed.toml").write_text(toml)
+    (tmp_path / "example.py").write_text("\n".join(code_blocks("python", text)))
+    for command in (["-W", "error::UserWarning", "example.py"], ["-m", *shlex.split(line)]):
+        done = subprocess.run(
+            [sys.executable, *command], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+    assert "settled" in done.stdout and (tmp_path / "hinf.html").exists()
+
+
 def test_inputs_of_the_guide_are_read(tmp_path):
     text = (ROOT / "docs" / "guide.md").read_text(encoding="utf-8")
     block, whole, _ = code_blocks("toml", text)

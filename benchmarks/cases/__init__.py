@@ -10,6 +10,7 @@ ORDER = (
     "batch",
     "batch_at_points",
     "lqr",
+    "sensitivity",
     "simulation_step",
     "trajectory",
     "loops",

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -14,14 +15,16 @@ from fflin.base.names import by_name, input_keys
 from fflin.base.validation import Array
 from fflin.base.validation import by_name as mapping
 from fflin.campaign.pointing import columns_of, in_lanes, misaligned, require_direction
-from fflin.campaign.sensing import Designed, Misled, noise_of
+from fflin.campaign.sensing import Bound, misled, noise_of
 from fflin.campaign.spreads import SEED, deviation_of, inverse_of, whole_number
-from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
-from fflin.control.policies import Allocation, StateFeedback
+from fflin.control.linear_controller import LinearController
+from fflin.control.output_feedback import TrajectoryOutputFeedback
+from fflin.control.policies import Allocation, StateFeedback, bound
 from fflin.dynamics.state import StateMap
 from fflin.kernel.accelerations import loads_of
 from fflin.kernel.tree import Tree
 from fflin.robot.frames import ROOT
+from fflin.robot.link_masses import pieces_of, with_share
 from fflin.robot.mass_properties import stretched, with_inertias
 from fflin.simulation.plant import Drives, Plant
 from fflin.simulation.times import Times
@@ -31,7 +34,7 @@ _OF_BODIES = {"mass": " ", "com": "xyz", "inertia": "xyz"}  # with their axes
 _AXES = _OF_BODIES | {"misalignment": "12"}
 _OF_INPUTS, _OF_SPRINGS = ("gain", "bias", "fails"), ("stiffness", "damping")
 _OF_SENSORS = ("sensor", "noise")
-_FACTORS = ("mass", "inertia", *_OF_SPRINGS)
+_FACTORS = ("mass", "inertia", "density", *_OF_SPRINGS)
 
 
 class Column(NamedTuple):
@@ -60,8 +63,9 @@ class Dispersions:
         self._times = times
         self._model = plant.robot._bare.model
         bodies = ["base", *list(self._model.names)[ROOT + 1 :]]
+        self._links = {n: each for n, each in pieces_of(plant.robot)[0].items() if not each.whole}
         self._sensors: tuple[str, ...] = ()
-        if isinstance(policy, StateFeedback | OutputFeedback):
+        if isinstance(policy, StateFeedback | LinearController):
             lin = policy.lin
             of_states = isinstance(policy, StateFeedback)
             self._sensors = lin.state_names if of_states else lin.output_names
@@ -71,6 +75,7 @@ class Dispersions:
             "state": plant.state.names,
             **dict.fromkeys(_OF_SENSORS, self._sensors),
             **dict.fromkeys(_OF_BODIES, bodies),
+            "density": tuple(self._links),
             **dict.fromkeys((*_OF_INPUTS, "misalignment"), input_keys(plant.actuation)),
             **dict.fromkeys(_OF_SPRINGS, plant.robot.joint_names),
         }
@@ -95,12 +100,17 @@ class Dispersions:
         if not self.columns:
             raise InputError("dispersions is empty; give at least one, such as {'q_b': 0.05}")
         self._kinds = {column.kind for column in self.columns}
+        heavier = {each.at[0] + ROOT: each.name for each in self.columns if each.kind == "mass"}
+        for name, at in self._densities():
+            if at in heavier:
+                raise InputError(f"'{heavier[at]}' and '{name}' both change a mass; give either")
 
     def _add(self, kind: str, spreads: Any, names: list[str], kinds: str) -> None:
         if kind in _OF_SENSORS and not names:
             raise InputError(
                 f"'{next(iter(spreads))}.{kind}' is dispersed, and a "
-                f"{type(self._policy).__name__} has no sensors; StateFeedback and OutputFeedback do"
+                f"{type(self._policy).__name__} has no sensors; StateFeedback, OutputFeedback and "
+                "LinearController do"
             )
         if kind in ("noise", "delay") and not self._times.sample:
             raise InputError(
@@ -175,12 +185,25 @@ class Dispersions:
         x = self._x0 + self._of("state", drawn, len(self._x0))[..., 0]
         return self._plant.state.points(x)[1:]
 
+    def _densities(self) -> Iterator[tuple[str, int]]:
+        """Yield the densities that are drawn, and the joint of each without wheels."""
+        names, joints = list(self._links), self._plant.robot.model.names
+        for column in self.columns:
+            if column.kind == "density":
+                at = self._links[names[column.at[0]]].joint
+                yield column.name, self._model.getJointId(joints[at]) if at > ROOT else ROOT
+
     def bodies(self, drawn: Array) -> dict[int, tuple[Array, Array, Array]]:
         """Return masses (N,), centres (N, 3) and inertias (N, 3, 3) of bodies that are drawn."""
         size, found = self._model.njoints - ROOT, {}
         of = [self._of(kind, drawn, size, len(axes)) for kind, axes in _OF_BODIES.items()]
         for at in sorted({each.at[0] for each in self.columns if each.kind in _OF_BODIES}):
             found[ROOT + at] = stretched(self._model.inertias[ROOT + at], *(x[:, at] for x in of))
+        names = self.names
+        for name, at in self._densities():
+            one, none = self._links[name.removesuffix(".density")], np.zeros((len(drawn), 3))
+            body = found.get(at) or stretched(self._model.inertias[at], none[:, :1], none, none)
+            found[at] = with_share(body, one, drawn[:, names.index(name)])
         return found
 
     def _springs(self, kind: str, drawn: Array) -> Array:
@@ -215,7 +238,7 @@ class Dispersions:
         """Return what differs from run to run, as the compiled loop takes it."""
         plant, (q, v) = self._plant, self.starts(drawn)
         runs = {"q": q, "nu": plant.state.velocities(v), **self._drives(drawn)._asdict()}
-        if self._kinds & {*_OF_BODIES}:
+        if self._kinds & {*_OF_BODIES, "density"}:
             parameters = np.tile(tree.bodies.reshape(1, -1, 10), (len(drawn), 1, 1))
             for at, body in self.bodies(drawn).items():
                 # In the tree wheels stand between the joints.
@@ -257,14 +280,16 @@ class Dispersions:
         if "misalignment" in self._kinds:
             robot = misaligned(robot, self._angles(rows)[0])
             if isinstance(policy, Allocation):  # which does not know of it
-                policy = Designed(policy, plant.robot)
+                given = policy
+                policy = Bound(lambda _: bound(given, plant.robot))
         if self._kinds & {*_OF_SENSORS}:
             error = noise_of(*(each[0] for each in self._sensing(rows)))
             if isinstance(policy, StateFeedback):
-                policy = Misled(policy, error)
+                policy = misled(policy, error)
             else:
                 noise = policy.noise or np.zeros_like
-                policy = replace(policy, noise=lambda t: error(t) + np.asarray(noise(t)))
+                policy = copy(policy)
+                vars(policy)["noise"] = lambda t: error(t) + np.asarray(noise(t))
         state = StateMap(robot, reference=plant.state.reference, frame=plant.state.frame)
         drives = Drives(*(x[0] for x in self._drives(rows)))
         faulty = drives if self._kinds & {*_OF_INPUTS, "misalignment"} else None

@@ -51,7 +51,7 @@ class Lanes:
         law = self._wide(law, "x", "y", "added", "u")._replace(
             path=self._wide(law.path, "e"),
             grid=self._wide(law.grid, "at"),
-            filter=self._wide(law.filter, "z", "next"),
+            filter=self._wide(law.filter, "z", "rates"),
         )
         if law.sharing:
             own = self._wide(law.sharing.point, "q", "pushing")

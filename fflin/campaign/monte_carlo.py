@@ -85,15 +85,18 @@ def monte_carlo(
           as in `Robot.perturbed`: the mass is multiplied by 1 + d and the inertia with it, each
           second moment per mass along the axes of its frame by 1 + d, and the centre of mass is
           shifted by d times the radius of gyration. The pseudo-inertia stays positive;
+        - ``LINK.density``, relative, of a link by its name in the URDF, also of one fixed to
+          another: all of its mass and inertia are multiplied by 1 + d, as in `sensitivity` and
+          `uncertain`, whose ``LINK.mass`` holds the inertia;
         - ``INPUT.gain``, relative, and ``INPUT.bias`` [N m|N]: (1 + d) u + b acts of a command u;
           ``INPUT.fails`` [s]: nothing acts of it from that time on. Inputs that are recorded are
           the commands, also of what has failed;
         - ``INPUT.misalignment`` [rad]: the direction of a thruster, the axis of a wheel or one of
           tau_b or F_b is turned about two axes across it, by an angle drawn for each;
         - ``NAME.sensor``: added to a state that a `StateFeedback` reads, or to an output that an
-          `OutputFeedback` or `TrajectoryOutputFeedback` measures; ``NAME.noise``: white noise
-          added to it at each sample, a number its standard deviation, and of another spread each
-          run has one of its own;
+          `OutputFeedback`, `LinearController` or `TrajectoryOutputFeedback` measures;
+          ``NAME.noise``: white noise added to it at each sample, a number its standard deviation,
+          and of another spread each run has one of its own;
         - ``delay`` [s]: added to that of `simulate`, to the next whole step and 0 or more;
         - ``JOINT.stiffness`` and ``JOINT.damping``, relative.
 

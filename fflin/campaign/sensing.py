@@ -3,39 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from fflin.base.validation import Array
-from fflin.control.policies import StateFeedback, bound
+from fflin.control.policies import Policy, StateFeedback, bound
 from fflin.robot.robot import Robot
 
 
-@dataclass(frozen=True)
-class Misled:
-    """A state feedback that reads states with an error."""
+class Bound(NamedTuple):
+    """A policy that a function makes for a robot."""
 
-    policy: StateFeedback
-    error: Callable[[float], Array]
-
-    def bind(self, robot: Robot) -> Callable[[float, Array, Array], Array]:
-        """Return the policy for a robot."""
-        inner, K = bound(self.policy, robot), self.policy.K
-        return lambda t, q, v: np.asarray(inner(t, q, v)) - K @ self.error(t)
+    bind: Callable[[Robot], Policy]
 
 
-@dataclass(frozen=True)
-class Designed:
-    """A policy for a robot as it should be."""
+def misled(policy: StateFeedback, error: Callable[[float], Array]) -> Bound:
+    """Return a state feedback that reads states with an error."""
 
-    policy: Any
-    robot: Robot
+    def bind(robot: Robot) -> Policy:
+        inner = bound(policy, robot)
+        return lambda t, q, v: np.asarray(inner(t, q, v)) - policy.K @ error(t)
 
-    def bind(self, _: Robot) -> Any:
-        """Return the policy for the other robot."""
-        return bound(self.policy, self.robot)
+    return Bound(bind)
 
 
 def noise_of(bias: Array, deviation: Array, seed: float) -> Callable[[float], Array]:

@@ -1,16 +1,26 @@
-"""The commands that say what a linear model is worth: structure, modes, and how far it reaches."""
+"""The commands that judge a linear model: structure, modes, its reach, and what masses change."""
 
 from __future__ import annotations
 
 import argparse
 from contextlib import nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fflin.base.errors import InputError
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, add_point, command, file_name, number
-from fflin.commands.points import linear_model
+from fflin.commands.arguments import (
+    Commands,
+    add_options,
+    add_output_file,
+    add_point,
+    add_robot,
+    add_system,
+    command,
+    number,
+)
+from fflin.commands.points import linear_model, load_robot, once, placed
 from fflin.commands.regulator import add_weights, gain_of, regulated_part
+from fflin.commands.tracking import say
 from fflin.commands.visual import add_figure, check_figure, draw
 
 if TYPE_CHECKING:
@@ -18,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def add_commands(commands: Commands) -> None:
-    """Add analyze, modes and validity."""
+    """Add analyze, modes, validity, sensitivity and uncertain."""
     analyze = command(
         commands,
         "analyze",
@@ -37,9 +47,7 @@ def add_commands(commands: Commands) -> None:
     )
     add_point(modes)
     add_figure(modes, "draw frequencies, damping and shapes")
-    modes.add_argument(
-        "--html", metavar="FILE", type=file_name, help="write a page that plays the mode shapes"
-    )
+    add_options(modes, "--html FILE: write a page that plays the mode shapes")
     validity = command(
         commands,
         "validity",
@@ -49,30 +57,50 @@ def add_commands(commands: Commands) -> None:
     )
     add_point(validity)
     add_weights(validity)
-    for name, metavar, read, default, what in (
-        ("attitude", "X", number, 90.0, "largest turn of the base [deg]"),
-        ("offset", "X", number, 0.5, "largest displacement of the base [m]"),
-        ("spread", "X", number, 1.0, "largest displacement of a joint [rad|m]"),
-        ("samples", "N", int, 100, "random runs"),
-        ("seed", "N", int, 0, "seed of the random runs"),
-        ("jobs", "N", int, 1, "processes, at most one for each core"),
-    ):
-        help = f"{what}; {default:g} by default"
-        validity.add_argument(f"--{name}", metavar=metavar, type=read, default=default, help=help)
-    validity.add_argument(
-        "--limits",
-        choices=("urdf", "none"),
-        default="none",
-        help="cut the inputs to the limits of the robot, or not (default)",
+    add_options(
+        validity,
+        """
+        --attitude X = 90: largest turn of the base [deg]; 90 by default
+        --offset X = 0.5: largest displacement of the base [m]; 0.5 by default
+        --spread X = 1: largest displacement of a joint [rad|m]; 1 by default
+        --samples N = 100: random runs; 100 by default
+        --seed S = 0: seed of the random runs; 0 by default
+        --jobs N = 1: processes, at most one for each core; 1 by default
+        --limits urdf|none = none: cut the inputs to the limits of the robot, or not (default)""",
     )
-    validity.add_argument(
-        "--frames",
-        nargs="+",
-        choices=("hybrid", "local", "world"),
-        default=(),
-        help="feed rates and inputs of the base back in the axes of these frames too",
-    )
+    frames = "--frames hybrid|local|world: feed the base's rates and inputs back in these axes too"
+    add_options(validity, frames, nargs="+", default=())
     add_figure(validity, "draw it")
+    sensitivity = command(
+        *(commands, "sensitivity", _sensitivity),
+        "show or save what masses, inertias, springs and thrusters change of A and B",
+        "fflin sensitivity servicer_7dof --joint joint_2=0.6 --top 10 -o changes.mat",
+    )
+    add_point(sensitivity)
+    add_options(sensitivity, "--dt H: of the model sampled, with inputs held over H [s]")
+    add_options(sensitivity, "--top N = 15: the N that change most; 15 by default")
+    add_output_file(sensitivity, "save dA, dB, df0 over each parameter: .npz, .mat or .json")
+    uncertain = command(
+        *(commands, "uncertain", _uncertain),
+        "show or save the model at rest as an exact fraction of parameters in ranges",
+        "fflin uncertain servicer_7dof --vary base.mass=0.2 --vary panel_left.stiffness=80:120 "
+        "-o uncertain.mat",
+    )
+    add_robot(uncertain)
+    add_options(uncertain, "--joint NAME=VALUE*: put a joint at VALUE [rad|m]; others at neutral")
+    add_system(uncertain)
+    vary = """--vary NAME=RANGE*: a parameter of `fflin sensitivity` or a pattern, and its range:
+        0.2, a share of its value, or LEAST:LARGEST"""
+    add_options(uncertain, vary, type=_range, required=True)
+    add_output_file(uncertain, "save A, B1 .. D22 and the blocks: .npz, .mat or .json")
+
+
+def _range(text: str) -> tuple[str, Any]:
+    name, _, value = text.rpartition("=")
+    ends = value.split(":")
+    if not name or len(ends) > 2:
+        raise argparse.ArgumentTypeError(f"'{text}' is not NAME=SHARE or NAME=LEAST:LARGEST")
+    return name, tuple(map(number, ends)) if ends[1:] else number(value)
 
 
 def _analyze(arguments: argparse.Namespace) -> int:
@@ -145,8 +173,6 @@ def _validity(arguments: argparse.Namespace) -> int:
     from fflin.batch.workers import OwnWorkers
     from fflin.campaign.validity import validity
 
-    if arguments.jobs < 1:
-        raise InputError(f"--jobs is {arguments.jobs}, expected at least 1")
     robot, lin = linear_model(arguments)
     check_figure(arguments.plot)
     lin = regulated_part(lin, arguments)
@@ -175,4 +201,21 @@ def _validity(arguments: argparse.Namespace) -> int:
     if cut or any(name in lin.limits for name in lin.input_names):
         print("inputs were " + ("cut to the limits of the robot" if cut else _FREE))
     draw(arguments.plot, "plot_validity", found)
+    return DONE
+
+
+def _sensitivity(arguments: argparse.Namespace) -> int:
+    from fflin.uncertainty.sensitivity import sensitivity
+
+    _, lin = linear_model(arguments)
+    found = sensitivity(lin if arguments.dt is None else lin.discretize(arguments.dt))
+    say(found, arguments, found.table(arguments.top))
+    return DONE
+
+
+def _uncertain(arguments: argparse.Namespace) -> int:
+    from fflin.uncertainty.uncertain import uncertain
+
+    robot, ranges = load_robot(arguments), once("--vary", arguments.vary)
+    say(uncertain(robot, ranges).lft(placed(robot, "--joint", arguments.joint)), arguments)
     return DONE

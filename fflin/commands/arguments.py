@@ -75,7 +75,7 @@ def lock(text: str) -> tuple[str, float | None]:
 
 _READ: dict[str, Callable[[str], Any]] = {
     **dict.fromkeys(("FILE", "FILE.npz"), file_name),
-    **dict.fromkeys(("T", "H", "P", "FPS", "SPEED"), number),
+    **dict.fromkeys(("T", "H", "P", "X", "FPS", "SPEED"), number),
     **{"N": count_of, "S": whole, "K": whole, "[NAME=]VALUE": passive, "NAME[=VALUE]": lock},
     "ALTITUDE[:BODY]": orbit,
     **dict.fromkeys(("NAME=VALUE", "NAME=W"), assignment),

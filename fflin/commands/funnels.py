@@ -18,7 +18,8 @@ _KINDS = "attitude [deg], position [m], joints, turning, moving or rates"
 _RUNS = ["knots", "samples", "seed", "confidence", "threads"]
 
 # What `along` refuses of others' options.
-_NONE = "free gain target_joint target_velocity effort equilibrium joint rpy position velocity"
+_NONE = "free gain controller target_joint target_velocity effort equilibrium"
+_NONE += " joint rpy position velocity"
 
 
 def add_commands(commands: of.Commands) -> None:

@@ -49,7 +49,7 @@ def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> 
 def refuse_law(arguments: argparse.Namespace) -> None:
     """Refuse what says how a regulator is, where there is none."""
     _refuse(arguments, ("limit", "delay"), "--free has no input to limit or delay")
-    names = (*_WEIGHTS, *_TARGETS[:2], "reduce", "allocate", "gain")
+    names = (*_WEIGHTS, *_TARGETS[:2], "reduce", "allocate", "gain", "controller")
     _refuse(arguments, names, "--free has no regulator to give weights, a target or thrusters")
 
 
@@ -83,6 +83,10 @@ def add_loop(command: argparse.ArgumentParser) -> Container:
         --schedule FILE: follow the trajectory with these gains, as tvlqr saves them; without it
             they are designed
         --gain FILE: regulate with this gain, as lqr saves it, about the point it was designed for
+        --controller FILE: close the loop with this linear system instead, u - u0 = system (y - y0)
+            about the target: .mat, .npz or .json with A, B, C, D, and dt or Ts where it is sampled;
+            y is what --output says
+        --negative-feedback: it was designed for u - u0 = -system (y - y0)
         --[no-]allocate: whether to design with torque and force on the base, and let the thrusters,
             none of which pulls, give what comes nearest; by default where they push every way; else
             a thrust below zero is cut
@@ -131,7 +135,8 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
     require_held(robot, feedback, q)
     if arguments.duration is None:
         options["duration"] = time_to_settle(robot, feedback, q, v)
-    return Loop(policy, options, *([feedback, lin] if policy is feedback else []))
+    alone = policy is feedback and not arguments.controller
+    return Loop(policy, options, *([feedback, lin] if alone else []))
 
 
 def start_of(robot: Robot, arguments: argparse.Namespace) -> tuple[Array, Array | None]:
@@ -141,12 +146,12 @@ def start_of(robot: Robot, arguments: argparse.Namespace) -> tuple[Array, Array 
     return q, velocity_of(robot, arguments, *names, start=robot.start)
 
 
-def about_point(
-    robot: Robot, arguments: argparse.Namespace
-) -> tuple[Any, StateFeedback, LinearModel | None]:
+def about_point(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, Any, LinearModel | None]:
     """Return the policy, the feedback in it, and the model that foresees it at every row."""
+    from fflin.control.linear_controller import LinearController
     from fflin.control.policies import Allocation, StateFeedback, thrusters_push_every_way
 
+    gain: Any = None
     allocate = thrusters_push_every_way(robot) if arguments.allocate is None else arguments.allocate
     if arguments.gain:
         from fflin.control.gain import Gain
@@ -161,8 +166,13 @@ def about_point(
     else:
         design = _without_thrusters(robot) if allocate else robot
         lin = _about_target(design, arguments)
-        gain = gain_of(lin, arguments)
-    feedback = StateFeedback(lin.discretize(gain.dt) if gain.dt else lin, gain.K)
+    if arguments.controller:
+        _refuse(arguments, (*_WEIGHTS, "gain", "reduce"), "--controller is what regulates")
+        sign = -1.0 if arguments.negative_feedback else 1.0
+        feedback: Any = LinearController(arguments.controller, lin, sign=sign)
+    else:
+        gain = gain or gain_of(lin, arguments)
+        feedback = StateFeedback(lin.discretize(gain.dt) if gain.dt else lin, gain.K)
     if allocate:
         return Allocation(feedback, design), feedback, None
     return feedback, feedback, None if arguments.reduce else lin
@@ -175,7 +185,11 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
     from fflin.control.tracking import TrajectoryFeedback
     from fflin.linear.trajectory import Trajectory
 
-    _refuse(arguments, ("free", "gain", *_TARGETS), "a trajectory says where the robot is to be")
+    _refuse(
+        arguments,
+        ("free", "gain", "controller", *_TARGETS),
+        "a trajectory says where the robot is to be",
+    )
     poses = ("joint", "rpy", "position", "velocity")
     _refuse(arguments, poses, "it starts on the trajectory, or beside it by --offset")
     design = _without_thrusters(robot) if arguments.allocate else robot
@@ -230,7 +244,7 @@ def _about_gain(robot: Robot, gain: Any, path: Path) -> LinearModel:
     return linearize(robot, q, v, gain.u0, frame=gain.frame)
 
 
-def require_held(robot: Robot, policy: StateFeedback, q: Array) -> None:
+def require_held(robot: Robot, policy: Any, q: Array) -> None:
     """Warn of what starts beside the target and is not fed back; refuse a start of nothing else."""
     from fflin.control.policies import fed_back
     from fflin.dynamics.state import StateMap

@@ -63,20 +63,16 @@ def models_along(arguments: argparse.Namespace, robot: Robot | None = None) -> L
     from fflin.linear.linear_trajectory import linearize_trajectory
     from fflin.linear.trajectory import Trajectory
 
-    for name in ("joint", "velocity", "effort", "equilibrium"):
-        if getattr(arguments, name, None):
+    for name in ("joint", "velocity", "effort", "equilibrium", "rpy", "position"):
+        given = getattr(arguments, name, None)
+        if given is True or any(given or ()):
             raise InputError(f"--{name} says a point and --trajectory a motion; give either")
-    if any(getattr(arguments, "rpy", None) or ()) or any(
-        getattr(arguments, "position", None) or ()
-    ):
-        raise InputError("--rpy and --position say a point and --trajectory a motion; give either")
     robot, options = (
         robot or load_robot(arguments),
         {"hold": arguments.hold, "frame": arguments.frame},
     )
-    return linearize_trajectory(
-        robot, Trajectory.load(arguments.trajectory, robot, **options), strict=arguments.strict
-    )
+    motion = Trajectory.load(arguments.trajectory, robot, **options)
+    return linearize_trajectory(robot, motion, strict=arguments.strict)
 
 
 def linearize_along(arguments: argparse.Namespace) -> int:
@@ -84,7 +80,7 @@ def linearize_along(arguments: argparse.Namespace) -> int:
     along = models_along(arguments)
     if getattr(arguments, "dt", None) is not None:
         along = along.discretize(arguments.dt)
-    _say(along, arguments)
+    say(along, arguments)
     return DONE
 
 
@@ -100,7 +96,7 @@ def _tvlqr(arguments: argparse.Namespace) -> int:
     if arguments.reduce:
         raise InputError("--reduce: over a finite time the inputs hold what they can; leave it out")
     along = models_along(arguments)
-    _say(schedule_of(along, arguments, once("--qf", arguments.qf) or "steady"), arguments)
+    say(schedule_of(along, arguments, once("--qf", arguments.qf) or "steady"), arguments)
     return DONE
 
 
@@ -120,9 +116,10 @@ def schedule_of(
     return tvlqr(along, Qf=Qf, **options)
 
 
-def _say(made: Any, arguments: argparse.Namespace) -> None:
+def say(made: Any, arguments: argparse.Namespace, text: str = "") -> None:
+    """Save what was made where -o says so, and show it."""
     if arguments.output_file:
         made.save(arguments.output_file)
-    print(made)
+    print(text or made)
     if arguments.output_file:
         print(f"wrote {arguments.output_file}")

@@ -25,6 +25,8 @@ class Law:
         # Beyond `slow`, a square of the velocity, a motion diverges and may make commands infinite.
         self._policy, self._names, self._limits, self._slow = policy, names, limits, slow
         self._shape = (len(names),)
+        # Of what integrates a state of its own along.
+        self.advance: Any = getattr(policy, "advance", None)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,), or raise `InputError` where it is none."""

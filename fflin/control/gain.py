@@ -14,7 +14,7 @@ from fflin.base.record import NOT_VERIFIED, Design
 from fflin.base.tables import grid, matrix, width
 from fflin.base.validation import Array
 from fflin.control.margins import Margins, input_margins
-from fflin.linear.model import LinearModel
+from fflin.linear.model import LinearModel, state_space
 
 if TYPE_CHECKING:
     from fflin.control.riccati import Solution
@@ -126,6 +126,10 @@ class Gain(Design):
         """A - B K (nx, nx)."""
         return self.A - self.B @ self.K
 
+    def to_control(self) -> Any:
+        """Return -K as a `control.StateSpace` from x - x0 to u - u0, if that is installed."""
+        return state_space(([], [], [], -self.K), self.dt, (), self.state_names, self.input_names)
+
     @cached_property
     def margins(self) -> Margins:
         """Gain and phase margins at the inputs, computed when first asked for."""
@@ -209,6 +213,8 @@ def _unregulated(gain: Gain) -> str:
             for names in (gain.regulated, (*gain.regulated, *speeds))
         )
         tied = "tied to the body's rate by the conserved momentum"
+        if gain.frame in ("lvlh", "hill"):
+            tied = "tied to the body's rate but for the field of the orbit"
         why = tied if held == both else "wheel_speeds=True regulates those that can be"
         parts.append(f"wheel speeds ({why})")
     return ", ".join(parts)

@@ -90,6 +90,12 @@ class Estimator(Design):
     def __repr__(self) -> str:
         return titled(self, nx=len(self.L), ny=self.L.shape[1])
 
+    def to_control(self) -> Any:
+        """Return a `control.StateSpace` from u - u0 and y - y0 to xh, if that is installed."""
+        L, both = self.L, (*self.input_names, *self.output_names)
+        system = self.A - L @ self.C, np.hstack((self.B - L @ self.D, L)), np.eye(len(L)), 0.0
+        return state_space(system, self.dt, self.state_names, both, self.state_names)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Compensator(Design):
@@ -143,7 +149,8 @@ class Compensator(Design):
         MissingPackageError
             If python-control is not installed.
         """
-        return state_space(self, np.zeros((len(self.C), self.B.shape[1])))
+        names = self.state_names, self.input_names, self.output_names
+        return state_space((self.A, self.B, self.C, 0.0), self.dt, *names)
 
 
 def kalman(
@@ -229,12 +236,8 @@ def kalman(
         L_update = np.linalg.solve(C @ solution.P @ C.T + V, C @ solution.P).T
     poles, margin = solution.ordered(lin.dt)
     return Estimator(
-        S.T @ L @ seen,
-        S.T @ L_update @ seen,
-        S.T @ solution.P @ S,
-        poles,
-        solution.residual,
-        margin,
+        *(S.T @ L @ seen, S.T @ L_update @ seen, S.T @ solution.P @ S),
+        *(poles, solution.residual, margin),
         W=S.T @ W @ S,
         V=noises,
         estimated=lin.state_names,

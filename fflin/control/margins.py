@@ -36,22 +36,22 @@ def input_margins(A: Array, B: Array, K: Array, R: Array, dt: float) -> Margins:
         inverse = np.linalg.inv(F + np.eye(len(F)))
         D = D - H @ inverse @ G
         F, G, H = inverse @ (F - np.eye(len(F))), 2.0**0.5 * inverse @ G, 2.0**0.5 * H @ inverse
-    disk = min(1.0 / largest_gain(F, G, H, D), 2.0)
+    disk = min(1.0 / largest_gain(F, G, H, D)[0], 2.0)
     gain = ((2.0 - disk) / (2.0 + disk), (2.0 + disk) / (2.0 - disk) if disk < 2.0 else math.inf)
     return Margins(disk, gain, math.degrees(2.0 * math.atan(disk / 2.0)))
 
 
-def largest_gain(A: Array, B: Array, C: Array, D: Array) -> float:
-    """Return the largest gain over all frequencies of a stable system, to five digits."""
+def largest_gain(A: Array, B: Array, C: Array, D: Array) -> tuple[float, float]:
+    """Return the largest gain of a stable system, to five digits, and the frequency of it."""
 
-    def gain(frequency: float) -> float:
+    def gain(frequency: float) -> tuple[float, float]:
         response = D + C @ np.linalg.solve(1j * frequency * np.eye(len(A)) - A, B)
-        return float(np.linalg.norm(response, 2))
+        return float(np.linalg.norm(response, 2)), frequency
 
     poles = np.linalg.eigvals(A)
-    norm = max(float(np.linalg.norm(D, 2)), *map(gain, {0.0, *np.abs(poles).tolist()}))
+    found = max((float(np.linalg.norm(D, 2)), math.inf), *map(gain, {0.0, *np.abs(poles).tolist()}))
     while True:
-        bound = norm * (1.0 + _ACCURACY)
+        bound = found[0] * (1.0 + _ACCURACY)
         inverse = np.linalg.inv(bound**2 * np.eye(D.shape[1]) - D.T @ D)
         F = A + B @ inverse @ D.T @ C
         spread = C.T @ (np.eye(len(D)) + D @ inverse @ D.T) @ C
@@ -61,10 +61,10 @@ def largest_gain(A: Array, B: Array, C: Array, D: Array) -> float:
         on_axis = np.abs(crossings.real) <= 1e-6 * np.abs(crossings)
         frequencies = np.sort(np.abs(crossings.imag[on_axis]))
         between = np.concatenate((frequencies, 0.5 * (frequencies[1:] + frequencies[:-1])))
-        best = max(map(gain, between.tolist()), default=0.0)
-        if best <= bound:
-            return max(norm, best)
-        norm = best
+        best = max(map(gain, between.tolist()), default=found)
+        if best[0] <= bound:
+            return max(found, best)
+        found = best
 
 
 class Loop(NamedTuple):

@@ -184,6 +184,7 @@ class Allocation:
             A, b = np.linalg.solve(factor, columns), np.linalg.solve(factor, force)
             return nearest(A, b, least, most)
 
+        vars(policy)["advance"] = inner.advance
         return policy
 
 

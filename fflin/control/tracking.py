@@ -12,6 +12,7 @@ from fflin.base.errors import EquilibriumError, InputError
 from fflin.base.names import by_name
 from fflin.base.validation import Array
 from fflin.control.gain_schedule import GainSchedule
+from fflin.control.linear_controller import LinearController
 from fflin.control.policies import Allocation, Policy, decider, fed_back
 from fflin.control.tvlqr import resting_end, steady_regulator
 from fflin.dynamics.actuation import Actuation
@@ -204,14 +205,16 @@ class TrajectoryFeedback:
         return policy
 
 
-def followed(policy: Any, robot: Robot, held: bool = False) -> Any:
-    """Return a policy, for a schedule the feedback along its trajectory."""
+def followed(policy: Any, robot: Robot, held: float = 0.0) -> Any:
+    """Return a policy, for a schedule the feedback along its trajectory; held so long, if it is."""
     if isinstance(policy, Allocation):
         return replace(policy, policy=followed(policy.policy, policy.design, held))
     if isinstance(policy, GainSchedule):
-        return TrajectoryFeedback(policy.trajectory(robot), policy, held=held)
+        return TrajectoryFeedback(policy.trajectory(robot), policy, held=held > 0.0)
     if held and isinstance(policy, TrajectoryFeedback):
         return replace(policy, held=True)
+    if held and isinstance(policy, LinearController):
+        return policy.sampled(held)
     return policy
 
 

@@ -14,20 +14,21 @@ from fflin.kernel.tracking import track
 from fflin.kernel.tree import PLACE
 from fflin.kernel.vectors import across, copy, get3, get_columns, plus, product, put3, times
 
-NOTHING, STATE, OUTPUT, TRACK = range(4)
+NOTHING, LINEAR, TRACK = range(3)
 
 
 class Law(
     namedtuple(
         "Law",
-        "kind turned origin near K offset grid filter measured gyros x y added u path sharing",
+        "kind turned origin near grid filter measured gyros x y added u path sharing",
     )
 ):
     """A policy; each array of doubles may have a second axis of eight lanes.
 
-    By its kind NOTHING, STATE: u = offset - K y, OUTPUT: u by a `filter` of y, or TRACK:
-    u = u* - K e along `path`. y (ny,) is what is `measured` of the state and the gyroscopes after
-    it, x, and of rows (slots, ny) what is `added` to it, sample by sample and round.
+    By its kind NOTHING, LINEAR: u by a `filter` of y, or by the gains of a `grid` that has joints,
+    or TRACK: u = u* - K e along `path`. y (ny,) is what is `measured` of the state and the
+    gyroscopes after it, x, and of rows (slots, ny) what is `added` to it, sample by sample and
+    round.
     `turned` says whether omega_b and v_b of the state stand in reference axes; row by row, sample
     by sample and the last to the end, `origin` (7,) is the world's origin seen from where x is 0
     and `near` (n,) which turn is taken of joints that go round. `u` is what is commanded, to be
@@ -35,8 +36,8 @@ class Law(
     """
 
 
-class Grid(namedtuple("Grid", "joint first values stride at")):
-    """Joints (k,) between whose `values` from `first` (k + 1,) on K and offset are interpolated.
+class Grid(namedtuple("Grid", "joint first values stride K offset at")):
+    """Joints (k,) between whose `values` from `first` (k + 1,) on u = offset - K y is interpolated.
 
     A step along each of them goes on by `stride` of the gains. `at` (k,) is work space.
     """
@@ -46,10 +47,11 @@ class Gyros(namedtuple("Gyros", "body axes")):
     """Bodies with a gyroscope (k,), and the columns (9 k,) of its axes in the body's."""
 
 
-class Filter(namedtuple("Filter", "A B C u0 y0 jump z next")):
-    """Row by row as `Law.origin`: u = u0 + C z, then z' = A z + B (y - y0), z having jumped before.
+class Filter(namedtuple("Filter", "A B C D u0 y0 jump z rates")):
+    """Row by row as `Law.origin`: u = u0 + C z + D dy, then A z + B dy of dy = y - y0.
 
-    z (nz,) is the state, `next` (nz,) work space.
+    z (nz,) is the state, which has jumped before. That is the next one, with `rates` (nz,) as work
+    space; or its rate, of the stages (1 + s, nz) that stand there behind z as the step began.
     """
 
 
@@ -103,28 +105,25 @@ def _measure(work, robot, law, point, count):
 @inlined
 def _times(matrix, row, x):
     """Return a row of a matrix times a vector."""
-    total, width = load(matrix, row * len(x)) * load(x, 0), len(x)
-    for index in range(1, width):
+    total, width = splat(x, 0.0), len(x)
+    for index in range(width):
         total = total + load(matrix, row * width + index) * load(x, index)
     return total
 
 
 @inlined
-def command(work, robot, law, point, t, count):
-    """Write the inputs that a policy asks for, at a sample of that count."""
+def command(work, robot, law, point, t, count, stage):
+    """Write the inputs that a policy asks for, at a sample of that count or a stage of a step."""
     if law.kind == TRACK:
         track(robot, law.path, point, law.u, t)
         return
     row = min(count, len(law.origin) // 7 - 1)
     read_state(robot, law, point, row)
     _measure(work, robot, law, point, count)
-    if law.kind == OUTPUT:
-        _filter(law.filter, law.y, law.u, row)
-    elif len(law.grid.joint) > 0:
+    if len(law.grid.joint) > 0:
         _feed_back_between(robot, law, point)
     else:
-        for index in range(len(law.u)):
-            store(law.u, index, load(law.offset, index) - _times(law.K, index, law.y))
+        _filter(law.filter, law.y, law.u, row, stage)
 
 
 @inlined
@@ -141,9 +140,9 @@ def _feed_back_between(robot, law, point):
             share, cell = _corner(grid, corner, lane)
             for row in range(inputs if share > 0.0 else 0):
                 at = cell * inputs + row
-                total = peek(law.offset, at, lane)
+                total = peek(grid.offset, at, lane)
                 for column in range(size):
-                    total -= peek(law.K, at * size + column, lane) * peek(y, column, lane)
+                    total -= peek(grid.K, at * size + column, lane) * peek(y, column, lane)
                 poke(u, row, lane, peek(u, row, lane) + share * total)
 
 
@@ -165,18 +164,22 @@ def _corner(grid, corner, lane):
 
 
 @called
-def _filter(by, y, u, row):
-    """Write what the estimate asks for, and bring it up to the next sample."""
+def _filter(by, y, u, row, stage):
+    """Write what a linear law asks for, and bring it up to the next sample or write its rate."""
     size, outputs, inputs = len(by.z), len(y), len(u)
+    along = len(by.rates) > size
+    first = (1 + stage) * size if along else 0
     for index in range(size):
         store(by.z, index, load(by.z, index) + load(by.jump, row * size + index))
-    for index in range(inputs):
-        at = row * inputs + index
-        store(u, index, load(by.u0, at) + _times(by.C, at, by.z))
     for index in range(outputs):
         store(y, index, load(y, index) - load(by.y0, row * outputs + index))
+    for index in range(inputs):
+        at = row * inputs + index
+        store(u, index, load(by.u0, at) + _times(by.C, at, by.z) + _times(by.D, at, y))
+    if first == size:
+        copy(by.z, 0, by.rates, 0, size)
     for index in range(size):
         at = row * size + index
-        total = splat(by.z, 0.0) + _times(by.A, at, by.z)
-        store(by.next, index, total + _times(by.B, at, y))
-    copy(by.next, 0, by.z, 0, size)
+        store(by.rates, first + index, _times(by.A, at, by.z) + _times(by.B, at, y))
+    if not along:
+        copy(by.rates, 0, by.z, 0, size)

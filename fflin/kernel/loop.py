@@ -77,7 +77,7 @@ def _act(work, channel, law, robot, point, step, stage, t):
     sample = channel.sample
     if law.kind != NOTHING and (sample == 0 or stage == 0):
         if sample == 0 or step % sample == 0:
-            command(work, robot, law, point, t, step // max(sample, 1))
+            command(work, robot, law, point, t, step // max(sample, 1), stage)
             share_out(law.sharing, point, law.u)
             limit(channel, point.u)
             if sample > 0:
@@ -129,20 +129,9 @@ def advance(
     """Go on with a run up to a step, or to one that led where `watch` stops.
 
     The point, the sums of the course, and what law and channel remember are brought up to there.
-
-    Parameters
-    ----------
-    robot, method, law, channel, watch, point, stages
-        As `simulation.packing` makes them.
-    course : tuple of Course, bool, bool
-        And whether it is imposed, and whether anything pushes from outside.
-    clock : ndarray (1,) of int
-        How many steps are done; `last` are to be done.
-    every : int
-        Steps from row to row; 0 where none is recorded.
-    rows : ndarray (rows * width,) or (rows * width, 8)
-        Gets q, nu, u, and the momentum (6,) and centre of mass (3,) that are kept, row by row.
-    work : ndarray (Layout.size,) or (Layout.size, 8)
+    `course` says besides whether it is imposed and anything pushes from outside, clock (1,) how
+    many steps are done of `last`. Each `every` steps, where that is not 0, a row gets q, nu, u, and
+    the momentum (6,) and centre of mass (3,) that are kept. `work` has `Layout.size` entries.
     """
     kept, project, pushed = course
     h, row = method.h, 0
@@ -164,6 +153,8 @@ def advance(
                 weight, moment = method.weights[stage], method.moments[stage]
                 add_wrench(work, robot, kept, point, weight, moment)
             _move(robot, method, stages, point, stage)
+            if len(law.filter.rates) > len(law.filter.z):
+                _combine(method.speed, stage, law.filter.rates, law.filter.z)
             configure(work, robot, point.q)
         if pushed:
             end_step(kept, h)

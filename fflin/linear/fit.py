@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from fflin.base.errors import InputError
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.state import StateMap
+from fflin.robot.outputs import FullState
 
 if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
@@ -29,6 +31,20 @@ def require_fit(lin: LinearModel, robot: Robot, state: StateMap) -> None:
     states = (lin.state_names, lin.state_units)
     require_same(made, robot, "state", states, (there, tuple(units[name] for name in there)))
     require_turns(made, len(lin.q), robot)
+
+
+def require_sensed(lin: LinearModel, robot: Robot, state: StateMap) -> None:
+    """Raise `InputError` where a model's states, inputs or outputs are not those of a robot."""
+    require_fit(lin, robot, state)
+    own = lin.output_names, lin.output_units
+    require_same(f"the model is one of '{lin.robot}'", robot, "output", own, sensed(state))
+
+
+def sensed(state: StateMap) -> Signals:
+    """Return names and units of what a robot measures."""
+    outputs = state.robot.outputs
+    found = state if outputs == (FullState(),) else Sensing(state, outputs)
+    return found.names, found.units
 
 
 def require_same(made: str, robot: Robot, kind: str, own: Signals, there: Signals) -> None:

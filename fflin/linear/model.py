@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from hashlib import sha256
@@ -345,7 +345,8 @@ class LinearModel(FrozenArrays):
             If the robot's model was changed after it was made.
         """
         self.require_unchanged()
-        return state_space(self, self.D)
+        matrices = (self.A, self.B, self.C, self.D)
+        return state_space(matrices, self.dt, self.state_names, self.input_names, self.output_names)
 
     def save(self, path: str | Path) -> None:
         """Write the model and its certificate, whole or not at all.
@@ -384,8 +385,8 @@ class LinearModel(FrozenArrays):
         return replace(lin, _certify=partial(same_certificate, lin, lin.fingerprint))
 
 
-def state_space(of: Any, D: Array) -> Any:
-    """Return a `control.StateSpace` of what has A, B, C, dt and names of signals."""
+def state_space(matrices: Any, dt: float, *signals: Sequence[str]) -> Any:
+    """Return a `control.StateSpace` of A, B, C, D and names of states, inputs and outputs."""
     try:
         import control
     except ImportError:
@@ -393,11 +394,8 @@ def state_space(of: Any, D: Array) -> Any:
             "to_control needs python-control; install it with: pip install 'fflin[control]'"
         ) from None
     # python-control reserves dots in signal names for its own system.signal syntax.
-    names = {
-        f"{kind}s": [name.replace(".", "_") for name in getattr(of, f"{kind}_names")]
-        for kind in ("state", "input", "output")
-    }
-    return control.ss(of.A, of.B, of.C, D, of.dt, **names)
+    states, inputs, outputs = ([name.replace(".", "_") for name in each] for each in signals)
+    return control.ss(*matrices, dt, states=states, inputs=inputs, outputs=outputs)
 
 
 def _same_M(continuous: LinearModel, _: LinearModel) -> Array:

@@ -7,15 +7,19 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.errors import InputError
 from fflin.base.rotation import rotation_matrices, rotation_matrix, skew
-from fflin.base.validation import Array
+from fflin.base.validation import Array, instance, vector
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.chart import Chart, times
 from fflin.dynamics.names import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.outputs import Measuring
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import moving_errors, state_history
 from fflin.linear.certificate import mobilities
+from fflin.linear.fit import require_sensed
 from fflin.linear.model import LinearModel
+from fflin.robot.robot import Robot
 
 # Where the base flies faster than this [m/s], the rounding of its speed would hide the rest.
 _FAST = 100.0
@@ -106,6 +110,48 @@ class ErrorDynamics(Nonlinear):
         flying = times(chart.R, linear) - at_linear - x[:, state.groups.r_b] @ skew(at_angular).T
         rates = state.velocities(v - self._v)[:, 6:]
         return np.concatenate((0.5 * turning, flying, rates, state.velocities(a) - self._a), axis=1)
+
+
+def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None) -> Array:
+    """Return what the outputs of a robot measure, as y0 of a linear model is at its point.
+
+    Attitudes are in the model's chart, where q0 >= 0, rotations of frames are counted from the
+    point, and continuous joints are on the turn nearest to it. So ``y - lin.y0`` is what a
+    controller of the model takes.
+
+    Parameters
+    ----------
+    robot : Robot
+        With the states, inputs and outputs of the model; its masses may be others.
+    lin : LinearModel
+    q, v : array_like (nq,), (nv,)
+        In Pinocchio's order; v is zero by default.
+    u : array_like (nu,), optional
+        What an accelerometer feels; u0 by default.
+
+    Returns
+    -------
+    ndarray (ny,)
+
+    Raises
+    ------
+    InputError
+        If a size is wrong, the model is of another robot or about a reference that moves.
+    """
+    instance("robot", robot, Robot, "a fflin.Robot")
+    if instance("lin", lin, LinearModel, "a fflin.LinearModel").moving:
+        raise InputError("the model is about a moving reference, expected one that stays")
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    require_sensed(lin, robot, state)
+    at = robot.checked_configuration(q)
+    moving = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
+    u = lin.u0 if u is None else vector("u", u, len(lin.u0), "one for each input")
+    a: Array = np.zeros(robot.nv)
+    if any(output.FEELS_ACCELERATION for output in robot.outputs):
+        aba = Aba(state)
+        a = aba.acceleration(at, moving, aba.actuation.in_base_axes(state.chart(at), u))
+    x = state.read(at, moving, near=state.read(lin.q, lin.v))
+    return Measuring(state, lin.q)(x, at, moving, a)
 
 
 def jacobian(f: Callable[[Array], Array], point: Array, steps: Array, bends: Any) -> Array:

@@ -22,3 +22,16 @@ def held_exponential(A: Array, driven: Array, h: float) -> tuple[Array, Array]:
         block[:n, :n], block[:n, n:] = A, driven
         exponential = expm(block * h)
         return exponential[:n, :n], exponential[:n, n:]
+
+
+def held_slopes(A: Array, driven: Array, h: float, dA: Array, d_driven: Array) -> tuple[Array, ...]:
+    """Return the derivatives of `held_exponential` along (dA, d_driven)."""
+    n = len(A)
+    if not dA.any() and not (A @ A).any():
+        return np.zeros_like(A), d_driven * h + A @ d_driven * (h * h / 2.0)
+    from scipy.linalg import expm_frechet
+
+    block, along = np.zeros((2, n + driven.shape[1], n + driven.shape[1]))
+    block[:n], along[:n] = np.hstack((A, driven)) * h, np.hstack((dA, d_driven)) * h
+    slope = expm_frechet(block, along, compute_expm=False)
+    return slope[:n, :n], slope[:n, n:]

@@ -85,3 +85,16 @@ def pieces_of(robot: Robot) -> tuple[dict[str, Piece], dict[str, str]]:
 def as_inertia(piece: Piece) -> pin.Inertia:
     """Return a piece as an inertia in its joint's frame."""
     return piece.placement.act(pin.Inertia(piece.mass, np.zeros(3), piece.inertia))
+
+
+def with_share(body: tuple[Array, ...], piece: Piece, share: Array) -> tuple[Array, Array, Array]:
+    """Return masses (N,), centres and inertias of bodies with so much more (N,) of a piece."""
+    mass, com, inertia = body
+    more, turn = share * piece.mass, piece.placement.rotation
+    total, apart = mass + more, piece.placement.translation - com
+    square = (apart * apart).sum(axis=1)[:, None, None] * np.eye(3) - apart[:, :, None] * apart[
+        :, None
+    ]
+    own = share[:, None, None] * (turn @ piece.inertia @ turn.T)
+    shifted = (mass * more / total)[:, None, None] * square
+    return total, com + (more / total)[:, None] * apart, inertia + own + shifted

@@ -9,11 +9,8 @@ import numpy as np
 
 from fflin.base.errors import InputError, unknown
 from fflin.base.progress import Progress
-from fflin.control.output_feedback import (
-    OutputFeedback,
-    TrajectoryOutputFeedback,
-    measured_at,
-)
+from fflin.control.linear_controller import LinearController, measured_at
+from fflin.control.output_feedback import OutputFeedback, TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.kernel.compiled import kernel, loop_pays, numba_is_there
@@ -26,24 +23,15 @@ from fflin.simulation.run import Recording, ending_of, go
 
 ENGINES = ("python", "compiled")
 
-_KNOWN = (StateFeedback, OutputFeedback, TrajectoryFeedback, TrajectoryOutputFeedback)
+_OF_OUTPUTS = OutputFeedback, LinearController, TrajectoryOutputFeedback
+_KNOWN = StateFeedback, TrajectoryFeedback, *_OF_OUTPUTS
 _SLICE, _FIRST_SLICE = 0.05, 16  # [s] and steps between looks at the clock and at Ctrl-C
 # Multiplications in the factor of M, beyond which ABA in the loop in Python is quicker.
 _LARGEST_FACTOR = 200_000
 
 
 def engine_of(engine: Any, plan: Plan, plant: Plant, runs: int = 0) -> str:
-    """Return which loop does a plan, or so many of its runs eight at a time.
-
-    It is the one that is asked for, or by default the quicker.
-
-    Raises
-    ------
-    InputError
-        If the compiled one is asked for and cannot.
-    UnknownNameError
-        If there is no such engine.
-    """
+    """Return which loop does a plan, or so many runs by eight: as asked for, or the quicker."""
     if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
         raise unknown("engine", str(engine), list(ENGINES))
     if engine == "python":
@@ -80,11 +68,13 @@ def _reason(plan: Plan, plant: Plant) -> str:
 
 def _unmeasured(plan: Plan, plant: Plant, policy: Any) -> str:
     """Say why a plan's compensator, if it has one, cannot have its samples."""
-    if not isinstance(policy, OutputFeedback | TrajectoryOutputFeedback):
+    if not isinstance(policy, _OF_OUTPUTS):
         return ""
-    dt = policy.lin.dt if isinstance(policy, OutputFeedback) else policy.filter.dt
-    if abs(plan.times.sample * plan.times.dt - dt) > 1e-6 * dt:
+    dt = policy.dt if isinstance(policy, LinearController) else policy.filter.dt
+    if abs(plan.times.sample * plan.times.dt - dt) > 1e-6 * dt and dt:
         return "it is sampled otherwise than the compensator"
+    if policy.noise is not None and not plan.times.sample:
+        return "noise is asked for at every stage"
     try:
         measured_at(plant.state)
     except InputError as error:

@@ -9,11 +9,8 @@ import pinocchio as pin
 
 from fflin.base.rotation import rotation_matrix
 from fflin.base.validation import Array, vector
-from fflin.control.output_feedback import (
-    OutputFeedback,
-    TrajectoryOutputFeedback,
-    measured_at,
-)
+from fflin.control.linear_controller import LinearController, measured_at
+from fflin.control.output_feedback import TrajectoryOutputFeedback
 from fflin.control.policies import Allocation, Gridded, StateFeedback
 from fflin.control.saturation import Pulses, Wheels
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
@@ -102,8 +99,8 @@ def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
         np.array(state.axes),
         pin.SE3ToXYZQUAT(state.origin),
         np.zeros(state.robot.n),
-        *(none, none, laws.Grid(nowhere, _places([0]), none, nowhere, none)),
-        laws.Filter(*(none,) * 8),
+        laws.Grid(nowhere, _places([0]), none, nowhere, none, none, none),
+        laws.Filter(*(none,) * 9),
         *(nowhere, laws.Gyros(nowhere, none), np.zeros(state.nx), none, none),
         np.zeros(len(asking.actuation.names)),
         _path(plan, policy, asking),
@@ -111,15 +108,16 @@ def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
     )
     if isinstance(policy, StateFeedback):
         K, offset, near = policy.terms(state)
-        law = law._replace(near=near[state.groups.q_m].copy(), K=K.ravel(), offset=offset)
+        direct = law.filter._replace(D=-K.ravel(), u0=offset, y0=np.zeros(state.nx))
+        law = law._replace(near=near[state.groups.q_m].copy(), filter=direct)
     elif isinstance(policy, Gridded):
         law = _between(law, policy, state)
-    elif isinstance(policy, OutputFeedback | TrajectoryOutputFeedback):
+    elif isinstance(policy, LinearController | TrajectoryOutputFeedback):
         law = _filtered(law, plan, policy, asking, mechanics.tree)
     elif isinstance(policy, TrajectoryFeedback):
         law = law._replace(kind=laws.TRACK)
-    if len(law.K):
-        law = law._replace(kind=laws.STATE, measured=np.arange(state.nx))
+    if isinstance(policy, StateFeedback | Gridded):
+        law = law._replace(kind=laws.LINEAR, measured=np.arange(state.nx))
     size, slots = len(law.measured), SLOTS if noise_of(plan) else 1
     return law._replace(y=np.zeros(size), added=np.zeros(slots * size))
 
@@ -127,7 +125,7 @@ def _law(plan: Plan, plant: Plant, mechanics: forward.Mechanics) -> laws.Law:
 def noise_of(plan: Plan) -> Any:
     """Return noise(t) of what a plan's policy measures, or None."""
     policy = plan.policy.policy if isinstance(plan.policy, Allocation) else plan.policy
-    known = isinstance(policy, OutputFeedback | TrajectoryOutputFeedback)
+    known = isinstance(policy, LinearController | TrajectoryOutputFeedback)
     return policy.noise if known else None
 
 
@@ -150,11 +148,11 @@ def _between(law: laws.Law, policy: Gridded, state: StateMap) -> laws.Law:
         _places(np.cumsum([0, *sizes])),
         np.concatenate(list(axes.values())),
         _places([np.prod(sizes[axis + 1 :]) for axis in range(len(sizes))]),
+        gains.ravel(),
+        (policy.lin.u0 + gains @ x0).ravel(),
         np.zeros(len(sizes)),
     )
-    offset = (policy.lin.u0 + gains @ x0).ravel()
-    near = x0[state.groups.q_m].copy()
-    return law._replace(near=near, K=gains.ravel(), offset=offset, grid=grid)
+    return law._replace(near=x0[state.groups.q_m].copy(), grid=grid)
 
 
 def _filtered(law: laws.Law, plan: Plan, policy: Any, asking: Plant, tree: Tree) -> laws.Law:
@@ -163,20 +161,20 @@ def _filtered(law: laws.Law, plan: Plan, policy: Any, asking: Plant, tree: Tree)
     if isinstance(policy, TrajectoryOutputFeedback):
         rows = min(len(policy.filter.A) + 2, -(-times.steps // times.sample))
     samples = [loop.sample(k * times.sample * times.dt) for k in range(rows)]
-    nz = len(samples[0][0].A)
+    nz, stages = len(samples[0][0].A), 1 if times.sample else 1 + len(plan.method.nodes)
     compensator = (
         np.concatenate([np.broadcast_to(getattr(by, key), shape).ravel() for by, *_ in samples])
-        for key in ("A", "B", "C", "u0", "y0", "jump")
+        for key in ("A", "B", "C", "D", "u0", "y0", "jump")
         for shape in [np.shape(getattr(samples[0][0], key)) or nz]
     )
     measured, gyros = measured_at(state)
     frames = [find_frame(asking.robot.model, gyro.frame) for gyro in gyros]
     turns = [tree.axes[f.joint - ROOT].T @ f.placement.rotation for f in frames]
     return law._replace(
-        kind=laws.OUTPUT,
+        kind=laws.LINEAR,
         origin=np.concatenate([pin.SE3ToXYZQUAT(chart.origin) for _, chart, _ in samples]),
         near=np.concatenate([x[joints] for *_, x in samples]),
-        filter=laws.Filter._make((*compensator, np.zeros(nz), np.zeros(nz))),
+        filter=laws.Filter._make((*compensator, np.zeros(nz), np.zeros(stages * nz))),
         measured=_places(measured),
         gyros=laws.Gyros(
             _places([frame.joint - ROOT for frame in frames]),

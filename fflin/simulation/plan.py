@@ -11,6 +11,7 @@ from fflin.base.errors import InputError
 from fflin.base.names import group_of
 from fflin.base.validation import Array, instance, truth, vector
 from fflin.control.channel import Channel, Law
+from fflin.control.linear_controller import growing
 from fflin.control.plants import notes_of
 from fflin.control.policies import axes_of, bound, feedback_of
 from fflin.control.saturation import Saturation, saturation, warn_beyond
@@ -116,6 +117,9 @@ def target_of(state: StateMap, target: Any) -> Array | None:
             f"target is a model of '{target.robot}', expected a state of '{state.robot.name}' or a "
             "model of it about a point that stays"
         )
+    if state.robot.orbit and target.frame != state.frame:
+        said = f"target is a model in frame '{target.frame}', expected '{state.frame}'"
+        raise InputError(f"{said}, in which the motion is, as q of the two is not the same")
     goal = state.read(target.q, target.v)
     # Where the model has another reference or frame, its state of the base is another.
     same = target.frame == state.frame and target.reference.isApprox(state.reference, 1e-12)
@@ -159,7 +163,7 @@ def planned(
     """Return what `simulate` does of its arguments, checked, and the robot that moves."""
     policy = followed(policy, robot)
     times = times_of(policy, duration, dt, every, sample, delay)
-    policy = followed(policy, robot, held=times.sample > 0)
+    policy = followed(policy, robot, held=times.sample * times.dt)
     lin, _ = feedback_of(policy)
     follows, along = reference_of(policy), tracking_of(policy)
     own_frame, own_reference = axes_of(policy)
@@ -237,7 +241,7 @@ def planned(
         target=goal,
         reference=follows,
         steered=steered_by(policy),
-        notes=(*notes_of(policy, robot), *times.notes),
+        notes=(*growing(policy), *notes_of(policy, robot), *times.notes),
         predictor=foresees,
     )
     return plan, plant

@@ -9,7 +9,7 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, instance
 from fflin.control.channel import Channel
-from fflin.control.output_feedback import OutputFeedback
+from fflin.control.linear_controller import Compensation, LinearController
 from fflin.control.policies import Allocation
 from fflin.control.tracking import AT_THE_END, TrajectoryFeedback
 from fflin.dynamics.state import StateMap
@@ -25,7 +25,10 @@ _WHY_NOT = {Allocation: "an Allocation has thrusters that cannot pull, so that i
 
 
 class Predictor(NamedTuple):
-    """A linear model, and what makes the law that it is under, which remembers nothing yet."""
+    """A linear model, and what makes the law that it is under, which remembers nothing yet.
+
+    States of a controller that are integrated along stand behind the robot's.
+    """
 
     lin: LinearModel
     law: Callable[[], LinearLaw]
@@ -49,15 +52,16 @@ def predictor(plant: Plant, policy: Any, linear: Any) -> Predictor | TrajectoryF
         own = _checked(plant, policy, linear)
     law = _law(policy, own) if isinstance(own, LinearModel) else None
     if law is not None and own.state_names == plant.state.names:
-        return Predictor(own, law)
+        along = isinstance(policy, LinearController) and not policy.dt
+        return Predictor(policy.around(own)[0] if along else own, law)
     if linear is None:
         return None
     why = _WHY_NOT.get(type(policy), f"a {type(policy).__name__} is not known to be linear")
     if law is not None:
         why = "this one's model is reduced: give linear= the whole model"
     raise InputError(
-        f"linear predicts under a StateFeedback, an OutputFeedback or no policy; {why}; leave it "
-        "out"
+        "linear predicts under a StateFeedback, an OutputFeedback, a LinearController or no "
+        f"policy; {why}; leave it out"
     )
 
 
@@ -67,7 +71,7 @@ def _checked(plant: Plant, policy: Any, linear: Any) -> LinearModel:
     state = plant.state
     names = (state.names, plant.actuation.names, state.frame)
     same = (linear.state_names, linear.input_names, linear.frame) == names and not linear.moving
-    if isinstance(policy, OutputFeedback):
+    if isinstance(policy, LinearController):
         same = same and linear.output_names == policy.lin.output_names
     if not same or not linear.reference.isApprox(state.reference, 1e-9):
         raise InputError(
@@ -82,20 +86,15 @@ def _law(policy: Any, lin: LinearModel) -> Callable[[], LinearLaw] | None:
     """Return what makes a policy's law of the deviation from a model's point, if it is linear."""
     if policy is None:
         return lambda: lambda _: np.zeros(len(lin.u0))
-    if isinstance(policy, OutputFeedback):
-        by = policy.compensator
+    if isinstance(policy, LinearController):
+        if not policy.dt:
+            _, gains, offset = policy.around(lin)
+            return lambda: lambda e: offset + gains @ e
+        stays = policy.terms
 
         def measured() -> LinearLaw:
-            z: Array = np.zeros(len(by.A))
-
-            def law(e: Array) -> Array:
-                nonlocal z
-                u: Array = by.u0 + by.C @ z
-                y = lin.y0 + lin.C @ e + lin.D @ (u - lin.u0)
-                z = by.A @ z + by.B @ (y - by.y0)
-                return u
-
-            return law
+            law = Compensation(len(stays.A), lambda _: stays)
+            return lambda e: law.step(0.0, lambda _, u: lin.y0 + lin.C @ e + lin.D @ (u - lin.u0))
 
         return measured
     own, K = getattr(policy, "lin", None), getattr(policy, "K", None)
@@ -103,12 +102,7 @@ def _law(policy: Any, lin: LinearModel) -> Callable[[], LinearLaw] | None:
         return None
     fed = [lin.state_names.index(name) for name in own.state_names]
     apart = lin.x0[fed] - own.x0
-
-    def feedback(e: Array) -> Array:
-        u: Array = own.u0 - K @ (e[fed] + apart)
-        return u
-
-    return lambda: feedback
+    return lambda: lambda e: own.u0 - K @ (e[fed] + apart)
 
 
 def predict(plan: Any, x: Array, steps: int, target: Array) -> Array:
@@ -138,7 +132,7 @@ def _states(predictor: Predictor, plan: Any, x: Array, steps: int) -> Array:
         limits = limits._replace(wheels=limits.wheels._replace(speeds=lambda e: (x0 + e)[of]))
     channel = Channel(predictor.law(), plan.initial, limits, sample, delay)
     rows = []
-    e: Array = x - x0
+    e: Array = np.concatenate((x, np.zeros(len(x0) - len(x)))) - x0
     if lin.dt:
         # Between the samples of a sampled model there is nothing to say.
         whole = round(lin.dt / dt)
@@ -171,7 +165,7 @@ def _states(predictor: Predictor, plan: Any, x: Array, steps: int) -> Array:
             e = held.A @ e + held.B @ (u - u0) + held.f0
         else:
             e = transition.dot(e) + shift if len(shift) else _after(dt, e, slope)
-    return np.array([*rows, e]) + x0
+    return (np.array([*rows, e]) + x0)[:, : len(x)]
 
 
 def _after(dt: float, e: Array, slope: Callable[[int, Array], Array]) -> Array:

@@ -108,8 +108,8 @@ def simulate(
         callback(t, q, v, u), called at every recorded row.
     linear : LinearModel or bool, optional
         Predicts the motion under the same law, of a StateFeedback, a feedback along a trajectory,
-        an OutputFeedback without its noise, or none; by default the policy's own model, False for
-        none. Sampled, it does so where every row is at a sample.
+        an OutputFeedback or LinearController without its noise, or none; by default the policy's
+        own model, False for none. Sampled, it does so where every row is at a sample.
     target : LinearModel or array_like (nx,), optional
         State, or model whose point it is, that errors are counted from; by default the point of
         the policy's own model, or along a trajectory the state that it has at each time, and none

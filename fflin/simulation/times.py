@@ -8,7 +8,8 @@ import numpy as np
 
 from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array, number, whole
-from fflin.control.policies import StateFeedback, fed_back, feedback_of
+from fflin.control.linear_controller import LinearController, closed_loop
+from fflin.control.policies import StateFeedback, decider, fed_back
 from fflin.control.tracking import TrajectoryFeedback, largest_rate, tracking_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.sampling import held_exponential
@@ -96,8 +97,9 @@ def times_of(
     if sample is not None:
         sample = _positive("sample", sample)
     else:
-        made = follows.schedule if follows else getattr(policy, "lin", None)
-        sample = getattr(made, "dt", None) or None
+        by = decider(policy)
+        made = by if isinstance(by, LinearController) else getattr(policy, "lin", None)
+        sample = getattr(follows.schedule if follows else made, "dt", None) or None
     fastest, mode = (0.0, "") if sample else _fastest_pole(policy, follows)
     if duration is None and follows is None:
         raise InputError("duration is missing; give it [s]")
@@ -144,10 +146,10 @@ def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> tuple[floa
     """Return the largest magnitude [1/s] of a continuous loop's poles, and the state that moves."""
     if follows is not None:
         return largest_rate(follows.schedule), ""
-    lin, K = feedback_of(policy)
-    if lin is None or K is None or lin.dt:
+    closed = closed_loop(policy)
+    if closed is None or closed[1]:
         return 0.0, ""
-    loop = lin.A - lin.B @ K
+    loop, _, names = closed
     fastest = float(np.abs(np.linalg.eigvals(loop)).max())
     if fastest * _STEP <= 1.0:
         return fastest, ""
@@ -155,7 +157,7 @@ def _fastest_pole(policy: Any, follows: TrajectoryFeedback | None) -> tuple[floa
 
     poles, left, right = eig(loop, left=True, right=True)
     parts = np.abs(left * right)[:, np.abs(poles).argmax()]
-    return fastest, lin.state_names[int(np.argmax(parts > (1.0 - _ALIKE) * parts.max()))]
+    return fastest, names[int(np.argmax(parts > (1.0 - _ALIKE) * parts.max()))]
 
 
 def _whole(dt: float, **times: float) -> list[int]:
@@ -186,16 +188,21 @@ def _positive(name: str, value: Any) -> float:
     return time
 
 
-def time_to_settle(robot: Robot, policy: StateFeedback, q: Array, v: Array | None) -> float:
+def time_to_settle(
+    robot: Robot, policy: StateFeedback | LinearController, q: Array, v: Array | None
+) -> float:
     """Return when [s] the linear loop stays within 1 % of each error; in tens of seconds."""
     lin = policy.lin
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     start = state.read(q, np.zeros(robot.nv) if v is None else v, near=state.read(lin.q, lin.v))
     e = start[[state.names.index(name) for name in lin.state_names]] - lin.x0
-    step = lin.dt or _LOOK
-    loop: Array = lin.A - lin.B @ policy.K
-    if not lin.dt:
+    closed = closed_loop(policy)
+    assert closed is not None
+    loop, dt, _ = closed
+    step = dt or _LOOK
+    if not dt:
         loop = held_exponential(loop, np.zeros((len(loop), 0)), step)[0]
+    e = np.concatenate((e, np.zeros(len(loop) - len(e))))
     places = [f"q_m.{name}" for name in robot.joint_names if name not in robot.wheels]
     kinds = [[f"{group}.{axis}" for axis in "xyz"] for group in ("q_b", "r_b")] + [places]
     fed = {*fed_back(policy)}

@@ -156,17 +156,8 @@ class LFT(Design):
             for name, repeats in zip(self.parameters, self.repeats, strict=True)
             for at in range(int(repeats))
         ]
-        return state_space(
-            _Open(self, channels), np.block([[self.D11, self.D12], [self.D21, self.D22]])
-        )
-
-
-class _Open:
-    """An LFT as a plain system, for `state_space`."""
-
-    def __init__(self, lft: LFT, channels: list[str]) -> None:
-        self.A, self.dt = lft.A, 0.0
-        self.B, self.C = np.hstack((lft.B1, lft.B2)), np.vstack((lft.C1, lft.C2))
-        self.state_names = lft.state_names
-        self.input_names = (*(f"w.{name}" for name in channels), *lft.input_names)
-        self.output_names = (*(f"z.{name}" for name in channels), *lft.output_names)
+        B, C = np.hstack((self.B1, self.B2)), np.vstack((self.C1, self.C2))
+        D = np.block([[self.D11, self.D12], [self.D21, self.D22]])
+        inputs = [*(f"w.{name}" for name in channels), *self.input_names]
+        outputs = [*(f"z.{name}" for name in channels), *self.output_names]
+        return state_space((self.A, B, C, D), 0.0, self.state_names, inputs, outputs)

@@ -24,31 +24,17 @@ ENTRIES = {a + b: (AXES.index(a), AXES.index(b)) for a, b in ("xx", "yy", "zz", 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter, and how a unit of it changes the robot.
-
-    Attributes
-    ----------
-    of, part : str
-        Whose it is, and which: "arm" and "inertia.xx".
-    unit : str
-    value : float
-        What it is now.
-    bodies : mapping
-        {Pinocchio joint: change (10,)} of the dynamic parameters of bodies: mass, first moment, and
-        inertia xx, xy, yy, xz, yz, zz at the joint's frame.
-    spring, damper : int
-        The joint whose stiffness or damping it is, in state order; -1 for none.
-    wrench : tuple or None
-        (Pinocchio joint, input, change (6,) of the wrench of a unit of it in the joint's frame).
-    """
+    """One parameter, such as "inertia.xx" of "arm", and how a unit of it changes the robot."""
 
     of: str
     part: str
     unit: str
     value: float
+    # {Pinocchio joint: change (10,)} of bodies: m, m c, and I xx, xy, yy, xz, yz, zz at the joint.
     bodies: dict[int, Array] = field(default_factory=dict)
-    spring: int = -1
+    spring: int = -1  # the joint whose stiffness or damping it is, in state order
     damper: int = -1
+    # (Pinocchio joint, input, change (6,) of the wrench of a unit of it in the joint's frame)
     wrench: tuple[int, int, Array] | None = None
 
     @property

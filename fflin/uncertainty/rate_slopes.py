@@ -47,14 +47,7 @@ _OF_BODIES = np.linalg.inv([body.toDynamicParameters() for body in _BODIES]).rou
 
 
 class BodySlopes:
-    """Derivatives over the ten dynamic parameters of every body, at one point.
-
-    With c the acceleration, F the forces that it takes, S_q, S_nu and D the slopes of c over q, nu
-    and u, and p a parameter as an index (MATH 10):
-
-        c_p = -M^-1 F_p,              D_p = -M^-1 M_p D,
-        S_q,p = -M^-1 (F_qp + d(M c_p)/dq + M_p S_q),   S_nu,p = -M^-1 (F_nup + M_p S_nu).
-    """
+    """Derivatives over the ten dynamic parameters of every body at one point, (12.1) and (12.2)."""
 
     def __init__(self, ready: Prepared, rates: Rates, q: Array, v: Array, inverse: Array) -> None:
         self.state, self.model = ready.map, ready.robot.model
@@ -62,9 +55,8 @@ class BodySlopes:
         # Nothing depends on where the base is and how fast it moves along, see `Accelerations`.
         self.q[:3] = self.v[:3] = 0.0
         field = field_of(ready.robot, self.state.frame)
-        self._tide = None
-        if field:
-            self._tide = Tide.at(field, q)
+        self._tide = Tide.at(field, q) if field else None
+        if self._tide:
             self.v[PIN_ANGULAR] += self._tide.spin
         self.data, self.rates = ready.robot.create_data(), rates
         self.joints = range(ROOT, self.model.njoints)

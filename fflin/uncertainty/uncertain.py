@@ -19,6 +19,7 @@ from fflin.robot.link_masses import Piece
 from fflin.robot.robot import Robot
 from fflin.uncertainty.fraction import Range, fraction
 from fflin.uncertainty.lft import LFT
+from fflin.uncertainty.model_slopes import WEIGH
 from fflin.uncertainty.parameters import Parameter
 from fflin.uncertainty.variants import Variants
 from fflin.uncertainty.worst import Worst, searched
@@ -191,7 +192,8 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     ----------
     robot : Robot
     ranges : mapping
-        {parameter: range}, the parameters those of `sensitivity`, or patterns. A number is a
+        {parameter: range}, the parameters those of `sensitivity`, or patterns; ``BODY.mass`` of
+        `monte_carlo` is a ``density`` here. A number is a
         relative half width, 0.2 for 20 %; a pair the least and the largest value. ``{link:
         {"mass": .., "inertia.xx": ..}}`` says several of a link.
 
@@ -273,8 +275,9 @@ def _range(one: Parameter, value: Any) -> Range:
 
 def _lft(of: Uncertain, lin: Any) -> LFT:
     ready = prepare(of.robot, frame=lin.frame, reference=None, moving=False)
-    if ready.sensing is not None and (lin.D.any() or ready.sensing.needs_acceleration):
-        raise InputError("an output feels accelerations; leave it out with robot.replace(outputs=)")
+    if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in of.robot.outputs):
+        feels = "an output feels accelerations or weighs the robot"
+        raise InputError(f"{feels}; leave it out with robot.replace(outputs=)")
     form = fraction(ready.map, ready.actuation, lin.q, of._variants.pieces, of.ranges)
     nv, nw = len(lin.A) // 2, len(form.z[0])
     x, w, u = form.a

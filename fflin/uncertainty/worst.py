@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from itertools import product
-from typing import Any
+from dataclasses import dataclass, replace
+from itertools import islice, product
+from operator import itemgetter
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from fflin.base.errors import InputError
+from fflin.base.progress import Progress
 from fflin.base.tables import folded
+from fflin.base.threads import in_one_thread
 from fflin.base.validation import Array, as_double
-from fflin.control.margins import input_margins, largest_gain
+from fflin.control.margins import largest_gain
 from fflin.uncertainty.lft import LFT
+from fflin.uncertainty.singular_value import largest_bound
 
-# Ends of a search, evaluations of each, corners that are tried, and frequencies of the bound.
-_STARTS, _STEPS, _CORNERS, _FREQUENCIES = 3, 150, 256, 80
+_CORNERS = 256
+# Ends of a search, steps of each, and how far these go, relative to half a range; 1e9 to a corner.
+_STARTS, _STEPS, _LENGTHS = 3, 25, np.array((1e9, 1.0, 0.3, 0.1, 0.03, 0.01, 1e-3))
+# Loops held exactly in a step, and frequencies at which the others are judged.
+_HELD, _FREQUENCIES, _DIFFERENCE = 3, 6, 1e-6
+
+Figure: TypeAlias = Callable[[Array], Array]  # how bad loops are, of rows of deltas
 
 
 @dataclass(frozen=True)
@@ -43,10 +52,10 @@ class Worst:
         Of the loops tried, how many were unstable.
     tried, excluded : int
         Loops tried, and draws and corners left out because they make no rigid bodies.
-    safe : float or None
+    safe : float
         The loop is stable for all ranges widened about their middles by this factor, by an upper
         bound of the structured singular value over a grid of frequencies; 1 or more is all of the
-        set. None without slycot.
+        set.
     """
 
     damping: Found
@@ -55,7 +64,7 @@ class Worst:
     unstable: int
     tried: int
     excluded: int
-    safe: float | None
+    safe: float
 
     def __str__(self) -> str:
         lines = [
@@ -69,107 +78,143 @@ class Worst:
         ):
             at = ", ".join(f"{name} {value:.4g}" for name, value in found.parameters.items())
             lines.append(f"{what} {found.value:.4g} at {at}")
-        if self.safe is None:
-            lines.append("no bound: pip install 'fflin[robust]' has the structured singular value")
-        elif self.safe >= 1.0:
+        if self.safe >= 1.0:
             lines.append(f"stable on all of the set, up to {self.safe:.3g} times as wide (bound)")
         else:
             lines.append(f"stable for sure on {100.0 * self.safe:.3g} % of each range (bound)")
         return folded(lines)
 
 
+@in_one_thread
 def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
     """Do what `Uncertain.worst` does."""
     K = as_double("gain", getattr(gain, "K", gain))
     if K.shape != lft.B2.T.shape:
         raise InputError(f"gain has shape {K.shape}, expected {lft.B2.T.shape} (nu, nx)")
-    R = getattr(gain, "R", np.eye(len(K)))
-    middle = lft.at(np.zeros(len(lft.repeats)))
-    if np.linalg.eigvals(middle[0] - middle[1] @ K).real.max() >= 0.0:
+    size, loops = len(lft.repeats), Loops(lft, K)
+    middle = np.zeros((1, size))
+    if loops.undamped(middle)[0] >= 0.0:
         raise InputError("the loop in the middle of the ranges is unstable; give another gain")
     draws, excluded = of.draws(samples, seed=seed)
-    if len(lft.repeats) > np.log2(_CORNERS):
-        signs = np.random.default_rng(seed).integers(0, 2, (_CORNERS, len(lft.repeats)))
-        corners = 2.0 * signs - 1.0
+    if 2**size <= _CORNERS:
+        corners = np.array(list(product((-1.0, 1.0), repeat=size)))
     else:
-        corners = np.array(list(product((-1.0, 1.0), repeat=len(lft.repeats))))
+        corners = np.random.default_rng(seed).choice((-1.0, 1.0), (_CORNERS, size))
     physical = np.array([of.makes(corner) for corner in corners])
-    excluded += int((~physical).sum())
-    tried = np.vstack((draws, corners[physical], np.zeros((1, len(lft.repeats)))))
-
-    def loop(delta: Array) -> tuple[Array, Array, Array]:
-        A, B, C, _ = lft.at(delta)
-        return A - B @ K, B, C
-
-    def damping(delta: Array) -> float:
-        poles = np.linalg.eigvals(loop(delta)[0])
-        return float((-poles.real / np.maximum(np.abs(poles), 1e-300)).min())
-
-    def margin(delta: Array) -> float:
-        A, B, _, _ = lft.at(delta)
-        return input_margins(A, B, K, R, 0.0).disk if damping(delta) > 0.0 else 0.0
-
-    def less_gain(delta: Array) -> float:
-        F, B, C = loop(delta)
-        if damping(delta) <= 0.0:
-            return -np.inf
-        return -largest_gain(F, B, C, np.zeros((len(C), B.shape[1])))
-
-    def least(figure: Callable[[Array], float]) -> Found:
-        value, at = _least(figure, tried, of.makes)
-        return Found(value, of.values(at))
-
-    largest = least(less_gain)
+    tried = np.vstack((draws, corners[physical], middle))
+    # The disk margin is of (S - T)/2, each input counted in sqrt(R_ii), as in control.margins.
+    scale = np.sqrt(getattr(gain, "R", np.eye(len(K))).diagonal())
+    disk = Gain(-scale[:, None] * K, 0.5 * np.eye(len(K)), 1.0 / scale)
+    whole = Gain(lft.C2, np.zeros((len(lft.C2), len(K))), np.ones(len(K)))
+    found, bar = [], Progress()
+    for figures in ((loops.undamped,) * 2, loops.figures(disk), loops.figures(whole)):
+        value, delta = _largest(*figures, tried, of.makes)
+        found.append(Found(value, of.values(delta)))
+        bar.update(len(found), 4)
+    safe = _safe(loops)
+    bar.close()
+    damping, margin, gained = found
     return Worst(
-        damping=least(damping),
-        margin=least(margin),
-        gain=Found(-largest.value, largest.parameters),
-        unstable=sum(damping(delta) <= 0.0 for delta in tried),
+        damping=replace(damping, value=-damping.value),
+        margin=replace(margin, value=min(1.0 / margin.value, 2.0)),
+        gain=gained,
+        unstable=int((loops.undamped(tried) >= 0.0).sum()),
         tried=len(tried),
-        excluded=excluded,
-        safe=_safe(lft, K, middle),
+        excluded=excluded + int((~physical).sum()),
+        safe=safe,
     )
 
 
-def _least(
-    figure: Callable[[Array], float], tried: Array, makes: Callable[[Array], bool]
+class Gain(NamedTuple):
+    """From a disturbance over `scale` at the inputs to C x, and D of the disturbance."""
+
+    C: Array
+    D: Array
+    scale: Array
+
+
+class Loops:
+    """Loops u = -K x of the robots of a fraction, deltas in rows (N, k); unstable ones are bad."""
+
+    def __init__(self, lft: LFT, K: Array) -> None:
+        self.lft, self.K = lft, K
+
+    def matrices(self, rows: Array) -> tuple[Array, Array]:
+        """Return A - B K and B."""
+        A, B, _, _ = self.lft.at(rows)
+        return A - B @ self.K, B
+
+    def undamped(self, rows: Array) -> Array:
+        """Return minus the least damping ratio (N,); 0 or more where a loop is unstable."""
+        poles = np.linalg.eigvals(self.matrices(rows)[0])
+        found: Array = (poles.real / np.maximum(np.abs(poles), 1e-300)).max(axis=-1)
+        return found
+
+    def gains(self, of: Gain, rows: Array, frequencies: Array) -> Array:
+        """Return the largest gains (N,) at these frequencies, infinite of unstable loops."""
+        F, B = self.matrices(rows)
+        found = np.zeros(len(F))
+        for w in frequencies:
+            inner = 1j * w * np.eye(F.shape[-1]) - F
+            response = of.C @ np.linalg.solve(inner, B * of.scale) + of.D
+            gram = response.conj().mT @ response
+            found = np.maximum(found, np.linalg.eigvalsh(gram)[..., -1])
+        return np.where(self.undamped(rows) >= 0.0, np.inf, np.sqrt(found))
+
+    def figures(self, of: Gain) -> tuple[Figure, Figure]:
+        """Return what judges gains of many loops by a few frequencies, and of one by all."""
+        middle = np.zeros((1, len(self.lft.repeats)))
+        sizes = np.unique(np.abs(np.linalg.eigvals(self.matrices(middle)[0])))
+        at = np.argsort([-self.gains(of, middle, np.array((w,)))[0] for w in sizes])
+        peaks = [0.0, *sizes[at[:_FREQUENCIES]]]
+
+        def exact(row: Array) -> Array:
+            F, B = (each[0] for each in self.matrices(row))
+            if np.linalg.eigvals(F).real.max() >= 0.0:
+                return np.array((np.inf,))
+            value, w = largest_gain(F, B * of.scale, of.C, of.D)
+            peaks.append(min(w, 1e300))  # where others like it have theirs
+            return np.array((value,))
+
+        return lambda rows: self.gains(of, rows, np.unique(peaks[-_FREQUENCIES:])), exact
+
+
+def _largest(
+    quick: Figure, exact: Figure, tried: Array, makes: Callable[[Array], bool]
 ) -> tuple[float, Array]:
-    """Return the least of a figure and where it is: of what was tried, and from there downhill."""
-    from scipy.optimize import minimize
-
-    values = np.array([figure(delta) for delta in tried])
-    order = np.argsort(values)
-    best, at = float(values[order[0]]), tried[order[0]]
-
-    def walled(delta: Array) -> float:
-        delta = np.clip(delta, -1.0, 1.0)
-        return figure(delta) if makes(delta) else float(values.max())
-
-    for start in tried[order[:_STARTS]]:
-        if not np.isfinite(best):
-            break
-        options = {"maxfev": _STEPS, "xatol": 1e-4, "fatol": 1e-9}
-        found = minimize(walled, start, method="Nelder-Mead", options=options)
-        if found.fun < best:
-            best, at = float(found.fun), np.clip(found.x, -1.0, 1.0)
+    """Climb a figure from the worst that was tried, along its slope and one delta at a time."""
+    best, at, unit = -np.inf, tried[0], np.eye(tried.shape[1])
+    for start in tried[np.argsort(-quick(tried))[:_STARTS]]:
+        value, delta = exact(start[None])[0], start
+        for _ in range(_STEPS):
+            if not np.isfinite(value):
+                break
+            around = quick(np.vstack((delta + _DIFFERENCE * unit, delta)))
+            slope = np.nan_to_num(around[:-1] - around[-1], posinf=1.0)
+            steps = _LENGTHS[:, None] * slope / max(np.abs(slope).max(), 1e-300)
+            alone = [np.where(unit, end, delta) for end in (-1.0, 1.0)]
+            trials = np.vstack((np.clip(delta + steps, -1.0, 1.0), *alone))
+            held = islice(filter(makes, trials[np.argsort(-quick(trials))]), _HELD)
+            ahead = max(
+                ((exact(x[None])[0], x) for x in held), key=itemgetter(0), default=(value, delta)
+            )
+            if not ahead[0] > value + 1e-9 * abs(value):
+                break
+            value, delta = ahead
+        if value > best:
+            best, at = value, delta
     return best, at
 
 
-def _safe(lft: LFT, K: Array, middle: Any) -> float | None:
+def _safe(loops: Loops) -> float:
     """Return by how much the set may be widened: the inverse of the largest bound on mu."""
-    try:
-        from slycot import ab13md
-    except ImportError:
-        return None
-    poles = np.linalg.eigvals(middle[0] - middle[1] @ K)
-    sizes = np.abs(poles)
-    grid = np.geomspace(0.01 * sizes.min(), 100.0 * sizes.max(), _FREQUENCIES)
-    blocks = lft.repeats.astype(int)
-    real = np.where(blocks == 1, 1, 2)
-    F, C = lft.A - lft.B2 @ K, lft.C1 - lft.D12 @ K
-    largest = float(ab13md(lft.D11, blocks, real)[0])  # at frequencies without end
-    for frequency in np.sort(np.concatenate(((0.0,), grid, np.abs(poles.imag), sizes))):
-        response = np.linalg.solve(1j * frequency * np.eye(len(F)) - F, lft.B1)
-        Z = C @ response + lft.D11
-        largest = max(largest, float(ab13md(Z, blocks, real)[0]))
+    lft, F = loops.lft, loops.matrices(np.zeros(len(loops.lft.repeats)))[0]
+    poles = np.linalg.eigvals(F)
+
+    def response(w: Array) -> Array:
+        inner = 1j * w[:, None, None] * np.eye(len(F)) - F
+        return (lft.C1 - lft.D12 @ loops.K) @ np.linalg.solve(inner, lft.B1) + lft.D11
+
+    rates = np.concatenate((np.abs(poles), np.abs(poles.imag)))
+    largest = largest_bound(response, lft.D11, rates[rates > 0.0], lft.repeats.astype(int))
     return 1.0 / largest if largest else np.inf

@@ -25,38 +25,15 @@ _LARGEST = 20_000
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles of one colour.
+    """Triangles of one colour."""
 
-    Attributes
-    ----------
-    vertices : ndarray (V, 3) of float32
-    faces : ndarray (F, 3) of uint32
-    color : tuple of float, optional
-        None where the file says none.
-    """
-
-    vertices: Array
-    faces: Indices
-    color: Color | None
+    vertices: Array  # (V, 3) of float32
+    faces: Indices  # (F, 3) of uint32
+    color: Color | None  # where the file says one
 
 
 def load_mesh(path: Path) -> tuple[Mesh, ...]:
-    """Read a mesh file, in its own unit of length.
-
-    Parameters
-    ----------
-    path : Path
-        What Pinocchio reads: STL, DAE, OBJ and others. Colours are taken of DAE.
-
-    Returns
-    -------
-    tuple of Mesh
-
-    Raises
-    ------
-    ValueError
-        If it cannot be read, or nothing of it can be seen.
-    """
+    """Read a mesh file, in its own unit of length, or raise ValueError where nothing is seen."""
     try:
         found = os.stat(path)
     except OSError as error:

@@ -66,14 +66,7 @@ class _Line(NamedTuple):
 
 
 def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]]:
-    """Return the distance of configurations (N, nq) from a target (1, nq) or targets (N, nq).
-
-    Returns
-    -------
-    dict
-        {what: (unit, values (N,))}: attitude and position of the base, and of joints that turn and
-        that slide, if there are any, the largest error; reaction wheels are none of them.
-    """
+    """Return {what: (unit, values (N,))}, how far q (N, nq) is from targets, wheels left out."""
     state = StateMap(robot)
     goals = map(pin.XYZQUATToSE3, np.broadcast_to(target, q.shape)[:, :7])
     relative = [

@@ -64,27 +64,7 @@ def body_paths(robot: Robot) -> list[str]:
 
 
 class Drawing:
-    """A robot drawn into a meshcat scene.
-
-    Parameters
-    ----------
-    robot : Robot
-    visualizer : meshcat.Visualizer
-        Node to draw below. The bodies become its children, named as their joints.
-    look : str
-        "real", or "ghost" and "linear" for translucent ones.
-    sent : set of str, optional
-        Meshes that the page has already; those of this drawing are added.
-
-    Attributes
-    ----------
-    notes : tuple of str
-        What could not be drawn, one line each.
-    corners : list of ndarray (8, 3)
-        Bounding box of each body's pieces in the body's frame, for those that have pieces.
-    bodies : list of int
-        The Pinocchio joints whose boxes these are.
-    """
+    """A robot drawn below a node of a meshcat scene, whose children are named as its joints."""
 
     def __init__(
         self, robot: Robot, visualizer: Visualizer, look: str = "real", sent: set[str] | None = None
@@ -107,7 +87,7 @@ class Drawing:
                 placed = shape.placement.homogeneous @ matrix
                 node[f"{index}_{part}"].set_object(_Piece(shown, placed, about))
                 corners.setdefault(shape.joint, []).append(_box_corners(placed, box))
-        self.bodies = list(corners)
+        self.bodies = list(corners)  # Pinocchio joints
         self.corners = [
             _box_corners(np.eye(4), _bounds(np.concatenate(boxes))) for boxes in corners.values()
         ]

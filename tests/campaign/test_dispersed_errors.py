@@ -20,6 +20,8 @@ ENGINES = ["python", "compiled"]
 DRAWN = {
     policies.state: {"q_b": 0.05, "*.noise": 1e-3, "delay": (0.0, 0.15)},
     policies.outputs: {"q_b": 0.05, "*.noise": 1e-3, "*.sensor": 1e-3, "delay": [0.0, 0.07]},
+    policies.controlled: {"q_b": 0.05, "*.sensor": 1e-3},
+    policies.controlled_in_samples: {"q_b": 0.05, "*.noise": 1e-3, "delay": [0.0, 0.07]},
     policies.followed: {"q_b": 0.05},
     policies.followed_outputs: {"q_b": 0.05, "*.noise": (1e-4, 1e-3), "*.sensor": 1e-3},
     policies.between_gains: {"q_m.*": 0.2},

@@ -294,7 +294,7 @@ def test_command_line():
     code, out, err = run("validity", "cubesat", "--samples", "4", "--jobs", "2")
     assert code == 0 and not err
     assert "4 of 4 runs" in out and max(map(len, out.splitlines())) <= 80
-    assert "--jobs is 0" in refused("validity", "cubesat", "--jobs", "0")
+    assert "--jobs: 0 is too few" in refused("validity", "cubesat", "--jobs", "0")
     assert "below 175 deg" in refused("validity", "cubesat", "--attitude", "200")
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.io
 
 import fflin
 from tests.support.commands import refused, run
@@ -343,3 +344,44 @@ def test_an_on_off_thruster_without_samples_is_told_of_dt(tmp_path):
     )
     said = refused("simulate", tmp_path / "t.toml", "--no-allocate", "--rpy", 9, 0, 0, "--reduce")
     assert said.endswith("or a policy on a sampled model (--dt)\n")
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_a_controller_from_a_file_closes_the_loop(tmp_path, dt):
+    robot = fflin.load("ets_vii", outputs=[fflin.BasePose(), fflin.JointPositions()])
+    lin = fflin.linearize(robot)
+    lin = lin.discretize(dt) if dt else lin
+    by = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4))
+    turned = {"A": by.A, "B": by.B, "C": -by.C, "D": np.zeros((len(by.C), by.B.shape[1])), "Ts": dt}
+    scipy.io.savemat(tmp_path / "K.mat", turned)
+    options = ("simulate", "ets_vii", "--output", "base", "--output", "joints", "--step", 0.02)
+    options = (*options, "--rpy", 10, 0, 0, "--controller", "K.mat", "--negative-feedback")
+    code, out, err = run(*options, "-o", "m.npz", cwd=tmp_path)
+    assert (code, err) == (0, "") and "settled" in out
+    motion = fflin.Motion.load(tmp_path / "m.npz")
+    assert motion.attitude_error[0] == pytest.approx(10.0) and motion.attitude_error[-1] < 0.05
+    policy = fflin.LinearController(by, lin)
+    again = fflin.simulate(robot, policy, q0=motion.q[0], duration=motion.t[-1], dt=0.02)
+    assert np.abs(again.x - motion.x).max() < 1e-9
+    (tmp_path / "u.toml").write_text("[dispersions]\nq_b = 0.01\n'*.sensor' = 1e-4\n")
+    code, out, err = run(
+        *("montecarlo", *options[1:], "u.toml", "--runs", 4, "--duration", 2), cwd=tmp_path
+    )
+    assert (code, err) == (0, "")
+
+
+def test_controllers_that_do_not_fit_are_refused(tmp_path):
+    scipy.io.savemat(tmp_path / "K.mat", {"K": np.eye(3)})
+    robot = ("simulate", "ets_vii", "--controller", "K.mat")
+    assert "it has K, expected A, B, C, D" in refused(*robot, cwd=tmp_path)
+    scipy.io.savemat(tmp_path / "K.mat", {"D": np.eye(3)})
+    assert "has 3 inputs and no names, expected" in refused(*robot, cwd=tmp_path)
+    assert "--dt: --controller is what regulates" in refused(*robot, "--dt", 1, cwd=tmp_path)
+    assert "--free has no regulator" in refused(*robot, "--free", cwd=tmp_path)
+    assert "none.mat: cannot be read" in refused(*robot[:3], "none.mat", cwd=tmp_path)
+    unstable = {"D": 100.0 * np.eye(12, 24, 6)}
+    scipy.io.savemat(tmp_path / "K.mat", unstable)
+    code, out, err = run(*robot, "--rpy", 1, 0, 0, "--limit", "tau_b=1", cwd=tmp_path)
+    assert not err
+    assert "the linear loop is unstable, with a pole at" in out
+    assert sorted(tmp_path.iterdir()) == [tmp_path / "K.mat"] and code in (0, 1)

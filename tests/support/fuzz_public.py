@@ -95,6 +95,7 @@ def sound(folder):
         | {"robot": robot, "strict": False, "hold": "previous", "frame": "world"},
         "Linearizer": {"robot": robot, "engine": None} | place,
         "list_robots": {},
+        "LinearController": {"system": -gain.K, "lin": lin, "sign": -1, "noise": None},
         "load": {
             **{"robot": "planar_detumble", "lock": [joint], "package_dirs": (), "inputs": None},
             **{"outputs": None, "stiffness": 1.0, "damping": "urdf", "rest": {}, "gravity": vector},
@@ -123,6 +124,7 @@ def sound(folder):
         },
         "observability": {"lin": lin},
         "OutputFeedback": {"lin": lin, "compensator": fflin.lqg(gain, filtered), "noise": None},
+        "outputs": {"lin": lin} | found,
         "plan": {
             **{"robot": robot, "goal": (q, None), "duration": 1.0, "q0": q, "v0": v, "x0": None},
             **{"knots": 3, "hold": "previous", "limits": None, "R": 1.0, "free": ()},

@@ -76,6 +76,22 @@ def outputs(robot):
     return robot, fflin.OutputFeedback(lin, by, lambda t: noise(t)[:size]), {"dt": 0.01}
 
 
+def controlled(robot):
+    """A continuous law with a direct term: a filtered estimate, and the rates of it damped."""
+    robot = seen(robot)
+    lin = fflin.linearize(robot)
+    by = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-2))
+    damping = -0.05 * np.linalg.pinv(lin.B) @ np.linalg.pinv(lin.C)
+    return robot, fflin.LinearController((by.A, by.B, by.C, damping), lin), {}
+
+
+def controlled_in_samples(robot):
+    robot, policy, _ = controlled(robot)
+    sampled = policy.sampled(SAMPLE)
+    size = len(policy.lin.output_names)
+    return robot, replace(sampled, noise=lambda t: noise(t)[:size]), {"dt": 0.01}
+
+
 def path(robot):
     """A slew that others follow, turned and moved from where they begin.
 
@@ -113,4 +129,7 @@ def shared(robot):
     return robot, fflin.Allocation(policy, design), {"sample": SAMPLE, "dt": 0.01}
 
 
-POLICIES = (state, between_gains, outputs, followed, followed_outputs, shared)
+POLICIES = (
+    *(state, between_gains, outputs, controlled, controlled_in_samples),
+    *(followed, followed_outputs, shared),
+)

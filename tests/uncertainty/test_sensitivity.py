@@ -234,8 +234,8 @@ def test_its_own_check_finds_it_right_and_what_is_wrong_wrong():
     S = fflin.sensitivity(fflin.linearize(robot, q, v))
     names = ["link_2.mass", "base.com.x", "link_4.inertia.xy"]
     assert max(S.check(names).values()) < 1e-7
-    S._of_bodies.by_q_m[:] *= 1.001
-    S._of_bodies.by_u[:] *= 1.001
+    S._slopes._of_bodies.by_q_m[:] *= 1.001
+    S._slopes._of_bodies.by_u[:] *= 1.001
     assert min(S.check(names).values()) > 1e-6
 
 
@@ -247,10 +247,6 @@ def test_what_is_wrong_is_one_line():
         S["link_2.mas"]
     with pytest.raises(fflin.InputError, match="take along"):
         S["link_2.*"]
-    with pytest.raises(fflin.InputError, match="sampled"):
-        fflin.sensitivity(lin.discretize(0.1))
-    with pytest.raises(fflin.InputError, match="momentum"):
-        fflin.sensitivity(fflin.linearize(robot.replace(outputs=[fflin.Momentum()])))
     with pytest.raises(fflin.InputError, match="gain has shape"):
         S.poles(np.zeros((2, 2)))
     with pytest.raises(fflin.InputError, match="empty"):
@@ -300,6 +296,43 @@ def test_rotors_are_no_parameters_of_bodies():
     q, v, u = random_point(robot, np.random.default_rng(2))
     found = fflin.sensitivity(fflin.linearize(robot, q, v, u)).check(["base.mass", "joint_3.com.x"])
     assert max(found.values()) < 1e-8
+
+
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_its_table_has_what_a_tenth_of_each_changes_and_the_most_first():
+    S = fflin.sensitivity(fflin.linearize(fflin.load("servicer_7dof")))
+    _, _, *rows = S.table(len(S.names)).splitlines()
+    shares = [float(row.split()[-2]) for row in rows]
+    assert shares == sorted(shares, reverse=True) and len(rows) == 80
+    largest = np.abs(S.lin.B).max()
+    for name, step in (("link_7.density", 0.1), ("link_3.mass", 0.95), ("link_7.com.x", 0.01)):
+        [row] = [row for row in rows if row.split()[0] == name]
+        expected = 100.0 * step * np.abs(S[name].dB).max() / largest
+        assert float(row.split()[-2]) == pytest.approx(expected, rel=0.05)
+    assert len(S.table(3).splitlines()) == 5
+    with pytest.raises(fflin.InputError, match="top is 0"):
+        S.table(0)
+
+
+@pytest.mark.parametrize("axis", "xyz")
+def test_every_place_and_direction_of_a_thruster(axis):
+    robot, at = fflin.load("ets_vii"), "xyz".index(axis)
+    where, along = np.array((0.1, 0.2, -0.1)), np.array((0.48, 0.6, 0.64))
+    jet = fflin.Thruster("link_4", where, along, name="jet")
+    q = random_point(robot, np.random.default_rng(3), degrees=60.0)[0]
+
+    def B(**fields):
+        return fflin.linearize(robot.replace(inputs=[replace(jet, **fields)]), q).B
+
+    S = fflin.sensitivity(fflin.linearize(robot.replace(inputs=[jet]), q))
+    unit = np.eye(3)[at]
+    slope = S[f"jet.position.{axis}"]
+    assert slope.unit == "m" and slope.value == where[at]
+    expected = B(position=where + 0.5 * unit) - B(position=where - 0.5 * unit)
+    assert np.abs(slope.dB - expected).max() < 1e-12 * np.abs(B()).max()
+    expected = fourth_order(lambda s: B(direction=along + s * unit), 3e-3)
+    got = S[f"jet.direction.{axis}"].dB
+    assert np.abs(got - expected).max() < 1e-8 * np.abs(expected).max()
 
 
 def test_in_orbit_masses_change_what_the_field_does():

@@ -1,4 +1,4 @@
-"""Pages of robots in orbit: the body that they circle stands where it is, and turns with the orbit."""
+"""Pages of robots in orbit: the body that they circle is where it is, and turns with the orbit."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,8 @@ def look(watched, towards, up=(0, 1, 0)):
         f"""(() => {{ const c = viewer.camera; viewer.controls.update = Boolean;
         viewer.set_property(["meshcat"], "visible", false); c.clearViewOffset();
         c.position.set(0, 0, 0); c.up.set({up[0]}, {up[1]}, {up[2]});
-        c.lookAt({", ".join(map(str, towards))}); c.updateMatrixWorld(); viewer.set_dirty(); }})()"""
+        c.lookAt({", ".join(map(str, towards))}); c.updateMatrixWorld();
+        viewer.set_dirty(); }})()"""
     )
     watched.drawn()
     return watched.picture().astype(float)

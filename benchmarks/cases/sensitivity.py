@@ -1,0 +1,54 @@
+"""Derivatives over the ten dynamic parameters of every body, beside one inverse of M."""
+
+import numpy as np
+import pinocchio as pin
+
+import fflin
+from benchmarks.peers import WrongResultError
+from benchmarks.robots import load
+from benchmarks.tables import Table, figure
+from benchmarks.timing import interleaved
+
+ROBOTS = ("ets_vii", "servicer_7dof", "canadarm2")
+
+
+def run() -> Table:
+    rows = []
+    for name in ROBOTS:
+        robot = load(name)
+        model, data = robot.model, robot.create_data()
+        q = pin.integrate(model, pin.neutral(model), np.random.default_rng(0).normal(size=model.nv))
+        lin = fflin.linearize(robot, q)
+        found = fflin.sensitivity(lin)
+        if max(found.check(["base.mass", "link_2.com.y"]).values()) > 1e-7:
+            raise WrongResultError(f"fflin on {name}: the derivatives do not pass their check")
+        slopes, parameters = found._slopes, list(found.parameters.values())
+        times = interleaved(
+            {
+                "inverse": lambda: pin.computeMinverse(model, data, q),  # noqa: B023
+                "rates": slopes.bodies.all,
+                "matrices": lambda: slopes.over(parameters),  # noqa: B023
+                "whole": lambda: fflin.sensitivity(lin).dB,  # noqa: B023
+            }
+        )
+        inverse = times["inverse"]
+        rows.append(
+            (
+                name,
+                str(10 * (robot.n + 1)),
+                figure(inverse.least * 1e6),
+                figure(times["rates"].ratio(inverse)),
+                str(len(parameters)),
+                figure(times["matrices"].ratio(inverse)),
+                figure(times["whole"].ratio(inverse)),
+            )
+        )
+    return Table(
+        "What masses change",
+        "Derivatives at rest over the ten dynamic parameters of every body, as ratios to one "
+        "`pin.computeMinverse`: of the accelerations over state and inputs, which are those of A "
+        "and B; of A, B, C, D and f0 over every named parameter; and with all that `sensitivity` "
+        "prepares.",
+        ("robot", "parameters", "inverse [us]", "slopes", "named", "matrices", "whole"),
+        tuple(rows),
+    )

@@ -1,0 +1,35 @@
+"""Make docs/controllers.png by what docs/controllers.md does: ``python docs/controllers.py``."""
+
+import os
+import re
+import tempfile
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+
+HERE = Path(__file__).resolve().parent
+NAMES = ("PD with a direct term", "H-infinity, weighed as an integral")
+
+
+def main() -> None:
+    """Run the page's code and draw the two motions that it ends with."""
+    page = (HERE / "controllers.md").read_text(encoding="utf-8")
+    toml, *_ = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    code, own = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), {}
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        Path("stowed.toml").write_text(toml, encoding="utf-8")
+        exec(compile(code, "controllers.md", "exec"), own)
+    figure, axes = plt.subplots(1, 2, figsize=(9.0, 3.2), layout="constrained")
+    for motion, name in zip(own["motions"], NAMES, strict=True):
+        axes[0].semilogy(motion.t, motion.attitude_error, label=name)
+        axes[1].plot(motion.t, motion.u[:, 0], label=name)
+    for each, title in zip(axes, ("attitude error [deg]", "torque tau_b.x [N m]"), strict=True):
+        each.set(title=title, xlabel="time [s]")
+        each.grid(color="#dddddd", linewidth=0.6)
+        each.legend(frameon=False)
+    figure.savefig(HERE / "controllers.png", dpi=110)
+
+
+if __name__ == "__main__":
+    main()

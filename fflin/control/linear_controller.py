@@ -1,0 +1,296 @@
+"""Feedback of the robot's outputs by a linear system, whoever designed it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import compress
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fflin.base.errors import InputError, listed
+from fflin.base.validation import Array, instance, number, vector
+from fflin.control.policies import Policy, decider, feedback_of
+from fflin.control.systems import fitted, system_of
+from fflin.dynamics.aba import Aba
+from fflin.dynamics.output_kinds import KINDS
+from fflin.dynamics.outputs import Measuring, state_indices
+from fflin.dynamics.state import StateMap
+from fflin.linear.fit import require_sensed
+from fflin.linear.model import LinearModel
+from fflin.linear.sampling import held_exponential
+from fflin.robot.outputs import Gyroscope
+from fflin.robot.robot import Robot
+
+# A pole beyond this share of the fastest is one that grows, and no rounding.
+_ROUNDING = 1e-6
+
+
+def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
+    """Return which states the outputs are, gyroscopes after them; InputError of other sensors."""
+    found, gyros = list[int](), list[Gyroscope]()
+    for output in state.robot.outputs:
+        if isinstance(output, Gyroscope):
+            first = state.nx + 3 * len(gyros)
+            found += range(first, first + 3)
+            gyros.append(output)
+        elif type(output) in KINDS:
+            raise InputError(f"a {type(output).__name__} is measured in Python")
+        else:
+            found += state_indices(state, output)
+    return found, gyros
+
+
+class Sample(NamedTuple):
+    """u = u0 + C (z + jump) + D dy, then z, or dz/dt, is A (z + jump) + B dy of dy = y - y0."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    u0: Array
+    y0: Array
+    seen: Array  # by which, and `through`, a linear model measures y
+    through: Array
+    jump: Array | float = 0.0
+
+
+class Compensation:
+    """What a law does from sample to sample or, where dt is 0, stage to stage, from z = 0 on."""
+
+    def __init__(self, size: int, at: Callable[[float], Sample], dt: float = 1.0) -> None:
+        self.at, self.dt = at, dt
+        self.estimate: Array = np.zeros(size)  # z of the sample or stage to come
+        self.rates: list[Array] = [self.estimate]
+        self.stages = 0
+
+    def step(self, t: float, measure: Callable[[Sample, Array], Array]) -> Array:
+        """Return the command of a sample, at which y is measured then."""
+        by = self.at(t)
+        z = self.estimate + by.jump
+        u: Array = by.u0 + by.C @ z
+        if by.D.any():  # of what does not feel u
+            u = u + by.D @ (measure(by, u) - by.y0)
+        after = by.A @ z + by.B @ (measure(by, u) - by.y0)
+        if self.dt:
+            self.estimate = after
+        else:
+            self.rates.append(after)
+        return u
+
+    def advance(self, shares: Array, last: bool) -> None:
+        """Integrate z to the next stage, by shares of it as the step began and of its rates."""
+        if not self.dt:
+            self.estimate, self.stages = shares @ np.array(self.rates), self.stages + 1
+            if last:
+                self.rates, self.stages = [self.estimate], 0
+
+
+class Loop(Compensation):
+    """The policy of a law on what the robot measures, relative to where it is to be."""
+
+    def __init__(
+        self, state: StateMap, dt: float, noise: Any, size: int, at: Any, there: Any
+    ) -> None:
+        super().__init__(size, at, dt)
+        self._noise, self._there = noise, there
+        self._still: Array = np.zeros(state.robot.nv)
+        felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
+        self._aba, self._asked = Aba(state) if felt else None, -np.inf
+
+    def sample(self, t: float) -> tuple[Sample, StateMap, Array]:
+        """Return what it does at a sample, and the chart and the state that y is relative to."""
+        measure, near = self._there(t)
+        return self.at(t), measure.state, near
+
+    def __call__(self, t: float, q: Array, v: Array) -> Array:
+        """Return the command at a sample or a stage."""
+        apart, dt = t - self._asked, self.dt
+        if dt and self._asked >= 0.0 and abs(apart - dt) > 1e-6 * dt:
+            raise InputError(
+                f"the controller is asked {apart:g} s after its last sample, expected {dt:g} s; "
+                "leave `sample` out"
+            )
+        if not dt and len(self.estimate) and len(self.rates) != self.stages + 1:
+            raise InputError(
+                "the states of a continuous controller are integrated along by fflin.simulate, "
+                "which must be given itself as the policy; or sample it"
+            )
+        self._asked = t
+        measure, near = self._there(t)
+        state, x = measure.state, measure.state.read(q, v, near=near)
+        y: Any = None
+        noise: Any = 0.0 if self._noise is None else None  # one, however often y is asked for
+
+        def measured(_: Sample, u: Array) -> Array:
+            nonlocal y, noise
+            if y is None or self._aba:
+                a = self._still
+                if aba := self._aba:
+                    a = aba.acceleration(q, v, aba.actuation.in_base_axes(state.chart(q), u))
+                y = measure(x, q, v, a)
+            if noise is None:
+                noise = vector("noise(t)", self._noise(t), len(y), "one value for each output")
+            return np.asarray(y + noise)
+
+        return self.step(t, measured)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearController:
+    r"""The feedback ``u - u0 = system (y - y0)`` of the robot's outputs by any linear system.
+
+    .. math:: \dot z = A z + B (y - y_0),\qquad u - u_0 = C z + D (y - y_0),\qquad z(0) = 0
+
+    y is what the robot's outputs measure in the chart of the model, as `outputs` returns it. What
+    the system gives is added to u0: that is positive feedback, as of ``hinfsyn`` and ``h2syn``.
+
+    In continuous time z is integrated along with the robot, by the same stages; where `simulate`
+    is given `sample` or `delay`, y is held from sample to sample and z follows exactly. A sampled
+    system is asked at its own times, multiples of the step, and u is held between them.
+
+    Parameters
+    ----------
+    system : python-control or SciPy system, array_like, tuple, `Compensator` or path
+        A state space or transfer function, a gain D (nu, ny), (A, B, C, D) or (A, B, C, D, dt), or
+        a .mat, .npz or .json file with A, B, C, D, and dt or Ts where it is sampled, or D alone.
+        Where it names its inputs and outputs (in a file ``input_names`` or ``InputName``, ...),
+        they are outputs and inputs of the model, dots or underscores, and need not be all of
+        them; else all are there, in order. A dt that is not said is the model's.
+    lin : LinearModel
+        The model about whose point it acts, continuous or sampled.
+    sign : {1, -1}
+        -1 of a system that was designed for negative feedback.
+    noise : callable, optional
+        noise(t) -> (ny,), added to y.
+
+    Attributes
+    ----------
+    system : tuple of A, B, C, D, dt, inputs, outputs
+        Over all outputs and inputs of the model, with its sign.
+    loop : ndarray (nx + nz, nx + nz)
+        Matrix of the linear loop, of the model's state and z.
+
+    Raises
+    ------
+    InputError
+        If a size, name or sampling time does not fit the model, an entry is not finite, a transfer
+        function is improper, or D acts on an output that feels the input at once.
+    FileError
+        If the file cannot be read or lacks what is named above.
+    """
+
+    system: Any
+    lin: LinearModel
+    sign: float = field(default=1.0, kw_only=True)
+    noise: Callable[[float], ArrayLike] | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        lin = instance("lin", self.lin, LinearModel, "a fflin.LinearModel")
+        if lin.moving or number("sign", self.sign) not in (1.0, -1.0):
+            raise InputError("expected a model about a point that stays, and sign 1 or -1")
+        by = fitted(system_of(self.system), lin)
+        felt = lin.D.any(axis=1) & by.D.any(axis=0)
+        if felt.any():
+            raise InputError(
+                f"D of the controller acts on {listed(compress(lin.output_names, felt))}, which "
+                "feels the input at once: an algebraic loop; take D = 0 there, such as behind a "
+                "low-pass filter"
+            )
+        dt = lin.dt if by.dt is None or (by.dt <= 0.0 and not len(by.A)) else by.dt
+        dt = lin.dt or dt if dt < 0.0 else dt
+        if dt < 0.0:
+            raise InputError("the controller is sampled at a dt that it does not say; give it one")
+        if lin.dt and abs(dt - lin.dt) > 1e-9 * lin.dt:
+            times = (
+                f"sampled at dt = {each:g} s" if each else "continuous" for each in (dt, lin.dt)
+            )
+            raise InputError(
+                "the controller is {}, the model {}; give the continuous model, or sample both "
+                "alike".format(*times)
+            )
+        by = by._replace(C=self.sign * by.C, D=self.sign * by.D, dt=dt)
+        vars(self).update(system=by, sign=1.0)
+
+    def __repr__(self) -> str:
+        (nu, ny), dt = self.system.D.shape, self.dt
+        time, nz = f"dt={dt:g} s" if dt else "continuous", len(self.system.A)
+        return f"{type(self).__name__}('{self.lin.robot}', nz={nz}, ny={ny}, nu={nu}, {time})"
+
+    @property
+    def dt(self) -> float:
+        """Sampling time [s]; 0 in continuous time."""
+        return float(self.system.dt)
+
+    @property
+    def terms(self) -> Sample:
+        """What it does at each sample or stage."""
+        (A, B, C, D, *_), lin = self.system, self.lin
+        return Sample(A, B, C, D, lin.u0, lin.y0, lin.C, lin.D)
+
+    def bind(self, robot: Robot) -> Policy:
+        """Return policy(t, q, v) -> u for a robot, with a state of its own.
+
+        Raises
+        ------
+        InputError
+            If the robot has not the model's states, inputs and outputs; its masses may be others.
+        """
+        lin, stays = self.lin, self.terms
+        state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+        require_sensed(lin, robot, state)
+        there = Measuring(state, lin.q), state.read(lin.q, lin.v)
+        return Loop(state, self.dt, self.noise, len(stays.A), lambda _: stays, lambda _: there)
+
+    def around(self, lin: LinearModel) -> tuple[LinearModel, Array, Array]:
+        """Return a model with the system's states besides, and K and u of u + K e of the two."""
+        A, B, C, D, u0, y0, *_ = self.terms
+        apart, none = lin.y0 - y0, np.zeros((len(lin.A), len(A)))
+        both = replace(
+            lin,
+            A=np.block([[lin.A, none], [B @ lin.C, A]]),
+            B=np.vstack((lin.B, B @ lin.D)),
+            f0=np.concatenate((lin.f0, B @ apart)),
+            x0=np.concatenate((lin.x0, np.zeros(len(A)))),
+        )
+        return both, np.hstack((D @ lin.C, C)), u0 + D @ apart
+
+    @cached_property
+    def loop(self) -> Array:
+        """The closed loop's matrix (nx + nz, nx + nz): of the model's state and the system's."""
+        lin = self.lin.discretize(self.dt) if self.dt and not self.lin.dt else self.lin
+        both, K, _ = self.around(lin)
+        return both.A + both.B @ K
+
+    def sampled(self, dt: float) -> LinearController:
+        """Return it in samples of dt [s], y held between them; itself where it is sampled."""
+        by = self.system
+        if by.dt or not len(by.A):
+            return self
+        A, B = held_exponential(by.A, by.B, dt)
+        return replace(self, system=by._replace(A=A, B=B, dt=dt))
+
+
+def growing(policy: Any) -> tuple[str, ...]:
+    """Say which poles grow, of the loop of a linear controller and of itself."""
+    said, by = [], decider(policy)
+    of = ("linear loop", "controller by itself") if isinstance(by, LinearController) else ()
+    for what in of:
+        poles = np.linalg.eigvals(by.loop if what == "linear loop" else by.system.A)
+        growth = np.abs(poles) - 1.0 if by.dt else poles.real
+        if (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
+            pole, unit = complex(poles[growth.argmax()]), "" if by.dt else " 1/s"
+            said.append(f"the {what} is unstable, with a pole at {pole:.4g}{unit}")
+    return tuple(said)
+
+
+def closed_loop(policy: Any) -> tuple[Array, float, tuple[str, ...]] | None:
+    """Return the matrix of a policy's linear loop, where it has one, its dt [s] and its states."""
+    (lin, K), by = feedback_of(policy), decider(policy)
+    if isinstance(by, LinearController):
+        own = (f"z_{k + 1} of the controller" for k in range(len(by.system.A)))
+        return by.loop, by.dt, (*by.lin.state_names, *own)
+    return None if lin is None or K is None else (lin.A - lin.B @ K, lin.dt, lin.state_names)

@@ -1,0 +1,164 @@
+"""The worst loop of a set of robots, and how far the set is surely safe."""
+
+import numpy as np
+import pytest
+
+import fflin
+from fflin.uncertainty import singular_value, worst
+from fflin.uncertainty.worst import Gain, Loops
+
+FOUR = {
+    "base.mass": 0.2,
+    "link_7": {"density": 0.3, "com.z": (-0.15, -0.11)},
+    "panel_left.stiffness": (80.0, 120.0),
+}
+
+
+@pytest.fixture(scope="module")
+def servicer():
+    """A robot, its gain, four parameters, and their loops."""
+    robot = fflin.load("servicer_7dof")
+    of = fflin.uncertain(robot, FOUR)
+    gain = fflin.lqr(fflin.linearize(robot.replace(stiffness={"panel_left": 100.0})))
+    return of, gain, Loops(of.lft(), gain.K)
+
+
+def disk_of(gain):
+    scale = np.sqrt(gain.R.diagonal())
+    return Gain(-scale[:, None] * gain.K, 0.5 * np.eye(len(scale)), 1.0 / scale)
+
+
+def whole_of(loops):
+    C = loops.lft.C2
+    return Gain(C, np.zeros((len(C), len(loops.K))), np.ones(len(loops.K)))
+
+
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_nothing_that_is_drawn_is_worse_than_what_is_found(servicer):
+    of, gain, loops = servicer
+    found = of.worst(gain, samples=30)
+    draws, frequencies = of.draws(400, seed=9)[0], np.geomspace(0.02, 3.0, 20)
+    assert found.damping.value <= -loops.undamped(draws).max()
+    assert found.gain.value >= loops.gains(whole_of(loops), draws, frequencies).max()
+    assert found.margin.value <= 1.0 / loops.gains(disk_of(gain), draws, frequencies).max()
+    # What is said is of the robot that is said.
+    robot = of.at(found.margin.parameters)
+    lin = fflin.linearize(robot)
+    F, scale = lin.A - lin.B @ gain.K, disk_of(gain).scale
+    peaks = [
+        np.linalg.norm(
+            0.5 * np.eye(len(scale))
+            - (gain.K / scale[:, None])
+            @ np.linalg.solve(1j * w * np.eye(len(F)) - F, lin.B * scale),
+            2,
+        )
+        for w in np.geomspace(0.01, 10.0, 800)
+    ]
+    assert found.margin.value == pytest.approx(1.0 / max(peaks), rel=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_of_many_signals_the_bound_asks_no_more_of_slycot_than_it_can(monkeypatch, servicer):
+    slycot = pytest.importorskip("slycot")
+    asked, own = [], slycot.ab13md
+    monkeypatch.setattr(slycot, "ab13md", lambda *a: asked.append(len(a[0])) or own(*a))
+    of, gain, _ = servicer
+    four = of.worst(gain, samples=2)
+    assert 0 < len(asked) < 60 and set(asked) == {14}
+    asked.clear()
+    many = {f"link_{i}.{part}": 0.2 for i in range(1, 8) for part in ("mass", "density")}
+    lft = fflin.uncertain(of.robot, many).lft()
+    bound = 1.0 / worst._safe(Loops(lft, gain.K))
+    assert not asked and len(lft.D11) == 63
+    assert 0.2 <= bound < 0.4 and four.safe > 1.0
+
+
+def test_the_bound_by_scaling_is_that_of_textbooks():
+    # Packard and Doyle, Automatica 29(1), 1993: of diagonal blocks the bound by D Z D^-1.
+    Z = np.array([[1.0, 4.0], [0.25, 1.0]])
+    assert singular_value.scaled(Z)[1] == pytest.approx(2.0, rel=1e-6)
+    rows = np.random.default_rng(0).normal(size=(20, 5, 5)) + 0j
+    scaled, bounds = singular_value.scaled(rows)
+    radii = np.abs(np.linalg.eigvals(rows)).max(axis=1)
+    assert (bounds >= radii * (1.0 - 1e-12)).all()
+    assert (bounds <= np.abs(np.linalg.eigvals(np.abs(rows))).max(axis=1) * (1.0 + 1e-6)).all()
+    assert np.linalg.eigvals(scaled[3])[0] == pytest.approx(np.linalg.eigvals(rows[3])[0])
+    nothing = singular_value.scaled(np.zeros((1, 3, 3)))
+    assert not nothing[0].any() and not nothing[1].any()
+
+
+def test_slycot_gives_the_structured_singular_value_of_its_own_example():
+    slycot = pytest.importorskip("slycot")
+    rows = (
+        (-1 + 6j, 2 - 3j, 3 + 8j, 3 + 8j, -5 - 9j, -6 + 2j),
+        (4 + 2j, -2 + 5j, -6 - 7j, -4 + 11j, 8 - 7j, 12 - 1j),
+        (5 - 4j, -4 - 8j, 1 - 3j, -6 + 14j, 2 - 5j, 4 + 16j),
+    )
+    Z = np.array(2 * rows)
+    blocks, kinds = [1, 1, 2, 1, 1], [1, 1, 2, 2, 2]
+    # The example of AB13MD in SLICOT.
+    assert slycot.ab13md(Z, blocks, kinds)[0] == pytest.approx(41.74753408, rel=1e-6)
+    # Real numbers and full blocks: as `worst` asks it.
+    assert singular_value._by_slycot(Z, np.array([1, 1, 2, 1, 1])) <= 41.74753408 * (1.0 + 1e-6)
+
+
+def test_the_worst_loop_of_one_parameter_is_at_its_end():
+    robot = fflin.load("cubesat")
+    lin = fflin.linearize(robot)
+    gain = fflin.lqr(lin)
+    of = fflin.uncertain(robot, {"base.density": (0.5, 2.0)})
+    worst = of.worst(gain, samples=20)
+    damping, gains = [], []
+    for density in np.linspace(0.5, 2.0, 61):
+        other = fflin.linearize(of.at({"base.density": density}))
+        F = other.A - other.B @ gain.K
+        poles = np.linalg.eigvals(F)
+        damping.append((-poles.real / np.abs(poles)).min())
+        gains.append(
+            max(
+                np.linalg.norm(np.linalg.solve(1j * w * np.eye(12) - F, other.B), 2)
+                for w in np.geomspace(1e-4, 1e1, 400)
+            )
+        )
+    assert worst.damping.value == pytest.approx(min(damping), rel=1e-6)
+    assert worst.damping.parameters["base.density"] == pytest.approx(2.0)
+    assert worst.gain.value == pytest.approx(max(gains), rel=1e-3)
+    assert worst.gain.value > max(gains) * (1.0 - 1e-5)
+    assert worst.unstable == 0
+
+
+def test_the_bound_is_that_of_the_structured_singular_value():
+    ab13md = pytest.importorskip("slycot").ab13md
+    # A real number that multiplies one signal: only at frequencies without end, where M is
+    # singular for an inertia of 0, is the loop at its limit.
+    robot = fflin.load("cubesat")
+    gain = fflin.lqr(fflin.linearize(robot))
+    worst = fflin.uncertain(robot, {"base.inertia.xx": 0.3}).worst(gain, samples=5)
+    assert worst.safe == pytest.approx(1.0 / 0.3, rel=1e-6)
+    # Packard and Doyle: of one full block it is the largest singular value, of a repeated one no
+    # more than that; of a diagonal one the bound by D Z D^-1.
+    Z = np.array([[1.0, 4.0], [0.25, 1.0]])
+    assert ab13md(Z, [2], [2])[0] == pytest.approx(np.linalg.norm(Z, 2), rel=1e-6)
+    assert ab13md(Z, [1, 1], [2, 2])[0] == pytest.approx(2.0, rel=1e-6)
+
+
+def test_what_is_safe_is_stable_and_no_more_is_promised():
+    pytest.importorskip("slycot")
+    robot = fflin.load("ets_vii")
+    gain = fflin.lqr(fflin.linearize(robot))
+    of = fflin.uncertain(robot, {"base.mass": 0.5, "link_6.mass": 0.5, "link_6.com.z": (-0.3, 0.3)})
+    worst, lft = of.worst(gain, samples=10), of.lft()
+    rng = np.random.default_rng(5)
+    for delta in min(worst.safe, 1.0) * rng.uniform(-1.0, 1.0, (200, 3)):
+        A, B, *_ = lft.at(delta)
+        assert np.linalg.eigvals(A - B @ gain.K).real.max() < 0.0
+
+
+def test_of_many_parameters_some_corners_are_tried(monkeypatch):
+    """2^30 of them would not go into memory."""
+    monkeypatch.setattr(worst, "product", None)
+    monkeypatch.setattr(worst, "_CORNERS", 4)
+    robot = fflin.load("cubesat")
+    parts = ["mass", "inertia.xx", "inertia.yy"]
+    of = fflin.uncertain(robot, {f"base.{part}": 0.01 for part in parts})
+    assert of.worst(fflin.lqr(fflin.linearize(robot)), samples=2).tried == 2 + 4 + 1
