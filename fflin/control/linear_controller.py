@@ -181,6 +181,16 @@ class LinearController:
         function is improper, or D acts on an output that feels the input at once.
     FileError
         If the file cannot be read or lacks what is named above.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> system = -fflin.lqr(lin).K  # or a state space, a transfer function, a .mat
+    >>> policy = fflin.LinearController(system, lin)
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> fflin.simulate(robot, policy, v0=v0, duration=1.0).u.shape[1]
+    9
     """
 
     system: Any
