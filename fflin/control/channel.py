@@ -26,6 +26,12 @@ class Law:
         self._policy, self._names, self._limits, self._slow = policy, names, limits, slow
         self._shape = (len(names),)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the policy has to say of the run."""
+        notes: tuple[str, ...] = getattr(self._policy, "notes", ())
+        return notes
+
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,), or raise `InputError` where it is none."""
         u = self._policy(t, q.copy(), v.copy())

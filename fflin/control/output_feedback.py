@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, vector
 from fflin.control.kalman import Compensator, kalman
-from fflin.control.policies import Policy
+from fflin.control.policies import Clock, Policy
 from fflin.control.tracking import TrajectoryFeedback
 from fflin.control.tvkalman import FilterSchedule
 from fflin.dynamics.aba import Aba
@@ -244,10 +244,10 @@ class _Loop(_Law):
         self, state: StateMap, dt: float, noise: Any, size: int, at: Any, there: Any
     ) -> None:
         super().__init__(size, at)
-        self._dt, self._noise, self._there = dt, noise, there
+        self._clock, self._noise, self._there = Clock(dt), noise, there
         self._still: Array = np.zeros(state.robot.nv)
         felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
-        self._aba, self._asked = Aba(state) if felt else None, -np.inf
+        self._aba = Aba(state) if felt else None
 
     def sample(self, t: float) -> tuple[_Sample, StateMap, Array]:
         """Return what it does at a sample, and the chart and the state that y is relative to."""
@@ -255,13 +255,7 @@ class _Loop(_Law):
         return self.at(t), measure.state, near
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
-        apart = t - self._asked
-        if self._asked >= 0.0 and abs(apart - self._dt) > 1e-6 * self._dt:
-            raise InputError(
-                f"the compensator is asked {apart:g} s after its last sample, expected "
-                f"{self._dt:g} s; leave `sample` out"
-            )
-        self._asked = t
+        self._clock.tick(t)
 
         def measured(_: _Sample, u: Array) -> Array:
             measure, near = self._there(t)
