@@ -1,4 +1,4 @@
-"""The plan of a receding horizon, sample by sample: the quadratic program and who solves it."""
+"""A receding horizon: the quadratic program of each sample, and the command that solves it."""
 
 import warnings
 from collections.abc import Sequence
@@ -11,18 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from fflin.base.errors import FflinWarning, InputError, MissingPackageError
 from fflin.base.validation import Array, number, vector
+from fflin.control.policies import Clock
 
-# DAQP has no infinity. A limit in a row of length 1 is kept to this, in shares of the limits' size.
-_OPEN, _EXACT = 1e30, 1e-9
+# Of limits, as rows of length 1 and in shares of their size: how well they are kept, what passing a
+# soft one costs, and of more than this multiplier how much it yields; what counts as passed.
+_EXACT, _PRICE, _YIELDS, _PASSED = 1e-9, 1e5, 1e-6, 1e-6
 
-# The price of passing a soft limit, in the same shares: by the first power, so that it is passed
-# where nothing else is left, and beyond that by the square over this.
-_PRICE, _YIELDS = 1e5, 1e-6
-
-# DAQP's words for a soft limit and for a plan that passes one, and how far that is, as above.
-_SOFT, _PASSES, _PASSED = 8, 2, 1e-6
-
-_MOST = 10_000  # iterations
+# DAQP's infinity, its words for a soft limit and for a plan that passes one, and most iterations.
+_OPEN, _SOFT, _PASSES, _MOST = 1e30, 8, 2, 10_000
 
 
 class Stage(NamedTuple):
@@ -39,42 +35,33 @@ class Stage(NamedTuple):
 
 
 class Matrices(NamedTuple):
-    r"""The quadratic program of a horizon, for any solver.
-
-    Over the deviations :math:`d = (u_0 - u^*_0, \dots, u_{N-1} - u^*_{N-1})` it is the least of
-
-    .. math:: \tfrac12 d^T H d + g^T d, \qquad \mathrm{low} \le G\,d \le \mathrm{high},
-
-    where the deviations of the state are :math:`e_k = \Phi_k e_0 + \Gamma_k d`. What is in `soft`
-    may be passed where nothing else is left.
-    """
+    """Least d'H d / 2 + g'd with low <= G d <= high over the d = u - u* of N samples."""
 
     H: Array  # (N nu, N nu)
     g: Array  # (N nu,)
     G: Array  # (m, N nu)
     low: Array  # (m,)
     high: Array  # (m,)
-    soft: NDArray[np.bool_]  # (m,)
-    Phi: Array  # (N + 1, nx, nx)
+    soft: NDArray[np.bool_]  # (m,), what may be passed where nothing else is left
+    Phi: Array  # (N + 1, nx, nx): e_k = Phi_k e + Gamma_k d
     Gamma: Array  # (N + 1, nx, N nu)
     inputs: tuple[str, ...]  # "name[k]" of d
-    limits: tuple[str, ...]  # "name[k]" of the rows of G, at the end of sample k but for inputs
+    limits: tuple[str, ...]  # of the rows of G; of states and outputs at the end of sample k
 
 
 def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Array]:
-    """Return e (N + 1, nx, ..), z or d (N nu, ..) and what is limited (m, ..) of (d or z, e_0)."""
-    nx, nu = stages[0].B.shape
-    size = len(stages) * nu
+    """Return e, z and what is limited (N + 1, nx | N nu | m, N nu + nx) of z, or of d, and e_0."""
+    (nx, nu), size = stages[0].B.shape, len(stages) * stages[0].B.shape[1]
     e = np.eye(nx, size + nx, size)
-    states, others, limited = [e], [], []
+    states, efforts, limited = [e], [], []
     for k, by in enumerate(stages):
         own = np.eye(nu, size + nx, k * nu)
-        z, d = (own, by.L @ own - by.K @ e) if planned else (by.K @ e + own, own)
-        others.append(d if planned else np.linalg.solve(by.L, z))
+        d = by.L @ own - by.K @ e if planned else own
+        efforts.append(own if planned else np.linalg.solve(by.L, own + by.K @ e))
         e = by.A @ e + by.B @ d
         states.append(e)
         limited.append(by.E @ e + by.D @ d)
-    return np.array(states), np.vstack(others), np.vstack(limited)
+    return np.array(states), np.vstack(efforts), np.vstack(limited)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,111 +70,129 @@ class Horizon:
 
     stages: tuple[Stage, ...]
     samples: int  # N
-    acting: list[int]  # inputs that are limited
     dt: float
     inputs: tuple[str, ...]
+    acting: NDArray[np.intp]  # the inputs that have limits
     limited: tuple[str, ...]
 
     @cached_property
     def _last(self) -> tuple[Stage, ...]:
         return self.stages[-self.samples :]
 
-    def window(self, k: int) -> tuple[Stage, ...]:
-        """Return the stages ahead of sample k; the same object where they are the same."""
-        beyond = k >= len(self.stages) - self.samples
-        return self._last if beyond else self.stages[k : k + self.samples]
+    def window(self, t: float) -> tuple[Stage, ...]:
+        """Return the samples ahead; the same object where they are the same."""
+        k = round(min(t / self.dt, len(self.stages)))
+        moves = k < len(self.stages) - self.samples
+        return self.stages[k : k + self.samples] if moves else self._last
+
+    def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Return the limits (m,) of some samples, and which are soft."""
+        soft = np.tile(np.arange(len(self.limited)) >= len(self.acting), len(stages))
+        low, high = (np.concatenate([each[i] for each in stages]) for i in (-2, -1))
+        return low, high, soft
 
     def matrices(self, e: ArrayLike | None, t: float) -> Matrices:
-        """Return the program of a sample at the deviation e (nx,) of the state."""
+        """Return the program of a sample [s] at the deviation e (nx,) of the state."""
         if (t := number("t", t)) < 0.0:
             raise InputError(f"t is {t:g} s, expected 0 or more")
-        stages = self.window(round(min(t / self.dt, len(self.stages))))
+        stages = self.window(t)
         nx, size = len(stages[0].A), len(self.inputs) * self.samples
         start = np.zeros(nx) if e is None else vector("e", e, nx, "a deviation of the state")
         states, z, limited = condensed(stages, planned=False)
-        of_d, of_e = z[:, :size], z[:, size:] @ start
-        free = limited[:, size:] @ start
-        low, high = (np.concatenate([getattr(s, at) for s in stages]) for at in ("low", "high"))
-        hard = np.arange(len(self.limited)) < len(self.acting)
-        named = [
-            [f"{x}[{k}]" for k in range(len(stages)) for x in of]
+        (low, high, soft), free = self.bounds(stages), limited[:, size:] @ start
+        slope = 2.0 * z[:, :size].T
+        H, g = slope @ z[:, :size], slope @ (z[:, size:] @ start)
+        names = (
+            tuple(f"{name}[{k}]" for k in range(self.samples) for name in of)
             for of in (self.inputs, self.limited)
-        ]
-        return Matrices(
-            *(2.0 * of_d.T @ of_d, 2.0 * of_d.T @ of_e, limited[:, :size], low - free, high - free),
-            *(np.tile(~hard, len(stages)), states[..., size:], states[..., :size]),
-            *map(tuple, named),
         )
+        program = (H, g, limited[:, :size], low - free, high - free, soft)
+        return Matrices(*program, states[..., size:], states[..., :size], *names)
 
 
 class Receding:
     """The commands of a run: at each sample the first of the plan that costs least."""
 
-    def __init__(self, horizon: Horizon) -> None:
-        self.of = horizon
+    # `at` says what u and e are at t, q, v.
+    def __init__(self, horizon: Horizon, at: Any = None) -> None:
+        self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
         self._stages: tuple[Stage, ...] = ()
         self.solves = self.softened = self.unfinished = 0
         self._worst, self._said = 0.0, ""
-
-    def step(self, t: float, e: Array) -> Array:
-        """Return the command (nu,) as the deviation from its target, at the state's e (nx,)."""
-        stages = self.of.window(round(t / self.of.dt))
-        now, acting = stages[0], self.of.acting
-        d: Array = -now.K @ e
-        if not self.of.limited:
-            return d
-        if stages is not self._stages:
-            self._change(stages)
-        free = self._free @ e
-        low, high = self._low - free, self._high - free
-        self.solves += 1
-        z, flag = self._solved(low, high)
-        if flag <= 0:  # once more, from nothing
-            self._start()
-            z, flag = self._solved(low, high)
-        if flag > 0:
-            d += now.L @ z[: len(d)]
-            if flag == _PASSES:
-                self._count(t, self._G @ z + free)
-        else:
-            self.unfinished += 1
-            if self.unfinished == 1:
-                warnings.warn(
-                    f"the plan at t = {t:g} s was not found (DAQP ends with {flag}); where that is "
-                    "so the regulator acts, cut at the limits of the inputs",
-                    FflinWarning,
-                    stacklevel=2,
-                )
-        d[acting] = np.clip(d[acting], now.low[: len(acting)], now.high[: len(acting)])
-        return d
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What is to be said of the run."""
         said = f"{self.solves} plans of {self.of.samples} samples of {self.of.dt:g} s"
         if self.softened:
-            said += f", {self.softened} of them beyond a limit, the farthest {self._said}"
+            said += f", {self.softened} beyond a limit, the farthest {self._said}"
         if self.unfinished:
-            said += f"; {self.unfinished} not found, where the regulator acted, cut at the limits"
+            said += f", {self.unfinished} not found, where the regulator acted, cut at the limits"
         return (said,)
+
+    def __call__(self, t: float, q: Array, v: Array) -> Array:
+        """Return the command (nu,) of a sample."""
+        self._clock.tick(t)
+        u, e = self._at(t, q, v)
+        command: Array = u + self.step(t, e)
+        return command
+
+    def step(self, t: float, e: Array) -> Array:
+        """Return the command (nu,) as the deviation from its target, at the state's e (nx,)."""
+        stages, acting = self.of.window(t), self.of.acting
+        now, d = stages[0], -stages[0].K @ e
+        if not self.of.limited:
+            return d
+        if stages is not self._stages:
+            self._change(stages)
+        free = self._free @ e
+        self.solves += 1
+        z, flag = self._solved(free)
+        if flag <= 0:  # once more, from nothing
+            self._start()
+            z, flag = self._solved(free)
+        if flag > 0:
+            d += now.L @ z[: len(d)]
+            self._count(t, free + self._G @ z, passes=flag == _PASSES)
+        else:
+            self.unfinished += 1
+            if self.unfinished == 1:
+                said = "where that is so the regulator acts, cut at the limits of the inputs"
+                warnings.warn(
+                    f"at t = {t:g} s no plan is found (DAQP ends with {flag}): {said}",
+                    FflinWarning,
+                    stacklevel=2,
+                )
+        d[acting] = np.clip(d[acting], now.low[: len(acting)], now.high[: len(acting)])
+        return d
+
+    def _count(self, t: float, reached: Array, *, passes: bool) -> None:
+        """Note how far a plan goes beyond the soft limits."""
+        excess = np.maximum(self._low - reached, reached - self._high) * self._soft
+        row = int((shares := excess * self._unit).argmax())
+        if passes and shares[row] > _PASSED * self._size:
+            self.softened += 1
+            if shares[row] > self._worst:
+                sample, at = divmod(row, len(self.of.limited))
+                self._worst, when = float(shares[row]), t + (sample + 1) * self.of.dt
+                self._said = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"
 
     def _change(self, stages: tuple[Stage, ...]) -> None:
         fresh, self._stages = not self._stages, stages
-        _, _, rows = condensed(stages, planned=True)
-        size = len(self.of.inputs) * self.of.samples
-        self._G, self._free = rows[:, :size], rows[:, size:]
-        self._low, self._high = (np.concatenate([s[i] for s in stages]) for i in (-2, -1))
-        soft = np.arange(len(self.of.limited)) >= len(self.of.acting)
-        self._soft = np.tile(soft, len(stages))
+        rows, size = condensed(stages, planned=True)[2], len(self.of.inputs) * self.of.samples
+        (low, high, self._soft), self._G, self._free = (
+            self.of.bounds(stages),
+            *np.split(rows, [size], 1),
+        )
         length = np.linalg.norm(self._G, axis=1)
-        # What no input moves within the horizon is no limit of it.
-        self._moved = length > 1e-12 * length.max()
-        self._unit = 1.0 / np.where(self._moved, length, 1.0)
-        width = ((self._high - self._low) * self._unit)[self._moved]
-        width = width[np.isfinite(width) & (width > 0.0)]
-        self._size = float(np.median(width)) if len(width) else 1.0
+        moved = length > 1e-12 * length.max()  # what no input moves within the horizon is let go
+        self._low, self._high = np.where(moved, low, -np.inf), np.where(moved, high, np.inf)
+        self._unit = 1.0 / np.where(moved, length, 1.0)
+        width = (self._high - self._low) * self._unit
+        self._size = (
+            float(np.median(width[np.isfinite(width)])) if np.isfinite(width).any() else 1.0
+        )
         self._rows = self._G * self._unit[:, None]
-        self._unit /= self._size
         if fresh:
             self._start()
         else:
@@ -201,30 +206,17 @@ class Receding:
                 "this needs the solver DAQP; install it with: pip install 'fflin[mpc]'"
             ) from None
         self._model: Any = daqp.Model()
-        self._model.settings = {
-            **{"primal_tol": _EXACT, "iter_limit": _MOST, "w_soft": _PRICE, "rho_soft": _YIELDS}
-        }
-        m, size = self._rows.shape
-        open_, kinds = np.full(m, _OPEN), (_SOFT * self._soft).astype(np.int32)
+        exact, price = _EXACT * self._size, _PRICE * self._size
+        self._model.settings = {"primal_tol": exact, "w_soft": price, "rho_soft": _YIELDS}
+        self._model.settings = {"iter_limit": _MOST}
+        (m, size), kinds = self._rows.shape, (_SOFT * self._soft).astype(np.int32)
+        open_ = np.full(m, _OPEN)
         self._model.setup(np.eye(size), np.zeros(size), self._rows, open_, -open_, kinds)
 
-    def _solved(self, low: Array, high: Array) -> tuple[Array, int]:
-        with np.errstate(invalid="ignore"):
-            low, high = (
-                np.where(self._moved, np.clip(x * self._unit, -_OPEN, _OPEN), y)
-                for x, y in ((low, -_OPEN), (high, _OPEN))
-            )
+    def _solved(self, free: Array) -> tuple[Array, int]:
+        low, high = (
+            np.clip((limit - free) * self._unit, -_OPEN, _OPEN) for limit in (self._low, self._high)
+        )
         self._model.update(bupper=high, blower=low)
         z, _, flag, _ = self._model.solve()
-        return self._size * z, int(flag)
-
-    def _count(self, t: float, reached: Array) -> None:
-        """Note how far the plan goes beyond the soft limits."""
-        excess = np.maximum(self._low - reached, reached - self._high) * self._soft
-        share = excess * self._unit
-        self.softened += bool(share.max() > _PASSED)
-        if share.max() > self._worst:
-            self._worst, row = float(share.max()), int(share.argmax())
-            sample, at = divmod(row, len(self.of.limited))
-            when = t + (sample + 1) * self.of.dt
-            self._said = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"
+        return z, int(flag)
