@@ -15,7 +15,7 @@ from fflin.control.policies import Clock
 
 # Of limits, as rows of length 1 and in shares of their size: how well they are kept, what passing a
 # soft one costs, and of more than this multiplier how much it yields; what counts as passed.
-_EXACT, _PRICE, _YIELDS, _PASSED = 1e-9, 1e5, 1e-6, 1e-6
+_EXACT, _PRICE, _YIELDS, _PASSED = 1e-9, 1e3, 1.0, 1e-6
 
 # DAQP's infinity, its words for a soft limit and for a plan that passes one, and most iterations.
 _OPEN, _SOFT, _PASSES, _MOST = 1e30, 8, 2, 10_000
