@@ -14,6 +14,7 @@ ORDER = (
     "trajectory",
     "loops",
     "campaigns",
+    "plans",
     "start_up",
     "memory",
 )

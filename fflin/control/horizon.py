@@ -119,6 +119,8 @@ class Receding:
         self._stages: tuple[Stage, ...] = ()
         self.solves = self.softened = self.unfinished = 0
         self._worst, self._said = 0.0, ""
+        if horizon.limited:  # before the first sample, which must not wait
+            self._change(horizon.window(0.0))
 
     @property
     def notes(self) -> tuple[str, ...]:
