@@ -155,45 +155,38 @@ class Receding:
             z, flag = self._solved(free)
         if flag > 0:
             d += now.L @ z[: len(d)]
-            self._count(t, free + self._G @ z, passes=flag == _PASSES)
-        else:
+        if flag == _PASSES:
+            self._count(t, free + self._G @ z)
+        if flag <= 0:
             self.unfinished += 1
+            said = f"at t = {t:g} s no plan is found (DAQP ends with {flag}): where that is so the "
             if self.unfinished == 1:
-                said = "where that is so the regulator acts, cut at the limits of the inputs"
-                warnings.warn(
-                    f"at t = {t:g} s no plan is found (DAQP ends with {flag}): {said}",
-                    FflinWarning,
-                    stacklevel=2,
-                )
+                warnings.warn(f"{said}regulator acts, cut at the limits", FflinWarning, 2)
         d[acting] = np.clip(d[acting], now.low[: len(acting)], now.high[: len(acting)])
         return d
 
-    def _count(self, t: float, reached: Array, *, passes: bool) -> None:
+    def _count(self, t: float, reached: Array) -> None:
         """Note how far a plan goes beyond the soft limits."""
         excess = np.maximum(self._low - reached, reached - self._high) * self._soft
         row = int((shares := excess * self._unit).argmax())
-        if passes and shares[row] > _PASSED * self._size:
-            self.softened += 1
-            if shares[row] > self._worst:
-                sample, at = divmod(row, len(self.of.limited))
-                self._worst, when = float(shares[row]), t + (sample + 1) * self.of.dt
-                self._said = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"
+        self.softened += bool(shares[row] > _PASSED * self._size)
+        if shares[row] > max(self._worst, _PASSED * self._size):
+            sample, at = divmod(row, len(self.of.limited))
+            self._worst, when = float(shares[row]), t + (sample + 1) * self.of.dt
+            self._said = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"
 
     def _change(self, stages: tuple[Stage, ...]) -> None:
         fresh, self._stages = not self._stages, stages
         rows, size = condensed(stages, planned=True)[2], len(self.of.inputs) * self.of.samples
-        (low, high, self._soft), self._G, self._free = (
-            self.of.bounds(stages),
-            *np.split(rows, [size], 1),
-        )
+        low, high, self._soft = self.of.bounds(stages)
+        self._G, self._free = rows[:, :size], rows[:, size:]
         length = np.linalg.norm(self._G, axis=1)
         moved = length > 1e-12 * length.max()  # what no input moves within the horizon is let go
         self._low, self._high = np.where(moved, low, -np.inf), np.where(moved, high, np.inf)
         self._unit = 1.0 / np.where(moved, length, 1.0)
         width = (self._high - self._low) * self._unit
-        self._size = (
-            float(np.median(width[np.isfinite(width)])) if np.isfinite(width).any() else 1.0
-        )
+        width = width[np.isfinite(width)]
+        self._size = (float(np.median(width)) if len(width) else 1.0) or 1.0
         self._rows = self._G * self._unit[:, None]
         if fresh:
             self._start()

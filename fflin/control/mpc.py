@@ -29,7 +29,7 @@ from fflin.linear.model import LinearModel
 from fflin.robot.fields import range_of
 from fflin.robot.limits import chosen_limits
 
-# Entries of the matrix that takes inputs to what is limited: 160 MB.
+# Entries of the matrices that take inputs to states and limits, some 160 MB.
 _MOST = 20_000_000
 
 
@@ -51,14 +51,12 @@ def mpc(
 
     .. math:: e_N^T Q_f\,e_N + \int_0^{N h} e^T Q\,e + \delta u^T R\,\delta u\;dt,
 
-    and commands the first. Where no limit is near that is the regulator of `lqr` or `tvlqr`. Inputs
-    never pass their limits. States and outputs keep within theirs at the samples, as the linear
-    model has it; where they cannot, they pass them by little, which the motion's `notes` say.
-    Where no plan is found, the regulator acts, cut at the limits, and a warning says so.
-
-    The plan is a quadratic program over the inputs, in coordinates in which its Hessian is the
-    identity (docs/mpc.md). DAQP (``pip install 'fflin[mpc]'``) finds which limits are active,
-    beginning with those of the sample before.
+    and commands the first: where no limit is near the regulator of `lqr` or `tvlqr`. Inputs never
+    pass their limits. States and outputs keep within theirs at the samples, as the linear model
+    has it; where they cannot, they pass them by little, which the motion's `notes` say. Where no
+    plan is found, the regulator acts, cut at the limits, and a warning says so. The quadratic
+    program (docs/mpc.md) is solved by DAQP (``pip install 'fflin[mpc]'``), which begins with the
+    limits that were active a sample before.
 
     Parameters
     ----------
@@ -97,8 +95,6 @@ def mpc(
 
     References
     ----------
-    J. B. Rawlings, D. Q. Mayne and M. M. Diehl, Model Predictive Control, 2017, section 2.5.
-
     D. Arnström, A. Bemporad and D. Axehill, A dual active-set solver for embedded quadratic
     programming using recursive LDL' updates, IEEE Trans. Automatic Control 67(8), 2022.
     """
@@ -116,7 +112,7 @@ def mpc(
     if source is None or source.dt or dt != (lin.dt or dt):
         raise InputError("lin is sampled otherwise; give the continuous one that it is of, and dt=")
     names, at, rows = _limits(source, limits, dt)
-    if samples**2 * len(at) * len(lin.input_names) > _MOST:
+    if samples**2 * (len(at) + len(lin.state_names)) * len(lin.input_names) > _MOST:
         raise InputError(f"horizon is {samples}, expected fewer samples of so many limits")
     designed: Any = _along if isinstance(source, LinearTrajectory) else _about
     made, stages = designed(source, (Q, R, weights), Qf, samples, dt, names, rows)
@@ -183,11 +179,9 @@ def _limits(of: Any, limits: Any, dt: float) -> tuple[tuple[str, ...], Any, Call
         raise InputError("lin is from a file, which has no robot; linearise it again")
     inputs, states, outputs = of.input_names, of.state_names, of.output_names
     beside = [name for name in outputs if name not in states]
-    known, several = (
-        (*state_keys(robot.joint_names), *input_keys(of)),
-        isinstance(limits, list | tuple),
-    )
-    parts, found = list(limits) if several else [limits], dict[str, Any]()
+    known = (*state_keys(robot.joint_names), *input_keys(of))
+    several, found = isinstance(limits, list | tuple), dict[str, Any]()
+    parts = list(limits) if several else [limits]
     for k, part in enumerate(parts):
         keys = [*part] if isinstance(part, Mapping) and beside else []
         own = [x for x in keys if stands_for_any(x, beside) and not stands_for_any(x, known)]
@@ -200,10 +194,8 @@ def _limits(of: Any, limits: Any, dt: float) -> tuple[tuple[str, ...], Any, Call
     names = (*inputs, *states, *(name if name in beside else "" for name in outputs))
     others = [found.get(name, (-np.inf, np.inf)) for name in names[len(inputs) :]]
     low, high = np.hstack((of_inputs, np.array(others).T))
-    if (low > high).any():
-        raise InputError(
-            f"limits leave {names[(low > high).argmax()]} nothing: least above largest"
-        )
+    if (least := low > high).any():
+        raise InputError(f"limits leave nothing to {names[least.argmax()]}: the least is above")
     at = np.flatnonzero(np.isfinite((low, high)).any(axis=0))
 
     def rows(C: Array, D: Array, *target: Array) -> tuple[Array, ...]:
@@ -224,9 +216,8 @@ def _about(
     gain = lqr(sampled, *given, weights=weights)
     StateFeedback(sampled, gain.K)  # refuses a moving reference
     limited = rows(lin.C, lin.D, lin.u0, lin.x0, lin.y0)
-    if beyond := [
-        x for x, low, high in zip(names, *limited[2:], strict=True) if max(low, -high) > 1e-9
-    ]:
+    far = np.maximum(limited[2], -limited[3]) > 1e-9
+    if beyond := [name for name, out in zip(names, far, strict=True) if out]:
         raise InputError(f"the point is beyond the limits of {listed(beyond)}; give wider ones")
     total = np.block([[gain.Q, gain.N], [gain.N.T, gain.R]])
     end = gain.P if asks_steady(Qf) else weight("Qf", Qf, lin.state_names)
@@ -245,21 +236,17 @@ def _along(
     follows, state = TrajectoryFeedback(traj, schedule), StateMap(traj.robot, frame="local")
     Q, R, models, end = schedule.Q, schedule.R, along(traj.resampled(dt)), follows.end
 
-    def about(of: Any, u: Array) -> tuple[Array, ...]:
-        x = np.zeros(state.nx)  # of the base's place the error is limited
-        x[state.groups.q_m] = state.joint_positions(of.q)
-        x[state.nx // 2 :] = state.velocities(of.v)
-        limited: tuple[Array, ...] = rows(of.C, of.D, u, x, of.y0)
-        return limited
+    def about(of: Any, u: Array) -> Any:
+        # Of the base's place the error is limited.
+        x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(of.v)))
+        return rows(of.C, of.D, u, x, of.y0)
 
     stages = []
     for k, sample in enumerate(held_stages(traj, dt, Q, R)):
         limited = about(models[k + 1], follows.commanded(k * dt)[2])
         stages.append(_stage(*sample, schedule.K[k], schedule.P[k + 1], limited))
-    held, sampled, (P, K) = (
-        *(sampled_cost(end, dt, Q, R), end.discretize(dt)),
-        steady_regulator(end, Q, R, dt),
-    )
+    held, sampled = sampled_cost(end, dt, Q, R), end.discretize(dt)
+    P, K = steady_regulator(end, Q, R, dt)
     total = np.block([[held.Q, held.N], [held.N.T, held.R]])
     last = _stage(total, np.hstack((sampled.A, sampled.B)), K, P, about(end, end.u0))
     return lambda ahead: TrajectoryMpc(traj, schedule, ahead), stages + [last] * samples
