@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fflin.base.errors import FflinWarning, InputError, MissingPackageError
+from fflin.base.errors import FflinWarning, MissingPackageError
 from fflin.base.validation import Array, number, vector
 from fflin.control.policies import Clock
 
@@ -93,9 +93,7 @@ class Horizon:
 
     def matrices(self, e: ArrayLike | None, t: float) -> Matrices:
         """Return the program of a sample [s] at the deviation e (nx,) of the state."""
-        if (t := number("t", t)) < 0.0:
-            raise InputError(f"t is {t:g} s, expected 0 or more")
-        stages = self.window(t)
+        stages = self.window(max(number("t", t), 0.0))
         nx, size = len(stages[0].A), len(self.inputs) * self.samples
         start = np.zeros(nx) if e is None else vector("e", e, nx, "a deviation of the state")
         states, z, limited = condensed(stages, planned=False)
@@ -111,9 +109,8 @@ class Horizon:
 
 
 class Receding:
-    """The commands of a run: at each sample the first of the plan that costs least."""
+    """The commands of a run, the first of each plan; `at` says what u* and e are at t, q, v."""
 
-    # `at` says what u and e are at t, q, v.
     def __init__(self, horizon: Horizon, at: Any = None) -> None:
         self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
         self._stages: tuple[Stage, ...] = ()
@@ -201,9 +198,8 @@ class Receding:
                 "this needs the solver DAQP; install it with: pip install 'fflin[mpc]'"
             ) from None
         self._model: Any = daqp.Model()
-        exact, price = _EXACT * self._size, _PRICE * self._size
-        self._model.settings = {"primal_tol": exact, "w_soft": price, "rho_soft": _YIELDS}
-        self._model.settings = {"iter_limit": _MOST}
+        self._model.settings = {"primal_tol": _EXACT * self._size, "iter_limit": _MOST}
+        self._model.settings = {"w_soft": _PRICE * self._size, "rho_soft": _YIELDS}
         (m, size), kinds = self._rows.shape, (_SOFT * self._soft).astype(np.int32)
         open_ = np.full(m, _OPEN)
         self._model.setup(np.eye(size), np.zeros(size), self._rows, open_, -open_, kinds)

@@ -106,12 +106,11 @@ def mpc(
     samples = whole("horizon", horizon, 1)
     if dt is None and not lin.dt:
         raise InputError("dt is missing; give the sampling time [s]")
-    if (dt := number("dt", lin.dt if dt is None else dt)) <= 0.0:
-        raise InputError(f"dt is {dt:g} s, expected a positive sampling time")
+    dt = number("dt", lin.dt if dt is None else dt)
     source = lin if isinstance(lin, LinearTrajectory) else lin.generator
     if source is None or source.dt or dt != (lin.dt or dt):
         raise InputError("lin is sampled otherwise; give the continuous one that it is of, and dt=")
-    names, at, rows = _limits(source, limits, dt)
+    names, at, rows = _limits(source, limits)
     if samples**2 * (len(at) + len(lin.state_names)) * len(lin.input_names) > _MOST:
         raise InputError(f"horizon is {samples}, expected fewer samples of so many limits")
     designed: Any = _along if isinstance(source, LinearTrajectory) else _about
@@ -173,7 +172,7 @@ class TrajectoryMpc(TrajectoryFeedback):
         return Receding(self.horizon, at)
 
 
-def _limits(of: Any, limits: Any, dt: float) -> tuple[tuple[str, ...], Any, Callable[..., Any]]:
+def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., Any]]:
     """Return what has limits, where it is among inputs, states and outputs, and a stage's rows."""
     if (robot := of.robot if isinstance(of, LinearTrajectory) else of._robot) is None:
         raise InputError("lin is from a file, which has no robot; linearise it again")
@@ -190,7 +189,7 @@ def _limits(of: Any, limits: Any, dt: float) -> tuple[tuple[str, ...], Any, Call
         parts[k] = {key: part[key] for key in keys if key not in own} if own else part
     acting = chosen_limits(robot, parts if several else parts[0])[0]
     found |= {name: acting[name] for name in states if name in acting}
-    of_inputs = np.array(saturation(robot, acting, robot.neutral(), dt, 1)[:2])
+    of_inputs = np.array(saturation(robot, acting, robot.neutral(), 1.0, 1)[:2])
     names = (*inputs, *states, *(name if name in beside else "" for name in outputs))
     others = [found.get(name, (-np.inf, np.inf)) for name in names[len(inputs) :]]
     low, high = np.hstack((of_inputs, np.array(others).T))
@@ -200,9 +199,9 @@ def _limits(of: Any, limits: Any, dt: float) -> tuple[tuple[str, ...], Any, Call
 
     def rows(C: Array, D: Array, *target: Array) -> tuple[Array, ...]:
         (nx, nu), there = (C.shape[1], D.shape[1]), np.concatenate(target)
-        E = np.vstack((np.zeros((nu, nx)), np.eye(nx), C))
-        through = np.vstack((np.eye(nu), np.zeros((nx, nu)), D))
-        return E[at], through[at], (low - there)[at], (high - there)[at]
+        of_e = np.vstack((np.zeros((nu, nx)), np.eye(nx), C))[at]
+        of_d = np.vstack((np.eye(nu), np.zeros((nx, nu)), D))[at]
+        return of_e, of_d, (low - there)[at], (high - there)[at]
 
     return tuple(names[i] for i in at), at, rows
 
