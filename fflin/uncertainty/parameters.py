@@ -24,28 +24,15 @@ ENTRIES = {a + b: (AXES.index(a), AXES.index(b)) for a, b in ("xx", "yy", "zz", 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter, and how a unit of it changes the robot.
+    """One parameter, and how a unit of it changes the robot."""
 
-    Attributes
-    ----------
-    of, part : str
-        Whose it is, and which: "arm" and "inertia.xx".
-    unit : str
-    value : float
-        What it is now.
-    bodies : mapping
-        {Pinocchio joint: change (10,)} of the dynamic parameters of bodies: mass, first moment, and
-        inertia xx, xy, yy, xz, yz, zz at the joint's frame.
-    spring, damper : int
-        The joint whose stiffness or damping it is, in state order; -1 for none.
-    wrench : tuple or None
-        (Pinocchio joint, input, change (6,) of the wrench of a unit of it in the joint's frame).
-    """
-
-    of: str
-    part: str
+    of: str  # whose it is, "arm"
+    part: str  # and which, "inertia.xx"
     unit: str
-    value: float
+    value: float  # what it is now
+    # Of bodies {Pinocchio joint: change (10,)} of mass, first moment, and inertia xx xy yy xz yz zz
+    # at the joint's frame; the joint whose stiffness or damping it is, or -1; and Pinocchio joint,
+    # input, and change (6,) of the wrench of a unit of that in the joint's frame.
     bodies: dict[int, Array] = field(default_factory=dict)
     spring: int = -1
     damper: int = -1

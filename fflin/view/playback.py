@@ -20,29 +20,15 @@ _MOST_FRAMES = 3000
 
 @dataclass(frozen=True)
 class Playback:
-    """What is shown of a motion at N frames.
+    """What is shown of a motion at N frames."""
 
-    Attributes
-    ----------
-    t : ndarray (N,)
-        Times [s]; each is one of the motion's own, so that no pose is interpolated.
-    poses : ndarray (N, njoints - 1, 7)
-        x, y, z and quaternion x, y, z, w of every joint's frame in the world.
-    com, tool : ndarray (N, 3)
-        Centre of mass and origin of the tool [m].
-    force, torque : ndarray (N, 3)
-        Base wrench in world axes [N], [N m].
-    thrust : ndarray (N, k)
-        Of each thruster [N].
-    """
-
-    t: Array
-    poses: Array
-    com: Array
-    tool: Array
-    force: Array
-    torque: Array
-    thrust: Array
+    t: Array  # (N,) [s], of the motion's own times, so that no pose is interpolated
+    poses: Array  # (N, njoints - 1, 7), x, y, z and quaternion of every joint's frame in the world
+    com: Array  # (N, 3) [m]
+    tool: Array  # (N, 3) [m]
+    force: Array  # (N, 3) [N], on the base, in world axes
+    torque: Array  # (N, 3) [N m]
+    thrust: Array  # (N, k) [N], of each thruster
 
 
 def frame_indices(t: Array, fps: float, speed: float) -> Array:

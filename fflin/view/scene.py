@@ -34,10 +34,7 @@ _ELSEWHERE = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
 
 
 class _Piece(MeshcatMesh):
-    """A three.js mesh as it is sent.
-
-    The page gives it its material, and the geometry of an earlier piece where it names one.
-    """
+    """A three.js mesh as it is sent; its material, and geometry sent before, are in the page."""
 
     def __init__(self, geometry: dict[str, Any], matrix: Array, about: dict[str, Any]) -> None:
         self._geometry, self._matrix, self._about = geometry, matrix, about
@@ -64,27 +61,7 @@ def body_paths(robot: Robot) -> list[str]:
 
 
 class Drawing:
-    """A robot drawn into a meshcat scene.
-
-    Parameters
-    ----------
-    robot : Robot
-    visualizer : meshcat.Visualizer
-        Node to draw below. The bodies become its children, named as their joints.
-    look : str
-        "real", or "ghost" and "linear" for translucent ones.
-    sent : set of str, optional
-        Meshes that the page has already; those of this drawing are added.
-
-    Attributes
-    ----------
-    notes : tuple of str
-        What could not be drawn, one line each.
-    corners : list of ndarray (8, 3)
-        Bounding box of each body's pieces in the body's frame, for those that have pieces.
-    bodies : list of int
-        The Pinocchio joints whose boxes these are.
-    """
+    """A robot drawn below a node of meshcat, its bodies named as their joints."""
 
     def __init__(
         self, robot: Robot, visualizer: Visualizer, look: str = "real", sent: set[str] | None = None
@@ -92,8 +69,8 @@ class Drawing:
         self.robot = robot
         self._visualizer = visualizer
         self._paths = body_paths(robot)
-        sent = set() if sent is None else sent
-        found, self.notes = shapes(robot)
+        sent = set() if sent is None else sent  # meshes that the page has, of these too
+        found, self.notes = shapes(robot)  # and what could not be drawn
         corners: dict[int, list[Array]] = {}
         for index, shape in enumerate(found):
             node = visualizer[self._paths[shape.joint - ROOT]]
@@ -107,6 +84,7 @@ class Drawing:
                 placed = shape.placement.homogeneous @ matrix
                 node[f"{index}_{part}"].set_object(_Piece(shown, placed, about))
                 corners.setdefault(shape.joint, []).append(_box_corners(placed, box))
+        # Joints of bodies that have pieces, and the boxes (8, 3) of these in the bodies' frames.
         self.bodies = list(corners)
         self.corners = [
             _box_corners(np.eye(4), _bounds(np.concatenate(boxes))) for boxes in corners.values()
