@@ -127,7 +127,7 @@ class Receding:
             said += f", {self.softened} beyond a limit, the farthest {self._said}"
         if self.unfinished:
             said += f", {self.unfinished} not found, where the regulator acted, cut at the limits"
-        return (said,)
+        return (said,) if self.solves else ()
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,) of a sample."""

@@ -303,6 +303,22 @@ def test_thrusters_do_not_pull_and_motors_may_have_failed():
     assert u[:, thrust].min() > -1e-9 and u[:, thrust].max() == pytest.approx(0.01)
 
 
+def test_a_part_of_the_states_and_allocated_inputs_will_do():
+    robot = fflin.load("servicer_7dof")
+    arm = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
+    part = fflin.momentum_reduction(fflin.linearize(arm))
+    policy, q0 = fflin.mpc(part, dt=0.2), fflin.configuration(arm, {"joint_2": 0.3})
+    motion = fflin.simulate(arm, policy, q0=q0, duration=20.0, limits="urdf")
+    assert np.abs(motion.error[-1, 6:15]).max() < 0.05 and not motion.passed
+    cubesat = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
+    wheels = [each for each in cubesat.inputs if isinstance(each, fflin.ReactionWheel)]
+    bounded = [fflin.BaseTorque(max=0.05), fflin.BaseForce(max=0.05), *wheels]
+    design = cubesat.replace(inputs=bounded)
+    policy = fflin.Allocation(fflin.mpc(fflin.linearize(design), dt=0.5), design)
+    motion = fflin.simulate(cubesat, policy, x0=0.05 * np.ones(18), duration=60.0)
+    assert motion.attitude_error[0] > 9.0 and motion.attitude_error[-1] < 0.01
+
+
 def test_campaigns_fly_it_and_the_compiled_loop_says_why_not(servicer):
     robot, lin = servicer
     policy = fflin.mpc(lin, *weights(lin), horizon=8, dt=0.25, limits=["urdf", WEAK])
