@@ -75,6 +75,7 @@ from fflin.control.gain import Gain as Gain
 from fflin.control.acceleration_lqr import acceleration_lqr as acceleration_lqr
 from fflin.control.weights import sampled_cost as sampled_cost
 from fflin.control.plan import plan as plan
+from fflin.control.mpc import mpc as mpc
 from fflin.control.tvlqr import tvlqr as tvlqr
 from fflin.control.gain_schedule import GainSchedule as GainSchedule
 from fflin.control.tvkalman import tvkalman as tvkalman

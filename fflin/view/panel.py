@@ -91,11 +91,7 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]
 
 
 def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, Any]:
-    """Return the readouts and plots of a motion's page, of the rows (N,) that it shows.
-
-    Errors are counted from a target for all rows or one each, (k, nq); where there is none there
-    are no errors, and the change from the start is shown.
-    """
+    """Return readouts and plots of a page's rows (N,), with errors where it has targets (k, nq)."""
     found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
     of = "{} error" if len(target) else "{} change"
     readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]

@@ -109,6 +109,10 @@ def sound(folder):
         "modes": {"lin": lin},
         "relative_equilibria": {"robot": robot.replace(orbit=7e5), "q": q, "frame": "hill"},
         "Momentum": {},
+        "mpc": {
+            **{"lin": lin, "Q": 1.0, "R": 1.0, "horizon": 2, "dt": 0.1, "limits": {"tau_b": 1.0}},
+            **{"Qf": "steady", "weights": None},
+        },
         "funnel": {
             **{"robot": robot, "schedule": schedule, "goal": {"attitude": 1.0}, "within": None},
             **{"knots": 1, "samples": 1, "seed": 0, "confidence": 0.9, "dt": 0.01, "engine": None},
