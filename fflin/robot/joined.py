@@ -52,8 +52,9 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     told = f"{robot.urdf_sha256} {other.urdf_sha256} {frame} {placement} {prefix}"
     weighed = b"".join(each.toDynamicParameters().tobytes() for each in model.inertias.tolist())
     whole = replace(
-        bare,
+        robot,
         model=model,
+        _wheelless=None,
         name=f"{robot.name}+{other.name}",
         urdf_sha256=sha256(told.encode() + weighed).hexdigest(),
         joints=tuple(sorted((*own, *theirs), key=lambda each: each.idx_v)),
@@ -61,8 +62,6 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         attached=(*robot.attached, (prefix, other)),
         **both,
     )
-    fields = {name: getattr(robot, name) for name in ("outputs", "passive", "limits", "weights")}
-    whole = replace(whole, **fields)
     return with_inputs(whole, robot.inputs)
 
 
