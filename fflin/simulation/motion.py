@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -23,8 +23,7 @@ from fflin.simulation.report import Limited, Passed, Saturated, passed, saturate
 FORMATS = (*record.FORMATS, ".csv")
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+    from fflin.dynamics.impact import Impact
     from fflin.linear.trajectory import Trajectory
     from fflin.robot.robot import Robot
 
@@ -79,11 +78,15 @@ class Motion(Design):
     limits : ndarray (k, 2)
         Their least and largest values, infinite where there is none, whether or not the run was
         kept within.
+    phases : tuple of str
+        What each phase began with, of a motion that was carried on (`then`).
+    starts : ndarray (k,)
+        When they began [s].
     """
 
     OPEN: ClassVar = ("limits",)
     VECTORS: ClassVar = (
-        *("t", "energy", "momentum_drift", "com_drift", "placement", "wheel_inertias"),
+        *("t", "energy", "momentum_drift", "com_drift", "placement", "wheel_inertias", "starts"),
     )
 
     t: Array
@@ -114,6 +117,9 @@ class Motion(Design):
     limit_names: tuple[str, ...] = field(default_factory=tuple)
     limits: Array = field(default_factory=lambda: np.zeros((0, 2)))
     engine: str = field(default_factory=str)
+    phases: tuple[str, ...] = field(default_factory=tuple)
+    starts: Array = field(default_factory=lambda: np.zeros(0))
+    _phases: tuple[Any, ...] = field(default=(), kw_only=True)  # motions and impacts; as _robot
 
     def __post_init__(self) -> None:
         rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)
@@ -172,6 +178,31 @@ class Motion(Design):
         """Angle (N,) [deg] between the base's attitude and the target's; None without target."""
         return attitude_errors(self.x, self.target) if self.target.size else None
 
+    def then(self, *later: Impact | Motion) -> Motion:
+        """Return one motion of this and what came after: ``approach.then(caught, held)``.
+
+        Parameters
+        ----------
+        *later : Impact or Motion
+            Of `capture` or `jam`, at the last row of the motion before it; and of `simulate`, from
+            there on, with that robot, or the same one under another policy.
+
+        Returns
+        -------
+        Motion
+            Of the robot that this is of, on one time axis, in its chart; a joint that jammed stands
+            still. Energy and momentum are those of the robot as it is at the time.
+
+        Raises
+        ------
+        InputError
+            If one does not begin where the one before ended, is in another frame, has inputs that
+            this has not, or is from a file.
+        """
+        from fflin.simulation.phases import carried_on
+
+        return carried_on(self, later)
+
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
         """Return the motion by knots, with inputs that are held or linear: what it holds to better.
 
@@ -182,6 +213,8 @@ class Motion(Design):
         from fflin.linear.trajectory_files import arguments
 
         robot = robot or self._robot
+        if self.phases:
+            raise InputError("a motion of several phases is of several robots; take each alone")
         if robot is None:
             raise InputError(
                 "the motion is from a file, without its robot; give the one that moves"
@@ -239,6 +272,8 @@ class Motion(Design):
 
     def plot(self, path: str | Path | None = None, **options: Any) -> Any:
         """Draw the motion, see `plot_motion`; into a file where a path is given."""
+        from fflin.simulation.motion_plot import plot_motion
+
         return plot_motion(self, path, **options)
 
 
@@ -246,39 +281,3 @@ def require_motion(motion: Any) -> Motion:
     """Return the motion, or raise `InputError` where it is none."""
     found: Motion = instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
     return found
-
-
-def plot_motion(
-    motion: Motion, path: str | Path | None = None, *, show: Sequence[str] | None = None
-) -> Figure:
-    """Draw the errors, inputs and momentum drift of a motion, linear beside nonlinear.
-
-    Parameters
-    ----------
-    motion : Motion
-        With a prediction, each group of states shows the nonlinear robot in full lines and the
-        linear model dashed, and below it their difference. Along a trajectory it shows the robot
-        over the pale reference, and below it the error, that of the linear model dashed; a dotted
-        line is where the reference comes to rest.
-    path : str or Path, optional
-        .png, .pdf or .svg to save to.
-    show : sequence of str, optional
-        What is drawn of states and inputs: names, groups or patterns such as ``q_m``, ``thrust``,
-        ``*.hinge_*``; all by default.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    MissingPackageError
-        If matplotlib is not installed.
-    FileError
-        If the ending is another or the file cannot be written.
-    UnknownNameError
-        If there is nothing of a name in `show`.
-    """
-    from fflin.simulation.motion_plot import draw_motion
-
-    return draw_motion(require_motion(motion), path, show)
