@@ -67,6 +67,7 @@ from fflin.analysis.momentum import generalized_jacobian as generalized_jacobian
 
 # Control
 from fflin.control.lqr import lqr as lqr
+from fflin.linear.fit import line_up as line_up
 from fflin.control.weights import bryson as bryson
 from fflin.control.gain import Gain as Gain
 from fflin.control.acceleration_lqr import acceleration_lqr as acceleration_lqr

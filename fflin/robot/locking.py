@@ -66,8 +66,8 @@ def _without(of: Any, gone: set[str]) -> Any:
     """Return a mapping, and those in it, without what is named NAME or GROUP.NAME."""
     if not isinstance(of, Mapping):
         return of
-    kept = {k: x for k, x in of.items() if not {k, k.partition(".")[2]} & gone}
-    return {name: _without(value, gone) for name, value in kept.items()}
+    named = {f"{group}{name}" for name in gone for group in ("", "q_m.", "qdot_m.", "tau_m.", "wheel.")}
+    return {name: _without(value, gone) for name, value in of.items() if name not in named}
 
 
 def locked_model(

@@ -96,7 +96,7 @@ def motion_page(
     if follow:
         shown_points = frame_points(drawing, film, info["size"], follow=True)
     info |= panel(robot, motion, shown, goal)
-    info |= marks(robot, film, tool, info["size"], goals)
+    info |= marks(robot, film, tool, info["size"], goals[:1] if motion.phases else goals)
     if cloud is not None:
         from fflin.view.cloud import cloud_of
 

@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from fflin.base.validation import Array
 from fflin.dynamics.capture import Capture
+from fflin.dynamics.impact import inertia_at
 from fflin.dynamics.integrators import CommutatorFree4
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT, find_frame, find_joint
@@ -18,8 +19,8 @@ from fflin.simulation.motion import Motion
 from fflin.simulation.plant import Plant
 from fflin.view.playback import body_poses
 
-# Longest step [s] of the way on which a payload came.
-_STEP = 0.05
+# Steps of the way on which a payload came: at most so long [s], and so much of its swing [rad].
+_STEP, _SWING = 0.05, 0.3
 
 
 def payloads(motion: Motion, shown: Array) -> Iterator[tuple[Capture, Array]]:
@@ -39,11 +40,13 @@ def payloads(motion: Motion, shown: Array) -> Iterator[tuple[Capture, Array]]:
 def _flight(caught: Capture, t: Array) -> list[Array]:
     """Return the poses of a payload at times before it is caught [s], as it flies undamped."""
     payload = caught.payload.replace(damping=0.0)
-    data, plant = payload.create_data(), Plant(StateMap(payload))
-    none, now, poses = np.zeros(len(plant.actuation.names)), 0.0, list[Array]()
-    q, v = caught.payload_q, caught.payload_v
+    data, state, q, v = payload.create_data(), StateMap(payload), caught.payload_q, caught.payload_v
+    plant, now, poses = Plant(state), 0.0, list[Array]()
+    none = np.zeros(len(plant.actuation.names))
+    softness = np.linalg.inv(state.project(inertia_at(payload, q))).diagonal()[6:]
+    rate = np.sqrt(softness @ payload.springs.stiffness)  # no swing is faster
     for time in t[::-1].tolist():
-        steps = math.ceil((now - time) / _STEP)
+        steps = math.ceil((now - time) * max(1.0 / _STEP, rate / _SWING))
         for _ in range(steps):
             take = CommutatorFree4(payload.model, (time - now) / steps).step
             q, v = take(lambda _, q, v: plant.stage(0.0, q, v, none)[0], 0.0, q, v)
