@@ -58,6 +58,8 @@ def plot_motion(
     title = f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"
     if motion.linear is not None:
         title += "; full: nonlinear, dashed: linear"
+    for name, start in zip(motion.phases[1:], motion.starts[1:], strict=True):
+        title += f"; {name} at {start:g} s"
     rest = resting_from(motion)
     if rest is not None:
         title += f"; reference at rest from {rest:.4g} s"
@@ -104,7 +106,8 @@ def _apart(motion: Motion) -> tuple[str, Signals] | None:
 
 def resting_from(motion: Motion) -> float | None:
     """Return the time [s] from which a target that moved stands still; None where none does."""
-    places = motion.target[:, : motion.x.shape[1] // 2] if motion.tracked else motion.x[:1]
+    moves = motion.tracked and not motion.phases
+    places = motion.target[:, : motion.x.shape[1] // 2] if moves else motion.x[:1]
     moved = np.flatnonzero(np.abs(np.diff(places, axis=0)).max(axis=1, initial=0.0) > _STILL)
     if not len(moved) or moved[-1] + 2 >= len(places):
         return None
