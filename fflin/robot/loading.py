@@ -9,9 +9,7 @@ from typing import Any
 
 import pinocchio as pin
 
-from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
-from fflin.base.names import joints_by_name
-from fflin.base.validation import Array, number
+from fflin.base.errors import FflinWarning, InputError, ModelError
 from fflin.base.writing import as_path, remember
 from fflin.robot.catalog import RobotFile, find_mesh, find_robot
 from fflin.robot.frames import ROOT
@@ -23,6 +21,7 @@ from fflin.robot.model_checks import check_model, check_order, check_root, joint
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
 from fflin.robot.urdf.reader import Advice, read_urdf
+
 
 def load(
     robot: str | Path,

@@ -66,7 +66,9 @@ def _without(of: Any, gone: set[str]) -> Any:
     """Return a mapping, and those in it, without what is named NAME or GROUP.NAME."""
     if not isinstance(of, Mapping):
         return of
-    named = {f"{group}{name}" for name in gone for group in ("", "q_m.", "qdot_m.", "tau_m.", "wheel.")}
+    named = {
+        f"{group}{name}" for name in gone for group in ("", "q_m.", "qdot_m.", "tau_m.", "wheel.")
+    }
     return {name: _without(value, gone) for name, value in of.items() if name not in named}
 
 

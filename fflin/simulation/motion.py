@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -23,6 +23,8 @@ from fflin.simulation.report import Limited, Passed, Saturated, passed, saturate
 FORMATS = (*record.FORMATS, ".csv")
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from fflin.dynamics.impact import Impact
     from fflin.linear.trajectory import Trajectory
     from fflin.robot.robot import Robot
@@ -78,10 +80,8 @@ class Motion(Design):
     limits : ndarray (k, 2)
         Their least and largest values, infinite where there is none, whether or not the run was
         kept within.
-    phases : tuple of str
-        What each phase began with, of a motion that was carried on (`then`).
-    starts : ndarray (k,)
-        When they began [s].
+    phases, starts : tuple of str, ndarray (k,)
+        Of a motion that was carried on (`then`), how each phase began and when [s].
     """
 
     OPEN: ClassVar = ("limits",)
@@ -184,20 +184,19 @@ class Motion(Design):
         Parameters
         ----------
         *later : Impact or Motion
-            Of `capture` or `jam`, at the last row of the motion before it; and of `simulate`, from
-            there on, with that robot, or the same one under another policy.
+            Of `capture` or `jam` at the last row before it, and of `simulate` from there on.
 
         Returns
         -------
         Motion
-            Of the robot that this is of, on one time axis, in its chart; a joint that jammed stands
+            Of this one's robot and in its chart, on one time axis; a joint that jammed stands
             still. Energy and momentum are those of the robot as it is at the time.
 
         Raises
         ------
         InputError
-            If one does not begin where the one before ended, is in another frame, has inputs that
-            this has not, or is from a file.
+            If one does not begin where the one before ended, has another frame or more inputs, or
+            is from a file.
         """
         from fflin.simulation.phases import carried_on
 
@@ -209,25 +208,9 @@ class Motion(Design):
         Of inputs that change all the time the last, which no row has, is extrapolated. A motion
         that was read from a file needs the `robot`.
         """
-        from fflin.linear.trajectory import Trajectory
-        from fflin.linear.trajectory_files import arguments
+        from fflin.linear.trajectory import along
 
-        robot = robot or self._robot
-        if self.phases:
-            raise InputError("a motion of several phases is of several robots; take each alone")
-        if robot is None:
-            raise InputError(
-                "the motion is from a file, without its robot; give the one that moves"
-            )
-        entries = {name: getattr(self, name) for name in ("t", "q", "v", "u", "placement")}
-        values = arguments(entries, robot, "previous", self.frame, self.verified)
-        held = Trajectory(robot, **values)
-        if not (self.u - self.u[0]).any():
-            return held
-        before, u = self.t[-4:-1] - self.t[-1], values["u"]
-        u[-1] = np.linalg.solve(np.vander(before).T, np.eye(len(before))[-1]) @ u[-4:-1]
-        smooth = Trajectory(robot, **values | {"hold": "linear", "u": u})
-        return min(held, smooth, key=lambda each: float(each.residual.max()))
+        return along(self, robot or self._robot)
 
     @property
     def passed(self) -> tuple[Passed, ...]:
@@ -272,8 +255,6 @@ class Motion(Design):
 
     def plot(self, path: str | Path | None = None, **options: Any) -> Any:
         """Draw the motion, see `plot_motion`; into a file where a path is given."""
-        from fflin.simulation.motion_plot import plot_motion
-
         return plot_motion(self, path, **options)
 
 
@@ -281,3 +262,39 @@ def require_motion(motion: Any) -> Motion:
     """Return the motion, or raise `InputError` where it is none."""
     found: Motion = instance("motion", motion, Motion, "a Motion, as fflin.simulate returns it")
     return found
+
+
+def plot_motion(
+    motion: Motion, path: str | Path | None = None, *, show: Sequence[str] | None = None
+) -> Figure:
+    """Draw the errors, inputs and momentum drift of a motion, linear beside nonlinear.
+
+    Parameters
+    ----------
+    motion : Motion
+        With a prediction, each group of states shows the nonlinear robot in full lines and the
+        linear model dashed, and below it their difference. Along a trajectory it shows the robot
+        over the pale reference, and below it the error, that of the linear model dashed; a dotted
+        line is where the reference comes to rest.
+    path : str or Path, optional
+        .png, .pdf or .svg to save to.
+    show : sequence of str, optional
+        What is drawn of states and inputs: names, groups or patterns such as ``q_m``, ``thrust``,
+        ``*.hinge_*``; all by default.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    MissingPackageError
+        If matplotlib is not installed.
+    FileError
+        If the ending is another or the file cannot be written.
+    UnknownNameError
+        If there is nothing of a name in `show`.
+    """
+    from fflin.simulation.motion_plot import draw_motion
+
+    return draw_motion(require_motion(motion), path, show)

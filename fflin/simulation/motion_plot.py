@@ -11,7 +11,6 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.names import chosen, input_keys
 from fflin.dynamics.state_rows import moving_errors
-from fflin.simulation.motion import Motion, require_motion
 from fflin.simulation.plots import Signals, draw
 
 if TYPE_CHECKING:
@@ -21,38 +20,8 @@ if TYPE_CHECKING:
 _STILL = 1e-12
 
 
-def plot_motion(
-    motion: Motion, path: str | Path | None = None, *, show: Sequence[str] | None = None
-) -> Figure:
-    """Draw the errors, inputs and momentum drift of a motion, linear beside nonlinear.
-
-    Parameters
-    ----------
-    motion : Motion
-        With a prediction, each group of states shows the nonlinear robot in full lines and the
-        linear model dashed, and below it their difference. Along a trajectory it shows the robot
-        over the pale reference, and below it the error, that of the linear model dashed; a dotted
-        line is where the reference comes to rest.
-    path : str or Path, optional
-        .png, .pdf or .svg to save to.
-    show : sequence of str, optional
-        What is drawn of states and inputs: names, groups or patterns such as ``q_m``, ``thrust``,
-        ``*.hinge_*``; all by default.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    MissingPackageError
-        If matplotlib is not installed.
-    FileError
-        If the ending is another or the file cannot be written.
-    UnknownNameError
-        If there is nothing of a name in `show`.
-    """
-    require_motion(motion)
+def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None) -> Figure:
+    """Draw a motion, see `plot_motion`."""
     limits = dict(zip(motion.limit_names, motion.limits, strict=True))
     inertias = motion.wheel_inertias.tolist()
     title = f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"
@@ -60,7 +29,7 @@ def plot_motion(
         title += "; full: nonlinear, dashed: linear"
     for name, start in zip(motion.phases[1:], motion.starts[1:], strict=True):
         title += f"; {name} at {start:g} s"
-    rest = resting_from(motion)
+    rest = None if motion.phases else resting_from(motion)
     if rest is not None:
         title += f"; reference at rest from {rest:.4g} s"
     names = (*motion.state_names, *input_keys(motion))
@@ -87,7 +56,7 @@ def plot_motion(
     )
 
 
-def _apart(motion: Motion) -> tuple[str, Signals] | None:
+def _apart(motion: Any) -> tuple[str, Signals] | None:
     """Return the errors from a reference, of attitude in degrees, or from the linear model."""
     names, units, linear = motion.state_names, motion.state_units, motion.linear
     if not motion.tracked:
@@ -104,10 +73,9 @@ def _apart(motion: Motion) -> tuple[str, Signals] | None:
     return "error", Signals(flown, names, ("deg",) * 3 + units[3:], {}, *foreseen)
 
 
-def resting_from(motion: Motion) -> float | None:
+def resting_from(motion: Any) -> float | None:
     """Return the time [s] from which a target that moved stands still; None where none does."""
-    moves = motion.tracked and not motion.phases
-    places = motion.target[:, : motion.x.shape[1] // 2] if moves else motion.x[:1]
+    places = motion.target[:, : motion.x.shape[1] // 2] if motion.tracked else motion.x[:1]
     moved = np.flatnonzero(np.abs(np.diff(places, axis=0)).max(axis=1, initial=0.0) > _STILL)
     if not len(moved) or moved[-1] + 2 >= len(places):
         return None

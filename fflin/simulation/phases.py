@@ -9,19 +9,18 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, instance
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.impact import Impact, joint_called
 from fflin.dynamics.state import StateMap
 from fflin.dynamics.state_rows import state_history
 from fflin.robot.robot import ROOT, Robot
-from fflin.simulation.motion import Motion, require_motion
 
 # Phases meet where no rate and no displacement differs by more.
 _MET = 1e-6
 
 
-def carried_on(first: Motion, later: tuple[Any, ...]) -> Motion:
+def carried_on(first: Any, later: tuple[Any, ...]) -> Any:
     """Return one motion of several, see `Motion.then`."""
     if not later or isinstance(later[-1], Impact):
         raise InputError("the last phase is a motion: simulate the robot after the impact")
@@ -34,14 +33,15 @@ def carried_on(first: Motion, later: tuple[Any, ...]) -> Motion:
             robot, q, v, event = part.robot, part.q, part.v, part.event
             whole = replace(whole, notes=(*whole.notes, f"{whole.t[-1]:g} s: {part.told}"))
         else:
-            name, other = event or require_motion(part).robot, _robot(part)
+            instance("a phase", part, type(first), "a Motion, or an Impact before one")
+            name, other = event or part.robot, _robot(part)
             _require_met(name, robot, q, v, other, part.q[0], part.v[0])
             robot, q, v, event = other, part.q[-1], part.v[-1], ""
             whole = _longer(whole, part, name)
     return whole
 
 
-def _robot(motion: Motion) -> Robot:
+def _robot(motion: Any) -> Robot:
     if motion._robot is None:
         raise InputError("a motion from a file is without its robot; go on from that of simulate")
     robot: Robot = motion._robot
@@ -73,7 +73,7 @@ def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[
     return own_q, own_v
 
 
-def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
+def _longer(whole: Any, motion: Any, name: str) -> Any:
     """Return the motion with another's rows at its end, in its own chart, joints and inputs."""
     if motion.frame != whole.frame:
         raise InputError(
@@ -86,7 +86,9 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
     q, v = _seen(state.robot, there.robot, last, motion.q, motion.v)
     target = np.zeros(0)
     if whole.target.size and motion.target.size:
-        goals = _seen(state.robot, there.robot, last, *there.points(np.atleast_2d(motion.target))[1:])
+        goals = _seen(
+            state.robot, there.robot, last, *there.points(np.atleast_2d(motion.target))[1:]
+        )
         rows = (whole.target, len(whole.t)), (state_history(state, *goals, near), len(t))
         target = np.vstack([np.broadcast_to(x, (n, state.nx)) for x, n in rows])
     alike = ("energy", "momentum", "momentum_drift", "com_drift")
@@ -109,14 +111,13 @@ def _longer(whole: Motion, motion: Motion, name: str) -> Motion:
     )
 
 
-def _inputs(whole: Motion, state: StateMap, motion: Motion, there: StateMap) -> Array:
+def _inputs(whole: Any, state: StateMap, motion: Any, there: StateMap) -> Array:
     """Return a motion's inputs (N, nu) as those of the whole: what it lacks is zero."""
     if more := [name for name in motion.input_names if name not in whole.input_names]:
         raise InputError(f"a phase has the input {more[0]}, which the first has not; give it that")
     u = np.zeros((len(motion.t), len(whole.input_names)))
     u[:, [whole.input_names.index(name) for name in motion.input_names]] = motion.u
-    turn, groups = state.reference.rotation.T @ there.reference.rotation, Actuation(state).groups
-    for kind, relative in zip(("tau_b", "F_b"), state.axes, strict=True):
-        if relative and kind in groups:
-            u[:, groups[kind]] = u[:, groups[kind]] @ turn.T
+    turn = there.reference.rotation.T @ state.reference.rotation
+    for held in Actuation(state).held:  # in reference axes
+        u[:, held.columns] = u[:, held.columns] @ turn
     return u

@@ -44,13 +44,7 @@ _GIF_FRAMES = 96
 
 
 def find_chromium() -> str:
-    """Return the path of a Chromium.
-
-    Raises
-    ------
-    MissingPackageError
-        If there is none.
-    """
+    """Return the path of a Chromium, or raise `MissingPackageError`."""
     found = next(filter(None, map(shutil.which, _NAMES)), None)
     if found is None:
         raise MissingPackageError(
@@ -61,17 +55,7 @@ def find_chromium() -> str:
 
 
 def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes:
-    """Return a PNG of a motion's page: with its panel at one time, a strip of it at several.
-
-    Parameters
-    ----------
-    page : Path
-        HTML file of `visualize`.
-    times : sequence of float
-        Of the motion [s].
-    size : tuple of int
-        Width and height of each picture [pixels].
-    """
+    """Return a PNG of a motion's page: with its panel at one time, a strip of it at several."""
     frames = _film(page, times, size, 1 if len(times) > 1 else -1)
     if len(frames) == 1:
         return frames[0]
@@ -86,18 +70,7 @@ def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes
 
 
 def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[int, int]) -> bytes:
-    """Return a GIF of a motion's page.
-
-    Parameters
-    ----------
-    page : Path
-    span : tuple of float
-        When the motion begins and ends [s].
-    speed : float
-        Seconds of it per second; a long one is shown faster.
-    size : tuple of int
-        Width and height [pixels].
-    """
+    """Return a GIF of a motion's page over a span [s], so many seconds of it per second."""
     from PIL import Image
 
     start, duration = span[0], span[1] - span[0]

@@ -25,15 +25,7 @@ _LARGEST = 20_000
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles of one colour.
-
-    Attributes
-    ----------
-    vertices : ndarray (V, 3) of float32
-    faces : ndarray (F, 3) of uint32
-    color : tuple of float, optional
-        None where the file says none.
-    """
+    """Triangles of one colour: corners (V, 3), faces (F, 3), colour where the file has one."""
 
     vertices: Array
     faces: Indices
@@ -41,22 +33,7 @@ class Mesh:
 
 
 def load_mesh(path: Path) -> tuple[Mesh, ...]:
-    """Read a mesh file, in its own unit of length.
-
-    Parameters
-    ----------
-    path : Path
-        What Pinocchio reads: STL, DAE, OBJ and others. Colours are taken of DAE.
-
-    Returns
-    -------
-    tuple of Mesh
-
-    Raises
-    ------
-    ValueError
-        If it cannot be read, or nothing of it can be seen.
-    """
+    """Read a mesh file, in its own unit of length; ValueError where nothing of it can be seen."""
     try:
         found = os.stat(path)
     except OSError as error:
@@ -89,10 +66,7 @@ def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
 
 
 def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
-    """Return vertices, faces and plain colour of each part of a COLLADA file, in metres.
-
-    Pinocchio's loader makes one part of them all. None where the file is not understood.
-    """
+    """Return vertices, faces and colour of each part of a COLLADA file [m], none of an odd one."""
     import trimesh
 
     try:

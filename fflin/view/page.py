@@ -18,22 +18,7 @@ _SCRIPTS = ("sky", "look", "stage", "marks", "plots", "player", "live", "modes",
 
 
 def build_page(info: dict[str, Any], commands: Iterable[bytes] = (), connect: str = "") -> str:
-    """Build the page.
-
-    Parameters
-    ----------
-    info : dict
-        What the scripts show, all but the robot.
-    commands : iterable of bytes
-        Messages of `Recorder.commands`.
-    connect : str
-        Where the page may connect to, in the words of a content security policy; nowhere by
-        default.
-
-    Returns
-    -------
-    str
-    """
+    """Build the page of what scripts and `Recorder.commands` show; it connects nowhere else."""
     info = {**info, "commands": [_base64(command) for command in commands]}
     # In a script element nothing but its own end tag and a comment's start is special.
     data = json.dumps(info, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

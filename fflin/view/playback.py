@@ -20,29 +20,15 @@ _MOST_FRAMES = 3000
 
 @dataclass(frozen=True)
 class Playback:
-    """What is shown of a motion at N frames.
+    """What is shown of a motion at N frames, each at one of its own times."""
 
-    Attributes
-    ----------
-    t : ndarray (N,)
-        Times [s]; each is one of the motion's own, so that no pose is interpolated.
-    poses : ndarray (N, njoints - 1, 7)
-        x, y, z and quaternion x, y, z, w of every joint's frame in the world.
-    com, tool : ndarray (N, 3)
-        Centre of mass and origin of the tool [m].
-    force, torque : ndarray (N, 3)
-        Base wrench in world axes [N], [N m].
-    thrust : ndarray (N, k)
-        Of each thruster [N].
-    """
-
-    t: Array
-    poses: Array
-    com: Array
+    t: Array  # [s]
+    poses: Array  # (N, njoints - 1, 7), of every joint's frame: x, y, z, quaternion x, y, z, w
+    com: Array  # (N, 3) [m]
     tool: Array
-    force: Array
-    torque: Array
-    thrust: Array
+    force: Array  # (N, 3), on the base in world axes [N]
+    torque: Array  # [N m]
+    thrust: Array  # (N, k) [N]
 
 
 def frame_indices(t: Array, fps: float, speed: float) -> Array:

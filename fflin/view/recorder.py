@@ -9,18 +9,7 @@ Lowered = dict[str, Any]
 
 
 class Recorder:
-    """Window of a meshcat.Visualizer that remembers the scene.
-
-    Parameters
-    ----------
-    forward : callable, optional
-        Given each command's bytes as it comes, for a browser that watches.
-
-    Attributes
-    ----------
-    web_url : str
-        What `Visualizer.url` returns.
-    """
+    """Window of a meshcat.Visualizer that remembers the scene, and may forward it to a browser."""
 
     def __init__(self, forward: Callable[[bytes], None] | None = None) -> None:
         self.web_url = ""

@@ -34,10 +34,7 @@ _ELSEWHERE = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
 
 
 class _Piece(MeshcatMesh):
-    """A three.js mesh as it is sent.
-
-    The page gives it its material, and the geometry of an earlier piece where it names one.
-    """
+    """A three.js mesh; the page gives it its material, and an earlier geometry that it names."""
 
     def __init__(self, geometry: dict[str, Any], matrix: Array, about: dict[str, Any]) -> None:
         self._geometry, self._matrix, self._about = geometry, matrix, about
@@ -64,27 +61,7 @@ def body_paths(robot: Robot) -> list[str]:
 
 
 class Drawing:
-    """A robot drawn into a meshcat scene.
-
-    Parameters
-    ----------
-    robot : Robot
-    visualizer : meshcat.Visualizer
-        Node to draw below. The bodies become its children, named as their joints.
-    look : str
-        "real", or "ghost" and "linear" for translucent ones.
-    sent : set of str, optional
-        Meshes that the page has already; those of this drawing are added.
-
-    Attributes
-    ----------
-    notes : tuple of str
-        What could not be drawn, one line each.
-    corners : list of ndarray (8, 3)
-        Bounding box of each body's pieces in the body's frame, for those that have pieces.
-    bodies : list of int
-        The Pinocchio joints whose boxes these are.
-    """
+    """A robot below a node, its bodies named as their joints; `sent` are meshes that are there."""
 
     def __init__(
         self, robot: Robot, visualizer: Visualizer, look: str = "real", sent: set[str] | None = None

@@ -21,29 +21,7 @@ _HOST = "127.0.0.1"
 
 
 class Server:
-    """Serves a page and keeps it up to date; it ends with its process.
-
-    Parameters
-    ----------
-    page : str
-        HTML that connects to ``/socket``.
-    scene : callable
-        Returns the messages that build the scene for a browser that has just come.
-    asked : callable
-        Given what a browser sends, a JSON value.
-    port : int
-        0 for one that is free.
-
-    Attributes
-    ----------
-    url : str
-    port : int
-
-    Raises
-    ------
-    InputError
-        If the port is taken.
-    """
+    """Serves a page, and what `scene` draws, to this machine; it ends with its process."""
 
     def __init__(
         self,

@@ -26,50 +26,19 @@ PLAIN: Color = (0.72, 0.74, 0.77, 1.0)
 
 @dataclass(frozen=True)
 class Shape:
-    """One visible piece of a robot, rigidly fixed to the body behind one joint.
+    """One visible piece of a robot, rigidly fixed to the body behind one joint."""
 
-    Attributes
-    ----------
-    joint : int
-        Index of the Pinocchio joint that moves it.
-    kind : str
-        "box", "sphere", "cylinder", "capsule" or "mesh".
-    size : tuple of float
-        Side lengths; radius; radius and length [m]; or the scale of the mesh.
-    placement : pin.SE3
-        Where it stands in the joint's frame; the axis of a cylinder is z.
-    color : tuple of float, optional
-        Red, green, blue, opacity, each in [0, 1]; None where a mesh brings its own.
-    finish : str
-        Name of its material, which may tell gold from paint.
-    mesh : Path, optional
-        File of a mesh.
-    """
-
-    joint: int
-    kind: str
-    size: tuple[float, ...]
-    placement: pin.SE3
-    color: Color | None = PLAIN
-    finish: str = ""
+    joint: int  # of Pinocchio, that moves it
+    kind: str  # "box", "sphere", "cylinder", "capsule" or "mesh"
+    size: tuple[float, ...]  # sides; radius; radius and length [m]; or the scale of the mesh
+    placement: pin.SE3  # in the joint's frame; the axis of a cylinder is z
+    color: Color | None = PLAIN  # None where a mesh brings its own
+    finish: str = ""  # name of its material, which may tell gold from paint
     mesh: Path | None = None
 
 
 def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
-    """Return what a robot looks like.
-
-    Parameters
-    ----------
-    robot : Robot
-
-    Returns
-    -------
-    shapes : tuple of Shape
-        Of its URDF's visual elements; where it has none, or no URDF, a box for each body whose
-        inertia is that of the body.
-    notes : tuple of str
-        What could not be drawn, one line each.
-    """
+    """Return a robot's looks, boxes where it has no visuals, and what could not be drawn."""
     notes: list[str] = []
     found = list(_visuals(robot, notes)) if robot.urdf else []
     if not found:

@@ -19,13 +19,7 @@ _COUNT, _THIN = 160, 1e-3  # ellipsoids along a path; the least half axis in siz
 def tubes(
     robot: Robot, funnel: Any, tool: str | None, size: float, colors: tuple[str, str]
 ) -> list[dict[str, Any]]:
-    """Return centres (N, 3) and half axes (N, 9) of the ellipsoids of tool and base.
-
-    Raises
-    ------
-    InputError
-        If the funnel is none of the robot.
-    """
+    """Return centres (N, 3) and half axes (N, 9) of the ellipsoids of tool and base."""
     from fflin.campaign.reach import Funnel
 
     if not isinstance(funnel, Funnel):

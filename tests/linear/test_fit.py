@@ -37,7 +37,10 @@ def test_states_and_inputs_are_matched_by_name(pair):
 
 def test_a_joint_that_jammed_takes_its_row_and_columns_along(pair):
     robot = pair[0]
-    gain, lin = fflin.lqr(fflin.linearize(robot)), fflin.linearize(fflin.jam(robot, "joint_2").robot)
+    gain, lin = (
+        fflin.lqr(fflin.linearize(robot)),
+        fflin.linearize(fflin.jam(robot, "joint_2").robot),
+    )
     K = fflin.line_up(gain, lin)
     rows = [gain.input_names.index(name) for name in lin.input_names]
     columns = [gain.state_names.index(name) for name in lin.state_names]
@@ -47,8 +50,10 @@ def test_a_joint_that_jammed_takes_its_row_and_columns_along(pair):
 def test_gains_between_masses_of_a_payload(pair):
     """At a mass on the grid the gain is that mass's own, and between two it regulates."""
     robot = pair[0]
-    heavy = [fflin.capture(robot, "tool", pin.Inertia(x * 200.0, BODY.lever, x * BODY.inertia))
-             for x in (0.5, 1.0)]
+    heavy = [
+        fflin.capture(robot, "tool", pin.Inertia(x * 200.0, BODY.lever, x * BODY.inertia))
+        for x in (0.5, 1.0)
+    ]
     models = [fflin.linearize(each) for each in (robot, *(c.robot for c in heavy))]
     K = np.stack([fflin.line_up(fflin.lqr(lin), models[1]) for lin in models])
     between = 0.5 * (K[0] + K[2])

@@ -52,7 +52,7 @@ def test_errors_are_counted_from_the_target_of_each_phase(flown):
 
 def test_momentum_and_energy_across_the_phases(flown):
     """What is lost of energy is what the impacts say, and no momentum."""
-    _, approach, caught, held, jammed, after, whole = flown
+    _, approach, caught, held, jammed, _, whole = flown
     for impact in (caught, jammed):
         size = np.abs(impact.momentum).max()
         assert np.abs(impact.momentum - impact.momentum_after).max() < 1e-13 * size
@@ -110,16 +110,16 @@ def test_what_does_not_go_on_is_one_line(flown):
     )
     pushed = fflin.simulate(pushed, None, q0=approach.q[-1], v0=approach.v[-1], duration=0.1)
     for call, said in [
-        (lambda: approach.then(), "the last phase is a motion"),
+        (approach.then, "the last phase is a motion"),
         (lambda: approach.then(caught), "the last phase is a motion"),
-        (lambda: approach.then(3), "expected a Motion"),
+        (lambda: approach.then(3), "a phase is a int, expected a Motion"),
         (lambda: approach.then(away, held), "does not begin where the motion before it ended"),
         (lambda: approach.then(caught, after), "'joint_3 jammed' does not|caught' does not"),
         (lambda: approach.then(held), "does not begin"),
         (lambda: approach.then(jammed, after), "does not begin"),
         (lambda: approach.then(turned), "in the frame 'world', the first phase in 'hybrid'"),
         (lambda: approach.then(pushed), "input jet"),
-        (lambda: whole.trajectory(), "several robots"),
+        (whole.trajectory, "several robots"),
     ]:
         with pytest.raises(fflin.InputError, match=said) as error:
             call()

@@ -56,7 +56,11 @@ def test_a_body_flies_to_the_grasp_and_is_held(browser, tmp_path):
         assert apart(body, pin.SE3(R, at)) < EXACT, t
         here = frames(flown.robot, flown.approach.q[row_at(flown.approach, t)])
         assert apart(shown(watched, "robot", "joint_7"), here["joint_7"]) < EXACT
-    for part, start, t in ((flown.held, 4.0, 4.0), (flown.held, 4.0, 8.3), (flown.after, 10.0, 12.0)):
+    for part, start, t in (
+        (flown.held, 4.0, 4.0),
+        (flown.held, 4.0, 8.3),
+        (flown.after, 10.0, 12.0),
+    ):
         watched.do(f"fflin.seek({t})")
         here = frames(part._robot, part.q[row_at(part, t - start)])
         assert apart(shown(watched, "held", "payload", "root_joint"), here["payload"]) < EXACT, t
