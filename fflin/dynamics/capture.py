@@ -11,8 +11,7 @@ import pinocchio as pin
 from fflin.base.errors import InputError
 from fflin.base.validation import Array, dimension, vector
 from fflin.base.validation import placement as checked_placement
-from fflin.dynamics.impact import Impact, inertia_at, joint_called, momentum_of, projected
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.impact import Impact, struck
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.joined import body_alone, inertia_of, joined
 from fflin.robot.robot import Robot
@@ -135,7 +134,10 @@ def capture(
     data = robot.create_data()
     pin.forwardKinematics(robot.model, data, q)
     other_q, other_v = _beside(other, data.oMi[joint] * on * at, payload_q, payload_v)
-    return _impact(whole, (robot, q, v), (other, other_q, other_v), prefix)
+    parts = [(robot, q, v), (other, other_q, other_v)]
+    said, impulse = struck(whole, parts, prefix, f"{prefix} of {other.mass:.6g} kg caught")
+    held = {"payload": other, "payload_q": other_q, "payload_v": other_v, "prefix": prefix}
+    return Capture(impulse=impulse[robot.nv : robot.nv + 6], **said, **held)
 
 
 def _beside(other: Robot, at: pin.SE3, q: Any, v: Any) -> tuple[Array, Array]:
@@ -150,45 +152,3 @@ def _beside(other: Robot, at: pin.SE3, q: Any, v: Any) -> tuple[Array, Array]:
     expected = "the twist (linear, angular) of the payload" + ", and its joints" * bool(other.n)
     v = vector("payload_v", v, other.nv, expected)
     return configuration, other.checked_velocity(v)
-
-
-def _impact(
-    whole: Robot, own: tuple[Robot, Array, Array], held: tuple[Robot, Array, Array], prefix: str
-) -> Capture:
-    state = StateMap(whole)
-    q, (robot, own_q, own_v), (other, other_q, other_v) = whole.neutral(), own, held
-    q[:7] = own_q[:7]
-    rows = {robot: np.zeros((robot.nv, whole.nv)), other: np.zeros((other.nv, whole.nv))}
-    rows[robot][:6, :6] = np.eye(6)
-    for of, values, start in ((robot, own_q, ""), (other, other_q, f"{prefix}.")):
-        for index in range(ROOT + 1, of.model.njoints):
-            there = joint_called(whole, start + of.model.names[index])
-            here = of.model.joints[index]
-            q[there.idx_q : there.idx_q + there.nq] = values[here.idx_q : here.idx_q + here.nq]
-            rows[of][here.idx_v, there.idx_v] = 1.0
-    data, local = whole.create_data(), pin.ReferenceFrame.LOCAL
-    at = whole.model.getFrameId(prefix, pin.FrameType.BODY)
-    rows[other][:6] = pin.computeFrameJacobian(whole.model, data, q, at, local)
-    spread = np.eye(whole.nv) if state.S is None else state.S
-    G = np.vstack((rows[robot], rows[other])) @ spread
-    before = np.concatenate((own_v, other_v))
-    M = np.zeros((len(G), len(G)))
-    M[: robot.nv, : robot.nv] = inertia_at(robot, own_q)
-    M[robot.nv :, robot.nv :] = inertia_at(other, other_q)
-    nu, jump = projected(M, G, before)
-    v = spread @ nu
-    return Capture(
-        robot=whole,
-        q=q,
-        v=v,
-        impulse=(M @ jump)[robot.nv : robot.nv + 6],
-        energy_lost=0.5 * float(jump @ M @ jump),
-        momentum=momentum_of(robot, own_q, own_v) + momentum_of(other, other_q, other_v),
-        momentum_after=momentum_of(whole, q, v),
-        event=f"{prefix} of {other.mass:.6g} kg caught",
-        payload=other,
-        payload_q=other_q,
-        payload_v=other_v,
-        prefix=prefix,
-        _before=own,
-    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +12,8 @@ import pinocchio as pin
 from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import folded
 from fflin.base.validation import Array
-from fflin.robot.robot import Robot
+from fflin.dynamics.state import StateMap
+from fflin.robot.robot import ROOT, Robot
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -60,10 +62,41 @@ class Impact(FrozenArrays):
         return f"{self.event}: {felt}, {self.energy_lost:.4g} J lost"
 
 
-def projected(M: Array, G: Array, before: Array) -> tuple[Array, Array]:
-    r"""Return the velocities after an impact and the jump, M-orthogonal to what G allows (13.1)."""
-    after = np.linalg.solve(G.T @ M @ G, G.T @ (M @ before))
-    return after, before - G @ after
+def struck(
+    whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
+) -> tuple[dict[str, Any], Array]:
+    """Return what `Impact` says where robots at q with v become one, by (13.1), and the impulses.
+
+    The first keeps its names, the joints that the whole lacks stop; a second hangs at a frame.
+    """
+    state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
+    sizes = [robot.nv for robot, *_ in parts]
+    G, M = np.zeros((sum(sizes), whole.nv)), np.zeros((sum(sizes), sum(sizes)))
+    q[:7], at = parts[0][1][:7], 0
+    for robot, own_q, _ in parts:
+        rows, start = G[at : at + robot.nv], f"{prefix}." if at else ""
+        M[at : at + robot.nv, at : at + robot.nv] = inertia_at(robot, own_q)
+        for name in list(robot.model.names)[ROOT + 1 :]:
+            if whole.model.existJointName(start + name):
+                here, there = joint_called(robot, name), joint_called(whole, start + name)
+                q[there.idx_q : there.idx_q + there.nq] = own_q[here.idx_q :][: here.nq]
+                rows[here.idx_v, there.idx_v] = 1.0
+        rows[:6, :6] = np.eye(6)
+        if at:
+            frame = whole.model.getFrameId(prefix, pin.FrameType.BODY)
+            data = whole.create_data()
+            rows[:6] = pin.computeFrameJacobian(whole.model, data, q, frame, local)
+        at += robot.nv
+    spread = np.eye(whole.nv) if state.S is None else state.S
+    G, before = G @ spread, np.concatenate([own_v for *_, own_v in parts])
+    nu = np.linalg.solve(G.T @ M @ G, G.T @ (M @ before))
+    jump, v = before - G @ nu, spread @ nu
+    said = {"robot": whole, "q": q, "v": v, "event": event, "_before": parts[0]}
+    return said | {
+        "energy_lost": 0.5 * float(jump @ M @ jump),
+        "momentum": sum(momentum_of(*part) for part in parts),
+        "momentum_after": momentum_of(whole, q, v),
+    }, M @ jump
 
 
 def inertia_at(robot: Robot, q: Array) -> Array:

@@ -8,11 +8,11 @@ import numpy as np
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
-from fflin.dynamics.impact import Impact, inertia_at, joint_called, momentum_of, projected
+from fflin.dynamics.impact import Impact, struck
 from fflin.dynamics.state import StateMap
 from fflin.robot.joints import by_joint
 from fflin.robot.locking import welded
-from fflin.robot.robot import ROOT, Robot
+from fflin.robot.robot import Robot
 
 
 def jam(
@@ -59,24 +59,6 @@ def jam(
     v = np.zeros(robot.nv) if v is None else robot.checked_velocity(v)
     at = {name: robot.joint(name).value(q) for name in named}
     left = welded(robot, at)
-    after = left.neutral()
-    for name in list(left.model.names)[ROOT:]:
-        here, there = joint_called(robot, name), joint_called(left, name)
-        after[there.idx_q : there.idx_q + there.nq] = q[here.idx_q : here.idx_q + here.nq]
-    kept = [robot.joint_names.index(name) for name in left.joint_names]
-    G = np.eye(6 + robot.n)[:, [*range(6), *(6 + i for i in kept)]]
-    M = state.project(inertia_at(robot, q))
-    nu, jump = projected(M, G, state.velocities(v))
-    v_after = StateMap(left).spread(nu)
+    said, impulse = struck(left, [(robot, q, v)], "", f"{', '.join(at)} jammed")
     stopped = [6 + robot.joint_names.index(name) for name in at]
-    return Impact(
-        robot=left,
-        q=after,
-        v=v_after,
-        impulse=-(M @ jump)[stopped],
-        energy_lost=0.5 * float(jump @ M @ jump),
-        momentum=momentum_of(robot, q, v),
-        momentum_after=momentum_of(left, after, v_after),
-        event=f"{', '.join(at)} jammed",
-        _before=(robot, q, v),
-    )
+    return Impact(impulse=-state.forces(impulse)[stopped], **said)
