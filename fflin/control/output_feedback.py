@@ -28,13 +28,7 @@ from fflin.robot.robot import Robot
 
 
 def measured_at(state: StateMap) -> tuple[list[int], list[Gyroscope]]:
-    """Return which states the outputs of a robot are, its gyroscopes counting after them.
-
-    Raises
-    ------
-    InputError
-        If one is another sensor.
-    """
+    """Return which states the outputs of a robot are, and its gyroscopes, that count after them."""
     found, gyros = list[int](), list[Gyroscope]()
     for output in state.robot.outputs:
         if isinstance(output, Gyroscope):

@@ -136,7 +136,7 @@ def capture(
     other_q, other_v = _beside(other, data.oMi[joint] * on * at, payload_q, payload_v)
     parts = [(robot, q, v), (other, other_q, other_v)]
     said, impulse = struck(whole, parts, prefix, f"{prefix} of {other.mass:.6g} kg caught")
-    held = {"payload": other, "payload_q": other_q, "payload_v": other_v, "prefix": prefix}
+    held: dict[str, Any] = {"payload": other, "payload_q": other_q, "payload_v": other_v, "prefix": prefix}
     return Capture(impulse=impulse[robot.nv : robot.nv + 6], **said, **held)
 
 

@@ -65,10 +65,7 @@ class Impact(FrozenArrays):
 def struck(
     whole: Robot, parts: Sequence[tuple[Robot, Array, Array]], prefix: str, event: str
 ) -> tuple[dict[str, Any], Array]:
-    """Return what `Impact` says where robots at q with v become one, by (13.1), and the impulses.
-
-    The first keeps its names, the joints that the whole lacks stop; a second hangs at a frame.
-    """
+    """Return what `Impact` says where robots at q with v become one by (13.1), and the impulses."""
     state, q, local = StateMap(whole), whole.neutral(), pin.ReferenceFrame.LOCAL
     sizes = [robot.nv for robot, *_ in parts]
     G, M = np.zeros((sum(sizes), whole.nv)), np.zeros((sum(sizes), sum(sizes)))

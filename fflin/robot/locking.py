@@ -21,6 +21,8 @@ from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
 from fflin.robot.wheels import with_inputs
 
+_GROUPS = ("", "q_m.", "qdot_m.", "tau_m.", "wheel.")
+
 Lock = Mapping[str, float | None] | Iterable[str]
 
 
@@ -66,9 +68,7 @@ def _without(of: Any, gone: set[str]) -> Any:
     """Return a mapping, and those in it, without what is named NAME or GROUP.NAME."""
     if not isinstance(of, Mapping):
         return of
-    named = {
-        f"{group}{name}" for name in gone for group in ("", "q_m.", "qdot_m.", "tau_m.", "wheel.")
-    }
+    named = {f"{group}{name}" for name in gone for group in _GROUPS}
     return {name: _without(value, gone) for name, value in of.items() if name not in named}
 
 

@@ -86,10 +86,9 @@ def _longer(whole: Any, motion: Any, name: str) -> Any:
     q, v = _seen(state.robot, there.robot, last, motion.q, motion.v)
     target = np.zeros(0)
     if whole.target.size and motion.target.size:
-        goals = _seen(
-            state.robot, there.robot, last, *there.points(np.atleast_2d(motion.target))[1:]
-        )
-        rows = (whole.target, len(whole.t)), (state_history(state, *goals, near), len(t))
+        goals = there.points(np.atleast_2d(motion.target))[1:]
+        goals = state_history(state, *_seen(state.robot, there.robot, last, *goals), near)
+        rows = (whole.target, len(whole.t)), (goals, len(t))
         target = np.vstack([np.broadcast_to(x, (n, state.nx)) for x, n in rows])
     alike = ("energy", "momentum", "momentum_drift", "com_drift")
     return replace(

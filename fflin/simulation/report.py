@@ -174,10 +174,7 @@ def motion_report(motion: Any) -> str:
 
 
 def _phases(motion: Any) -> list[list[str]]:
-    """Return the table of phases, each of which ends in a row of the time at which the next begins.
-
-    Momentum is of the robot as it is in the phase, about its own centre of mass.
-    """
+    """Return the table of phases; momentum is of the robot as it is, about its centre of mass."""
     heads = [["phase", "from [s]", "energy [J]", "at its end", "|momentum| [N s]", "[N m s]"]]
     ends = [*np.searchsorted(motion.t, motion.starts[1:], "right") - 1, len(motion.t)]
     for k, (name, start) in enumerate(zip(motion.phases, motion.starts, strict=True)):
