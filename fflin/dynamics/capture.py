@@ -95,8 +95,8 @@ def capture(
     UnknownNameError
         If there is no such frame.
     InputError
-        If a size or value is wrong, the payload is no body, its names are taken, its gravity is
-        another, or a wheel of it stores momentum without an inertia.
+        If a size or value is wrong, the payload is no body, its names are taken, its gravity or
+        orbit is another, or a wheel of it stores momentum without an inertia.
     ModelError
         If a robot was changed after it was made.
 
@@ -109,7 +109,8 @@ def capture(
         raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
     robot.require_unchanged()
     if isinstance(payload, pin.Inertia):
-        other = body_alone(inertia_of(payload), prefix)
+        alone = body_alone(inertia_of(payload), prefix)
+        other = replace(alone, gravity=robot.gravity, orbit=robot.orbit)
     elif isinstance(payload, Robot):
         payload.require_unchanged()
         other = replace(payload)  # which may be the robot's twin, the same object
@@ -117,10 +118,10 @@ def capture(
         raise InputError(
             f"payload is a {type(payload).__name__}, expected a pin.Inertia or a fflin.Robot"
         )
-    if isinstance(payload, Robot) and robot.gravity != other.gravity:
-        raise InputError(
-            f"the robot's gravity is {robot.gravity}, the payload's {other.gravity}; give both one"
-        )
+    for field in ("gravity", "orbit") if isinstance(payload, Robot) else ():
+        own, theirs = (getattr(each, field) for each in (robot, other))
+        if own != theirs:
+            raise InputError(f"the robot's {field} is {own}, the payload's {theirs}; give both one")
     if other.stored_momentum:
         raise InputError(
             "a wheel of the payload stores momentum and has no inertia, so that it is no joint and "
@@ -136,8 +137,8 @@ def capture(
     other_q, other_v = _beside(other, data.oMi[joint] * on * at, payload_q, payload_v)
     parts = [(robot, q, v), (other, other_q, other_v)]
     said, impulse = struck(whole, parts, prefix, f"{prefix} of {other.mass:.6g} kg caught")
-    held: dict[str, Any] = {"payload": other, "payload_q": other_q, "payload_v": other_v, "prefix": prefix}
-    return Capture(impulse=impulse[robot.nv : robot.nv + 6], **said, **held)
+    held = {"payload": other, "payload_q": other_q, "payload_v": other_v}
+    return Capture(impulse=impulse[robot.nv : robot.nv + 6], prefix=prefix, **said, **held)
 
 
 def _beside(other: Robot, at: pin.SE3, q: Any, v: Any) -> tuple[Array, Array]:

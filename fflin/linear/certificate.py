@@ -14,6 +14,7 @@ from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import Chart
 from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import Certificate, LinearModel
 from fflin.robot.robot import Robot
@@ -58,9 +59,10 @@ def aba_route(
     chart, g, nv = state.chart(q), state.groups, 6 + state.robot.n
     nu, u = state.velocities(v), aba.actuation.in_base_axes(chart, u)
     # Pinocchio differentiates in world axes at the world's origin, where a distant base costs
-    # digits; nothing depends on where the base is.
+    # digits; nothing depends on where the base is but in an orbit, which sees to that itself.
     at_origin = q.copy()
-    at_origin[:3] = 0.0
+    if state.robot.orbit is None:
+        at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
     acceleration = state.velocities(aba.acceleration(at_origin, v, u))
 
@@ -136,9 +138,12 @@ def compare(
     groups, inputs = state.groups._asdict(), actuation.groups
     errors, errors_B = _blocks(difference_A, groups, groups), _blocks(difference_B, groups, inputs)
     if errors.any():
-        terms = _cancelling_terms(state, lin, lin.v, mobility, input_mobility)
+        # In an orbit it is the absolute velocity whose terms cancel.
+        field = field_of(state.robot, state.frame)
+        v = field.absolute(lin.q, lin.v) if field else lin.v
+        terms = _cancelling_terms(state, lin, v, mobility, input_mobility)
         if steps is not None:
-            v = np.abs(lin.v) + state.spread(steps[-nv:])
+            v = np.abs(v) + state.spread(steps[-nv:])
             there = _cancelling_terms(state, lin, v, mobility, input_mobility)
             terms = np.maximum(terms, rounding * there)
         sizes = np.maximum(_blocks(scaled_A, groups, groups), terms)

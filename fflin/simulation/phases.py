@@ -75,19 +75,17 @@ def _seen(robot: Robot, other: Robot, last: Array, q: Array, v: Array) -> tuple[
 
 def _longer(whole: Any, motion: Any, name: str) -> Any:
     """Return the motion with another's rows at its end, in its own chart, joints and inputs."""
-    if motion.frame != whole.frame:
-        raise InputError(
-            f"'{name}' is in the frame '{motion.frame}', the first phase in '{whole.frame}'; "
-            "simulate both in one"
-        )
+    if (motion.frame, motion.circles) != (whole.frame, whole.circles):
+        where, before = (f"'{m.frame}'{' in orbit' * bool(m.circles)}" for m in (motion, whole))
+        raise InputError(f"'{name}' is in the frame {where}, the first phase in {before}; take one")
     frame: Any = whole.frame
     state, there = (StateMap(m._robot, reference=m.reference, frame=frame) for m in (whole, motion))
     last, near, t = whole.q[-1], whole.x[-1], motion.t - motion.t[0] + whole.t[-1]
     q, v = _seen(state.robot, there.robot, last, motion.q, motion.v)
     target = np.zeros(0)
     if whole.target.size and motion.target.size:
-        goals = there.points(np.atleast_2d(motion.target))[1:]
-        goals = state_history(state, *_seen(state.robot, there.robot, last, *goals), near)
+        points = there.points(np.atleast_2d(motion.target))[1:]
+        goals = state_history(state, *_seen(state.robot, there.robot, last, *points), near)
         rows = (whole.target, len(whole.t)), (goals, len(t))
         target = np.vstack([np.broadcast_to(x, (n, state.nx)) for x, n in rows])
     alike = ("energy", "momentum", "momentum_drift", "com_drift")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -30,18 +31,19 @@ def payloads(motion: Motion, shown: Array) -> Iterator[tuple[Capture, Array]]:
     for k, caught in enumerate(parts):
         if not isinstance(caught, Capture):
             continue
-        poses = _flight(caught, motion.t[shown[shown < first[k]]] - motion.t[first[k]])
+        before = motion.t[shown[shown < first[k]]] - motion.t[first[k]]
+        poses = _flight(caught, motion.frame, before)
         for part, start, end in zip(parts[k:], first[k:], first[k + 1 :], strict=False):
             rows = shown[(shown >= start) & (shown < end)] - start
             poses += _held(caught, part._robot, part.q[rows]) if len(rows) else []
         yield caught, np.array(poses)
 
 
-def _flight(caught: Capture, t: Array) -> list[Array]:
+def _flight(caught: Capture, frame: Any, t: Array) -> list[Array]:
     """Return the poses of a payload at times before it is caught [s], as it flies undamped."""
     payload = caught.payload.replace(damping=0.0)
-    data, state, q, v = payload.create_data(), StateMap(payload), caught.payload_q, caught.payload_v
-    plant, now, poses = Plant(state), 0.0, list[Array]()
+    data, state = payload.create_data(), StateMap(payload, frame=frame)
+    q, v, plant, now, poses = caught.payload_q, caught.payload_v, Plant(state), 0.0, list[Array]()
     none = np.zeros(len(plant.actuation.names))
     softness = np.linalg.inv(state.project(inertia_at(payload, q))).diagonal()[6:]
     rate = np.sqrt(softness @ payload.springs.stiffness)  # no swing is faster
