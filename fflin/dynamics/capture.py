@@ -137,8 +137,8 @@ def capture(
     other_q, other_v = _beside(other, data.oMi[joint] * on * at, payload_q, payload_v)
     parts = [(robot, q, v), (other, other_q, other_v)]
     said, impulse = struck(whole, parts, prefix, f"{prefix} of {other.mass:.6g} kg caught")
-    held = {"payload": other, "payload_q": other_q, "payload_v": other_v}
-    return Capture(impulse=impulse[robot.nv : robot.nv + 6], prefix=prefix, **said, **held)
+    said |= {"payload": other, "payload_q": other_q, "payload_v": other_v, "prefix": prefix}
+    return Capture(impulse=impulse[robot.nv : robot.nv + 6], **said)
 
 
 def _beside(other: Robot, at: pin.SE3, q: Any, v: Any) -> tuple[Array, Array]:

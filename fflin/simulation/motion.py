@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -16,10 +14,11 @@ from fflin.base import record
 from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, instance
-from fflin.base.writing import as_path, check_ending, write_whole
+from fflin.base.writing import as_path, check_ending
 from fflin.dynamics.state_rows import attitude_errors, moving_errors
+from fflin.linear.trajectory_files import write_table
 from fflin.robot.orbit import CircularOrbit
-from fflin.simulation.report import Limited, Passed, Saturated, passed, saturated
+from fflin.simulation.report import Passed, Saturated, limited, motion_report, passed, saturated
 
 FORMATS = (*record.FORMATS, ".csv")
 
@@ -82,8 +81,7 @@ class Motion(Design):
     engine : str
         What ran the loop, "compiled" or "python"; empty where a file does not tell.
     limits : ndarray (k, 2)
-        Their least and largest values, infinite where there is none, whether or not the run was
-        kept within.
+        Their least and largest values, infinite where there is none, kept within or not.
     phases, starts : tuple of str, ndarray (k,)
         Of a motion that was carried on (`then`), how each phase began and when [s].
     """
@@ -148,8 +146,6 @@ class Motion(Design):
         )
 
     def __str__(self) -> str:
-        from fflin.simulation.report import motion_report
-
         report = motion_report(self)
         return report if self.verified else f"{report}\n{record.NOT_VERIFIED}"
 
@@ -230,21 +226,13 @@ class Motion(Design):
     @property
     def passed(self) -> tuple[Passed, ...]:
         """What went beyond its limit, the farthest first, with value, time and limit."""
-        return passed(self.t, self._limited())
+        return passed(self.t, limited(self))
 
     @property
     def saturated(self) -> tuple[Saturated, ...]:
         """Inputs at their limit and wheels at their speed, the longest share of the run first."""
         names = {*self.input_names, *(f"qdot_m.{name}" for name in self.wheels)}
-        return saturated(self.t, (each for each in self._limited() if each[0] in names))
-
-    def _limited(self) -> Iterator[Limited]:
-        names, units = self.state_names + self.input_names, self.state_units + self.input_units
-        found = dict(
-            zip(names, zip(np.hstack((self.x, self.u)).T, units, strict=True), strict=True)
-        )
-        for name, limits in zip(self.limit_names, self.limits, strict=True):
-            yield name, *found[name], limits
+        return saturated(self.t, (each for each in limited(self) if each[0] in names))
 
     def save(self, path: str | Path) -> None:
         """Write it to a .npz, .mat, .json or .csv file, whole or not at all.
@@ -262,11 +250,8 @@ class Motion(Design):
             super().save(target)
             return
         record.require_finite({"t": self.t, "x": self.x, "u": self.u})
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(["t", *self.state_names, *(f"u.{name}" for name in self.input_names)])
-        writer.writerows(np.column_stack((self.t, self.x, self.u)).tolist())
-        write_whole({target: text.getvalue().encode()})
+        names = ["t", *self.state_names, *(f"u.{name}" for name in self.input_names)]
+        write_table(target, names, np.column_stack((self.t, self.x, self.u)))
 
     def plot(self, path: str | Path | None = None, **options: Any) -> Any:
         """Draw the motion, see `plot_motion`; into a file where a path is given."""

@@ -1,6 +1,6 @@
 """What is said of a motion: whether it arrived, what it took, what it passed, what proves it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -92,6 +92,17 @@ def saturated(t: Array, histories: Iterable[Limited]) -> tuple[Saturated, ...]:
         ].any()
     ]
     return tuple(sorted(found, key=lambda each: -each.share))
+
+
+def limited(motion: Any) -> Iterator[Limited]:
+    """Yield what of a motion has limits."""
+    names = motion.state_names + motion.input_names
+    units = motion.state_units + motion.input_units
+    found = dict(
+        zip(names, zip(np.hstack((motion.x, motion.u)).T, units, strict=True), strict=True)
+    )
+    for name, limits in zip(motion.limit_names, motion.limits, strict=True):
+        yield name, *found[name], limits
 
 
 def _name(name: str) -> str:

@@ -118,7 +118,8 @@ def motion_page(
         "phases": [*zip(motion.phases, motion.starts.tolist(), strict=True)],
         "held": [caught.prefix for caught, _ in held],
     }
-    notes = dict.fromkeys(note for each, _ in moving for note in each.notes)
+    told = (each.notes for each, _ in moving if each is drawing or each.robot.urdf)
+    notes = dict.fromkeys(note for notes in told for note in notes)
     return build_page(info, window.commands()), tuple(notes)
 
 

@@ -42,8 +42,7 @@ def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
     notes: list[str] = []
     found = list(_visuals(robot, notes)) if robot.urdf else []
     if not found:
-        if robot.n or robot.urdf:  # a body alone has none
-            notes.append(f"{robot.name}: no visual geometry; drawn as boxes of the links' inertias")
+        notes.append(f"{robot.name}: no visual geometry; drawn as boxes of the links' inertias")
         return tuple(_inertia_boxes(robot)), tuple(notes)
     for prefix, other in robot.attached:
         theirs, said = shapes(other)
