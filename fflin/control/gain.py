@@ -199,6 +199,8 @@ def _unregulated(gain: Gain) -> str:
             for names in (gain.regulated, (*gain.regulated, *speeds))
         )
         tied = "tied to the body's rate by the conserved momentum"
+        if gain.frame in ("lvlh", "hill"):
+            tied = "tied to the body's rate but for the field of the orbit"
         why = tied if held == both else "wheel_speeds=True regulates those that can be"
         parts.append(f"wheel speeds ({why})")
     return ", ".join(parts)

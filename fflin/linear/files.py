@@ -8,14 +8,13 @@ import io
 import json
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
 from fflin.base import record
 from fflin.base.record import Record, figure, figures, text, texts
 from fflin.base.writing import check_ending, read_file, write_whole
-from fflin.dynamics.names import Frame
 
 # Of what the rows and columns of each matrix are, and the entries of each vector.
 _MATRICES = {
@@ -86,7 +85,7 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, float]]:
 def _fields(entries: Record) -> dict[str, Any]:
     fields: dict[str, Any] = {key: texts(entries[key]) for key in _LISTS}
     fields |= {key: text(entries[key]) for key in _TEXTS}
-    if fields["frame"] not in get_args(Frame):
+    if fields["frame"] not in ("hybrid", "local", "world", "lvlh", "hill"):
         raise ValueError(f"unknown frame '{fields['frame']}'")
     sizes = {signal: len(fields[f"{signal}_names"]) for signal in _SIGNALS}
     sizes["velocity"] = sizes["state"] // 2

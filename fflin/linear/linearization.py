@@ -47,16 +47,19 @@ class Linearizer:
     Elsewhere :math:`\dot\nu = M^{-1}(\tau - b(q, \nu))` is differentiated in base axes as
     :math:`-M^{-1}\,\partial\,\mathrm{rnea}(q, \nu, \dot\nu)` and carried to the chart and frame.
     The dynamics do not depend on the base's position and linear velocity (Galilei), so they are
-    evaluated without them: an orbit costs no digits. docs/derivation.md has the equations.
+    evaluated without them: a base far away costs no digits. docs/derivation.md has the equations,
+    in section 14 those of a robot in orbit, whose rates are relative to the orbit's frame.
 
     Parameters
     ----------
     robot : Robot
-    frame : {"hybrid", "local", "world"}, optional
-        Axes of the base's velocities and wrenches, see `StateMap`; "hybrid" by default.
+    frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
+        Axes of the base's velocities and wrenches, see `StateMap`; "hybrid" by default, and of a
+        robot in orbit "lvlh", with "hill" the frames that its world may be.
     reference : pin.SE3, optional
         Placement that attitude and position are relative to; by default the base's own at each
-        point, so that the model is taken about the pose where the robot stands.
+        point, so that the model is taken about the pose where the robot stands. In orbit it is
+        the orbit's frame.
     moving : bool
         The error dynamics about a reference that moves through the point with the robot's own
         dynamics: the error is q_b = vec(q*^-1 q), r_b = R*^T (p - p*), the frame is "local", and
@@ -280,10 +283,12 @@ def linearize(
         Velocity in Pinocchio's order; at rest by default.
     u : array_like (nu,), optional
         Over the robot's inputs, those on the base in the frame's axes; zero by default.
-    frame : {"hybrid", "local", "world"}, optional
-        Axes of the base's velocities and wrenches, see `StateMap`; "hybrid" by default.
+    frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
+        Axes of the base's velocities and wrenches, see `StateMap`; "hybrid" by default, of a robot
+        in orbit "lvlh".
     reference : pin.SE3, optional
-        Placement that attitude and position are relative to; the base's own by default.
+        Placement that attitude and position are relative to; the base's own by default, in orbit
+        the orbit's frame.
     moving : bool
         The error dynamics about a reference that moves through the point, see `Linearizer`.
 

@@ -15,7 +15,7 @@ from fflin.base.frozen import frozen
 from fflin.base.validation import Array, truth
 from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.names import frame_of, unknown_frame
+from fflin.dynamics.names import unknown_frame
 from fflin.dynamics.orbital import mean_motion
 from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.compiled import numba_is_there
@@ -91,7 +91,7 @@ def prepare(
             "whose frame is what it moves with; leave it out, or take robot.replace(orbit=None)"
         )
     if frame is None:
-        frame = frame_of(robot, None) if not moving else "local"
+        frame = "local" if moving else None
     elif not isinstance(frame, str):  # nor one whose comparison below is an array
         raise unknown_frame(frame)
     if moving and (reference is not None or frame != "local"):

@@ -33,7 +33,7 @@ _LARGEST_FACTOR = 200_000
 
 
 def engine_of(engine: Any, plan: Plan, plant: Plant, runs: int = 0) -> str:
-    """Return which loop does a plan, or so many runs eight at a time: as asked, or the quicker."""
+    """Return which loop does a plan, or so many runs by eight: as asked for, or the quicker."""
     if engine is not None and not (isinstance(engine, str) and engine in ENGINES):
         raise unknown("engine", str(engine), list(ENGINES))
     if engine == "python":

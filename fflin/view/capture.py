@@ -55,7 +55,7 @@ def find_chromium() -> str:
 
 
 def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes:
-    """Return a PNG of a motion's page: with its panel at one time, a strip of it at several."""
+    """Return a PNG of a motion's page: with its panel at one time [s], a strip of it at several."""
     frames = _film(page, times, size, 1 if len(times) > 1 else -1)
     if len(frames) == 1:
         return frames[0]
@@ -70,7 +70,7 @@ def take_png(page: Path, times: Sequence[float], size: tuple[int, int]) -> bytes
 
 
 def take_gif(page: Path, span: tuple[float, float], speed: float, size: tuple[int, int]) -> bytes:
-    """Return a GIF of a motion's page over a span [s], so many seconds of it per second."""
+    """Return a GIF of a motion's page over a span [s], shown faster where it is long."""
     from PIL import Image
 
     start, duration = span[0], span[1] - span[0]

@@ -25,15 +25,15 @@ _LARGEST = 20_000
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles of one colour: corners (V, 3), faces (F, 3), colour where the file has one."""
+    """Triangles of one colour."""
 
-    vertices: Array
-    faces: Indices
-    color: Color | None
+    vertices: Array  # (V, 3) of float32
+    faces: Indices  # (F, 3) of uint32
+    color: Color | None  # where the file says one
 
 
 def load_mesh(path: Path) -> tuple[Mesh, ...]:
-    """Read a mesh file, in its own unit of length; ValueError where nothing of it can be seen."""
+    """Read a mesh file, in its own unit of length, or raise ValueError where nothing is seen."""
     try:
         found = os.stat(path)
     except OSError as error:
@@ -66,7 +66,10 @@ def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
 
 
 def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
-    """Return vertices, faces and colour of each part of a COLLADA file [m], none of an odd one."""
+    """Return vertices, faces and plain colour of each part of a COLLADA file, in metres.
+
+    Pinocchio's loader makes one part of them all. None where the file is not understood.
+    """
     import trimesh
 
     try:

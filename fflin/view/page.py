@@ -18,7 +18,7 @@ _SCRIPTS = ("sky", "orbit", "look", "stage", "marks", "plots", "player", "live",
 
 
 def build_page(info: dict[str, Any], commands: Iterable[bytes] = (), connect: str = "") -> str:
-    """Build the page of what scripts and `Recorder.commands` show; it connects nowhere else."""
+    """Build the page of what scripts show and `Recorder.commands`; it may `connect` there alone."""
     info = {**info, "commands": [_base64(command) for command in commands]}
     # In a script element nothing but its own end tag and a comment's start is special.
     data = json.dumps(info, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")

@@ -66,7 +66,7 @@ class _Line(NamedTuple):
 
 
 def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]]:
-    """Return {what: (unit, distances (N,))} from a target (1, nq) or targets, without wheels."""
+    """Return {what: (unit, values (N,))}, how far q (N, nq) is from targets, wheels left out."""
     state = StateMap(robot)
     goals = map(pin.XYZQUATToSE3, np.broadcast_to(target, q.shape)[:, :7])
     relative = [
@@ -91,7 +91,11 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]
 
 
 def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, Any]:
-    """Return readouts and plots of rows (N,); without a target changes from the start."""
+    """Return the readouts and plots of a motion's page, of the rows (N,) that it shows.
+
+    Errors are counted from a target for all rows or one each, (k, nq); where there is none there
+    are no errors, and the change from the start is shown.
+    """
     found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
     of = "{} error" if len(target) else "{} change"
     readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]

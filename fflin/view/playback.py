@@ -20,15 +20,15 @@ _MOST_FRAMES = 3000
 
 @dataclass(frozen=True)
 class Playback:
-    """What is shown of a motion at N frames, each at one of its own times."""
+    """What is shown of a motion at N frames."""
 
-    t: Array  # [s]
-    poses: Array  # (N, njoints - 1, 7), of every joint's frame: x, y, z, quaternion x, y, z, w
+    t: Array  # (N,) [s]; each is one of the motion's own, so that no pose is interpolated
+    poses: Array  # (N, njoints - 1, 7), x, y, z and quaternion of every joint's frame in the world
     com: Array  # (N, 3) [m]
-    tool: Array
-    force: Array  # (N, 3), on the base in world axes [N]
-    torque: Array  # [N m]
-    thrust: Array  # (N, k) [N]
+    tool: Array  # (N, 3) origin of the tool [m]
+    force: Array  # (N, 3) on the base in world axes [N]
+    torque: Array  # (N, 3) [N m]
+    thrust: Array  # (N, k) of each thruster [N]
 
 
 def frame_indices(t: Array, fps: float, speed: float) -> Array:

@@ -9,7 +9,7 @@ Lowered = dict[str, Any]
 
 
 class Recorder:
-    """Window of a meshcat.Visualizer that remembers the scene, and may forward it to a browser."""
+    """Window of a meshcat.Visualizer that remembers the scene, and forwards each command."""
 
     def __init__(self, forward: Callable[[bytes], None] | None = None) -> None:
         self.web_url = ""

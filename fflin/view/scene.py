@@ -34,7 +34,10 @@ _ELSEWHERE = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
 
 
 class _Piece(MeshcatMesh):
-    """A three.js mesh; the page gives it its material, and an earlier geometry that it names."""
+    """A three.js mesh as it is sent.
+
+    The page gives it its material, and the geometry of an earlier piece where it names one.
+    """
 
     def __init__(self, geometry: dict[str, Any], matrix: Array, about: dict[str, Any]) -> None:
         self._geometry, self._matrix, self._about = geometry, matrix, about
@@ -61,7 +64,7 @@ def body_paths(robot: Robot) -> list[str]:
 
 
 class Drawing:
-    """A robot below a node, its bodies named as their joints; `sent` are meshes that are there."""
+    """A robot drawn below a node of a meshcat scene, whose children are named as its joints."""
 
     def __init__(
         self, robot: Robot, visualizer: Visualizer, look: str = "real", sent: set[str] | None = None
@@ -84,7 +87,7 @@ class Drawing:
                 placed = shape.placement.homogeneous @ matrix
                 node[f"{index}_{part}"].set_object(_Piece(shown, placed, about))
                 corners.setdefault(shape.joint, []).append(_box_corners(placed, box))
-        self.bodies = list(corners)
+        self.bodies = list(corners)  # Pinocchio joints
         self.corners = [
             _box_corners(np.eye(4), _bounds(np.concatenate(boxes))) for boxes in corners.values()
         ]

@@ -21,7 +21,7 @@ _HOST = "127.0.0.1"
 
 
 class Server:
-    """Serves a page, and what `scene` draws, to this machine; it ends with its process."""
+    """Serves a page and keeps it up to date; it ends with its process."""
 
     def __init__(
         self,

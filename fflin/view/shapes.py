@@ -30,15 +30,15 @@ class Shape:
 
     joint: int  # of Pinocchio, that moves it
     kind: str  # "box", "sphere", "cylinder", "capsule" or "mesh"
-    size: tuple[float, ...]  # sides; radius; radius and length [m]; or the scale of the mesh
+    size: tuple[float, ...]  # side lengths; radius; radius and length [m]; or a mesh's scale
     placement: pin.SE3  # in the joint's frame; the axis of a cylinder is z
-    color: Color | None = PLAIN  # None where a mesh brings its own
+    color: Color | None = PLAIN  # red, green, blue, opacity; None where a mesh brings its own
     finish: str = ""  # name of its material, which may tell gold from paint
     mesh: Path | None = None
 
 
 def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
-    """Return a robot's looks, boxes where it has no visuals, and what could not be drawn."""
+    """Return a robot's pieces, of its URDF or boxes of inertias, and what could not be drawn."""
     notes: list[str] = []
     found = list(_visuals(robot, notes)) if robot.urdf else []
     if not found:
