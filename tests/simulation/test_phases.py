@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fflin
-from tests.support.phases import DEBRIS, phases
+from tests.support.phases import DEBRIS, TWIST, phases
 
 
 @pytest.fixture(scope="module")
@@ -124,3 +124,30 @@ def test_what_does_not_go_on_is_one_line(flown):
         with pytest.raises(fflin.InputError, match=said) as error:
             call()
         assert "\n" not in str(error.value)
+
+
+def test_in_orbit_phases_keep_momentum_and_their_frame():
+    orbit = fflin.CircularOrbit(altitude=700e3)
+    robot = fflin.load("servicer_7dof", lock=["panel_*"], orbit=orbit)
+    q = fflin.configuration(robot, {"joint_2": 0.6, "joint_4": -1.2})
+    v = fflin.velocity(robot, {"joint_3": 0.02, "omega_b.y": 0.01})
+    first = fflin.simulate(robot, None, q0=q, v0=v, duration=1.0)
+    end = {"q": first.q[-1], "v": first.v[-1]}
+    caught = fflin.capture(robot, "tool", DEBRIS, **end, payload_v=TWIST)
+    assert caught.robot.orbit == caught.payload.orbit == orbit
+    jammed = fflin.jam(caught.robot, "joint_3", q=caught.q, v=caught.v)
+    for impact in (caught, jammed):
+        assert impact.robot.orbit == orbit and impact.energy_lost > 0.0
+        size = np.abs(impact.momentum).max()
+        assert np.abs(impact.momentum - impact.momentum_after).max() < 1e-13 * size
+    start = {"q0": caught.q, "v0": caught.v, "duration": 1.0}
+    held = fflin.simulate(caught.robot, None, **start)
+    whole = first.then(caught, held)
+    assert whole.orbit == orbit and whole.frame == "lvlh" and not len(whole.com_drift)
+    with pytest.raises(fflin.InputError, match="'hill' in orbit, the first phase in 'lvlh' in"):
+        first.then(caught, fflin.simulate(caught.robot, None, **start, frame="hill"))
+    still = fflin.simulate(caught.robot.replace(orbit=None), None, **start)
+    with pytest.raises(fflin.InputError, match="in the frame 'hybrid', the first"):
+        first.then(caught, still)
+    with pytest.raises(fflin.InputError, match=r"robot's orbit is .* the payload's None"):
+        fflin.capture(robot, "tool", fflin.load("ets_vii"))

@@ -1,11 +1,14 @@
 """The page of a motion of several phases: what is caught flies to the grasp, and is held."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pinocchio as pin
 import pytest
 
 import fflin
 from fflin.robot.frames import ROOT
+from fflin.view.phases import _flight
 from tests.support.browser import Watched, chromium
 from tests.support.phases import DEBRIS, TWIST, phases
 
@@ -111,3 +114,18 @@ def test_a_payload_with_joints_comes_with_them(browser, tmp_path):
         assert apart(first[name], was[name]) < EXACT
     assert not watched.errors
     watched.page.close()
+
+
+@pytest.mark.parametrize("frame", ["lvlh", "hill"])
+def test_in_orbit_a_payload_came_as_it_flies_there(frame):
+    orbit = fflin.CircularOrbit(mean_motion=0.05, mu=1e9, body="rock", body_radius=1e3)
+    payload = fflin.load("cubesat", orbit=orbit)
+    q = fflin.configuration(payload, base=pin.SE3(np.eye(3), np.array([3.0, -2.0, 1.0])))
+    v = 0.1 * np.array([1.0, -2.0, 1.0, 0.5, 0.3, -0.4])
+    flown = fflin.simulate(payload, None, q0=q, v0=v, duration=20.0, dt=0.05, frame=frame)
+    end = SimpleNamespace(payload=payload, payload_q=flown.q[-1], payload_v=flown.v[-1])
+    first, *_, last = _flight(end, frame, np.array([-20.0, -10.0, -0.05]))
+    assert first[0] == pytest.approx(q, abs=1e-6)
+    assert last[0] == pytest.approx(flown.q[-2], abs=1e-9)
+    other = {"lvlh": "hill", "hill": "lvlh"}[frame]
+    assert np.abs(_flight(end, other, np.array([-20.0]))[0][0] - q).max() > 0.1
