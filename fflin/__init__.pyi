@@ -13,7 +13,7 @@ from fflin.dynamics.points import velocity as velocity
 from fflin.dynamics.points import effort as effort
 from fflin.dynamics.capture import capture as capture
 from fflin.dynamics.capture import Capture as Capture
-from fflin.dynamics.jam import jam as jam
+from fflin.dynamics.impact import jam as jam
 from fflin.dynamics.impact import Impact as Impact
 
 # Inputs

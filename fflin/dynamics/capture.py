@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array, dimension, vector
+from fflin.base.validation import Array, dimension, instance, vector
 from fflin.base.validation import placement as checked_placement
 from fflin.dynamics.impact import Impact, struck
 from fflin.robot.frames import ROOT, find_frame
@@ -105,19 +105,13 @@ def capture(
     Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989, for free joints; the
     impact is that of two bodies that stay together.
     """
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
-    robot.require_unchanged()
+    instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
     if isinstance(payload, pin.Inertia):
         alone = body_alone(inertia_of(payload), prefix)
         other = replace(alone, gravity=robot.gravity, orbit=robot.orbit)
-    elif isinstance(payload, Robot):
-        payload.require_unchanged()
-        other = replace(payload)  # which may be the robot's twin, the same object
     else:
-        raise InputError(
-            f"payload is a {type(payload).__name__}, expected a pin.Inertia or a fflin.Robot"
-        )
+        instance("payload", payload, Robot, "a pin.Inertia or a fflin.Robot").require_unchanged()
+        other = replace(payload)  # which may be the robot's twin, the same object
     for field in ("gravity", "orbit") if isinstance(payload, Robot) else ():
         own, theirs = (getattr(each, field) for each in (robot, other))
         if own != theirs:

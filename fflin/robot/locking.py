@@ -12,7 +12,6 @@ import pinocchio as pin
 from fflin.base.errors import InputError, unknown
 from fflin.base.names import joints_by_name
 from fflin.base.validation import Array, number
-from fflin.robot.fields import kept_start
 from fflin.robot.frames import ROOT
 from fflin.robot.inputs import ReactionWheel, named_inputs
 from fflin.robot.model_checks import joint_of
@@ -45,7 +44,7 @@ def welded(robot: Robot, values: Mapping[str, float]) -> Robot:
         else each
         for each in robot.outputs
     ]
-    per_joint = ("stiffness", "damping", "rest", "urdf_damping", "limits", "weights")
+    per_joint = ("urdf_damping", "limits", "weights")
     fields: dict[str, Any] = {name: _without(getattr(robot, name), gone) for name in per_joint}
     whole = replace(
         robot,
@@ -58,7 +57,6 @@ def welded(robot: Robot, values: Mapping[str, float]) -> Robot:
         ),
         passive=tuple(name for name in robot.passive if name not in gone),
         outputs=tuple(x for x in outputs if getattr(x, "joints", None) != ()),
-        start=kept_start(robot.start, [x for x in robot.joint_names if x not in gone]),
         **fields,
     )
     return with_inputs(whole, inputs)

@@ -25,8 +25,10 @@ def carried_on(first: Any, later: tuple[Any, ...]) -> Any:
     if not later or isinstance(later[-1], Impact):
         raise InputError("the last phase is a motion: simulate the robot after the impact")
     parts = (*(first._phases or (first,)), *later)
+    if not all(getattr(part, "_robot", part) for part in parts):
+        raise InputError("a motion from a file is without its robot; go on from that of simulate")
     whole = replace(parts[0], phases=(parts[0].robot,), starts=parts[0].t[:1], _phases=parts)
-    robot, q, v, event = _robot(whole), whole.q[-1], whole.v[-1], ""
+    robot, q, v, event = whole._robot, whole.q[-1], whole.v[-1], ""
     for part in parts[1:]:
         if isinstance(part, Impact):
             _require_met(part.event, robot, q, v, *part._before)
@@ -34,18 +36,11 @@ def carried_on(first: Any, later: tuple[Any, ...]) -> Any:
             whole = replace(whole, notes=(*whole.notes, f"{whole.t[-1]:g} s: {part.told}"))
         else:
             instance("a phase", part, type(first), "a Motion, or an Impact before one")
-            name, other = event or part.robot, _robot(part)
+            name, other = event or part.robot, part._robot
             _require_met(name, robot, q, v, other, part.q[0], part.v[0])
             robot, q, v, event = other, part.q[-1], part.v[-1], ""
             whole = _longer(whole, part, name)
     return whole
-
-
-def _robot(motion: Any) -> Robot:
-    if motion._robot is None:
-        raise InputError("a motion from a file is without its robot; go on from that of simulate")
-    robot: Robot = motion._robot
-    return robot
 
 
 def _require_met(
