@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fflin.analysis.mechanics import floating_inertia
+from fflin.analysis.mechanics import floating_inertia, warn_of_stiffness
 from fflin.analysis.ranks import EPS
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
@@ -35,6 +35,7 @@ class NaturalModes(NamedTuple):
 
 def natural_modes(lin: LinearModel) -> NaturalModes:
     """Find the natural modes of a continuous model of positions and their rates."""
+    warn_of_stiffness(lin)
     inertia = np.sqrt(lin.M.diagonal())
     A = _significant(lin)
     weight, fastest = _scales(A, inertia)

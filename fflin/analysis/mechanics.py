@@ -43,15 +43,11 @@ def checked(lin: LinearModel) -> LinearModel:
 def warn_of_stiffness(lin: LinearModel) -> None:
     """Warn where a vibration is so fast that an orbit's field is in the rounding beside it."""
     nv, size = len(lin.M), np.sqrt(lin.M.diagonal())
-    if not lin.mean_motion:
-        return
-    fall = np.abs(slopes(lin)[nv:, :nv]) * size[:, None] / size
-    fastest = float(fall.max()) ** 0.5
-    if lin.mean_motion < _SLOWEST * fastest:
+    fastest = float((np.abs(slopes(lin)[nv:, :nv]) * size[:, None] / size).max()) ** 0.5
+    if 0.0 < lin.mean_motion < _SLOWEST * fastest:
         warnings.warn(
-            f"the orbit of '{lin.robot}' turns at {lin.mean_motion:.3g} rad/s, and joints vibrate "
-            f"at about {fastest:.3g} rad/s: beside them what its field does is rounding and may "
-            "be missed; lock these joints, or make the springs softer",
+            f"what the orbit of '{lin.robot}' does at {lin.mean_motion:.3g} rad/s is rounding as "
+            f"joints vibrate at {fastest:.3g} rad/s, and may be missed; lock these joints",
             FflinWarning,
             stacklevel=4,
         )

@@ -1,8 +1,12 @@
 """A circular orbit's frame: rates relative to it, and the field that is felt in it (14.1)."""
 
+import math
+import warnings
+
 import numpy as np
 import pinocchio as pin
 
+from fflin.base.errors import FflinWarning, InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.names import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
@@ -19,6 +23,10 @@ _AXES = {
 def mean_motion(robot: Robot) -> float:
     """Return that of a robot's orbit [rad/s], 0 where it has none."""
     return robot.orbit.mean_motion if robot.orbit else 0.0
+
+
+# Errors of the linear field that are worth a warning, and beyond which it is of no use.
+_COARSE, _USELESS = 0.01, 0.5
 
 
 class OrbitField:
@@ -45,9 +53,8 @@ class OrbitField:
         self._levers = np.array([skew(body.lever) for body in bodies])
         self._inertia = np.array([body.inertia for body in bodies])
         self._none = pin.Force.Zero()
-        places = [*robot.model.jointPlacements.tolist()[ROOT + 1 :]]
-        lengths = [np.linalg.norm(place.translation) for place in places]
-        self._reach = float(np.sum(lengths) + np.linalg.norm(self._lever, axis=1).max())
+        steps = [place.translation for place in robot.model.jointPlacements.tolist()[ROOT + 1 :]]
+        self._reach = sum(float(np.linalg.norm(x)) for x in (*steps, *self._lever))
 
     def base(self, q: Array) -> tuple[Array, Array]:
         """Return attitude (3, 3) and place (3,) of the base."""
@@ -56,9 +63,16 @@ class OrbitField:
 
     def require_near(self, q: Array) -> None:
         """Warn or refuse where the robot, its joints anyhow, is far from the orbit's point."""
-        if orbit := self.robot.orbit:
-            distance = float(np.linalg.norm(self.base(q)[1])) + self._reach
-            orbit.require_near(self.robot.name, distance)
+        distance = float(np.linalg.norm(self.base(q)[1])) + self._reach
+        error = 1.5 * distance / (self.robot.orbit.radius if self.robot.orbit else math.inf)
+        said = (
+            f"'{self.robot.name}' reaches {distance / 1e3:.4g} km from its orbit's point, where "
+            f"the field, taken linear in the distance, is off by up to {100.0 * error:.2g} %"
+        )
+        if error > _USELESS:
+            raise InputError(f"{said}; give it an orbit nearer to it")
+        if error > _COARSE:
+            warnings.warn(said, FflinWarning, stacklevel=7)
 
     def absolute(self, q: Array, v: Array) -> Array:
         """Return the velocity (nv,) in axes that stand still of one relative to the orbit's."""
@@ -89,22 +103,21 @@ class OrbitField:
     def slopes(self, data: pin.Data) -> Array:
         """Return the slopes (nv, nv) over q of the forces of `wrenches`, the base not shifted."""
         # Of a joint that turns by t, in its axes: those of R^T tide R are T [t]x - [t]x T.
-        model = self.robot.model
-        total = np.zeros((model.nv, model.nv))
-        for joint in range(ROOT, model.njoints):
-            inertia, place = model.inertias[joint], data.oMi[joint]
-            lever, R = inertia.lever, place.rotation
-            T, center = R.T @ self.tide @ R, R.T @ place.act(lever)
-            jacobian = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL)
-            moved = jacobian.copy()
-            moved[:, PIN_LINEAR] = 0.0
-            turned = moved[PIN_ANGULAR]
-            shift = moved[PIN_LINEAR] + (skew(center) - skew(lever)) @ turned
-            force = inertia.mass * (T @ shift + (skew(T @ center) - T @ skew(center)) @ turned)
-            changes = [T @ skew(t) - skew(t) @ T for t in np.eye(3)]
-            turns = [inertia.inertia @ change for change in changes]
-            torque = np.column_stack([pin.unSkew(turn - turn.T) for turn in turns]) @ turned
-            total += jacobian.T @ np.vstack((force, torque + skew(lever) @ force))
+        model, (R, place) = self.robot.model, self._places(data)
+        joints, local = range(ROOT, model.njoints), pin.ReferenceFrame.LOCAL
+        J = np.array([pin.getJointJacobian(model, data, joint, local) for joint in joints])
+        moved = J.copy()
+        moved[:, :, PIN_LINEAR] = 0.0
+        linear, turned = moved[:, PIN_LINEAR], moved[:, PIN_ANGULAR]
+        T, center = R.mT @ self.tide @ R, skew((R.mT @ place)[..., 0])
+        shift = linear + (center - self._levers) @ turned
+        pull = skew((R.mT @ self.tide @ place)[..., 0])
+        force = self._mass[..., None] * (T @ shift + (pull - T @ center) @ turned)
+        units, T = skew(np.eye(3)), T[:, None]
+        turn = self._inertia[:, None] @ (T @ units - units @ T)
+        turn -= turn.mT
+        torque = turn[..., (2, 0, 1), (1, 2, 0)].mT @ turned + self._levers @ force
+        total: Array = (J.mT @ np.concatenate((force, torque), axis=1)).sum(axis=0)
         return total
 
     def near(self, q: Array, v: Array) -> tuple[Array, Array]:

@@ -31,8 +31,7 @@ class Tide(NamedTuple):
         field.require_near(q)
         R, place = field.base(q)
         n = mean_motion(field.robot)
-        axes = R.T @ field.axes
-        turns = zip((share * n * n for share in _SHARES), axes.T, strict=True)
+        turns = zip((share * n * n for share in _SHARES), (R.T @ field.axes).T, strict=True)
         return cls(tuple(turns), R.T @ field.rate, R.T @ (field.pull @ place))
 
     def force(self, model: pin.Model, data: pin.Data, q: Array) -> Array:

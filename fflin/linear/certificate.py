@@ -59,10 +59,9 @@ def aba_route(
     chart, g, nv = state.chart(q), state.groups, 6 + state.robot.n
     nu, u = state.velocities(v), aba.actuation.in_base_axes(chart, u)
     # Pinocchio differentiates in world axes at the world's origin, where a distant base costs
-    # digits; nothing depends on where the base is but in an orbit, which sees to that itself.
+    # digits; no slope depends on where the base is, nor in the axes of an orbit.
     at_origin = q.copy()
-    if state.robot.orbit is None:
-        at_origin[:3] = 0.0
+    at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
     acceleration = state.velocities(aba.acceleration(at_origin, v, u))
 

@@ -137,8 +137,7 @@ def equilibrium(
     mobility = np.sqrt(np.linalg.inv(M).diagonal())
     terms = np.abs(M) @ np.abs(acceleration)
     rounding, wanted = _rounding(robot, lin, M), -M @ acceleration
-    noise = _ROUNDING * terms + (rounding if robot.orbit else 0.0)
-    wanted[np.abs(wanted) <= noise] = 0.0
+    wanted[np.abs(wanted) <= _ROUNDING * terms + rounding * bool(robot.orbit)] = 0.0
     one_sided = np.zeros(len(actuation.names), dtype=bool)
     one_sided[actuation.groups.get("thrust", [])] = True
 

@@ -15,7 +15,7 @@ from fflin.base.frozen import frozen
 from fflin.base.validation import Array, truth
 from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.names import unknown_frame
+from fflin.dynamics.names import refuse_orbit, unknown_frame
 from fflin.dynamics.orbital import mean_motion
 from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.compiled import numba_is_there
@@ -74,9 +74,8 @@ class Prepared:
         if numba_is_there():
             if self.kernel() is not None:
                 return
-            reason = f"a joint of '{self.robot.name}' is of another kind"
-            if self.robot.orbit:
-                reason = f"'{self.robot.name}' is in orbit"
+            kind = "is in orbit" if self.robot.orbit else "is of another kind"
+            reason = f"{'' if self.robot.orbit else 'a joint of '}'{self.robot.name}' {kind}"
         raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
 
 
@@ -85,11 +84,8 @@ def prepare(
 ) -> Prepared:
     """Prepare a robot; arguments and errors are those of `Linearizer`."""
     moving = truth("moving", moving)
-    if moving and getattr(robot, "orbit", None):
-        raise InputError(
-            f"moving=True is the error from a motion of its own, and '{robot.name}' is in orbit, "
-            "whose frame is what it moves with; leave it out, or take robot.replace(orbit=None)"
-        )
+    if moving:
+        refuse_orbit(robot, "models with moving=True")
     if frame is None:
         frame = "local" if moving else None
     elif not isinstance(frame, str):  # nor one whose comparison below is an array

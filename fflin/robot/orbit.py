@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, asdict, dataclass
 from typing import Any
 
-from fflin.base.errors import FflinWarning, InputError, unknown
+from fflin.base.errors import InputError, unknown
 from fflin.base.validation import number
 
 # Gravitational parameter [m^3/s^2] and equatorial radius [m]: JPL DE440, IAU 2015.
@@ -22,9 +21,6 @@ BODIES = {
     "jupiter": (1.266865341e17, 71492000.0),
     "saturn": (3.793120749e16, 60268000.0),
 }
-
-# Errors of the linear field that are worth a warning, and beyond which it is of no use.
-_COARSE, _USELESS = 0.01, 0.5
 
 _FOLLOWS: Any = None  # from the others
 
@@ -141,18 +137,6 @@ class CircularOrbit:
         orbit = cls(**parts)
         object.__setattr__(orbit, "mean_motion", _positive("mean_motion", n))
         return orbit
-
-    def require_near(self, name: str, distance: float) -> None:
-        """Warn where the field, linear in the distance [m] from the point, is coarse, or refuse."""
-        error = 1.5 * distance / self.radius
-        said = (
-            f"'{name}' reaches {distance / 1e3:.4g} km from its orbit's point, where the field, "
-            f"taken linear in the distance, is off by up to {100.0 * error:.2g} %"
-        )
-        if error > _USELESS:
-            raise InputError(f"{said}; give it an orbit nearer to it")
-        if error > _COARSE:
-            warnings.warn(said, FflinWarning, stacklevel=8)
 
     def __str__(self) -> str:
         return (

@@ -116,6 +116,9 @@ def target_of(state: StateMap, target: Any) -> Array | None:
             f"target is a model of '{target.robot}', expected a state of '{state.robot.name}' or a "
             "model of it about a point that stays"
         )
+    if state.robot.orbit and target.frame != state.frame:
+        said = f"target is a model in frame '{target.frame}', expected '{state.frame}'"
+        raise InputError(f"{said}, in which the motion is, as q of the two is not the same")
     goal = state.read(target.q, target.v)
     # Where the model has another reference or frame, its state of the base is another.
     same = target.frame == state.frame and target.reference.isApprox(state.reference, 1e-12)

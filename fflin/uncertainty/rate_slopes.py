@@ -62,9 +62,8 @@ class BodySlopes:
         # Nothing depends on where the base is and how fast it moves along, see `Accelerations`.
         self.q[:3] = self.v[:3] = 0.0
         field = field_of(ready.robot, self.state.frame)
-        self._tide = None
-        if field:
-            self._tide = Tide.at(field, q)
+        self._tide = Tide.at(field, q) if field else None
+        if self._tide:
             self.v[PIN_ANGULAR] += self._tide.spin
         self.data, self.rates = ready.robot.create_data(), rates
         self.joints = range(ROOT, self.model.njoints)

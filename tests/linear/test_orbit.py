@@ -118,6 +118,18 @@ def test_the_orbit_of_the_earth_stands_beside_what_is_large():
         assert not fflin.check(other, lin).ok
 
 
+def test_a_root_that_stands_askew_in_the_world_changes_nothing():
+    rng = np.random.default_rng(8)
+    model = fflin.load("servicer_7dof").model.copy()
+    model.jointPlacements[1] = random_pose(rng, 70.0)
+    robot = in_orbit(fflin.from_model(model))
+    lin = fflin.linearize(robot, *moved(robot, rng))
+    assert fflin.check(robot, lin).ok
+    for one in fflin.relative_equilibria(robot)[::7]:
+        about = model.jointPlacements[1] * pin.XYZQUATToSE3(one.q[:7])
+        assert np.abs(fflin.equilibrium(robot, one.q, reference=about).u[:6]).max() < 1e-12
+
+
 def test_a_base_that_flies_fast_is_seen_from_the_frame_that_turns():
     robot = in_orbit(fflin.load("cubesat"))
     v = fflin.velocity(robot, {"v_b.x": 150.0, "omega_b.y": 0.1})

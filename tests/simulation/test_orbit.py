@@ -129,3 +129,11 @@ def test_refused():
         fflin.simulate(robot, q0=q, v0=v, duration=0.1, engine="compiled")
     with pytest.raises(fflin.InputError, match="take lvlh or hill"):
         fflin.simulate(robot, q0=q, v0=v, duration=0.1, frame="world")
+
+
+def test_a_target_in_the_other_frame_is_no_target():
+    robot = fflin.load("cubesat", orbit=8e5)
+    target = fflin.linearize(robot, frame="hill")
+    with pytest.raises(fflin.InputError, match="frame 'hill', expected 'lvlh'"):
+        fflin.simulate(robot, target=target, duration=0.1)
+    assert fflin.simulate(robot, target=target, duration=0.1, frame="hill").frame == "hill"
