@@ -13,6 +13,8 @@ from fflin.dynamics.points import velocity as velocity
 from fflin.dynamics.points import effort as effort
 from fflin.dynamics.capture import capture as capture
 from fflin.dynamics.capture import Capture as Capture
+from fflin.dynamics.impact import jam as jam
+from fflin.dynamics.impact import Impact as Impact
 
 # Inputs
 from fflin.robot.inputs import BaseTorque as BaseTorque
@@ -70,6 +72,7 @@ from fflin.analysis.momentum import generalized_jacobian as generalized_jacobian
 
 # Control
 from fflin.control.lqr import lqr as lqr
+from fflin.linear.fit import line_up as line_up
 from fflin.control.weights import bryson as bryson
 from fflin.control.gain import Gain as Gain
 from fflin.control.acceleration_lqr import acceleration_lqr as acceleration_lqr

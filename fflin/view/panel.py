@@ -119,7 +119,7 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
             for label, unit, values in readouts
         ],
         "plots": plots,
-        "rest": resting_from(motion) if len(target) > 1 else None,
+        "rest": resting_from(motion) if len(target) > 1 and not motion.phases else None,
         "passed": [[str(each), each.time] for each in motion.passed],
     }
 
