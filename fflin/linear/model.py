@@ -19,6 +19,7 @@ from fflin.linear.sampling import held_exponential
 if TYPE_CHECKING:
     import pinocchio as pin
 
+    from fflin import ToolModel
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
 
@@ -300,6 +301,28 @@ class LinearModel(FrozenArrays):
         )
         certify = partial(same_certificate, self, sampled.fingerprint)
         return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))
+
+    def to(self, tool: str, **options: Any) -> ToolModel:
+        """Return the model in the coordinates of another tool, see `transform`.
+
+        Parameters
+        ----------
+        tool : {"drake", "mujoco", "pinocchio", "spart", "euler"}
+        **options
+            ``joints``, ``rates`` and ``dt`` of `transform`.
+
+        Raises
+        ------
+        InputError
+            If the model is from a file and its robot not known, or as `transform`.
+        """
+        from fflin import transform
+
+        if self._robot is None:
+            raise InputError(
+                "the robot of this model is not known: fflin.transform(robot, lin, tool)"
+            )
+        return transform(self._robot, self, tool, **options)
 
     def to_scipy(self) -> Any:
         """Return a `scipy.signal.StateSpace` of the deviations; names and f0 are lost."""

@@ -1,0 +1,292 @@
+"""Linear models in the coordinates of other tools, and back: (14.1) to (14.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import InputError
+from fflin.base.record import Design
+from fflin.base.validation import Array, as_double, instance, number, vector
+from fflin.dynamics.state import Frame, StateMap
+from fflin.linear.fit import require_fit
+from fflin.linear.linearization import linearize
+from fflin.linear.model import LinearModel
+from fflin.linear.sampling import held_exponential
+from fflin.linear.tool_coordinates import Slopes, own_coordinates, tool_coordinates
+from fflin.robot.robot import Robot
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ToolModel(Design):
+    r"""A linear model in another tool's coordinates, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
+
+    The output is ``y = y0 + C (x - x0) + D (u - u0)``; for ``dt > 0`` the left side is the next
+    sample's ``x - x0``. x is q and v of the tool. Where q is a manifold to it (mujoco, pinocchio,
+    spart) the displacement from the point's q, in the order of v, stands for it.
+
+    Attributes
+    ----------
+    tool : str
+    A, B, C, D, f0, x0, u0, y0, dt
+        As of `LinearModel`.
+    state_names, input_names, output_names : tuple of str
+    state_units, input_units, output_units : tuple of str
+    T : ndarray (nx, 12 + 2n)
+        From deviations of the state of the `LinearModel` to those of x.
+    T_left : ndarray (12 + 2n, nx)
+        Its inverse; a left inverse where x has all four of a quaternion or joints that mimic.
+    T_u : ndarray (nu, nu)
+        Likewise of the input: with a gain K of the `LinearModel` ``T_u K T_left`` is the tool's.
+    q, v : ndarray
+        The point as the tool has it.
+    robot : str
+    reference : str
+        "fixed", or "moving" where x is the deviation from what moves through the point.
+    """
+
+    VECTORS: ClassVar = ("f0", "x0", "u0", "y0", "q", "v")
+
+    tool: str
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    f0: Array
+    x0: Array
+    u0: Array
+    y0: Array
+    dt: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+    T: Array
+    T_left: Array
+    T_u: Array
+    q: Array
+    v: Array
+    robot: str
+    reference: str
+
+    def __repr__(self) -> str:
+        nx, nu = self.B.shape
+        time = f"dt={self.dt:g} s" if self.dt else "continuous"
+        return f"ToolModel('{self.robot}', tool='{self.tool}', nx={nx}, nu={nu}, {time})"
+
+
+def transform(
+    robot: Robot,
+    lin: LinearModel,
+    tool: str,
+    *,
+    joints: Sequence[str] | None = None,
+    dt: float | None = None,
+) -> ToolModel:
+    r"""Return a linear model in the coordinates, order and axes of another tool.
+
+    Deviations are x' = T x and u' = T_u u, and at any point, in motion too,
+
+    .. math:: A' = (T A + \dot T)\,T^+ + \ldots, \qquad B' = T B\,T_u^{-1}
+
+    with what comes of inputs held in other axes and of the length of a quaternion: (14.1) to
+    (14.6) of docs/derivation.md. docs/tools.md has the conventions side by side.
+
+    Parameters
+    ----------
+    robot : Robot
+    lin : LinearModel
+        Of this robot, about any point. One that is sampled is sampled in the tool's coordinates.
+    tool : {"drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"}
+    joints : sequence of str, optional
+        All joints, mimic joints too, in the tool's order; by default that of `Robot.model`, where
+        siblings are sorted by name and other tools mostly take them as they stand in the file.
+    dt : float, optional
+        Of "mujoco": its time step [s], for the pair of ``mjd_transitionFD`` with the integrator
+        Euler (of a robot with dampers: with ``eulerdamp`` disabled).
+
+    Returns
+    -------
+    ToolModel
+
+    Raises
+    ------
+    InputError
+        If the model is not of this robot or is sampled and from a file, or an option does not suit.
+    UnknownNameError
+        If there is no such tool.
+    ChartError
+        If the pitch of Euler's angles is 90 deg.
+    """
+    instance("robot", robot, Robot, "a fflin.Robot")
+    instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
+    require_fit(lin, robot, StateMap(robot, frame=lin.frame))
+    sampled, whole = lin.dt, lin.generator
+    step = None if dt is None else _step(tool, dt)
+    if whole is None or (step and sampled):
+        raise InputError("the model is sampled; transform the continuous one that it was made of")
+    lin, bridge = whole, _Bridge(robot, whole, tool, joints)
+    own, to, kind = bridge.own, bridge.to, bridge.kind
+    A, B = carried(own, to, lin.A, lin.B)
+    q, v = kind.vectors(lin.q, lin.v)
+    states, tangent = kind.states(), kind.convention.attitude in ("turn", "pose")
+    x0 = np.concatenate((np.zeros(len(v)) if tangent else q, v))
+    C, D, y0, outputs = np.eye(len(A)), np.zeros(B.shape), x0, states
+    if lin.output_names != lin.state_names:
+        D = lin.D @ np.linalg.inv(own.V)
+        C, D = (lin.C @ own.P + D @ (to.H - own.H)) @ to.left, D @ to.V
+        y0, outputs = lin.y0, dict(zip(lin.output_names, lin.output_units, strict=True))
+    rate = to.P @ bridge.rates
+    f0 = rate * (not lin.moving)
+    if step:
+        A, B, after = _stepped(A, B, v, rate, step)
+        f0 = after * (not lin.moving)
+    elif sampled:
+        A, held = held_exponential(A, np.column_stack((B, f0)), sampled)
+        B, f0 = held[:, :-1], held[:, -1]
+    signals = {"state": states, "input": kind.inputs, "output": outputs}
+    return ToolModel(
+        **{"tool": tool, "A": A, "B": B, "C": C, "D": D, "f0": f0, "x0": x0, "y0": y0},
+        **{"T": bridge.T, "T_left": own.P @ to.left, "T_u": bridge.T_u, "u0": bridge.T_u @ lin.u0},
+        **{f"{name}_names": tuple(units) for name, units in signals.items()},
+        **{f"{name}_units": tuple(units.values()) for name, units in signals.items()},
+        **{"dt": step or sampled, "q": q, "v": v, "robot": lin.robot, "verified": lin.verified},
+        reference="moving" if lin.moving else "fixed",
+    )
+
+
+def from_tool(
+    robot: Robot,
+    tool: str,
+    q: Array,
+    v: Array | None = None,
+    u: Array | None = None,
+    *,
+    A: Array | None = None,
+    B: Array | None = None,
+    joints: Sequence[str] | None = None,
+    dt: float | None = None,
+    frame: Frame | None = None,
+    reference: pin.SE3 | None = None,
+    moving: bool = False,
+) -> LinearModel:
+    """Return the linear model at a point of another tool, of that tool's matrices.
+
+    Parameters
+    ----------
+    robot : Robot
+    tool, joints, dt
+        See `transform`; dt is the step that A and B are of.
+    q, v : array_like
+        Of the tool; at rest by default. Of "spart" q is R0 column by column, r0 and qm, and v is
+        u0 and um.
+    u : array_like (nu,), optional
+        Over the robot's inputs in the tool's order and axes; zero by default.
+    A, B : array_like, optional
+        Of the tool at that point, see `ToolModel`; fflin's own by default.
+    frame, reference, moving
+        Of the model that is returned, see `linearize`.
+
+    Returns
+    -------
+    LinearModel
+        Its ``q``, ``v`` and ``u0`` are the point in fflin's order; `check` and ``certificate`` tell
+        how far A and B hold.
+
+    Raises
+    ------
+    InputError
+        If a size is wrong, an entry is not finite, or an attitude is none.
+    UnknownNameError
+        If there is no such tool.
+    ChartError
+        If the base is turned by 180 deg from the reference, or as `transform`.
+    """
+    instance("robot", robot, Robot, "a fflin.Robot")
+    q, v = tool_coordinates(robot, tool, joints).to_pinocchio(q, v)
+    place: Any = {"frame": frame, "reference": reference, "moving": moving}
+    lin = linearize(robot, q, v, **place)
+    if u is not None:
+        u = vector("u", u, len(lin.u0), "the robot's inputs, as the tool has them")
+        u = np.linalg.solve(_Bridge(robot, lin, tool, joints).T_u, u)
+        lin = linearize(robot, q, v, u, **place)
+    if A is None and B is None:
+        return lin
+    bridge = _Bridge(robot, lin, tool, joints)
+    ours = carried(bridge.own, bridge.to, lin.A, lin.B)
+    if dt is not None:
+        # The rows of the rates say all.
+        h, nv = _step(tool, dt), len(bridge.T) // 2
+        held = np.hstack((np.zeros((nv, nv)), np.eye(nv)))
+        A, B = (
+            own
+            if given is None
+            else np.vstack((own[:nv], (_matrix(name, given, own)[nv:] - less) / h))
+            for name, given, own, less in zip("AB", (A, B), ours, (held, 0.0), strict=True)
+        )
+    A, B = (
+        own if given is None else _matrix(name, given, own)
+        for name, given, own in zip("AB", (A, B), ours, strict=True)
+    )
+    A, B = carried(bridge.to, bridge.own, A, B)
+    return replace(lin, A=A, B=B)
+
+
+class _Bridge:
+    """Between a linear model's coordinates and a tool's, at the model's point."""
+
+    def __init__(
+        self, robot: Robot, lin: LinearModel, tool: str, joints: Sequence[str] | None
+    ) -> None:
+        state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+        if lin.state_names != state.names:
+            raise InputError("lin has not all states of the robot; take the whole model of it")
+        own = own_coordinates(state, moving=lin.moving)
+        self.kind = tool_coordinates(robot, tool, joints, moving=lin.moving)
+        q, nu, rates = lin.q, state.velocities(lin.v), lin.drift
+        u = own.actuation.in_base_axes(state.chart(q), lin.u0)
+        if rates is None:  # f0 is P times the rate of y
+            rates = own.slopes(q, nu, 0.0 * nu, u).left @ lin.f0
+        self.rates = np.concatenate((nu, rates[len(nu) :]))
+        self.own, self.to = (each.slopes(q, nu, rates[len(nu) :], u) for each in (own, self.kind))
+        self.T = self.to.P @ self.own.left
+        self.T_u = np.linalg.solve(self.to.V, self.own.V)
+
+
+def carried(source: Slopes, to: Slopes, A: Array, B: Array) -> tuple[Array, Array]:
+    """Return A and B in other coordinates (14.3), (14.4)."""
+    B = source.left @ B @ np.linalg.inv(source.V)
+    A = source.left @ (A @ source.P - source.rate) + B @ (to.H - source.H)
+    return (to.P @ A + to.rate) @ to.left + to.extra, to.P @ B @ to.V
+
+
+def _step(tool: str, dt: Any) -> float:
+    if (h := number("dt", dt)) <= 0.0 or tool != "mujoco":
+        raise InputError(f"dt is {h:g} s for {tool}, expected a positive step of mujoco")
+    return h
+
+
+def _stepped(A: Array, B: Array, v: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
+    """Return A, B and f0 of a step of semi-implicit Euler (14.6); of the base linear, angular."""
+    nv, a = len(v), rate[len(v) :]
+    moved = h * (v + h * a)
+    K, G = np.eye(nv), h * np.eye(nv)
+    K[3:6, 3:6], G[3:6, 3:6] = pin.exp3(-moved[3:6]), h * pin.Jexp3(moved[3:6])
+    A, B = h * A[nv:], h * B[nv:]
+    A[:, nv:] += np.eye(nv)
+    A, B = np.vstack((G @ A, A)), np.vstack((G @ B, B))
+    A[:nv, :nv] += K
+    return A, B, np.concatenate((moved, h * a))
+
+
+def _matrix(name: str, value: Any, like: Array) -> Array:
+    array = as_double(name, value)
+    if array.shape != like.shape or not np.isfinite(array).all():
+        raise InputError(f"{name} has shape {array.shape}, expected {like.shape} of finite numbers")
+    return array

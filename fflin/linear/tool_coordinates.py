@@ -1,0 +1,293 @@
+"""How tools write pose, twist and wrench of a free flyer, and the slopes of such coordinates.
+
+A `Convention` says it once; names, vectors and slopes come from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+import fflin.base.rotation as turning
+from fflin.base.errors import ChartError, InputError, unknown
+from fflin.base.rotation import quaternion_product, skew
+from fflin.base.validation import NORM_TOLERANCE, Array, is_rotation, vector
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.chart import SMALLEST_Q0
+from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR
+from fflin.dynamics.state import StateMap
+from fflin.robot.frames import ROOT
+from fflin.robot.link_masses import pieces_of
+from fflin.robot.robot import Robot
+
+# Along a motion by so little that its square is nothing: derivatives without any difference.
+_STEP = 1e-20j
+
+_STORED = {"wxyz": 4, "xyzw": 4, "matrix": 9, "euler": 3}  # entries of q
+_ANGLES = ("roll", "pitch", "yaw")
+
+
+class Convention(NamedTuple):
+    """How a tool writes a free flyer."""
+
+    # In x "wxyz", "q_b", "euler", or a tangent: a "turn" in base axes, or "pose", the logarithm of
+    # the whole displacement; and in q.
+    attitude: str
+    stored: str
+    angular_first: bool
+    axes: tuple[bool, bool]  # whether (omega, v), and (torque, force), stand in the world's axes
+    at_centre: bool = False  # of the root link's own mass, in the axes that its inertia has
+    rates: bool = False  # of the angles in place of omega
+
+
+TOOLS = {
+    "drake": Convention("wxyz", "wxyz", True, IN_REFERENCE_AXES["world"]),
+    "mujoco": Convention("turn", "wxyz", False, IN_REFERENCE_AXES["hybrid"]),
+    "pinocchio": Convention("pose", "xyzw", False, IN_REFERENCE_AXES["local"]),
+    "spart": Convention("turn", "matrix", True, IN_REFERENCE_AXES["hybrid"], at_centre=True),
+    "euler": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"]),
+    "euler_rates": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"], rates=True),
+}
+
+
+class Slopes(NamedTuple):
+    """Slopes of coordinates x' and inputs u' at a point, over y (14.1) and u in base axes."""
+
+    P: Array  # of x' over y (14.2)
+    rate: Array  # of P along the motion
+    left: Array  # left inverse of P
+    V: Array  # of u over u'
+    H: Array  # of u over y, u' held (14.4)
+    extra: Array  # of dx'/dt along what y has not: the length of a quaternion (14.5)
+
+
+class ToolCoordinates:
+    """Coordinates of a robot, relative to the reference of a `StateMap`, by a convention."""
+
+    def __init__(
+        self,
+        state: StateMap,
+        kind: Convention,
+        moving: bool = False,
+        joints: Sequence[str] | None = None,
+    ) -> None:
+        robot, own = state.robot, kind.attitude == "q_b"
+        self.state, self.convention, self._moving = state, kind, moving
+        self._roll = 0 if kind.angular_first else 3  # from angular, linear to the tool's order
+        self._world = np.repeat(kind.axes, 3)[:, None]
+        self._base = _centre(robot) if kind.at_centre else pin.SE3.Identity()
+        order = np.array([3, 4, 5, 0, 1, 2])  # Pinocchio's is linear, angular
+        # Displacements and twists of the tool's base are X y and X nu, wrenches on it X^-T w.
+        self._X: Array = self._base.toActionMatrixInverse()[np.ix_(order, order)]
+        followers = [] if own else [follower.joint for follower in robot.followers]
+        self.joints = sorted((*robot.joints, *followers), key=lambda joint: joint.idx_v)
+        named = {joint.name: joint for joint in self.joints}
+        if joints is not None:
+            if not isinstance(joints, list | tuple) or sorted(map(str, joints)) != sorted(named):
+                raise InputError(f"joints is {joints!r:.70}, expected all of {', '.join(named)}")
+            self.joints = [named[name] for name in joints]
+        self._idx_v = [joint.idx_v for joint in self.joints]
+        self.actuation = acting = Actuation(state)
+        none = np.zeros(0, dtype=np.intp)
+        torque, force, motors = (acting.groups.get(g, none) for g in ("tau_b", "F_b", "tau_m"))
+        # Of the six of a wrench those that are inputs, and which inputs these are.
+        self._rows = [*range(3)] * bool(torque.size) + [*range(3, 6)] * bool(force.size)
+        self._at = np.concatenate((torque, force))
+        if force.size and not torque.size and self._X[LINEAR, ANGULAR].any():
+            raise InputError(
+                "spart's force acts at the root link's centre of mass, and a BaseForce alone takes "
+                "no moment about the link's origin; give the robot a BaseTorque too"
+            )
+        # Which of the robot's inputs stands where among the tool's.
+        self._inputs = np.arange(len(acting.names))
+        if not own:
+            self._inputs[np.sort(self._at)] = np.roll(self._at, self._roll)
+            places = [f"tau_m.{joint.name}" for joint in self.joints]
+            self._inputs[motors] = sorted(motors, key=lambda i: places.index(acting.names[i]))
+        self.inputs = {acting.names[i]: acting.units[i] for i in self._inputs}
+
+    def states(self) -> dict[str, str]:
+        """Return {name: unit} of x'."""
+        kind, found = self.convention, dict[str, str]()
+        attitude = {"wxyz": [f"quat.{i}" for i in "wxyz"], "euler": _ANGLES}.get(kind.attitude)
+        turn = attitude or [f"theta.{i}" for i in "xyz"], "1" if kind.attitude == "wxyz" else "rad"
+        omega = [f"{angle}_rate" for angle in _ANGLES], "rad/s"
+        omega = omega if kind.rates else ([f"omega.{i}" for i in "xyz"], "rad/s")
+        shift, v = (([f"{name}.{i}" for i in "xyz"], of) for name, of in (("p", "m"), ("v", "m/s")))
+        for name, parts, per in (("q_m", (turn, shift), ""), ("qdot_m", (omega, v), "/s")):
+            for names, unit in parts[:: 1 if kind.angular_first else -1]:
+                found |= dict.fromkeys(names, unit)
+            found |= {f"{name}.{joint.name}": f"{joint.unit}{per}" for joint in self.joints}
+        return found
+
+    def vectors(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return q and v as the tool has them, of valid ones of Pinocchio's."""
+        stored = self.convention.stored
+        if stored == "xyzw":
+            return q, v
+        attitude, R = self._attitude(q)
+        at = pin.SE3(self.state.rotation(q), self.state.positions(q)) * self._base
+        attitude = np.roll(attitude, 1) if stored == "wxyz" else R.T.ravel()  # column by column
+        pose = np.concatenate((_angles(R) if stored == "euler" else attitude, at.translation))
+        twist = self._twist(R) @ self._X @ self.state.velocities(v)[:6]
+        joints = [joint.value(q) for joint in self.joints]
+        parts = (pose, joints), (twist, v[self._idx_v])
+        q, v = (np.concatenate((np.roll(base, self._roll), rest)) for base, rest in parts)
+        return q, v
+
+    def to_pinocchio(self, q: Any, v: Any) -> tuple[Array, Array]:
+        """Return Pinocchio's q and v of those of the tool; v None is rest."""
+        robot, state, k = self.state.robot, self.state, 3 + _STORED[self.convention.stored]
+        size = 6 + len(self.joints)
+        v = np.zeros(size) if v is None else vector("v", v, size, "the tool's: base, then joints")
+        if self.convention.stored == "xyzw":
+            return robot.checked_configuration(q), robot.checked_velocity(v)
+        q = vector("q", q, k - 6 + size, "the tool's: base, then joints")
+        pose, twist = np.roll(q[:k], -self._roll), np.roll(v[:6], -self._roll)
+        quaternion, at = self._quaternion(pose[:-3]), pin.neutral(robot.model)
+        R = turning.rotation_matrix(quaternion)
+        at[:3] = state.origin.actInv(pin.SE3(R, pose[-3:]) * self._base.inverse()).translation
+        at[3:7] = quaternion_product(turning.conjugate(state.origin_quaternion), quaternion)
+        base = turning.conjugate(pin.SE3ToXYZQUAT(self._base)[3:])
+        at[3:7] = quaternion_product(at[3:7], base)
+        for joint, value in zip(self.joints, q[k:].tolist(), strict=True):
+            joint.place(at, value)
+        nu = np.linalg.solve(self._twist(R) @ self._X, twist)
+        speed = state.spread(np.concatenate((nu, np.zeros(robot.n))))
+        speed[self._idx_v] = v[6:]
+        return robot.checked_configuration(at), robot.checked_velocity(speed)
+
+    def _quaternion(self, attitude: Array) -> Array:
+        """Return the quaternion x, y, z, w of an attitude as it is stored."""
+        if self.convention.stored == "euler":
+            return pin.Quaternion(pin.rpy.rpyToMatrix(*attitude)).coeffs()
+        if self.convention.stored == "matrix":
+            if not is_rotation(R := attitude.reshape(3, 3).T):
+                raise InputError("R0, q[:9] by columns, is no rotation: R^T R and det R must be 1")
+            return pin.Quaternion(R).normalized().coeffs()
+        length = float(np.linalg.norm(attitude))
+        if abs(length - 1.0) > NORM_TOLERANCE:
+            raise InputError(f"the quaternion w, x, y, z has length {length:.9g}, expected 1")
+        return np.roll(attitude, -1) / length
+
+    def _attitude(self, q: Array) -> tuple[Array, Array]:
+        """Return the quaternion x, y, z, w and the rotation that x' is about."""
+        quaternion = quaternion_product(self.state.origin_quaternion, q[3:7])
+        if self.convention.at_centre:
+            quaternion = quaternion_product(quaternion, pin.SE3ToXYZQUAT(self._base)[3:])
+        if self.convention.attitude == "q_b":
+            quaternion *= -1.0 if quaternion[3] < 0.0 else 1.0
+            quaternion = np.array((0.0, 0.0, 0.0, 1.0)) if self._moving else quaternion
+        return quaternion, turning.rotation_matrix(quaternion)
+
+    def _turn(self, R: Array) -> Array:
+        """Return the matrix (6, 6) that takes a wrench in base axes to the tool's axes."""
+        return np.where(self._world, np.kron(np.eye(2), R), np.eye(6))
+
+    def _twist(self, R: Array) -> Array:
+        """Return the matrix (6, 6) that takes a twist in base axes to the tool's."""
+        turn = self._turn(R)
+        if self.convention.rates:
+            turn[ANGULAR, ANGULAR] = _of_angles(_angles(R))[0]
+        return turn
+
+    def _held(self, parts: Array) -> Array:
+        """Return the slopes (6, 3) over a turn of what is held in the world, in base axes (4.4)."""
+        return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
+
+    def slopes(self, q: Array, nu: Array, rates: Array, u: Array) -> Slopes:
+        """Return the slopes at a point; nu (6 + n,), its rates and u (nu,) are in base axes."""
+        n, nv, X, moves = self.state.robot.n, 6 + len(self.joints), self._X, self._X @ nu[:6]
+        still, R = self._attitude(q)
+        turns = 0.5 * turning.product_matrix(still) @ np.append(moves[ANGULAR], 0.0)
+        # With a moving reference errors and tangents move along.
+        ahead = (
+            still + (0.0 if self._moving and self.convention.attitude == "q_b" else _STEP) * turns
+        )
+        went = (0.0 if self._moving else _STEP) * moves
+        pose, by_turn, by_twist = self._of_base(ahead, moves + _STEP * (X @ rates[:6]), went)
+        k, first = len(pose), len(pose) - 6 + nv
+        P = np.zeros((first + nv, 12 + 2 * n), dtype=complex)
+        P[:k, :6] = np.roll(pose @ X, self._roll, axis=0)
+        P[first : first + 6, :3] = np.roll(by_turn @ X[ANGULAR, ANGULAR], self._roll, axis=0)
+        P[first : first + 6, 6 + n : 12 + n] = np.roll(by_twist @ X, self._roll, axis=0)
+        of_joints = self.state.spread(np.eye(6 + n))[6:, self._idx_v].T
+        P[k:first, 6 : 6 + n] = P[first + 6 :, 12 + n :] = of_joints
+        at_rest, extra = P.real.copy(), np.zeros((len(P), len(P)))
+        at_rest[first:, : 6 + n] = 0.0
+        if self.convention.attitude == "wxyz":
+            extra[:4, :4] = np.outer(np.roll(turns, 1), np.roll(still, 1))
+        left = np.linalg.solve(at_rest.T @ P.real, at_rest.T)
+        # Wrenches.
+        V, H, wrench = np.eye(len(u)), np.zeros((len(u), 12 + 2 * n)), np.zeros(6)
+        V[np.ix_(self._at, self._at)] = (X.T @ self._turn(R).T)[np.ix_(self._rows, self._rows)]
+        wrench[self._rows] = u[self._at]
+        held = X.T @ self._held(np.linalg.solve(X.T, wrench)) @ X[ANGULAR, ANGULAR]
+        H[self._at, :3] = held[self._rows]
+        return Slopes(P.real, P.imag / _STEP.imag, left, V[:, self._inputs], H, extra)
+
+    def _of_base(self, quaternion: Array, nu: Array, went: Array) -> tuple[Array, Array, Array]:
+        """Return slopes of the pose over (theta, p), and of the twist over theta and the twist."""
+        R, vec, kind = turning.rotation_matrix(quaternion), quaternion[:3], self.convention
+        by_twist, by_turn = self._twist(R), -self._turn(R) @ self._held(nu)
+        attitude = np.eye(3) + 0.5 * skew(went[ANGULAR])
+        if kind.attitude == "euler":
+            attitude, bends = _of_angles(_angles(R), nu[ANGULAR])
+            by_turn[ANGULAR] = kind.rates * bends @ attitude
+        elif kind.attitude in ("wxyz", "q_b"):
+            attitude = 0.5 * (quaternion[3] * np.eye(3) + skew(vec))
+            if kind.attitude == "wxyz":
+                attitude = np.vstack((-0.5 * vec, attitude))
+        pose = np.zeros((len(attitude) + 3, 6), dtype=complex)
+        pose[:-3, :3], pose[-3:, 3:] = attitude, R
+        if kind.attitude == "pose":
+            pose[-3:, :3], pose[-3:, 3:] = 0.5 * skew(went[LINEAR]), attitude
+        return pose, by_turn, by_twist
+
+
+def own_coordinates(state: StateMap, *, moving: bool) -> ToolCoordinates:
+    """Return those of a linear model."""
+    return ToolCoordinates(state, Convention("q_b", "xyzw", True, state.axes), moving)
+
+
+def tool_coordinates(
+    robot: Robot, tool: str, joints: Sequence[str] | None, *, moving: bool = False
+) -> ToolCoordinates:
+    """Return those of a tool."""
+    if not isinstance(tool, str) or tool not in TOOLS:
+        raise unknown("tool", str(tool), TOOLS)
+    if joints is not None and tool == "pinocchio":
+        raise InputError("pinocchio's joints stand in the order of robot.model; leave joints out")
+    return ToolCoordinates(StateMap(robot), TOOLS[tool], moving, joints)
+
+
+def _centre(robot: Robot) -> pin.SE3:
+    """Return where the root link's own mass is, in the axes that its inertia is given in."""
+    frames = (f for f in robot.model.frames.tolist() if f.type == pin.FrameType.BODY)
+    name = next((frame.name for frame in frames if frame.parentJoint == ROOT), "")
+    if piece := pieces_of(robot)[0].get(name):
+        return piece.placement
+    return pin.SE3(np.eye(3), np.array(robot.model.inertias[ROOT].lever))
+
+
+def _angles(R: Array) -> Array:
+    """Return roll, pitch and yaw of R = R_z(yaw) R_y(pitch) R_x(roll), along a complex step too."""
+    if np.hypot(R[0, 0].real, R[1, 0].real) < SMALLEST_Q0:
+        raise ChartError("the pitch is 90 deg, where roll and yaw of Euler's angles turn alike")
+    angles: Array = pin.rpy.matrixToRpy(R.real)
+    if np.iscomplexobj(R):
+        W = R.real.T @ R.imag
+        angles = angles + 1j * _of_angles(angles)[0] @ (W[2, 1], W[0, 2], W[1, 0])
+    return angles
+
+
+def _of_angles(angles: Array, omega: Any = (0.0, 0.0, 0.0)) -> tuple[Array, Array]:
+    """Return G, the rates of the angles being G omega, and the slope of G omega over them."""
+    (s, _, _), (c, cp, _), tp = np.sin(angles), np.cos(angles), np.tan(angles[1])
+    G = np.array([[1.0, s * tp, c * tp], [0.0, c, -s], [0.0, s / cp, c / cp]])
+    _, pitch, yaw = G @ omega
+    bends = [[tp * pitch, yaw / cp, 0.0], [-cp * yaw, 0.0, 0.0], [pitch / cp, tp * yaw, 0.0]]
+    return G, np.array(bends)
