@@ -20,6 +20,9 @@ from fflin.linear.sampling import held_exponential
 from fflin.linear.tool_coordinates import Slopes, own_coordinates, tool_coordinates
 from fflin.robot.robot import Robot
 
+# Of the largest entry, what another route to a matrix may differ by and be the same.
+_ROUNDING = 1e-12
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ToolModel(Design):
@@ -145,7 +148,7 @@ def transform(
     rate = to.P @ bridge.rates
     f0 = rate * (not lin.moving)
     if step:
-        A, B, after = _stepped(A, B, v, rate, step)
+        A, B, after = _stepped(A, B, rate, step)
         f0 = after * (not lin.moving)
     elif sampled:
         A, held = held_exponential(A, np.column_stack((B, f0)), sampled)
@@ -219,22 +222,23 @@ def from_tool(
     if A is None and B is None:
         return lin
     bridge = _Bridge(robot, lin, tool, joints)
-    ours = carried(bridge.own, bridge.to, lin.A, lin.B)
-    if dt is not None:
-        # The rows of the rates say all.
-        h, nv = _step(tool, dt), len(bridge.T) // 2
-        held = np.hstack((np.zeros((nv, nv)), np.eye(nv)))
-        A, B = (
-            own
-            if given is None
-            else np.vstack((own[:nv], (_matrix(name, given, own)[nv:] - less) / h))
-            for name, given, own, less in zip("AB", (A, B), ours, (held, 0.0), strict=True)
-        )
+    own, to = bridge.own, bridge.to
+    ours, h = carried(own, to, lin.A, lin.B), None if dt is None else _step(tool, dt)
+    if h:
+        ours = _stepped(*ours, to.P @ bridge.rates, h)[:2]
+    changes = [
+        np.zeros(expected.shape) if given is None else _change(name, given, expected)
+        for name, given, expected in zip("AB", (A, B), ours, strict=True)
+    ]
+    if h:  # the rows of positions follow from those of rates
+        nv = len(changes[0]) // 2
+        changes = [np.vstack((0.0 * change[:nv], change[nv:] / h)) for change in changes]
+    own, to = (each._replace(rate=0.0 * each.rate, extra=0.0 * each.extra) for each in (own, to))
     A, B = (
-        own if given is None else _matrix(name, given, own)
-        for name, given, own in zip("AB", (A, B), ours, strict=True)
+        # A zero is no rounding.
+        np.where((old == 0.0) & (np.abs(new) < _ROUNDING * np.abs(old).max()), 0.0, old + new)
+        for old, new in zip((lin.A, lin.B), carried(to, own, *changes), strict=True)
     )
-    A, B = carried(bridge.to, bridge.own, A, B)
     return replace(lin, A=A, B=B)
 
 
@@ -272,9 +276,10 @@ def _step(tool: str, dt: Any) -> float:
     return h
 
 
-def _stepped(A: Array, B: Array, v: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
+def _stepped(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
     """Return A, B and f0 of a step of semi-implicit Euler (14.6); of the base linear, angular."""
-    nv, a = len(v), rate[len(v) :]
+    nv = len(rate) // 2
+    v, a = rate[:nv], rate[nv:]
     moved = h * (v + h * a)
     K, G = np.eye(nv), h * np.eye(nv)
     K[3:6, 3:6], G[3:6, 3:6] = pin.exp3(-moved[3:6]), h * pin.Jexp3(moved[3:6])
@@ -285,8 +290,10 @@ def _stepped(A: Array, B: Array, v: Array, rate: Array, h: float) -> tuple[Array
     return A, B, np.concatenate((moved, h * a))
 
 
-def _matrix(name: str, value: Any, like: Array) -> Array:
+def _change(name: str, value: Any, expected: Array) -> Array:
+    """Return by how much a matrix of the caller is more than expected."""
     array = as_double(name, value)
-    if array.shape != like.shape or not np.isfinite(array).all():
-        raise InputError(f"{name} has shape {array.shape}, expected {like.shape} of finite numbers")
-    return array
+    if array.shape != expected.shape or not np.isfinite(array).all():
+        raise InputError(f"{name} has shape {array.shape}, expected finite {expected.shape}")
+    change: Array = array - expected
+    return change
