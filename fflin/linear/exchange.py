@@ -153,15 +153,13 @@ def transform(
     elif sampled:
         A, held = held_exponential(A, np.column_stack((B, f0)), sampled)
         B, f0 = held[:, :-1], held[:, -1]
-    signals = {"state": states, "input": kind.inputs, "output": outputs}
-    return ToolModel(
-        **{"tool": tool, "A": A, "B": B, "C": C, "D": D, "f0": f0, "x0": x0, "y0": y0},
-        **{"T": bridge.T, "T_left": own.P @ to.left, "T_u": bridge.T_u, "u0": bridge.T_u @ lin.u0},
-        **{f"{name}_names": tuple(units) for name, units in signals.items()},
-        **{f"{name}_units": tuple(units.values()) for name, units in signals.items()},
-        **{"dt": step or sampled, "q": q, "v": v, "robot": lin.robot, "verified": lin.verified},
-        reference="moving" if lin.moving else "fixed",
-    )
+    fields: dict[str, Any] = {"q": q, "v": v, "T": bridge.T, "T_left": own.P @ to.left}
+    for signal, units in (("state", states), ("input", kind.inputs), ("output", outputs)):
+        fields |= {f"{signal}_names": tuple(units), f"{signal}_units": tuple(units.values())}
+    fields |= {"f0": f0, "x0": x0, "u0": bridge.T_u @ lin.u0, "y0": y0, "T_u": bridge.T_u}
+    fields |= {"A": A, "B": B, "C": C, "D": D, "dt": step or sampled, "verified": lin.verified}
+    about = "moving" if lin.moving else "fixed"
+    return ToolModel(tool=tool, robot=lin.robot, reference=about, **fields)
 
 
 def from_tool(

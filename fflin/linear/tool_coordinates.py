@@ -216,11 +216,13 @@ class ToolCoordinates:
         P[first : first + 6, 6 + n : 12 + n] = np.roll(by_twist @ X, self._roll, axis=0)
         of_joints = self.state.spread(np.eye(6 + n))[6:, self._idx_v].T
         P[k:first, 6 : 6 + n] = P[first + 6 :, 12 + n :] = of_joints
-        at_rest, extra = P.real.copy(), np.zeros((len(P), len(P)))
-        at_rest[first:, : 6 + n] = 0.0
+        extra = np.zeros((len(P), len(P)))
         if self.convention.attitude == "wxyz":
             extra[:4, :4] = np.outer(np.roll(turns, 1), np.roll(still, 1))
-        left = np.linalg.solve(at_rest.T @ P.real, at_rest.T)
+        # By blocks, so that zeros stay zeros.
+        poses, twists = _left(P.real[:first, : 6 + n]), _left(P.real[first:, 6 + n :])
+        below = -twists @ P.real[first:, : 6 + n] @ poses
+        left = np.block([[poses, np.zeros((6 + n, nv))], [below, twists]])
         # Wrenches.
         V, H, wrench = np.eye(len(u)), np.zeros((len(u), 12 + 2 * n)), np.zeros(6)
         V[np.ix_(self._at, self._at)] = (X.T @ self._turn(R).T)[np.ix_(self._rows, self._rows)]
@@ -229,7 +231,7 @@ class ToolCoordinates:
         H[self._at, :3] = held[self._rows]
         return Slopes(P.real, P.imag / _STEP.imag, left, V[:, self._inputs], H, extra)
 
-    def _of_base(self, quaternion: Array, nu: Array, went: Array) -> tuple[Array, Array, Array]:
+    def _of_base(self, quaternion: Any, nu: Any, went: Any) -> tuple[Array, Array, Array]:
         """Return slopes of the pose over (theta, p), and of the twist over theta and the twist."""
         R, vec, kind = turning.rotation_matrix(quaternion), quaternion[:3], self.convention
         by_twist, by_turn = self._twist(R), -self._turn(R) @ self._held(nu)
@@ -271,6 +273,12 @@ def _centre(robot: Robot) -> pin.SE3:
     if piece := pieces_of(robot)[0].get(name):
         return piece.placement
     return pin.SE3(np.eye(3), np.array(robot.model.inertias[ROOT].lever))
+
+
+def _left(P: Array) -> Array:
+    square = P.shape[0] == P.shape[1]
+    inverse: Array = np.linalg.inv(P) if square else np.linalg.solve(P.T @ P, P.T)
+    return inverse
 
 
 def _angles(R: Array) -> Array:
