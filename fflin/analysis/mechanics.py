@@ -14,6 +14,9 @@ from fflin.linear.model import LinearModel
 # A momentum with a larger relative residual is not the rate of a coordinate: the model moves.
 _CONSISTENT = 1e-8
 
+# Rounding of springs and dampers, in units of energy, beside the square and the speed of a spin.
+_OF_SPIN = 1e-15
+
 
 def checked(lin: LinearModel) -> LinearModel:
     """Return a model whose state is positions and their rates, or raise `InputError`."""
@@ -83,7 +86,13 @@ def second_order(lin: LinearModel) -> SecondOrder:
     if lin.dt:
         # Every entry of an exponential carries the rounding of the largest.
         spread[:, : 2 * nv] += 4.0 * nv * EPS * np.abs(lin.A).max() / lin.dt * (X[nv:] != 0.0)
-    forces = Noisy(M @ rates, np.abs(M) @ spread)
+    noise = np.abs(M) @ spread
+    # What balances in a spin leaves rounding, and may leave nothing else to compare it with.
+    turns = [x for x, unit in zip(lin.x0, lin.state_units, strict=True) if unit == "rad/s"]
+    spin = float(np.abs(turns).max(initial=0.0))
+    noise[:, :nv] += _OF_SPIN * np.outer(size, size) * spin**2
+    noise[:, nv : 2 * nv] += _OF_SPIN * np.outer(size, size) * spin
+    forces = Noisy(M @ rates, noise)
     K, D, S = map(forces.columns, (slice(0, nv), slice(nv, 2 * nv), slice(2 * nv, None)))
     # The forces of an input are compared with the largest of the same input.
     each = np.linalg.norm(S.values / size[:, None], axis=0)

@@ -39,14 +39,8 @@ def ignorable_wheels(lin: LinearModel) -> tuple[Indices, Indices]:
     if not len(at):
         return at, at
     system = second_order(lin.generator or lin)
-    # What balances in a spin leaves rounding, and may leave nothing else to compare it with.
-    turns = [x for x, unit in zip(lin.x0, lin.state_units, strict=True) if unit == "rad/s"]
-    rounding = 1e-14 * np.outer(system.size, system.size[at])
-    spin = float(np.abs(turns).max(initial=0.0))
-    still = np.abs(system.K.values[:, at]) <= rounding * spin**2
-    free = np.abs(system.D.values[:, at]) <= rounding * spin
-    angle = still.all(axis=0)
-    return at[angle], at[angle & free.all(axis=0)]
+    angle, speed = (~matrix.values[:, at].any(axis=0) for matrix in (system.K, system.D))
+    return at[angle], at[angle & speed]
 
 
 def leaving(lin: LinearModel, wheel_speeds: bool | None) -> Indices:
@@ -115,7 +109,17 @@ def without(lin: LinearModel, left: Indices) -> LinearModel:
     kept = np.setdiff1d(np.arange(len(lin.M)), left)
     names = [lin.state_names[i] for i in (*kept, *(kept + len(lin.M)))]
     rest = floating_inertia(lin.M, kept, left)
-    return selected(lin, names, rest, partial(without, left=left))
+    return selected(_balanced(lin), names, rest, partial(without, left=left))
+
+
+def _balanced(lin: LinearModel) -> LinearModel:
+    """Return a model without the forces that are rounding of a spin, which its parts lack."""
+    nv, A, system = len(lin.M), lin.A.copy(), second_order(lin)
+    if not lin.dt and not system.K.values.any():
+        A[nv:, :nv] = 0.0
+    if not lin.dt and not system.D.values.any():
+        A[nv:, nv:] = 0.0
+    return replace(lin, A=A)
 
 
 def selected(lin: LinearModel, names: Sequence[str], M: Array, make: Make) -> LinearModel:
