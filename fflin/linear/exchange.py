@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -19,6 +18,8 @@ from fflin.linear.model import LinearModel
 from fflin.linear.sampling import held_exponential
 from fflin.linear.tool_coordinates import Slopes, own_coordinates, tool_coordinates
 from fflin.robot.robot import Robot
+
+_LONGEST = 1e3  # [s]
 
 # Of the largest entry, what another route to a matrix may differ by and be the same.
 _ROUNDING = 1e-12
@@ -84,14 +85,7 @@ class ToolModel(Design):
         return f"ToolModel('{self.robot}', tool='{self.tool}', nx={nx}, nu={nu}, {time})"
 
 
-def transform(
-    robot: Robot,
-    lin: LinearModel,
-    tool: str,
-    *,
-    joints: Sequence[str] | None = None,
-    dt: float | None = None,
-) -> ToolModel:
+def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = None) -> ToolModel:
     r"""Return a linear model in the coordinates, order and axes of another tool.
 
     Deviations are x' = T x and u' = T_u u, and at any point, in motion too,
@@ -107,9 +101,6 @@ def transform(
     lin : LinearModel
         Of this robot, about any point. One that is sampled is sampled in the tool's coordinates.
     tool : {"drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"}
-    joints : sequence of str, optional
-        All joints, mimic joints too, in the tool's order; by default that of `Robot.model`, where
-        siblings are sorted by name and other tools mostly take them as they stand in the file.
     dt : float, optional
         Of "mujoco": its time step [s], for the pair of ``mjd_transitionFD`` with the integrator
         Euler (of a robot with dampers: with ``eulerdamp`` disabled).
@@ -134,7 +125,7 @@ def transform(
     step = None if dt is None else _step(tool, dt)
     if whole is None or (step and sampled):
         raise InputError("the model is sampled; transform the continuous one that it was made of")
-    lin, bridge = whole, _Bridge(robot, whole, tool, joints)
+    lin, bridge = whole, _Bridge(robot, whole, tool)
     own, to, kind = bridge.own, bridge.to, bridge.kind
     A, B = carried(own, to, lin.A, lin.B)
     q, v = kind.vectors(lin.q, lin.v)
@@ -171,7 +162,6 @@ def from_tool(
     *,
     A: Array | None = None,
     B: Array | None = None,
-    joints: Sequence[str] | None = None,
     dt: float | None = None,
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
@@ -182,7 +172,7 @@ def from_tool(
     Parameters
     ----------
     robot : Robot
-    tool, joints, dt
+    tool, dt
         See `transform`; dt is the step that A and B are of.
     q, v : array_like
         Of the tool; at rest by default. Of "spart" q is R0 column by column, r0 and qm, and v is
@@ -210,16 +200,16 @@ def from_tool(
         If the base is turned by 180 deg from the reference, or as `transform`.
     """
     instance("robot", robot, Robot, "a fflin.Robot")
-    q, v = tool_coordinates(robot, tool, joints).to_pinocchio(q, v)
+    q, v = tool_coordinates(robot, tool).to_pinocchio(q, v)
     place: Any = {"frame": frame, "reference": reference, "moving": moving}
     lin = linearize(robot, q, v, **place)
     if u is not None:
         u = vector("u", u, len(lin.u0), "the robot's inputs, as the tool has them")
-        u = np.linalg.solve(_Bridge(robot, lin, tool, joints).T_u, u)
+        u = np.linalg.solve(_Bridge(robot, lin, tool).T_u, u)
         lin = linearize(robot, q, v, u, **place)
     if A is None and B is None:
         return lin
-    bridge = _Bridge(robot, lin, tool, joints)
+    bridge = _Bridge(robot, lin, tool)
     own, to = bridge.own, bridge.to
     ours, h = carried(own, to, lin.A, lin.B), None if dt is None else _step(tool, dt)
     if h:
@@ -243,14 +233,12 @@ def from_tool(
 class _Bridge:
     """Between a linear model's coordinates and a tool's, at the model's point."""
 
-    def __init__(
-        self, robot: Robot, lin: LinearModel, tool: str, joints: Sequence[str] | None
-    ) -> None:
+    def __init__(self, robot: Robot, lin: LinearModel, tool: str) -> None:
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
         if lin.state_names != state.names:
             raise InputError("lin has not all states of the robot; take the whole model of it")
         own = own_coordinates(state, moving=lin.moving)
-        self.kind = tool_coordinates(robot, tool, joints, moving=lin.moving)
+        self.kind = tool_coordinates(robot, tool, moving=lin.moving)
         q, nu, rates = lin.q, state.velocities(lin.v), lin.drift
         u = own.actuation.in_base_axes(state.chart(q), lin.u0)
         if rates is None:  # f0 is P times the rate of y
@@ -269,8 +257,8 @@ def carried(source: Slopes, to: Slopes, A: Array, B: Array) -> tuple[Array, Arra
 
 
 def _step(tool: str, dt: Any) -> float:
-    if (h := number("dt", dt)) <= 0.0 or tool != "mujoco":
-        raise InputError(f"dt is {h:g} s for {tool}, expected a positive step of mujoco")
+    if not 0.0 < (h := number("dt", dt)) < _LONGEST or str(tool) != "mujoco":
+        raise InputError(f"dt is {h:g} s for {tool}, expected a step of mujoco")
     return h
 
 

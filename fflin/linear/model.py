@@ -302,19 +302,13 @@ class LinearModel(FrozenArrays):
         certify = partial(same_certificate, self, sampled.fingerprint)
         return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))
 
-    def to(self, tool: str, **options: Any) -> ToolModel:
-        """Return the model in the coordinates of another tool, see `transform`.
-
-        Parameters
-        ----------
-        tool : {"drake", "mujoco", "pinocchio", "spart", "euler"}
-        **options
-            ``joints``, ``rates`` and ``dt`` of `transform`.
+    def to(self, tool: str, *, dt: float | None = None) -> ToolModel:
+        """Return the model in the coordinates of another tool: `transform` of its own robot.
 
         Raises
         ------
         InputError
-            If the model is from a file and its robot not known, or as `transform`.
+            If the model is from a file, so that its robot is not known; or as `transform`.
         """
         from fflin import transform
 
@@ -322,7 +316,7 @@ class LinearModel(FrozenArrays):
             raise InputError(
                 "the robot of this model is not known: fflin.transform(robot, lin, tool)"
             )
-        return transform(self._robot, self, tool, **options)
+        return transform(self._robot, self, tool, dt=dt)
 
     def to_scipy(self) -> Any:
         """Return a `scipy.signal.StateSpace` of the deviations; names and f0 are lost."""

@@ -5,7 +5,6 @@ A `Convention` says it once; names, vectors and slopes come from it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,13 +40,16 @@ class Convention(NamedTuple):
     axes: tuple[bool, bool]  # whether (omega, v), and (torque, force), stand in the world's axes
     at_centre: bool = False  # of the root link's own mass, in the axes that its inertia has
     rates: bool = False  # of the angles in place of omega
+    as_in_file: bool = False  # joints, depth first; else as in `Robot.model`
 
 
 TOOLS = {
-    "drake": Convention("wxyz", "wxyz", True, IN_REFERENCE_AXES["world"]),
-    "mujoco": Convention("turn", "wxyz", False, IN_REFERENCE_AXES["hybrid"]),
+    "drake": Convention("wxyz", "wxyz", True, IN_REFERENCE_AXES["world"], as_in_file=True),
+    "mujoco": Convention("turn", "wxyz", False, IN_REFERENCE_AXES["hybrid"], as_in_file=True),
     "pinocchio": Convention("pose", "xyzw", False, IN_REFERENCE_AXES["local"]),
-    "spart": Convention("turn", "matrix", True, IN_REFERENCE_AXES["hybrid"], at_centre=True),
+    "spart": Convention(
+        "turn", "matrix", True, IN_REFERENCE_AXES["hybrid"], at_centre=True, as_in_file=True
+    ),
     "euler": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"]),
     "euler_rates": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"], rates=True),
 }
@@ -67,13 +69,7 @@ class Slopes(NamedTuple):
 class ToolCoordinates:
     """Coordinates of a robot, relative to the reference of a `StateMap`, by a convention."""
 
-    def __init__(
-        self,
-        state: StateMap,
-        kind: Convention,
-        moving: bool = False,
-        joints: Sequence[str] | None = None,
-    ) -> None:
+    def __init__(self, state: StateMap, kind: Convention, *, moving: bool = False) -> None:
         robot, own = state.robot, kind.attitude == "q_b"
         self.state, self.convention, self._moving = state, kind, moving
         self._roll = 0 if kind.angular_first else 3  # from angular, linear to the tool's order
@@ -84,11 +80,8 @@ class ToolCoordinates:
         self._X: Array = self._base.toActionMatrixInverse()[np.ix_(order, order)]
         followers = [] if own else [follower.joint for follower in robot.followers]
         self.joints = sorted((*robot.joints, *followers), key=lambda joint: joint.idx_v)
-        named = {joint.name: joint for joint in self.joints}
-        if joints is not None:
-            if not isinstance(joints, list | tuple) or sorted(map(str, joints)) != sorted(named):
-                raise InputError(f"joints is {joints!r:.70}, expected all of {', '.join(named)}")
-            self.joints = [named[name] for name in joints]
+        if kind.as_in_file and robot.file_joints:
+            self.joints.sort(key=lambda joint: _way(robot, joint.name))
         self._idx_v = [joint.idx_v for joint in self.joints]
         self.actuation = acting = Actuation(state)
         none = np.zeros(0, dtype=np.intp)
@@ -252,18 +245,14 @@ class ToolCoordinates:
 
 def own_coordinates(state: StateMap, *, moving: bool) -> ToolCoordinates:
     """Return those of a linear model."""
-    return ToolCoordinates(state, Convention("q_b", "xyzw", True, state.axes), moving)
+    return ToolCoordinates(state, Convention("q_b", "xyzw", True, state.axes), moving=moving)
 
 
-def tool_coordinates(
-    robot: Robot, tool: str, joints: Sequence[str] | None, *, moving: bool = False
-) -> ToolCoordinates:
+def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:
     """Return those of a tool."""
     if not isinstance(tool, str) or tool not in TOOLS:
         raise unknown("tool", str(tool), TOOLS)
-    if joints is not None and tool == "pinocchio":
-        raise InputError("pinocchio's joints stand in the order of robot.model; leave joints out")
-    return ToolCoordinates(StateMap(robot), TOOLS[tool], moving, joints)
+    return ToolCoordinates(StateMap(robot), TOOLS[tool], moving=moving)
 
 
 def _centre(robot: Robot) -> pin.SE3:
@@ -273,6 +262,18 @@ def _centre(robot: Robot) -> pin.SE3:
     if piece := pieces_of(robot)[0].get(name):
         return piece.placement
     return pin.SE3(np.eye(3), np.array(robot.model.inertias[ROOT].lever))
+
+
+def _way(robot: Robot, name: str) -> list[int]:
+    """Return where the joints from the root to one stand in the file; what has none comes last."""
+    frames, way, order = robot.model.frames, list[int](), robot.file_joints
+    at = robot.model.getFrameId(name, pin.FrameType.JOINT)
+    while at:
+        frame = frames[at]
+        if frame.type != pin.FrameType.BODY:
+            way.insert(0, order.index(frame.name) if frame.name in order else len(order))
+        at = frame.parentFrame
+    return way
 
 
 def _left(P: Array) -> Array:

@@ -13,10 +13,12 @@ ROBOTS = ("servicer_7dof", "canadarm2", "dual_arm", "cubesat")
 
 
 @pytest.fixture(params=ROBOTS)
-def motion(request):
-    """A robot in motion, turned and pushed."""
-    robot = fflin.load(request.param)
-    return robot, *random_point(robot, np.random.default_rng(11), degrees=80.0)
+def motion(request, tmp_path):
+    """A robot in motion, turned and pushed, and the file that all read."""
+    path = tmp_path / "robot.urdf"
+    path.write_text(plain_urdf(fflin.load(request.param)))
+    robot = fflin.load(path)
+    return robot, path.read_text(), *random_point(robot, np.random.default_rng(11), degrees=80.0)
 
 
 def relative(a, b):
@@ -28,7 +30,8 @@ def last_body(robot, q, v):
     model, data = robot.model, robot.create_data()
     pin.forwardKinematics(model, data, q, v)
     index, axes = model.njoints - 1, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-    name = f"link {model.names[index]}" if index > 1 else BASE
+    bodies = [f for f in model.frames if f.type == pin.FrameType.BODY]
+    name = next(f.name for f in bodies if f.parentJoint == index)
     return name, data.oMi[index], pin.getVelocity(model, data, index, axes)
 
 
@@ -44,8 +47,8 @@ def drake_plant(urdf):
 
 
 def test_drake(motion):
-    robot, q, v, u = motion
-    plant = drake_plant(plain_urdf(robot))
+    robot, urdf, q, v, u = motion
+    plant = drake_plant(urdf)
     from pydrake.systems.framework import OutputPortSelection
     from pydrake.systems.primitives import FirstOrderTaylorApproximation
 
@@ -98,9 +101,9 @@ def mujoco_model(urdf, h):
 
 
 def test_mujoco(motion):
-    robot, q, v, u = motion
+    robot, urdf, q, v, u = motion
     h = 1e-3
-    mujoco, model, data = mujoco_model(plain_urdf(robot), h)
+    mujoco, model, data = mujoco_model(urdf, h)
     lin = fflin.linearize(robot, q, v, u)
     m, nv = lin.to("mujoco", dt=h), model.nv
     data.qpos[:], data.qvel[:], data.qfrc_applied[:] = m.q, m.v, m.u0
@@ -137,7 +140,7 @@ def test_mujoco(motion):
 
 
 def test_pinocchio(motion):
-    robot, q, v, u = motion
+    robot, _, q, v, u = motion
     model, data, nv = robot.model, robot.create_data(), robot.nv
     m = fflin.linearize(robot, q, v, u, frame="world").to("pinocchio")
     pin.computeABADerivatives(model, data, m.q, m.v, m.u0)
@@ -178,7 +181,7 @@ def test_the_order_of_joints_is_what_the_tool_says(tmp_path):
     q, v, u = random_point(robot, np.random.default_rng(2), degrees=40.0)
     lin, order = fflin.linearize(robot, q, v, u), tuple(f"to_{n}" for n in names)
     plant = drake_plant(path.read_text())
-    m = lin.to("drake", joints=order)
+    m = lin.to("drake")
     kinds = {"rad": "q", "m": "x"}
     states = zip(m.state_names[7:11], m.state_units[7:11], strict=True)
     assert plant.GetPositionNames()[7:] == [
@@ -191,5 +194,5 @@ def test_the_order_of_joints_is_what_the_tool_says(tmp_path):
     assert relative(m.f0, rates) < 1e-11
     _, model, _ = mujoco_model(path.read_text(), 1e-3)
     assert [model.joint(i).name for i in range(1, model.njnt)] == list(order)
-    back = fflin.from_tool(robot, "drake", m.q, m.v, m.u0, A=m.A, B=m.B, joints=order)
+    back = fflin.from_tool(robot, "drake", m.q, m.v, m.u0, A=m.A, B=m.B)
     assert relative(back.A, lin.A) < 1e-13 and relative(back.q, lin.q) < 1e-13
