@@ -13,7 +13,7 @@ import pinocchio as pin
 import fflin.base.rotation as turning
 from fflin.base.errors import ChartError, InputError, unknown
 from fflin.base.rotation import quaternion_product, skew
-from fflin.base.validation import NORM_TOLERANCE, Array, is_rotation, vector
+from fflin.base.validation import NORM_TOLERANCE, Array, placement, vector
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import SMALLEST_Q0
 from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR
@@ -25,8 +25,12 @@ from fflin.robot.robot import Robot
 # Along a motion by so little that its square is nothing: derivatives without any difference.
 _STEP = 1e-20j
 
-_STORED = {"wxyz": 4, "xyzw": 4, "matrix": 9, "euler": 3}  # entries of q
-_ANGLES = ("roll", "pitch", "yaw")
+_NAMES = {
+    "wxyz": ("quat.w", "quat.x", "quat.y", "quat.z"),
+    "euler": ("roll", "pitch", "yaw"),
+    "tangent": ("theta.x", "theta.y", "theta.z"),
+}
+_UNITS = {"quat": "1", "p": "m", "v": "m/s"}  # of the others rad
 
 
 class Convention(NamedTuple):
@@ -75,45 +79,41 @@ class ToolCoordinates:
         self._roll = 0 if kind.angular_first else 3  # from angular, linear to the tool's order
         self._world = np.repeat(kind.axes, 3)[:, None]
         self._base = _centre(robot) if kind.at_centre else pin.SE3.Identity()
-        order = np.array([3, 4, 5, 0, 1, 2])  # Pinocchio's is linear, angular
+        swap = np.roll(np.arange(6), 3)  # of Pinocchio's linear, angular
         # Displacements and twists of the tool's base are X y and X nu, wrenches on it X^-T w.
-        self._X: Array = self._base.toActionMatrixInverse()[np.ix_(order, order)]
+        self._X: Array = self._base.toActionMatrixInverse()[np.ix_(swap, swap)]
         followers = [] if own else [follower.joint for follower in robot.followers]
         self.joints = sorted((*robot.joints, *followers), key=lambda joint: joint.idx_v)
         if kind.as_in_file and robot.file_joints:
             self.joints.sort(key=lambda joint: _way(robot, joint.name))
         self._idx_v = [joint.idx_v for joint in self.joints]
         self.actuation = acting = Actuation(state)
-        none = np.zeros(0, dtype=np.intp)
-        torque, force, motors = (acting.groups.get(g, none) for g in ("tau_b", "F_b", "tau_m"))
-        # Of the six of a wrench those that are inputs, and which inputs these are.
-        self._rows = [*range(3)] * bool(torque.size) + [*range(3, 6)] * bool(force.size)
-        self._at = np.concatenate((torque, force))
-        if force.size and not torque.size and self._X[LINEAR, ANGULAR].any():
+        self._wrench = wrench = acting.fixed[:6]  # of the inputs
+        if wrench[LINEAR].any() and not wrench[ANGULAR].any() and self._X[LINEAR, ANGULAR].any():
             raise InputError(
                 "spart's force acts at the root link's centre of mass, and a BaseForce alone takes "
                 "no moment about the link's origin; give the robot a BaseTorque too"
             )
         # Which of the robot's inputs stands where among the tool's.
-        self._inputs = np.arange(len(acting.names))
+        self._inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))
         if not own:
-            self._inputs[np.sort(self._at)] = np.roll(self._at, self._roll)
+            self._inputs[at] = at[np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)]
+            motors = acting.groups.get("tau_m", at[:0])
             places = [f"tau_m.{joint.name}" for joint in self.joints]
             self._inputs[motors] = sorted(motors, key=lambda i: places.index(acting.names[i]))
         self.inputs = {acting.names[i]: acting.units[i] for i in self._inputs}
 
     def states(self) -> dict[str, str]:
         """Return {name: unit} of x'."""
-        kind, found = self.convention, dict[str, str]()
-        attitude = {"wxyz": [f"quat.{i}" for i in "wxyz"], "euler": _ANGLES}.get(kind.attitude)
-        turn = attitude or [f"theta.{i}" for i in "xyz"], "1" if kind.attitude == "wxyz" else "rad"
-        omega = [f"{angle}_rate" for angle in _ANGLES], "rad/s"
-        omega = omega if kind.rates else ([f"omega.{i}" for i in "xyz"], "rad/s")
-        shift, v = (([f"{name}.{i}" for i in "xyz"], of) for name, of in (("p", "m"), ("v", "m/s")))
-        for name, parts, per in (("q_m", (turn, shift), ""), ("qdot_m", (omega, v), "/s")):
-            for names, unit in parts[:: 1 if kind.angular_first else -1]:
-                found |= dict.fromkeys(names, unit)
-            found |= {f"{name}.{joint.name}": f"{joint.unit}{per}" for joint in self.joints}
+        omega = [f"{name}_rate" for name in _NAMES["euler"]]
+        omega = omega if self.convention.rates else ["omega.x", "omega.y", "omega.z"]
+        turn = _NAMES.get(self.convention.attitude, _NAMES["tangent"])
+        pose, twist, found = [*turn, "p.x", "p.y", "p.z"], [*omega, "v.x", "v.y", "v.z"], {}
+        for names, joint_name, angle in ((pose, "q_m", "rad"), (twist, "qdot_m", "rad/s")):
+            for name in np.roll(names, self._roll).tolist():
+                found[name] = _UNITS.get(name.partition(".")[0], angle)
+            for joint in self.joints:
+                found[f"{joint_name}.{joint.name}"] = joint.unit + angle[3:]
         return found
 
     def vectors(self, q: Array, v: Array) -> tuple[Array, Array]:
@@ -133,11 +133,11 @@ class ToolCoordinates:
 
     def to_pinocchio(self, q: Any, v: Any) -> tuple[Array, Array]:
         """Return Pinocchio's q and v of those of the tool; v None is rest."""
-        robot, state, k = self.state.robot, self.state, 3 + _STORED[self.convention.stored]
-        size = 6 + len(self.joints)
+        robot, state, size = self.state.robot, self.state, 6 + len(self.joints)
         v = np.zeros(size) if v is None else vector("v", v, size, "the tool's: base, then joints")
         if self.convention.stored == "xyzw":
             return robot.checked_configuration(q), robot.checked_velocity(v)
+        k = 3 + {"wxyz": 4, "matrix": 9}.get(self.convention.stored, 3)
         q = vector("q", q, k - 6 + size, "the tool's: base, then joints")
         pose, twist = np.roll(q[:k], -self._roll), np.roll(v[:6], -self._roll)
         quaternion, at = self._quaternion(pose[:-3]), pin.neutral(robot.model)
@@ -158,9 +158,8 @@ class ToolCoordinates:
         if self.convention.stored == "euler":
             return pin.Quaternion(pin.rpy.rpyToMatrix(*attitude)).coeffs()
         if self.convention.stored == "matrix":
-            if not is_rotation(R := attitude.reshape(3, 3).T):
-                raise InputError("R0, q[:9] by columns, is no rotation: R^T R and det R must be 1")
-            return pin.Quaternion(R).normalized().coeffs()
+            R0 = placement("R0, q[:9] by columns,", pin.SE3(attitude.reshape(3, 3).T, np.zeros(3)))
+            return pin.SE3ToXYZQUAT(R0)[3:]
         length = float(np.linalg.norm(attitude))
         if abs(length - 1.0) > NORM_TOLERANCE:
             raise InputError(f"the quaternion w, x, y, z has length {length:.9g}, expected 1")
@@ -217,11 +216,10 @@ class ToolCoordinates:
         below = -twists @ P.real[first:, : 6 + n] @ poses
         left = np.block([[poses, np.zeros((6 + n, nv))], [below, twists]])
         # Wrenches.
-        V, H, wrench = np.eye(len(u)), np.zeros((len(u), 12 + 2 * n)), np.zeros(6)
-        V[np.ix_(self._at, self._at)] = (X.T @ self._turn(R).T)[np.ix_(self._rows, self._rows)]
-        wrench[self._rows] = u[self._at]
-        held = X.T @ self._held(np.linalg.solve(X.T, wrench)) @ X[ANGULAR, ANGULAR]
-        H[self._at, :3] = held[self._rows]
+        pick = self._wrench
+        V = np.eye(len(u)) + pick.T @ (X.T @ self._turn(R).T - np.eye(6)) @ pick
+        H = np.zeros((len(u), 12 + 2 * n))
+        H[:, :3] = pick.T @ X.T @ self._held(np.linalg.solve(X.T, pick @ u)) @ X[ANGULAR, ANGULAR]
         return Slopes(P.real, P.imag / _STEP.imag, left, V[:, self._inputs], H, extra)
 
     def _of_base(self, quaternion: Any, nu: Any, went: Any) -> tuple[Array, Array, Array]:
