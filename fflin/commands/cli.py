@@ -42,18 +42,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Returns
-    -------
-    int
-        0 done; 1 a check fell short; 2 bad input.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        On Ctrl-C.
-    """
+    """Run the command line; return 0 done, 1 a check fell short, 2 bad input."""
     # What other packages warn of is shown at the end of what went well: an error says why.
     held: list[str] = []
     told: set[str] = set()  # each once, however many models a command makes

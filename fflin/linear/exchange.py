@@ -20,26 +20,21 @@ from fflin.linear.tool_coordinates import Slopes, own_coordinates, tool_coordina
 from fflin.robot.robot import Robot
 
 _LONGEST = 1e3  # [s]
-
-# Of the largest entry, what another route to a matrix may differ by and be the same.
-_ROUNDING = 1e-12
+_ROUNDING = 1e-12  # of the largest entry, by which another route to a matrix may miss a zero
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ToolModel(Design):
     r"""A linear model in another tool's coordinates, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
 
-    The output is ``y = y0 + C (x - x0) + D (u - u0)``; for ``dt > 0`` the left side is the next
-    sample's ``x - x0``. x is q and v of the tool. Where q is a manifold to it (mujoco, pinocchio,
-    spart) the displacement from the point's q, in the order of v, stands for it.
+    x is q and v of the tool. Where its q is a manifold (mujoco, pinocchio, spart) the displacement
+    from the point, in the order of v, stands for q.
 
     Attributes
     ----------
-    tool : str
-    A, B, C, D, f0, x0, u0, y0, dt
+    tool, robot : str
+    A, B, C, D, f0, x0, u0, y0, dt, state_names, ..., output_units
         As of `LinearModel`.
-    state_names, input_names, output_names : tuple of str
-    state_units, input_units, output_units : tuple of str
     T : ndarray (nx, 12 + 2n)
         From deviations of the state of the `LinearModel` to those of x.
     T_left : ndarray (12 + 2n, nx)
@@ -48,7 +43,6 @@ class ToolModel(Design):
         Likewise of the input: with a gain K of the `LinearModel` ``T_u K T_left`` is the tool's.
     q, v : ndarray
         The point as the tool has it.
-    robot : str
     reference : str
         "fixed", or "moving" where x is the deviation from what moves through the point.
     """
@@ -56,6 +50,7 @@ class ToolModel(Design):
     VECTORS: ClassVar = ("f0", "x0", "u0", "y0", "q", "v")
 
     tool: str
+    robot: str
     A: Array
     B: Array
     C: Array
@@ -76,13 +71,11 @@ class ToolModel(Design):
     T_u: Array
     q: Array
     v: Array
-    robot: str
     reference: str
 
     def __repr__(self) -> str:
-        nx, nu = self.B.shape
         time = f"dt={self.dt:g} s" if self.dt else "continuous"
-        return f"ToolModel('{self.robot}', tool='{self.tool}', nx={nx}, nu={nu}, {time})"
+        return f"ToolModel('{self.robot}', tool='{self.tool}', nx={len(self.A)}, {time})"
 
 
 def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = None) -> ToolModel:
@@ -112,7 +105,7 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     Raises
     ------
     InputError
-        If the model is not of this robot or is sampled and from a file, or an option does not suit.
+        If the model is not of this robot or is sampled and from a file, or `dt` does not suit.
     UnknownNameError
         If there is no such tool.
     ChartError
@@ -121,27 +114,23 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     instance("robot", robot, Robot, "a fflin.Robot")
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
     require_fit(lin, robot, StateMap(robot, frame=lin.frame))
-    sampled, whole = lin.dt, lin.generator
-    step = None if dt is None else _step(tool, dt)
+    sampled, whole, step = lin.dt, lin.generator, _step(tool, dt)
     if whole is None or (step and sampled):
         raise InputError("the model is sampled; transform the continuous one that it was made of")
     lin, bridge = whole, _Bridge(robot, whole, tool)
     own, to, kind = bridge.own, bridge.to, bridge.kind
     A, B = carried(own, to, lin.A, lin.B)
-    q, v = kind.vectors(lin.q, lin.v)
-    states, tangent = kind.states(), kind.convention.attitude in ("turn", "pose")
-    x0 = np.concatenate((np.zeros(len(v)) if tangent else q, v))
+    (q, v), states, rate = kind.vectors(lin.q, lin.v), kind.states(), to.P @ bridge.rates
+    x0 = np.concatenate((np.zeros(len(v)) if kind.tangent else q, v))
     C, D, y0, outputs = np.eye(len(A)), np.zeros(B.shape), x0, states
     if lin.output_names != lin.state_names:
         D = lin.D @ np.linalg.inv(own.V)
         C, D = (lin.C @ own.P + D @ (to.H - own.H)) @ to.left, D @ to.V
         y0, outputs = lin.y0, dict(zip(lin.output_names, lin.output_units, strict=True))
-    rate = to.P @ bridge.rates
-    f0 = rate * (not lin.moving)
     if step:
-        A, B, after = _stepped(A, B, rate, step)
-        f0 = after * (not lin.moving)
-    elif sampled:
+        A, B, rate = _stepped(A, B, rate, step)
+    f0 = rate * (not lin.moving)
+    if sampled:
         A, held = held_exponential(A, np.column_stack((B, f0)), sampled)
         B, f0 = held[:, :-1], held[:, -1]
     fields: dict[str, Any] = {"q": q, "v": v, "T": bridge.T, "T_left": own.P @ to.left}
@@ -202,7 +191,7 @@ def from_tool(
     instance("robot", robot, Robot, "a fflin.Robot")
     q, v = tool_coordinates(robot, tool).to_pinocchio(q, v)
     place: Any = {"frame": frame, "reference": reference, "moving": moving}
-    lin = linearize(robot, q, v, **place)
+    lin, step = linearize(robot, q, v, **place), _step(tool, dt)
     if u is not None:
         u = vector("u", u, len(lin.u0), "the robot's inputs, as the tool has them")
         u = np.linalg.solve(_Bridge(robot, lin, tool).T_u, u)
@@ -211,19 +200,15 @@ def from_tool(
         return lin
     bridge = _Bridge(robot, lin, tool)
     own, to = bridge.own, bridge.to
-    ours, h = carried(own, to, lin.A, lin.B), None if dt is None else _step(tool, dt)
-    if h:
-        ours = _stepped(*ours, to.P @ bridge.rates, h)[:2]
-    changes = [
-        np.zeros(expected.shape) if given is None else _change(name, given, expected)
-        for name, given, expected in zip("AB", (A, B), ours, strict=True)
-    ]
-    if h:  # the rows of positions follow from those of rates
-        nv = len(changes[0]) // 2
-        changes = [np.vstack((0.0 * change[:nv], change[nv:] / h)) for change in changes]
+    ours = carried(own, to, lin.A, lin.B)
+    if step:
+        ours = _stepped(*ours, to.P @ bridge.rates, step)[:2]
+    changes = [_change(*each) for each in zip("AB", (A, B), ours, strict=True)]
+    if step:  # the rows of positions follow from those of rates
+        nv = len(ours[0]) // 2
+        changes = [np.vstack((0.0 * each[:nv], each[nv:] / step)) for each in changes]
     own, to = (each._replace(rate=0.0 * each.rate, extra=0.0 * each.extra) for each in (own, to))
     A, B = (
-        # A zero is no rounding.
         np.where((old == 0.0) & (np.abs(new) < _ROUNDING * np.abs(old).max()), 0.0, old + new)
         for old, new in zip((lin.A, lin.B), carried(to, own, *changes), strict=True)
     )
@@ -257,29 +242,28 @@ def carried(source: Slopes, to: Slopes, A: Array, B: Array) -> tuple[Array, Arra
 
 
 def _step(tool: str, dt: Any) -> float:
-    if not 0.0 < (h := number("dt", dt)) < _LONGEST or str(tool) != "mujoco":
+    """Return a time step, 0 where there is none."""
+    h = 0.0 if dt is None else number("dt", dt)
+    if dt is not None and (not 0.0 < h < _LONGEST or str(tool) != "mujoco"):
         raise InputError(f"dt is {h:g} s for {tool}, expected a step of mujoco")
     return h
 
 
 def _stepped(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
     """Return A, B and f0 of a step of semi-implicit Euler (14.6); of the base linear, angular."""
-    nv = len(rate) // 2
-    v, a = rate[:nv], rate[nv:]
-    moved = h * (v + h * a)
+    v, a = np.split(rate, 2)
+    nv, moved = len(v), h * (v + h * a)
     K, G = np.eye(nv), h * np.eye(nv)
     K[3:6, 3:6], G[3:6, 3:6] = pin.exp3(-moved[3:6]), h * pin.Jexp3(moved[3:6])
-    A, B = h * A[nv:], h * B[nv:]
-    A[:, nv:] += np.eye(nv)
+    A, B = h * A[nv:] + np.eye(nv, 2 * nv, nv), h * B[nv:]
     A, B = np.vstack((G @ A, A)), np.vstack((G @ B, B))
     A[:nv, :nv] += K
     return A, B, np.concatenate((moved, h * a))
 
 
-def _change(name: str, value: Any, expected: Array) -> Array:
+def _change(name: str, given: Any, expected: Array) -> Array:
     """Return by how much a matrix of the caller is more than expected."""
-    array = as_double(name, value)
+    array = expected if given is None else as_double(name, given)
     if array.shape != expected.shape or not np.isfinite(array).all():
         raise InputError(f"{name} has shape {array.shape}, expected finite {expected.shape}")
-    change: Array = array - expected
-    return change
+    return np.asarray(array - expected)

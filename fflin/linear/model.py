@@ -133,14 +133,7 @@ class LinearModel(FrozenArrays):
 
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> LinearModel:
-        """Return a model whose fields are given; its arrays must be read-only and stay so.
-
-        Parameters
-        ----------
-        values : dict
-            Every field by its name. What it has under ``_when_asked`` is {name of a field:
-            function of q} for those that are made when they are asked for.
-        """
+        """Return a model of fields, or under ``_when_asked`` functions of q; arrays stay as they are."""
         # The generated __init__ sets two dozen frozen fields one by one, which takes as long
         # as the dynamics of a small robot.
         lin = _new(cls)
@@ -303,13 +296,7 @@ class LinearModel(FrozenArrays):
         return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))
 
     def to(self, tool: str, *, dt: float | None = None) -> ToolModel:
-        """Return the model in the coordinates of another tool: `transform` of its own robot.
-
-        Raises
-        ------
-        InputError
-            If the model is from a file, so that its robot is not known; or as `transform`.
-        """
+        """Return the model in another tool's coordinates: `transform`, of the robot it is made of."""
         from fflin import transform
 
         if self._robot is None:

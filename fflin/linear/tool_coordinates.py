@@ -1,7 +1,4 @@
-"""How tools write pose, twist and wrench of a free flyer, and the slopes of such coordinates.
-
-A `Convention` says it once; names, vectors and slopes come from it.
-"""
+"""How tools write a free flyer, said in a line of `TOOLS`, and the slopes of such coordinates."""
 
 from __future__ import annotations
 
@@ -25,35 +22,26 @@ from fflin.robot.robot import Robot
 # Along a motion by so little that its square is nothing: derivatives without any difference.
 _STEP = 1e-20j
 
-_NAMES = {
-    "wxyz": ("quat.w", "quat.x", "quat.y", "quat.z"),
-    "euler": ("roll", "pitch", "yaw"),
-    "tangent": ("theta.x", "theta.y", "theta.z"),
-}
-_UNITS = {"quat": "1", "p": "m", "v": "m/s"}  # of the others rad
+_NAMES = {"wxyz": ["quat.w", "quat.x", "quat.y", "quat.z"], "euler": ["roll", "pitch", "yaw"]}
+_UNITS = {"quat": "1", "p": "m", "v": "m/s"}  # of the others rad and rad/s
 
 
 class Convention(NamedTuple):
     """How a tool writes a free flyer."""
 
-    # In x "wxyz", "q_b", "euler", or a tangent: a "turn" in base axes, or "pose", the logarithm of
-    # the whole displacement; and in q.
-    attitude: str
-    stored: str
+    attitude: str  # in x: "wxyz", "q_b", "euler", or a tangent: "turn", or "pose" with the position
+    stored: str  # in q
     angular_first: bool
     axes: tuple[bool, bool]  # whether (omega, v), and (torque, force), stand in the world's axes
     at_centre: bool = False  # of the root link's own mass, in the axes that its inertia has
     rates: bool = False  # of the angles in place of omega
-    as_in_file: bool = False  # joints, depth first; else as in `Robot.model`
 
 
 TOOLS = {
-    "drake": Convention("wxyz", "wxyz", True, IN_REFERENCE_AXES["world"], as_in_file=True),
-    "mujoco": Convention("turn", "wxyz", False, IN_REFERENCE_AXES["hybrid"], as_in_file=True),
+    "drake": Convention("wxyz", "wxyz", True, IN_REFERENCE_AXES["world"]),
+    "mujoco": Convention("turn", "wxyz", False, IN_REFERENCE_AXES["hybrid"]),
     "pinocchio": Convention("pose", "xyzw", False, IN_REFERENCE_AXES["local"]),
-    "spart": Convention(
-        "turn", "matrix", True, IN_REFERENCE_AXES["hybrid"], at_centre=True, as_in_file=True
-    ),
+    "spart": Convention("turn", "matrix", True, IN_REFERENCE_AXES["hybrid"], at_centre=True),
     "euler": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"]),
     "euler_rates": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"], rates=True),
 }
@@ -76,6 +64,7 @@ class ToolCoordinates:
     def __init__(self, state: StateMap, kind: Convention, *, moving: bool = False) -> None:
         robot, own = state.robot, kind.attitude == "q_b"
         self.state, self.convention, self._moving = state, kind, moving
+        self.tangent = kind.attitude in ("turn", "pose")
         self._roll = 0 if kind.angular_first else 3  # from angular, linear to the tool's order
         self._world = np.repeat(kind.axes, 3)[:, None]
         self._base = _centre(robot) if kind.at_centre else pin.SE3.Identity()
@@ -84,7 +73,7 @@ class ToolCoordinates:
         self._X: Array = self._base.toActionMatrixInverse()[np.ix_(swap, swap)]
         followers = [] if own else [follower.joint for follower in robot.followers]
         self.joints = sorted((*robot.joints, *followers), key=lambda joint: joint.idx_v)
-        if kind.as_in_file and robot.file_joints:
+        if kind.stored in ("wxyz", "matrix") and robot.file_joints:
             self.joints.sort(key=lambda joint: _way(robot, joint.name))
         self._idx_v = [joint.idx_v for joint in self.joints]
         self.actuation = acting = Actuation(state)
@@ -105,15 +94,16 @@ class ToolCoordinates:
 
     def states(self) -> dict[str, str]:
         """Return {name: unit} of x'."""
-        omega = [f"{name}_rate" for name in _NAMES["euler"]]
-        omega = omega if self.convention.rates else ["omega.x", "omega.y", "omega.z"]
-        turn = _NAMES.get(self.convention.attitude, _NAMES["tangent"])
-        pose, twist, found = [*turn, "p.x", "p.y", "p.z"], [*omega, "v.x", "v.y", "v.z"], {}
+        turn = _NAMES.get(self.convention.attitude, ["theta.x", "theta.y", "theta.z"])
+        omega = ["omega.x", "omega.y", "omega.z"]
+        if self.convention.rates:
+            omega = [f"{name}_rate" for name in turn]
+        found: dict[str, str] = {}
+        pose, twist = [*turn, "p.x", "p.y", "p.z"], [*omega, "v.x", "v.y", "v.z"]
         for names, joint_name, angle in ((pose, "q_m", "rad"), (twist, "qdot_m", "rad/s")):
-            for name in np.roll(names, self._roll).tolist():
-                found[name] = _UNITS.get(name.partition(".")[0], angle)
-            for joint in self.joints:
-                found[f"{joint_name}.{joint.name}"] = joint.unit + angle[3:]
+            base = np.roll(names, self._roll).tolist()
+            found |= {name: _UNITS.get(name.partition(".")[0], angle) for name in base}
+            found |= {f"{joint_name}.{j.name}": j.unit + angle[3:] for j in self.joints}
         return found
 
     def vectors(self, q: Array, v: Array) -> tuple[Array, Array]:
@@ -140,12 +130,9 @@ class ToolCoordinates:
         k = 3 + {"wxyz": 4, "matrix": 9}.get(self.convention.stored, 3)
         q = vector("q", q, k - 6 + size, "the tool's: base, then joints")
         pose, twist = np.roll(q[:k], -self._roll), np.roll(v[:6], -self._roll)
-        quaternion, at = self._quaternion(pose[:-3]), pin.neutral(robot.model)
-        R = turning.rotation_matrix(quaternion)
-        at[:3] = state.origin.actInv(pin.SE3(R, pose[-3:]) * self._base.inverse()).translation
-        at[3:7] = quaternion_product(turning.conjugate(state.origin_quaternion), quaternion)
-        base = turning.conjugate(pin.SE3ToXYZQUAT(self._base)[3:])
-        at[3:7] = quaternion_product(at[3:7], base)
+        R, at = self._rotation(pose[:-3]), pin.neutral(robot.model)
+        base = pin.SE3(R, pose[-3:]) * self._base.inverse()
+        at[:7] = pin.SE3ToXYZQUAT(state.origin.actInv(base))
         for joint, value in zip(self.joints, q[k:].tolist(), strict=True):
             joint.place(at, value)
         nu = np.linalg.solve(self._twist(R) @ self._X, twist)
@@ -153,17 +140,17 @@ class ToolCoordinates:
         speed[self._idx_v] = v[6:]
         return robot.checked_configuration(at), robot.checked_velocity(speed)
 
-    def _quaternion(self, attitude: Array) -> Array:
-        """Return the quaternion x, y, z, w of an attitude as it is stored."""
+    def _rotation(self, attitude: Array) -> Array:
+        """Return the rotation (3, 3) of an attitude as it is stored."""
         if self.convention.stored == "euler":
-            return pin.Quaternion(pin.rpy.rpyToMatrix(*attitude)).coeffs()
+            return pin.rpy.rpyToMatrix(*attitude)
         if self.convention.stored == "matrix":
-            R0 = placement("R0, q[:9] by columns,", pin.SE3(attitude.reshape(3, 3).T, np.zeros(3)))
-            return pin.SE3ToXYZQUAT(R0)[3:]
+            R0 = pin.SE3(attitude.reshape(3, 3).T, np.zeros(3))
+            return placement("R0, q[:9] by columns,", R0).rotation
         length = float(np.linalg.norm(attitude))
         if abs(length - 1.0) > NORM_TOLERANCE:
             raise InputError(f"the quaternion w, x, y, z has length {length:.9g}, expected 1")
-        return np.roll(attitude, -1) / length
+        return turning.rotation_matrix(np.roll(attitude, -1) / length)
 
     def _attitude(self, q: Array) -> tuple[Array, Array]:
         """Return the quaternion x, y, z, w and the rotation that x' is about."""
@@ -194,12 +181,10 @@ class ToolCoordinates:
         """Return the slopes at a point; nu (6 + n,), its rates and u (nu,) are in base axes."""
         n, nv, X, moves = self.state.robot.n, 6 + len(self.joints), self._X, self._X @ nu[:6]
         still, R = self._attitude(q)
+        # Errors and tangents move along with a reference that moves.
+        follows = self._moving and self.convention.attitude == "q_b"
         turns = 0.5 * turning.product_matrix(still) @ np.append(moves[ANGULAR], 0.0)
-        # With a moving reference errors and tangents move along.
-        ahead = (
-            still + (0.0 if self._moving and self.convention.attitude == "q_b" else _STEP) * turns
-        )
-        went = (0.0 if self._moving else _STEP) * moves
+        ahead, went = still + (not follows) * _STEP * turns, (not self._moving) * _STEP * moves
         pose, by_turn, by_twist = self._of_base(ahead, moves + _STEP * (X @ rates[:6]), went)
         k, first = len(pose), len(pose) - 6 + nv
         P = np.zeros((first + nv, 12 + 2 * n), dtype=complex)
@@ -209,13 +194,12 @@ class ToolCoordinates:
         of_joints = self.state.spread(np.eye(6 + n))[6:, self._idx_v].T
         P[k:first, 6 : 6 + n] = P[first + 6 :, 12 + n :] = of_joints
         extra = np.zeros((len(P), len(P)))
-        if self.convention.attitude == "wxyz":
+        if k == 7:
             extra[:4, :4] = np.outer(np.roll(turns, 1), np.roll(still, 1))
         # By blocks, so that zeros stay zeros.
         poses, twists = _left(P.real[:first, : 6 + n]), _left(P.real[first:, 6 + n :])
         below = -twists @ P.real[first:, : 6 + n] @ poses
         left = np.block([[poses, np.zeros((6 + n, nv))], [below, twists]])
-        # Wrenches.
         pick = self._wrench
         V = np.eye(len(u)) + pick.T @ (X.T @ self._turn(R).T - np.eye(6)) @ pick
         H = np.zeros((len(u), 12 + 2 * n))
@@ -267,10 +251,8 @@ def _way(robot: Robot, name: str) -> list[int]:
     frames, way, order = robot.model.frames, list[int](), robot.file_joints
     at = robot.model.getFrameId(name, pin.FrameType.JOINT)
     while at:
-        frame = frames[at]
-        if frame.type != pin.FrameType.BODY:
-            way.insert(0, order.index(frame.name) if frame.name in order else len(order))
-        at = frame.parentFrame
+        name, at = frames[at].name, frames[at].parentFrame
+        way.insert(0, order.index(name) if name in order else len(order))
     return way
 
 

@@ -372,4 +372,4 @@ def test_a_body_without_joints_and_files(tmp_path):
         loaded = fflin.ToolModel.load(tmp_path / f"{tool}.mat")
         for key in ("A", "B", "T", "T_left", "T_u", "q", "v", "x0"):
             assert np.array_equal(getattr(loaded, key), getattr(m, key)), key
-        assert loaded.state_names == m.state_names and loaded.tool == tool and "nu=6" in repr(m)
+        assert loaded.state_names == m.state_names and loaded.tool == tool and "nx=1" in repr(m)
