@@ -133,7 +133,7 @@ class LinearModel(FrozenArrays):
 
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> LinearModel:
-        """Return a model of fields, or under ``_when_asked`` functions of q; arrays stay as they are."""
+        """Return a model of fields, under ``_when_asked`` functions of q; arrays stay as they are."""
         # The generated __init__ sets two dozen frozen fields one by one, which takes as long
         # as the dynamics of a small robot.
         lin = _new(cls)
@@ -296,7 +296,7 @@ class LinearModel(FrozenArrays):
         return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))
 
     def to(self, tool: str, *, dt: float | None = None) -> ToolModel:
-        """Return the model in another tool's coordinates: `transform`, of the robot it is made of."""
+        """Return the model in another tool's coordinates: `transform`, of its own robot."""
         from fflin import transform
 
         if self._robot is None:
