@@ -95,11 +95,10 @@ def _linearize(arguments: argparse.Namespace) -> int:
     if arguments.trajectory:
         return linearize_along(arguments)
     if arguments.output_file:
-        from fflin.base import record
         from fflin.base.writing import check_place
         from fflin.linear.files import FORMATS
 
-        check_place(arguments.output_file, record.FORMATS if arguments.tool else FORMATS)
+        check_place(arguments.output_file, FORMATS)
     check_figure(arguments.plot)
     _, lin = linear_model(arguments)
     if arguments.dt is not None:

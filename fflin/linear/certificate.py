@@ -62,7 +62,7 @@ def aba_route(
     at_origin = q.copy()
     at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
-    there = own.slopes(q, nu, state.velocities(aba.acceleration(at_origin, v, u)), u)
+    there = own.slopes(q, nu, u, state.velocities(aba.acceleration(at_origin, v, u)))
     # The tangent of what moves on turns with it.
     A, B = np.zeros((state.nx, state.nx)), np.zeros((state.nx, len(u)))
     A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = -skew(nu[ANGULAR])

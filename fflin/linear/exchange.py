@@ -16,7 +16,12 @@ from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
 from fflin.linear.sampling import held_exponential
-from fflin.linear.tool_coordinates import Slopes, own_coordinates, tool_coordinates
+from fflin.linear.tool_coordinates import (
+    Slopes,
+    ToolCoordinates,
+    own_coordinates,
+    tool_coordinates,
+)
 from fflin.robot.robot import Robot
 
 _LONGEST = 1e3  # [s]
@@ -111,16 +116,14 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     ChartError
         If the pitch of Euler's angles is 90 deg.
     """
-    instance("robot", robot, Robot, "a fflin.Robot")
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
     require_fit(lin, robot, StateMap(robot, frame=lin.frame))
     sampled, whole, step = lin.dt, lin.generator, _step(tool, dt)
     if whole is None or (step and sampled):
         raise InputError("the model is sampled; transform the continuous one that it was made of")
-    lin, bridge = whole, _Bridge(robot, whole, tool)
-    own, to, kind = bridge.own, bridge.to, bridge.kind
+    lin, (kind, own, to, rates) = whole, _bridge(robot, whole, tool)
     A, B = carried(own, to, lin.A, lin.B)
-    (q, v), states, rate = kind.vectors(lin.q, lin.v), kind.states(), to.P @ bridge.rates
+    (q, v), states, rate = kind.vectors(lin.q, lin.v), kind.states(), to.P @ rates
     x0 = np.concatenate((np.zeros(len(v)) if kind.tangent else q, v))
     C, D, y0, outputs = np.eye(len(A)), np.zeros(B.shape), x0, states
     if lin.output_names != lin.state_names:
@@ -133,13 +136,13 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     if sampled:
         A, held = held_exponential(A, np.column_stack((B, f0)), sampled)
         B, f0 = held[:, :-1], held[:, -1]
-    fields: dict[str, Any] = {"q": q, "v": v, "T": bridge.T, "T_left": own.P @ to.left}
+    T_u, about = np.linalg.solve(to.V, own.V), "moving" if lin.moving else "fixed"
+    fields: dict[str, Any] = {"tool": tool, "robot": lin.robot, "reference": about}
     for signal, units in (("state", states), ("input", kind.inputs), ("output", outputs)):
         fields |= {f"{signal}_names": tuple(units), f"{signal}_units": tuple(units.values())}
-    fields |= {"f0": f0, "x0": x0, "u0": bridge.T_u @ lin.u0, "y0": y0, "T_u": bridge.T_u}
+    fields |= {"q": q, "v": v, "T": to.P @ own.left, "T_left": own.P @ to.left, "T_u": T_u}
     fields |= {"A": A, "B": B, "C": C, "D": D, "dt": step or sampled, "verified": lin.verified}
-    about = "moving" if lin.moving else "fixed"
-    return ToolModel(tool=tool, robot=lin.robot, reference=about, **fields)
+    return ToolModel(f0=f0, x0=x0, u0=T_u @ lin.u0, y0=y0, **fields)
 
 
 def from_tool(
@@ -188,21 +191,19 @@ def from_tool(
     ChartError
         If the base is turned by 180 deg from the reference, or as `transform`.
     """
-    instance("robot", robot, Robot, "a fflin.Robot")
     q, v = tool_coordinates(robot, tool).to_pinocchio(q, v)
     place: Any = {"frame": frame, "reference": reference, "moving": moving}
     lin, step = linearize(robot, q, v, **place), _step(tool, dt)
     if u is not None:
         u = vector("u", u, len(lin.u0), "the robot's inputs, as the tool has them")
-        u = np.linalg.solve(_Bridge(robot, lin, tool).T_u, u)
-        lin = linearize(robot, q, v, u, **place)
+        _, own, to, _ = _bridge(robot, lin, tool)
+        lin = linearize(robot, q, v, np.linalg.solve(own.V, to.V @ u), **place)
     if A is None and B is None:
         return lin
-    bridge = _Bridge(robot, lin, tool)
-    own, to = bridge.own, bridge.to
+    _, own, to, rates = _bridge(robot, lin, tool)
     ours = carried(own, to, lin.A, lin.B)
     if step:
-        ours = _stepped(*ours, to.P @ bridge.rates, step)[:2]
+        ours = _stepped(*ours, to.P @ rates, step)[:2]
     changes = [_change(*each) for each in zip("AB", (A, B), ours, strict=True)]
     if step:  # the rows of positions follow from those of rates
         nv = len(ours[0]) // 2
@@ -215,23 +216,21 @@ def from_tool(
     return replace(lin, A=A, B=B)
 
 
-class _Bridge:
-    """Between a linear model's coordinates and a tool's, at the model's point."""
-
-    def __init__(self, robot: Robot, lin: LinearModel, tool: str) -> None:
-        state = StateMap(robot, reference=lin.reference, frame=lin.frame)
-        if lin.state_names != state.names:
-            raise InputError("lin has not all states of the robot; take the whole model of it")
-        own = own_coordinates(state, moving=lin.moving)
-        self.kind = tool_coordinates(robot, tool, moving=lin.moving)
-        q, nu, rates = lin.q, state.velocities(lin.v), lin.drift
-        u = own.actuation.in_base_axes(state.chart(q), lin.u0)
-        if rates is None:  # f0 is P times the rate of y
-            rates = own.slopes(q, nu, 0.0 * nu, u).left @ lin.f0
-        self.rates = np.concatenate((nu, rates[len(nu) :]))
-        self.own, self.to = (each.slopes(q, nu, rates[len(nu) :], u) for each in (own, self.kind))
-        self.T = self.to.P @ self.own.left
-        self.T_u = np.linalg.solve(self.to.V, self.own.V)
+def _bridge(
+    robot: Robot, lin: LinearModel, tool: str
+) -> tuple[ToolCoordinates, Slopes, Slopes, Array]:
+    """Return a tool's coordinates, the slopes of a model's own and of these, and the rate of y."""
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    if lin.state_names != state.names:
+        raise InputError("lin has not all states of the robot; take the whole model of it")
+    own = own_coordinates(state, moving=lin.moving)
+    kind = tool_coordinates(robot, tool, moving=lin.moving)
+    nu, rates = state.velocities(lin.v), lin.drift
+    point = lin.q, nu, own.actuation.in_base_axes(state.chart(lin.q), lin.u0)
+    if rates is None:  # f0 is P times the rate of y
+        rates = own.slopes(*point, 0.0 * nu).left @ lin.f0
+    rates = rates[len(nu) :]
+    return kind, own.slopes(*point, rates), kind.slopes(*point, rates), np.append(nu, rates)
 
 
 def carried(source: Slopes, to: Slopes, A: Array, B: Array) -> tuple[Array, Array]:

@@ -133,7 +133,7 @@ class LinearModel(FrozenArrays):
 
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> LinearModel:
-        """Return a model of fields, under ``_when_asked`` functions of q; arrays stay as they are."""
+        """Return a model of fields; those under ``_when_asked`` are functions of q."""
         # The generated __init__ sets two dozen frozen fields one by one, which takes as long
         # as the dynamics of a small robot.
         lin = _new(cls)

@@ -115,7 +115,7 @@ class ToolCoordinates:
         at = pin.SE3(self.state.rotation(q), self.state.positions(q)) * self._base
         attitude = np.roll(attitude, 1) if stored == "wxyz" else R.T.ravel()  # column by column
         pose = np.concatenate((_angles(R) if stored == "euler" else attitude, at.translation))
-        twist = self._twist(R) @ self._X @ self.state.velocities(v)[:6]
+        twist = self._turn(R, rates=self.convention.rates) @ self._X @ self.state.velocities(v)[:6]
         joints = [joint.value(q) for joint in self.joints]
         parts = (pose, joints), (twist, v[self._idx_v])
         q, v = (np.concatenate((np.roll(base, self._roll), rest)) for base, rest in parts)
@@ -135,7 +135,7 @@ class ToolCoordinates:
         at[:7] = pin.SE3ToXYZQUAT(state.origin.actInv(base))
         for joint, value in zip(self.joints, q[k:].tolist(), strict=True):
             joint.place(at, value)
-        nu = np.linalg.solve(self._twist(R) @ self._X, twist)
+        nu = np.linalg.solve(self._turn(R, rates=self.convention.rates) @ self._X, twist)
         speed = state.spread(np.concatenate((nu, np.zeros(robot.n))))
         speed[self._idx_v] = v[6:]
         return robot.checked_configuration(at), robot.checked_velocity(speed)
@@ -162,14 +162,10 @@ class ToolCoordinates:
             quaternion = np.array((0.0, 0.0, 0.0, 1.0)) if self._moving else quaternion
         return quaternion, turning.rotation_matrix(quaternion)
 
-    def _turn(self, R: Array) -> Array:
-        """Return the matrix (6, 6) that takes a wrench in base axes to the tool's axes."""
-        return np.where(self._world, np.kron(np.eye(2), R), np.eye(6))
-
-    def _twist(self, R: Array) -> Array:
-        """Return the matrix (6, 6) that takes a twist in base axes to the tool's."""
-        turn = self._turn(R)
-        if self.convention.rates:
+    def _turn(self, R: Array, *, rates: bool = False) -> Array:
+        """Return the matrix (6, 6) that takes a twist or wrench in base axes to the tool's."""
+        turn = np.where(self._world, np.kron(np.eye(2), R), np.eye(6))
+        if rates:
             turn[ANGULAR, ANGULAR] = _of_angles(_angles(R))[0]
         return turn
 
@@ -177,20 +173,36 @@ class ToolCoordinates:
         """Return the slopes (6, 3) over a turn of what is held in the world, in base axes (4.4)."""
         return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
 
-    def slopes(self, q: Array, nu: Array, rates: Array, u: Array) -> Slopes:
-        """Return the slopes at a point; nu (6 + n,), its rates and u (nu,) are in base axes."""
-        n, nv, X, moves = self.state.robot.n, 6 + len(self.joints), self._X, self._X @ nu[:6]
-        still, R = self._attitude(q)
-        # Errors and tangents move along with a reference that moves.
-        follows = self._moving and self.convention.attitude == "q_b"
-        turns = 0.5 * turning.product_matrix(still) @ np.append(moves[ANGULAR], 0.0)
-        ahead, went = still + (not follows) * _STEP * turns, (not self._moving) * _STEP * moves
-        pose, by_turn, by_twist = self._of_base(ahead, moves + _STEP * (X @ rates[:6]), went)
-        k, first = len(pose), len(pose) - 6 + nv
+    def slopes(self, q: Array, nu: Array, u: Array, rates: Array) -> Slopes:
+        """Return the slopes at a point; nu (6 + n,), u (nu,), rates of nu (6 + n,) in base axes."""
+        n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
+        still, R_now = self._attitude(q)
+        # A step along the motion; errors and tangents go along with a reference that moves.
+        twist: Any = X @ nu[:6] + _STEP * (X @ rates[:6])
+        went = (not self._moving) * _STEP * twist.real
+        turns = 0.5 * turning.product_matrix(still) @ np.append(twist.real[ANGULAR], 0.0)
+        quaternion = still + (not (self._moving and kind.attitude == "q_b")) * _STEP * turns
+        R, w, vec = turning.rotation_matrix(quaternion), quaternion[3], quaternion[:3]
+        by_turn = -self._turn(R) @ self._held(twist)
+        attitude: Any = np.eye(3) + 0.5 * skew(went[ANGULAR])
+        if kind.attitude == "euler":
+            attitude, bends = _of_angles(_angles(R), twist[ANGULAR])
+            by_turn[ANGULAR] = kind.rates * bends @ attitude
+        elif not self.tangent:
+            attitude = 0.5 * (w * np.eye(3) + skew(vec))
+            if kind.attitude == "wxyz":
+                attitude = np.vstack((-0.5 * vec, attitude))
+        k = len(attitude) + 3
+        base = np.zeros((k + 6, 12), dtype=complex)  # over (theta, p), (omega, v)
+        base[: k - 3, :3], base[k - 3 : k, 3:6] = attitude, R
+        if kind.attitude == "pose":
+            base[k - 3 : k, :6] = np.hstack((0.5 * skew(went[LINEAR]), attitude))
+        base[k:, :3], base[k:, 6:] = by_turn, self._turn(R, rates=kind.rates)
+        base[:k], base[k:] = (np.roll(rows, self._roll, axis=0) for rows in (base[:k], base[k:]))
+        first = k + nv - 6
         P = np.zeros((first + nv, 12 + 2 * n), dtype=complex)
-        P[:k, :6] = np.roll(pose @ X, self._roll, axis=0)
-        P[first : first + 6, :3] = np.roll(by_turn @ X[ANGULAR, ANGULAR], self._roll, axis=0)
-        P[first : first + 6, 6 + n : 12 + n] = np.roll(by_twist @ X, self._roll, axis=0)
+        rows, columns = [*range(k), *range(first, first + 6)], [*range(6), *range(6 + n, 12 + n)]
+        P[np.ix_(rows, columns)] = base @ np.kron(np.eye(2), X)
         of_joints = self.state.spread(np.eye(6 + n))[6:, self._idx_v].T
         P[k:first, 6 : 6 + n] = P[first + 6 :, 12 + n :] = of_joints
         extra = np.zeros((len(P), len(P)))
@@ -200,29 +212,10 @@ class ToolCoordinates:
         poses, twists = _left(P.real[:first, : 6 + n]), _left(P.real[first:, 6 + n :])
         below = -twists @ P.real[first:, : 6 + n] @ poses
         left = np.block([[poses, np.zeros((6 + n, nv))], [below, twists]])
-        pick = self._wrench
-        V = np.eye(len(u)) + pick.T @ (X.T @ self._turn(R).T - np.eye(6)) @ pick
-        H = np.zeros((len(u), 12 + 2 * n))
+        pick, H = self._wrench, np.zeros((len(u), 12 + 2 * n))
+        V = np.eye(len(u)) + pick.T @ (X.T @ self._turn(R_now).T - np.eye(6)) @ pick
         H[:, :3] = pick.T @ X.T @ self._held(np.linalg.solve(X.T, pick @ u)) @ X[ANGULAR, ANGULAR]
         return Slopes(P.real, P.imag / _STEP.imag, left, V[:, self._inputs], H, extra)
-
-    def _of_base(self, quaternion: Any, nu: Any, went: Any) -> tuple[Array, Array, Array]:
-        """Return slopes of the pose over (theta, p), and of the twist over theta and the twist."""
-        R, vec, kind = turning.rotation_matrix(quaternion), quaternion[:3], self.convention
-        by_twist, by_turn = self._twist(R), -self._turn(R) @ self._held(nu)
-        attitude = np.eye(3) + 0.5 * skew(went[ANGULAR])
-        if kind.attitude == "euler":
-            attitude, bends = _of_angles(_angles(R), nu[ANGULAR])
-            by_turn[ANGULAR] = kind.rates * bends @ attitude
-        elif kind.attitude in ("wxyz", "q_b"):
-            attitude = 0.5 * (quaternion[3] * np.eye(3) + skew(vec))
-            if kind.attitude == "wxyz":
-                attitude = np.vstack((-0.5 * vec, attitude))
-        pose = np.zeros((len(attitude) + 3, 6), dtype=complex)
-        pose[:-3, :3], pose[-3:, 3:] = attitude, R
-        if kind.attitude == "pose":
-            pose[-3:, :3], pose[-3:, 3:] = 0.5 * skew(went[LINEAR]), attitude
-        return pose, by_turn, by_twist
 
 
 def own_coordinates(state: StateMap, *, moving: bool) -> ToolCoordinates:
