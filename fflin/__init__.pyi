@@ -7,6 +7,7 @@ from fflin.robot.loading import load as load
 from fflin.robot.loading import from_model as from_model
 from fflin.robot.catalog import list_robots as list_robots
 from fflin.robot.robot import Robot as Robot
+from fflin.robot.orbit import CircularOrbit as CircularOrbit
 from fflin.dynamics.points import configuration as configuration
 from fflin.dynamics.points import velocity as velocity
 from fflin.dynamics.points import effort as effort
@@ -61,6 +62,9 @@ from fflin.analysis.gramians import Gramians as Gramians
 from fflin.analysis.modes import modes as modes
 from fflin.analysis.modes import Modes as Modes
 from fflin.analysis.modes import Mode as Mode
+from fflin.analysis.relative_equilibria import relative_equilibria as relative_equilibria
+from fflin.analysis.relative_equilibria import RelativeEquilibria as RelativeEquilibria
+from fflin.analysis.relative_equilibria import RelativeEquilibrium as RelativeEquilibrium
 from fflin.analysis.momentum import momentum_reduction as momentum_reduction
 from fflin.analysis.momentum import ReducedModel as ReducedModel
 from fflin.analysis.momentum import generalized_inertia as generalized_inertia

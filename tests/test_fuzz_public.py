@@ -53,8 +53,7 @@ RESULTS = {
     *("Gain", "GainSchedule", "Gramians", "Grid", "LinearModel", "LinearTrajectory", "Mode"),
     *("LFT", "Sensitivity", "Uncertain"),
     *("Modes", "Motion", "Observability", "RandomConfigurations", "ReducedModel", "Robot"),
-    "ToolModel",
-    "Validity",
+    *("RelativeEquilibria", "RelativeEquilibrium", "ToolModel", "Validity"),
 }
 
 

@@ -20,7 +20,9 @@ def code_blocks(language, text=README):
     return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/guide.md", "docs/tools.md", "docs/uncertainty.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "docs/guide.md", "docs/tools.md", "docs/uncertainty.md"]
+)
 def test_python_examples_run(tmp_path, page):
     text = (ROOT / page).read_text(encoding="utf-8")
     (tmp_path / "example.py").write_text("\n".join(code_blocks("python", text)))

@@ -1,5 +1,6 @@
 """A linear model as a mechanical system: its slopes, its forces, the momenta it conserves."""
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from fflin.analysis.ranks import EPS, Margin, Noisy, echelon, null_space, stacked, without_rounding
 from fflin.analysis.second_order import SecondOrder
-from fflin.base.errors import InputError
+from fflin.base.errors import FflinWarning, InputError
 from fflin.base.validation import Array
 from fflin.linear.model import LinearModel
 
@@ -16,6 +17,9 @@ _CONSISTENT = 1e-8
 
 # Rounding of springs and dampers, in units of energy, beside the square and the speed of a spin.
 _OF_SPIN = 1e-15
+
+# An orbit that is slower beside the fastest vibration has squares near its rounding.
+_SLOWEST = 3e-6
 
 
 def checked(lin: LinearModel) -> LinearModel:
@@ -32,7 +36,25 @@ def checked(lin: LinearModel) -> LinearModel:
     for name in "ABCD":
         if not np.isfinite(getattr(lin, name)).all():
             raise InputError(f"{name} of the model has entries that are not finite")
+    warn_of_stiffness(lin)
     return lin
+
+
+def warn_of_stiffness(lin: LinearModel) -> None:
+    """Warn where a vibration is so fast that an orbit's field is in the rounding beside it."""
+    nv, size = len(lin.M), np.sqrt(lin.M.diagonal())
+    if not lin.mean_motion:
+        return
+    fall = np.abs(slopes(lin)[nv:, :nv]) * size[:, None] / size
+    fastest = float(fall.max()) ** 0.5
+    if lin.mean_motion < _SLOWEST * fastest:
+        warnings.warn(
+            f"the orbit of '{lin.robot}' turns at {lin.mean_motion:.3g} rad/s, and joints vibrate "
+            f"at about {fastest:.3g} rad/s: beside them what its field does is rounding and may "
+            "be missed; lock these joints, or make the springs softer",
+            FflinWarning,
+            stacklevel=4,
+        )
 
 
 def state_sizes(lin: LinearModel) -> Array:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fflin.analysis.eigenpairs import natural_modes
+from fflin.analysis.mechanics import warn_of_stiffness
 from fflin.base.errors import InputError
 from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import counted, grid, width
@@ -210,6 +211,7 @@ def modes(lin: LinearModel) -> Modes:
     nx, nv = len(lin.A), len(lin.M)
     if nx != 2 * nv:
         raise InputError(f"the model has {nx} states, expected {nv} positions and their velocities")
+    warn_of_stiffness(lin)
     found = natural_modes(lin)
     triples = sorted(found.triples, key=lambda triple: (abs(triple[0]), triple[0].real))
     return Modes(

@@ -14,6 +14,7 @@ from fflin.base.errors import InputError
 from fflin.base.record import reading
 from fflin.base.validation import Array
 from fflin.batch.files import read_rows
+from fflin.dynamics.orbital import mean_motion
 from fflin.linear.files import given
 
 if TYPE_CHECKING:
@@ -30,13 +31,13 @@ _ARRAYS = ("A", "B_lower", "C", "D", "f0", "u0", "q", "v", "_root")
 _MAYBE = ("_x0", "_y0", "_reference", "_drift")
 
 # What a model computes when it is asked for it, by its fields' names.
-_OF_ROBOT = ("_certify", "_inertia", "_ignorable", "_limits", "weights", "_robot")
+_OF_ROBOT = ("_certify", "_inertia", "_ignorable", "_limits", "weights", "_robot", "mean_motion")
 
 
 def texts_of(batch: Any, count: int) -> dict[str, str]:
     """Return what of a `LinearBatch` of so many points is text."""
     texts = {key: getattr(batch, key) for key in _TEXTS}
-    texts["_ignorable"] = batch[0].ignorable
+    texts |= {"_ignorable": batch[0].ignorable, "mean_motion": batch[0].mean_motion}
     return {"header": json.dumps({**texts, "points": count, "columns": batch.columns})}
 
 
@@ -47,6 +48,7 @@ def read_batch(path: Path, robot: Robot | None, *, verify: bool) -> dict[str, An
         record = json.loads(texts["header"])
         fields = {**_fields(arrays, record, constant), "verified": verified}
         ignorable = tuple(record["_ignorable"])
+        n = float(record.get("mean_motion", 0.0))
     if robot is None:
         return fields | {
             "_asked": {
@@ -55,11 +57,13 @@ def read_batch(path: Path, robot: Robot | None, *, verify: bool) -> dict[str, An
                 "_ignorable": partial(given, ignorable),
                 "_limits": dict,
                 "weights": {},
+                "mean_motion": n,
             }
         }
     joints = [name.removeprefix("q_m.") for name in fields["state_names"] if name[:4] == "q_m."]
     made_of = fields["urdf_sha256"], fields["locked"], tuple(joints)
-    if (robot.urdf_sha256, robot.locked, robot.joint_names) != made_of:
+    given_one = robot.urdf_sha256, robot.locked, robot.joint_names
+    if (*given_one, mean_motion(robot)) != (*made_of, n):
         raise InputError(f"'{robot.name}' is not the robot that the batch is of")
     from fflin.linear.prepared import prepare
 

@@ -23,7 +23,7 @@ from fflin.robot.frames import ROOT
 # Attributes of a robot that, with its model and its mappings, tell it from others.
 _OF_THE_ROBOT = (
     *("name", "urdf_sha256", "locked", "joints", "followers"),
-    *("inputs", "outputs", "gravity"),
+    *("inputs", "outputs", "gravity", "orbit"),
 )
 
 

@@ -24,7 +24,7 @@ from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES, batch_tree
 from fflin.robot.robot import Robot
 from fflin.simulation.compiled import engine_of
-from fflin.simulation.conservation import Conserved
+from fflin.simulation.jacobi import conserved_by
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Plan, law_of, planned
 from fflin.simulation.plant import Plant
@@ -124,7 +124,7 @@ class CampaignJob:
         return tally.outcome(run.steps, stop)
 
     def _gone(self, plan: Plan, plant: Plant) -> Recording:
-        run = go(plan, plant, Conserved(plant.robot, plan.q))
+        run = go(plan, plant, conserved_by(plant.robot, plan.q, plant.field))
         if run.stopped.startswith("interrupted"):
             raise KeyboardInterrupt
         return run

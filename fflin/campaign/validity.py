@@ -22,7 +22,7 @@ from fflin.batch.run import Progress, check_workers
 from fflin.batch.workers import OwnWorkers
 from fflin.campaign.dispersions import Draws
 from fflin.campaign.settling import OUTCOMES, Loop, SettlingJob, checked_loop, flown
-from fflin.dynamics.state import Frame
+from fflin.dynamics.names import Frame, refuse_orbit
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 
@@ -212,6 +212,7 @@ def validity(
     confidence = share("confidence", confidence)
     if isinstance(frames, str) or not isinstance(frames, Iterable):
         raise InputError(f"frames is {frames!r}, expected several, such as ('hybrid', 'local')")
+    refuse_orbit((frames := tuple(frames)) and robot, "loops in other `frames`")
     loops = {loop.lin.frame: loop} | {each: loop.fed_back_in(each) for each in frames}
     check_workers(executor, workers, threads, None, progress)
     levels = (np.arange(samples) + 0.5) / samples
@@ -292,9 +293,8 @@ def _crossing(errors: Array) -> float:
     first = int(beyond[0])
     if first == 0 or not np.isfinite(errors[first]):
         # Below the first level the error is proportional to it.
-        if not np.isfinite(errors[0]):
-            return 0.0
         at = max(first - 1, 0)
-        return float(min(_LEVELS[at] * TRUSTED / errors[at], _LEVELS[first]))
+        near = float(min(_LEVELS[at] * TRUSTED / errors[at], _LEVELS[first]))
+        return near if np.isfinite(errors[0]) else 0.0
     pair = slice(first - 1, first + 1)
     return float(np.exp(np.interp(np.log(TRUSTED), np.log(errors[pair]), np.log(_LEVELS[pair]))))

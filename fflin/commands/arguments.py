@@ -62,6 +62,12 @@ def passive(text: str) -> tuple[str | None, float | str]:
     return None, text if text == "urdf" else number(text)
 
 
+def orbit(text: str) -> dict[str, float | str]:
+    """Read ALTITUDE or ALTITUDE:BODY."""
+    altitude, _, body = text.partition(":")
+    return {"altitude": number(altitude), "body": body or "earth"}
+
+
 def lock(text: str) -> tuple[str, float | None]:
     """Read NAME=VALUE, or NAME for neutral (value None)."""
     return assignment(text) if "=" in text else (text, None)
@@ -71,6 +77,7 @@ _READ: dict[str, Callable[[str], Any]] = {
     **dict.fromkeys(("FILE", "FILE.npz"), file_name),
     **dict.fromkeys(("T", "H", "P", "FPS", "SPEED"), number),
     **{"N": count_of, "S": whole, "K": whole, "[NAME=]VALUE": passive, "NAME[=VALUE]": lock},
+    "ALTITUDE[:BODY]": orbit,
     **dict.fromkeys(("NAME=VALUE", "NAME=W"), assignment),
 }
 
@@ -179,8 +186,19 @@ def add_inputs_there(command: Container) -> None:
     )
 
 
+def add_orbit(command: Container) -> None:
+    """Add --orbit."""
+    add_options(
+        command,
+        """
+        --orbit ALTITUDE[:BODY]: a circular orbit at so many metres over the earth (default), moon,
+            mars ...: the world is then the frame of the orbit""",
+    )
+
+
 def add_system(command: Container) -> None:
     """Add what acts on the robot, what is watched of it, and in which axes."""
+    add_orbit(command)
     add_options(
         command,
         """
@@ -196,9 +214,10 @@ def add_system(command: Container) -> None:
             rates:NAME (a joint or a pattern), com, momentum, frame:NAME (pose and velocity),
             pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME; relative:NAME:TO, as
             another frame sees it
-        --frame hybrid|local|world = hybrid: axes of velocities and wrenches: angular in base axes
+        --frame hybrid|local|world|lvlh|hill: axes of velocities and wrenches: angular in base axes
             and linear in reference axes (hybrid, default), both in base axes (local), both in
-            reference axes (world)""",
+            reference axes (world); in orbit the world is along, minus normal, to the body (lvlh,
+            default), or from the body, along, normal (hill), with axes as hybrid""",
     )
 
 

@@ -12,6 +12,7 @@ from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
     add_options,
+    add_orbit,
     add_output_file,
     add_point,
     add_robot,
@@ -32,6 +33,7 @@ def add_commands(commands: Commands) -> None:
         commands, "info", _info, "show tree, joints, masses and limits", "fflin info servicer_7dof"
     )
     add_robot(info)
+    add_orbit(info)
     add_options(info, "--inputs FILE.toml: show these as well: a file, or a bundled one's name")
     linearize = command(
         *(commands, "linearize", _linearize),

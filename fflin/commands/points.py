@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def load_robot(arguments: argparse.Namespace) -> Robot:
-    """Load the robot with the passive joints, inputs, outputs and gravity that are given."""
+    """Load the robot with the passive joints, inputs, outputs, gravity and orbit that are given."""
     from fflin.robot.loading import load, with_fields
 
     lock, passive = once("--lock", arguments.lock), getattr(arguments, "passive", [])
@@ -38,6 +38,8 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
             fields[name] = for_all[0] if for_all else once(f"--{name}", values)
     if getattr(arguments, "gravity", None):
         fields["gravity"] = arguments.gravity
+    if getattr(arguments, "orbit", None):
+        fields["orbit"] = arguments.orbit
     if getattr(arguments, "inputs", None) is not None:
         inputs = _inputs(robot, arguments.inputs)
         try:
@@ -177,4 +179,4 @@ def inputs_at(
         raise InputError("--effort and --equilibrium both say the inputs at the point; give either")
     from fflin.linear.equilibrium import equilibrium
 
-    return equilibrium(robot, q, v=v, frame=arguments.frame or "hybrid", reference=reference).u
+    return equilibrium(robot, q, v=v, frame=arguments.frame, reference=reference).u

@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fflin.commands import DONE
-from fflin.commands.arguments import Commands, Container, add_options, add_pose, add_robot, command
+from fflin.commands.arguments import (
+    Commands,
+    Container,
+    add_options,
+    add_orbit,
+    add_pose,
+    add_robot,
+    command,
+)
 from fflin.commands.points import configuration_of, load_robot
 
 if TYPE_CHECKING:
@@ -28,6 +36,8 @@ def add_commands(commands: Commands) -> None:
     )
     add_robot(view)
     add_pose(view)
+    add_orbit(view)
+    add_options(view, "--frame lvlh|hill: of an orbit, which the world is (lvlh by default)")
     _add_scene(view)
     add_options(view, "--no-open: open no browser; the address is on stderr")
     add_options(view, "--port N = 0: port on 127.0.0.1; a free one by default", type=int)
@@ -122,7 +132,7 @@ def _view(arguments: argparse.Namespace) -> int:
     from fflin.view.visualize import visualize
 
     robot = load_robot(arguments)
-    how: Any = {name: getattr(arguments, name) for name in (*_SHOWN, "port")}
+    how: Any = {name: getattr(arguments, name) for name in (*_SHOWN, "port", "frame")}
     live = visualize(robot, open=False, q=configuration_of(robot, arguments, robot.start), **how)
     assert isinstance(live, Live)  # for there is no motion
     print(f"fflin: {robot.name} at {live.url} (Ctrl-C ends)", file=sys.stderr, flush=True)

@@ -54,7 +54,7 @@ def acceleration_lqr(
     Parameters
     ----------
     lin : LinearModel
-        At rest, without gravity, springs and dampers, every coordinate that `lqr` regulates
+        At rest, without gravity, orbit, springs and dampers, every coordinate that `lqr` regulates
         actuated; sampled or not.
     Qp, Qv, Ra : array_like (6 + n,) or float, or mapping
         Diagonal weights on the positions (q_b, r_b, q_m), the velocities and their
@@ -148,7 +148,7 @@ def _integrators(lin: LinearModel) -> tuple[Array, Array]:
     ):
         raise InputError(
             "the model is not of double integrators alone, as one at rest without gravity, "
-            "springs and dampers is; use lqr"
+            "orbit, springs and dampers is; use lqr"
         )
     sizes = np.abs(L).max(axis=1, keepdims=True)
     if not sizes.all() or np.linalg.matrix_rank(L / sizes, tol=1e-10) < len(s):

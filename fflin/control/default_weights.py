@@ -86,8 +86,10 @@ def _damping(lin: LinearModel) -> Array:
         return np.zeros_like(lin.M)
     D = second_order(lin).D.values
     rates, modes = eigh(0.5 * (D + D.T), lin.M)
-    # What motion brings to one, it takes from another.
-    damped: Any = rates.sum() > 1e-9 * np.abs(rates).sum()
+    # What motion brings to one, it takes from another; what an orbit turns is not damped.
+    size = np.sqrt(lin.M.diagonal())
+    whole = max(np.abs(rates).sum(), np.abs(D / np.outer(size, size)).max())
+    damped: Any = rates.sum() > 1e-9 * whole
     forces = lin.M @ modes
     return (forces * rates.clip(0.0)) @ forces.T * damped
 

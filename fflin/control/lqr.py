@@ -132,7 +132,7 @@ def require_fixed_point(lin: LinearModel) -> None:
         return
     rate = lin.f0 if lin.drift is None else lin.drift
     judged = [name not in lin.ignorable for name in lin.state_names]
-    rows = [i for i in np.argsort(-np.abs(rate)) if judged[i] and abs(rate[i]) > 1e-9]
+    rows = [i for i in np.argsort(-np.abs(rate)) if judged[i] and abs(rate[i]) > lin.bound(1e-9)]
     shown = ", ".join(
         f"d {lin.state_names[i]}/dt = {rate[i] / (lin.dt or 1.0):.6g}"
         for i in rows[:_SHOWN_RESIDUALS]

@@ -18,6 +18,7 @@ from fflin.control.stage_qp import StageQP, StageSolution
 from fflin.control.weights import Weight, weight
 from fflin.dynamics import points
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.names import refuse_orbit
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import LinearModel
 from fflin.linear.trajectory import Trajectory
@@ -115,6 +116,7 @@ def plan(
     control problems, IFAC World Congress, 1984.
     """
     state = StateMap(robot)
+    refuse_orbit(robot, "plans")
     start = points.point_of(state, x0, q0, v0, partial(points.start_of, robot))
     ends: Any = (goal.q, goal.v) if isinstance(goal, LinearModel) else goal
     x, q, v = (None, *ends) if isinstance(ends, tuple) and len(ends) == 2 else (ends, None, None)

@@ -173,12 +173,12 @@ def decider(policy: Any) -> Any:
     return policy.policy if isinstance(policy, Allocation) else policy
 
 
-def axes_of(policy: Any) -> tuple[Frame, pin.SE3 | None]:
-    """Return the frame and reference that a policy's state and inputs are in."""
+def axes_of(policy: Any) -> tuple[Frame | None, pin.SE3 | None]:
+    """Return the frame and reference that a policy's state and inputs are in, if they are known."""
     lin, _ = feedback_of(policy)
     if lin is not None:
         return lin.frame, lin.reference
-    return getattr(decider(policy), "frame", "hybrid"), None
+    return getattr(decider(policy), "frame", None), None
 
 
 def bound(policy: Any, robot: Robot) -> Policy:

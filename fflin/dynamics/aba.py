@@ -7,6 +7,7 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.names import PIN_ANGULAR
+from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT
 
@@ -24,6 +25,7 @@ class Aba:
         self._model.gravity.linear = np.array(robot.gravity)
         # M^-1 in base axes as ABA has it, of the last slopes.
         self.inverse: Array = np.zeros((6 + robot.n, 6 + robot.n))
+        self.field = field_of(robot, state.frame)
         self._resists = any(values.any() for values in robot.springs)
         self._none = pin.StdVec_Force(robot.model.njoints, pin.Force.Zero())
 
@@ -34,7 +36,9 @@ class Aba:
             forces += self._passive_force(q, v)
         if tau is not None:
             forces += self.state.forces(tau)
-        return self._accelerate(self._model, q, v, forces, self._wrenches(q, v, u))
+        absolute = self.field.absolute(q, v) if self.field else v
+        rate = self._accelerate(self._model, q, absolute, forces, self._pulls(q, absolute, u))
+        return self.field.relative(v, absolute, rate) if self.field else rate
 
     def terms(self, q: Array, v: Array, u: Array) -> Array:
         """Return the size (6 + n,) of the terms that add up to the accelerations; `u` as above."""
@@ -51,8 +55,11 @@ class Aba:
         # d(B u)/dq too. B comes from the accelerations of unit inputs at rest.
         state = self.state
         stiffness, damping, _ = state.robot.springs
-        tau = state.lift(self.actuation.torques(u) + self._passive_force(q, v))
-        external = self._wrenches(q, v, u)
+        tau, field = state.lift(self.actuation.torques(u) + self._passive_force(q, v)), self.field
+        here = q, v
+        if field:
+            q, v = field.near(q, v)
+        external = self._pulls(q, v, u)
         if state.S is None:
             slopes = pin.computeABADerivatives(self._model, self._data, q, v, tau, external)
             by_q, by_v, by_force = (state.project(slope) for slope in slopes)
@@ -66,6 +73,10 @@ class Aba:
             by_v += torque @ state.columns(jacobian)
         by_q[:, 6:] -= by_force[:, 6:] * stiffness
         by_v[:, 6:] -= by_force[:, 6:] * damping
+        if field:
+            pin.computeJointJacobians(self._model, self._data, q)
+            by_q += by_force @ state.forces(state.columns(field.slopes(self._data)))
+            field.add_turning(*here, by_q, by_v)
         at_rest = np.zeros_like(v)
         by_u = []
         for unit in np.eye(len(u)):
@@ -73,6 +84,16 @@ class Aba:
             rate = self._accelerate(self._weightless, q, at_rest, forces, wrenches)
             by_u.append(state.velocities(rate))
         return by_q, by_v, np.column_stack(by_u)
+
+    def _pulls(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
+        """Return `_wrenches` with the pull of an orbit's field."""
+        wrenches = self._wrenches(q, v, u)
+        if self.field:
+            wrenches = pin.StdVec_Force(wrenches)
+            pin.forwardKinematics(self._model, self._data, q)
+            for joint, pull in enumerate(self.field.wrenches(self._data)):
+                wrenches[joint] = wrenches[joint] + pull
+        return wrenches
 
     def _wrenches(self, q: Array, v: Array, u: Array) -> pin.StdVec_Force:
         """Return what acts on the links, stored momentum turned with them included."""

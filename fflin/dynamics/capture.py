@@ -109,8 +109,8 @@ def capture(
     UnknownNameError
         If there is no such frame.
     InputError
-        If a size or value is wrong, the payload is no body, its names are taken, its gravity is
-        another, or a wheel of it stores momentum without an inertia.
+        If a size or value is wrong, the payload is no body, its names are taken, its gravity or
+        orbit is another, or a wheel of it stores momentum without an inertia.
     ModelError
         If a robot was changed after it was made.
 
@@ -131,10 +131,10 @@ def capture(
         raise InputError(
             f"payload is a {type(payload).__name__}, expected a pin.Inertia or a fflin.Robot"
         )
-    if isinstance(payload, Robot) and robot.gravity != other.gravity:
-        raise InputError(
-            f"the robot's gravity is {robot.gravity}, the payload's {other.gravity}; give both one"
-        )
+    for field in ("gravity", "orbit") if isinstance(payload, Robot) else ():
+        own, theirs = (getattr(each, field) for each in (robot, other))
+        if own != theirs:
+            raise InputError(f"the robot's {field} is {own}, the payload's {theirs}; give both one")
     if other.stored_momentum:
         raise InputError(
             "a wheel of the payload stores momentum and has no inertia, so that it is no joint and "

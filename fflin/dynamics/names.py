@@ -1,12 +1,15 @@
 """Names, units and axes of the state X = (q_b, r_b, q_m, omega_b, v_b, qdot_m) and its forces."""
 
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 from fflin.base.errors import InputError
 from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.robot import Robot
 
-Frame = Literal["hybrid", "local", "world"]
+Frame = Literal["hybrid", "local", "world", "lvlh", "hill"]
+
+# The frames of a circular orbit, which are the world of a robot that has one.
+ORBITAL: tuple[Frame, ...] = ("lvlh", "hill")
 
 # Which base velocities (omega_b, v_b), and wrenches (tau_b, F_b) with them, stand in the axes
 # of the reference instead of the base's.
@@ -14,6 +17,7 @@ IN_REFERENCE_AXES: dict[str, tuple[bool, bool]] = {
     "hybrid": (False, True),
     "local": (False, False),
     "world": (True, True),
+    **dict.fromkeys(ORBITAL, (False, True)),
 }
 
 # Rows of the base's angular and linear part in any (6 + n) velocity or wrench of state order,
@@ -25,6 +29,30 @@ PIN_LINEAR, PIN_ANGULAR = slice(0, 3), slice(3, 6)
 def unknown_frame(frame: object) -> InputError:
     """Build the error for what is no frame of velocities."""
     return InputError(f"frame is {frame!r}, expected one of {', '.join(get_args(Frame))}")
+
+
+def frame_of(robot: Robot, frame: object) -> Frame:
+    """Return the frame that is asked for, or a robot's default one; it has to suit an orbit."""
+    if frame is None:
+        return ORBITAL[0] if robot.orbit else "hybrid"
+    if not isinstance(frame, str) or frame not in get_args(Frame):
+        raise unknown_frame(frame)
+    if (frame in ORBITAL) != bool(robot.orbit):
+        suits = " or ".join(ORBITAL) if robot.orbit else "hybrid, local or world"
+        raise InputError(
+            f"frame is '{frame}', and '{robot.name}' is in {'an' if robot.orbit else 'no'} orbit; "
+            f"take {suits}{'' if robot.orbit else ', or give it one (orbit=, --orbit)'}"
+        )
+    return cast("Frame", frame)
+
+
+def refuse_orbit(robot: Any, what: str) -> None:
+    """Raise `InputError` where a robot is in orbit, of which something is not."""
+    if getattr(robot, "orbit", None):
+        raise InputError(
+            f"{what} are of robots that float free, and '{robot.name}' is in orbit; take "
+            "robot.replace(orbit=None)"
+        )
 
 
 class Groups(NamedTuple):

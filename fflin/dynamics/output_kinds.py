@@ -41,7 +41,8 @@ class Point(NamedTuple):
     v_b: Array  # velocity of the base's origin and gravity (3,), in base axes
     g: Array
     # Momentum (3,) of wheels that are no joints: the joint that carries it, and it in its axes.
-    stored: tuple[tuple[int, Array], ...] = ()
+    stored: tuple[tuple[int, Array], ...]
+    spin: Array  # (3,) rate at which an orbit turns the world, in base axes
 
     def placement(self, frame: Carried) -> pin.SE3:
         """Return where a frame is on the robot."""
@@ -56,6 +57,7 @@ class World(NamedTuple):
     reference: pin.SE3  # what positions and axes are relative to
     gravity: Array
     stored: tuple[tuple[int, Array], ...]  # as in `Point`
+    spin: Array  # in its own axes
 
     def placement(self, frame: Carried) -> pin.SE3:
         """Return where a frame is in the world."""
@@ -133,7 +135,7 @@ def _frame_pose(world: World, before: Sequence[Array], frame: Carried) -> Array:
 
 
 def _frame_velocity_slopes(at: Point, to: Sensed, frame: Carried) -> None:
-    _gyroscope_slopes(at, to.part(slice(0, 3)), frame)
+    _angular_slopes(at, to.part(slice(0, 3)), frame)
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     velocity = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL)
     R = at.R.dot(at.placement(frame).rotation)
@@ -172,15 +174,23 @@ def _relative_pose(world: World, before: Sequence[Array], *frames: Carried) -> A
     return np.concatenate((seen, turned))
 
 
-def _gyroscope_slopes(at: Point, to: Sensed, frame: Carried) -> None:
+def _angular_slopes(at: Point, to: Sensed, frame: Carried) -> None:
     by_q, jacobian = pin.getFrameVelocityDerivatives(at.model, at.data, *frame, _LOCAL)
     to.y[:] = pin.getFrameVelocity(at.model, at.data, *frame, _LOCAL).angular
     to.by_q[:] = by_q[PIN_ANGULAR]
     to.by_v[:] = jacobian[PIN_ANGULAR]
 
 
+def _gyroscope_slopes(at: Point, to: Sensed, frame: Carried) -> None:
+    _angular_slopes(at, to, frame)
+    spin = at.placement(frame).rotation.T.dot(at.spin)
+    to.y[:] += spin
+    to.by_q[:] += skew(spin).dot(to.by_v)  # the frame's angular Jacobian
+
+
 def _gyroscope(world: World, _: object, frame: Carried) -> Array:
-    return np.asarray(world.velocity(frame).angular)
+    spin = world.placement(frame).rotation.T @ world.spin
+    return np.asarray(world.velocity(frame).angular + spin)
 
 
 def _accelerometer_slopes(at: Point, to: Sensed, frame: Carried) -> None:

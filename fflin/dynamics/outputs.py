@@ -9,6 +9,7 @@ from fflin.base.errors import InputError
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.names import PIN_ANGULAR, PIN_LINEAR
+from fflin.dynamics.orbital import field_of
 from fflin.dynamics.output_kinds import KINDS, Point, Sensed, Slopes, World
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT, Carried, find_frame
@@ -56,6 +57,12 @@ class Sensing:
         twice = [name for index, name in enumerate(self.names) if name in self.names[:index]]
         if twice:
             raise InputError(f"output '{twice[0]}' is asked for twice; leave one of them out")
+        inertial = [x.WORD for x in outputs if x.WORD in ("accelerometer", "momentum")]
+        if robot.orbit and inertial:
+            raise InputError(
+                f"output {inertial[0]} is of axes that do not turn, and the world of "
+                f"'{robot.name}' turns with its orbit; leave it out"
+            )
         # Where one does, D is not zero.
         self.needs_acceleration = any(output.FEELS_ACCELERATION for output in outputs)
 
@@ -94,9 +101,10 @@ class Sensing:
         R, r_b = _STANDING
         if not self._own_reference:
             R, r_b = state.rotation(q), state.positions(q)
+        spin = R.T @ state.orbit[0] if state.orbit else np.zeros(3)
         return Point(
             *(robot.model, data, still_q, still_v, R, r_b),
-            *(v[PIN_LINEAR], state.gravity(q), robot.stored_momentum),
+            *(v[PIN_LINEAR], state.gravity(q), robot.stored_momentum, spin),
         )
 
 
@@ -105,10 +113,11 @@ class Measuring:
 
     def __init__(self, state: StateMap, q: Array) -> None:
         self.state = state
-        robot = state.robot
+        robot, field = state.robot, field_of(state.robot, state.frame)
         self._world = world = World(
             *(robot.model, robot.create_data(), state.reference),
             *(np.array(robot.gravity), robot.stored_momentum),
+            np.zeros(3) if field is None else field.rate,
         )
         pin.forwardKinematics(robot.model, world.data, q)
         frames = [[find_frame(world.model, x) for x in output.frames] for output in robot.outputs]

@@ -9,8 +9,10 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.inertia import Inertia
-from fflin.dynamics.names import LINEAR, PIN_ANGULAR
+from fflin.dynamics.names import ANGULAR, LINEAR, PIN_ANGULAR
+from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
+from fflin.dynamics.tidal import Tide
 
 
 class Rates(NamedTuple):
@@ -21,6 +23,7 @@ class Rates(NamedTuple):
     by_nu: Array  # D_nu (6 + n, 6 + n) of (3.3), zero over the base's linear velocity
     by_u: Array  # D_u (6 + n, nu) of (3.3), u held in base axes
     gravity: Array  # (3,) in base axes
+    by_turn: Array  # (6 + n, 3) slopes of c over a turn of the base in an orbit (14.5), else zero
 
 
 class Gyroscopic(NamedTuple):
@@ -45,6 +48,7 @@ class Accelerations:
         self._resists = any(values.any() for values in robot.springs)
         self._joints = np.arange(6, self._nv)
         self._stored = [(joint, skew(momentum)) for joint, momentum in robot.stored_momentum]
+        self._field, self._none = field_of(robot, state.frame), np.zeros((self._nv, 3))
 
     def invert(self, q: Array, out: Array) -> None:
         """Write M^-1 (6 + n, 6 + n) at a valid configuration into a C-contiguous array."""
@@ -53,11 +57,15 @@ class Accelerations:
     def rates(self, q: Array, v: Array, nu: Array, q_m: Array, u: Array) -> Rates:
         """Return the rates at q, v and u in base axes, v being `nu` and q_m in state order."""
         model, data, state = self._model, self._data, self._state
+        tide = self._field and Tide.at(self._field, q)
         # Without the base's position and linear velocity: nothing here depends on them, and
         # Pinocchio's derivatives lose digits to both. Nor does it depend on gravity, which
         # accelerates the base origin and nothing against it (equivalence).
         q_still, v_still = q.copy(), v.copy()
         q_still[:3] = v_still[:3] = 0.0
+        if tide:
+            v_still[PIN_ANGULAR] += tide.spin
+            pull = tide.force(model, data, q_still)
         inverse = np.empty((self._nv, self._nv))
         self._inertia.invert(q_still, inverse)
         columns = self._actuation.columns(data, q_still)
@@ -65,6 +73,8 @@ class Accelerations:
         gyroscopic = self._gyroscopic(q_still, v_still, u) if self._stored else None
         if gyroscopic:
             bias = bias - gyroscopic.force
+        if tide:
+            bias = bias - pull
         force = (u if self._actuation.default else columns.dot(u)) - state.forces(bias)
         if self._resists:
             stiffness, damping, rest = self._passive
@@ -75,7 +85,14 @@ class Accelerations:
         by_nu = negative.dot(by_v)
         by_nu[:, LINEAR] = 0.0
         by_u = inverse if self._actuation.default else inverse.dot(columns)
-        return Rates(c, negative.dot(by_q), by_nu, by_u, state.gravity(q))
+        by_q_m, gravity, by_turn = negative.dot(by_q), state.gravity(q), self._none
+        if tide:
+            pull_by_q, pull_by_turn = tide.slopes(model, data, q_still)
+            by_q_m += inverse.dot(state.project(pull_by_q)[:, 6:])
+            by_turn = inverse.dot(state.forces(pull_by_turn))
+            by_turn += by_nu[:, ANGULAR].dot(skew(tide.spin))
+            gravity = tide.fall
+        return Rates(c, by_q_m, by_nu, by_u, gravity, by_turn)
 
     def _bias_slopes(
         self, q: Array, v: Array, c: Array, u: Array, gyroscopic: Gyroscopic | None

@@ -2,7 +2,6 @@
 
 from copy import copy
 from itertools import compress
-from typing import get_args
 
 import numpy as np
 import pinocchio as pin
@@ -13,6 +12,7 @@ from fflin.base.validation import Array, placement, vector
 from fflin.dynamics import names
 from fflin.dynamics.chart import SMALLEST_Q0, Chart
 from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR, Frame
+from fflin.dynamics.orbital import field_of
 from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
@@ -29,9 +29,10 @@ class StateMap:
     robot : Robot
     reference : pin.SE3, optional
         Placement oMref that the attitude and position are relative to; identity by default.
-    frame : {"hybrid", "local", "world"}
+    frame : {"hybrid", "local", "world", "lvlh", "hill"}
         Axes of the velocities. hybrid: omega_b in base axes, v_b = d r_b/dt in reference axes.
-        local: both in base axes. world: both in reference axes. All at the base origin.
+        local: both in base axes. world: both in reference axes. All at the base origin. Of a robot
+        in orbit lvlh (default) or hill, the frame that Pinocchio's world is, with axes as hybrid.
 
     Attributes
     ----------
@@ -51,6 +52,9 @@ class StateMap:
         Which of the n joints turn without end.
     origin_quaternion : ndarray (4,)
         Attitude of `origin`.
+    orbit : tuple of ndarray (3,), (3, 3), or None
+        Of a robot in orbit the rate at which the reference turns and the field that is felt at
+        rest in it, in its axes.
 
     Raises
     ------
@@ -64,18 +68,16 @@ class StateMap:
         return f"StateMap('{self.robot.name}', nx={self.nx}, frame='{self.frame}')"
 
     def __init__(
-        self, robot: Robot, *, reference: pin.SE3 | None = None, frame: Frame = "hybrid"
+        self, robot: Robot, *, reference: pin.SE3 | None = None, frame: Frame | None = None
     ) -> None:
         if not isinstance(robot, Robot):
             raise InputError(
                 f"robot is a {type(robot).__name__}, expected a fflin.Robot; fflin.load makes one"
             )
-        if not isinstance(frame, str) or frame not in get_args(Frame):
-            raise names.unknown_frame(frame)
         robot.require_unchanged()
         n, self.robot = robot.n, robot
-        self.frame: Frame = frame
-        self.axes = IN_REFERENCE_AXES[frame]
+        self.frame = names.frame_of(robot, frame)
+        self.axes = IN_REFERENCE_AXES[self.frame]
         self.in_reference = tuple(compress((ANGULAR, LINEAR), self.axes))
         self.nx = 12 + 2 * n
         self.groups = names.groups_of(n)
@@ -113,6 +115,8 @@ class StateMap:
         self._position, self.origin_quaternion = offset[:3], offset[3:]
         self._rotation = turning.rotation_matrix(self.origin_quaternion)
         self._aligned = bool((self._rotation == np.eye(3)).all())
+        field, R = field_of(self.robot, self.frame), oMref.rotation
+        self.orbit = (R.T @ field.rate, R.T @ field.pull @ R) if field else None
 
     @property
     def reference(self) -> pin.SE3:

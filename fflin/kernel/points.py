@@ -104,6 +104,7 @@ class PointKernel:
             lower[:, nv:],
             part(robot.places.by_u, nv, nu),
             gravity,
+            np.zeros((nv, 3)),
         )
 
     def _begin(self, work: Array, rest: Array) -> None:

@@ -55,13 +55,15 @@ _TREES: WeakKeyDictionary[Robot, Tree | None] = WeakKeyDictionary()
 
 
 def batch_tree(robot: Robot) -> Tree | None:
-    """Return a robot's tree, or None where a joint is not a screw about a fixed axis."""
+    """Return a robot's tree, or None where a joint is no screw about a fixed axis, or in orbit."""
     if robot not in _TREES:
         _TREES[robot] = _tree(robot)
     return _TREES[robot]
 
 
 def _tree(robot: Robot) -> Tree | None:
+    if robot.orbit:
+        return None
     model = robot.model
     joints = model.joints.tolist()[ROOT:]
     screws = [_screw(model, joint) for joint in joints[1:]]

@@ -13,6 +13,7 @@ from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.names import ANGULAR, LINEAR
+from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import Certificate, LinearModel
 from fflin.linear.tool_coordinates import own_coordinates
@@ -54,13 +55,14 @@ def inertia_residual(M: Array, inverse: Array) -> float:
 def aba_route(
     state: StateMap, aba: Aba, q: Array, v: Array, u: Array, *, moving: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Build A and B from the derivatives of ABA, (4.9) and (14.3), and return its M^-1 too."""
+    """Build A and B from the derivatives of ABA, (4.9) and (15.3), and return its M^-1 too."""
     own, nu = own_coordinates(state, moving=moving), state.velocities(v)
     u, nv = aba.actuation.in_base_axes(state.chart(q), u), len(nu)
     # Pinocchio differentiates in world axes at the world's origin, where a distant base costs
-    # digits; nothing depends on where the base is.
+    # digits; nothing depends on where the base is but in an orbit, which sees to that itself.
     at_origin = q.copy()
-    at_origin[:3] = 0.0
+    if state.robot.orbit is None:
+        at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
     there = own.slopes(q, nu, u, state.velocities(aba.acceleration(at_origin, v, u)))
     # The tangent of what moves on turns with it.
@@ -97,9 +99,12 @@ def compare(
     groups, inputs = state.groups._asdict(), actuation.groups
     errors, errors_B = _blocks(difference_A, groups, groups), _blocks(difference_B, groups, inputs)
     if errors.any():
-        terms = _cancelling_terms(state, lin, lin.v, mobility, input_mobility)
+        # In an orbit it is the absolute velocity whose terms cancel.
+        field = field_of(state.robot, state.frame)
+        v = field.absolute(lin.q, lin.v) if field else lin.v
+        terms = _cancelling_terms(state, lin, v, mobility, input_mobility)
         if steps is not None:
-            v = np.abs(lin.v) + state.spread(steps[-nv:])
+            v = np.abs(v) + state.spread(steps[-nv:])
             there = _cancelling_terms(state, lin, v, mobility, input_mobility)
             terms = np.maximum(terms, rounding * there)
         sizes = np.maximum(_blocks(scaled_A, groups, groups), terms)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +12,8 @@ from fflin.base.errors import EquilibriumError, listed
 from fflin.base.frozen import FrozenArrays
 from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.names import forces_of
+from fflin.dynamics.names import ORBITAL, forces_of
+from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.linearization import Linearizer
 from fflin.robot.robot import Robot
@@ -67,12 +68,14 @@ def equilibrium(
     q: Array | None = None,
     *,
     v: Array | None = None,
-    frame: Frame = "hybrid",
+    frame: Frame | None = None,
     reference: pin.SE3 | None = None,
 ) -> Equilibrium:
     r"""Find the inputs of least norm that balance all that acts on a robot at a point.
 
-    Springs, gravity, dampers and the forces of a steady motion: whatever `linearize` knows of.
+    Springs, gravity, dampers and the forces of a steady motion: whatever `linearize` knows of. In
+    an orbit the pull of its field and the turning of its frame, in which the base rests; see
+    `relative_equilibria` for attitudes that no torque on the base need hold.
     With f the generalised forces without u, the inputs solve
 
     .. math::
@@ -92,11 +95,11 @@ def equilibrium(
         A steady motion, whose velocities in base axes do not change; at rest by default. Joints
         may move if they are rotors, see `LinearModel.ignorable`, and under gravity the base may
         turn about the vertical only.
-    frame : {"hybrid", "local", "world"}
+    frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
         Axes of the inputs on the base, as in `linearize`.
     reference : pin.SE3, optional
         Placement whose axes are the reference axes, as in `linearize`; by default the base's
-        own, so that in every frame the inputs on the base are in base axes.
+        own, so that in every frame the inputs on the base are in base axes, or in orbit its frame.
 
     Returns
     -------
@@ -118,31 +121,36 @@ def equilibrium(
     The bounds make it a least distance problem, which non-negative least squares solve exactly
     (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974, chapter 23).
     """
-    lin = Linearizer(robot, moving=True, engine="python")(q, v)
-    drift = lin.drift
-    assert drift is not None
-    _require_steady(lin, drift)
     state = StateMap(robot, frame=frame, reference=reference)
+    axes: Any = {"frame": frame, "reference": reference} if robot.orbit else {"moving": True}
+    lin = Linearizer(robot, **axes, engine="python")(q, v)
+    drift = lin.f0 if lin.drift is None else lin.drift
+    _require_steady(lin, drift)
     actuation = Actuation(state)
     columns = actuation.columns(robot.create_data(), lin.q)
 
-    mobility = np.sqrt(np.linalg.inv(lin.M).diagonal())
-    acceleration = drift[-len(mobility) :]
-    terms = np.abs(lin.M) @ np.abs(acceleration)
-    wanted = -lin.M @ acceleration
-    wanted[np.abs(wanted) <= _ROUNDING * terms] = 0.0
+    M, acceleration = lin.M, drift[-len(lin.M) :]
+    if robot.orbit:
+        chart = state.chart(lin.q)
+        M = state.to_base(chart, state.to_base(chart, M).T).T
+        acceleration = state.to_base(chart, acceleration[:, None])[:, 0]
+    mobility = np.sqrt(np.linalg.inv(M).diagonal())
+    terms = np.abs(M) @ np.abs(acceleration)
+    rounding, wanted = _rounding(robot, lin, M), -M @ acceleration
+    noise = _ROUNDING * terms + (rounding if robot.orbit else 0.0)
+    wanted[np.abs(wanted) <= noise] = 0.0
     one_sided = np.zeros(len(actuation.names), dtype=bool)
     one_sided[actuation.groups.get("thrust", [])] = True
 
     scaled, target = mobility[:, None] * columns, mobility * wanted
     u, left = _least_norm(scaled, target, one_sided)
     allowed = _TOLERANCE * float(np.linalg.norm(target))
-    allowed += float(np.linalg.norm(mobility * _rounding(robot, lin)))
+    allowed += float(np.linalg.norm(mobility * rounding))
     pushes = forces_of(robot)
     residual = left / mobility
     if float(np.linalg.norm(left)) > allowed:
         raise _unbalanced(robot, residual, np.abs(left), pushes)
-    if reference is not None:
+    if reference is not None or robot.orbit:
         chart = state.chart(lin.q)
         for held, _ in actuation.held:
             u[held] = chart.R @ u[held]
@@ -162,19 +170,26 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
             f"no input keeps '{lin.robot}' as it is while it moves: {listed(moving)}; only rotors "
             "may, which are symmetric about their axis and have nothing fixed on them"
         )
-    if "q_b.x" not in lin.ignorable and np.abs(drift[:3]).max() > _TOLERANCE:
+    if lin.frame in ORBITAL:
+        if np.abs(drift[:6]).max() > _TOLERANCE:
+            raise EquilibriumError(
+                f"no input keeps '{lin.robot}' as it is while its base moves in the orbit's frame; "
+                "leave the velocity of the base out"
+            )
+    elif "q_b.x" not in lin.ignorable and np.abs(drift[:3]).max() > _TOLERANCE:
         raise EquilibriumError(
             f"no input keeps '{lin.robot}' as it is while it turns across gravity; it may turn "
             "about the vertical only"
         )
 
 
-def _rounding(robot: Robot, lin: LinearModel) -> Array:
+def _rounding(robot: Robot, lin: LinearModel, M: Array) -> Array:
     """Return how much of the forces (6 + n,) may be the rounding of terms that cancel."""
-    state = StateMap(robot, frame="local")
-    speed = np.abs(state.velocities(lin.v))
+    state = StateMap(robot)
+    field = field_of(robot, lin.frame)
+    speed = np.abs(state.velocities(field.absolute(lin.q, lin.v) if field else lin.v))
     rate = max(float(speed[:3].max()), float(speed[6:].max(initial=0.0)))
-    terms = rate * (np.abs(lin.M) @ speed)
+    terms = rate * (np.abs(M) @ speed)
     stiffness, _, rest = robot.springs
     terms[6:] += stiffness * (np.abs(state.joint_positions(lin.q)) + np.abs(rest))
     return _ROUNDING * terms

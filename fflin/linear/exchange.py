@@ -1,4 +1,4 @@
-"""Linear models in the coordinates of other tools, and back: (14.1) to (14.6)."""
+"""Linear models in the coordinates of other tools, and back: (15.1) to (15.6)."""
 
 from __future__ import annotations
 
@@ -90,8 +90,8 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
 
     .. math:: A' = (T A + \dot T)\,T^+ + \ldots, \qquad B' = T B\,T_u^{-1}
 
-    with what comes of inputs held in other axes and of the length of a quaternion: (14.1) to
-    (14.6) of docs/derivation.md. docs/tools.md has the conventions side by side.
+    with what comes of inputs held in other axes and of the length of a quaternion: (15.1) to
+    (15.6) of docs/derivation.md. docs/tools.md has the conventions side by side.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def _bridge(
 
 
 def carried(source: Slopes, to: Slopes, A: Array, B: Array) -> tuple[Array, Array]:
-    """Return A and B in other coordinates (14.3), (14.4)."""
+    """Return A and B in other coordinates (15.3), (15.4)."""
     B = source.left @ B @ np.linalg.inv(source.V)
     A = source.left @ (A @ source.P - source.rate) + B @ (to.H - source.H)
     return (to.P @ A + to.rate) @ to.left + to.extra, to.P @ B @ to.V
@@ -249,7 +249,7 @@ def _step(tool: str, dt: Any) -> float:
 
 
 def _stepped(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
-    """Return A, B and f0 of a step of semi-implicit Euler (14.6); of the base linear, angular."""
+    """Return A, B and f0 of a step of semi-implicit Euler (15.6); of the base linear, angular."""
     v, a = np.split(rate, 2)
     nv, moved = len(v), h * (v + h * a)
     K, G = np.eye(nv), h * np.eye(nv)

@@ -8,13 +8,14 @@ import io
 import json
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from fflin.base import record
 from fflin.base.record import Record, figure, figures, text, texts
 from fflin.base.writing import check_ending, read_file, write_whole
+from fflin.dynamics.names import Frame
 
 # Of what the rows and columns of each matrix are, and the entries of each vector.
 _MATRICES = {
@@ -32,8 +33,10 @@ _LISTS = (
     *("locked", "ignorable", "limit_names"),
 )
 # Which older files have not.
-_LATER: Record = {"ignorable": (), "drift": (), "limit_names": (), "limits": (), "weights": "{}"}
+_LATER: Record = {"ignorable": (), "drift": (), "limit_names": (), "limits": ()}
+_LATER |= {"weights": "{}", "mean_motion": 0.0}
 _TEXTS = ("frame", "robot", "urdf_sha256", "fflin_version", "pinocchio_version", "weights")
+_FIGURES = ("dt", "moving", "mean_motion")
 _CERTIFICATE = ("condition", "inertia_residual", "route_A", "route_B", "f0")
 
 # Of csv, the last of which has the digest of all.
@@ -52,7 +55,7 @@ def record_of(lin: Any) -> Record:
     entries["limit_names"] = list(lin.limits)
     entries |= {key: getattr(lin, key) for key in _TEXTS[:-1]}
     entries["weights"] = json.dumps(dict(lin.weights))
-    entries["dt"], entries["moving"] = float(lin.dt), float(lin.moving)
+    entries |= {key: float(getattr(lin, key)) for key in _FIGURES}
     entries["certificate"] = {key: getattr(lin.certificate, key) for key in _CERTIFICATE}
     return entries
 
@@ -83,7 +86,7 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, float]]:
 def _fields(entries: Record) -> dict[str, Any]:
     fields: dict[str, Any] = {key: texts(entries[key]) for key in _LISTS}
     fields |= {key: text(entries[key]) for key in _TEXTS}
-    if fields["frame"] not in ("hybrid", "local", "world"):
+    if fields["frame"] not in get_args(Frame):
         raise ValueError(f"unknown frame '{fields['frame']}'")
     sizes = {signal: len(fields[f"{signal}_names"]) for signal in _SIGNALS}
     sizes["velocity"] = sizes["state"] // 2
@@ -103,6 +106,7 @@ def _fields(entries: Record) -> dict[str, Any]:
     M.setflags(write=False)
     return fields | {
         "dt": figure(entries["dt"]),
+        "mean_motion": figure(entries["mean_motion"]),
         "moving": bool(figure(entries["moving"])),
         "weights": _weights(fields.pop("weights")),
         "_reference": reference,
@@ -155,7 +159,7 @@ def _tables(entries: Record) -> dict[str, list[list[Any]]]:
         tables[f"{signal}s"] = [["name", "unit", *vectors], *map(list, lines)]
     point = [[f"{key}[{i}]", x] for key in _POINT for i, x in enumerate(entries[key].tolist())]
     tables["point"] = [["name", "value"], *point]
-    info = {key: entries[key] for key in (*_TEXTS, "dt", "moving")}
+    info = {key: entries[key] for key in (*_TEXTS, *_FIGURES)}
     info |= {key: ";".join(entries[key]) for key in _LISTS[-3:]}
     info |= {f"certificate.{key}": value for key, value in entries["certificate"].items()}
     tables["info"] = [["name", "value"], *map(list, info.items())]
@@ -208,7 +212,7 @@ def _from_csv(path: Path) -> tuple[Record, bool]:
         entries[key] = [entry for entry in info.get(key, "").split(";") if entry]
     return {
         **entries,
-        **{key: info[key] for key in (*_TEXTS, "dt", "moving") if key in info},
+        **{key: info[key] for key in (*_TEXTS, *_FIGURES) if key in info},
     }, bool(mark)
 
 

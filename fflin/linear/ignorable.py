@@ -14,7 +14,9 @@ _ROUNDING = 1e-12
 def ignorable_states(robot: Robot, lin: LinearModel) -> tuple[str, ...]:
     """Return the names of the ignorable coordinates of a linear model of this robot."""
     # Found on the robot and not at a point: uniform gravity is the same everywhere, and without it
-    # error dynamics do not depend on the attitude either.
+    # error dynamics do not depend on the attitude either. In an orbit all of it matters.
+    if robot.orbit:
+        return tuple(f"q_m.{name}" for name in rotor_names(robot))
     groups = ["r_b"] if any(robot.gravity) or not lin.moving else ["q_b", "r_b"]
     base = [f"{group}.{axis}" for group in groups for axis in "xyz"]
     return (*base, *(f"q_m.{name}" for name in rotor_names(robot)))

@@ -72,7 +72,7 @@ class LinearModel(FrozenArrays):
     state_names, input_names, output_names : tuple of str
     state_units, input_units, output_units : tuple of str
     frame : str
-        "hybrid", "local" or "world": axes of velocities and wrenches.
+        "hybrid", "local" or "world": axes of velocities and wrenches; in orbit "lvlh" or "hill".
     moving : bool
         Whether the state is the error from a reference that moves through the point.
     q : ndarray (nq,)
@@ -92,6 +92,8 @@ class LinearModel(FrozenArrays):
         what is made of it.
     weights : mapping
         What `lqr` weighs where it is given nothing, as `Robot.replace` takes it.
+    mean_motion : float
+        Of the orbit [rad/s] in whose frame the robot is; 0 where there is none.
     """
 
     A: Array
@@ -130,6 +132,7 @@ class LinearModel(FrozenArrays):
     _limits: Callable[[], Mapping[str, float]] | None = None
     weights: Mapping[str, Any] = field(default_factory=dict)
     _robot: Robot | None = None  # that it was made of; None where it is from a file
+    mean_motion: float = 0.0
 
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> LinearModel:
@@ -224,7 +227,7 @@ class LinearModel(FrozenArrays):
         """The states that nothing in the model depends on, found on the robot.
 
         Where the base is, and the angles of rotors; with `moving`, without gravity, the attitude
-        too. A rotor is symmetric about its axis and has nothing fixed on it.
+        too; in orbit the latter alone. A rotor is symmetric about its axis and carries nothing.
         """
         return () if self._ignorable is None else self._ignorable(self)
 
@@ -248,11 +251,16 @@ class LinearModel(FrozenArrays):
         Parameters
         ----------
         tol : float
-            What no rate may exceed, in SI units; those of ignorable coordinates may.
+            What no rate may exceed, in SI units; those of ignorable coordinates may. In orbit
+            times its mean motion, since its field is weak.
         """
         rate = self.f0 if self.drift is None else self.drift
         judged = [name not in self.ignorable for name in self.state_names]
-        return bool(np.abs(rate[judged]).max(initial=0.0) <= number("tol", tol))
+        return bool(np.abs(rate[judged]).max(initial=0.0) <= self.bound(number("tol", tol)))
+
+    def bound(self, tol: float) -> float:
+        """Return what a tolerance is of rates at an equilibrium."""
+        return tol * min(1.0, self.mean_motion or 1.0)
 
     def discretize(self, dt: float) -> LinearModel:
         r"""Sample the model with its input held constant between samples.

@@ -32,7 +32,8 @@ class Nonlinear:
         self.state = state
         self.aba = aba or Aba(state)
         observer = rotation_matrix(lin.q[3:7]) @ lin.v[PIN_LINEAR]
-        self._observer = observer if np.linalg.norm(observer) > _FAST else np.zeros(3)
+        flies = np.linalg.norm(observer) > _FAST and state.robot.orbit is None
+        self._observer = observer if flies else np.zeros(3)
 
     def acceleration(self, x: Array, u: Array) -> tuple[Array, Array, Array]:
         """Return (q, v, a) in Pinocchio's order."""

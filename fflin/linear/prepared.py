@@ -15,7 +15,8 @@ from fflin.base.frozen import frozen
 from fflin.base.validation import Array, truth
 from fflin.base.version import __version__
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.names import unknown_frame
+from fflin.dynamics.names import frame_of, unknown_frame
+from fflin.dynamics.orbital import mean_motion
 from fflin.dynamics.state import Frame, StateMap
 from fflin.kernel.compiled import numba_is_there
 from fflin.linear.certificate import certify, inertia_matrix
@@ -74,6 +75,8 @@ class Prepared:
             if self.kernel() is not None:
                 return
             reason = f"a joint of '{self.robot.name}' is of another kind"
+            if self.robot.orbit:
+                reason = f"'{self.robot.name}' is in orbit"
         raise InputError(f"engine='compiled' cannot run this: {reason}; leave it out")
 
 
@@ -82,8 +85,13 @@ def prepare(
 ) -> Prepared:
     """Prepare a robot; arguments and errors are those of `Linearizer`."""
     moving = truth("moving", moving)
+    if moving and getattr(robot, "orbit", None):
+        raise InputError(
+            f"moving=True is the error from a motion of its own, and '{robot.name}' is in orbit, "
+            "whose frame is what it moves with; leave it out, or take robot.replace(orbit=None)"
+        )
     if frame is None:
-        frame = "local" if moving else "hybrid"
+        frame = frame_of(robot, None) if not moving else "local"
     elif not isinstance(frame, str):  # nor one whose comparison below is an array
         raise unknown_frame(frame)
     if moving and (reference is not None or frame != "local"):
@@ -92,14 +100,20 @@ def prepare(
             "reference, and the frame or make it 'local'"
         )
     state = StateMap(robot, reference=reference, frame=frame)
+    own = reference is None and robot.orbit is None  # in orbit it is the orbit's frame
     require_inertia(robot)
     actuation = Actuation(state)
     sensing = None
     if robot.outputs != (FullState(),):
         from fflin.dynamics.outputs import Sensing
 
-        sensing = Sensing(state, robot.outputs, own_reference=reference is None)
-    acts = any(robot.gravity) or robot.stored_momentum or any(x.any() for x in robot.springs)
+        sensing = Sensing(state, robot.outputs, own_reference=own)
+    acts = (
+        robot.orbit
+        or any(robot.gravity)
+        or robot.stored_momentum
+        or any(x.any() for x in robot.springs)
+    )
     nu = len(actuation.names)
     seen = sensing or state
     return Prepared(
@@ -108,7 +122,7 @@ def prepare(
         actuation=actuation,
         sensing=sensing,
         moving=moving,
-        own_reference=reference is None,
+        own_reference=own,
         reference=frozen(pin.SE3ToXYZQUAT(state.reference)),
         free=sensing is None and not moving and not acts,
         common={
@@ -133,6 +147,7 @@ def prepare(
             "_ignorable": partial(ignorable_states, robot),
             "_limits": partial(magnitudes_of, robot),
             "weights": robot.weights,
+            "mean_motion": mean_motion(robot),
             "_robot": robot,
         },
         rest={

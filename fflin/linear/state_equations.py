@@ -42,6 +42,9 @@ def assemble(
     w, v = nu[..., ANGULAR], nu[..., LINEAR]
     W = skew(w)
     by_turn = _over_turns(state, actuation, nu, u, rates)
+    if state.orbit:  # (14.5)
+        spin = chart.R.mT @ state.orbit[0]
+        by_turn[..., ANGULAR, :] += W @ skew(spin)
     F = partial(chart.to_reference, state.in_reference)
 
     # Attitude and position.
@@ -66,6 +69,12 @@ def assemble(
     F(actuation.over_inputs(chart, rates.by_u, out=B_lower), out=B_lower)  # (4.7)
     a = rates.c.copy()
     a[..., LINEAR] += rates.gravity
+    if state.orbit:  # (14.6)
+        turn, pull = state.orbit
+        A[..., g.v_b, g.r_b], A[..., g.v_b, g.v_b] = pull, 0.0 - 2.0 * skew(turn)
+        A[..., g.omega_b, g.omega_b] -= skew(spin)
+        a[..., ANGULAR] += times(W, spin)
+        a[..., LINEAR] -= 2.0 * times(skew(spin), v)
     if not v_in_reference:
         A[..., g.v_b, g.omega_b] += V  # (4.5)
         A[..., g.v_b, g.v_b] -= W
@@ -78,7 +87,7 @@ def assemble(
 def _over_turns(state: StateMap, actuation: Actuation, nu: Array, u: Array, rates: Rates) -> Array:
     """Return the slopes of the rates over turns of the base, Theta (.., 6 + n, 3) of (4.4)."""
     omega_in_reference, v_in_reference = state.axes
-    by_turn = np.zeros((*nu.shape, 3))
+    by_turn = np.zeros((*nu.shape, 3)) + rates.by_turn
     for columns, _ in actuation.held:
         by_turn += rates.by_u[..., columns] @ skew(u[..., columns])
     if omega_in_reference:

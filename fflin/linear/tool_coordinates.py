@@ -13,7 +13,7 @@ from fflin.base.rotation import quaternion_product, skew
 from fflin.base.validation import NORM_TOLERANCE, Array, placement, vector
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.chart import SMALLEST_Q0
-from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR
+from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR, refuse_orbit
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import ROOT
 from fflin.robot.link_masses import pieces_of
@@ -48,14 +48,14 @@ TOOLS = {
 
 
 class Slopes(NamedTuple):
-    """Slopes of coordinates x' and inputs u' at a point, over y (14.1) and u in base axes."""
+    """Slopes of coordinates x' and inputs u' at a point, over y (15.1) and u in base axes."""
 
-    P: Array  # of x' over y (14.2)
+    P: Array  # of x' over y (15.2)
     rate: Array  # of P along the motion
     left: Array  # left inverse of P
     V: Array  # of u over u'
-    H: Array  # of u over y, u' held (14.4)
-    extra: Array  # of dx'/dt along what y has not: the length of a quaternion (14.5)
+    H: Array  # of u over y, u' held (15.4)
+    extra: Array  # of dx'/dt along what y has not: the length of a quaternion (15.5)
 
 
 class ToolCoordinates:
@@ -227,6 +227,8 @@ def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCo
     """Return those of a tool."""
     if not isinstance(tool, str) or tool not in TOOLS:
         raise unknown("tool", str(tool), TOOLS)
+    if tool[:5] != "euler":
+        refuse_orbit(robot, f"the coordinates of {tool}")
     return ToolCoordinates(StateMap(robot), TOOLS[tool], moving=moving)
 
 

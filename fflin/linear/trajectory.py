@@ -18,6 +18,7 @@ from fflin.base.tables import folded
 from fflin.base.validation import Array, as_double, number, vector
 from fflin.base.writing import as_path
 from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.names import refuse_orbit
 from fflin.dynamics.state import StateMap
 from fflin.linear.flow import Flow
 from fflin.linear.trajectory_doubt import doubt
@@ -66,6 +67,7 @@ class Trajectory(Design):
     frame: str = field(default="local", kw_only=True)
 
     def __post_init__(self) -> None:
+        refuse_orbit(self.robot, "trajectories")
         robot, nu = self.robot, len(Actuation(self._state).names)
         times = as_double("t", self.t)
         times = vector("t", times, times.size, "times of the knots")

@@ -11,6 +11,7 @@ from fflin.base.validation import dimension, number, numbers
 from fflin.robot import inputs as kinds
 from fflin.robot.inputs import Input, JointTorque, named_inputs, named_wheels, three_numbers
 from fflin.robot.joints import Find, by_joint
+from fflin.robot.orbit import checked_orbit
 from fflin.robot.outputs import Output
 
 # The least and the largest value; infinite where there is no limit.
@@ -20,7 +21,7 @@ _OF_JOINTS = ("q_m", "qdot_m")
 
 # In the order in which a robot file gives them: names of inputs are known after the inputs.
 FIELDS = (
-    *("passive", "inputs", "outputs", "stiffness", "damping", "rest", "gravity"),
+    *("passive", "inputs", "outputs", "stiffness", "damping", "rest", "gravity", "orbit"),
     *("limits", "weights", "start"),
 )
 RULES = ("urdf", "identity")
@@ -45,6 +46,7 @@ def checked_fields(
     check: dict[str, Callable[[Any], Any]] = {
         "outputs": _outputs,
         "gravity": lambda value: three_numbers("gravity", value),
+        "orbit": checked_orbit,
         "limits": lambda value: given_limits(inputs, joints, value),
         "weights": lambda value: _weights(value, joints, inputs),
         "start": lambda value: _start(value, find, joints),

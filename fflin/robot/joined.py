@@ -61,8 +61,8 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         attached=(*robot.attached, (prefix, other)),
         **both,
     )
-    fields = {name: getattr(robot, name) for name in ("outputs", "passive", "limits", "weights")}
-    whole = replace(whole, **fields)
+    own_fields = ("outputs", "passive", "limits", "weights", "gravity", "orbit")
+    whole = replace(whole, **{name: getattr(robot, name) for name in own_fields})
     return with_inputs(whole, robot.inputs)
 
 

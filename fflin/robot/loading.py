@@ -48,9 +48,9 @@ def load(
         Folders in which ``package://`` paths of meshes are looked up when the robot is drawn,
         before those that the URDF lies in.
     **fields
-        inputs, outputs, stiffness, damping, rest, gravity, limits, passive, weights, start: see
-        `Robot.replace`. What is given here goes before what a robot file says; of locks, limits,
-        springs and dampers name by name.
+        inputs, outputs, stiffness, damping, rest, gravity, orbit, limits, passive, weights, start:
+        see `Robot.replace`. What is given here goes before what a robot file says; of locks,
+        limits, springs and dampers name by name.
 
     Returns
     -------

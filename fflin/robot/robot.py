@@ -18,6 +18,7 @@ from fflin.robot.fields import Range, checked_fields, checked_passive
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.inputs import BaseForce, BaseTorque, Input, JointTorque, named_wheels
 from fflin.robot.joints import Follower, Joint
+from fflin.robot.orbit import CircularOrbit
 from fflin.robot.outputs import FullState, Output
 from fflin.robot.wheels import stored_momentum, with_inputs
 
@@ -67,6 +68,8 @@ class Robot(Coordinates):
         {joint: position [rad|m]} where a spring is relaxed; 0 where not named.
     gravity : tuple of float (3,)
         Uniform acceleration [m/s^2] in Pinocchio's world axes. `model` itself has none.
+    orbit : CircularOrbit or None
+        What it circles; Pinocchio's world is then the orbit's frame, see `CircularOrbit`.
     package_dirs : tuple of Path
         Folders in which ``package://`` paths of meshes are looked up when it is drawn.
     passive : tuple of str
@@ -100,6 +103,7 @@ class Robot(Coordinates):
     damping: Mapping[str, float] = field(default_factory=dict)
     rest: Mapping[str, float] = field(default_factory=dict)
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    orbit: CircularOrbit | None = None
     package_dirs: tuple[Path, ...] = ()
     passive: tuple[str, ...] = ()
     weights: Mapping[str, Any] = field(default_factory=dict)
@@ -122,7 +126,7 @@ class Robot(Coordinates):
             object.__setattr__(self, "inputs", default)
 
     def replace(self, **fields: Any) -> Robot:
-        """Return the same robot with other inputs, passive joints or gravity.
+        """Return the same robot with other inputs, passive joints, gravity or orbit.
 
         Parameters
         ----------
@@ -142,6 +146,8 @@ class Robot(Coordinates):
             {joint: position [rad|m]} where its spring is relaxed.
         gravity : sequence of float (3,)
             Uniform acceleration [m/s^2] in Pinocchio's world axes.
+        orbit : CircularOrbit, float, mapping or None
+            What it circles, or the altitude over the earth [m], or {parameter: value} of one.
         passive : sequence of str
             Joints without a motor: their torques leave the inputs.
         weights : mapping
@@ -163,7 +169,7 @@ class Robot(Coordinates):
         ------
         InputError
             If a value is negative or not a number, a field is not one of these, or a wheel has
-            more inertia than what carries it.
+            more inertia than what carries it, or there are both gravity and an orbit.
         UnknownNameError
             If there is no such joint, no such frame for an input or output, or nothing to limit.
         ModelError
@@ -179,6 +185,11 @@ class Robot(Coordinates):
         joints, own = robot.joint_names, robot._bare.joint_names
         known = (robot.joint, joints, own, robot.inputs, self.urdf_damping)
         robot = replace(robot, **checked_fields(fields, *known))
+        if robot.orbit and any(robot.gravity):
+            raise InputError(
+                f"'{self.name}' has uniform gravity and an orbit, which has the field of its own "
+                "body; leave one out"
+            )
         for name in robot.used_frames:
             find_frame(robot.model, name)
         return robot

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # What holds names; all else holds numbers, but for what may be a word.
 _OF_NAMES = ("urdf", "package_dirs", "lock", "passive", "outputs")
-_WORDS = (["damping"], ["weights", "rule"])
+_WORDS = (["damping"], ["weights", "rule"], ["orbit", "body"])
 
 
 class RobotToml:

@@ -32,6 +32,8 @@ def robot_info(robot: Robot) -> str:
         f"{robot.name}: {counted(robot.n, 'joint')}, {12 + 2 * robot.n} states, "
         f"{counted(inputs, 'input')}, mass {robot.mass:.6g} kg\nfrom {source}"
     )
+    if robot.orbit:
+        head += f"\n{robot.orbit}"
     depth = {0: -1, 1: 0}
     rows = [["joint", "type", "mass [kg]", "lower", "upper", "effort", "velocity"]]
     rows.append(["(base)", "free", f"{model.inertias[1].mass:.6g}", ".", ".", ".", "."])

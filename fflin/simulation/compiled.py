@@ -61,8 +61,8 @@ def _reason(plan: Plan, plant: Plant) -> str:
     policy, robots = plan.policy, [plant.robot]
     if not numba_is_there():
         return "numba is not installed (pip install 'fflin[fast]')"
-    if plan.events or plan.callback or plant.disturbance:
-        return "events, callbacks and disturbances are functions in Python"
+    if plan.events or plan.callback or plant.disturbance or plant.field:
+        return "events, callbacks, disturbances and the field of an orbit are computed in Python"
     if isinstance(policy, Allocation):
         robots.append(policy.design)
         policy = policy.policy

@@ -18,6 +18,7 @@ from fflin.base.record import Design
 from fflin.base.validation import Array, instance
 from fflin.base.writing import as_path, check_ending, write_whole
 from fflin.dynamics.state_rows import attitude_errors, moving_errors
+from fflin.robot.orbit import CircularOrbit
 from fflin.simulation.report import Limited, Passed, Saturated, passed, saturated
 
 FORMATS = (*record.FORMATS, ".csv")
@@ -50,17 +51,20 @@ class Motion(Design):
     prediction : ndarray (N, nx)
         The state as the linear model has it under the same law; no rows where there is none.
     energy : ndarray (N,)
-        Kinetic, of gravity and of springs [J].
+        Kinetic, of gravity and of springs [J]; in orbit the Jacobi integral, which is kinetic
+        relative to the frame, of tide and turning of the frame, and of springs.
     momentum : ndarray (N, 6)
-        Angular about the centre of mass [N m s], then linear [N s], in world axes.
+        Angular about the centre of mass [N m s], then linear [N s], in world axes; in orbit that
+        of the motion relative to the frame.
     momentum_drift : ndarray (N,)
         How far the momentum is from its initial value and the impulse since, relative to the
-        largest sum of the momenta of base and joints.
+        largest sum of the momenta of base and joints. In orbit, where none is kept, how far
+        `energy` is from its initial value and the work since, relative to its largest terms.
     com_drift : ndarray (N,)
         How far the centre of mass is from where its initial velocity and the impulse since take
-        it [m]; no rows where a file does not tell.
+        it [m]; no rows in orbit, and where a file does not tell.
     state_names, input_names, state_units, input_units : tuple of str
-    frame : {"hybrid", "local", "world"}
+    frame : {"hybrid", "local", "world", "lvlh", "hill"}
     robot, urdf_sha256 : str
     stopped : str
         Why it ended before its time; empty where it did not.
@@ -114,6 +118,7 @@ class Motion(Design):
     limit_names: tuple[str, ...] = field(default_factory=tuple)
     limits: Array = field(default_factory=lambda: np.zeros((0, 2)))
     engine: str = field(default_factory=str)
+    circles: str = field(default_factory=str)  # the orbit, as text
 
     def __post_init__(self) -> None:
         rows = (self.q, self.v, self.x, self.u, self.energy, self.momentum, self.momentum_drift)
@@ -132,7 +137,7 @@ class Motion(Design):
         stopped = f", stopped: {self.stopped}" if self.stopped else ""
         return (
             f"Motion('{self.robot}', {len(self.t)} rows, {self.t[0]:g} to {self.t[-1]:g} s, "
-            f"momentum drift {self.momentum_drift.max():.1e}, "
+            f"{self.kept} drift {self.momentum_drift.max():.1e}, "
             f"com drift {self.com_drift.max(initial=0.0):.1e} m{stopped})"
         )
 
@@ -146,6 +151,16 @@ class Motion(Design):
     def reference(self) -> pin.SE3:
         """Placement that attitude and position are relative to."""
         return pin.XYZQUATToSE3(self.placement)
+
+    @property
+    def orbit(self) -> CircularOrbit | None:
+        """What it circles, if anything; the world is then the frame of it that `frame` says."""
+        return CircularOrbit.from_json(self.circles) if self.circles else None
+
+    @property
+    def kept(self) -> str:
+        """What it conserves but for what acts on it, whose drift is `momentum_drift`."""
+        return "Jacobi integral" if self.circles else "momentum"
 
     @property
     def linear(self) -> Array | None:

@@ -47,7 +47,7 @@ def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None
         Signals(motion.u, motion.input_names, motion.input_units, limits).only(inputs),
         dict.fromkeys(motion.wheels, 0.0) | dict(zip(motion.wheels, inertias, strict=False)),
         apart and (apart[0], apart[1].only(states)),
-        {"momentum": motion.momentum_drift, "centre of mass [m]": motion.com_drift},
+        {motion.kept: motion.momentum_drift, "centre of mass [m]": motion.com_drift},
         title=f"{title}\n{motion.stopped}" if motion.stopped else title,
         rest=rest,
         path=path,

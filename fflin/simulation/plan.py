@@ -24,6 +24,7 @@ from fflin.control.tracking import (
 )
 from fflin.dynamics import points
 from fflin.dynamics.integrators import Integrator, integrator
+from fflin.dynamics.names import ORBITAL, refuse_orbit
 from fflin.dynamics.state import Frame, StateMap
 from fflin.linear.ignorable import rotor_names
 from fflin.linear.model import LinearModel
@@ -56,7 +57,7 @@ class Plan:
     limits: Saturation  # what acts of a command
     known: dict[str, Range]  # limits of states and inputs, whether they cut or not
     method: type[Integrator]
-    project: bool  # whether momentum and centre of mass are kept
+    project: bool  # whether momentum and centre of mass are kept, which they are in no orbit
     turning: Array  # the velocities whose turn within a step has a bound
     chart: StateMap | None  # that ends the run where the base leaves it
     events: tuple[Event, ...]
@@ -169,11 +170,21 @@ def planned(
             f"frame is {frame!r}, expected '{own_frame}' along a trajectory, whose inputs are in "
             "base axes; leave it out"
         )
+    if along:
+        refuse_orbit(robot, "trajectories to follow")
+    if own_frame and (own_frame in ORBITAL) != bool(robot.orbit):
+        made, flown = ("in orbit", "no") if own_frame in ORBITAL else ("without an orbit", "an")
+        raise InputError(
+            f"the policy was made {made}, frame '{own_frame}', and '{robot.name}' is in {flown} "
+            "orbit; make it for the robot as it flies"
+        )
     axes = {"reference": own_reference if reference is None else reference}
     state = StateMap(robot, **axes, frame=own_frame if frame is None else frame)
     plant = Plant(state, disturbance)
     foresees = predictor(plant, policy, linear)
     q, v = start_of(state, x0, q0, v0, follows)
+    if plant.field:
+        plant.field.require_near(q)
     times.require_room(robot.nq + robot.nv + 2 * state.nx, chosen=dt is None)
     acting, known = chosen_limits(robot, limits)
     within = saturation(robot, acting, q, times.dt, times.sample)
@@ -216,7 +227,7 @@ def planned(
         limits=within,
         known=known,
         method=integrates,
-        project=truth("project", project),
+        project=truth("project", project) and robot.orbit is None,
         turning=np.array([3, 4, 5, *(joint.idx_v for joint in joints)]),
         chart=None if lin is None else state,
         events=called,

@@ -73,10 +73,15 @@ class Plant:
             and not robot.stored_momentum
             and not any(values.any() for values in robot.springs)
             and not any(robot.gravity)
+            and not robot.orbit
         )
+        self.field = self._aba.field
 
     def stage(self, t: float, q: Array, v: Array, u: Array) -> tuple[Array, Array]:
-        """Return dv/dt (nv,), and the wrench (6,) on the base but gravity's, in base axes."""
+        """Return dv/dt (nv,), and the wrench (6,) on the base but gravity's, in base axes.
+
+        In orbit the power [W] of all but the orbit and springs, and zeros, instead of the wrench.
+        """
         if self._faulty:
             gain, bias, until, turn = self.drives
             u = np.where(t < until, gain * u + bias, 0.0)
@@ -89,17 +94,24 @@ class Plant:
         if self._plain and self.disturbance is None:
             tau = self._columns.dot(u)
             return _aba(self._model, self._data, q, v, tau), tau[:6]
-        push = (self.actuation.columns(self._data, q)[:6] @ u)[_LINEAR_FIRST]
-        if self.disturbance is None:
-            return self._aba.acceleration(q, v, u), push
-        disturbed = self._disturbed(self.disturbance(t, q.copy(), v.copy()), t, v)
-        return self._aba.acceleration(q, v, u, disturbed), push + disturbed[:6]
+        force = self.actuation.columns(self._data, q) @ u
+        disturbed = None
+        if self.disturbance is not None:
+            disturbed = self._disturbed(self.disturbance(t, q.copy(), v.copy()), t, v)
+        rate = self._aba.acceleration(q, v, u, disturbed)
+        push = force[_LINEAR_FIRST] if disturbed is None else force[_LINEAR_FIRST] + disturbed[:6]
+        if self.field:
+            nu = self.state.velocities(v)
+            power = nu.dot(force) - self.robot.springs.damping.dot(nu[6:] ** 2)
+            push = np.append(power if disturbed is None else power + v.dot(disturbed), np.zeros(5))
+        return rate, push
 
     def isolated(self, *, driven: bool) -> bool:
         """Whether nothing pushes from outside, whatever the inputs are or where none acts."""
         driven = driven or bool(self.drives.bias.any())
         base = driven and (self._columns[:6].any() or self.actuation.carried)
-        return not (base or self.disturbance is not None or any(self.robot.gravity))
+        outside = self.disturbance is not None or any(self.robot.gravity) or self.robot.orbit
+        return not (base or outside)
 
     def _disturbed(self, given: ArrayLike, t: float, v: Array) -> Array:
         force = as_double(f"disturbance(t, q, v) at t = {t:g} s", given)

@@ -247,7 +247,7 @@ def _drifts(axes: Axes, t: Array, drifts: Mapping[str, Array]) -> None:
     shown = {k: np.maximum(v, np.finfo(float).eps / 10.0) for k, v in drifts.items() if len(v)}
     for color, (label, drift) in zip(COLORS, shown.items(), strict=False):
         axes.semilogy(t, drift, color=color, label=label)
-    axes.set(title="momentum drift, relative", xlabel="t [s]")
+    axes.set(title=f"{next(iter(shown))} drift, relative", xlabel="t [s]")
     axes.set_ylim(1e-17, max(1e-13, *(10.0 * float(drift.max()) for drift in shown.values())))
     axes.legend(handlelength=1.2)
 

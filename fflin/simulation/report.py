@@ -143,7 +143,8 @@ def motion_report(motion: Any) -> str:
     head = [verdict(motion, kinds)] if kinds or motion.stopped else []
     by = ", compiled" if motion.engine == "compiled" else ""
     run = f"{motion.t[-1]:g} s, {len(motion.t)} rows, frame {motion.frame}{by}"
-    parts = [folded([*head, f"{motion.robot}: {run}", *motion.notes])]
+    circling = [str(motion.orbit)] if motion.orbit else []
+    parts = [folded([*head, f"{motion.robot}: {run}", *circling, *motion.notes])]
     if kinds:
         settled = f"within {100.0 * SETTLED:g} % after [s]"
         rows = [["error", "unit", "first", "largest", "last", settled]]
@@ -156,7 +157,7 @@ def motion_report(motion: Any) -> str:
         parts.append(folded(said[:_MOST] + more))
     first, last = (f"{energy:.6g} J" for energy in motion.energy[[0, -1]])
     drift = f"{motion.momentum_drift.max():.1e}"
-    parts.append(f"energy {first} at first, {last} at last; momentum drift {drift}")
+    parts.append(f"energy {first} at first, {last} at last; {motion.kept} drift {drift}")
     if len(motion.com_drift):
         far = f"{motion.com_drift.max():.1e} m"
         parts.append(f"largest distance of the centre of mass from its line: {far}")

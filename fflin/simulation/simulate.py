@@ -16,7 +16,7 @@ from fflin.dynamics.state_rows import state_history
 from fflin.linear.model import LinearModel
 from fflin.robot.robot import Robot
 from fflin.simulation.compiled import carried_out, engine_of
-from fflin.simulation.conservation import Conserved
+from fflin.simulation.jacobi import conserved_by
 from fflin.simulation.motion import Motion
 from fflin.simulation.plan import Event, Plan, planned
 from fflin.simulation.plant import Disturbance, Plant
@@ -61,6 +61,9 @@ def simulate(
     take it, and its velocity is set so that the momentum is what the impulse from outside makes
     it, :math:`\nu_b = M_{bb}^{-1}(H - M_{bm} \dot q_m)`, where H is integrated with the weights of
     the method. Thrusters never pull: a negative thrust is cut to zero.
+
+    In orbit q and v are relative to the orbit's frame, here and in what a policy is given; nothing
+    keeps the momentum, and no base is shifted.
 
     Parameters
     ----------
@@ -111,9 +114,10 @@ def simulate(
         State, or model whose point it is, that errors are counted from; by default the point of
         the policy's own model, or along a trajectory the state that it has at each time, and none
         under a policy without one.
-    frame : {"hybrid", "local", "world"}, optional
+    frame : {"hybrid", "local", "world", "lvlh", "hill"}, optional
     reference : pin.SE3, optional
-        Chart of x and axes of u; the policy's by default, else hybrid and the identity.
+        Chart of x and axes of u; the policy's by default, else hybrid, in orbit lvlh, and the
+        identity.
     every : int, optional
         Steps from one recorded row to the next; by default 1, or where that would be more than
         100,000 rows, as many as leave 10,000, which the motion's `notes` say.
@@ -121,8 +125,8 @@ def simulate(
         Whether a bar is shown on stderr; by default on a terminal, for runs that take long.
     engine : {"python", "compiled"}, optional
         What runs the loop; by default the compiled one where it can and is the quicker. It needs
-        numba, and no policy, event, callback or disturbance in Python. Both give the same to
-        rounding.
+        numba, no orbit, and no policy, event, callback or disturbance in Python. Both give the
+        same to rounding.
 
     Returns
     -------
@@ -167,8 +171,10 @@ def simulate(
 def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = None) -> Motion:
     """Return the motion that a plan leads to, or led to where its run is given."""
     state, robot = plant.state, plant.robot
-    conserved = Conserved(robot, plan.q)
+    conserved = conserved_by(robot, plan.q, plant.field)
     run = run or carried_out(plan, plant, conserved, engine)
+    if plant.field and not run.stopped:
+        plant.field.require_near(run.q[np.linalg.norm(run.q[:, :3], axis=1).argmax()])
     x = state_history(state, run.q, run.v, plan.near, run.t)
     target = np.zeros(0) if plan.target is None else plan.target
     if plan.reference is not None:
@@ -183,13 +189,15 @@ def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = Non
         energy=history.energy,
         momentum=np.roll(history.momentum, 3, axis=1),
         momentum_drift=conserved.momentum_drift(history, run.momentum),
-        com_drift=np.linalg.norm(history.center - run.center, axis=1),
+        # In orbit the centre of mass keeps to no line.
+        com_drift=np.linalg.norm(history.center - run.center, axis=1)[: 0 if robot.orbit else None],
         placement=pin.SE3ToXYZQUAT(state.reference),
         state_names=state.names,
         input_names=plant.actuation.names,
         state_units=state.units,
         input_units=plant.actuation.units,
         frame=state.frame,
+        circles=robot.orbit.to_json() if robot.orbit else "",
         robot=robot.name,
         urdf_sha256=robot.urdf_sha256,
         _robot=robot,

@@ -13,8 +13,10 @@ import pinocchio as pin
 
 from fflin.base.rotation import skew
 from fflin.base.validation import Array
-from fflin.dynamics.names import LINEAR
+from fflin.dynamics.names import LINEAR, PIN_ANGULAR
+from fflin.dynamics.orbital import field_of
 from fflin.dynamics.rnea import Rates
+from fflin.dynamics.tidal import Tide
 from fflin.linear.prepared import Prepared
 from fflin.robot.frames import ROOT
 from fflin.uncertainty.parameters import Parameter
@@ -59,25 +61,32 @@ class BodySlopes:
         self.q, self.v, self.inverse = q.copy(), v.copy(), inverse
         # Nothing depends on where the base is and how fast it moves along, see `Accelerations`.
         self.q[:3] = self.v[:3] = 0.0
+        field = field_of(ready.robot, self.state.frame)
+        self._tide = None
+        if field:
+            self._tide = Tide.at(field, q)
+            self.v[PIN_ANGULAR] += self._tide.spin
         self.data, self.rates = ready.robot.create_data(), rates
         self.joints = range(ROOT, self.model.njoints)
 
     def all(self) -> Rates:
         """Return them as rates, (bodies * 10, ..), of the joints in Pinocchio's order."""
-        rates, size, n = self.rates, len(self.inverse), len(self.inverse) - 6
-        given = np.concatenate((rates.by_u, rates.by_q_m, rates.by_nu), axis=1)
+        rates, size = self.rates, len(self.inverse)
+        parts = (rates.by_u, rates.by_q_m, rates.by_nu, rates.by_turn)
+        given = np.concatenate(parts, axis=1)
         moved = self._by_inertia(given).reshape(-1, size, given.shape[1])
-        nu = rates.by_u.shape[1]
-        by_u, by_q_m, by_nu = np.split(moved, (nu, nu + n), axis=2)
+        ends = np.cumsum([part.shape[1] for part in parts[:-1]])
+        by_u, by_q_m, by_nu, by_turn = np.split(moved, ends, axis=2)
         c = np.zeros((len(moved), size))
         if self.v.any() or rates.c.any():
-            F, F_q, F_nu = self._forces()
+            F, F_q, F_nu, F_turn = self._forces()
             c = -F @ self.inverse
             F_q += [self._slope(self.model, np.zeros_like(self.v), each)[1] for each in c]
             by_q_m = by_q_m - self.inverse @ F_q
             by_nu = by_nu - self.inverse @ F_nu
+            by_turn = by_turn - self.inverse @ F_turn
         by_nu[..., LINEAR] = 0.0
-        return Rates(c, by_q_m, by_nu, by_u, np.zeros((len(moved), 3)))
+        return Rates(c, by_q_m, by_nu, by_u, np.zeros((len(moved), 3)), by_turn)
 
     def share(self, changes: Mapping[int, Array]) -> float:
         """Return how much of M a change of bodies is at the most: the radius of M^-1 M_p."""
@@ -101,30 +110,39 @@ class BodySlopes:
         product = -(X.mT @ Z)
         return product.reshape(bodies, size, 10, k).transpose(0, 2, 1, 3)
 
-    def _forces(self) -> tuple[Array, Array, Array]:
-        """Return F_p (bodies * 10, 6 + n), F_qp over q_m and F_nup."""
+    def _forces(self) -> tuple[Array, ...]:
+        """Return F_p (bodies * 10, 6 + n), F_qp over q_m, F_nup, and in orbit that over turns."""
         lone = self.model.copy()
         lone.armature = np.zeros_like(lone.armature)
         for joint in range(lone.njoints):
             lone.inertias[joint] = pin.Inertia.Zero()
-        found: tuple[list[Array], ...] = ([], [], [])
+        found: tuple[list[Array], ...] = ([], [], [], [])
         for joint in self.joints:
             of_bodies = []
             for body in _BODIES:
                 lone.inertias[joint] = body
-                of_bodies.append(self._slope(lone, self.v, self.rates.c))
+                of_bodies.append(self._slope(lone, self.v, self.rates.c, self._tide))
             lone.inertias[joint] = pin.Inertia.Zero()
             for kept, values in zip(found, zip(*of_bodies, strict=True), strict=True):
                 kept.append(np.tensordot(_OF_BODIES, values, 1))
-        F, F_q, F_nu = (np.concatenate(each) for each in found)
-        return F, F_q, F_nu
+        return tuple(np.concatenate(each) for each in found)
 
-    def _slope(self, model: pin.Model, v: Array, c: Array) -> tuple[Array, Array, Array]:
-        """Return RNEA and its slopes over q_m and nu, without springs and inputs."""
-        state = self.state
-        by_q, by_v, _ = pin.computeRNEADerivatives(model, self.data, self.q, v, state.spread(c))
-        tau = state.forces(np.array(self.data.tau))
-        return tau, state.project(by_q)[:, 6:], state.project(by_v)
+    def _slope(
+        self, model: pin.Model, v: Array, c: Array, tide: Tide | None = None
+    ) -> tuple[Array, ...]:
+        """Return RNEA and its slopes over q_m, nu and turns, without springs and inputs."""
+        state, data, q = self.state, self.data, self.q
+        by_turn: Array = np.zeros((len(v), 3))
+        if tide:  # first, as what Pinocchio returns is overwritten
+            pull = tide.force(model, data, q)
+            pull_by_q, by_turn = tide.slopes(model, data, q)
+        by_q, by_v, _ = pin.computeRNEADerivatives(model, data, q, v, state.spread(c))
+        tau = np.array(data.tau)
+        if tide:
+            tau, by_q = tau - pull, by_q - pull_by_q
+            by_turn = by_v[:, PIN_ANGULAR] @ skew(tide.spin) - by_turn
+        project = state.project
+        return state.forces(tau), project(by_q)[:, 6:], project(by_v), state.forces(by_turn)
 
 
 def slopes_of(parameters: Sequence[Parameter], at: BodySlopes, of_bodies: Rates, u: Array) -> Rates:
@@ -171,4 +189,5 @@ def _of_force(parameter: Parameter, at: BodySlopes, u: Array) -> Rates:
     c = -at.inverse @ F
     if c.any():
         F_q = F_q + at._slope(at.model, np.zeros_like(at.v), c)[1]
-    return Rates(c, -at.inverse @ F_q, -at.inverse @ F_nu, at.inverse @ B, np.zeros(3))
+    of_turn = np.zeros((size, 3))
+    return Rates(c, -at.inverse @ F_q, -at.inverse @ F_nu, at.inverse @ B, np.zeros(3), of_turn)

@@ -305,6 +305,7 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
 
 def _made(lin: LinearModel, robot: Robot) -> Sensitivity:
     own = lin.moving or bool(np.array_equal(lin.placement, own_reference(robot, lin.q)))
+    own = own and robot.orbit is None
     reference = None if own else lin.reference
     ready = prepare(robot, frame=lin.frame, reference=reference, moving=lin.moving)
     state, data = ready.map, robot.create_data()

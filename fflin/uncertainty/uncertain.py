@@ -70,15 +70,17 @@ class Uncertain:
         Raises
         ------
         InputError
-            If the point is no fixed point whatever the parameters: springs out of rest, gravity,
-            stored momentum; or if an output feels accelerations or masses.
+            If the point is no fixed point whatever the parameters: springs out of rest, gravity, an
+            orbit, stored momentum; or if an output feels accelerations or masses.
         """
         robot = self.robot
         lin = linearize(robot, q)
         rest = robot.springs.rest - StateMap(robot).joint_positions(lin.q)
         pulled = [rest[each.parameter.spring] for each in self.ranges if each.parameter.spring >= 0]
-        if lin.f0.any() or any(pulled) or any(robot.gravity) or robot.stored_momentum:
+        pulled += [lin.f0.any(), *robot.gravity, robot.orbit, robot.stored_momentum]
+        if any(pulled):
             pulls = "gravity" if any(robot.gravity) else "a spring out of its rest"
+            pulls = "the field of an orbit" if robot.orbit else pulls
             raise InputError(
                 "the point is no fixed point whatever the parameters: there is "
                 f"{'stored momentum' if robot.stored_momentum else pulls}; take a point at rest "

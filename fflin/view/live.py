@@ -45,6 +45,8 @@ class Live:
         Seconds of simulation per second, at most.
     port : int
         0 for one that is free.
+    frame : str, optional
+        "lvlh" or "hill", of a robot in orbit.
 
     Attributes
     ----------
@@ -68,6 +70,7 @@ class Live:
         follow: bool = False,
         speed: float = 1.0,
         port: int = 0,
+        frame: str | None = None,
     ) -> None:
         self.robot = robot
         self._data = robot.model.createData()
@@ -82,7 +85,7 @@ class Live:
         drawing = Drawing(robot, self.meshcat["robot"])
         self.notes = drawing.notes
         poses = body_poses(robot, self._data, q)
-        info = stage_info(robot, drawing, poses, scene=scene, subtitle=subtitle(robot))
+        info = stage_info(robot, drawing, poses, scene=scene, subtitle=subtitle(robot), frame=frame)
         info |= {
             "mode": "live",
             "follow": follow,

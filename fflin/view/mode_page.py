@@ -51,7 +51,7 @@ def mode_page(
     drawing.place(at_rest)
     Drawing(robot, scenery["rest"], "ghost", sent).place(at_rest)
     about = f"{subtitle(robot)}, {counted(len(found.vibrations), 'vibration')}"
-    info = stage_info(robot, drawing, at_rest, scene=scene, subtitle=about)
+    info = stage_info(robot, drawing, at_rest, scene=scene, subtitle=about, frame=lin.frame)
     swings = [_swing(state, drawing, mode, lin, info["size"]) for mode in found.vibrations]
     points = [corner_points(drawing, poses) for swing in swings for poses in swing[:: _PHASES // 4]]
     info |= {

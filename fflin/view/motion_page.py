@@ -10,6 +10,8 @@ import pinocchio as pin
 
 from fflin.base.tables import counted
 from fflin.base.validation import Array
+from fflin.dynamics.names import frame_of
+from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.robot.frames import find_frame
 from fflin.robot.robot import ROOT, Robot
@@ -80,7 +82,9 @@ def motion_page(
     window.send(Animation(clips))
 
     about = f"{subtitle(robot)}, {t[-1] - t[0]:.4g} s"
-    info = stage_info(robot, drawing, film.poses[0], scene=scene, subtitle=about)
+    info = stage_info(
+        robot, drawing, film.poses[0], scene=scene, subtitle=about, frame=motion.frame
+    )
     shown_points = frame_points(drawing, film, info["size"])
     for poses in goals[:: max(1, len(goals) // 24)]:
         shown_points = np.concatenate((shown_points, corner_points(drawing, poses)))
@@ -126,7 +130,8 @@ def subtitle(robot: Robot) -> str:
     """Return what the page says of a robot below its name."""
     wheels = len(robot.wheels)
     parts = [counted(robot.n - wheels, "joint"), *[counted(wheels, "wheel")] * bool(wheels)]
-    return ", ".join([*parts, f"{robot.mass:.4g} kg"])
+    orbit = [f"{robot.orbit.altitude / 1e3:.6g} km over {robot.orbit.body}"] if robot.orbit else []
+    return ", ".join([*parts, f"{robot.mass:.4g} kg", *orbit])
 
 
 def frame_points(drawing: Drawing, film: Playback, size: float, *, follow: bool = False) -> Array:
@@ -161,22 +166,39 @@ def corner_points(drawing: Drawing, poses: Array) -> Array:
 
 
 def stage_info(
-    robot: Robot, drawing: Drawing, poses: Array, *, scene: str, subtitle: str
+    robot: Robot,
+    drawing: Drawing,
+    poses: Array,
+    *,
+    scene: str,
+    subtitle: str,
+    frame: str | None = None,
 ) -> dict[str, Any]:
     """Return what the page's stage needs, of the first frame's poses (njoints - 1, 7)."""
     points = corner_points(drawing, poses)
     low, high = points.min(axis=0), points.max(axis=0)
     centre = (low + high) / 2.0
     size = max(float(np.linalg.norm(points - centre, axis=1).max()), 1e-3)
-    return {
+    sun, direction, orbit = np.array(SUN), np.array(VIEWS[scene]), dict[str, Any]()
+    field = field_of(robot, frame_of(robot, frame)) if scene == "space" else None
+    if field and robot.orbit:
+        # Up is away from the body, and x along the orbit.
+        radial, along, normal = field.axes.T
+        sun, direction = (along * x + normal * y + radial * z for x, y, z in (sun, direction))
+        far = robot.orbit.radius / robot.orbit.body_radius
+        orbit = {
+            "up": [along.tolist(), radial.tolist(), (-normal).tolist()],
+            "orbit": {"body": robot.orbit.body, "distance": far, "rate": robot.orbit.mean_motion},
+        }
+    return orbit | {
         "title": robot.name,
         "subtitle": subtitle,
         "scene": scene,
         "size": size,
         "centre": centre.tolist(),
         "floor": [*centre[:2].tolist(), float(low[2])],
-        "sun": SUN,
-        "direction": VIEWS[scene],
+        "sun": sun.tolist(),
+        "direction": direction.tolist(),
         "base": ["meshcat", "robot", body_paths(robot)[0]],
     }
 

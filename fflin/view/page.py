@@ -14,7 +14,7 @@ import numpy as np
 
 from fflin.base.validation import Array
 
-_SCRIPTS = ("sky", "look", "stage", "marks", "plots", "player", "live", "modes", "main")
+_SCRIPTS = ("sky", "orbit", "look", "stage", "marks", "plots", "player", "live", "modes", "main")
 
 
 def build_page(info: dict[str, Any], commands: Iterable[bytes] = (), connect: str = "") -> str:

@@ -111,7 +111,7 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
         for title, unit, values in readouts[: 4 if len(target) > 1 else 2]
         if values.any()
     ]
-    readouts.append(("momentum drift", "", motion.momentum_drift[shown]))
+    readouts.append((f"{motion.kept} drift", "", motion.momentum_drift[shown]))
     if len(motion.com_drift):  # a file may not tell
         readouts.append(("centre of mass drift", "m", motion.com_drift[shown]))
     reference = motion.target[shown] if len(target) > 1 else np.zeros((0, motion.x.shape[1]))

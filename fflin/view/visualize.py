@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from warnings import warn
 
 from fflin.base.errors import FflinWarning, FileError, InputError
-from fflin.base.validation import Array, number, truth
+from fflin.base.validation import Array, instance, number, truth
 from fflin.base.writing import as_path, check_distinct, check_place, write_whole
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.points import start_of
@@ -55,6 +55,7 @@ def visualize(
     funnel: Funnel | None = None,
     q: Array | None = None,
     port: int = 0,
+    frame: str | None = None,
 ) -> Live | Path | None:
     """Show a robot live, or a motion of it as one HTML file that needs no network.
 
@@ -83,7 +84,9 @@ def visualize(
     open : bool, optional
         Whether to open a browser; by default where no file is named.
     scene : {"space", "lab"}, optional
-        Sky and planet, or a floor with a grid; the latter by default where there is gravity.
+        Sky and planet, or a floor with a grid; the latter by default where there is gravity. In
+        orbit the planet is the body that it circles, in its true size and below, where it turns
+        with the stars as the orbit goes on; the sun stays.
     fps : float
         Frames per second of watching.
     speed : float, optional
@@ -106,6 +109,8 @@ def visualize(
         Where a live robot stands first; by default at its `start`, or neutral.
     port : int
         Of the live page; a free one by default.
+    frame : {"lvlh", "hill"}, optional
+        Of a live robot in orbit, which of the orbit's frames its world is; lvlh by default.
 
     Returns
     -------
@@ -129,10 +134,7 @@ def visualize(
     FflinWarning
         Of what could not be drawn: missing meshes; boxes where there is no visual geometry.
     """
-    if not isinstance(robot, Robot):
-        raise InputError(
-            f"robot is a {type(robot).__name__}, expected a fflin.Robot; fflin.load makes one"
-        )
+    instance("robot", robot, Robot, "a fflin.Robot; fflin.load makes one")
     if scene is None:
         scene = "lab" if any(robot.gravity) else "space"
     if not isinstance(scene, str) or scene not in SCENES:
@@ -149,10 +151,8 @@ def visualize(
         start = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
 
-        pace = _speed(speed, 1.0)
-        live = Live(
-            robot, start, scene=scene, tool=tool, follow=bool(follow), speed=pace, port=port
-        )
+        how: Any = {"scene": scene, "tool": tool, "follow": bool(follow), "frame": frame}
+        live = Live(robot, start, **how, speed=_speed(speed, 1.0), port=port)
         for note in live.notes:
             warn(note, FflinWarning, stacklevel=2)
         if opened is not False:
@@ -174,7 +174,7 @@ def visualize(
         from fflin.view.motion_page import motion_page
 
         goal = None if target is None else _configuration(robot, "target", target)
-        how: Any = {"scene": scene, "fps": fps, "speed": speed, "follow": follow, "target": goal}
+        how = {"scene": scene, "fps": fps, "speed": speed, "follow": follow, "target": goal}
         page, notes = motion_page(robot, motion, **how, tool=tool, cloud=cloud, funnel=funnel)
         contents = _pictures(page, outputs, motion, speed, times)
     for note in notes:

@@ -187,7 +187,7 @@ def differences(f, step=2e-3):
 
 
 def test_four_numbers_of_a_quaternion_have_a_direction_that_nothing_moves():
-    """n = (quaternion, 0): a left inverse sees none of it, and A n is the rate of n (14.5)."""
+    """n = (quaternion, 0): a left inverse sees none of it, and A n is the rate of n (15.5)."""
     robot = fflin.load("servicer_7dof")
     q, v, u, _ = point(robot, 4, {})
     m = fflin.linearize(robot, q, v, u).to("drake")

@@ -69,6 +69,10 @@ def sound(folder):
             **{"placement": pin.SE3.Identity(), "payload_q": None, "payload_v": np.zeros(6)},
             "prefix": "caught",
         },
+        "CircularOrbit": {
+            **{"altitude": 7e5, "mean_motion": None, "body": "earth", "mu": None},
+            "body_radius": None,
+        },
         "check": {"robot": robot, "lin": lin},
         "configuration": {"robot": robot, "joints": {joint: 0.1}, "base": pin.SE3.Identity()},
         "controllability": {"lin": lin},
@@ -103,6 +107,7 @@ def sound(folder):
         "lqr": {"lin": lin} | weights | {"N": None},
         "lqr_batch": {"batch": batch} | weights,
         "modes": {"lin": lin},
+        "relative_equilibria": {"robot": robot.replace(orbit=7e5), "q": q, "frame": "hill"},
         "Momentum": {},
         "from_tool": {
             **{"robot": robot, "tool": "mujoco", "q": given.q, "v": given.v, "u": given.u0},

@@ -8,7 +8,8 @@ import pytest
 
 import fflin
 from tests.support.complex_crba import inertia, motions
-from tests.support.robots import BUNDLED, random_point
+from tests.support.orbits import in_orbit
+from tests.support.robots import BUNDLED, random_point, random_pose
 
 H = 1e-30
 
@@ -299,3 +300,16 @@ def test_rotors_are_no_parameters_of_bodies():
     q, v, u = random_point(robot, np.random.default_rng(2))
     found = fflin.sensitivity(fflin.linearize(robot, q, v, u)).check(["base.mass", "joint_3.com.x"])
     assert max(found.values()) < 1e-8
+
+
+def test_in_orbit_masses_change_what_the_field_does():
+    robot, rng = in_orbit(fflin.load("servicer_7dof")), np.random.default_rng(6)
+    joints = {name: rng.uniform(-1.0, 1.0) for name in robot.joint_names}
+    for speed, frame in ((0.0, "hill"), (0.4, "lvlh")):
+        base = random_pose(rng, 100.0)
+        q = fflin.configuration(robot, joints, base)
+        v = speed * rng.normal(size=robot.nv)
+        for reference in (None, base):
+            lin = fflin.linearize(robot, q, v, frame=frame, reference=reference)
+            found = fflin.sensitivity(lin).check(["link_3.mass", "base.inertia.xy", "link_7.com.x"])
+            assert max(found.values()) < 2e-9

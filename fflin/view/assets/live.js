@@ -49,7 +49,7 @@ function makeSlider(parent, joint, long, send) {
   };
 }
 
-function makeLive({ viewer, aim, keepFramed }, info) {
+function makeLive({ viewer, aim, keepFramed, turn }, info) {
   const panel = document.getElementById("panel");
   let socket = null;
   const send = (message) => { if (socket && socket.readyState === 1) socket.send(JSON.stringify(message)); };
@@ -87,9 +87,10 @@ function makeLive({ viewer, aim, keepFramed }, info) {
     if (last) {
       const shift = base.clone().sub(last);
       centre.add(shift);
-      if (info.follow) { viewer.camera.position.add(shift); viewer.controls.target.add(shift); gone.add(shift); }
+      if (info.follow) { viewer.camera.position.add(shift); viewer.controls.target.add(shift); gone.add(shift.clone().applyQuaternion(upright.clone().invert())); }
     }
     last = base;
+    turn(state.time ?? 0);
     aim(centre);
     live.state = state;
     viewer.set_dirty();
@@ -109,7 +110,7 @@ function makeLive({ viewer, aim, keepFramed }, info) {
     };
     socket.onclose = () => { problem("No connection to fflin; it will be taken up again."); setTimeout(connect, 1000); };
   };
-  keepFramed(() => [info.points.map(([x, y, z]) => [x + gone.x, y - gone.z, z + gone.y]), info.direction]);
+  keepFramed(() => [info.points.map(([x, y, z]) => [x + gone.x, y + gone.y, z + gone.z]), info.direction]);
   connect();
   return live;
 }

@@ -66,7 +66,7 @@ function main() {
     console.warn(error);
     return;
   }
-  const { viewer, aim, keepFramed } = stage;
+  const { viewer, aim, keepFramed, turn } = stage;
   window.viewer = viewer;
   for (const command of info.commands) {
     try {
@@ -112,14 +112,15 @@ function main() {
   let follow = info.follow;
   let plots = [];
   const player = makePlayer(viewer, info, (i, time) => {
+    turn(time);
     showMarks(i);
     showFigures(i);
     stamp.textContent = `t = ${figure(time, 3)} s`;
     for (const show of plots) show(i, time);
     const moved = base.position.clone().sub(last);
     last.copy(base.position);
-    const shift = new THREE.Vector3(moved.x, moved.z, -moved.y);
-    if (follow) { camera.position.add(shift); controls.target.add(shift); gone.add(shift); }
+    const shift = moved.clone().applyQuaternion(upright);
+    if (follow) { camera.position.add(shift); controls.target.add(shift); gone.add(moved); }
     centre.add(shift);
     aim(centre);
   });
@@ -138,7 +139,7 @@ function main() {
   press();
   document.getElementById("bar").append(button);
   player.seek(player.first);
-  keepFramed(() => [info.points.map(([x, y, z]) => [x + gone.x, y - gone.z, z + gone.y]), info.direction]);
+  keepFramed(() => [info.points.map(([x, y, z]) => [x + gone.x, y + gone.y, z + gone.z]), info.direction]);
   window.addEventListener("resize", () => requestAnimationFrame(() => player.seek(player.state.time)));
   const plain = (on, keyed) => {
     document.body.classList.toggle("plain", on);

@@ -10,12 +10,7 @@ void main() {
   gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
 }`;
 
-const SKY_FRAGMENT = `
-varying vec3 direction;
-uniform vec3 sun;
-uniform float distanceToCentre;
-uniform float studio;
-
+const NOISE = `
 float hash(vec3 p) {
   p = fract(p * 0.3183099 + vec3(0.71, 0.113, 0.419));
   p *= 17.0;
@@ -38,24 +33,39 @@ float fbm(vec3 p) {
   }
   return total;
 }
-vec3 planet(vec3 n, vec3 view) {
+`;
+
+// The ground of a planet, its alpha where the sea glitters; and how that is lit, with its air.
+const GROUND = `
+uniform vec3 sun, sea, low, high, air;
+uniform float land, clouds;
+vec4 ground(vec3 n) {
   vec3 place = n.zxy * 7.0 + vec3(4.0, 2.3, 8.0);
-  float land = smoothstep(0.50, 0.56, fbm(place));
-  float dry = fbm(place * 2.7 + 5.0);
-  vec3 ground = mix(vec3(0.05, 0.10, 0.035), vec3(0.22, 0.15, 0.08), smoothstep(0.35, 0.6, dry));
-  vec3 sea = vec3(0.006, 0.035, 0.105);
+  float dry = fbm(place * 2.7 + 5.0), ashore = smoothstep(land, land + 0.06, fbm(place));
+  vec3 surface = mix(sea, mix(low, high, smoothstep(0.35, 0.6, dry)), ashore);
   vec3 swirl = place * vec3(1.6, 3.4, 1.6);
   float warp = fbm(swirl * 0.8 + 9.0);
-  float cloud = smoothstep(0.50, 0.80, fbm(swirl * 1.5 + 2.2 * warp) * 0.72 + 0.3 * warp);
-  float day = dot(n, sun);
-  float light = smoothstep(-0.10, 0.55, day);
-  vec3 surface = mix(sea, ground, land);
-  vec3 halfway = normalize(sun - view);
-  surface += (1.0 - land) * vec3(0.45, 0.40, 0.30) * pow(max(dot(n, halfway), 0.0), 60.0);
-  surface = mix(surface, vec3(0.78, 0.82, 0.86), cloud * 0.86) * light;
-  float rim = pow(1.0 - max(dot(n, -view), 0.0), 3.2);
-  return 0.55 * surface + vec3(0.09, 0.25, 0.62) * (0.04 + 0.85 * rim) * light;
+  float cloud = clouds * smoothstep(0.50, 0.80, fbm(swirl * 1.5 + 2.2 * warp) * 0.72 + 0.3 * warp);
+  return vec4(mix(surface, vec3(0.78, 0.82, 0.86), cloud), (1.0 - ashore) * (1.0 - cloud));
 }
+vec3 lit(vec4 g, vec3 n, vec3 view) {
+  float light = smoothstep(-0.10, 0.55, dot(n, sun));
+  vec3 surface = g.rgb + g.a * air * vec3(2.2, 0.83, 0.3) * pow(max(dot(n, normalize(sun - view)), 0.0), 60.0);
+  return light * (0.55 * surface + air * vec3(0.45, 0.52, 0.62) * (0.04 + 0.85 * pow(1.0 - max(dot(n, -view), 0.0), 3.2)));
+}
+vec3 rim(vec3 colour, vec3 d, float b, float miss, vec3 c) {
+  float height = max(sqrt(miss) - 1.0, 0.0), over = smoothstep(0.994, 1.0, miss) * step(0.001, air.z);
+  float light = smoothstep(-0.15, 0.45, dot(normalize(d * b - c), sun));
+  vec3 glow = air * (0.50 * exp(-height * 230.0) + vec3(0.10, 0.12, 0.16) * exp(-height * 60.0));
+  return mix(colour, (miss < 1.0 ? vec3(0.0) : colour) + light * glow, over);
+}`;
+
+const SKY_FRAGMENT = `
+varying vec3 direction;
+uniform float distanceToCentre;
+uniform float studio;
+${NOISE}
+${GROUND}
 void main() {
   vec3 d = normalize(direction);
   vec3 c = vec3(0.0, -distanceToCentre, 0.0);
@@ -67,17 +77,10 @@ void main() {
   float milk = exp(-band * band * 22.0) * smoothstep(0.30, 0.75, dust);
   colour += milk * mix(vec3(0.010, 0.012, 0.020), vec3(0.024, 0.019, 0.020), fbm(d * 9.0 + 4.0));
   if (b > 0.0 && miss < 1.0) {
-    vec3 p = d * (b - sqrt(1.0 - miss));
-    colour = planet(normalize(p - c), d);
+    vec3 n = normalize(d * (b - sqrt(1.0 - miss)) - c);
+    colour = lit(ground(n), n, d);
   }
-  if (b > 0.0 && miss > 0.994) {
-    float height = max(sqrt(miss) - 1.0, 0.0);
-    float over = smoothstep(0.994, 1.0, miss);
-    vec3 n = normalize(d * b - c);
-    float light = smoothstep(-0.15, 0.45, dot(n, sun));
-    vec3 air = vec3(0.20, 0.48, 1.0) * 0.50 * exp(-height * 230.0) + vec3(0.06, 0.16, 0.45) * 0.35 * exp(-height * 60.0);
-    colour = mix(colour, (miss < 1.0 ? vec3(0.0) : colour) + light * air, over);
-  }
+  if (b > 0.0) colour = rim(colour, d, b, miss, c);
   float toSun = max(dot(d, sun), 0.0);
   colour += vec3(1.0, 0.94, 0.84) * (pow(toSun, 1600.0) * 12.0 + pow(toSun, 60.0) * 0.05);
   // What only mirrors see: lamps, without which metal in a dark sky is black.
@@ -98,10 +101,11 @@ void main() {
   gl_FragColor = vec4(colour, 1.0);
 }`;
 
-function makeSky(renderer, sun, space) {
+function makeSky(renderer, sun, space, orbit) {
   const uniforms = {
+    ...bodyUniforms(orbit ? orbit.body : "earth"),
     sun: { value: sun },
-    distanceToCentre: { value: 1 / Math.cos(PLANET_DIP) },
+    distanceToCentre: { value: orbit ? orbit.distance : 1 / Math.cos(PLANET_DIP) },
     studio: { value: 0 },
   };
   const material = new THREE.ShaderMaterial({
@@ -122,7 +126,15 @@ function makeSky(renderer, sun, space) {
     renderer.toneMapping = mapping;
     return target.texture;
   };
+  if (orbit) { // whose stars alone are of this sky
+    uniforms.sun.value = new THREE.Vector3();
+    uniforms.distanceToCentre.value = 1e3;
+  }
   const background = space ? render(1024) : null;
+  if (orbit) {
+    uniforms.sun.value = sun;
+    uniforms.distanceToCentre.value = orbit.distance;
+  }
   uniforms.studio.value = 1;
   const mirrored = new THREE.PMREMGenerator(renderer).fromCubemap(render(128)).texture;
   return { background, environment: mirrored };
@@ -138,10 +150,10 @@ function randomNumbers(seed) {
   };
 }
 
-function makeStars() {
+function makeStars(orbit) {
   const random = randomNumbers(7);
   const positions = [], colours = [], sizes = [];
-  const lowest = -Math.sin(PLANET_DIP) + 0.012;
+  const lowest = orbit ? -1 : -Math.sin(PLANET_DIP) + 0.012, horizon = orbit ? -Math.sqrt(1 - orbit.distance ** -2) : -2;
   while (sizes.length < 4500) {
     const y = 2 * random() - 1, turn = 2 * Math.PI * random();
     if (y < lowest) continue;
@@ -159,12 +171,14 @@ function makeStars() {
   geometry.setAttribute("size", new THREE.Float32BufferAttribute(sizes, 1));
   const material = new THREE.ShaderMaterial({
     transparent: true, depthWrite: false, depthTest: true, blending: THREE.AdditiveBlending,
-    uniforms: { ratio: { value: window.devicePixelRatio || 1 } },
+    uniforms: { ratio: { value: window.devicePixelRatio || 1 }, turned: { value: 0 }, horizon: { value: horizon } },
     vertexShader: `
-      attribute vec3 color; attribute float size; uniform float ratio; varying vec3 shade;
+      attribute vec3 color; attribute float size; uniform float ratio, turned, horizon; varying vec3 shade;
       void main() {
-        shade = color;
-        vec4 p = projectionMatrix * vec4(mat3(viewMatrix) * position, 1.0);
+        float s = sin(turned), c = cos(turned);
+        vec3 there = vec3(c * position.x - s * position.y, s * position.x + c * position.y, position.z);
+        shade = color * step(horizon, there.y);
+        vec4 p = projectionMatrix * vec4(mat3(viewMatrix) * there, 1.0);
         gl_Position = p.xyww * vec4(1.0, 1.0, 0.999999, 1.0);
         gl_PointSize = size * ratio;
       }`,

@@ -1,7 +1,9 @@
 // The stage: meshcat's viewer with our light, sky and camera. The scene is z-up below a root that
-// three.js turns to y-up: (x, y, z) of the scene is (x, z, -y) to the camera.
+// three.js turns to y-up: (x, y, z) of the scene is (x, z, -y) to the camera, or in orbit what its
+// `up` says.
 
-const yUp = ([x, y, z]) => new THREE.Vector3(x, z, -y);
+const upright = new THREE.Quaternion();
+const yUp = ([x, y, z]) => new THREE.Vector3(x, y, z).applyQuaternion(upright);
 
 const FIELD_OF_VIEW = 34;
 
@@ -9,7 +11,11 @@ function makeStage(info) {
   const viewer = new MeshCat.Viewer(document.getElementById("meshcat-pane"), false);
   window.onload = null;
   const { renderer, scene } = viewer;
-  const space = info.scene === "space";
+  const space = info.scene === "space", orbit = info.orbit;
+  const [x, y, z] = (info.up ?? [[1, 0, 0], [0, 0, 1], [0, -1, 0]]).map((row) => new THREE.Vector3(...row));
+  upright.setFromRotationMatrix(new THREE.Matrix4().makeBasis(x, y, z).transpose());
+  scene.quaternion.copy(upright);
+  viewer.scene_tree.find(["Cameras", "default", "rotated"]).object.quaternion.copy(upright).invert(); // as meshcat does
   renderer.outputEncoding = THREE.sRGBEncoding;
   renderer.toneMapping = THREE.ACESFilmicToneMapping;
   renderer.toneMappingExposure = space ? 1.0 : 0.95;
@@ -21,8 +27,8 @@ function makeStage(info) {
   viewer.set_property(["Axes"], "visible", false);
 
   const towardsSun = yUp(info.sun).normalize();
-  const sky = makeSky(renderer, towardsSun, space);
-  scene.background = sky.background;
+  const sky = makeSky(renderer, towardsSun, space, orbit);
+  scene.background = orbit ? null : sky.background;
   scene.environment = sky.environment;
 
   const size = info.size;
@@ -35,14 +41,24 @@ function makeStage(info) {
   Object.assign(sun.shadow.camera, { left: -reach, right: reach, top: reach, bottom: -reach, near: 0.1 * size, far: 9 * size });
   const glow = new THREE.HemisphereLight(space ? 0x9db4d8 : 0xffffff, space ? 0x2f5fae : 0xb0b4ba, space ? 0.28 : 0.35);
   const lights = new THREE.Group();
-  lights.rotation.x = Math.PI / 2; // undoes the turn of the scene
+  lights.quaternion.copy(upright).invert(); // undoes the turn of the scene
   lights.add(sun, sun.target, glow);
   viewer.scene_tree.find(["Lights", "sun"]).object.add(lights);
   const aim = (centre) => {
     sun.target.position.copy(centre);
     sun.position.copy(towardsSun).multiplyScalar(5 * size).add(centre);
   };
-  if (space) scene.add(makeStars());
+  const stars = space ? makeStars(orbit) : null;
+  const below = orbit ? makeOrbitSky(renderer, towardsSun, orbit, sky.background) : null;
+  // To a time [s]: the body and the stars go back as the orbit goes on.
+  const turn = (time) => {
+    if (!orbit) return;
+    const angle = (orbit.rate * time) % (2 * Math.PI);
+    below.turn(angle);
+    stars.material.uniforms.turned.value = angle;
+  };
+  if (orbit) scene.add(below.dome);
+  if (space) scene.add(stars);
   else viewer.scene_tree.find(["Floor"]).object.add(makeFloor(info));
 
   const camera = viewer.camera;
@@ -124,7 +140,7 @@ function makeStage(info) {
   viewer.set_object = (path, object) => { object.traverse(dress); setObject(path, object); };
   aim(new THREE.Vector3());
   viewer.animate();
-  return { viewer, aim, keepFramed };
+  return { viewer, aim, keepFramed, turn };
 }
 
 function makeFloor(info) {

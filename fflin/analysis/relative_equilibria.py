@@ -1,0 +1,155 @@
+"""The attitudes in which an orbit's field leaves a rigid body at rest, and whether it stays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations, product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import InputError
+from fflin.base.frozen import FrozenArrays
+from fflin.base.tables import grid
+from fflin.base.validation import Array
+from fflin.dynamics.names import frame_of
+from fflin.dynamics.orbital import field_of, mean_motion
+from fflin.robot.frames import ROOT
+from fflin.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from fflin.dynamics.state import Frame
+
+# Of the principal moments, relative to the largest: what eigenvalues and sums over bodies lose.
+_ROUNDING = 1e3 * float(np.finfo(float).eps)
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeEquilibrium(FrozenArrays):
+    """An attitude that the field of an orbit does not turn, the joints held.
+
+    Attributes
+    ----------
+    q : ndarray (nq,)
+        Configuration, its centre of mass on the orbit; what holds the joints there is
+        ``equilibrium(robot, q).u``.
+    moments : ndarray (3,)
+        Moments of inertia about the centre of mass [kg m^2], about the axes away from the body,
+        along the orbit and along its normal.
+    poles : ndarray (6,)
+        Of the attitude, the joints held [rad/s]: pitch, then roll and yaw.
+    stable : bool or None
+        Whether no pole grows; None where rounding decides.
+    margin : float
+        The least of what stability asks for, relative to its rounding: below -1 unstable, above 1
+        stable.
+    """
+
+    q: Array
+    moments: Array
+    poles: NDArray[np.complexfloating[Any]]
+    stable: bool | None
+    margin: float
+
+
+class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
+    """The 24 attitudes, the most stable ones first; prints as a table of the six kinds."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        """Show one of the four attitudes of each kind."""
+        rows = [["radial", "along", "normal [kg m^2]", "", "grows by [1/s]"]]
+        for one in self[::4]:
+            said = {True: "stable", False: "unstable", None: "undecided"}[one.stable]
+            growth = float(one.poles.real.max()) if one.stable is False else 0.0
+            sizes = [f"{moment:.5g}" for moment in one.moments]
+            rows.append([*sizes, said, f"{growth:.4g}" if growth else "."])
+        return f"principal moments, 4 attitudes each\n{grid(rows, 'rrrlr')}"
+
+
+def relative_equilibria(
+    robot: Robot, q: Array | None = None, *, frame: Frame | None = None
+) -> RelativeEquilibria:
+    r"""List the attitudes in which a robot with held joints stays at rest in its orbit's frame.
+
+    There the principal axes of its inertia stand along the axes of the frame, in 24 ways. With
+    the moments :math:`I_r, I_a, I_n` about the axes away from the body, along and normal,
+
+    .. math::
+        \lambda^2 = -3 n^2 (I_a - I_r)/I_n, \qquad
+        \lambda^4 + (1 + 3 k_a + k_a k_r)\,n^2 \lambda^2 + 4 k_a k_r\,n^4 = 0, \qquad
+        k_a = (I_n - I_r)/I_a, \quad k_r = (I_n - I_a)/I_r,
+
+    are the poles of pitch, and of roll and yaw, (14.8) of docs/derivation.md. Where all are
+    imaginary and simple the body librates.
+
+    Parameters
+    ----------
+    robot : Robot
+        In orbit.
+    q : array_like (nq,), optional
+        Its joints count; neutral by default.
+    frame : {"lvlh", "hill"}, optional
+        What q of the result is relative to; "lvlh" by default.
+
+    Returns
+    -------
+    RelativeEquilibria
+        A tuple of 24 `RelativeEquilibrium`.
+
+    Raises
+    ------
+    InputError
+        If the robot is in no orbit, or an argument is none.
+
+    References
+    ----------
+    D. B. DeBra and R. H. Delp, Rigid body attitude stability and natural frequencies in a circular
+    orbit, J. Astronautical Sciences 8, 1961. P. C. Hughes, Spacecraft Attitude Dynamics, 1986.
+    """
+    if not isinstance(robot, Robot):
+        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
+    field = field_of(robot, frame_of(robot, frame))
+    if field is None:
+        raise InputError(
+            f"'{robot.name}' is in no orbit; give it one: "
+            "robot.replace(orbit=fflin.CircularOrbit(altitude=...))"
+        )
+    q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
+    q[:7] = pin.SE3ToXYZQUAT(pin.SE3.Identity())
+    data, root = robot.create_data(), robot.model.jointPlacements[ROOT]
+    pin.ccrba(robot.model, data, q, np.zeros(robot.nv))
+    center = root.actInv(data.com[0])
+    sizes, axes = np.linalg.eigh(root.rotation.T @ data.Ig.inertia @ root.rotation)
+    n, found = mean_motion(robot), []
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        own = axes[:, order] * signs
+        if np.linalg.det(own) < 0.0:
+            continue
+        R = field.axes @ own.T
+        at, moments = q.copy(), sizes[list(order)]
+        at[:7] = pin.SE3ToXYZQUAT(root.inverse() * pin.SE3(R, -R @ center))
+        poles, margin = _libration(moments, n)
+        stable = None if abs(margin) <= 1.0 else margin > 0.0
+        found.append(RelativeEquilibrium(at, moments, poles, stable, margin))
+    return RelativeEquilibria(sorted(found, key=lambda one: (-one.margin, *one.moments)))
+
+
+def _libration(moments: Array, n: float) -> tuple[NDArray[np.complexfloating[Any]], float]:
+    """Return the poles (6,) of a body's attitude, and the least of what stability asks for."""
+    radial, along, normal = moments.tolist()
+    pitch = 3.0 * (along - radial) / normal
+    k_a, k_r = (normal - radial) / along, (normal - along) / radial
+    b, c = 1.0 + 3.0 * k_a + k_a * k_r, 4.0 * k_a * k_r
+    # Of mu^2 + b mu + c = 0, mu = lambda^2 / n^2, without cancellation.
+    root = np.sqrt(complex(b * b - 4.0 * c))
+    larger = -0.5 * (b + (root if b >= 0.0 else -root))
+    squares = np.array([-pitch, larger, c / larger if larger else 0.0], dtype=complex)
+    roots = n * np.sqrt(squares)
+    poles = np.column_stack((roots, -roots)).ravel()
+    rounding = _ROUNDING * (max(moments) / min(moments)) ** 2
+    return poles, float(min(pitch, c, b, b * b - 4.0 * c) / rounding)

@@ -1,0 +1,152 @@
+"""A circular orbit's frame: rates relative to it, and the field that is felt in it (14.1)."""
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.rotation import skew
+from fflin.base.validation import Array
+from fflin.dynamics.names import ANGULAR, LINEAR, PIN_ANGULAR, PIN_LINEAR
+from fflin.robot.frames import ROOT
+from fflin.robot.robot import Robot
+
+# Unit vectors away from the body, and along the orbit's normal, in each frame.
+_AXES = {
+    "hill": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "lvlh": ((0.0, 0.0, -1.0), (0.0, -1.0, 0.0)),
+}
+
+
+def mean_motion(robot: Robot) -> float:
+    """Return that of a robot's orbit [rad/s], 0 where it has none."""
+    return robot.orbit.mean_motion if robot.orbit else 0.0
+
+
+class OrbitField:
+    """What an orbit does to a robot whose world is the orbit's frame.
+
+    The frame turns with `rate` (3,) [rad/s], and pulls with `tide` x per mass at the place x; what
+    is at rest in it feels `pull` x, n^2 (3 r r^T - z z^T) x. `axes` (3, 3) are the unit vectors
+    away from the body, along the orbit and along its normal.
+    """
+
+    def __init__(self, robot: Robot, frame: str) -> None:
+        r, z = (np.array(axis) for axis in _AXES[frame])
+        n = mean_motion(robot)
+        bodies = robot.model.inertias.tolist()[ROOT:]
+        self.robot = robot
+        self._root, self._stored = robot.model.jointPlacements[ROOT], robot.stored_momentum
+        self.rate: Array = n * z
+        self.tide: Array = n * n * (3.0 * np.outer(r, r) - np.eye(3))
+        self.axes: Array = np.column_stack((r, np.cross(z, r), z))
+        self._turning = skew(self.rate)
+        self.pull: Array = self.tide - self._turning @ self._turning
+        self._mass = np.array([[body.mass] for body in bodies])
+        self._lever = np.array([body.lever for body in bodies])[..., None]
+        self._levers = np.array([skew(body.lever) for body in bodies])
+        self._inertia = np.array([body.inertia for body in bodies])
+        self._none = pin.Force.Zero()
+        places = [*robot.model.jointPlacements.tolist()[ROOT + 1 :]]
+        lengths = [np.linalg.norm(place.translation) for place in places]
+        self._reach = float(np.sum(lengths) + np.linalg.norm(self._lever, axis=1).max())
+
+    def base(self, q: Array) -> tuple[Array, Array]:
+        """Return attitude (3, 3) and place (3,) of the base."""
+        base = self._root * pin.XYZQUATToSE3(q[:7])
+        return base.rotation, base.translation
+
+    def require_near(self, q: Array) -> None:
+        """Warn or refuse where the robot, its joints anyhow, is far from the orbit's point."""
+        if orbit := self.robot.orbit:
+            distance = float(np.linalg.norm(self.base(q)[1])) + self._reach
+            orbit.require_near(self.robot.name, distance)
+
+    def absolute(self, q: Array, v: Array) -> Array:
+        """Return the velocity (nv,) in axes that stand still of one relative to the orbit's."""
+        R, place = self.base(q)
+        found = v.copy()
+        found[PIN_LINEAR] += R.T @ (self._turning @ place)
+        found[PIN_ANGULAR] += R.T @ self.rate
+        return found
+
+    def relative(self, v: Array, absolute: Array, rate: Array) -> Array:
+        """Return dv/dt (nv,) where the absolute velocity changes by `rate`: (14.2)."""
+        frame, own, found = absolute - v, skew(v[PIN_ANGULAR]), rate.copy()
+        found[PIN_LINEAR] += own @ frame[PIN_LINEAR] - skew(frame[PIN_ANGULAR]) @ v[PIN_LINEAR]
+        found[PIN_ANGULAR] += own @ frame[PIN_ANGULAR]
+        return found
+
+    def wrenches(self, data: pin.Data) -> list[pin.Force]:
+        """Return what pulls on each body, in its joint's frame; `data` says where joints are."""
+        R, center = self._places(data)
+        back = R.swapaxes(1, 2)
+        force = self._mass * (back @ (self.tide @ center))[..., 0]
+        # 3 n^2 r x (I r) is the axial vector of I tide - tide I.
+        turn = self._inertia @ (back @ self.tide @ R)
+        turn -= turn.swapaxes(1, 2)
+        torque = turn[:, (2, 0, 1), (1, 2, 0)] + (self._levers @ force[..., None])[..., 0]
+        return [self._none, *map(pin.Force, force, torque)]
+
+    def slopes(self, data: pin.Data) -> Array:
+        """Return the slopes (nv, nv) over q of the forces of `wrenches`, the base not shifted."""
+        # Of a joint that turns by t, in its axes: those of R^T tide R are T [t]x - [t]x T.
+        model = self.robot.model
+        total = np.zeros((model.nv, model.nv))
+        for joint in range(ROOT, model.njoints):
+            inertia, place = model.inertias[joint], data.oMi[joint]
+            lever, R = inertia.lever, place.rotation
+            T, center = R.T @ self.tide @ R, R.T @ place.act(lever)
+            jacobian = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL)
+            moved = jacobian.copy()
+            moved[:, PIN_LINEAR] = 0.0
+            turned = moved[PIN_ANGULAR]
+            shift = moved[PIN_LINEAR] + (skew(center) - skew(lever)) @ turned
+            force = inertia.mass * (T @ shift + (skew(T @ center) - T @ skew(center)) @ turned)
+            changes = [T @ skew(t) - skew(t) @ T for t in np.eye(3)]
+            turns = [inertia.inertia @ change for change in changes]
+            torque = np.column_stack([pin.unSkew(turn - turn.T) for turn in turns]) @ turned
+            total += jacobian.T @ np.vstack((force, torque + skew(lever) @ force))
+        return total
+
+    def near(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return q and the absolute v of a base that is not displaced, which falls as any other."""
+        q, v = q.copy(), self.absolute(q, v)
+        q[:3] = v[PIN_LINEAR] = 0.0
+        return q, v
+
+    def add_turning(self, q: Array, v: Array, by_q: Array, by_v: Array) -> None:
+        """Make slopes in state order at `near` those of the relative rates at q and v."""
+        R, place = self.base(q)
+        fall = R.T @ (self.pull @ place - self.tide @ self.base(np.r_[0.0, 0.0, 0.0, q[3:]])[1])
+        spin, W, V = (skew(x) for x in (R.T @ self.rate, v[PIN_ANGULAR], v[PIN_LINEAR]))
+        # Of dw/dt + w x spin, and of dv/dt = c + fall - 2 spin x v - w x v.
+        by_q[:, ANGULAR] += by_v[:, ANGULAR] @ spin
+        by_q[ANGULAR, ANGULAR] += W @ spin
+        by_v[ANGULAR, ANGULAR] -= spin
+        by_v[:, LINEAR] = 0.0
+        by_q[LINEAR, ANGULAR] += skew(fall) + 2.0 * V @ spin
+        by_q[LINEAR, LINEAR] += R.T @ self.pull @ R
+        by_v[LINEAR, ANGULAR] += V
+        by_v[LINEAR, LINEAR] -= 2.0 * spin + W
+
+    def potential(self, data: pin.Data) -> float:
+        """Return what the tide and the frame's turning have of energy [J], as `wrenches` does."""
+        # -1/2 the integral of x^T G x over the masses.
+        R, center = self._places(data)
+        G, inertia = self.pull, self._inertia
+        second = 0.5 * np.trace(inertia, axis1=1, axis2=2)[:, None, None] * np.eye(3) - inertia
+        flying = (self._mass[..., None] * center.swapaxes(1, 2) @ G @ center).sum()
+        energy = -0.5 * float(flying + (R.swapaxes(1, 2) @ G @ R * second).sum())
+        for joint, momentum in self._stored:
+            energy -= float(self.rate @ data.oMi[joint].rotation @ momentum)
+        return energy
+
+    def _places(self, data: pin.Data) -> tuple[Array, Array]:
+        """Return attitude (k, 3, 3) and centre of mass (k, 3, 1) of each body."""
+        places = data.oMi.tolist()[ROOT:]
+        R = np.array([place.rotation for place in places])
+        return R, np.array([place.translation for place in places])[..., None] + R @ self._lever
+
+
+def field_of(robot: Robot, frame: str) -> OrbitField | None:
+    """Return the field of a robot's orbit in a frame, if it has one."""
+    return None if robot.orbit is None else OrbitField(robot, frame)

@@ -1,0 +1,70 @@
+"""What flies many runs of a robot in orbit, or refuses to."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from tests.support.orbits import in_orbit
+
+
+@pytest.fixture(scope="module")
+def regulated():
+    robot = in_orbit(fflin.load("planar_detumble"))
+    lin = fflin.linearize(robot, u=fflin.equilibrium(robot).u)
+    return robot, lin, fflin.lqr(lin)
+
+
+def test_a_campaign_flies_as_simulate_does(regulated):
+    robot, lin, gain = regulated
+    policy = fflin.StateFeedback(lin, gain.K)
+    dispersions = {"q_b": 0.05, "base.mass": 0.1}
+    flown = fflin.monte_carlo(robot, policy, dispersions, runs=3, duration=0.5, engine="python")
+    motion = flown.replay(1)
+    assert motion.orbit == robot.orbit and motion.frame == "lvlh"
+    assert motion.momentum_drift.max() < 1e-6
+    free = fflin.simulate(robot.replace(orbit=None), q0=motion.q[0], duration=0.5)
+    assert np.abs(free.x[-1] - motion.x[-1]).max() > 1e-3
+    assert np.abs(motion.x[-1] - flown.x[1]).max() == 0.0
+
+
+def test_a_loop_in_orbit_settles(regulated):
+    found = fflin.validity(*regulated, samples=2, attitude=20.0)
+    assert found.outcomes == ("settled", "settled")
+
+
+def test_refused(regulated):
+    robot, lin, gain = regulated
+    free = robot.replace(orbit=None)
+    along = fflin.simulate(free, duration=0.1).trajectory()
+    schedule = fflin.tvlqr(fflin.linearize_trajectory(free, along), 1.0, 1.0, 1.0)
+    q, v, u = robot.neutral(), np.zeros(robot.nv), np.zeros(len(lin.u0))
+    knots = [np.tile(row, (2, 1)) for row in (q, v, u)]
+    there = fflin.linearize(free)
+    policy = fflin.StateFeedback(there, fflin.lqr(there).K)
+    with pytest.raises(fflin.InputError, match=r"loops in other `frames` are of robots that float"):
+        fflin.validity(robot, lin, gain, frames=("hill",))
+    with pytest.raises(fflin.InputError, match="compiled' cannot run this"):
+        fflin.monte_carlo(robot, None, {"q_b": 0.1}, runs=2, duration=0.1, engine="compiled")
+    for refused in (
+        lambda: fflin.funnel(robot, schedule, goal={"attitude": 1.0}),
+        lambda: fflin.simulate(robot, schedule),
+        lambda: fflin.linearize_trajectory(robot, [0.0, 0.1], *knots),
+        lambda: fflin.plan(robot, (q, v), 1.0),
+        lambda: fflin.simulate(robot, duration=0.1).trajectory(),
+    ):
+        with pytest.raises(fflin.InputError, match=r"in orbit; take robot\.replace\(orbit=None\)"):
+            refused()
+    with pytest.raises(fflin.InputError, match="made without an orbit, frame 'hybrid'"):
+        fflin.simulate(robot, policy, duration=0.1)
+    with pytest.raises(fflin.InputError, match="made in orbit, frame 'lvlh'"):
+        fflin.simulate(free, fflin.StateFeedback(lin, gain.K), duration=0.1)
+
+
+def test_a_capture_stays_in_orbit():
+    robot = in_orbit(fflin.load("cubesat", inputs=fflin.load_inputs("cubesat")))
+    body = fflin.from_model(fflin.load("cubesat").model)
+    caught = fflin.capture(robot, "base", pin.Inertia(1.0, np.zeros(3), 0.01 * np.eye(3)))
+    assert robot.wheels and caught.robot.orbit == robot.orbit
+    with pytest.raises(fflin.InputError, match=r"orbit is .*; give both one"):
+        fflin.capture(robot, "base", body)

@@ -1,0 +1,91 @@
+"""Circular orbits, and robots that have one."""
+
+import math
+import pickle
+import subprocess
+import sys
+
+import pytest
+
+import fflin
+from fflin.robot.orbit import BODIES
+
+
+def test_altitude_and_mean_motion_say_the_same():
+    high = fflin.CircularOrbit(altitude=35_786e3)
+    assert high.period == pytest.approx(86164.1, rel=1e-4)  # a sidereal day
+    assert high.radius == pytest.approx(42164e3, rel=1e-4)
+    assert high.mean_motion**2 * high.radius**3 == pytest.approx(high.mu, rel=1e-14)
+    same = fflin.CircularOrbit(mean_motion=high.mean_motion)
+    assert same.altitude == pytest.approx(high.altitude, rel=1e-12)
+    assert pickle.loads(pickle.dumps(high)) == high
+    assert all(type(each).from_json(each.to_json()) == each for each in (high, same))
+    assert "35786 km over earth" in str(high)
+
+
+def test_other_bodies():
+    assert fflin.CircularOrbit(100e3, body="moon").period == pytest.approx(7066.0, rel=2e-3)
+    own = fflin.CircularOrbit(1e3, body="bennu", mu=4.89, body_radius=245.0)
+    assert own.mean_motion == pytest.approx(math.sqrt(4.89 / 1245.0**3))
+    assert {"earth", "moon", "mars"} <= set(BODIES)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({}, "neither is given; give one"),
+        ({"altitude": 7e5, "mean_motion": 1e-3}, "both are given; give one"),
+        ({"altitude": -1.0}, "at or below the surface"),
+        ({"altitude": 0.0}, "at or below the surface"),
+        ({"mean_motion": 2e-3}, "below the surface; expected .* below 0.001239 rad/s"),
+        ({"mean_motion": 1e-300}, "mean motion|no orbit"),
+        ({"mean_motion": -1e-3}, "mean_motion is -0.001, expected more than 0"),
+        ({"altitude": math.nan}, "altitude is nan"),
+        ({"altitude": "high"}, "altitude is 'high'"),
+        ({"altitude": 7e5, "body": "mars_2"}, "no central body named 'mars_2'; did you mean mars"),
+        ({"altitude": 7e5, "mu": 4.0}, "both mu and body_radius"),
+        ({"altitude": 7e5, "body": "x", "mu": 0.0, "body_radius": 1.0}, "mu is 0, expected more"),
+    ],
+)
+def test_refused(given, said):
+    with pytest.raises(fflin.FflinError, match=said):
+        fflin.CircularOrbit(**given)
+
+
+def test_a_robot_has_one():
+    orbit = fflin.CircularOrbit(altitude=700e3)
+    robot = fflin.load("cubesat", orbit=orbit)
+    assert robot.orbit is orbit
+    assert robot.replace(orbit=700e3).orbit == orbit
+    assert robot.replace(orbit={"altitude": 700e3, "body": "earth"}).orbit == orbit
+    assert robot.replace(orbit=None).orbit is None
+    with pytest.raises(fflin.InputError, match="uniform gravity and an orbit"):
+        robot.replace(gravity=(0, 0, -9.81))
+    with pytest.raises(fflin.UnknownNameError, match="no part of orbit named 'altitud'"):
+        robot.replace(orbit={"altitud": 1.0})
+
+
+def test_robot_file(tmp_path):
+    file = tmp_path / "robot.toml"
+    file.write_text('urdf = "cubesat"\n[orbit]\naltitude = 300e3\nbody = "mars"\n')
+    assert fflin.load(file).orbit == fflin.CircularOrbit(300e3, body="mars")
+    file.write_text('urdf = "cubesat"\norbit = 700e3\n')
+    assert fflin.load(file).orbit == fflin.CircularOrbit(700e3)
+    file.write_text('urdf = "cubesat"\n\norbit = -1.0\n')
+    with pytest.raises(fflin.InputError, match=r"robot\.toml:3: an altitude of -1 m"):
+        fflin.load(file)
+
+
+def test_frames_suit_the_orbit():
+    robot = fflin.load("cubesat")
+    for given, said in ((robot, "in no orbit"), (robot.replace(orbit=7e5), "is in an orbit")):
+        frame = "lvlh" if given is robot else "hybrid"
+        with pytest.raises(fflin.InputError, match=said):
+            fflin.StateMap(given, frame=frame)
+    assert fflin.StateMap(robot.replace(orbit=7e5)).frame == "lvlh"
+
+
+def test_an_orbit_loads_no_numpy_dynamics():
+    code = "import fflin, sys; fflin.CircularOrbit(7e5); print('pinocchio' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

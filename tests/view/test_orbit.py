@@ -1,0 +1,78 @@
+"""Pages of robots in orbit: the body that they circle stands where it is, and turns with the orbit."""
+
+import numpy as np
+import pytest
+
+import fflin
+from tests.support.browser import Watched, chromium
+from tests.view.test_page import page_data
+
+HEIGHT, HALF = 600, np.tan(np.radians(17.0))  # of the window [px], and of the field of view
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """A page in each frame, and one of the same robot without an orbit."""
+    folder, robot = tmp_path_factory.mktemp("orbit"), fflin.load("cubesat")
+    for frame in ("lvlh", "hill", "hybrid"):
+        own = robot if frame == "hybrid" else robot.replace(orbit=700e3)
+        motion = fflin.simulate(own, duration=40.0, dt=0.5, frame=frame)
+        fflin.visualize(own, motion, html=folder / f"{frame}.html", open=False)
+    return folder
+
+
+def test_what_pages_are_told(pages):
+    lvlh, hill, plain = (page_data(pages / f"{x}.html") for x in ("lvlh", "hill", "hybrid"))
+    assert "orbit" not in plain and "up" not in plain
+    orbit = fflin.CircularOrbit(700e3)
+    for data in (lvlh, hill):
+        assert data["orbit"]["distance"] == pytest.approx(orbit.radius / orbit.body_radius)
+        assert data["orbit"]["rate"] == orbit.mean_motion
+        # What is told in the frame's axes is the same in those of the screen.
+        Q = np.array(data["up"])
+        assert np.allclose(Q @ Q.T, np.eye(3)) and np.linalg.det(Q) == pytest.approx(1.0)
+        screen = [[1, 0, 0], [0, 0, 1], [0, -1, 0]] @ np.array([plain["sun"], plain["direction"]]).T
+        assert np.allclose(Q @ np.array([data["sun"], data["direction"]]).T, screen)
+        assert "700 km over earth" in data["subtitle"]
+    assert np.allclose(lvlh["up"], [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    assert np.allclose(hill["up"], [[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+
+
+def look(watched, towards, up=(0, 1, 0)):
+    """Look from the orbit's point along a direction of the screen's axes, at the sky alone."""
+    watched.do(
+        f"""(() => {{ const c = viewer.camera; viewer.controls.update = Boolean;
+        viewer.set_property(["meshcat"], "visible", false); c.clearViewOffset();
+        c.position.set(0, 0, 0); c.up.set({up[0]}, {up[1]}, {up[2]});
+        c.lookAt({", ".join(map(str, towards))}); c.updateMatrixWorld(); viewer.set_dirty(); }})()"""
+    )
+    watched.drawn()
+    return watched.picture().astype(float)
+
+
+@pytest.mark.parametrize("frame", ["lvlh", "hill"])
+def test_the_earth_is_below_in_its_true_size_and_goes_back(pages, frame):
+    with chromium() as browser:
+        watched = Watched(browser, (pages / f"{frame}.html").as_uri() + "#pause", (960, HEIGHT))
+        orbit = fflin.CircularOrbit(700e3)
+        dip = np.arccos(orbit.body_radius / orbit.radius)
+        level = look(watched, (-np.cos(dip), -np.sin(dip), 0.0))
+        blue = level[:, 470:490, 2].mean(axis=1)
+        assert abs(int(blue.argmax()) - HEIGHT / 2) < 8  # the rim of the air is at the horizon
+        assert blue[: HEIGHT // 4].max() < 0.3 * blue.max()
+        assert blue[3 * HEIGHT // 4 :].min() > 0.3 * blue.max()
+        # Straight down, ahead being up: what was below is behind after some seconds.
+        before = look(watched, (0, -1, 0), (1, 0, 0))
+        watched.do("fflin.seek(10)")
+        after = look(watched, (0, -1, 0), (1, 0, 0))
+        turned = orbit.mean_motion * 10.0
+        R, far = orbit.body_radius, orbit.radius
+        angle = np.arctan2(R * np.sin(turned), far - R * np.cos(turned))
+        expected = np.tan(angle) / HALF * HEIGHT / 2
+        middle = slice(150, 350)
+        misfit = [
+            np.abs(after[150 + s : 350 + s, 200:760] - before[middle, 200:760]).mean()
+            for s in range(-140, 141)
+        ]
+        assert np.argmin(misfit) - 140 == pytest.approx(expected, abs=8)
+        assert not watched.errors
