@@ -123,26 +123,28 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
         raise InputError("the model is sampled; transform the continuous one that it was made of")
     lin, (kind, own, to, rates) = whole, _bridge(robot, whole, tool)
     A, B = carried(own, to, lin.A, lin.B)
-    (q, v), states, rate = kind.vectors(lin.q, lin.v), kind.states(), to.P @ rates
+    (q, v), states = kind.vectors(lin.q, lin.v), kind.states()
+    rate: Array = to.P @ rates
     x0 = np.concatenate((np.zeros(len(v)) if kind.tangent else q, v))
-    C, D, y0, outputs = np.eye(len(A)), np.zeros(B.shape), x0, states
+    fields: dict[str, Any] = {"C": np.eye(len(A)), "D": np.zeros(B.shape), "y0": x0}
+    outputs, about = states, "moving" if lin.moving else "fixed"
     if lin.output_names != lin.state_names:
         D = lin.D @ np.linalg.inv(own.V)
-        C, D = (lin.C @ own.P + D @ (to.H - own.H)) @ to.left, D @ to.V
-        y0, outputs = lin.y0, dict(zip(lin.output_names, lin.output_units, strict=True))
+        C = (lin.C @ own.P + D @ (to.H - own.H)) @ to.left
+        fields = {"C": C, "D": D @ to.V, "y0": lin.y0}
+        outputs = dict(zip(lin.output_names, lin.output_units, strict=True))
     if step:
         A, B, rate = _stepped(A, B, rate, step)
-    f0 = rate * (not lin.moving)
+    f0: Array = rate * (not lin.moving)
     if sampled:
         A, held = held_exponential(A, np.column_stack((B, f0)), sampled)
         B, f0 = held[:, :-1], held[:, -1]
-    T_u, about = np.linalg.solve(to.V, own.V), "moving" if lin.moving else "fixed"
-    fields: dict[str, Any] = {"tool": tool, "robot": lin.robot, "reference": about}
+    T_u = np.linalg.solve(to.V, own.V)
     for signal, units in (("state", states), ("input", kind.inputs), ("output", outputs)):
         fields |= {f"{signal}_names": tuple(units), f"{signal}_units": tuple(units.values())}
     fields |= {"q": q, "v": v, "T": to.P @ own.left, "T_left": own.P @ to.left, "T_u": T_u}
-    fields |= {"A": A, "B": B, "C": C, "D": D, "dt": step or sampled, "verified": lin.verified}
-    return ToolModel(f0=f0, x0=x0, u0=T_u @ lin.u0, y0=y0, **fields)
+    fields |= {"A": A, "B": B, "f0": f0, "x0": x0, "u0": T_u @ lin.u0, "dt": step or sampled}
+    return ToolModel(tool=tool, robot=lin.robot, reference=about, verified=lin.verified, **fields)
 
 
 def from_tool(

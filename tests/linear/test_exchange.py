@@ -373,3 +373,19 @@ def test_a_body_without_joints_and_files(tmp_path):
         for key in ("A", "B", "T", "T_left", "T_u", "q", "v", "x0"):
             assert np.array_equal(getattr(loaded, key), getattr(m, key)), key
         assert loaded.state_names == m.state_names and loaded.tool == tool and "nx=1" in repr(m)
+
+
+def test_an_orbit_has_angles_and_no_other_tool():
+    """Roll, pitch and yaw are those from the orbit's frame, which no other tool's world is."""
+    orbit = fflin.CircularOrbit(mean_motion=1e-3)
+    robot = fflin.load("servicer_7dof").replace(orbit=orbit)
+    q, v, *_ = point(robot, 3, {}, degrees=40.0)
+    lin = fflin.linearize(robot, q, v)
+    for tool in ("euler", "euler_rates"):
+        m = lin.to(tool)
+        back = fflin.from_tool(robot, tool, m.q, m.v, A=m.A, B=m.B)
+        assert relative(back.A, lin.A) < 1e-13 and back.frame == lin.frame == "lvlh"
+    n = len(m.A) // 2
+    assert relative(m.A[:n], np.eye(n, 2 * n, n)) < 1e-13  # coordinates and their rates
+    for tool in ("drake", "mujoco", "pinocchio", "spart"):
+        refused(r"is in orbit; take robot.replace", lin.to, tool)
