@@ -308,9 +308,7 @@ class LinearModel(FrozenArrays):
         from fflin import transform
 
         if self._robot is None:
-            raise InputError(
-                "the robot of this model is not known: fflin.transform(robot, lin, tool)"
-            )
+            raise InputError("this model's robot is not known: fflin.transform(robot, lin, tool)")
         return transform(self._robot, self, tool, dt=dt)
 
     def to_scipy(self) -> Any:
