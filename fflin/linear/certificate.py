@@ -16,7 +16,7 @@ from fflin.dynamics.names import ANGULAR, LINEAR
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import Certificate, LinearModel
-from fflin.linear.tool_coordinates import own_coordinates
+from fflin.linear.tool_coordinates import ToolCoordinates
 from fflin.robot.robot import Robot
 
 # Terms that cancel exactly still leave their rounding, 1e-16 of their size. Counted with this
@@ -56,7 +56,7 @@ def aba_route(
     state: StateMap, aba: Aba, q: Array, v: Array, u: Array, *, moving: bool = False
 ) -> tuple[Array, Array, Array]:
     """Build A and B from the derivatives of ABA, (4.9) and (15.3), and return its M^-1 too."""
-    own, nu = own_coordinates(state, moving=moving), state.velocities(v)
+    own, nu = ToolCoordinates(state, moving=moving), state.velocities(v)
     u, nv = aba.actuation.in_base_axes(state.chart(q), u), len(nu)
     # Pinocchio differentiates in world axes at the world's origin, where a distant base costs
     # digits; nothing depends on where the base is but in an orbit, which sees to that itself.

@@ -12,11 +12,11 @@ from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, as_double, instance, number, vector
 from fflin.dynamics.state import Frame, StateMap
-from fflin.linear import tool_coordinates as coordinates
 from fflin.linear.fit import require_fit
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
 from fflin.linear.sampling import held_exponential
+from fflin.linear.tool_coordinates import Slopes, ToolCoordinates, tool_coordinates
 from fflin.robot.robot import Robot
 
 _LONGEST = 1e3  # [s]
@@ -74,8 +74,7 @@ class ToolModel(Design):
     reference: str
 
     def __repr__(self) -> str:
-        time = f"dt={self.dt:g} s" if self.dt else "continuous"
-        return f"ToolModel('{self.robot}', tool='{self.tool}', nx={len(self.A)}, {time})"
+        return f"ToolModel('{self.robot}', '{self.tool}', nx={len(self.A)}, dt={self.dt:g})"
 
 
 def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = None) -> ToolModel:
@@ -188,7 +187,7 @@ def from_tool(
     ChartError
         If the base is turned by 180 deg from the reference, or as `transform`.
     """
-    q, v = coordinates.tool_coordinates(robot, tool).to_pinocchio(q, v)
+    q, v = tool_coordinates(robot, tool).to_pinocchio(q, v)
     place: Any = {"frame": frame, "reference": reference, "moving": moving}
     lin, step = linearize(robot, q, v, **place), _step(tool, dt)
     if u is not None:
@@ -213,15 +212,13 @@ def from_tool(
     return replace(lin, A=A, B=B)
 
 
-def _bridge(
-    robot: Robot, lin: LinearModel, tool: str
-) -> tuple[coordinates.ToolCoordinates, coordinates.Slopes, coordinates.Slopes, Array]:
+def _bridge(robot: Robot, lin: LinearModel, tool: str) -> tuple[Any, Slopes, Slopes, Array]:
     """Return a tool's coordinates, the slopes of a model's own and of these, and the rate of y."""
     state = StateMap(robot, reference=lin.reference, frame=lin.frame)
     if lin.state_names != state.names:
         raise InputError("lin has not all states of the robot; take the whole model of it")
-    own = coordinates.own_coordinates(state, moving=lin.moving)
-    kind = coordinates.tool_coordinates(robot, tool, moving=lin.moving)
+    own = ToolCoordinates(state, moving=lin.moving)
+    kind = tool_coordinates(robot, tool, moving=lin.moving)
     nu, rates = state.velocities(lin.v), lin.drift
     point = lin.q, nu, own.actuation.in_base_axes(state.chart(lin.q), lin.u0)
     if rates is None:  # f0 is P times the rate of y
@@ -230,9 +227,7 @@ def _bridge(
     return kind, own.slopes(*point, rates), kind.slopes(*point, rates), np.append(nu, rates)
 
 
-def carried(
-    source: coordinates.Slopes, to: coordinates.Slopes, A: Array, B: Array
-) -> tuple[Array, Array]:
+def carried(source: Slopes, to: Slopes, A: Array, B: Array) -> tuple[Array, Array]:
     """Return A and B in other coordinates (15.3), (15.4)."""
     B = source.left @ B @ np.linalg.inv(source.V)
     A = source.left @ (A @ source.P - source.rate) + B @ (to.H - source.H)

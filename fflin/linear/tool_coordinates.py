@@ -59,10 +59,11 @@ class Slopes(NamedTuple):
 
 
 class ToolCoordinates:
-    """Coordinates of a robot, relative to the reference of a `StateMap`, by a convention."""
+    """Coordinates relative to the reference of a `StateMap`: a tool's, or a linear model's own."""
 
-    def __init__(self, state: StateMap, kind: Convention, *, moving: bool = False) -> None:
-        robot, own = state.robot, kind.attitude == "q_b"
+    def __init__(self, state: StateMap, tool: str = "", *, moving: bool = False) -> None:
+        robot, own = state.robot, not tool
+        kind = TOOLS[tool] if tool else Convention("q_b", "xyzw", True, state.axes)
         self.state, self.convention, self._moving = state, kind, moving
         self.tangent = kind.attitude in ("turn", "pose")
         self._roll = 0 if kind.angular_first else 3  # from angular, linear to the tool's order
@@ -94,11 +95,9 @@ class ToolCoordinates:
 
     def states(self) -> dict[str, str]:
         """Return {name: unit} of x'."""
-        turn = _NAMES.get(self.convention.attitude, ["theta.x", "theta.y", "theta.z"])
-        omega = ["omega.x", "omega.y", "omega.z"]
-        if self.convention.rates:
-            omega = [f"{name}_rate" for name in turn]
-        found: dict[str, str] = {}
+        kind, found = self.convention, dict[str, str]()
+        turn = _NAMES.get(kind.attitude, ["theta.x", "theta.y", "theta.z"])
+        omega = [f"{x}_rate" for x in turn] if kind.rates else [f"omega.{x}" for x in "xyz"]
         pose, twist = [*turn, "p.x", "p.y", "p.z"], [*omega, "v.x", "v.y", "v.z"]
         for names, joint_name, angle in ((pose, "q_m", "rad"), (twist, "qdot_m", "rad/s")):
             base = np.roll(names, self._roll).tolist()
@@ -155,8 +154,7 @@ class ToolCoordinates:
     def _attitude(self, q: Array) -> tuple[Array, Array]:
         """Return the quaternion x, y, z, w and the rotation that x' is about."""
         quaternion = quaternion_product(self.state.origin_quaternion, q[3:7])
-        if self.convention.at_centre:
-            quaternion = quaternion_product(quaternion, pin.SE3ToXYZQUAT(self._base)[3:])
+        quaternion = quaternion_product(quaternion, pin.SE3ToXYZQUAT(self._base)[3:])
         if self.convention.attitude == "q_b":
             quaternion *= -1.0 if quaternion[3] < 0.0 else 1.0
             quaternion = np.array((0.0, 0.0, 0.0, 1.0)) if self._moving else quaternion
@@ -218,18 +216,13 @@ class ToolCoordinates:
         return Slopes(P.real, P.imag / _STEP.imag, left, V[:, self._inputs], H, extra)
 
 
-def own_coordinates(state: StateMap, *, moving: bool) -> ToolCoordinates:
-    """Return those of a linear model."""
-    return ToolCoordinates(state, Convention("q_b", "xyzw", True, state.axes), moving=moving)
-
-
 def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:
     """Return those of a tool."""
     if not isinstance(tool, str) or tool not in TOOLS:
         raise unknown("tool", str(tool), TOOLS)
     if tool[:5] != "euler":
         refuse_orbit(robot, f"the coordinates of {tool}")
-    return ToolCoordinates(StateMap(robot), TOOLS[tool], moving=moving)
+    return ToolCoordinates(StateMap(robot), tool, moving=moving)
 
 
 def _centre(robot: Robot) -> pin.SE3:

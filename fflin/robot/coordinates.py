@@ -127,10 +127,7 @@ class Coordinates:
         return placed
 
     def require_unchanged(self) -> None:
-        """Raise `ModelError` where the model was changed in place after the robot was made.
-
-        Results prepared before the change would be of another robot than those made after it.
-        """
+        """Raise `ModelError` where the model was changed in place after the robot was made."""
         assert self._as_made is not None
         made = self._as_made[1]
         # Tells in a microsecond that nothing at all was changed.

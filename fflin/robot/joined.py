@@ -19,11 +19,7 @@ from fflin.robot.wheels import carry_over, with_inputs
 
 
 def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: str) -> Robot:
-    """Return a robot with another, by its base, welded to a frame of it.
-
-    The other's joints, frames and links are called PREFIX.NAME, and its base's frame PREFIX. Inputs
-    and outputs are those of the robot; springs, dampers and mimic joints those of both.
-    """
+    """Return a robot with another's base welded to a frame; inputs and outputs are the robot's."""
     bare = robot._bare
     joint, at = find_frame(bare.model, frame)
     _require_new_names(robot, prefix)
