@@ -19,7 +19,6 @@ from fflin.linear.sampling import held_exponential
 from fflin.linear.tool_coordinates import Slopes, ToolCoordinates, tool_coordinates
 from fflin.robot.robot import Robot
 
-_LONGEST = 1e3  # [s]
 _ROUNDING = 1e-12  # of the largest entry, by which another route to a matrix may miss a zero
 
 
@@ -124,8 +123,7 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
     outputs, about = states, "moving" if lin.moving else "fixed"
     if lin.output_names != lin.state_names:
         D = lin.D @ np.linalg.inv(own.V)
-        C = (lin.C @ own.P + D @ (to.H - own.H)) @ to.left
-        fields = {"C": C, "D": D @ to.V, "y0": lin.y0}
+        fields = {"C": (lin.C @ own.P + D @ (to.H - own.H)) @ to.left, "D": D @ to.V, "y0": lin.y0}
         outputs = dict(zip(lin.output_names, lin.output_units, strict=True))
     if step:
         A, B, rate = _stepped(A, B, rate, step)
@@ -198,8 +196,7 @@ def from_tool(
         return lin
     _, own, to, rates = _bridge(robot, lin, tool)
     ours = carried(own, to, lin.A, lin.B)
-    if step:
-        ours = _stepped(*ours, to.P @ rates, step)[:2]
+    ours = _stepped(*ours, to.P @ rates, step)[:2] if step else ours
     changes = [_change(*each) for each in zip("AB", (A, B), ours, strict=True)]
     if step:  # the rows of positions follow from those of rates
         nv = len(ours[0]) // 2
@@ -237,7 +234,7 @@ def carried(source: Slopes, to: Slopes, A: Array, B: Array) -> tuple[Array, Arra
 def _step(tool: str, dt: Any) -> float:
     """Return a time step, 0 where there is none."""
     h = 0.0 if dt is None else number("dt", dt)
-    if dt is not None and (not 0.0 < h < _LONGEST or str(tool) != "mujoco"):
+    if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
         raise InputError(f"dt is {h:g} s for {tool}, expected a step of mujoco")
     return h
 

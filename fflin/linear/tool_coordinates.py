@@ -107,8 +107,7 @@ class ToolCoordinates:
 
     def vectors(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return q and v as the tool has them, of valid ones of Pinocchio's."""
-        stored = self.convention.stored
-        if stored == "xyzw":
+        if (stored := self.convention.stored) == "xyzw":
             return q, v
         attitude, R = self._attitude(q)
         at = pin.SE3(self.state.rotation(q), self.state.positions(q)) * self._base
@@ -245,9 +244,7 @@ def _way(robot: Robot, name: str) -> list[int]:
 
 
 def _left(P: Array) -> Array:
-    square = P.shape[0] == P.shape[1]
-    inverse: Array = np.linalg.inv(P) if square else np.linalg.solve(P.T @ P, P.T)
-    return inverse
+    return np.asarray(np.linalg.inv(P) if len(P) == len(P.T) else np.linalg.solve(P.T @ P, P.T))
 
 
 def _angles(R: Array) -> Array:

@@ -68,11 +68,7 @@ class Coordinates:
             follower.place(q)
 
     def checked_configuration(self, q: Array) -> Array:
-        """Return `q` (nq,), never modified, as a valid configuration, or raise `InputError`.
-
-        Its quaternion, the (cos, sin) of continuous joints and the mimic joints are put right
-        where they are within 1e-6.
-        """
+        """Return q (nq,) as a valid configuration, put right within 1e-6, or raise `InputError`."""
         if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != (self.nq,):
             q = vector("q", q, self.nq, _CONFIGURATION)
         entries = q.tolist()
