@@ -49,6 +49,9 @@ from fflin.linear.equilibrium import Equilibrium as Equilibrium
 from fflin.linear.trajectory import Trajectory as Trajectory
 from fflin.linear.linear_trajectory import linearize_trajectory as linearize_trajectory
 from fflin.linear.linear_trajectory import LinearTrajectory as LinearTrajectory
+from fflin.linear.exchange import transform as transform
+from fflin.linear.exchange import from_tool as from_tool
+from fflin.linear.exchange import ToolModel as ToolModel
 from fflin.linear.check import check as check
 from fflin.linear.check import Check as Check
 

@@ -62,7 +62,7 @@ RESULTS = {
     ),
     *("LFT", "Sensitivity", "Uncertain"),
     *("Modes", "Motion", "Observability", "RandomConfigurations", "ReducedModel", "Robot"),
-    *("RelativeEquilibria", "RelativeEquilibrium", "Validity"),
+    *("RelativeEquilibria", "RelativeEquilibrium", "ToolModel", "Validity"),
 }
 
 

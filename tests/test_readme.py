@@ -21,7 +21,11 @@ def code_blocks(language, text=README):
 
 
 @pytest.mark.parametrize(
-    "page", ["README.md", *(f"docs/{name}.md" for name in ("guide", "uncertainty", "mpc", "catch"))]
+    "page",
+    [
+        "README.md",
+        *(f"docs/{name}.md" for name in ("guide", "tools", "uncertainty", "mpc", "catch")),
+    ],
 )
 def test_python_examples_run(tmp_path, page):
     text = (ROOT / page).read_text(encoding="utf-8")

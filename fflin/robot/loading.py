@@ -133,6 +133,7 @@ def _load(
         package_dirs=folders,
         urdf_damping=damping,
         links={name: LinkMass.of(link) for name, link in description.links.items()},
+        file_joints=description.joints,
     )
     return loaded, description.advice
 
