@@ -21,7 +21,12 @@ def code_blocks(language, text=README):
 
 
 @pytest.mark.parametrize(
-    "page", ["README.md", "docs/index.md", "docs/guide.md", "docs/uncertainty.md", "docs/peers.md"]
+    "page",
+    [
+        "README.md",
+        *("docs/index.md", "docs/peers.md"),
+        *(f"docs/{name}.md" for name in ("guide", "tools", "uncertainty", "mpc", "catch")),
+    ],
 )
 def test_python_examples_run(tmp_path, page):
     text = (ROOT / page).read_text(encoding="utf-8")

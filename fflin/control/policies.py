@@ -188,6 +188,23 @@ class Allocation:
         return policy
 
 
+class Clock:
+    """The samples of a controller that remembers, each `dt` [s] after the last."""
+
+    def __init__(self, dt: float) -> None:
+        self._dt, self._last = dt, -np.inf
+
+    def tick(self, t: float) -> None:
+        """Raise `InputError` where a sample comes at another time."""
+        apart = t - self._last
+        if self._last >= 0.0 and abs(apart - self._dt) > 1e-6 * self._dt:
+            raise InputError(
+                f"the controller is asked {apart:g} s after its last sample, expected "
+                f"{self._dt:g} s; leave `sample` out"
+            )
+        self._last = t
+
+
 def decider(policy: Any) -> Any:
     """Return what decides on commands: of an allocation its policy."""
     return policy.policy if isinstance(policy, Allocation) else policy

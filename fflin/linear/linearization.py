@@ -136,30 +136,7 @@ class Linearizer:
     def __call__(
         self, q: Array | None = None, v: Array | None = None, u: Array | None = None
     ) -> LinearModel:
-        """Linearise about a point.
-
-        Parameters
-        ----------
-        q : array_like (nq,), optional
-            Configuration in Pinocchio's order; neutral by default.
-        v : array_like (nv,), optional
-            Velocity in Pinocchio's order; at rest by default.
-        u : array_like (nu,), optional
-            Over the robot's inputs, those on the base in the frame's axes; zero by default.
-
-        Returns
-        -------
-        LinearModel
-
-        Raises
-        ------
-        InputError
-            If a size is wrong or an entry is not finite or not of unit length.
-        ChartError
-            If the base is turned by pi from the reference.
-        SingularInertiaError
-            If a joint moves no mass.
-        """
+        """Linearise about a point; q, v, u, and what is raised, are those of `linearize`."""
         robot = self.robot
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
         known = v is None and u is None and self._known

@@ -214,7 +214,7 @@ def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = Non
         wheels=tuple(robot.wheels),
         wheel_inertias=np.array(list(robot.wheels.values())),
         steered=plan.steered,
-        notes=plan.notes,
+        notes=(*plan.notes, *getattr(plan.law and plan.law.policy, "notes", ())),
         limit_names=tuple(plan.known),
         limits=np.array(list(plan.known.values())).reshape(-1, 2),
     )
