@@ -97,6 +97,16 @@ def mpc(
     ----------
     D. Arnström, A. Bemporad and D. Axehill, A dual active-set solver for embedded quadratic
     programming using recursive LDL' updates, IEEE Trans. Automatic Control 67(8), 2022.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> policy = fflin.mpc(lin, dt=0.2, horizon=10, limits={"tau_b": 2.0, "tau_m": 1.0})
+    >>> q0 = fflin.configuration(robot, {"joint_2": 0.4})
+    >>> motion = fflin.simulate(robot, policy, q0=q0, duration=4.0, dt=0.05)
+    >>> bool(abs(motion.u[:, 6:]).max() <= 1.0), policy.matrices(motion.x[0]).H.shape
+    (True, (90, 90))
     """
     if not isinstance(lin, LinearModel | LinearTrajectory):
         raise InputError(

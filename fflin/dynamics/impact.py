@@ -39,6 +39,14 @@ class Impact(FrozenArrays):
         The same after: they differ by rounding.
     event : str
         What happened, in words.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> spin = fflin.velocity(robot, {"joint_1": 0.2})
+    >>> jammed = fflin.jam(robot, "joint_1", v=spin)
+    >>> bool(abs(jammed.momentum_after - jammed.momentum).max() < 1e-12), jammed.event
+    (True, 'joint_1 jammed')
     """
 
     robot: Robot
@@ -99,6 +107,14 @@ def jam(
         If a size or value is wrong, or no joint or no input is left to name.
     ModelError
         If the robot was changed after it was made.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> spin = fflin.velocity(robot, {"joint_1": 0.2})
+    >>> jammed = fflin.jam(robot, "joint_1", v=spin)
+    >>> jammed.robot.joint_names, jammed.energy_lost > 0
+    (('joint_2', 'joint_3'), True)
     """
     state = StateMap(robot)
     keys = [joints] if isinstance(joints, str) else joints

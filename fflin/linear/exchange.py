@@ -44,6 +44,14 @@ class ToolModel(Design):
         The point as the tool has it.
     reference : str
         "fixed", or "moving" where x is the deviation from what moves through the point.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> spart = lin.to("spart")
+    >>> K = spart.T_u @ fflin.lqr(lin).K @ spart.T_left  # the gain in its coordinates
+    >>> K.shape, spart.state_names[:3], spart.reference
+    ((9, 18), ('theta.x', 'theta.y', 'theta.z'), 'fixed')
     """
 
     VECTORS: ClassVar = ("f0", "x0", "u0", "y0", "q", "v")
@@ -108,6 +116,16 @@ def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = N
         If there is no such tool.
     ChartError
         If the pitch of Euler's angles is 90 deg.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> drake = fflin.transform(robot, lin, "drake")  # or lin.to("drake")
+    >>> drake.A.shape, drake.state_names[:4]
+    ((19, 19), ('quat.w', 'quat.x', 'quat.y', 'quat.z'))
+    >>> bool(abs(drake.T_left @ drake.A @ drake.T - lin.A).max() < 1e-12)
+    True
     """
     instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
     require_fit(lin, robot, StateMap(robot, frame=lin.frame))
@@ -184,6 +202,15 @@ def from_tool(
         If there is no such tool.
     ChartError
         If the base is turned by 180 deg from the reference, or as `transform`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> mujoco = lin.to("mujoco")
+    >>> back = fflin.from_tool(robot, "mujoco", mujoco.q, mujoco.v, A=mujoco.A, B=mujoco.B)
+    >>> bool(abs(back.B - lin.B).max() < 1e-13)
+    True
     """
     q, v = tool_coordinates(robot, tool).to_pinocchio(q, v)
     place: Any = {"frame": frame, "reference": reference, "moving": moving}

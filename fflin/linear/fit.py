@@ -100,6 +100,14 @@ def line_up(gain: Any, lin: LinearModel) -> Array:
     InputError
         If they are in different frames or of different sampling times, or if neither has all
         states, or all inputs, of the other: then they are not of one robot.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> stuck = fflin.linearize(fflin.load("planar_detumble", lock=["joint_1"]))
+    >>> fflin.line_up(fflin.lqr(lin), stuck).shape
+    (8, 16)
     """
     if not hasattr(gain, "K") or not hasattr(gain, "state_names"):
         raise InputError(f"gain is a {type(gain).__name__}, expected a Gain or GainBatch")
