@@ -9,6 +9,7 @@ from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.outputs import Measuring, Sensing
+from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.certificate import (
     aba_route,
@@ -199,7 +200,9 @@ def _point_errors(
     state = model.state
     mobility, input_mobility = mobilities(M, lin.B)
     rate = model(lin.x0, lin.u0)
-    _, rate_of_turn, momentum = speeds(state, v)
+    # In an orbit it is the absolute velocity whose terms cancel.
+    field = field_of(state.robot, state.frame)
+    _, rate_of_turn, momentum = speeds(state, field.absolute(q, v) if field else v)
     push = float((np.abs(lin.u0) * input_mobility).max(initial=0.0))
     push += rate_of_turn**2 * float((1.0 / mobility).max())
     push += rate_of_turn * momentum * float(mobility.max())
