@@ -8,8 +8,8 @@ import numpy as np
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
-from fflin.dynamics.outputs import Measuring, Sensing
 from fflin.dynamics.orbital import field_of
+from fflin.dynamics.outputs import Measuring, Sensing
 from fflin.dynamics.state import StateMap
 from fflin.linear.certificate import (
     aba_route,
