@@ -17,6 +17,9 @@ from fflin.control.policies import Clock
 # soft one costs, and of more than this multiplier how much it yields; what counts as passed.
 _EXACT, _PRICE, _YIELDS, _PASSED = 1e-9, 1e3, 1.0, 1e-6
 
+# Of a limit's width, what the robot passes it by without a word.
+_OVER = 1e-3
+
 # DAQP's infinity, its words for a soft limit and for a plan that passes one, and most iterations.
 _OPEN, _SOFT, _PASSES, _MOST = 1e30, 8, 2, 10_000
 
@@ -114,8 +117,9 @@ class Receding:
     def __init__(self, horizon: Horizon, at: Any = None) -> None:
         self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
         self._stages: tuple[Stage, ...] = ()
-        self.solves = self.softened = self.unfinished = 0
-        self._worst, self._said = 0.0, ""
+        self.solves = self.softened = self.unfinished = self.passed = 0
+        self._worst, self._said, self._over, self._met = 0.0, "", _OVER, ""
+        self._due: tuple[Stage, Array] | None = None  # the sample that ends at the next one
         if horizon.limited:  # before the first sample, which must not wait
             self._change(horizon.window(0.0))
 
@@ -125,6 +129,8 @@ class Receding:
         said = f"{self.solves} plans of {self.of.samples} samples of {self.of.dt:g} s"
         if self.softened:
             said += f", {self.softened} beyond a limit, the farthest {self._said}"
+        if self.passed:
+            said += f"; the robot passed one at {self.passed} samples, the farthest {self._met}"
         if self.unfinished:
             said += f", {self.unfinished} not found, where the regulator acted, cut at the limits"
         return (said,) if self.solves else ()
@@ -146,6 +152,7 @@ class Receding:
             self._change(stages)
         free = self._free @ e
         self.solves += 1
+        self._judge(t, e)
         z, flag = self._solved(free)
         if flag <= 0:  # once more, from nothing
             self._start()
@@ -160,7 +167,22 @@ class Receding:
             if self.unfinished == 1:
                 warnings.warn(f"{said}regulator acts, cut at the limits", FflinWarning, 2)
         d[acting] = np.clip(d[acting], now.low[: len(acting)], now.high[: len(acting)])
+        self._due = now, d
         return d
+
+    def _judge(self, t: float, e: Array) -> None:
+        """Note where the robot, which is not quite the linear model, is beyond the soft limits."""
+        if self._due is None:
+            return
+        (by, d), first = self._due, len(self.of.acting)
+        reached, low, high = ((by.E @ e + by.D @ d)[first:], by.low[first:], by.high[first:])
+        width = np.where(np.isfinite(high - low), high - low, 1.0)
+        shares = np.maximum(low - reached, reached - high) / width
+        self.passed += bool(shares.max(initial=0.0) > _OVER)
+        if shares.max(initial=0.0) > self._over:
+            at = int(shares.argmax())
+            self._over, by_much = float(shares[at]), shares[at] * width[at]
+            self._met = f"{self.of.limited[first + at]} by {by_much:.2g} at {t:.4g} s"
 
     def _count(self, t: float, reached: Array) -> None:
         """Note how far a plan goes beyond the soft limits."""
