@@ -129,6 +129,8 @@ def results_within(app: Sphinx) -> None:
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register with Sphinx."""
+    # What Sphinx keeps for its next build is no part of the site.
+    app.doctreedir = app.srcdir / "_build"
     os.environ["FFLIN_DOCS_PAGES"] = str(Path(app.outdir) / "pages")
     reference(app)  # here, since autosummary looks for its tables before anything is read
     app.connect("builder-inited", results_within, priority=900)  # after myst_nb has chosen
