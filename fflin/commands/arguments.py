@@ -182,8 +182,11 @@ def add_inputs_there(command: Container) -> None:
         """
         --effort NAME=VALUE*: an input at the point, by its name in u, such as tau_m.joint_1
         --equilibrium: take the least inputs that balance springs, gravity and a steady motion at
-            the point; refused where there are none""",
+            the point, where passive joints sag on their springs; refused where there are none""",
     )
+    text = """--relative-equilibrium N: in orbit, take the N-th attitude (default 1) that its field
+        does not turn, and the inputs of --equilibrium; attitude and position count from there"""
+    add_options(command, text, nargs="?", const=1)
 
 
 def add_orbit(command: Container) -> None:

@@ -16,7 +16,14 @@ from fflin.commands.arguments import (
     add_robot,
     add_system,
 )
-from fflin.commands.points import configuration_of, inputs_at, once, placed, velocity_of
+from fflin.commands.points import (
+    configuration_of,
+    held_at,
+    once,
+    placed,
+    relative_point,
+    velocity_of,
+)
 from fflin.commands.regulator import add_weights, gain_of, regulated_part
 from fflin.commands.tracking import add_trajectory, models_along, schedule_of
 
@@ -125,13 +132,13 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
         return Loop(policy, options | start)
     if arguments.offset or arguments.hold:
         raise InputError("--offset and --hold are of a --trajectory; give one, or leave them out")
-    q, v = start_of(robot, arguments)
-    options |= {"q0": q, "v0": v}
     if arguments.free:
         refuse_law(arguments)
+        options["q0"], options["v0"] = start_of(robot, arguments)
         options["duration"] = SHORTEST if arguments.duration is None else arguments.duration
         return Loop(None, options | {"frame": arguments.frame})
     policy, feedback, lin = about_point(robot, arguments)
+    options["q0"], options["v0"] = q, v = start_of(robot, arguments, feedback.lin.reference)
     require_held(robot, feedback, q)
     if arguments.duration is None:
         options["duration"] = time_to_settle(robot, feedback, q, v)
@@ -139,9 +146,16 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
     return Loop(policy, options, *([feedback, lin] if alone else []))
 
 
-def start_of(robot: Robot, arguments: argparse.Namespace) -> tuple[Array, Array | None]:
+def start_of(
+    robot: Robot, arguments: argparse.Namespace, reference: Any = None
+) -> tuple[Array, Array | None]:
     """Return q (nq,) and v (nv,) that the arguments or the robot say."""
     q = configuration_of(robot, arguments, robot.start)
+    if number := arguments.relative_equilibrium:
+        import pinocchio as pin
+
+        about = reference or relative_point(robot, q, number, arguments.frame)[1]
+        q[:7] = pin.SE3ToXYZQUAT(about * pin.XYZQUATToSE3(q[:7]))
     names = ("target_velocity", "velocity")
     return q, velocity_of(robot, arguments, *names, start=robot.start)
 
@@ -162,7 +176,7 @@ def about_point(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, Any, 
         if arguments.allocate is None:
             allocate = allocate and "tau_b.x" in gain.input_names
         design = _without_thrusters(robot) if allocate else robot
-        lin = _about_gain(design, gain, arguments.gain)
+        lin = _about_gain(design, gain, arguments)
     else:
         design = _without_thrusters(robot) if allocate else robot
         lin = _about_target(design, arguments)
@@ -187,7 +201,7 @@ def along(robot: Robot, arguments: argparse.Namespace) -> tuple[Any, dict[str, A
 
     _refuse(
         arguments,
-        ("free", "gain", "controller", *_TARGETS),
+        ("free", "gain", "controller", "relative_equilibrium", *_TARGETS),
         "a trajectory says where the robot is to be",
     )
     poses = ("joint", "rpy", "position", "velocity")
@@ -229,19 +243,22 @@ def _require_own(schedule: Any, motion: Any, arguments: argparse.Namespace) -> N
         )
 
 
-def _about_gain(robot: Robot, gain: Any, path: Path) -> LinearModel:
-    """Return the model about the point of a gain, with the base at the world's origin there."""
+def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> LinearModel:
+    """Return the model about the point of a gain, with the base at its reference there."""
     from fflin.dynamics.actuation import Actuation
     from fflin.dynamics.state import StateMap
     from fflin.linear.fit import require_same
     from fflin.linear.linearization import linearize
 
-    state, made = StateMap(robot, frame=gain.frame), f"{path} is a gain of '{gain.robot}'"
+    made = f"{arguments.gain} is a gain of '{gain.robot}'"
+    state, reference = StateMap(robot, frame=gain.frame), None
     for kind, there in (("state", state), ("input", Actuation(state))):
         own = getattr(gain, f"{kind}_names"), getattr(gain, f"{kind}_units")
         require_same(made, robot, kind, own, (there.names, there.units))
     q, v = state.to_pinocchio(gain.x0)
-    return linearize(robot, q, v, gain.u0, frame=gain.frame)
+    if number := arguments.relative_equilibrium:
+        q, reference = relative_point(robot, q, number, gain.frame)
+    return linearize(robot, q, v, gain.u0, frame=gain.frame, reference=reference)
 
 
 def require_held(robot: Robot, policy: Any, q: Array) -> None:
@@ -282,5 +299,6 @@ def _about_target(robot: Robot, arguments: argparse.Namespace) -> LinearModel:
 
     q = placed(robot, "--target-joint", arguments.target_joint)
     v = velocity_of(robot, arguments, "target_velocity")
-    u = inputs_at(robot, q, v, arguments)
-    return regulated_part(linearize(robot, q, v, u, frame=arguments.frame), arguments)
+    q, u, reference = held_at(robot, q, v, arguments)
+    lin = linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
+    return regulated_part(lin, arguments)

@@ -133,10 +133,13 @@ def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
     from fflin.linear.linearization import linearize
 
     robot = load_robot(arguments)
-    q = configuration_of(robot, arguments)
+    q, v = configuration_of(robot, arguments), velocity_of(robot, arguments)
+    if arguments.relative_equilibrium and (arguments.rpy or arguments.position):
+        raise InputError(
+            "--relative-equilibrium says how the base stands; leave --rpy and --position out"
+        )
     reference = pin.SE3.Identity() if arguments.reference == "world" else None
-    v = velocity_of(robot, arguments)
-    u = inputs_at(robot, q, v, arguments, reference)
+    q, u, reference = held_at(robot, q, v, arguments, reference)
     return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
 
 
@@ -160,20 +163,41 @@ def velocity_of(
     return velocity(robot, values) if values else None
 
 
-def inputs_at(
+def held_at(
     robot: Robot,
     q: Array,
     v: Array | None,
     arguments: argparse.Namespace,
     reference: pin.SE3 | None = None,
-) -> Array | None:
-    """Return the inputs (nu,) that --effort or --equilibrium say."""
-    if not arguments.equilibrium:
+) -> tuple[Array, Array | None, pin.SE3 | None]:
+    """Return q, u (nu,) and the reference with --effort or in one of the equilibria."""
+    number = arguments.relative_equilibrium
+    if not arguments.equilibrium and not number:
         from fflin.dynamics.points import effort
 
-        return effort(robot, once("--effort", arguments.effort)) if arguments.effort else None
+        given = once("--effort", arguments.effort)
+        return q, effort(robot, given) if given else None, reference
+    option = "--relative-equilibrium" if number else "--equilibrium"
     if arguments.effort:
-        raise InputError("--effort and --equilibrium both say the inputs at the point; give either")
+        raise InputError(f"--effort and {option} both say the inputs at the point; give either")
     from fflin.linear.equilibrium import equilibrium
 
-    return equilibrium(robot, q, v=v, frame=arguments.frame, reference=reference).u
+    if number:
+        q, reference = relative_point(robot, q, number, arguments.frame)
+    held = equilibrium(robot, q, v=v, frame=arguments.frame, reference=reference)
+    return held.q, held.u, reference
+
+
+def relative_point(robot: Robot, q: Array, number: int, frame: Any) -> tuple[Array, pin.SE3]:
+    """Return q (nq,) and the base's placement in a relative equilibrium, from 1 on."""
+    import pinocchio as pin
+
+    from fflin.analysis.relative_equilibria import relative_equilibria
+
+    if robot.orbit is None:
+        raise InputError(f"--relative-equilibrium: '{robot.name}' is in no orbit; give --orbit")
+    found = relative_equilibria(robot, q, frame=frame)
+    if number > len(found):
+        raise InputError(f"--relative-equilibrium is {number}, but there are {len(found)}")
+    q = found[number - 1].q
+    return q, pin.XYZQUATToSE3(q[:7])

@@ -185,7 +185,8 @@ def resting_end(traj: Trajectory, end: int = -1) -> LinearModel:
     rotors = rotor_names(robot)
     spinning = [joint.idx_v for joint in robot.joints if joint.name in rotors]
     v[spinning] = traj.v[end, spinning]
-    return Linearizer(robot, moving=True, engine="python")(q, v, equilibrium(robot, q, v=v).u)
+    held = equilibrium(robot, q, v=v)
+    return Linearizer(robot, moving=True, engine="python")(held.q, v, held.u)
 
 
 def steady_regulator(

@@ -1,4 +1,4 @@
-"""The inputs that hold a robot in equilibrium."""
+"""The inputs that hold a robot in equilibrium, and where its springs give way."""
 
 from __future__ import annotations
 
@@ -15,21 +15,19 @@ from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.names import ORBITAL, forces_of
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import Frame, StateMap
+from fflin.linear.least_norm import TOLERANCE, least_norm
 from fflin.linear.linearization import Linearizer
+from fflin.robot.frames import ROOT
 from fflin.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from fflin.linear.model import LinearModel
 
-_EPS = float(np.finfo(float).eps)
-
-# Largest share of the forces to be balanced that may be left over.
-_TOLERANCE = 1e-9
+# Newton's steps until springs settle; a few do.
+_STEPS = 20
 
 # Round-off of M a and of the accelerations themselves, relative to the terms that they sum.
-_ROUNDING = 1e3 * _EPS
+_ROUNDING = 1e3 * float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +36,13 @@ class Equilibrium(FrozenArrays):
 
     Attributes
     ----------
+    q : ndarray (nq,)
+        The given configuration, in which passive joints sag on their springs; takes the place of
+        q in `linearize`.
     u : ndarray (nu,)
         Over the robot's inputs; takes the place of u in `linearize`.
+    sag : ndarray (n,)
+        How far the joints of q are from where they were given [rad | m].
     residual : ndarray (6 + n,)
         Generalised forces that are left, those on the base in base axes.
     input_names, input_units : tuple of str
@@ -53,9 +56,15 @@ class Equilibrium(FrozenArrays):
     >>> held = fflin.equilibrium(robot, fflin.configuration(robot, {"joint_1": 0.2}))
     >>> round(float(held.u[6]), 6), held.input_names[6]
     (10.0, 'tau_m.joint_1')
+    >>> soft = fflin.load("planar_detumble", passive=["joint_1"], stiffness={"joint_1": 50.0})
+    >>> print(fflin.equilibrium(soft, fflin.configuration(soft, {"joint_1": 0.2})))
+    u: all zero
+    sags: joint_1 = -0.2 rad
     """
 
+    q: Array
     u: Array
+    sag: Array
     residual: Array
     input_names: tuple[str, ...]
     input_units: tuple[str, ...]
@@ -65,9 +74,14 @@ class Equilibrium(FrozenArrays):
     def __str__(self) -> str:
         from fflin.base.tables import signals
 
-        if not self.u.any():
-            return "u: all zero"
-        return signals("u", self.u, self.input_names, self.input_units)
+        said = "u: all zero"
+        if self.u.any():
+            said = signals("u", self.u, self.input_names, self.input_units)
+        if not (shown := np.where(np.abs(self.sag) > _ROUNDING, self.sag, 0.0)).any():
+            return said
+        names = [name.partition(".")[2] for name in self.force_names[6:]]
+        units = ["m" if unit == "N" else "rad" for unit in self.force_units[6:]]
+        return f"{said}\n{signals('sags', shown, names, units)}"
 
 
 def equilibrium(
@@ -78,7 +92,7 @@ def equilibrium(
     frame: Frame | None = None,
     reference: pin.SE3 | None = None,
 ) -> Equilibrium:
-    r"""Find the inputs of least norm that balance all that acts on a robot at a point.
+    r"""Find the inputs of least norm that balance all that acts on a robot, as its springs sag.
 
     Springs, gravity, dampers and the forces of a steady motion: whatever `linearize` knows of. In
     an orbit the pull of its field and the turning of its frame, in which the base rests; see
@@ -92,6 +106,10 @@ def equilibrium(
     The norm is that of the numbers in u, each in its own unit. The rows of the balance, N m and
     N, are made comparable by the mobilities :math:`\sqrt{(M^{-1})_{ii}}`; so weighed, what is
     left must not exceed 1e-9 of what is balanced.
+
+    Passive joints with a spring, those of no `JointTorque`, sag where no input holds them: their
+    positions are solved for too, by Newton's method on their rows of the balance, down to
+    rounding. The slope is :math:`M\,\partial\dot\nu/\partial q_m`, of the A of `linearize`.
 
     Parameters
     ----------
@@ -111,13 +129,13 @@ def equilibrium(
     Returns
     -------
     Equilibrium
-        ``linearize(robot, q, v, u=result.u)`` with the same frame and reference.
+        ``linearize(robot, result.q, v, u=result.u)`` with the same frame and reference.
 
     Raises
     ------
     EquilibriumError
-        If no inputs balance it; names the forces that are left. Or if the motion cannot be
-        steady under any inputs.
+        If no inputs balance it; names the forces that are left. If springs are too weak to hold
+        what they carry, or do not settle. Or if the motion cannot be steady under any inputs.
     InputError
         If a size is wrong or an entry is not a number.
     ChartError, SingularInertiaError
@@ -132,44 +150,81 @@ def equilibrium(
     --------
     >>> robot = fflin.load("planar_detumble", stiffness={"joint_1": 50.0})
     >>> q = fflin.configuration(robot, {"joint_1": 0.2})
-    >>> u = fflin.equilibrium(robot, q).u
-    >>> fflin.linearize(robot, q, u=u).is_equilibrium(1e-9)
+    >>> held = fflin.equilibrium(robot, q)
+    >>> fflin.linearize(robot, held.q, u=held.u).is_equilibrium(1e-9)
     True
     """
     state = StateMap(robot, frame=frame, reference=reference)
-    axes: Any = {"frame": frame, "reference": reference} if robot.orbit else {"moving": True}
-    lin = Linearizer(robot, **axes, engine="python")(q, v)
-    drift = lin.f0 if lin.drift is None else lin.drift
-    _require_steady(lin, drift)
-    actuation = Actuation(state)
-    columns = actuation.columns(robot.create_data(), lin.q)
-
-    M, acceleration = lin.M, drift[-len(lin.M) :]
-    if robot.orbit:
-        chart = state.chart(lin.q)
-        M = state.to_base(chart, state.to_base(chart, M).T).T
-        acceleration = state.to_base(chart, acceleration[:, None])[:, 0]
-    mobility = np.sqrt(np.linalg.inv(M).diagonal())
-    terms = np.abs(M) @ np.abs(acceleration)
-    rounding, wanted = _rounding(robot, lin, M), -M @ acceleration
-    wanted[np.abs(wanted) <= _ROUNDING * terms + rounding * bool(robot.orbit)] = 0.0
-    one_sided = np.zeros(len(actuation.names), dtype=bool)
-    one_sided[actuation.groups.get("thrust", [])] = True
-
-    scaled, target = mobility[:, None] * columns, mobility * wanted
-    u, left = _least_norm(scaled, target, one_sided)
-    allowed = _TOLERANCE * float(np.linalg.norm(target))
-    allowed += float(np.linalg.norm(mobility * rounding))
-    pushes = forces_of(robot)
-    residual = left / mobility
-    if float(np.linalg.norm(left)) > allowed:
-        raise _unbalanced(robot, residual, np.abs(left), pushes)
+    given = robot.neutral() if q is None else robot.checked_configuration(q)
+    axes: Any = {"moving": True}
+    if robot.orbit:  # its own placement, so that there too forces and inputs are in base axes
+        own = robot.model.jointPlacements[ROOT] * pin.XYZQUATToSE3(given[:7])
+        axes = {"frame": frame, "reference": own}
+    linearizer = Linearizer(robot, **axes, engine="python")
+    actuation, pushes = Actuation(state), forces_of(robot)
+    free = {f"tau_m.{name}" for name in robot.stiffness} - set(actuation.names)
+    soft = np.array([name in free for name in pushes])
+    held = _Held(linearizer, actuation, given, v)
+    fine = held.fine
+    for _ in range(_STEPS):
+        loose = soft & (np.abs(held.residual) > fine)
+        if not loose.any():
+            break
+        step = state.spread(held.settling(linearizer, soft))
+        at = pin.integrate(robot.model, held.lin.q, step)
+        at[:7] = given[:7]
+        held = _Held(linearizer, actuation, at, v)
+        fine = np.maximum(fine, held.fine)
+    left = np.where(soft & ~loose, 0.0, held.left)
+    if float(np.linalg.norm(left)) > held.allowed:
+        raise _unbalanced(robot, held.residual, np.abs(left), pushes)
+    at, u = held.lin.q, held.u
     if reference is not None or robot.orbit:
-        chart = state.chart(lin.q)
-        for held, _ in actuation.held:
-            u[held] = chart.R @ u[held]
-    units = tuple(pushes.values())
-    return Equilibrium(u, residual, actuation.names, actuation.units, tuple(pushes), units)
+        chart = state.chart(at)
+        for columns, _ in actuation.held:
+            u[columns] = chart.R @ u[columns]
+    names = actuation.names, actuation.units, tuple(pushes), tuple(pushes.values())
+    return Equilibrium(at, u, state.joints_apart(given, at), held.residual, *names)
+
+
+class _Held:
+    """The inputs of least norm at a point, in base axes, and what they leave."""
+
+    def __init__(
+        self, linearizer: Linearizer, actuation: Actuation, q: Array, v: Array | None
+    ) -> None:
+        robot = linearizer.robot
+        self.lin = lin = linearizer(q, v)
+        drift = lin.f0 if lin.drift is None else lin.drift
+        _require_steady(lin, drift)
+        columns = actuation.columns(robot.create_data(), lin.q)
+        M, acceleration = lin.M, drift[-len(lin.M) :]
+        mobility = np.sqrt(np.linalg.inv(M).diagonal())
+        terms = _ROUNDING * (np.abs(M) @ np.abs(acceleration))
+        rounding, wanted = _rounding(robot, lin, M), -M @ acceleration
+        wanted[np.abs(wanted) <= terms + rounding * bool(robot.orbit)] = 0.0
+        one_sided = np.zeros(len(actuation.names), dtype=bool)
+        one_sided[actuation.groups.get("thrust", [])] = True
+        target = mobility * wanted
+        self.u, self.left = least_norm(mobility[:, None] * columns, target, one_sided)
+        self.allowed = TOLERANCE * float(np.linalg.norm(target))
+        self.allowed += float(np.linalg.norm(mobility * rounding))
+        self.residual, self.fine = self.left / mobility, rounding + terms
+
+    def settling(self, linearizer: Linearizer, soft: Any) -> Array:
+        """Return Newton's step (6 + n,) of the joints whose rows of the forces are `soft`."""
+        robot, lin = linearizer.robot, linearizer(self.lin.q, self.lin.v, self.u)
+        hold = -(lin.M @ lin.A[-len(soft) :, : len(soft)])[np.ix_(soft, soft)]
+        own = np.sqrt(robot.springs.stiffness[soft[6:]])
+        if np.linalg.eigvals(hold / np.outer(own, own)).real.min() <= TOLERANCE:
+            names = listed([robot.joint_names[i] for i in np.flatnonzero(soft[6:])])
+            raise EquilibriumError(
+                f"the springs of {names} give '{robot.name}' no hold against what they carry here; "
+                "make them stiffer, or take another point"
+            )
+        step: Array = np.zeros(len(soft))
+        step[soft] = np.linalg.solve(hold, self.residual[soft])
+        return step
 
 
 def _require_steady(lin: LinearModel, drift: Array) -> None:
@@ -185,12 +240,12 @@ def _require_steady(lin: LinearModel, drift: Array) -> None:
             "may, which are symmetric about their axis and have nothing fixed on them"
         )
     if lin.frame in ORBITAL:
-        if np.abs(drift[:6]).max() > _TOLERANCE:
+        if np.abs(drift[:6]).max() > TOLERANCE:
             raise EquilibriumError(
                 f"no input keeps '{lin.robot}' as it is while its base moves in the orbit's frame; "
                 "leave the velocity of the base out"
             )
-    elif "q_b.x" not in lin.ignorable and np.abs(drift[:3]).max() > _TOLERANCE:
+    elif "q_b.x" not in lin.ignorable and np.abs(drift[:3]).max() > TOLERANCE:
         raise EquilibriumError(
             f"no input keeps '{lin.robot}' as it is while it turns across gravity; it may turn "
             "about the vertical only"
@@ -207,63 +262,6 @@ def _rounding(robot: Robot, lin: LinearModel, M: Array) -> Array:
     stiffness, _, rest = robot.springs
     terms[6:] += stiffness * (np.abs(state.joint_positions(lin.q)) + np.abs(rest))
     return _ROUNDING * terms
-
-
-def _least_norm(C: Array, d: Array, one_sided: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return the least u with ``C u = d``, ``u[one_sided] >= 0``, and ``C u - d``."""
-    u = _pseudo_solve(C, d)
-    if (u[one_sided] < 0.0).any():
-        u = _least_distance(C, u, one_sided)
-        # Exactly the least on the face that was found: those that do not push stay out.
-        pushing = ~one_sided | (u > _TOLERANCE * float(np.abs(u).max(initial=0.0)))
-        polished: Array = np.zeros(len(u))
-        polished[pushing] = _pseudo_solve(C[:, pushing], d)
-        left = C @ polished - d
-        most = _TOLERANCE * np.linalg.norm(d)
-        if (polished[one_sided] < 0.0).any() or np.linalg.norm(left) > most:
-            polished = _least_residual(C, d, one_sided)
-        u = polished
-    return u, C @ u - d
-
-
-def _pseudo_solve(C: Array, d: Array) -> Array:
-    """Return the u of least norm among those with the least ``|C u - d|``."""
-    u: Array = np.linalg.lstsq(C, d, rcond=None)[0]
-    u += np.linalg.lstsq(C, d - C @ u, rcond=None)[0]
-    # An input below the rounding of the largest one is noise: it counts as zero.
-    u[np.abs(u) <= 16.0 * _EPS * float(np.abs(u).max(initial=0.0))] = 0.0
-    return u
-
-
-def _least_distance(C: Array, start: Array, one_sided: NDArray[np.bool_]) -> Array:
-    """Return the least u = start + Z z with u[one_sided] >= 0, where C Z = 0."""
-    from scipy.linalg import null_space
-    from scipy.optimize import nnls
-
-    # min |z| subject to G z >= h is solved by the residual r = E y - e of min |E y - e|, y >= 0,
-    # with E = [G^T; h^T] and e = (0, ..., 0, 1): z = -r_z / r_e.
-    Z = null_space(C)
-    size = float(np.linalg.norm(start))
-    E = np.vstack((Z[one_sided].T, -start[one_sided] / size))
-    e = np.zeros(len(E))
-    e[-1] = 1.0
-    y = nnls(E, e, maxiter=100 * max(E.shape))[0]
-    r = E @ y - e
-    # r_e = -|r|^2, and zero where the inequalities contradict each other.
-    z = -r[:-1] / r[-1] if r[-1] < -_TOLERANCE else np.zeros(Z.shape[1])
-    u: Array = start + Z @ (size * z)
-    return np.where(one_sided, np.maximum(u, 0.0), u)
-
-
-def _least_residual(C: Array, d: Array, one_sided: NDArray[np.bool_]) -> Array:
-    """Return a u with u[one_sided] >= 0 that leaves the least ``|C u - d|``."""
-    from scipy.optimize import nnls
-
-    both = np.hstack((C, -C[:, ~one_sided]))
-    split = nnls(both, d, maxiter=100 * max(both.shape))[0]
-    u: Array = split[: C.shape[1]]
-    u[~one_sided] -= split[C.shape[1] :]
-    return u
 
 
 def _unbalanced(

@@ -85,6 +85,16 @@ def test_joints_hold_their_posture_in_a_relative_equilibrium():
         fflin.equilibrium(robot, stands)
 
 
+def test_passive_panels_sag_beside_motors_in_a_relative_equilibrium():
+    robot = fflin.load("servicer_7dof", orbit=800e3, passive=["panel_*"])
+    robot = robot.replace(stiffness={"panel_*": 40.0})
+    q = fflin.relative_equilibria(robot, fflin.configuration(robot, {"joint_2": 0.5}))[0].q
+    about = pin.XYZQUATToSE3(q[:7])
+    held = fflin.equilibrium(robot, q, reference=about)
+    lin = fflin.linearize(robot, held.q, u=held.u, reference=about)
+    assert held.sag.any() and fflin.modes(lin).equilibrium and not lin.x0[:6].any()
+
+
 @pytest.mark.parametrize("n", [0.3, LEO, GEO])
 def test_what_thrust_reaches_is_known(n):
     """Along the orbit all of the plane, away from the body all but one; askew, as the plane and

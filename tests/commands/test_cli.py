@@ -548,3 +548,35 @@ def test_linearize_shows_no_rounding_in_f0_and_calls_no_frozen_model_unstable():
     code, falling, _ = run(*hover, "--joint", "joint_2=0.3", "--effort", "F_b.z=9000")
     assert code == 0 and "not a fixed point" in falling
     assert "unstable" not in falling and "f0:" in falling
+
+
+def test_equilibria_in_orbit_are_taken_as_panels_sag(tmp_path):
+    soft = ["servicer_7dof", "--passive", "panel_*", "--stiffness", "panel_*=40"]
+    soft += ["--orbit", "400e3"]
+    code, out, err = run("linearize", *soft, "--rpy", 5, 0, 0, "--equilibrium")
+    assert (code, err) == (0, "") and "a fixed point" in out and "q_m.panel_left = " in out
+    code, out, err = run("modes", *soft, "--relative-equilibrium")
+    assert (code, err) == (0, "") and "not an equilibrium" not in out
+    robot = fflin.load("servicer_7dof", passive=["panel_*"], stiffness={"panel_*": 40.0})
+    robot = robot.replace(orbit=400e3)
+    slow = np.sort(fflin.relative_equilibria(robot)[0].poles.imag)[-1]
+    assert f"{slow:.4g}" in out  # of the libration, which soft panels change but little
+    for command in ("analyze", "lqr"):
+        assert run(command, *soft, "--relative-equilibrium", 5)[0] == 0
+    assert "--relative-equilibrium" in run("modes", *soft, "--rpy", 5, 0, 0)[1]
+    assert "--relative-equilibrium" in refused("lqr", *soft, "--rpy", 5, 0, 0)
+    gain = tmp_path / "gain.npz"
+    assert run("lqr", *soft, "--relative-equilibrium", 2, "-o", gain)[0] == 0
+    short = ["--duration", 2, "--relative-equilibrium", 2, "--rpy", 0.5, 0, 0]
+    for law in ((), ("--gain", gain), ("--free",)):
+        code, out, _ = run("simulate", *soft, *short, *law)
+        assert code == 0
+    for words, options in {
+        "give --orbit": ["cubesat"],
+        "there are 24": [*soft, 25],
+        "--rpy": [*soft, "--rpy", 5, 0, 0],
+        "--effort": [*soft, "--effort", "F_b.x=1"],
+    }.items():
+        name, *more = options
+        number = [more.pop()] if more and more[-1] == 25 else []
+        assert words in refused("modes", name, *more, "--relative-equilibrium", *number)

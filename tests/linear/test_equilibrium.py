@@ -127,10 +127,9 @@ def test_least_norm_against_every_active_set():
 
 
 def test_refusal_names_what_is_left():
-    robot = fflin.load("servicer_7dof", stiffness=100.0, rest={"panel_left": 0.2})
-    robot = robot.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce()])
-    with pytest.raises(fflin.EquilibriumError, match=r"left are tau_m.panel_left 20 N m; give"):
-        fflin.equilibrium(robot)
+    heavy = fflin.load("servicer_7dof", gravity=(0, 0, -9.81), passive=["joint_2"])
+    with pytest.raises(fflin.EquilibriumError, match=r"left are tau_m.joint_2 -?\d+ N m; give"):
+        fflin.equilibrium(heavy)
     heavy = fflin.load("cubesat", gravity=(0, 0, -2.0), inputs=[fflin.BaseTorque()])
     with pytest.raises(fflin.EquilibriumError, match=rf"left are F_b.z -{2 * heavy.mass:.3g} N;"):
         fflin.equilibrium(heavy)
@@ -161,8 +160,86 @@ def test_nothing_to_balance_takes_nothing():
     sprung = robot.replace(stiffness=1e3, rest=rest)
     slightly = {joint: 0.1 + 0.2 for joint in rest}  # 0.30000000000000004
     assert np.abs(fflin.equilibrium(sprung, fflin.configuration(sprung, slightly)).u).max() < 1e-12
-    with pytest.raises(fflin.EquilibriumError):
-        fflin.equilibrium(sprung, fflin.configuration(sprung, dict.fromkeys(rest, 0.3 + 1e-9)))
+
+
+def flexible(**fields):
+    """A robot with motors in its arm and springs alone in its panels."""
+    return fflin.load("servicer_7dof", passive=["panel_*"], stiffness={"panel_*": 40.0}, **fields)
+
+
+def test_passive_joints_relax_on_their_springs():
+    """As after a catch that leaves them beside their rest: nothing else pulls."""
+    robot = flexible(rest={"panel_left": 0.2})
+    q = fflin.configuration(robot, {"joint_2": 0.4, "panel_left": 0.2 + 1e-6, "panel_right": 0.3})
+    held = fflin.equilibrium(robot, q)
+    at = StateMap(robot).joint_positions(held.q)
+    expected = {"joint_2": 0.4, "panel_left": 0.2}
+    assert np.array_equal(held.q[:7], q[:7]) and not held.u.any()
+    assert at == pytest.approx([expected.get(n, 0.0) for n in robot.joint_names], abs=1e-15)
+    assert str(held) == "u: all zero\nsags: panel_left = -1e-06 rad, panel_right = -0.3 rad"
+    fflin.lqr(fflin.linearize(robot, held.q, u=held.u))
+    again = fflin.equilibrium(robot, held.q)
+    assert again.q == pytest.approx(held.q, abs=1e-15) and str(again) == "u: all zero"
+    # What a motor holds, and what hangs on no spring, stays where it is given.
+    bent = fflin.load("servicer_7dof", stiffness=40.0, inputs=[fflin.JointTorque("*")])
+    assert np.array_equal(fflin.equilibrium(bent, q).q, q)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_passive_joints_sag_under_gravity(seed):
+    """Against Pinocchio's gravity, for some joints of a tree: q and u solve the static balance."""
+    rng = np.random.default_rng(seed)
+    tree = random_tree(rng, 6)
+    names = list(rng.choice(tree.joint_names, 3, replace=False))
+    motors = [fflin.JointTorque(name) for name in tree.joint_names if name not in names]
+    robot = tree.replace(
+        inputs=[fflin.BaseTorque(), fflin.BaseForce(), *motors],
+        gravity=rng.normal(size=3),
+        stiffness=dict.fromkeys(names, 50.0 * tree.mass),
+    )
+    joints = {joint: rng.uniform(-1, 1) for joint in robot.joint_names}
+    q = fflin.configuration(robot, joints, random_pose(rng, 100.0))
+    for frame in FRAMES:
+        held = fflin.equilibrium(robot, q, frame=frame, reference=pin.SE3.Identity())
+        lin = fflin.linearize(robot, held.q, u=held.u, frame=frame, reference=pin.SE3.Identity())
+        assert lin.is_equilibrium(1e-9)
+        state = StateMap(robot)
+        at = state.joint_positions(held.q)
+        robot.model.gravity.linear = np.array(robot.gravity)
+        pull = pin.computeGeneralizedGravity(robot.model, robot.create_data(), held.q)
+        robot.model.gravity.linear = np.zeros(3)
+        soft = [robot.joint_names.index(name) for name in names]
+        spring = 50.0 * tree.mass * at[soft]
+        there = [robot.joint(name).idx_v for name in names]
+        assert -spring == pytest.approx(pull[there], abs=1e-11 * np.abs(pull).max())
+        assert held.sag[soft] == pytest.approx(at[soft] - [joints[name] for name in names])
+        stiff = np.setdiff1d(range(robot.n), soft)
+        assert np.array_equal(at[stiff], state.joint_positions(q)[stiff])
+
+
+def test_springs_that_give_no_hold_are_told():
+    """A pendulum that stands on a spring weaker than its weight, and beside it."""
+    for gravity, words in ((20.0, "no hold"), (1e5, "no hold|do not settle")):
+        robot = fflin.load("planar_detumble", gravity=(-gravity, 0, 0), passive=["joint_2"])
+        robot = robot.replace(stiffness={"joint_2": 0.01})
+        with pytest.raises(fflin.EquilibriumError, match=f"joint_2.*{words}|{words}.*joint_2"):
+            fflin.equilibrium(robot, fflin.configuration(robot, {"joint_2": 0.05}))
+
+
+def test_in_orbit_panels_sag_against_the_gradient():
+    robot = flexible(orbit=400e3)
+    turned = pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.zeros(3))
+    for reference in (None, random_pose(np.random.default_rng(5), 40.0)):
+        q = fflin.configuration(robot, base=turned)
+        held = fflin.equilibrium(robot, q, reference=reference)
+        assert 1e-9 < np.abs(held.sag).max() < 1e-4 and "sags: panel_left = " in str(held)
+        lin = fflin.linearize(robot, held.q, u=held.u, reference=reference)
+        assert lin.is_equilibrium(1e-12)
+        # The spring's torque on a panel is that of the gradient.
+        bare = fflin.linearize(robot.replace(stiffness={}), held.q, u=held.u, reference=reference)
+        index = robot.joint_names.index("panel_left")
+        force = (bare.M @ bare.f0[-len(bare.M) :])[6 + index]
+        assert 40.0 * held.sag[index] == pytest.approx(force, rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))
