@@ -139,7 +139,7 @@ def relative_equilibria(
     if field is None:
         raise InputError(
             f"'{robot.name}' is in no orbit; give it one: "
-            "robot.replace(orbit=fflin.CircularOrbit(altitude=...))"
+            "robot.replace(orbit=fflin.CircularOrbit(altitude=...)), --orbit on the command line"
         )
     q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
     q[:7] = pin.SE3ToXYZQUAT(pin.SE3.Identity())

@@ -133,6 +133,8 @@ def _modes(arguments: argparse.Namespace) -> int:
     robot, lin = linear_model(arguments)
     found = modes(lin)
     print(found)
+    if robot.orbit and not found.equilibrium:
+        print("\nequilibria in orbit: --equilibrium, --relative-equilibrium")
     draw(arguments.plot, "plot_modes", found)
     if arguments.html:
         from fflin.view.visualize import visualize

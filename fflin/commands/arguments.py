@@ -184,9 +184,9 @@ def add_inputs_there(command: Container) -> None:
         --equilibrium: take the least inputs that balance springs, gravity and a steady motion at
             the point, where passive joints sag on their springs; refused where there are none""",
     )
-    text = """--relative-equilibrium N: in orbit, take the N-th attitude (default 1) that its field
-        does not turn, and the inputs of --equilibrium; attitude and position count from there"""
-    add_options(command, text, nargs="?", const=1)
+    text = """--relative-equilibrium N: in orbit, take the N-th of 24 attitudes (default 1) that the
+        field does not turn, with --equilibrium; attitude and position count from there"""
+    add_options(command, text, nargs="?", const=1, choices=range(1, 25))
 
 
 def add_orbit(command: Container) -> None:

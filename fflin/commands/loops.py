@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fflin.base.errors import FflinWarning, InputError, listed
@@ -16,14 +15,7 @@ from fflin.commands.arguments import (
     add_robot,
     add_system,
 )
-from fflin.commands.points import (
-    configuration_of,
-    held_at,
-    once,
-    placed,
-    relative_point,
-    velocity_of,
-)
+from fflin.commands.points import attitude, configuration_of, held_at, once, placed, velocity_of
 from fflin.commands.regulator import add_weights, gain_of, regulated_part
 from fflin.commands.tracking import add_trajectory, models_along, schedule_of
 
@@ -154,7 +146,7 @@ def start_of(
     if number := arguments.relative_equilibrium:
         import pinocchio as pin
 
-        about = reference or relative_point(robot, q, number, arguments.frame)[1]
+        about = reference or attitude(robot, q, number, arguments.frame)[1]
         q[:7] = pin.SE3ToXYZQUAT(about * pin.XYZQUATToSE3(q[:7]))
     names = ("target_velocity", "velocity")
     return q, velocity_of(robot, arguments, *names, start=robot.start)
@@ -257,7 +249,7 @@ def _about_gain(robot: Robot, gain: Any, arguments: argparse.Namespace) -> Linea
         require_same(made, robot, kind, own, (there.names, there.units))
     q, v = state.to_pinocchio(gain.x0)
     if number := arguments.relative_equilibrium:
-        q, reference = relative_point(robot, q, number, gain.frame)
+        q, reference = attitude(robot, q, number, gain.frame)
     return linearize(robot, q, v, gain.u0, frame=gain.frame, reference=reference)
 
 

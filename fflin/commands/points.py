@@ -135,9 +135,7 @@ def linear_model(arguments: argparse.Namespace) -> tuple[Robot, LinearModel]:
     robot = load_robot(arguments)
     q, v = configuration_of(robot, arguments), velocity_of(robot, arguments)
     if arguments.relative_equilibrium and (arguments.rpy or arguments.position):
-        raise InputError(
-            "--relative-equilibrium says how the base stands; leave --rpy and --position out"
-        )
+        raise InputError("--relative-equilibrium says where the base is, as --rpy, --position do")
     reference = pin.SE3.Identity() if arguments.reference == "world" else None
     q, u, reference = held_at(robot, q, v, arguments, reference)
     return robot, linearize(robot, q, v, u, frame=arguments.frame, reference=reference)
@@ -177,27 +175,23 @@ def held_at(
 
         given = once("--effort", arguments.effort)
         return q, effort(robot, given) if given else None, reference
-    option = "--relative-equilibrium" if number else "--equilibrium"
     if arguments.effort:
-        raise InputError(f"--effort and {option} both say the inputs at the point; give either")
+        raise InputError(
+            "--effort and an equilibrium both say the inputs at the point; give either"
+        )
     from fflin.linear.equilibrium import equilibrium
 
     if number:
-        q, reference = relative_point(robot, q, number, arguments.frame)
+        q, reference = attitude(robot, q, number, arguments.frame)
     held = equilibrium(robot, q, v=v, frame=arguments.frame, reference=reference)
     return held.q, held.u, reference
 
 
-def relative_point(robot: Robot, q: Array, number: int, frame: Any) -> tuple[Array, pin.SE3]:
+def attitude(robot: Robot, q: Array, number: int, frame: Any) -> tuple[Array, pin.SE3]:
     """Return q (nq,) and the base's placement in a relative equilibrium, from 1 on."""
     import pinocchio as pin
 
     from fflin.analysis.relative_equilibria import relative_equilibria
 
-    if robot.orbit is None:
-        raise InputError(f"--relative-equilibrium: '{robot.name}' is in no orbit; give --orbit")
-    found = relative_equilibria(robot, q, frame=frame)
-    if number > len(found):
-        raise InputError(f"--relative-equilibrium is {number}, but there are {len(found)}")
-    q = found[number - 1].q
+    q = relative_equilibria(robot, q, frame=frame)[number - 1].q
     return q, pin.XYZQUATToSE3(q[:7])

@@ -78,14 +78,9 @@ def gain_of(lin: LinearModel, arguments: argparse.Namespace) -> Gain:
         require_fixed_point(lin)
     except EquilibriumError as error:
         # It balances forces; a base that moves stays no fixed point.
-        given = arguments.equilibrium or arguments.relative_equilibrium
-        hint = " (--equilibrium)" * (not given and not lin.v.any())
-        hint = (
-            hint.replace(")", ", --relative-equilibrium)")
-            if lin.frame in ("lvlh", "hill")
-            else hint
-        )
-        raise EquilibriumError(f"{error}{hint}") from None
+        given = arguments.equilibrium or arguments.relative_equilibrium or lin.v.any()
+        more = ", --relative-equilibrium" if lin.frame in ("lvlh", "hill") else ""
+        raise EquilibriumError(str(error) if given else f"{error} (--equilibrium{more})") from None
     if arguments.dt is not None:
         lin = lin.discretize(arguments.dt)
     try:

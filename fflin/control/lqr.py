@@ -152,7 +152,7 @@ def require_fixed_point(lin: LinearModel) -> None:
         + (
             "the reference does not move steadily; take fflin.tvlqr along its trajectory"
             if lin.moving
-            else "linearise about one, with the inputs of fflin.equilibrium, or about a steady "
+            else "linearise about one, with the q and u of fflin.equilibrium, or about a steady "
             "motion with moving=True"
         )
     )

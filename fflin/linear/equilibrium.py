@@ -23,9 +23,6 @@ from fflin.robot.robot import Robot
 if TYPE_CHECKING:
     from fflin.linear.model import LinearModel
 
-# Newton's steps until springs settle; a few do.
-_STEPS = 20
-
 # Round-off of M a and of the accelerations themselves, relative to the terms that they sum.
 _ROUNDING = 1e3 * float(np.finfo(float).eps)
 
@@ -107,9 +104,8 @@ def equilibrium(
     N, are made comparable by the mobilities :math:`\sqrt{(M^{-1})_{ii}}`; so weighed, what is
     left must not exceed 1e-9 of what is balanced.
 
-    Passive joints with a spring, those of no `JointTorque`, sag where no input holds them: their
-    positions are solved for too, by Newton's method on their rows of the balance, down to
-    rounding. The slope is :math:`M\,\partial\dot\nu/\partial q_m`, of the A of `linearize`.
+    Joints with a spring and no `JointTorque` sag where no input holds them: their positions are
+    solved for too, by Newton's method, :math:`M\,\partial\dot\nu/\partial q_m` its slope.
 
     Parameters
     ----------
@@ -162,18 +158,17 @@ def equilibrium(
         axes = {"frame": frame, "reference": own}
     linearizer = Linearizer(robot, **axes, engine="python")
     actuation, pushes = Actuation(state), forces_of(robot)
-    free = {f"tau_m.{name}" for name in robot.stiffness} - set(actuation.names)
+    free = {f"tau_m.{name}" for name, k in robot.stiffness.items() if k} - set(actuation.names)
     soft = np.array([name in free for name in pushes])
-    held = _Held(linearizer, actuation, given, v)
-    fine = held.fine
-    for _ in range(_STEPS):
+    fine = (held := _Held(linearizer, given, v)).fine
+    for _ in range(20):  # Newton's method: a few do
         loose = soft & (np.abs(held.residual) > fine)
         if not loose.any():
             break
         step = state.spread(held.settling(linearizer, soft))
         at = pin.integrate(robot.model, held.lin.q, step)
         at[:7] = given[:7]
-        held = _Held(linearizer, actuation, at, v)
+        held = _Held(linearizer, at, v)
         fine = np.maximum(fine, held.fine)
     left = np.where(soft & ~loose, 0.0, held.left)
     if float(np.linalg.norm(left)) > held.allowed:
@@ -190,10 +185,8 @@ def equilibrium(
 class _Held:
     """The inputs of least norm at a point, in base axes, and what they leave."""
 
-    def __init__(
-        self, linearizer: Linearizer, actuation: Actuation, q: Array, v: Array | None
-    ) -> None:
-        robot = linearizer.robot
+    def __init__(self, linearizer: Linearizer, q: Array, v: Array | None) -> None:
+        robot, actuation = linearizer.robot, linearizer.prepared.actuation
         self.lin = lin = linearizer(q, v)
         drift = lin.f0 if lin.drift is None else lin.drift
         _require_steady(lin, drift)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from fflin.base.validation import Array
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _EPS = float(np.finfo(float).eps)
 
@@ -17,7 +14,7 @@ _EPS = float(np.finfo(float).eps)
 TOLERANCE = 1e-9
 
 
-def least_norm(C: Array, d: Array, one_sided: NDArray[np.bool_]) -> tuple[Array, Array]:
+def least_norm(C: Array, d: Array, one_sided: Any) -> tuple[Array, Array]:
     """Return the least u with ``C u = d``, ``u[one_sided] >= 0``, and ``C u - d``."""
     u = _pseudo_solve(C, d)
     if (u[one_sided] < 0.0).any():
@@ -29,7 +26,10 @@ def least_norm(C: Array, d: Array, one_sided: NDArray[np.bool_]) -> tuple[Array,
         left = C @ polished - d
         most = TOLERANCE * np.linalg.norm(d)
         if (polished[one_sided] < 0.0).any() or np.linalg.norm(left) > most:
-            polished = _least_residual(C, d, one_sided)
+            from scipy.optimize import lsq_linear
+
+            bounds = np.where(one_sided, 0.0, -np.inf), np.inf
+            polished = lsq_linear(C, d, bounds, method="bvls").x
         u = polished
     return u, C @ u - d
 
@@ -43,7 +43,7 @@ def _pseudo_solve(C: Array, d: Array) -> Array:
     return u
 
 
-def _least_distance(C: Array, start: Array, one_sided: NDArray[np.bool_]) -> Array:
+def _least_distance(C: Array, start: Array, one_sided: Any) -> Array:
     """Return the least u = start + Z z with u[one_sided] >= 0, where C Z = 0."""
     from scipy.linalg import null_space
     from scipy.optimize import nnls
@@ -61,14 +61,3 @@ def _least_distance(C: Array, start: Array, one_sided: NDArray[np.bool_]) -> Arr
     z = -r[:-1] / r[-1] if r[-1] < -TOLERANCE else np.zeros(Z.shape[1])
     u: Array = start + Z @ (size * z)
     return np.where(one_sided, np.maximum(u, 0.0), u)
-
-
-def _least_residual(C: Array, d: Array, one_sided: NDArray[np.bool_]) -> Array:
-    """Return a u with u[one_sided] >= 0 that leaves the least ``|C u - d|``."""
-    from scipy.optimize import nnls
-
-    both = np.hstack((C, -C[:, ~one_sided]))
-    split = nnls(both, d, maxiter=100 * max(both.shape))[0]
-    u: Array = split[: C.shape[1]]
-    u[~one_sided] -= split[C.shape[1] :]
-    return u
