@@ -13,6 +13,8 @@ from fflin.dynamics.points import velocity as velocity
 from fflin.dynamics.points import effort as effort
 from fflin.dynamics.capture import capture as capture
 from fflin.dynamics.capture import Capture as Capture
+from fflin.dynamics.impact import jam as jam
+from fflin.dynamics.impact import Impact as Impact
 
 # Inputs
 from fflin.robot.inputs import BaseTorque as BaseTorque
@@ -47,6 +49,9 @@ from fflin.linear.equilibrium import Equilibrium as Equilibrium
 from fflin.linear.trajectory import Trajectory as Trajectory
 from fflin.linear.linear_trajectory import linearize_trajectory as linearize_trajectory
 from fflin.linear.linear_trajectory import LinearTrajectory as LinearTrajectory
+from fflin.linear.exchange import transform as transform
+from fflin.linear.exchange import from_tool as from_tool
+from fflin.linear.exchange import ToolModel as ToolModel
 from fflin.linear.check import check as check
 from fflin.linear.check import Check as Check
 
@@ -70,11 +75,13 @@ from fflin.analysis.momentum import generalized_jacobian as generalized_jacobian
 
 # Control
 from fflin.control.lqr import lqr as lqr
+from fflin.linear.fit import line_up as line_up
 from fflin.control.weights import bryson as bryson
 from fflin.control.gain import Gain as Gain
 from fflin.control.acceleration_lqr import acceleration_lqr as acceleration_lqr
 from fflin.control.weights import sampled_cost as sampled_cost
 from fflin.control.plan import plan as plan
+from fflin.control.mpc import mpc as mpc
 from fflin.control.tvlqr import tvlqr as tvlqr
 from fflin.control.gain_schedule import GainSchedule as GainSchedule
 from fflin.control.tvkalman import tvkalman as tvkalman

@@ -50,10 +50,19 @@ RESULTS = {
         "Estimator",
     ),
     *("FilterSchedule", "Funnel"),
-    *("Gain", "GainSchedule", "Gramians", "Grid", "LinearModel", "LinearTrajectory", "Mode"),
+    *(
+        "Gain",
+        "GainSchedule",
+        "Gramians",
+        "Grid",
+        "Impact",
+        "LinearModel",
+        "LinearTrajectory",
+        "Mode",
+    ),
     *("LFT", "Sensitivity", "Uncertain"),
     *("Modes", "Motion", "Observability", "RandomConfigurations", "ReducedModel", "Robot"),
-    *("RelativeEquilibria", "RelativeEquilibrium", "Validity"),
+    *("RelativeEquilibria", "RelativeEquilibrium", "ToolModel", "Validity"),
 }
 
 

@@ -15,6 +15,7 @@ ORDER = (
     "trajectory",
     "loops",
     "campaigns",
+    "plans",
     "start_up",
     "memory",
 )

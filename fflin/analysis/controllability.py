@@ -59,6 +59,13 @@ class Controllability(FrozenArrays):
         Distance of the rank decisions from doubt: far above 1, far below 1.
     notes : tuple of str
         What to know beside it.
+
+    Examples
+    --------
+    >>> robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
+    >>> found = fflin.controllability(fflin.linearize(robot))
+    >>> found.controllable[:3], found.uncontrollable[:2]
+    (('q_b.x', 'q_b.y', 'q_b.z'), ('linear momentum x', 'linear momentum y'))
     """
 
     dimension: int
@@ -132,6 +139,14 @@ def controllability(lin: LinearModel) -> Controllability:
     ----------
     P. C. Hughes and R. E. Skelton, Controllability and observability of linear matrix
     second-order systems, J. Applied Mechanics 47(2), 1980.
+
+    Examples
+    --------
+    >>> motors = [fflin.JointTorque(f"joint_{i}") for i in (1, 2, 3)]
+    >>> arm = fflin.load("planar_detumble", inputs=motors)
+    >>> found = fflin.controllability(fflin.linearize(arm))
+    >>> found.dimension, found.stabilizable
+    (6, False)
     """
     lin = mechanics.checked(lin)
     held = mechanics.conserved(lin)

@@ -26,6 +26,13 @@ class Gramians(FrozenArrays):
         The output energy that x leaves behind is ``x^T W x``.
     duration : float
         The horizon [s]; infinite where the model is asymptotically stable and none was given.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> within = fflin.gramians(lin, duration=10.0)
+    >>> within.duration, within.observability.shape
+    (10.0, (18, 18))
     """
 
     controllability: Array
@@ -66,6 +73,12 @@ def gramians(lin: LinearModel, duration: float | None = None) -> Gramians:
     ----------
     C. Van Loan, Computing integrals involving the matrix exponential, IEEE Trans. Automatic
     Control 23(3), 1978.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> fflin.gramians(lin, duration=10.0).controllability.shape
+    (18, 18)
     """
     if not isinstance(lin, LinearModel):
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")

@@ -35,6 +35,14 @@ class Mode(FrozenArrays):
         Whether it grows, by more than rounding can explain.
     margin : float
         The real part of the pole as a multiple of its rounding; infinite where it has none.
+
+    Examples
+    --------
+    >>> springs = {"panel_left": 100.0, "panel_right": 90.0}  # N m/rad
+    >>> robot = fflin.load("servicer_7dof", stiffness=springs)
+    >>> mode = fflin.modes(fflin.linearize(robot)).modes[0]
+    >>> mode.unstable, mode.shape.shape
+    (False, (30,))
     """
 
     pole: complex
@@ -86,6 +94,14 @@ class Modes:
     robot : str
     lin : LinearModel
         What they are modes of.
+
+    Examples
+    --------
+    >>> springs = {"panel_left": 100.0, "panel_right": 90.0}  # N m/rad
+    >>> robot = fflin.load("servicer_7dof", stiffness=springs)
+    >>> found = fflin.modes(fflin.linearize(robot))
+    >>> found.damping_ratios.round(6), found.equilibrium
+    (array([0., 0.]), True)
     """
 
     modes: tuple[Mode, ...]
@@ -202,6 +218,14 @@ def modes(lin: LinearModel) -> Modes:
     ----------
     P. C. Hughes, Spacecraft Attitude Dynamics, 1986, on unconstrained modes. V. Kublanovskaya,
     USSR Computational Mathematics and Mathematical Physics 6(4), 1966, on Jordan blocks.
+
+    Examples
+    --------
+    >>> springs = {"panel_left": 100.0, "panel_right": 90.0}  # N m/rad
+    >>> robot = fflin.load("servicer_7dof", stiffness=springs)
+    >>> found = fflin.modes(fflin.linearize(robot))
+    >>> found.rigid_body, found.frequencies.round(1)
+    (13, array([0.9, 1.2]))
     """
     if not isinstance(lin, LinearModel):
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")

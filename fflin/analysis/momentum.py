@@ -45,6 +45,16 @@ class ReducedModel(LinearModel):
         Distance from doubt of the decision on what is conserved: far above 1, far below 1.
     notes : tuple of str
         What is undecided.
+
+    Examples
+    --------
+    >>> motors = [fflin.JointTorque(f"joint_{i}") for i in (1, 2, 3)]
+    >>> arm = fflin.load("planar_detumble", inputs=motors)
+    >>> reduced = fflin.momentum_reduction(fflin.linearize(arm))
+    >>> reduced.T.shape, reduced.momenta.shape
+    ((18, 6), (6, 18))
+    >>> bool(abs(reduced.S @ reduced.T - np.eye(6)).max() < 1e-12)
+    True
     """
 
     T: Array
@@ -102,6 +112,14 @@ def momentum_reduction(lin: LinearModel, *, wheel_speeds: bool | None = None) ->
     References
     ----------
     Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989.
+
+    Examples
+    --------
+    >>> motors = [fflin.JointTorque(f"joint_{i}") for i in (1, 2, 3)]
+    >>> arm = fflin.load("planar_detumble", inputs=motors)
+    >>> reduced = fflin.momentum_reduction(fflin.linearize(arm))
+    >>> reduced.state_names[:2], len(fflin.lqr(reduced, 1.0, 1.0).poles)
+    (('q_m.joint_1', 'q_m.joint_2'), 6)
     """
     whole = checked(lin)
     wheels = leaving(whole, wheel_speeds)
@@ -149,6 +167,12 @@ def generalized_inertia(lin: LinearModel) -> Array:
     ------
     InputError
         If the base is not among the states.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> fflin.generalized_inertia(lin).shape
+    (3, 3)
     """
     lin = checked(lin)
     joints = sum(name.startswith("q_m.") for name in lin.state_names)
@@ -185,6 +209,12 @@ def generalized_jacobian(robot: Robot, q: Array | None = None, frame: str = "") 
         If there is no such frame.
     InputError
         If `q` is no configuration of the robot.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> fflin.generalized_jacobian(robot, frame="hand").shape
+    (6, 3)
     """
     state = StateMap(robot)
     q = robot.neutral() if q is None else robot.checked_configuration(q)

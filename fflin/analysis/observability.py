@@ -40,6 +40,12 @@ class Observability(FrozenArrays):
         Distance of the rank decisions from doubt: far above 1, far below 1.
     notes : tuple of str
         What is undecided.
+
+    Examples
+    --------
+    >>> robot = fflin.load("cubesat", outputs=[fflin.Gyroscope("base")])
+    >>> fflin.observability(fflin.linearize(robot)).unobservable[:3]
+    ('q_b.x', 'q_b.y', 'q_b.z')
     """
 
     dimension: int
@@ -85,6 +91,13 @@ def observability(lin: LinearModel) -> Observability:
     ------
     InputError
         If `lin` is no linear model of positions and their rates.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", outputs=[fflin.JointPositions()])
+    >>> found = fflin.observability(fflin.linearize(robot))
+    >>> found.dimension, found.detectable
+    (6, False)
     """
     lin = mechanics.checked(lin)
     motions, fixed, method = _unobservable(lin)

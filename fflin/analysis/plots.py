@@ -32,6 +32,11 @@ def plot_matrices(lin: LinearModel, path: str | Path | None = None) -> Figure:
     lin : LinearModel
     path : str or Path, optional
         .png, .pdf or .svg to save to; errors as in `plot_motion`.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> figure = fflin.plot_matrices(lin, "matrices.png")
     """
     if not isinstance(lin, LinearModel):
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
@@ -103,6 +108,12 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     modes : Modes
     path : str or Path, optional
         .png, .pdf or .svg to save to; errors as in `plot_motion`.
+
+    Examples
+    --------
+    >>> springs = {"panel_left": 100.0, "panel_right": 90.0}  # N m/rad
+    >>> robot = fflin.load("servicer_7dof", stiffness=springs)
+    >>> figure = fflin.plot_modes(fflin.modes(fflin.linearize(robot)), "modes.png")
     """
     if not isinstance(modes, Modes):
         raise InputError(f"modes is a {type(modes).__name__}, expected what fflin.modes returns")
@@ -165,6 +176,12 @@ def plot_check(check: Check, path: str | Path | None = None) -> Figure:
     check : Check
     path : str or Path, optional
         .png, .pdf or .svg to save to; errors as in `plot_motion`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> figure = fflin.plot_check(fflin.check(robot, lin), "check.png")
     """
     if not isinstance(check, Check):
         raise InputError(f"check is a {type(check).__name__}, expected what fflin.check returns")

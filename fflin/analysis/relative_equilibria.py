@@ -46,6 +46,13 @@ class RelativeEquilibrium(FrozenArrays):
     margin : float
         The least of what stability asks for, relative to its rounding: below -1 unstable, above 1
         stable.
+
+    Examples
+    --------
+    >>> robot = fflin.load("servicer_7dof", orbit=fflin.CircularOrbit(altitude=700e3))
+    >>> best = fflin.relative_equilibria(robot)[0]
+    >>> bool(best.moments.argmin() == 0), best.poles.shape  # the longest axis to the body
+    (True, (6,))
     """
 
     q: Array
@@ -56,7 +63,15 @@ class RelativeEquilibrium(FrozenArrays):
 
 
 class RelativeEquilibria(tuple[RelativeEquilibrium, ...]):
-    """The 24 attitudes, the most stable ones first; prints as a table of the six kinds."""
+    """The 24 attitudes, the most stable ones first; prints as a table of the six kinds.
+
+    Examples
+    --------
+    >>> robot = fflin.load("servicer_7dof", orbit=fflin.CircularOrbit(altitude=700e3))
+    >>> found = fflin.relative_equilibria(robot)
+    >>> sum(bool(each.stable) for each in found)
+    4
+    """
 
     __slots__ = ()
 
@@ -110,6 +125,13 @@ def relative_equilibria(
     ----------
     D. B. DeBra and R. H. Delp, Rigid body attitude stability and natural frequencies in a circular
     orbit, J. Astronautical Sciences 8, 1961. P. C. Hughes, Spacecraft Attitude Dynamics, 1986.
+
+    Examples
+    --------
+    >>> robot = fflin.load("servicer_7dof", orbit=fflin.CircularOrbit(altitude=700e3))
+    >>> found = fflin.relative_equilibria(robot)
+    >>> len(found), found[0].stable
+    (24, True)
     """
     if not isinstance(robot, Robot):
         raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")

@@ -6,7 +6,16 @@ from typing import Any
 
 
 class FflinError(Exception):
-    """Base of every error that a public call of fflin raises on purpose; reads as one line."""
+    """Base of every error that a public call of fflin raises on purpose; reads as one line.
+
+    Examples
+    --------
+    >>> try:
+    ...     fflin.load("ets_vi")
+    ... except fflin.FflinError as error:
+    ...     print(error)
+    no robot named 'ets_vi'; did you mean ets_vii?
+    """
 
     def __str__(self) -> str:
         text = " ".join(line.strip() for line in super().__str__().splitlines())
@@ -15,35 +24,107 @@ class FflinError(Exception):
 
 
 class InputError(FflinError, ValueError):
-    """An argument has a wrong size, type or value."""
+    """An argument has a wrong size, type or value.
+
+    Examples
+    --------
+    >>> fflin.linearize(fflin.load("cubesat"), q=[0.0])
+    Traceback (most recent call last):
+        ...
+    fflin.base.errors.InputError: q has shape (1,), expected (7,): a configuration in ...
+    """
 
 
 class UnknownNameError(FflinError, LookupError):
-    """A robot, joint or frame of that name does not exist."""
+    """A robot, joint or frame of that name does not exist.
+
+    Examples
+    --------
+    >>> fflin.configuration(fflin.load("planar_detumble"), {"joint_9": 0.1})
+    Traceback (most recent call last):
+        ...
+    fflin.base.errors.UnknownNameError: no joint named 'joint_9'; did you mean joint_3, ...
+    """
 
 
 class FileError(FflinError, OSError):
-    """A file cannot be read or written."""
+    """A file cannot be read or written.
+
+    Examples
+    --------
+    >>> fflin.load("none.urdf")
+    Traceback (most recent call last):
+        ...
+    fflin.base.errors.FileError: no file at 'none.urdf'; give a URDF's path or a name of `fflin ...
+    """
 
 
 class UrdfError(FflinError, ValueError):
-    """A robot description is malformed or describes what cannot exist."""
+    """A robot description is malformed or describes what cannot exist.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> _ = Path("empty.urdf").write_text("<robot name='empty'/>")
+    >>> fflin.load("empty.urdf")
+    Traceback (most recent call last):
+        ...
+    fflin.base.errors.UrdfError: empty.urdf:1: <robot> has no <link>; add one
+    """
 
 
 class ModelError(FflinError, ValueError):
-    """A model is not one free-flying tree of one-degree-of-freedom joints."""
+    """A model is not one free-flying tree of one-degree-of-freedom joints.
+
+    Examples
+    --------
+    >>> import pinocchio as pin
+    >>> fflin.from_model(pin.buildSampleModelManipulator())
+    Traceback (most recent call last):
+        ...
+    fflin.base.errors.ModelError: 'model': the root joint is JointModelRX, expected ...
+    """
 
 
 class SingularInertiaError(FflinError, ArithmeticError):
-    """The joint-space inertia matrix cannot be inverted."""
+    """The joint-space inertia matrix cannot be inverted.
+
+    Examples
+    --------
+    >>> fflin.linearize(fflin.load("romeo"))
+    Traceback (most recent call last):
+        ...
+    fflin.base.errors.SingularInertiaError: M of 'romeo' cannot be inverted at any ...
+    """
 
 
 class ChartError(FflinError, ValueError):
-    """The base is turned by pi from the reference, where the attitude chart ends."""
+    """The base is turned by pi from the reference, where the attitude chart ends.
+
+    Examples
+    --------
+    >>> import pinocchio as pin
+    >>> robot = fflin.load("cubesat")
+    >>> turned = pin.SE3(pin.rpy.rpyToMatrix(np.pi, 0.0, 0.0), np.zeros(3))
+    >>> q = fflin.configuration(robot, base=turned)
+    >>> fflin.linearize(robot, q, reference=pin.SE3.Identity())
+    Traceback (most recent call last):
+        ...
+    fflin.base.errors.ChartError: the base is turned by 180 deg from the reference, where the ...
+    """
 
 
 class EquilibriumError(FflinError, ValueError):
-    """A point is no fixed point where one is needed, or no input makes it one."""
+    """A point is no fixed point where one is needed, or no input makes it one.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", gravity=(0, 0, -9.81))
+    >>> fflin.lqr(fflin.linearize(robot))
+    Traceback (most recent call last):
+        ...
+    fflin.base.errors.EquilibriumError: the point is not a fixed point: d v_b.z/dt = -9.81; ...
+    """
 
 
 class StabilizabilityError(FflinError, ValueError):
@@ -53,6 +134,14 @@ class StabilizabilityError(FflinError, ValueError):
     ----------
     margin : Margin or None
         Distance from doubt of the decisions behind it; None where they were not made.
+
+    Examples
+    --------
+    >>> robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
+    >>> fflin.lqr(fflin.linearize(robot))
+    Traceback (most recent call last):
+        ...
+    fflin.base.errors.StabilizabilityError: the inputs cannot hold base position (linear ...
     """
 
     margin: Any = None
@@ -65,13 +154,28 @@ class DetectabilityError(FflinError, ValueError):
     ----------
     margin : Margin or None
         Distance from doubt of the decisions behind it; None where they were not made.
+
+    Examples
+    --------
+    >>> robot = fflin.load("cubesat", outputs=[fflin.Gyroscope("base")])
+    >>> lin = fflin.linearize(robot)
+    >>> fflin.kalman(lin, 1e-3, 1e-4)
+    Traceback (most recent call last):
+        ...
+    fflin.base.errors.DetectabilityError: the outputs do not show r_b.x, r_b.y, r_b.z and their ...
     """
 
     margin: Any = None
 
 
 class MissingPackageError(FflinError, ImportError):
-    """An optional package is needed and not installed."""
+    """An optional package is needed and not installed.
+
+    Examples
+    --------
+    >>> issubclass(fflin.MissingPackageError, ImportError)
+    True
+    """
 
 
 class SweepError(FflinError, RuntimeError):
@@ -83,6 +187,17 @@ class SweepError(FflinError, RuntimeError):
         (start, stop, reason) of each: its points, stop not among them.
     batch : LinearBatch or None
         The others, in order, where they are in memory.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> points = np.tile(robot.neutral(), (3, 1))
+    >>> try:
+    ...     batch = fflin.sweep(robot, points)
+    ... except fflin.SweepError as error:
+    ...     batch = error.batch  # of the chunks that went well
+    >>> len(batch)
+    3
     """
 
     def __init__(
@@ -93,7 +208,15 @@ class SweepError(FflinError, RuntimeError):
 
 
 class FflinWarning(UserWarning):
-    """Something about a robot that its user should know and that is no error."""
+    """Something about a robot that its user should know and that is no error.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", fflin.FflinWarning)  # a doubtful URDF is refused
+    ...     robot = fflin.load("cubesat")
+    """
 
 
 def listed(names: Iterable[str]) -> str:

@@ -38,6 +38,13 @@ class Grid:
         {joint: values (k,) [rad|m]}.
     start : ndarray (nq,)
         What the base and the other joints are at.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> points = fflin.grid(robot, {"joint_1": [-0.5, 0.5]}, joints={"joint_3": 0.2})
+    >>> points.shape, sorted(points.axes)
+    ((2,), ['joint_1'])
     """
 
     robot: Robot
@@ -73,6 +80,13 @@ class RandomConfigurations:
         {joint: (low, high) [rad|m]}.
     start : ndarray (nq,)
         What the base is at.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> points = fflin.random_configurations(robot, 4, ranges={"joint_1": (0.1, 0.2)})
+    >>> len(points), sorted(points.ranges)[0]
+    (4, 'joint_1')
     """
 
     robot: Robot
@@ -143,6 +157,13 @@ def grid(
         If there is no such joint.
     InputError
         If there is no axis, or its values are none, not finite or do not increase.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> points = fflin.grid(robot, {"joint_1": [-0.5, 0.0, 0.5], "joint_2": [0.0, 1.0]})
+    >>> len(points)
+    6
     """
     start = configuration(robot, joints, base)
     if not isinstance(axes, Mapping) or not axes:
@@ -204,6 +225,13 @@ def random_configurations(
     InputError
         If the count or seed is no whole number, a range is empty, or a joint that slides has no
         limits and no range.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> points = fflin.random_configurations(robot, 4, seed=1)
+    >>> len(fflin.sweep(robot, points))
+    4
     """
     count, seed = whole("count", count, 1), whole("seed", seed, 0)
     start = configuration(robot, base=base)

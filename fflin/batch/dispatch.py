@@ -58,10 +58,7 @@ class Job(Protocol):
         """Shape of each array that it makes, for one row."""
 
     def run(self, rows: Any, start: int, out: Mapping[str, Array] | None = None, /) -> ChunkResult:
-        """Do the rows from number `start` on, into arrays `out` or new ones.
-
-        Threads may share a job. A `FflinError` is why there is no result.
-        """
+        """Do the rows from number `start` on, into arrays `out` or new ones; on any thread."""
 
 
 class Done(NamedTuple):

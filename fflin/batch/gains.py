@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -19,7 +19,7 @@ from fflin.batch.rows import column, positions
 from fflin.control.lqr import lqr
 from fflin.control.weights import weight
 from fflin.dynamics.state import StateMap
-from fflin.linear.fit import require_fit
+from fflin.linear.fit import line_up, require_fit
 from fflin.linear.model import LinearModel
 
 if TYPE_CHECKING:
@@ -48,6 +48,14 @@ class GainBatch(Design):
         The points [rad|m].
     joint_names, state_names, input_names : tuple of str
     frame, robot : str
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> batch = fflin.sweep(robot, fflin.grid(robot, {"joint_1": [-0.5, 0.0, 0.5]}))
+    >>> gains = fflin.lqr_batch(batch, 1.0, 1.0)
+    >>> gains.gain([0.25, 0.0, 0.0]).shape, bool(gains.margin.min() > 0)
+    ((9, 18), True)
     """
 
     VECTORS: ClassVar = ("residual", "margin")
@@ -160,6 +168,13 @@ def lqr_batch(batch: LinearBatch, Q: Weight, R: Weight) -> GainBatch:
         If a weight is of a wrong size or sign.
     EquilibriumError, StabilizabilityError
         If there is no regulator about a point; it is named.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> batch = fflin.sweep(robot, fflin.grid(robot, {"joint_1": [-0.5, 0.0, 0.5]}))
+    >>> fflin.lqr_batch(batch, 1.0, 1.0).K.shape
+    (3, 9, 18)
     """
     if not isinstance(batch, LinearBatch):
         raise InputError(f"batch is a {type(batch).__name__}, expected a LinearBatch of sweep")
@@ -210,12 +225,22 @@ class ScheduledFeedback:
     lin : LinearModel
         About the target.
     gains : GainBatch
-        On a grid of the same robot, inputs and frame.
+        On a grid of the same robot; or of it free where it has caught something since, or the
+        other way: `line_up` matches states and inputs.
 
     Raises
     ------
     InputError
-        If they are of different states, inputs or frames, or the gains are not on a grid.
+        If they cannot be lined up, or the gains are not on a grid.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> batch = fflin.sweep(robot, fflin.grid(robot, {"joint_1": [-0.5, 0.0, 0.5]}))
+    >>> policy = fflin.ScheduledFeedback(lin, fflin.lqr_batch(batch, 1.0, 1.0))
+    >>> fflin.simulate(robot, policy, duration=0.5).u.shape[1]
+    9
     """
 
     lin: LinearModel
@@ -225,10 +250,18 @@ class ScheduledFeedback:
         for name, kind in (("lin", LinearModel), ("gains", GainBatch)):
             if not isinstance(value := getattr(self, name), kind):
                 raise InputError(f"{name} is a {type(value).__name__}, expected a {kind.__name__}")
-        for key in ("state_names", "input_names", "frame"):
-            if getattr(self.lin, key) != getattr(self.gains, key):
-                raise InputError(f"the {key} of the model and of the gains differ")
-        _ = self.gains.grid
+        lin, by = self.lin, self.gains
+        here = [k for k, x in enumerate(by.joint_names) if f"q_m.{x}" in lin.state_names]
+        lined = replace(
+            by,
+            K=line_up(by, lin),
+            state_names=lin.state_names,
+            input_names=lin.input_names,
+            joint_names=tuple(by.joint_names[k] for k in here),
+            joint_positions=by.joint_positions[:, here],
+        )
+        object.__setattr__(self, "gains", lined)
+        _ = lined.grid
 
     def table(self) -> tuple[dict[str, Array], Array]:
         """Return the joints of the grid and their values, and the gains (N, nu, nx) in order."""
@@ -240,7 +273,7 @@ class ScheduledFeedback:
         lin, gains = self.lin, self.gains
         state = StateMap(robot, reference=lin.reference, frame=lin.frame)
         require_fit(lin, robot, state)
-        columns = [column(joint) for joint in robot.joints]
+        columns = [column(robot.joint(name)) for name in gains.joint_names]
 
         def policy(_: float, q: Array, v: Array) -> Array:
             K = gains._between(positions(q[None], columns)[0])

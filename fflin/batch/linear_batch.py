@@ -65,6 +65,15 @@ class LinearBatch:
     verified : bool
         Whether it is as it was made; False of a file that has no digest to tell damage by, or
         that was not held against it.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> batch = fflin.sweep(robot, fflin.grid(robot, {"joint_1": np.linspace(-1, 1, 5)}))
+    >>> batch.B_lower.shape, batch.select({"joint_1": (-1, 0)}).q.shape[0]
+    ((5, 9, 9), 3)
+    >>> len(batch[1:3]), batch.nearest({"joint_1": 0.4}).B.shape
+    (2, (18, 9))
     """
 
     A: Array

@@ -111,6 +111,14 @@ def sweep(
     -----
     FflinWarning
         Where M is ill-conditioned: once, with the number of points.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> points = fflin.grid(robot, {"joint_1": np.linspace(-1, 1, 5), "joint_2": [0.0, 0.5]})
+    >>> batch = fflin.sweep(robot, points)
+    >>> len(batch), batch[3].B.shape
+    (10, (18, 9))
     """
     check_workers(executor, workers, threads, chunk, progress)
     path = None if out is None else output_path(out)

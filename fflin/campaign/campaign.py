@@ -64,6 +64,17 @@ class Campaign(FrozenArrays):
         How many runs were asked for; more than there are where `until` was met before.
     goals : tuple of str
         The conditions that report and figure tell the shares of.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    >>> runs = fflin.monte_carlo(robot, policy, {"q_b": 0.02}, runs=8, duration=5.0, dt=0.05)
+    >>> len(runs), runs.quantile("attitude", 0.5).value < 10
+    (8, True)
+    >>> float(runs.replay(runs.worst(1)[0]).t[-1])
+    5.0
     """
 
     drawn: Array

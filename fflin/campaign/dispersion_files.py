@@ -77,6 +77,13 @@ def load_dispersions(path: str | Path) -> dict[str, Any]:
         If there is no such table, kind of spread, distribution or parameter; with file and line.
     InputError
         If the file is not TOML or a value is wrong; with file and line.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> _ = Path("uncertain.toml").write_text("dispersions.q_b = {uniform = [-0.1, 0.1]}")
+    >>> fflin.load_dispersions("uncertain.toml").keys()
+    dict_keys(['q_b'])
     """
     try:
         document = TomlFile(as_path(path))

@@ -198,6 +198,17 @@ def funnel(
 
     L. Shala, S. Vyas, M. K. Ben-Larbi, S. Kumar and E. Stoll, Region of attraction estimation for
     free-floating systems under time-varying LQR control, arXiv:2405.06726, 2024.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> schedule = fflin.tvlqr(along, sample=0.1)
+    >>> reach = fflin.funnel(robot, schedule, {"attitude": 5.0}, samples=4, knots=2)
+    >>> len(reach.rho)
+    2
     """
     if not isinstance(robot, Robot):
         raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")

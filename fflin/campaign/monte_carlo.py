@@ -155,6 +155,16 @@ def monte_carlo(
     ----------
     P. M. Wensing, S. Kim and J.-J. E. Slotine, Linear matrix inequalities for physically-consistent
     inertial parameter identification, IEEE Robotics and Automation Letters 3(1), 2018.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    >>> spreads = {"q_b": 0.02, "*.mass": 0.05, "tau_b.bias": 0.01}
+    >>> runs = fflin.monte_carlo(robot, policy, spreads, runs=16, duration=30.0, dt=0.05)
+    >>> len(runs), runs.fraction("attitude < 1 deg").value > 0.5
+    (16, True)
     """
     for name in options:
         if name not in _OPTIONS:

@@ -53,6 +53,14 @@ def plot_campaign(campaign: Campaign, path: str | Path | None = None, *, worst: 
         If matplotlib is not installed.
     FileError
         If the ending is another or the file cannot be written.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    >>> runs = fflin.monte_carlo(robot, policy, {"q_b": 0.02}, runs=8, duration=5.0, histories=20)
+    >>> figure = fflin.plot_campaign(runs, "campaign.png")
     """
     if not isinstance(campaign, Campaign):
         said = f"campaign is a {type(campaign).__name__}, expected a Campaign"

@@ -60,10 +60,7 @@ def misaligned(robot: Robot, angles: Array) -> Robot:
 
 
 def in_lanes(robot: Robot, tree: Tree, loads: Loads, angles: Array) -> dict[str, Array]:
-    """Return the wrenches, stored momenta and joints of runs (N,) as the kernel has them.
-
-    And what is to be added to the `bodies` of the tree: J a a^T of wheels is no more in them.
-    """
+    """Return wrenches, stored momenta and joints of runs (N,), and what `bodies` lack of wheels."""
     model, count, names = robot._bare.model, len(angles), list(robot.model.names)
     wrench, stored, fixed, bodies = (
         np.tile(each, (count, 1)).reshape(count, -1, size)

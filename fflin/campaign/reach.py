@@ -64,6 +64,16 @@ class Funnel(Design):
         Of the schedule.
     knots, q, v, u, hold, frame
         The trajectory, see `trajectory`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> reach = fflin.funnel(robot, fflin.tvlqr(along), {"attitude": 5.0}, samples=4, knots=2)
+    >>> bool(reach.contains(0.0, q=motion.q[0], v=motion.v[0]))
+    True
     """
 
     VECTORS: ClassVar = ("t", "tried", "at", "knots")

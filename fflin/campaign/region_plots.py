@@ -25,6 +25,13 @@ def plot_validity(validity: Validity, path: str | Path | None = None) -> Figure:
     validity : Validity
     path : str or Path, optional
         .png, .pdf or .svg to save to; errors as in `plot_motion`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> reach = fflin.validity(robot, lin, fflin.lqr(lin), samples=4)
+    >>> figure = fflin.plot_validity(reach, "validity.png")
     """
     if not isinstance(validity, Validity):
         raise InputError(
@@ -82,6 +89,15 @@ def plot_funnel(funnel: Funnel, path: str | Path | None = None) -> Figure:
     funnel : Funnel
     path : str or Path, optional
         .png, .pdf or .svg to save to; errors as in `plot_motion`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> reach = fflin.funnel(robot, fflin.tvlqr(along), {"attitude": 5.0}, samples=4, knots=2)
+    >>> figure = fflin.plot_funnel(reach, "funnel.png")
     """
     if not isinstance(funnel, Funnel):
         raise InputError(f"funnel is a {type(funnel).__name__}, expected what fflin.funnel returns")

@@ -53,10 +53,7 @@ def stop_of(said: str) -> int:
 
 
 class Tally:
-    """The worst of some runs that go on together, up to now.
-
-    Errors are from `home` (nx,), or from its rows (steps + 1, nx). Those at some `steps` are kept.
-    """
+    """The worst of some runs up to now, of errors from `home` (nx,) or (steps + 1, nx)."""
 
     span = 2**20  # steps between looks at what is over
 

@@ -73,6 +73,14 @@ class Validity(FrozenArrays):
         In whose axes rates and inputs of the base are fed back.
     frames : dict
         {frame: Validity} of the others that were asked for.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> reach = fflin.validity(robot, lin, fflin.lqr(lin), samples=4)
+    >>> sorted(reach.trusted), bool(1.5 < reach.slope < 2.5)
+    (['attitude', 'joint', 'position'], True)
     """
 
     levels: Array
@@ -205,6 +213,14 @@ def validity(
     ----------
     C. J. Clopper and E. S. Pearson, The use of confidence or fiducial limits illustrated in the
     case of the binomial, Biometrika 26(4), 1934.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> reach = fflin.validity(robot, lin, fflin.lqr(lin), samples=4)
+    >>> reach.inside <= 4, len(reach.outcomes)
+    (True, 4)
     """
     loop = checked_loop(robot, lin, gain)
     largest = checked_displacement(loop.lin, attitude, position, joint)

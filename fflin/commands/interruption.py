@@ -12,12 +12,7 @@ from fflin.commands import INTERRUPTED
 
 
 def listen() -> None:
-    """Have Ctrl-C raise `KeyboardInterrupt` in the main thread where it cannot be lost.
-
-    What the interpreter itself does raises it in the middle of an import, which packages turn into
-    an `ImportError`, and in a callback such as that of a weak reference, where it is printed and
-    passed over. Here it is raised after the import, and again after such a callback.
-    """
+    """Have Ctrl-C raise `KeyboardInterrupt` after imports and callbacks, where it would be lost."""
     # Where it is ignored, as under nohup, it stays so.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _heard)

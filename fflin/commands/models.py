@@ -7,7 +7,7 @@ import os
 import warnings
 from typing import TYPE_CHECKING
 
-from fflin.base.errors import FflinError, FflinWarning
+from fflin.base.errors import FflinError, FflinWarning, InputError
 from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
@@ -42,6 +42,8 @@ def add_commands(commands: Commands) -> None:
     )
     add_point(linearize)
     add_options(linearize, "--dt H: sample it, with inputs held over H [s]")
+    tools = "drake|mujoco|pinocchio|spart|euler|euler_rates"
+    add_options(linearize, f"--for {tools}: in that tool's coordinates, saved to FILE", dest="tool")
     add_trajectory(linearize)
     add_output_file(
         linearize, "save to FILE: .npz, .mat, .json, or .csv (one file a matrix: NAME.A.csv, ...)"
@@ -90,6 +92,8 @@ def _info(arguments: argparse.Namespace) -> int:
 
 
 def _linearize(arguments: argparse.Namespace) -> int:
+    if arguments.tool and (arguments.trajectory or not arguments.output_file):
+        raise InputError("--for is of the model at a point that is saved; give it with -o FILE")
     if arguments.trajectory:
         return linearize_along(arguments)
     if arguments.output_file:
@@ -102,8 +106,10 @@ def _linearize(arguments: argparse.Namespace) -> int:
     if arguments.dt is not None:
         lin = lin.discretize(arguments.dt)
     if arguments.output_file:
-        lin.save(arguments.output_file)
-        print(f"wrote {arguments.output_file}: {lin.B.shape[0]} states, {lin.B.shape[1]} inputs")
+        model = lin.to(arguments.tool) if arguments.tool else lin
+        model.save(arguments.output_file)
+        nx, nu = model.B.shape
+        print(f"wrote {arguments.output_file}: {nx} states, {nu} inputs")
     else:
         from fflin.commands.model_text import model_report
 

@@ -146,10 +146,7 @@ def velocity_of(
     *options: str,
     start: Mapping[str, Any] | None = None,
 ) -> Array | None:
-    """Return the velocity (nv,) that --velocity says, or these options, the later before others.
-
-    A start goes before all but --velocity.
-    """
+    """Return the velocity (nv,) of --velocity, of these options, or of a start."""
     from fflin.base.names import rates_by_name
     from fflin.dynamics.points import velocity
 

@@ -85,6 +85,13 @@ def acceleration_lqr(
     ----------
     Y. Yang, Analytic LQR design for spacecraft control system based on quaternion model, J.
     Aerospace Engineering 25(3), 2012: its attitude regulator is the weight Ra = J R J.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> gain = fflin.acceleration_lqr(lin, 1.0, 1.0, 1.0)
+    >>> gain.method, round(float(gain.poles.real.max()), 3)
+    ('closed form', -0.707)
     """
     require_fixed_point(lin)
     if dt is not None:

@@ -23,14 +23,14 @@ class Law:
         slow: float,
     ) -> None:
         # Beyond `slow`, a square of the velocity, a motion diverges and may make commands infinite.
-        self._policy, self._names, self._limits, self._slow = policy, names, limits, slow
+        self.policy, self._names, self._limits, self._slow = policy, names, limits, slow
         self._shape = (len(names),)
         # Of what integrates a state of its own along.
         self.advance: Any = getattr(policy, "advance", None)
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command (nu,), or raise `InputError` where it is none."""
-        u = self._policy(t, q.copy(), v.copy())
+        u = self.policy(t, q.copy(), v.copy())
         if type(u) is not np.ndarray or u.dtype is not DOUBLE:
             u = as_double(f"policy(t, q, v) at t = {t:g} s", u)
         else:

@@ -122,11 +122,9 @@ def solve_back(at: Callable[[float], Coefficients], knots: Array, P: Array) -> t
 
 
 def samples_back(stages: Iterable[tuple[Array, Array]], P: Array) -> tuple[Array, Array, float]:
-    """Return K and P of samples, from the last on, and the worst residual.
-
-    A stage is what a sample costs, of the error and the input at its start, (nx + nu, nx + nu),
-    and what takes these two to the next sample (nx, nx + nu).
-    """
+    """Return K and P of samples, from the last on, and the worst residual."""
+    # A stage is what a sample costs, of the error and the input at its start, (nx + nu, nx + nu),
+    # and what takes these two to the next sample (nx, nx + nu).
     nx, gains, costs, worst = len(P), list[Array](), [P], 0.0
     for weights, whole in stages:
         total = weights + whole.T @ P @ whole

@@ -57,6 +57,16 @@ class Gain(Design):
         The rule that made the weights, in words.
     regulated : tuple of str (nz,)
         The states that are fed back, all where it is empty; K, P, Q and N are zero elsewhere.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> gain = fflin.lqr(lin)
+    >>> gain.save("gain.json")
+    >>> bool((fflin.Gain.load("gain.json").K == gain.K).all()), gain.method
+    (True, 'structured')
+    >>> float(gain.poles.real.max()) < 0
+    True
     """
 
     VECTORS: ClassVar = ("poles", "x0", "u0")

@@ -93,6 +93,17 @@ class GainSchedule(Schedule):
         The rule that made the weights, in words.
     knots, q, v, u, hold, frame
         The trajectory, see `trajectory`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> schedule = fflin.tvlqr(along)
+    >>> schedule.gain(0.5).shape, schedule.residual < 1e-3
+    ((9, 18), True)
+    >>> flight = fflin.simulate(robot, schedule, q0=robot.neutral(), duration=1.0)
     """
 
     VECTORS: ClassVar = ("t", "knots")

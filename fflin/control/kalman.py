@@ -54,6 +54,13 @@ class Estimator(Design):
     robot : str
     estimated : tuple of str (nz,)
         The states that are, all where it is empty; L, P and W are zero elsewhere.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> estimator = fflin.kalman(lin, 1e-3, 1e-4)
+    >>> bool(estimator.poles.real.max() < 0), estimator.residual < 1e-9
+    (True, True)
     """
 
     VECTORS: ClassVar = ("poles", "x0", "u0", "y0")
@@ -108,6 +115,13 @@ class Compensator(Design):
     state_names, input_names, output_names : tuple of str
         Its inputs are the outputs of the model.
     robot : str
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> compensator = fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, 1e-3, 1e-4))
+    >>> compensator.A.shape, bool(compensator.poles.real.max() < 0)
+    ((18, 18), True)
     """
 
     VECTORS: ClassVar = ("poles", "y0", "u0")
@@ -192,6 +206,13 @@ def kalman(
     References
     ----------
     R. E. Kalman and R. S. Bucy, J. Basic Engineering 83(1), 1961.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> noise = {"tau_b": 0.1, "F_b": 0.1, "tau_m": 0.01}
+    >>> fflin.kalman(lin, noise, 1e-4, G=lin.B).L.shape
+    (18, 18)
     """
     require_fixed_point(lin)
     noise, through = disturbance(lin, W, G)
@@ -247,6 +268,14 @@ def lqg(gain: Gain, estimator: Estimator) -> Compensator:
     ------
     InputError
         If the two are of different models, or the gain feeds back what is not estimated.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> sampled = lin.discretize(0.1)
+    >>> compensator = fflin.lqg(fflin.lqr(sampled), fflin.kalman(sampled, 1e-3, 1e-4))
+    >>> compensator.dt
+    0.1
     """
     if not isinstance(gain, Gain) or not isinstance(estimator, Estimator):
         raise InputError("lqg takes a Gain, as lqr returns it, and an Estimator, as kalman does")

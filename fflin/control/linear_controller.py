@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError, listed
 from fflin.base.validation import Array, instance, number, vector
-from fflin.control.policies import Policy, decider, feedback_of
+from fflin.control.policies import Clock, Policy, decider, feedback_of
 from fflin.control.systems import fitted, system_of
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.output_kinds import KINDS
@@ -99,7 +99,7 @@ class Loop(Compensation):
         self._noise, self._there = noise, there
         self._still: Array = np.zeros(state.robot.nv)
         felt = any(output.FEELS_ACCELERATION for output in state.robot.outputs)
-        self._aba, self._asked = Aba(state) if felt else None, -np.inf
+        self._aba, self._clock = Aba(state) if felt else None, Clock(dt)
 
     def sample(self, t: float) -> tuple[Sample, StateMap, Array]:
         """Return what it does at a sample, and the chart and the state that y is relative to."""
@@ -108,18 +108,13 @@ class Loop(Compensation):
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:
         """Return the command at a sample or a stage."""
-        apart, dt = t - self._asked, self.dt
-        if dt and self._asked >= 0.0 and abs(apart - dt) > 1e-6 * dt:
-            raise InputError(
-                f"the controller is asked {apart:g} s after its last sample, expected {dt:g} s; "
-                "leave `sample` out"
-            )
-        if not dt and len(self.estimate) and len(self.rates) != self.stages + 1:
+        if self.dt:
+            self._clock.tick(t)
+        elif len(self.estimate) and len(self.rates) != self.stages + 1:
             raise InputError(
                 "the states of a continuous controller are integrated along by fflin.simulate, "
                 "which must be given itself as the policy; or sample it"
             )
-        self._asked = t
         measure, near = self._there(t)
         state, x = measure.state, measure.state.read(q, v, near=near)
         y: Any = None
@@ -181,6 +176,16 @@ class LinearController:
         function is improper, or D acts on an output that feels the input at once.
     FileError
         If the file cannot be read or lacks what is named above.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> system = -fflin.lqr(lin).K  # or a state space, a transfer function, a .mat
+    >>> policy = fflin.LinearController(system, lin)
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> fflin.simulate(robot, policy, v0=v0, duration=1.0).u.shape[1]
+    9
     """
 
     system: Any

@@ -105,6 +105,15 @@ def lqr(
     References
     ----------
     B. D. O. Anderson and J. B. Moore, Optimal Control: Linear Quadratic Methods, 1990.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> gain = fflin.lqr(lin)  # within the limits of the URDF
+    >>> gain.K.shape, gain.residual < 1e-10
+    ((9, 18), True)
+    >>> fflin.lqr(lin, {"q_b": 100.0, "r_b": 10.0, "q_m": 10.0}, 1.0).margin > 0
+    True
     """
     require_fixed_point(lin)
     rule = "as given"

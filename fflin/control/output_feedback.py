@@ -43,6 +43,16 @@ class OutputFeedback(LinearController):
     ------
     InputError
         If the compensator is of another model or not sampled.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> sampled = lin.discretize(0.1)
+    >>> compensator = fflin.lqg(fflin.lqr(sampled), fflin.kalman(sampled, 1e-3, 1e-4))
+    >>> policy = fflin.OutputFeedback(sampled, compensator)
+    >>> fflin.simulate(robot, policy, duration=1.0).u.shape[1]
+    9
     """
 
     def __init__(
@@ -93,6 +103,17 @@ class TrajectoryOutputFeedback(TrajectoryFeedback):
     ------
     InputError
         If the two are not sampled alike or of different trajectories.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> filtered = fflin.tvkalman(along, 1e-3, 1e-4, sample=0.1)
+    >>> policy = fflin.TrajectoryOutputFeedback(along, fflin.tvlqr(along, sample=0.1), filtered)
+    >>> fflin.simulate(robot, policy, duration=1.0).u.shape[1]
+    9
     """
 
     filter: FilterSchedule

@@ -114,6 +114,15 @@ def plan(
     ----------
     H. G. Bock and K.-J. Plitt, A multiple shooting algorithm for direct solution of optimal
     control problems, IFAC World Congress, 1984.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> goal = fflin.configuration(robot, {"joint_1": 0.3})
+    >>> limits = {"tau_b": 6.0, "F_b": 3.5, "tau_m": 3.0}
+    >>> motion = fflin.plan(robot, (goal, None), 20.0, knots=21, limits=limits)
+    >>> bool(motion.residual.max() < 1e-5)
+    True
     """
     state = StateMap(robot)
     refuse_orbit(robot, "plans")

@@ -37,6 +37,11 @@ def plot_poles(
     dt : float
         Sampling time of poles that are given as numbers; then the unit circle is drawn.
     title : str
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> figure = fflin.plot_poles(fflin.lqr(lin), "poles.png")
     """
     dt = number("dt", dt)
     sets = poles if isinstance(poles, dict) else {"": poles}
@@ -59,6 +64,11 @@ def plot_loops(gain: Gain, path: str | Path | None = None) -> Figure:
     gain : Gain
     path : str or Path, optional
         .png, .pdf or .svg to save to; errors as in `plot_motion`.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> figure = fflin.plot_loops(fflin.lqr(lin), "loops.png")
     """
     if not isinstance(gain, Gain):
         raise InputError(f"gain is a {type(gain).__name__}, expected what fflin.lqr returns")

@@ -52,6 +52,15 @@ class StateFeedback:
     ------
     InputError
         If K has another shape or the model is one about a moving reference.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    >>> q0 = fflin.configuration(robot, {"joint_1": 0.3})
+    >>> fflin.simulate(robot, policy, q0=q0, duration=1.0).u.shape[1]
+    9
     """
 
     lin: LinearModel
@@ -117,6 +126,16 @@ class Allocation:
     policy : policy or StateFeedback
     design : Robot
         The same robot with the inputs that the policy decides on.
+
+    Examples
+    --------
+    >>> cubesat = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
+    >>> wheels = [each for each in cubesat.inputs if isinstance(each, fflin.ReactionWheel)]
+    >>> design = cubesat.replace(inputs=[fflin.BaseTorque(), fflin.BaseForce(), *wheels])
+    >>> sampled = fflin.linearize(design).discretize(0.1)
+    >>> law = fflin.StateFeedback(sampled, fflin.acceleration_lqr(sampled, 1.0, 1.0, 1.0).K)
+    >>> fflin.simulate(cubesat, fflin.Allocation(law, design), duration=0.2).u.shape[1]
+    15
     """
 
     policy: Any
@@ -167,6 +186,23 @@ class Allocation:
 
         vars(policy)["advance"] = inner.advance
         return policy
+
+
+class Clock:
+    """The samples of a controller that remembers, each `dt` [s] after the last."""
+
+    def __init__(self, dt: float) -> None:
+        self._dt, self._last = dt, -np.inf
+
+    def tick(self, t: float) -> None:
+        """Raise `InputError` where a sample comes at another time."""
+        apart = t - self._last
+        if self._last >= 0.0 and abs(apart - self._dt) > 1e-6 * self._dt:
+            raise InputError(
+                f"the controller is asked {apart:g} s after its last sample, expected "
+                f"{self._dt:g} s; leave `sample` out"
+            )
+        self._last = t
 
 
 def decider(policy: Any) -> Any:

@@ -47,6 +47,16 @@ class TrajectoryFeedback:
     held : bool
         Whether what it commands is held for a while, as it is of a sampled schedule in any case:
         then what it commands at the very end is what holds the robot there.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> policy = fflin.TrajectoryFeedback(motion.trajectory(), fflin.tvlqr(along))
+    >>> bool(fflin.simulate(robot, policy, duration=1.0).attitude_error.max() < 1e-3)
+    True
     """
 
     trajectory: Trajectory

@@ -55,6 +55,16 @@ class FilterSchedule(Schedule):
     robot : str
     dt : float
         Time [s] between samples; 0 for continuous time.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> filtered = fflin.tvkalman(along, 1e-3, 1e-4, sample=0.1)
+    >>> filtered.dt, filtered.P.shape[1:]
+    (0.1, (18, 18))
     """
 
     VECTORS: ClassVar = ("t",)
@@ -146,6 +156,16 @@ def tvkalman(
     References
     ----------
     R. E. Kalman and R. S. Bucy, J. Basic Engineering 83(1), 1961.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> noise = {"tau_b": 0.1, "F_b": 0.1, "tau_m": 0.01}
+    >>> fflin.tvkalman(along, noise, 1e-4, G=along.B, sample=0.1).L.shape
+    (21, 18, 18)
     """
     require_continuous(traj)
     dt = 0.0 if sample is None else number("sample", sample)

@@ -94,12 +94,19 @@ def tvlqr(
     W.-W. Lin and E. K.-W. Chu (with others), structure-preserving doubling algorithms, 2018.
     E. Celledoni, A. Marthinsen and B. Owren, Commutator-free Lie group methods, Future Generation
     Computer Systems 19(3), 2003.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> fflin.tvlqr(along, sample=0.1).K.shape
+    (21, 9, 18)
     """
     require_continuous(traj)
     names, dt = traj.state_names, 0.0 if sample is None else number("sample", sample)
-    steady = isinstance(Qf, str)
-    if steady and Qf != "steady":
-        raise InputError(f"Qf is {Qf!r}, expected 'steady' or a weight")
+    steady = asks_steady(Qf)
     given, by_rule = list[Any]((Q, R)), Q is None and R is None
     if not by_rule and (weights is not None or Q is None or R is None):
         raise InputError("give Q and R, both, or weights='urdf' or 'identity' without them")
@@ -127,6 +134,26 @@ def tvlqr(
     K = np.linalg.solve(R, B.transpose(0, 2, 1) @ P)
     residual = riccati.Passed(t, P, K, (A, B, Q, R), 0.0, -1.0).residual(at)
     return GainSchedule(t=t, K=K, P=P, A=A, B=B, residual=residual, **fields)
+
+
+def asks_steady(Qf: Any) -> bool:
+    """Whether Qf is "steady", or raise `InputError` where it is another word."""
+    if isinstance(Qf, str) and Qf != "steady":
+        raise InputError(f"Qf is {Qf!r}, expected 'steady' or a weight")
+    return isinstance(Qf, str)
+
+
+def held_stages(
+    traj: LinearTrajectory, dt: float, Q: Array, R: Array
+) -> Iterator[tuple[Array, Array]]:
+    """Yield the samples that `samples_back` takes, from first to last."""
+    nx, W = len(Q), block_diag(Q, R)
+    for steps, whole in transitions(traj, traj.matrices, dt):
+        total, way = np.zeros_like(W), np.eye(len(W))
+        for F, h, step, _ in steps:
+            total += way.T @ held_cost(F, W, h) @ way
+            way[:nx] = step @ way
+        yield total, whole
 
 
 def require_continuous(traj: LinearTrajectory) -> None:
@@ -182,18 +209,8 @@ def steady_regulator(
 
 def _sampled(traj: LinearTrajectory, dt: float, Q: Array, R: Array, P: Array) -> dict[str, Any]:
     """Return t, K, P, A, B and the residual of the regulator whose inputs are held."""
-    nx, W = len(Q), block_diag(Q, R)
-    held = list(transitions(traj, traj.matrices, dt))
-
-    def stages() -> Iterator[tuple[Array, Array]]:
-        for steps, whole in reversed(held):
-            total, way = np.zeros_like(W), np.eye(len(W))
-            for F, h, step, _ in steps:
-                total += way.T @ held_cost(F, W, h) @ way
-                way[:nx] = step @ way
-            yield total, whole
-
-    K, P, residual = riccati.samples_back(stages(), P)
-    maps = np.array([whole for _, whole in held])
+    nx, stages = len(Q), list(held_stages(traj, dt, Q, R))
+    K, P, residual = riccati.samples_back(reversed(stages), P)
+    maps = np.array([whole for _, whole in stages])
     found = {"t": traj.samples(dt), "K": np.concatenate((K[::-1], K[:1])), "P": P[::-1]}
     return found | {"A": maps[:, :, :nx], "B": maps[:, :, nx:], "residual": residual}

@@ -52,8 +52,11 @@ def bryson(lin: LinearModel, largest: Mapping[str, float]) -> Array:
 
     Examples
     --------
-    >>> Q = bryson(lin, {"q_b": 0.05, "r_b": 0.1, "q_m": 0.1})  # doctest: +SKIP
-    >>> R = bryson(lin, {"tau_b": 1.0, "F_b": 5.0, "tau_m": 2.0})  # doctest: +SKIP
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> Q = fflin.bryson(lin, {"q_b": 0.05, "r_b": 0.1, "q_m": 0.1})
+    >>> R = fflin.bryson(lin, {"tau_b": 1.0, "F_b": 5.0, "tau_m": 2.0})
+    >>> fflin.lqr(lin, Q, R).K.shape
+    (9, 18)
     """
     if not (hasattr(lin, "state_names") and hasattr(lin, "input_names")):
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
@@ -216,6 +219,13 @@ def sampled_cost(
     ----------
     C. F. van Loan, Computing integrals involving the matrix exponential, IEEE Trans. Automatic
     Control 23(3), 1978.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> cost = fflin.sampled_cost(lin, 0.1, 1.0, 1.0)
+    >>> fflin.lqr(lin.discretize(0.1), *cost).dt
+    0.1
     """
     if not isinstance(lin, LinearModel) or lin.dt:
         raise InputError("lin must be a continuous LinearModel; give the one before discretize")

@@ -9,55 +9,50 @@ import numpy as np
 import pinocchio as pin
 
 from fflin.base.errors import InputError
-from fflin.base.frozen import FrozenArrays
-from fflin.base.tables import folded
-from fflin.base.validation import Array, dimension, vector
+from fflin.base.validation import Array, dimension, instance, vector
 from fflin.base.validation import placement as checked_placement
-from fflin.dynamics.state import StateMap
+from fflin.dynamics.impact import Impact, struck
 from fflin.robot.frames import ROOT, find_frame
 from fflin.robot.joined import body_alone, inertia_of, joined
 from fflin.robot.robot import Robot
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Capture(FrozenArrays):
-    """A robot with what it has grasped, and the impact.
+class Capture(Impact):
+    """A robot with what it has grasped, and the impact; see also `Impact`.
 
     Attributes
     ----------
-    robot : Robot
-        With the payload on it, to be linearised, regulated and simulated like any other.
-    q, v : ndarray (nq,), (nv,)
-        Of that robot, just after.
     impulse : ndarray (6,)
         On the robot, at the payload's frame and in its axes: force [N s], then torque [N m s].
-    energy_lost : float
-        [J], never negative.
-    momentum : ndarray (6,)
-        Linear [N s], and angular [N m s] about the world's origin, of both together before.
-    momentum_after : ndarray (6,)
-        The same of the one after: they differ by rounding.
+    payload : Robot
+        What was grasped, as a robot; its configuration and velocity just before are
+        ``payload_q`` (nq,) and ``payload_v`` (nv,).
+    prefix : str
+        What its frame is called in the robot that carries it.
+
+    Examples
+    --------
+    >>> import pinocchio as pin
+    >>> robot = fflin.load("planar_detumble")
+    >>> ballast = pin.Inertia.FromSphere(5.0, 0.1)
+    >>> caught = fflin.capture(robot, "hand", ballast, payload_v=[0.1, 0, 0, 0, 0, 0])
+    >>> bool(abs(caught.momentum_after - caught.momentum).max() < 1e-9)
+    True
     """
 
-    robot: Robot
-    q: Array
-    v: Array
-    impulse: Array
-    energy_lost: float
-    momentum: Array
-    momentum_after: Array
+    payload: Robot
+    payload_q: Array
+    payload_v: Array
+    prefix: str
 
-    def __repr__(self) -> str:
-        return f"Capture('{self.robot.name}', {self.energy_lost:.4g} J lost)"
-
-    def __str__(self) -> str:
+    @property
+    def told(self) -> str:
+        """What happened and what it took, in a line."""
         force, torque = (np.linalg.norm(each) for each in np.split(self.impulse, 2))
-        return folded(
-            [
-                f"{self.robot.name}: {self.robot.mass:.6g} kg, {self.robot.n} joints",
-                f"the grasp pulled by {force:.4g} N s and {torque:.4g} N m s; "
-                f"{self.energy_lost:.4g} J were lost",
-            ]
+        return (
+            f"{self.event}: the grasp pulled by {force:.4g} N s and {torque:.4g} N m s; "
+            f"{self.energy_lost:.4g} J were lost"
         )
 
 
@@ -118,19 +113,23 @@ def capture(
     ----------
     Y. Umetani and K. Yoshida, IEEE Trans. Robotics and Automation 5(3), 1989, for free joints; the
     impact is that of two bodies that stay together.
+
+    Examples
+    --------
+    >>> import pinocchio as pin
+    >>> robot = fflin.load("planar_detumble")
+    >>> ball = pin.Inertia.FromSphere(5.0, 0.1)
+    >>> caught = fflin.capture(robot, "hand", ball, payload_v=[0.01, 0, 0, 0, 0, 0.02])
+    >>> caught.robot.n, caught.energy_lost > 0
+    (3, True)
     """
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
-    robot.require_unchanged()
+    instance("robot", robot, Robot, "a fflin.Robot").require_unchanged()
     if isinstance(payload, pin.Inertia):
-        other = body_alone(inertia_of(payload), prefix)
-    elif isinstance(payload, Robot):
-        payload.require_unchanged()
-        other = replace(payload)  # which may be the robot's twin, the same object
+        alone = body_alone(inertia_of(payload), prefix)
+        other = replace(alone, gravity=robot.gravity, orbit=robot.orbit)
     else:
-        raise InputError(
-            f"payload is a {type(payload).__name__}, expected a pin.Inertia or a fflin.Robot"
-        )
+        instance("payload", payload, Robot, "a pin.Inertia or a fflin.Robot").require_unchanged()
+        other = replace(payload)  # which may be the robot's twin, the same object
     for field in ("gravity", "orbit") if isinstance(payload, Robot) else ():
         own, theirs = (getattr(each, field) for each in (robot, other))
         if own != theirs:
@@ -148,7 +147,10 @@ def capture(
     data = robot.create_data()
     pin.forwardKinematics(robot.model, data, q)
     other_q, other_v = _beside(other, data.oMi[joint] * on * at, payload_q, payload_v)
-    return _impact(whole, (robot, q, v), (other, other_q, other_v), prefix)
+    parts = [(robot, q, v), (other, other_q, other_v)]
+    said, impulse = struck(whole, parts, prefix, f"{prefix} of {other.mass:.6g} kg caught")
+    said |= {"payload": other, "payload_q": other_q, "payload_v": other_v, "prefix": prefix}
+    return Capture(impulse=impulse[robot.nv : robot.nv + 6], **said)
 
 
 def _beside(other: Robot, at: pin.SE3, q: Any, v: Any) -> tuple[Array, Array]:
@@ -163,55 +165,3 @@ def _beside(other: Robot, at: pin.SE3, q: Any, v: Any) -> tuple[Array, Array]:
     expected = "the twist (linear, angular) of the payload" + ", and its joints" * bool(other.n)
     v = vector("payload_v", v, other.nv, expected)
     return configuration, other.checked_velocity(v)
-
-
-def _impact(
-    whole: Robot, own: tuple[Robot, Array, Array], held: tuple[Robot, Array, Array], prefix: str
-) -> Capture:
-    state = StateMap(whole)
-    q, (robot, own_q, own_v), (other, other_q, other_v) = whole.neutral(), own, held
-    q[:7] = own_q[:7]
-    rows = {robot: np.zeros((robot.nv, whole.nv)), other: np.zeros((other.nv, whole.nv))}
-    rows[robot][:6, :6] = np.eye(6)
-    for of, values, start in ((robot, own_q, ""), (other, other_q, f"{prefix}.")):
-        for index in range(ROOT + 1, of.model.njoints):
-            there = whole.model.joints[whole.model.getJointId(start + of.model.names[index])]
-            here = of.model.joints[index]
-            q[there.idx_q : there.idx_q + there.nq] = values[here.idx_q : here.idx_q + here.nq]
-            rows[of][here.idx_v, there.idx_v] = 1.0
-    data, local = whole.create_data(), pin.ReferenceFrame.LOCAL
-    at = whole.model.getFrameId(prefix, pin.FrameType.BODY)
-    rows[other][:6] = pin.computeFrameJacobian(whole.model, data, q, at, local)
-    spread = np.eye(whole.nv) if state.S is None else state.S
-    G = np.vstack((rows[robot], rows[other])) @ spread
-    before = np.concatenate((own_v, other_v))
-    M = np.zeros((len(G), len(G)))
-    M[: robot.nv, : robot.nv], M[robot.nv :, robot.nv :] = _inertia(*own[:2]), _inertia(*held[:2])
-    nu = np.linalg.solve(G.T @ M @ G, G.T @ (M @ before))
-    jump = before - G @ nu
-    v = spread @ nu
-    momentum = _momentum(robot, own_q, own_v) + _momentum(other, other_q, other_v)
-    return Capture(
-        robot=whole,
-        q=q,
-        v=v,
-        impulse=(M @ jump)[robot.nv : robot.nv + 6],
-        energy_lost=0.5 * float(jump @ M @ jump),
-        momentum=momentum,
-        momentum_after=_momentum(whole, q, v),
-    )
-
-
-def _inertia(robot: Robot, q: Array) -> Array:
-    still = q.copy()
-    M = np.triu(pin.crba(robot.model, robot.create_data(), still))
-    full: Array = M + np.triu(M, 1).T
-    return full
-
-
-def _momentum(robot: Robot, q: Array, v: Array) -> Array:
-    """Return linear and angular momentum (6,) about the world's origin, in its axes."""
-    data = robot.create_data()
-    pin.computeCentroidalMomentum(robot.model, data, q, v)
-    linear, angular = data.hg.linear, data.hg.angular + np.cross(data.com[0], data.hg.linear)
-    return np.concatenate((linear, angular))

@@ -41,6 +41,14 @@ def configuration(
         If there is no such joint.
     InputError
         If a value is not a finite number, or a joint mimics another.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> fflin.configuration(robot, {"joint_2": 0.4})
+    array([0.        , 0.        , 0.        , 0.        , 0.        ,
+           0.        , 1.        , 1.        , 0.        , 0.92106099,
+           0.38941834, 1.        , 0.        ])
     """
     if not isinstance(robot, Robot):
         raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")
@@ -100,6 +108,12 @@ def velocity(robot: Robot, values: Mapping[str, float]) -> Array:
         If there is no such joint or component.
     InputError
         If a value is not a finite number.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> fflin.velocity(robot, {"omega_b.z": 0.02, "joint_1": 0.1})
+    array([0.  , 0.  , 0.  , 0.  , 0.  , 0.02, 0.1 , 0.  , 0.  ])
     """
     checked = numbers("values", values, "velocity", "velocity")
     state = StateMap(robot)
@@ -129,6 +143,12 @@ def effort(robot: Robot, values: Mapping[str, float]) -> Array:
         If there is no such input.
     InputError
         If a value is not a finite number.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> fflin.effort(robot, {"tau_b.z": 2.0, "joint_1": 0.5})
+    array([0. , 0. , 2. , 0. , 0. , 0. , 0.5, 0. , 0. ])
     """
     checked = numbers("values", values, "input", "effort")
     keys = input_keys(Actuation(StateMap(robot)))

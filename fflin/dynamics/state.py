@@ -62,6 +62,15 @@ class StateMap:
         If the frame is unknown or the reference is not a pin.SE3.
     ModelError
         If the robot's model was changed after it was made.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> state = fflin.StateMap(robot, frame="local")
+    >>> x = state.to_state(robot.neutral(), fflin.velocity(robot, {"joint_1": 0.1}))
+    >>> q, v = state.to_pinocchio(x)
+    >>> state.nx, state.names[-3], float(x[-3])
+    (18, 'qdot_m.joint_1', 0.1)
     """
 
     def __repr__(self) -> str:

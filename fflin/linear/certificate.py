@@ -11,12 +11,12 @@ from fflin.base.rotation import skew
 from fflin.base.validation import Array
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.actuation import Actuation
-from fflin.dynamics.chart import Chart
 from fflin.dynamics.inertia import Inertia
 from fflin.dynamics.names import ANGULAR, LINEAR
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
 from fflin.linear.model import Certificate, LinearModel
+from fflin.linear.tool_coordinates import ToolCoordinates
 from fflin.robot.robot import Robot
 
 # Terms that cancel exactly still leave their rounding, 1e-16 of their size. Counted with this
@@ -55,62 +55,23 @@ def inertia_residual(M: Array, inverse: Array) -> float:
 def aba_route(
     state: StateMap, aba: Aba, q: Array, v: Array, u: Array, *, moving: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Build A and B from the derivatives of ABA, (4.9) and (4.10), and return its M^-1 too."""
-    chart, g, nv = state.chart(q), state.groups, 6 + state.robot.n
-    nu, u = state.velocities(v), aba.actuation.in_base_axes(chart, u)
+    """Build A and B from the derivatives of ABA, (4.9) and (15.3), and return its M^-1 too."""
+    own, nu = ToolCoordinates(state, moving=moving), state.velocities(v)
+    u, nv = aba.actuation.in_base_axes(state.chart(q), u), len(nu)
     # Pinocchio differentiates in world axes at the world's origin, where a distant base costs
     # digits; no slope depends on where the base is, nor in the axes of an orbit.
     at_origin = q.copy()
     at_origin[:3] = 0.0
     by_q, by_v, by_u = aba.slopes(at_origin, v, u)
-    acceleration = state.velocities(aba.acceleration(at_origin, v, u))
-
-    J, R = chart.J, chart.R
-    A: Array = np.zeros((state.nx, state.nx))
-    B: Array = np.zeros((state.nx, len(u)))
-    w, linear = nu[ANGULAR], nu[LINEAR]
-    A[g.q_b, g.q_b] = -0.5 * (np.outer(w, chart.q_b) / chart.q0 + skew(w))
-    A[g.q_b, g.omega_b] = 0.5 * chart.Q
-    A[g.r_b, g.q_b] = -R @ skew(linear) @ J
-    A[g.r_b, g.v_b] = R
-    A[g.q_m, g.qdot_m] = np.eye(state.robot.n)
-    if moving:
-        # The reference, turning with w, carries the axes of the error with it.
-        A[g.q_b, g.q_b] -= 0.5 * skew(w)
-        A[g.r_b, g.r_b] -= skew(w)
-    A[-nv:, g.q_b] = by_q[:, ANGULAR] @ J
-    A[-nv:, g.r_b] = by_q[:, LINEAR] @ R.T
-    A[-nv:, g.q_m] = by_q[:, 6:]
-    A[-nv:, -nv:] = by_v
-    B[-nv:] = by_u
-
-    T, T_rate = _change_of_coordinates(state, chart, nu, acceleration)
-    B = T @ B
-    A[:] = (T @ A + T_rate) @ np.linalg.inv(T)
-    for columns, _ in aba.actuation.held:
-        A[:, g.q_b] += B[:, columns] @ skew(u[columns]) @ J
-        B[:, columns] = B[:, columns] @ R.T
-    return A, B, aba.inverse
-
-
-def _change_of_coordinates(
-    state: StateMap, chart: Chart, nu: Array, acceleration: Array
-) -> tuple[Array, Array]:
-    """Return T (nx, nx) with x_frame = T x_local for deviations, and its time derivative."""
-    g = state.groups
-    T, T_rate = np.eye(state.nx), np.zeros((state.nx, state.nx))
-    J, R, w = chart.J, chart.R, nu[ANGULAR]
-    q_b_rate = 0.5 * chart.Q @ w
-    q0_rate = -0.5 * float(chart.q_b @ w)
-    J_rate = -0.5 * J @ (q0_rate * np.eye(3) + skew(q_b_rate)) @ J
-    for turned, rows, group in zip(state.axes, (ANGULAR, LINEAR), (g.omega_b, g.v_b), strict=True):
-        if turned:
-            s, s_rate = skew(nu[rows]), skew(acceleration[rows])
-            T[group, group] = R
-            T[group, g.q_b] = -R @ s @ J
-            T_rate[group, group] = R @ skew(w)
-            T_rate[group, g.q_b] = -R @ (skew(w) @ s + s_rate) @ J - R @ s @ J_rate
-    return T, T_rate
+    there = own.slopes(q, nu, u, state.velocities(aba.acceleration(at_origin, v, u)))
+    # The tangent of what moves on turns with it.
+    A, B = np.zeros((state.nx, state.nx)), np.zeros((state.nx, len(u)))
+    A[ANGULAR, ANGULAR] = A[LINEAR, LINEAR] = -skew(nu[ANGULAR])
+    A[LINEAR, ANGULAR] = -skew(nu[LINEAR])
+    A[:nv, nv:] = np.eye(nv)
+    A[nv:], B[nv:] = np.hstack((by_q, by_v)), by_u
+    A = (there.P @ (A + B @ there.H) + there.rate) @ there.left
+    return A, there.P @ B @ there.V, aba.inverse
 
 
 def compare(

@@ -46,6 +46,13 @@ class Equilibrium(FrozenArrays):
         Of u.
     force_names, force_units : tuple of str
         Of the residual: tau_b, F_b, and tau_m of every joint.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", stiffness={"joint_1": 50.0})
+    >>> held = fflin.equilibrium(robot, fflin.configuration(robot, {"joint_1": 0.2}))
+    >>> round(float(held.u[6]), 6), held.input_names[6]
+    (10.0, 'tau_m.joint_1')
     """
 
     u: Array
@@ -120,6 +127,14 @@ def equilibrium(
     -----
     The bounds make it a least distance problem, which non-negative least squares solve exactly
     (C. Lawson and R. Hanson, Solving Least Squares Problems, 1974, chapter 23).
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", stiffness={"joint_1": 50.0})
+    >>> q = fflin.configuration(robot, {"joint_1": 0.2})
+    >>> u = fflin.equilibrium(robot, q).u
+    >>> fflin.linearize(robot, q, u=u).is_equilibrium(1e-9)
+    True
     """
     state = StateMap(robot, frame=frame, reference=reference)
     axes: Any = {"frame": frame, "reference": reference} if robot.orbit else {"moving": True}

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
 
 from fflin.base.errors import InputError
+from fflin.base.validation import Array
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.outputs import Sensing
 from fflin.dynamics.state import StateMap
+from fflin.linear.model import LinearModel
 from fflin.robot.outputs import FullState
 
 if TYPE_CHECKING:
-    from fflin.linear.model import LinearModel
     from fflin.robot.robot import Robot
 
 # Names and units, in their order.
@@ -74,3 +77,58 @@ def require_turns(made: str, size: int, robot: Robot) -> None:
             f"{made}, not of '{robot.name}' as it is given, whose configuration has {robot.nq} "
             f"entries, not {size}: other joints are continuous; linearise this robot"
         )
+
+
+def line_up(gain: Any, lin: LinearModel) -> Array:
+    """Return K of a gain for another model, its states and inputs matched by name.
+
+    A robot, the same with what it has caught, and the same with a joint that jammed have most of
+    their states in common. What the model alone has is not fed back, nor is what the gain alone
+    has: zero columns and rows.
+
+    Parameters
+    ----------
+    gain : Gain or GainBatch
+    lin : LinearModel
+
+    Returns
+    -------
+    ndarray (nu, nx) or (N, nu, nx)
+
+    Raises
+    ------
+    InputError
+        If they are in different frames or of different sampling times, or if neither has all
+        states, or all inputs, of the other: then they are not of one robot.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> stuck = fflin.linearize(fflin.load("planar_detumble", lock=["joint_1"]))
+    >>> fflin.line_up(fflin.lqr(lin), stuck).shape
+    (8, 16)
+    """
+    if not hasattr(gain, "K") or not hasattr(gain, "state_names"):
+        raise InputError(f"gain is a {type(gain).__name__}, expected a Gain or GainBatch")
+    if not isinstance(lin, LinearModel):
+        raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
+    for key in ("frame", "dt"):
+        own, other = getattr(gain, key, lin.dt), getattr(lin, key)
+        if own != other:
+            raise InputError(f"the {key} of the gain is {own}, that of the model {other}")
+    at = []
+    for kind in ("input", "state"):
+        own, other = getattr(gain, f"{kind}_names"), getattr(lin, f"{kind}_names")
+        lacking, beside = ([n for n in a if n not in b] for a, b in ((own, other), (other, own)))
+        if lacking and beside:
+            raise InputError(
+                f"the gain of '{gain.robot}' has the {kind} {lacking[0]}, which the model of "
+                f"'{lin.robot}' has not, and not its {beside[0]}; one must have all of the other's"
+            )
+        common = [name for name in other if name in own]
+        at.append(([other.index(name) for name in common], [own.index(name) for name in common]))
+    (rows, own_rows), (columns, own_columns) = at
+    K = np.zeros((*gain.K.shape[:-2], len(lin.input_names), len(lin.state_names)))
+    K[..., np.array(rows)[:, None], columns] = gain.K[..., np.array(own_rows)[:, None], own_columns]
+    return K

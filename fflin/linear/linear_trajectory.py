@@ -47,6 +47,15 @@ class LinearTrajectory(Trajectory):
     dt : float
         Time [s] that du is held; 0 for continuous time.
     robot, t, q, v, u, hold, frame : see `Trajectory`
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> along[3].moving, along.discretize(0.05).dt
+    (True, 0.05)
     """
 
     A: Array
@@ -178,6 +187,15 @@ def linearize_trajectory(
     -----
     FflinWarning
         Of knots that are no motion of the robot: when, by how much, and what would mend it.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> along = fflin.linearize_trajectory(robot, motion.trajectory())
+    >>> along.A.shape, along.check().ok
+    ((11, 18, 18), True)
     """
     if isinstance(t, Trajectory):
         if options or not q is v is u is None:

@@ -93,6 +93,14 @@ class Linearizer:
     ----------
     Y. Yang, J. Aerospace Engineering 25(3), 2012. J. Carpentier and N. Mansard, Analytical
     derivatives of rigid body dynamics algorithms, Robotics: Science and Systems, 2018.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> linearizer = fflin.Linearizer(robot, frame="local")
+    >>> models = [linearizer(fflin.configuration(robot, {"joint_2": x})) for x in (0.0, 0.4)]
+    >>> len(models), models[1].frame
+    (2, 'local')
     """
 
     def __init__(
@@ -128,30 +136,7 @@ class Linearizer:
     def __call__(
         self, q: Array | None = None, v: Array | None = None, u: Array | None = None
     ) -> LinearModel:
-        """Linearise about a point.
-
-        Parameters
-        ----------
-        q : array_like (nq,), optional
-            Configuration in Pinocchio's order; neutral by default.
-        v : array_like (nv,), optional
-            Velocity in Pinocchio's order; at rest by default.
-        u : array_like (nu,), optional
-            Over the robot's inputs, those on the base in the frame's axes; zero by default.
-
-        Returns
-        -------
-        LinearModel
-
-        Raises
-        ------
-        InputError
-            If a size is wrong or an entry is not finite or not of unit length.
-        ChartError
-            If the base is turned by pi from the reference.
-        SingularInertiaError
-            If a joint moves no mass.
-        """
+        """Linearise about a point; q, v, u, and what is raised, are those of `linearize`."""
         robot = self.robot
         q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
         known = v is None and u is None and self._known
@@ -310,6 +295,15 @@ def linearize(
     See Also
     --------
     Linearizer : the same, prepared once for many points; the equations stand there.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot, fflin.configuration(robot, {"joint_2": 0.4}))
+    >>> lin.A.shape, lin.B.shape
+    ((18, 18), (18, 9))
+    >>> lin.is_equilibrium(1e-9)
+    True
     """
     # Preparing the kernel for one point does not pay; so the last bits are the same everywhere.
     options: Any = {"reference": reference, "moving": moving, "engine": "python"}

@@ -19,6 +19,7 @@ from fflin.linear.sampling import held_exponential
 if TYPE_CHECKING:
     import pinocchio as pin
 
+    from fflin import ToolModel
     from fflin.dynamics.state import Frame
     from fflin.robot.robot import Robot
 
@@ -40,6 +41,13 @@ class Certificate:
         block it stands in.
     f0 : float
         Largest entry of the state derivative at the point; 0 at a fixed point.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> figures = lin.certificate
+    >>> figures.route_A < 1e-12, figures.inertia_residual < 1e-12
+    (True, True)
     """
 
     condition: float
@@ -93,6 +101,16 @@ class LinearModel(FrozenArrays):
         What `lqr` weighs where it is given nothing, as `Robot.replace` takes it.
     mean_motion : float
         Of the orbit [rad/s] in whose frame the robot is; 0 where there is none.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> lin.state_names[:3], lin.input_units[0]
+    (('q_b.x', 'q_b.y', 'q_b.z'), 'N m')
+    >>> sampled = lin.discretize(0.1)
+    >>> lin.save("model.mat")
+    >>> fflin.LinearModel.load("model.mat").dt, sampled.dt
+    (0.0, 0.1)
     """
 
     A: Array
@@ -135,14 +153,7 @@ class LinearModel(FrozenArrays):
 
     @classmethod
     def from_fields(cls, values: dict[str, Any]) -> LinearModel:
-        """Return a model whose fields are given; its arrays must be read-only and stay so.
-
-        Parameters
-        ----------
-        values : dict
-            Every field by its name. What it has under ``_when_asked`` is {name of a field:
-            function of q} for those that are made when they are asked for.
-        """
+        """Return a model of fields; those under ``_when_asked`` are functions of q."""
         # The generated __init__ sets two dozen frozen fields one by one, which takes as long
         # as the dynamics of a small robot.
         lin = _new(cls)
@@ -308,6 +319,14 @@ class LinearModel(FrozenArrays):
         )
         certify = partial(same_certificate, self, sampled.fingerprint)
         return replace(sampled, _certify=certify, _source=(sampled.fingerprint, self))
+
+    def to(self, tool: str, *, dt: float | None = None) -> ToolModel:
+        """Return the model in another tool's coordinates: `transform`, of its own robot."""
+        from fflin import transform
+
+        if self._robot is None:
+            raise InputError("this model's robot is not known: fflin.transform(robot, lin, tool)")
+        return transform(self._robot, self, tool, dt=dt)
 
     def to_scipy(self) -> Any:
         """Return a `scipy.signal.StateSpace` of the deviations; names and f0 are lost."""

@@ -137,6 +137,13 @@ def outputs(robot: Robot, lin: LinearModel, q: Any, v: Any = None, u: Any = None
     ------
     InputError
         If a size is wrong, the model is of another robot or about a reference that moves.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", outputs=[fflin.JointPositions()])
+    >>> lin = fflin.linearize(robot)
+    >>> fflin.outputs(robot, lin, fflin.configuration(robot, {"joint_2": 0.4}))
+    array([0. , 0.4, 0. ])
     """
     instance("robot", robot, Robot, "a fflin.Robot")
     if instance("lin", lin, LinearModel, "a fflin.LinearModel").moving:

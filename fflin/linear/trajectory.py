@@ -54,6 +54,17 @@ class Trajectory(Design):
     ------
     InputError
         If a size is wrong, the times do not increase, or a row is no configuration or velocity.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> flown = motion.trajectory()
+    >>> flown.save("flown.csv")
+    >>> back = fflin.Trajectory.load("flown.csv", robot)
+    >>> back.q.shape, back.hold, bool(back.residual.max() < 1e-6)
+    ((11, 13), 'previous', True)
     """
 
     VECTORS: ClassVar = ("t",)
@@ -265,3 +276,22 @@ def _configurations(robot: Robot, q: ArrayLike, count: int) -> Array:
     angles = wide[:, cosines]
     wide[:, cosines], wide[:, cosines + 1] = np.cos(angles), np.sin(angles)
     return wide
+
+
+def along(motion: Any, robot: Robot | None) -> Trajectory:
+    """Return a motion by knots, its inputs held or linear, whichever has the least residual."""
+    if motion.phases:
+        raise InputError("a motion of several phases is of several robots; take each alone")
+    if robot is None:
+        raise InputError("the motion is from a file, without its robot; give the one that moves")
+    entries = {name: getattr(motion, name) for name in ("t", "q", "v", "u", "placement")}
+    from fflin.linear.trajectory_files import arguments
+
+    values = arguments(entries, robot, "previous", motion.frame, motion.verified)
+    held = Trajectory(robot, **values)
+    if not (motion.u - motion.u[0]).any():
+        return held
+    before, u = motion.t[-4:-1] - motion.t[-1], values["u"]
+    u[-1] = np.linalg.solve(np.vander(before).T, np.eye(len(before))[-1]) @ u[-4:-1]
+    smooth = Trajectory(robot, **values | {"hold": "linear", "u": u})
+    return min(held, smooth, key=lambda each: float(each.residual.max()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +27,17 @@ FORMATS = (*record.FORMATS, ".csv")
 def write_csv(path: Path, traj: Any) -> None:
     """Write named columns, as `Trajectory.load` reads them."""
     columns = [f"{name}[{i}]" for name in "qv" for i in range(getattr(traj, name).shape[1])]
+    names = ["t", *columns, *Actuation(StateMap(traj.robot)).names, "hold", "frame"]
+    rows = np.column_stack((traj.t, traj.q, traj.v, traj.u))
+    write_table(path, names, rows, (traj.hold, traj.frame))
+
+
+def write_table(path: Path, names: Sequence[str], rows: Array, last: Sequence[str] = ()) -> None:
+    """Write named columns, and behind them what is the same in every row."""
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(["t", *columns, *Actuation(StateMap(traj.robot)).names, "hold", "frame"])
-    for row in np.column_stack((traj.t, traj.q, traj.v, traj.u)).tolist():
-        writer.writerow([*row, traj.hold, traj.frame])
+    writer.writerow(names)
+    writer.writerows([*row, *last] for row in rows.tolist())
     write_whole({path: table.getvalue().encode()})
 
 

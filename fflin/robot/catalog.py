@@ -58,6 +58,11 @@ def list_robots() -> tuple[str, ...]:
     Returns
     -------
     tuple of str
+
+    Examples
+    --------
+    >>> fflin.list_robots()[:3]
+    ('astrobee_arm', 'canadarm2', 'cubesat')
     """
     return tuple({**_bundled(), **_example_robot_data()})
 

@@ -68,25 +68,7 @@ class Coordinates:
             follower.place(q)
 
     def checked_configuration(self, q: Array) -> Array:
-        """Return `q` as a valid configuration of this robot.
-
-        Parameters
-        ----------
-        q : array_like (nq,)
-            Configuration in Pinocchio's order. Its quaternion, the (cos, sin) of every continuous
-            joint and the mimic joints are put right where they are within 1e-6.
-
-        Returns
-        -------
-        ndarray (nq,)
-            `q` itself where nothing was to be done, never modified.
-
-        Raises
-        ------
-        InputError
-            If the size is wrong, an entry is not finite, a part is not of unit length, or a mimic
-            joint is not where its leader puts it.
-        """
+        """Return q (nq,) as a valid configuration, put right within 1e-6, or raise `InputError`."""
         if type(q) is not np.ndarray or q.dtype is not DOUBLE or q.shape != (self.nq,):
             q = vector("q", q, self.nq, _CONFIGURATION)
         entries = q.tolist()
@@ -114,14 +96,7 @@ class Coordinates:
         return self._followed(q) if self.followers else q
 
     def checked_velocity(self, v: Array) -> Array:
-        """Return `v` as a valid velocity (nv,), never modified.
-
-        Raises
-        ------
-        InputError
-            If the size is wrong, an entry is not finite, or a mimic joint does not move as its
-            leader makes it.
-        """
+        """Return `v` as a valid velocity (nv,), never modified, or raise `InputError`."""
         v = vector("v", v, self.nv, "a velocity in Pinocchio's order")
         for joint, leader, multiplier, _ in self.followers:
             expected = multiplier * v[leader.idx_v]
@@ -148,10 +123,7 @@ class Coordinates:
         return placed
 
     def require_unchanged(self) -> None:
-        """Raise `ModelError` where the model was changed in place after the robot was made.
-
-        Results prepared before the change would be of another robot than those made after it.
-        """
+        """Raise `ModelError` where the model was changed in place after the robot was made."""
         assert self._as_made is not None
         made = self._as_made[1]
         # Tells in a microsecond that nothing at all was changed.
@@ -162,13 +134,7 @@ class Coordinates:
             )
 
     def create_data(self) -> pin.Data:
-        """Make Pinocchio's work space for this robot.
-
-        Raises
-        ------
-        ModelError
-            If it would take more than 1 GiB.
-        """
+        """Make Pinocchio's work space for this robot, or raise `ModelError` beyond 1 GiB."""
         self.require_room()
         return self.model.createData()
 

@@ -112,7 +112,7 @@ def given_limits(inputs: Sequence[Input], joints: Sequence[str], given: Any) -> 
     floors += [-math.inf] * len(states)
     if not isinstance(given, Mapping):
         given = dict.fromkeys(dict.fromkeys(item.GROUP for item in inputs), given)
-    ranges = {str(key): _range(key, value) for key, value in given.items()}
+    ranges = {str(key): range_of(key, value) for key, value in given.items()}
     of_inputs = {key: ranges[key] for key in ranges if stands_for_any(key, keys)}
     of_states = {key: ranges[key] for key in ranges if key not in of_inputs}
     # The group of all joints leaves wheels out, whose speeds are of another size.
@@ -157,7 +157,8 @@ def _damping(value: Any, find: Find, joints: Sequence[str], urdf: Mapping[str, f
     return dict(urdf)
 
 
-def _range(name: str, value: Any) -> Range:
+def range_of(name: str, value: Any) -> Range:
+    """Return a limit of a magnitude, or of (least, largest)."""
     if dimension(f"limit of '{name}'", value) == 1 and len(value) == 2:
         least, largest = (number(f"limit of '{name}'", x) for x in value)
     else:

@@ -34,3 +34,11 @@ def find_frame(model: pin.Model, name: str | None) -> Carried:
         return Carried(ROOT, pin.SE3.Identity())
     frame = model.frames[frame_index(model, name)]
     return Carried(frame.parentJoint, pin.SE3(frame.placement))
+
+
+def find_joint(model: pin.Model, name: str) -> Carried:
+    """Return where a joint's frame is, also of one that was welded."""
+    if model.existJointName(name):
+        return Carried(model.getJointId(name), pin.SE3.Identity())
+    frame = model.frames[model.getFrameId(name, pin.FrameType.FIXED_JOINT)]
+    return Carried(frame.parentJoint, pin.SE3(frame.placement))

@@ -98,6 +98,10 @@ def load_inputs(path: str | Path) -> tuple[Input, ...]:
         direction = [1, 0, 0]
 
     gives ``(JointTorque("joint_1"), Thruster("base", (-0.9, 0, 0.65), (1, 0, 0), "nozzle"))``.
+
+    >>> inputs = fflin.load_inputs("cubesat")  # bundled
+    >>> len(inputs), inputs[-1].name
+    (15, 'wheel_z')
     """
     document = TomlFile(find_inputs(path))
     check_keys(document)

@@ -87,6 +87,12 @@ class BaseTorque(Input):
     ----------
     max, min : float or sequence of float (3,), optional
         Limits [N m] of each of its entries, as for every input; by keyword.
+
+    Examples
+    --------
+    >>> robot = fflin.load("cubesat", inputs=[fflin.BaseTorque(max=0.01)])
+    >>> fflin.linearize(robot).input_names
+    ('tau_b.x', 'tau_b.y', 'tau_b.z')
     """
 
     KEY, GROUP, ENTRIES = "base_torque", "tau_b", "xyz"
@@ -99,6 +105,12 @@ class BaseForce(Input):
     ----------
     max, min : float or sequence of float (3,), optional
         Limits [N] of each of its entries; by keyword.
+
+    Examples
+    --------
+    >>> robot = fflin.load("cubesat", inputs=[fflin.BaseForce()])
+    >>> fflin.linearize(robot).input_units
+    ('N', 'N', 'N')
     """
 
     KEY, GROUP, UNIT, ENTRIES = "base_force", "F_b", "N", "xyz"
@@ -114,6 +126,12 @@ class JointTorque(Input):
         An independent joint. What mimics it is driven with it.
     max, min : float, optional
         Limits [N m | N] in place of the URDF's effort; by keyword.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", inputs=[fflin.JointTorque("joint_2")])
+    >>> fflin.linearize(robot).input_names
+    ('tau_m.joint_2',)
     """
 
     KEY, GROUP = "joint_torque", "tau_m"
@@ -146,6 +164,13 @@ class Thruster(WrenchInput):
         to the next sample, so that the impulse is right in the mean.
     least_impulse : float, optional
         [N s] of a sample, below which it does not fire; that is carried over too.
+
+    Examples
+    --------
+    >>> nozzle = fflin.Thruster("base", position=(-0.9, 0, 0), direction=(1, 0, 0), max=22.0)
+    >>> robot = fflin.load("servicer_7dof", inputs=[nozzle])
+    >>> fflin.linearize(robot).input_names
+    ('thruster_1',)
     """
 
     KEY, GROUP, UNIT, PULLS = "thruster", "thrust", "N", False
@@ -206,6 +231,14 @@ class ReactionWheel(WrenchInput):
     max_speed : float, optional
         Largest speed [rad/s] relative to the carrier, either way, of a wheel with an inertia J:
         it stores up to J max_speed [N m s].
+
+    Examples
+    --------
+    >>> wheel = fflin.ReactionWheel((0, 0, 1), inertia=1e-5, name="wheel_z")
+    >>> robot = fflin.load("cubesat", inputs=[wheel])
+    >>> lin = fflin.linearize(robot, v=fflin.velocity(robot, {"wheel_z": 500.0}))
+    >>> lin.state_names[-1], lin.state_units[-1]
+    ('qdot_m.wheel_z', 'rad/s')
     """
 
     KEY, GROUP = "reaction_wheel", "wheel"

@@ -19,11 +19,7 @@ from fflin.robot.wheels import carry_over, with_inputs
 
 
 def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: str) -> Robot:
-    """Return a robot with another, by its base, welded to a frame of it.
-
-    The other's joints, frames and links are called PREFIX.NAME, and its base's frame PREFIX. Inputs
-    and outputs are those of the robot; springs, dampers and mimic joints those of both.
-    """
+    """Return a robot with the base of another, all PREFIX.NAME and no motors, welded to a frame."""
     bare = robot._bare
     joint, at = find_frame(bare.model, frame)
     _require_new_names(robot, prefix)
@@ -52,8 +48,9 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
     told = f"{robot.urdf_sha256} {other.urdf_sha256} {frame} {placement} {prefix}"
     weighed = b"".join(each.toDynamicParameters().tobytes() for each in model.inertias.tolist())
     whole = replace(
-        bare,
+        robot,
         model=model,
+        _wheelless=None,
         name=f"{robot.name}+{other.name}",
         urdf_sha256=sha256(told.encode() + weighed).hexdigest(),
         joints=tuple(sorted((*own, *theirs), key=lambda each: each.idx_v)),
@@ -61,8 +58,6 @@ def joined(robot: Robot, frame: str, other: Robot, placement: pin.SE3, prefix: s
         attached=(*robot.attached, (prefix, other)),
         **both,
     )
-    own_fields = ("outputs", "passive", "limits", "weights", "gravity", "orbit")
-    whole = replace(whole, **{name: getattr(robot, name) for name in own_fields})
     return with_inputs(whole, robot.inputs)
 
 

@@ -50,11 +50,7 @@ class Piece(NamedTuple):
 
 
 def pieces_of(robot: Robot) -> tuple[dict[str, Piece], dict[str, str]]:
-    """Return {name: piece} of each link, and of each body of several by its joint or ``base``.
-
-    With {body: link} of the others. Links of a body that was given other masses than the URDF's
-    are known as a whole only; that counts the wheels.
-    """
+    """Return {name: piece} of links and of bodies of several, and {body: link} of the others."""
     model = robot._bare.model
     found, also = dict[str, Piece](), dict[str, str]()
     of_body: dict[int, dict[str, Piece]] = {}

@@ -2,29 +2,25 @@
 
 import os
 import warnings
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pinocchio as pin
 
-from fflin.base.errors import FflinWarning, InputError, ModelError, unknown
-from fflin.base.names import joints_by_name
-from fflin.base.validation import Array, number
+from fflin.base.errors import FflinWarning, InputError, ModelError
 from fflin.base.writing import as_path, remember
 from fflin.robot.catalog import RobotFile, find_mesh, find_robot
 from fflin.robot.frames import ROOT
 from fflin.robot.joints import Follower
 from fflin.robot.link_masses import LinkMass
+from fflin.robot.locking import Lock, locked_model
 from fflin.robot.massless import idle_coordinates, massless_note
 from fflin.robot.model_checks import check_model, check_order, check_root, joint_of
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.joints import Mimic
 from fflin.robot.urdf.reader import Advice, read_urdf
-
-Lock = Mapping[str, float | None] | Iterable[str]
 
 
 def load(
@@ -73,6 +69,14 @@ def load(
     -----
     FflinWarning
         Of what the file holds and the model does not, and of what cannot be quite right in it.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> robot.joint_names
+    ('joint_1', 'joint_2', 'joint_3')
+    >>> fflin.load("servicer_7dof", lock={"panel_left": 0.1}, gravity=(0, 0, -9.81)).n
+    8
     """
     found = find_robot(robot)
     if found.path.suffix.lower() != ".toml":
@@ -137,6 +141,7 @@ def _load(
         package_dirs=folders,
         urdf_damping=damping,
         links={name: LinkMass.of(link) for name, link in description.links.items()},
+        file_joints=description.joints,
     )
     return loaded, description.advice
 
@@ -167,6 +172,13 @@ def from_model(
         If the root is not one free-flyer, a joint has more than one degree of freedom, the
         joints are not in depth-first order, in which CRBA would be silently wrong, or a
         placement, a body or an armature is not physical.
+
+    Examples
+    --------
+    >>> import pinocchio as pin
+    >>> model = pin.buildSampleModelHumanoidRandom()  # on a free-flyer
+    >>> fflin.from_model(model, name="random").n
+    26
     """
     if not isinstance(model, pin.Model):
         raise ModelError(f"the model is a {type(model).__name__}, expected a pin.Model")
@@ -194,7 +206,7 @@ def _robot(
     check_root(model, name)
     locked: tuple[str, ...] = ()
     if any(lock is not None for lock in locks):
-        model, mimics, locked = _locked(model, locks, mimics)
+        model, mimics, locked = locked_model(model, locks, mimics)
     all_joints = [joint_of(model, index) for index in range(ROOT + 1, model.njoints)]
     by_name = {joint.name: joint for joint in all_joints}
     joints = tuple(joint for joint in all_joints if joint.name not in mimics)
@@ -206,69 +218,3 @@ def _robot(
     robot.require_room()
     check_order(model, name)
     return robot
-
-
-def _locked(
-    model: pin.Model, locks: Sequence[Lock | None], mimics: Mapping[str, Mimic]
-) -> tuple[pin.Model, dict[str, Mimic], tuple[str, ...]]:
-    """Weld joints and what mimics them; return the model, the mimics left, and what was welded."""
-    movable = list(model.names)[ROOT + 1 :]
-
-    def found(name: str) -> str:
-        if name not in movable:
-            raise unknown("joint to lock", name, movable)
-        return name
-
-    given: dict[str, float | None] = {}
-    for lock in locks:
-        if lock is not None:
-            given |= joints_by_name("joint to lock", _asked(lock), movable, found)
-    values = {n: None if x is None else number(f"lock '{n}'", x) for n, x in given.items()}
-    for name, mimic in mimics.items():
-        leader_value = values.get(mimic.leader, 0.0) or 0.0
-        if mimic.leader in values or values.get(name, 0.0) is None:
-            values.setdefault(name, None)
-            if values[name] is None:
-                values[name] = mimic.multiplier * leader_value + mimic.offset
-    q, indices, locked = pin.neutral(model), [], []
-    for name, value in values.items():
-        index = model.getJointId(name)
-        indices.append(index)
-        locked.append(f"{name}={0.0 if value is None else value!r}")
-        if value is not None:
-            joint_of(model, index).place(q, value)
-        # Without a frame for the joint, which models built in code may lack, Pinocchio crashes.
-        if not model.existFrame(name, pin.FrameType.JOINT):
-            model.addJointFrame(index)
-    left = {name: mimic for name, mimic in mimics.items() if name not in values}
-    return _reduced(model, indices, q), left, tuple(locked)
-
-
-def _asked(lock: Any) -> dict[str, float | None]:
-    """Return {joint or pattern: value, or None at neutral} of what a caller locks."""
-    try:
-        names = [lock] if isinstance(lock, str) else list(lock)
-    except TypeError:
-        names = [None]
-    if not all(isinstance(name, str) for name in names):
-        raise InputError(
-            f"lock is a {type(lock).__name__}, expected {{joint: value}} or names of joints"
-        )
-    return dict(lock) if isinstance(lock, Mapping) else dict.fromkeys(names)
-
-
-def _reduced(model: pin.Model, indices: Sequence[int], q: Array) -> pin.Model:
-    """Weld joints at q (nq,)."""
-    # Pinocchio looks frames up by name, which links and joints may share: joints keep theirs.
-    names = Counter(frame.name for frame in model.frames.tolist())
-    shared: dict[str, str] = {}
-    for index, frame in enumerate(model.frames):
-        if index and frame.type != pin.FrameType.JOINT and names[frame.name] > 1:
-            alias = f"{index}/{frame.name}"
-            while alias in names:
-                alias += "/"
-            shared[alias], frame.name = frame.name, alias
-    reduced = pin.buildReducedModel(model, indices, q)
-    for frame in reduced.frames:
-        frame.name = shared.get(frame.name, frame.name)
-    return reduced

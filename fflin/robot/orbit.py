@@ -67,7 +67,13 @@ class CircularOrbit:
 
     Examples
     --------
-    >>> robot = fflin.load("cubesat", orbit=fflin.CircularOrbit(altitude=700e3))
+    >>> orbit = fflin.CircularOrbit(altitude=700e3)
+    >>> round(orbit.period)  # s
+    5926
+    >>> robot = fflin.load("cubesat", orbit=orbit)
+    >>> lin = fflin.linearize(robot, frame="hill")
+    >>> round(float(lin.A[9, 3] / orbit.mean_motion**2), 6)  # 3, of Hill's equations
+    3.0
     """
 
     altitude: float = _FOLLOWS

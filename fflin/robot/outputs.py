@@ -46,13 +46,29 @@ class FrameOutput(Output):
 
 
 class FullState(Output):
-    """Every state, under its own name, in the order and axes of the state."""
+    """Every state, under its own name, in the order and axes of the state.
+
+    Examples
+    --------
+    >>> robot = fflin.load("cubesat")
+    >>> robot.outputs
+    (FullState(),)
+    >>> fflin.linearize(robot).C.shape
+    (12, 12)
+    """
 
     WORD = "state"
 
 
 class BasePose(Output):
-    """Attitude q_b (3) [1] and position r_b (3) [m] of the base, the states."""
+    """Attitude q_b (3) [1] and position r_b (3) [m] of the base, the states.
+
+    Examples
+    --------
+    >>> robot = fflin.load("cubesat", outputs=[fflin.BasePose()])
+    >>> fflin.linearize(robot).output_names[:2]
+    ('q_b.x', 'q_b.y')
+    """
 
     WORD = "base"
 
@@ -78,6 +94,12 @@ class JointPositions(JointOutput):
     joints : tuple of str, optional
         Independent joints, or patterns, in the order wanted; all of them, in state order, by
         default.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", outputs=[fflin.JointPositions()])
+    >>> fflin.linearize(robot).output_names
+    ('q_m.joint_1', 'q_m.joint_2', 'q_m.joint_3')
     """
 
     WORD = "joints"
@@ -91,6 +113,12 @@ class JointVelocities(JointOutput):
     joints : tuple of str, optional
         Independent joints, or patterns, in the order wanted; all of them, in state order, by
         default.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", outputs=[fflin.JointVelocities()])
+    >>> fflin.linearize(robot).output_units
+    ('rad/s', 'rad/s', 'rad/s')
     """
 
     WORD = "rates"
@@ -106,6 +134,12 @@ class FramePose(FrameOutput):
     Parameters
     ----------
     frame : str
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", outputs=[fflin.FramePose("hand")])
+    >>> fflin.linearize(robot).output_names[:2]
+    ('hand.position.x', 'hand.position.y')
     """
 
     WORD = "pose"
@@ -121,6 +155,12 @@ class FrameVelocity(FrameOutput):
     Parameters
     ----------
     frame : str
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", outputs=[fflin.FrameVelocity("hand")])
+    >>> fflin.linearize(robot).output_names[:2]
+    ('hand.angular_velocity.x', 'hand.angular_velocity.y')
     """
 
     WORD = "velocity"
@@ -140,6 +180,12 @@ class RelativePose(FrameOutput):
     frame : str
     to : str
         The frame that sees it.
+
+    Examples
+    --------
+    >>> robot = fflin.load("servicer_7dof", outputs=[fflin.RelativePose("tool", "panel_left")])
+    >>> len(fflin.linearize(robot).y0)
+    6
     """
 
     WORD = "relative"
@@ -148,7 +194,14 @@ class RelativePose(FrameOutput):
 
 
 class CenterOfMass(Output):
-    """Position (3) [m] of the centre of mass relative to the reference, in reference axes."""
+    """Position (3) [m] of the centre of mass relative to the reference, in reference axes.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", outputs=[fflin.CenterOfMass()])
+    >>> fflin.linearize(robot).output_names
+    ('com.x', 'com.y', 'com.z')
+    """
 
     WORD = "com"
     VECTORS = (("com", "m"),)
@@ -159,6 +212,12 @@ class Momentum(Output):
 
     Angular momentum (3) [N m s] about the centre of mass, that of every wheel included, and
     linear momentum (3) [N s].
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble", outputs=[fflin.Momentum()])
+    >>> fflin.linearize(robot).output_units
+    ('N m s', 'N m s', 'N m s', 'N s', 'N s', 'N s')
     """
 
     WORD = "momentum"
@@ -171,6 +230,12 @@ class Gyroscope(FrameOutput):
     Parameters
     ----------
     frame : str
+
+    Examples
+    --------
+    >>> robot = fflin.load("cubesat", outputs=[fflin.Gyroscope("base")])
+    >>> fflin.linearize(robot).output_units
+    ('rad/s', 'rad/s', 'rad/s')
     """
 
     WORD = "gyroscope"
@@ -186,6 +251,12 @@ class Accelerometer(FrameOutput):
     Parameters
     ----------
     frame : str
+
+    Examples
+    --------
+    >>> robot = fflin.load("cubesat", outputs=[fflin.Accelerometer("base")])
+    >>> bool(fflin.linearize(robot).D.any())
+    True
     """
 
     WORD = "accelerometer"

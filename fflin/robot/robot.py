@@ -82,8 +82,18 @@ class Robot(Coordinates):
         {name of an input or state: (least, largest)} in place of what the URDF and the inputs say.
     links : mapping
         {link: LinkMass} of those that weigh something, as the URDF has them.
+    file_joints : tuple of str
+        All joints, fixed ones too, as its file has them.
     attached : tuple of (str, Robot)
         What it has grasped, each with the prefix of its names.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> heavy = robot.with_mass_properties({"base": {"mass": 900.0}})
+    >>> stiff = robot.replace(stiffness={"joint_1": 50.0}, gravity=(0, 0, -1.62))
+    >>> robot.n, stiff.stiffness["joint_1"], round(heavy.mass)
+    (3, 50.0, 972)
     """
 
     model: pin.Model
@@ -108,6 +118,7 @@ class Robot(Coordinates):
     start: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, Range] = field(default_factory=dict)
     links: Mapping[str, Any] = field(default_factory=dict)
+    file_joints: tuple[str, ...] = ()
     attached: tuple[tuple[str, Robot], ...] = ()
     # Where some of its joints are wheels: the same robot without them.
     _wheelless: Robot | None = None

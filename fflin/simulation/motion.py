@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -16,16 +14,18 @@ from fflin.base import record
 from fflin.base.errors import InputError
 from fflin.base.record import Design
 from fflin.base.validation import Array, instance
-from fflin.base.writing import as_path, check_ending, write_whole
+from fflin.base.writing import as_path, check_ending
 from fflin.dynamics.state_rows import attitude_errors, moving_errors
+from fflin.linear.trajectory_files import write_table
 from fflin.robot.orbit import CircularOrbit
-from fflin.simulation.report import Limited, Passed, Saturated, passed, saturated
+from fflin.simulation.report import Passed, Saturated, limited, motion_report, passed, saturated
 
 FORMATS = (*record.FORMATS, ".csv")
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from fflin.dynamics.impact import Impact
     from fflin.linear.trajectory import Trajectory
     from fflin.robot.robot import Robot
 
@@ -81,13 +81,23 @@ class Motion(Design):
     engine : str
         What ran the loop, "compiled" or "python"; empty where a file does not tell.
     limits : ndarray (k, 2)
-        Their least and largest values, infinite where there is none, whether or not the run was
-        kept within.
+        Their least and largest values, infinite where there is none, kept within or not.
+    phases, starts : tuple of str, ndarray (k,)
+        Of a motion that was carried on (`then`), how each phase began and when [s].
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> spin = fflin.velocity(robot, {"omega_b.z": 0.1})
+    >>> motion = fflin.simulate(robot, v0=spin, duration=2.0)
+    >>> motion.save("motion.npz")
+    >>> fflin.Motion.load("motion.npz").x.shape == motion.x.shape
+    True
     """
 
     OPEN: ClassVar = ("limits",)
     VECTORS: ClassVar = (
-        *("t", "energy", "momentum_drift", "com_drift", "placement", "wheel_inertias"),
+        *("t", "energy", "momentum_drift", "com_drift", "placement", "wheel_inertias", "starts"),
     )
 
     t: Array
@@ -118,6 +128,9 @@ class Motion(Design):
     limit_names: tuple[str, ...] = field(default_factory=tuple)
     limits: Array = field(default_factory=lambda: np.zeros((0, 2)))
     engine: str = field(default_factory=str)
+    phases: tuple[str, ...] = field(default_factory=tuple)
+    starts: Array = field(default_factory=lambda: np.zeros(0))
+    _phases: tuple[Any, ...] = field(default=(), kw_only=True)  # motions and impacts; as _robot
     circles: str = field(default_factory=str)  # the orbit, as text
 
     def __post_init__(self) -> None:
@@ -142,8 +155,6 @@ class Motion(Design):
         )
 
     def __str__(self) -> str:
-        from fflin.simulation.report import motion_report
-
         report = motion_report(self)
         return report if self.verified else f"{report}\n{record.NOT_VERIFIED}"
 
@@ -187,48 +198,50 @@ class Motion(Design):
         """Angle (N,) [deg] between the base's attitude and the target's; None without target."""
         return attitude_errors(self.x, self.target) if self.target.size else None
 
+    def then(self, *later: Impact | Motion) -> Motion:
+        """Return one motion of this and what came after: ``approach.then(caught, held)``.
+
+        Parameters
+        ----------
+        *later : Impact or Motion
+            Of `capture` or `jam` at the last row before it, and of `simulate` from there on.
+
+        Returns
+        -------
+        Motion
+            Of this one's robot and in its chart, on one time axis; a joint that jammed stands
+            still. Energy and momentum are those of the robot as it is at the time.
+
+        Raises
+        ------
+        InputError
+            If one does not begin where the one before ended, has another frame or more inputs, or
+            is from a file.
+        """
+        from fflin.simulation.phases import carried_on
+
+        return carried_on(self, later)
+
     def trajectory(self, robot: Robot | None = None) -> Trajectory:
         """Return the motion by knots, with inputs that are held or linear: what it holds to better.
 
         Of inputs that change all the time the last, which no row has, is extrapolated. A motion
         that was read from a file needs the `robot`.
         """
-        from fflin.linear.trajectory import Trajectory
-        from fflin.linear.trajectory_files import arguments
+        from fflin.linear.trajectory import along
 
-        robot = robot or self._robot
-        if robot is None:
-            raise InputError(
-                "the motion is from a file, without its robot; give the one that moves"
-            )
-        entries = {name: getattr(self, name) for name in ("t", "q", "v", "u", "placement")}
-        values = arguments(entries, robot, "previous", self.frame, self.verified)
-        held = Trajectory(robot, **values)
-        if not (self.u - self.u[0]).any():
-            return held
-        before, u = self.t[-4:-1] - self.t[-1], values["u"]
-        u[-1] = np.linalg.solve(np.vander(before).T, np.eye(len(before))[-1]) @ u[-4:-1]
-        smooth = Trajectory(robot, **values | {"hold": "linear", "u": u})
-        return min(held, smooth, key=lambda each: float(each.residual.max()))
+        return along(self, robot or self._robot)
 
     @property
     def passed(self) -> tuple[Passed, ...]:
         """What went beyond its limit, the farthest first, with value, time and limit."""
-        return passed(self.t, self._limited())
+        return passed(self.t, limited(self))
 
     @property
     def saturated(self) -> tuple[Saturated, ...]:
         """Inputs at their limit and wheels at their speed, the longest share of the run first."""
         names = {*self.input_names, *(f"qdot_m.{name}" for name in self.wheels)}
-        return saturated(self.t, (each for each in self._limited() if each[0] in names))
-
-    def _limited(self) -> Iterator[Limited]:
-        names, units = self.state_names + self.input_names, self.state_units + self.input_units
-        found = dict(
-            zip(names, zip(np.hstack((self.x, self.u)).T, units, strict=True), strict=True)
-        )
-        for name, limits in zip(self.limit_names, self.limits, strict=True):
-            yield name, *found[name], limits
+        return saturated(self.t, (each for each in limited(self) if each[0] in names))
 
     def save(self, path: str | Path) -> None:
         """Write it to a .npz, .mat, .json or .csv file, whole or not at all.
@@ -246,11 +259,8 @@ class Motion(Design):
             super().save(target)
             return
         record.require_finite({"t": self.t, "x": self.x, "u": self.u})
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(["t", *self.state_names, *(f"u.{name}" for name in self.input_names)])
-        writer.writerows(np.column_stack((self.t, self.x, self.u)).tolist())
-        write_whole({target: text.getvalue().encode()})
+        names = ["t", *self.state_names, *(f"u.{name}" for name in self.input_names)]
+        write_table(target, names, np.column_stack((self.t, self.x, self.u)))
 
     def plot(self, path: str | Path | None = None, **options: Any) -> Any:
         """Draw the motion, see `plot_motion`; into a file where a path is given."""
@@ -293,6 +303,13 @@ def plot_motion(
         If the ending is another or the file cannot be written.
     UnknownNameError
         If there is nothing of a name in `show`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> v0 = fflin.velocity(robot, {"joint_1": 0.1})
+    >>> motion = fflin.simulate(robot, v0=v0, duration=2.0, every=20)
+    >>> figure = fflin.plot_motion(motion, "motion.png", show=["q_b", "*.joint_1"])
     """
     from fflin.simulation.motion_plot import draw_motion
 

@@ -27,7 +27,9 @@ def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None
     title = f"{motion.robot}: {motion.t[-1]:g} s, frame {motion.frame}"
     if motion.linear is not None:
         title += "; full: nonlinear, dashed: linear"
-    rest = resting_from(motion)
+    for name, start in zip(motion.phases[1:], motion.starts[1:], strict=True):
+        title += f"; {name} at {start:g} s"
+    rest = None if motion.phases else resting_from(motion)
     if rest is not None:
         title += f"; reference at rest from {rest:.4g} s"
     names = (*motion.state_names, *input_keys(motion))
@@ -49,7 +51,7 @@ def draw_motion(motion: Any, path: str | Path | None, show: Sequence[str] | None
         apart and (apart[0], apart[1].only(states)),
         {motion.kept: motion.momentum_drift, "centre of mass [m]": motion.com_drift},
         title=f"{title}\n{motion.stopped}" if motion.stopped else title,
-        rest=rest,
+        marks=[*motion.starts[1:].tolist(), *([] if rest is None else [rest])],
         path=path,
     )
 

@@ -25,15 +25,12 @@ _LINEAR_FIRST = [3, 4, 5, 0, 1, 2]
 
 
 class Drives(NamedTuple):
-    """What inputs (nu,) give of a command u: gain u + bias, and nothing from `until` [s] on.
-
-    Of each vector on the base, see `triads`, `turn` (9,) has the columns along which its three act.
-    """
+    """What inputs (nu,) give of a command u: gain u + bias, and nothing from `until` [s] on."""
 
     gain: Array
     bias: Array
     until: Array
-    turn: Array
+    turn: Array  # (k, 9), the columns along which the three of each of `triads` act
 
 
 def triads(actuation: Actuation) -> list[int]:

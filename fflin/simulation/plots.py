@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -75,7 +76,7 @@ def draw(
     drifts: Mapping[str, Array],
     *,
     title: str,
-    rest: float | None = None,
+    marks: Sequence[float] = (),
     path: str | Path | None = None,
 ) -> Figure:
     """Draw states, what they are `apart` from, inputs, `wheels` {name: inertia} and drifts."""
@@ -120,8 +121,8 @@ def draw(
             # Joints are many, have long names, and are the same in three panels.
             limit = {"limit": lines.pop("limit")} if "limit" in lines else {}
             _below(figure, lines | limit, "joints", "left" if figure.legends else "center")
-        for axes in figure.axes if rest is not None else ():
-            axes.axvline(rest, lw=0.8, ls=":", color="#555555", label="_rest")
+        for axes, mark in product(figure.axes, marks):
+            axes.axvline(mark, lw=0.8, ls=":", color="#555555", label="_rest")
         _drifts(figure.add_subplot(next(places)), t, drifts)
         for axes in figure.axes:
             axes.margins(x=0.0)

@@ -1,6 +1,6 @@
 """What is said of a motion: whether it arrived, what it took, what it passed, what proves it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -94,6 +94,17 @@ def saturated(t: Array, histories: Iterable[Limited]) -> tuple[Saturated, ...]:
     return tuple(sorted(found, key=lambda each: -each.share))
 
 
+def limited(motion: Any) -> Iterator[Limited]:
+    """Yield what of a motion has limits."""
+    names = motion.state_names + motion.input_names
+    units = motion.state_units + motion.input_units
+    found = dict(
+        zip(names, zip(np.hstack((motion.x, motion.u)).T, units, strict=True), strict=True)
+    )
+    for name, limits in zip(motion.limit_names, motion.limits, strict=True):
+        yield name, *found[name], limits
+
+
 def _name(name: str) -> str:
     group, _, entry = name.partition(".")
     return entry if group in ("q_m", "qdot_m") else name
@@ -155,6 +166,8 @@ def motion_report(motion: Any) -> str:
     if said:
         more = [f"and {len(said) - _MOST} more"] if len(said) > _MOST else []
         parts.append(folded(said[:_MOST] + more))
+    if motion.phases:
+        parts.append(f"\n{grid(_phases(motion), 'l')}\n")
     first, last = (f"{energy:.6g} J" for energy in motion.energy[[0, -1]])
     drift = f"{motion.momentum_drift.max():.1e}"
     parts.append(f"energy {first} at first, {last} at last; {motion.kept} drift {drift}")
@@ -170,6 +183,18 @@ def motion_report(motion: Any) -> str:
         where = f"{size} in {motion.state_names[most]}"
         parts.append(f"largest difference from the linear model: {where}")
     return "\n".join(parts)
+
+
+def _phases(motion: Any) -> list[list[str]]:
+    """Return the table of phases; momentum is of the robot as it is, about its centre of mass."""
+    heads = [["phase", "from [s]", "energy [J]", "at its end", "|momentum| [N s]", "[N m s]"]]
+    ends = [*np.searchsorted(motion.t, motion.starts[1:], "right") - 1, len(motion.t)]
+    for k, (name, start) in enumerate(zip(motion.phases, motion.starts, strict=True)):
+        rows = slice(ends[k - 1] if k else 0, ends[k])
+        energy, momentum = motion.energy[rows], motion.momentum[rows][-1]
+        sizes = (np.linalg.norm(each) for each in (momentum[3:], momentum[:3]))
+        heads.append([name, *(f"{x:.4g}" for x in (start, *energy[[0, -1]], *sizes))])
+    return heads
 
 
 def courses(motion: Any) -> list[Course]:
@@ -202,7 +227,8 @@ def verdict(motion: Any, kinds: list[Course]) -> str:
     judged = [kind for kind in places if kind.steered] or [k for k in kinds if k.steered]
     moved = [kind for kind in judged if kind.size.max() > THERE]
     if motion.tracked:
-        said = f"beside its trajectory at the end: {_and([kind.last for kind in judged])}"
+        where = "its phases' targets" if motion.phases else "its trajectory"
+        said = f"beside {where} at the end: {_and([kind.last for kind in judged])}"
     elif failed := [kind.last for kind in moved if kind.late]:
         said = f"not settled: {_and(failed)} at the end"
     elif moved:

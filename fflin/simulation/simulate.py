@@ -151,6 +151,16 @@ def simulate(
     References
     ----------
     E. Celledoni, A. Marthinsen and B. Owren, Future Generation Computer Systems 19(3), 2003.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> q0 = fflin.configuration(robot, {"joint_1": 0.3})
+    >>> policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+    >>> motion = fflin.simulate(robot, policy, q0=q0, duration=5.0, limits="urdf")
+    >>> motion.u.shape[1], float(motion.t[-1])
+    (9, 5.0)
     """
     plan, plant = planned(
         robot,
@@ -204,7 +214,7 @@ def motion_of(plan: Plan, plant: Plant, engine: str, run: Recording | None = Non
         wheels=tuple(robot.wheels),
         wheel_inertias=np.array(list(robot.wheels.values())),
         steered=plan.steered,
-        notes=plan.notes,
+        notes=(*plan.notes, *getattr(plan.law and plan.law.policy, "notes", ())),
         limit_names=tuple(plan.known),
         limits=np.array(list(plan.known.values())).reshape(-1, 2),
     )

@@ -41,6 +41,14 @@ class LFT(Design):
     units : tuple of str
     state_names, input_names, output_names : tuple of str
     robot : str
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lft = fflin.uncertain(robot, {"base.density": 0.2}).lft()
+    >>> A, B, C, D = lft.at({"base.density": 1.1})
+    >>> lft.parameters, B.shape
+    (('base.density',), (18, 9))
     """
 
     VECTORS: ClassVar = ("repeats", "middle", "half")

@@ -78,6 +78,16 @@ class Sensitivity:
     lin : LinearModel
     parameters : Parameters
         {name: Parameter} in the robot's order.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> S = fflin.sensitivity(lin)
+    >>> heavier = S.along({"base.density": 0.1})
+    >>> (lin.B + heavier.dB).shape
+    (18, 9)
+    >>> len(S.names) > 30
+    True
     """
 
     lin: LinearModel
@@ -261,6 +271,13 @@ def sensitivity(lin: LinearModel) -> Sensitivity:
         If the model is from a file.
     ModelError
         If the robot was changed after the model was made.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> S = fflin.sensitivity(lin)
+    >>> S["base.mass"].dB.shape, bool(S["base.mass"].dA.any())
+    ((18, 9), False)
     """
     if not isinstance(lin, LinearModel):
         raise InputError(f"lin is a {type(lin).__name__}, expected a LinearModel of linearize")

@@ -38,6 +38,15 @@ class Uncertain:
         As it is.
     ranges : tuple of Range
         Each with its `parameter`, the `middle` and `half` the width.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> of = fflin.uncertain(robot, {"base.mass": 0.2})
+    >>> round(of.samples(3, seed=1)[0].mass)
+    173
+    >>> len(of.samples(3, seed=1))
+    3
     """
 
     robot: Robot
@@ -203,6 +212,13 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     ----------
     P. M. Wensing, S. Kim and J.-J. E. Slotine, IEEE Robotics and Automation Letters 3(1), 2018, on
     when an inertia is that of a body.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> of = fflin.uncertain(robot, {"base.mass": 0.2, "link_1": {"density": 0.3}})
+    >>> len(of.samples(5, seed=1))
+    5
     """
     if not isinstance(robot, Robot):
         raise InputError(f"robot is a {type(robot).__name__}, expected a fflin.Robot")

@@ -8,11 +8,11 @@ from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from fflin.base.errors import InputError
 from fflin.base.validation import Array
 from fflin.control.tracking import Reference, followed, reference_of
+from fflin.dynamics.impact import inertia_at
 from fflin.dynamics.state import StateMap
 from fflin.robot.robot import Robot
 from fflin.view.motion_page import corner_points, rounded, stage_info, subtitle, triads
@@ -29,24 +29,6 @@ class Live:
     It is served by a thread of this process, to this machine only, and ends with it. Given to
     `simulate` as its callback, it shows the simulation as it runs; `follow` shows the trajectory's
     ghost with it.
-
-    Parameters
-    ----------
-    robot : Robot
-    q : ndarray (nq,)
-        Where it stands first.
-    scene : str
-        "space" or "lab".
-    tool : str or None
-        Frame that gets a triad.
-    follow : bool
-        Whether the camera follows the base.
-    speed : float
-        Seconds of simulation per second, at most.
-    port : int
-        0 for one that is free.
-    frame : str, optional
-        "lvlh" or "hill", of a robot in orbit.
 
     Attributes
     ----------
@@ -123,25 +105,12 @@ class Live:
         return self
 
     def show(self, q: Array, t: float | None = None) -> None:
-        """Put the robot at a configuration.
-
-        Parameters
-        ----------
-        q : array_like (nq,)
-        t : float, optional
-            Time to show [s].
-
-        Raises
-        ------
-        InputError
-            If q is no configuration of the robot.
-        """
+        """Put the robot at a valid configuration (nq,); t [s] is the time that is shown."""
         q = self.robot.checked_configuration(q).copy()
         q.setflags(write=False)
         with self._lock:
             poses = body_poses(self.robot, self._data, q)
-            inertia = pin.crba(self.robot.model, self._data, q)
-            inertia = self._state_map.project(np.triu(inertia) + np.triu(inertia, 1).T)
+            inertia = self._state_map.project(inertia_at(self.robot, q))
             scale = np.sqrt(np.diag(inertia))
             state = {
                 "time": None if t is None else float(t),

@@ -66,10 +66,7 @@ def _loaded(path: Path, _modified: int, _size: int) -> tuple[Mesh, ...]:
 
 
 def _colored(path: Path) -> list[tuple[Array, Indices, Color | None]]:
-    """Return vertices, faces and plain colour of each part of a COLLADA file, in metres.
-
-    Pinocchio's loader makes one part of them all. None where the file is not understood.
-    """
+    """Return vertices, faces and colour of each part of a COLLADA file [m]; None if it is odd."""
     import trimesh
 
     try:

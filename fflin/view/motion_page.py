@@ -17,6 +17,7 @@ from fflin.robot.frames import find_frame
 from fflin.robot.robot import ROOT, Robot
 from fflin.view.page import build_page, packed
 from fflin.view.panel import panel
+from fflin.view.phases import payloads
 from fflin.view.playback import Playback, body_poses, frame_indices, play_back, thrusters
 from fflin.view.recorder import Recorder
 from fflin.view.scene import Animation, Drawing, Visualizer, body_paths
@@ -75,6 +76,9 @@ def motion_page(
         predicted = [state.to_pinocchio(x)[0] for x in motion.linear[shown]]
         poses = np.array([body_poses(robot, data, each) for each in predicted])
         moving.append((Drawing(robot, scenery["linear"], "linear", sent), poses))
+    held = list(payloads(motion, shown))
+    for caught, poses in held:
+        moving.append((Drawing(caught.payload, scenery["held"][caught.prefix], sent=sent), poses))
     clips = []
     for each, poses in moving:
         each.place(poses[0])
@@ -86,8 +90,9 @@ def motion_page(
         robot, drawing, film.poses[0], scene=scene, subtitle=about, frame=motion.frame
     )
     shown_points = frame_points(drawing, film, info["size"])
-    for poses in goals[:: max(1, len(goals) // 24)]:
-        shown_points = np.concatenate((shown_points, corner_points(drawing, poses)))
+    for each, rows in ((drawing, goals), *moving[len(moving) - len(held) :]):
+        for poses in rows[:: max(1, len(rows) // 24)]:
+            shown_points = np.concatenate((shown_points, corner_points(each, poses)))
     info["floor"][2] = float(shown_points[:, 2].min())
     if follow is None:
         # All of a long way at once, and nothing is to be seen of the robot.
@@ -95,7 +100,7 @@ def motion_page(
     if follow:
         shown_points = frame_points(drawing, film, info["size"], follow=True)
     info |= panel(robot, motion, shown, goal)
-    info |= marks(robot, film, tool, info["size"], goals)
+    info |= marks(robot, film, tool, info["size"], goals[:1] if motion.phases else goals)
     if cloud is not None:
         from fflin.view.cloud import cloud_of
 
@@ -110,8 +115,12 @@ def motion_page(
         "points": rounded(shown_points, info["size"]),
         "target": len(goal) > 0,
         "linear": motion.linear is not None,
+        "phases": [*zip(motion.phases, motion.starts.tolist(), strict=True)],
+        "held": [caught.prefix for caught, _ in held],
     }
-    return build_page(info, window.commands()), drawing.notes
+    told = (each.notes for each, _ in moving if each is drawing or each.robot.urdf)
+    notes = dict.fromkeys(note for notes in told for note in notes)
+    return build_page(info, window.commands()), tuple(notes)
 
 
 def chart_of(robot: Robot, motion: Motion) -> StateMap:

@@ -91,11 +91,7 @@ def errors(robot: Robot, q: Array, target: Array) -> dict[str, tuple[str, Array]
 
 
 def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str, Any]:
-    """Return the readouts and plots of a motion's page, of the rows (N,) that it shows.
-
-    Errors are counted from a target for all rows or one each, (k, nq); where there is none there
-    are no errors, and the change from the start is shown.
-    """
+    """Return readouts and plots of a page's rows (N,), with errors where it has targets (k, nq)."""
     found = errors(robot, motion.q[shown], target if len(target) else motion.q[:1])
     of = "{} error" if len(target) else "{} change"
     readouts = [(of.format(what), unit, values) for what, (unit, values) in found.items()]
@@ -123,7 +119,7 @@ def panel(robot: Robot, motion: Motion, shown: Array, target: Array) -> dict[str
             for label, unit, values in readouts
         ],
         "plots": plots,
-        "rest": resting_from(motion) if len(target) > 1 else None,
+        "rest": resting_from(motion) if len(target) > 1 and not motion.phases else None,
         "passed": [[str(each), each.time] for each in motion.passed],
     }
 

@@ -34,10 +34,7 @@ _ELSEWHERE = {"uuid": "elsewhere", "type": "SphereGeometry", "radius": 0.0}
 
 
 class _Piece(MeshcatMesh):
-    """A three.js mesh as it is sent.
-
-    The page gives it its material, and the geometry of an earlier piece where it names one.
-    """
+    """A three.js mesh as it is sent; its material, and geometry sent before, are in the page."""
 
     def __init__(self, geometry: dict[str, Any], matrix: Array, about: dict[str, Any]) -> None:
         self._geometry, self._matrix, self._about = geometry, matrix, about
@@ -72,8 +69,8 @@ class Drawing:
         self.robot = robot
         self._visualizer = visualizer
         self._paths = body_paths(robot)
-        sent = set() if sent is None else sent
-        found, self.notes = shapes(robot)
+        sent = set() if sent is None else sent  # meshes that the page has, of these too
+        found, self.notes = shapes(robot)  # and what could not be drawn
         corners: dict[int, list[Array]] = {}
         for index, shape in enumerate(found):
             node = visualizer[self._paths[shape.joint - ROOT]]

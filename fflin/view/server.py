@@ -26,9 +26,9 @@ class Server:
     def __init__(
         self,
         page: str,
-        scene: Callable[[], Iterable[bytes]],
-        asked: Callable[[Any], None],
-        port: int,
+        scene: Callable[[], Iterable[bytes]],  # for a browser that has just come
+        asked: Callable[[Any], None],  # takes what a browser sends
+        port: int,  # 0 for one that is free
     ) -> None:
         self.scene, self.asked = scene, asked
         self.state = "{}"

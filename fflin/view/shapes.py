@@ -12,7 +12,7 @@ import pinocchio as pin
 from fflin.base.errors import FflinError
 from fflin.base.writing import shown
 from fflin.robot.catalog import find_mesh
-from fflin.robot.frames import ROOT, find_frame
+from fflin.robot.frames import ROOT, find_frame, find_joint
 from fflin.robot.robot import Robot
 from fflin.robot.urdf.links import read_pose
 from fflin.robot.urdf.reader import read_document
@@ -53,10 +53,10 @@ def shapes(robot: Robot) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
 
 def _carried(robot: Robot, prefix: str, other: Robot, shape: Shape) -> Shape:
     """Return a shape of what a robot has grasped as one of that robot."""
+    held_by = find_frame(robot.model, prefix)
     if shape.joint > ROOT:
-        name = f"{prefix}.{other.model.names[shape.joint]}"
-        return replace(shape, joint=robot.model.getJointId(name))
-    joint, held = find_frame(robot.model, prefix)
+        held_by = find_joint(robot.model, f"{prefix}.{other.model.names[shape.joint]}")
+    joint, held = held_by
     return replace(shape, joint=joint, placement=held * shape.placement)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from warnings import warn
 
 from fflin.base.errors import FflinWarning, FileError, InputError
-from fflin.base.validation import Array, instance, number, truth
+from fflin.base.validation import Array, instance, number, truth, whole
 from fflin.base.writing import as_path, check_distinct, check_place, write_whole
 from fflin.dynamics.actuation import Actuation
 from fflin.dynamics.points import start_of
@@ -133,6 +133,13 @@ def visualize(
     -----
     FflinWarning
         Of what could not be drawn: missing meshes; boxes where there is no visual geometry.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> motion = fflin.simulate(robot, v0=fflin.velocity(robot, {"joint_1": 0.1}), duration=2.0)
+    >>> fflin.visualize(robot, motion, html="motion.html").name
+    'motion.html'
     """
     instance("robot", robot, Robot, "a fflin.Robot; fflin.load makes one")
     if scene is None:
@@ -147,7 +154,7 @@ def visualize(
     if motion is None:
         if any(file is not None for file in (html, png, gif)):
             raise InputError("a file shows a motion; give one, as fflin.simulate makes it")
-        _check_port(port)
+        port = whole("port", port, 0, 2**16 - 1)
         start = start_of(robot)[0] if q is None else _configuration(robot, "q", q)
         from fflin.view.live import Live
 
@@ -194,11 +201,6 @@ def _temporary(name: str) -> Path:
         "wb", prefix=f"fflin-{safe}-", suffix=".html", delete=False
     ) as file:
         return Path(file.name)
-
-
-def _check_port(port: Any) -> None:
-    if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port < 2**16:
-        raise InputError(f"port is {port!r}, expected 0 to 65535 (0: one that is free)")
 
 
 def check_outputs(files: dict[str, Any]) -> dict[str, Path]:

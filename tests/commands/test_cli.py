@@ -8,6 +8,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import fflin
@@ -186,6 +187,23 @@ def test_linearize_saves_what_python_gives(ending, tmp_path):
     lin = fflin.linearize(robot, fflin.configuration(robot, {"left_2": 0.3}), frame="local")
     assert (saved.B == lin.B).all() and saved.state_names == lin.state_names
     assert saved.frame == "local" and saved.certificate == lin.certificate
+
+
+def test_linearize_for_a_tool_saves_what_python_gives(tmp_path):
+    code, out, _ = run(
+        *("linearize", "cubesat", "--rpy", "20", "10", "0", "--velocity", "omega_b.z=0.2"),
+        *("--for", "drake", "-o", str(tmp_path / "a.mat")),
+    )
+    assert code == 0 and out.endswith("a.mat: 13 states, 6 inputs\n")
+    saved = fflin.ToolModel.load(tmp_path / "a.mat")
+    robot = fflin.load("cubesat")
+    turned = pin.SE3(pin.rpy.rpyToMatrix(*np.radians((20.0, 10.0, 0.0))), np.zeros(3))
+    v = fflin.velocity(robot, {"omega_b.z": 0.2})
+    lin = fflin.linearize(robot, fflin.configuration(robot, {}, turned), v)
+    assert np.array_equal(saved.A, lin.to("drake").A) and saved.tool == "drake"
+    for options in ((), ("-o", str(tmp_path / "a.csv")), ("--trajectory", "x.csv", "-o", "a.npz")):
+        assert refused("linearize", "cubesat", "--for", "drake", *options)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mat"]
 
 
 def test_reference_world_keeps_the_attitude_in_the_state(tmp_path):

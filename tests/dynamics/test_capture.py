@@ -239,3 +239,13 @@ def test_all_of_a_payload_hangs_where_it_was_on_its_base(tmp_path):
     moving = fflin.capture(robot, "tool", held, placement=at, payload_v=v)
     size = np.abs(moving.momentum).max()
     assert np.abs(moving.momentum - moving.momentum_after).max() < 1e-13 * size
+
+
+def test_a_robot_with_wheels_keeps_its_gravity():
+    robot = fflin.load("cubesat", inputs=[fflin.ReactionWheel((0, 0, 1.0), inertia=1e-3)])
+    robot = robot.replace(gravity=(0.0, 0.0, -9.81))
+    whole = fflin.capture(robot, "base", DEBRIS).robot
+    assert whole.gravity == (0.0, 0.0, -9.81) and list(whole.wheels) == ["wheel_1"]
+    other = fflin.load("ets_vii")
+    with pytest.raises(fflin.InputError, match=r"gravity is \(0.0, 0.0, -9.81\), the payload's"):
+        fflin.capture(robot, "base", other)

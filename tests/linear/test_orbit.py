@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -235,3 +236,18 @@ def test_far_from_its_point_the_field_is_said_to_be_coarse():
         far(robot, 20e3)
     with pytest.warns(fflin.FflinWarning, match="off by up to 2.1 %"):
         far(robot, 100e3)
+
+
+@pytest.mark.parametrize("name", ["servicer_7dof", "cubesat"])
+def test_a_held_attitude_checks_though_its_inputs_are_rounding(name):
+    locks = list(fflin.load(name).joint_names)
+    robot = fflin.load(name, lock=locks, orbit=fflin.CircularOrbit(700e3))
+    for attitude in fflin.relative_equilibria(robot)[::5]:
+        about = pin.XYZQUATToSE3(attitude.q[:7])
+        held = fflin.equilibrium(robot, attitude.q, reference=about)
+        lin = fflin.linearize(robot, attitude.q, u=held.u, reference=about)
+        assert fflin.check(robot, lin).ok
+        # What does not balance is still found: a tenth of the gradient's torque.
+        f0 = lin.f0.copy()
+        f0[6] += 0.1 * robot.orbit.mean_motion**2
+        assert not fflin.check(robot, replace(lin, f0=f0)).ok

@@ -38,6 +38,7 @@ def sound(folder):
     robot = fflin.load("planar_detumble")
     q, v, u = robot.neutral(), np.zeros(robot.nv), np.zeros(6 + robot.n)
     lin = fflin.linearize(robot)
+    given = lin.to("mujoco")
     gain = fflin.lqr(lin, 1.0, 1.0)
     filtered = fflin.kalman(lin, 1.0, 1.0)
     motion = fflin.simulate(robot, fflin.StateFeedback(lin, gain.K), duration=0.05)
@@ -86,6 +87,7 @@ def sound(folder):
         "gramians": {"lin": filtered_model, "duration": 1.0},
         "grid": {"robot": robot, "axes": {joint: [0.0, 1.0]}, "base": None},
         "Gyroscope": {"frame": "base"},
+        "jam": {"robot": robot, "joints": [joint], "q": q, "v": v},
         "JointPositions": {"joints": (joint,)},
         "JointTorque": {"joint": joint, "max": 1.0, "min": -0.5},
         "JointVelocities": {"joints": (joint,)},
@@ -103,12 +105,26 @@ def sound(folder):
         },
         "load_dispersions": {"path": "nosuch.toml"},
         "load_inputs": {"path": "nosuch.toml"},
+        "line_up": {"gain": gain, "lin": lin},
         "lqg": {"gain": gain, "estimator": filtered},
         "lqr": {"lin": lin} | weights | {"N": None},
         "lqr_batch": {"batch": batch} | weights,
         "modes": {"lin": lin},
         "relative_equilibria": {"robot": robot.replace(orbit=7e5), "q": q, "frame": "hill"},
         "Momentum": {},
+        "mpc": {
+            **{"lin": lin, "Q": 1.0, "R": 1.0, "horizon": 2, "dt": 0.1, "limits": {"tau_b": 1.0}},
+            **{"Qf": "steady", "weights": None},
+        },
+        "from_tool": {
+            **{"robot": robot, "tool": "mujoco", "q": given.q, "v": given.v, "u": given.u0},
+            **{"A": given.A, "B": given.B, "dt": None, "frame": "hybrid"},
+            **{"reference": pin.SE3.Identity(), "moving": False},
+        },
+        "transform": {"robot": robot, "lin": lin, "tool": "mujoco", "dt": 0.1},
+        "LinearModel.to": {"self": lin, "tool": "euler", "dt": None},
+        "ToolModel.load": {"path": "nosuch.npz"},
+        "ToolModel.save": {"self": given, "path": folder / "d.npz"},
         "funnel": {
             **{"robot": robot, "schedule": schedule, "goal": {"attitude": 1.0}, "within": None},
             **{"knots": 1, "samples": 1, "seed": 0, "confidence": 0.9, "dt": 0.01, "engine": None},

@@ -47,6 +47,7 @@ class Description(NamedTuple):
     friction: dict[str, float]  # the same [N m | N]
     meshes: tuple[str, ...]  # mesh files as it names them; they are not read
     links: dict[str, Link]  # those that weigh something
+    joints: tuple[str, ...]  # all, as they stand in it
     notes: tuple[str, ...]  # warnings, one line each
     advice: tuple[Advice, ...] = ()  # those that hold where the robot's fields say no more
 
@@ -95,9 +96,8 @@ def describe(document: bytes, path: Path, prune: Sequence[str] = ()) -> Descript
             text = f"{path.stem}: {', '.join(of)} 0 of {joints}: no limit (or passive)"
             advice.append(Advice("passive", zero, text))
     weights = {name: link for name, link in urdf.links.items() if link.mass}
-    return Description(
-        model, digest, mimics, damping, friction, meshes, weights, tuple(notes), tuple(advice)
-    )
+    of_links, said = (weights, tuple(urdf.joints)), (tuple(notes), tuple(advice))
+    return Description(model, digest, mimics, damping, friction, meshes, *of_links, *said)
 
 
 def read_document(path: Path) -> bytes:

@@ -13,7 +13,7 @@ function problem(message) {
   box.hidden = !message;
 }
 
-const GHOST = "#8fb4ff";
+const GHOST = "#8fb4ff", HELD = "#b8bdc4";
 
 // What is drawn beside the robot; each can be switched off.
 function legendOf(info) {
@@ -28,6 +28,7 @@ function legendOf(info) {
   const dashed = info.followed.length > 0;
   if (info.target) entries.push({ ...entry(dashed ? `reference${rest}` : "target", GHOST, "target"), dashed });
   info.tubes.forEach(({ name, colour }) => entries.push(entry(`funnel of the ${name}`, colour, "funnel", name)));
+  entries.push(...info.held.map((name) => entry(name, HELD, "held", name)));
   if (info.linear) entries.push(entry("linear model", "#ff7fc8", "linear"));
   // In the panel thrusters are named in their plot; a strip of pictures has none.
   return [...entries, ...info.plumes.map(({ name, colour }) => ({ label: name, colour, strip: true }))];
@@ -104,6 +105,7 @@ function main() {
   const panel = document.getElementById("panel");
   const showMarks = makeMarks(viewer, info);
   const showFigures = makeReadouts(panel, info.readouts);
+  const showPhase = makePhases(panel, info.phases, (time) => goTo(time));
   const stamp = document.getElementById("stamp");
   const base = viewer.scene_tree.find(info.base).object;
   const centre = yUp(info.centre), last = new THREE.Vector3().copy(base.position);
@@ -115,7 +117,7 @@ function main() {
     turn(time);
     showMarks(i);
     showFigures(i);
-    stamp.textContent = `t = ${figure(time, 3)} s`;
+    stamp.textContent = `t = ${figure(time, 3)} s${showPhase(time)}`;
     for (const show of plots) show(i, time);
     const moved = base.position.clone().sub(last);
     last.copy(base.position);
@@ -126,7 +128,8 @@ function main() {
   });
   const goTo = (time) => { player.pause(); player.seek(time); };
   makePassed(panel, info.passed, goTo);
-  plots = info.plots.map((plot) => makePlot(panel, info.t, plot, goTo, info.rest));
+  const marks = [...info.phases.slice(1).map(([, start]) => start), info.rest].filter((time) => time !== null);
+  plots = info.plots.map((plot) => makePlot(panel, info.t, plot, goTo, marks));
   if (plots.length) makeSpan(panel, info.t);
   fitPlots(panel);
   window.addEventListener("resize", () => { if (fitPlots(panel)) window.dispatchEvent(new Event("resize")); });

@@ -39,6 +39,27 @@ function makePassed(parent, passed, seek) {
   parent.append(line);
 }
 
+// The phases of a motion, which lead to their times. Returns what shows and tells the one at a time.
+function makePhases(parent, phases, seek) {
+  if (!phases.length) return () => "";
+  const list = document.createElement("div");
+  list.className = "phases";
+  const rows = phases.map(([name, start]) => {
+    const row = document.createElement("button"), at = document.createElement("span");
+    at.textContent = `${Number(start.toPrecision(4))} s`;
+    row.append(name, at);
+    row.addEventListener("click", () => seek(start));
+    list.append(row);
+    return row;
+  });
+  parent.append(list);
+  return (time) => {
+    const now = phases.reduce((last, [, start], k) => (start <= time ? k : last), 0);
+    rows.forEach((row, k) => row.setAttribute("aria-pressed", k === now));
+    return `, ${phases[now][0]}`;
+  };
+}
+
 // Where the time of the plots begins and ends.
 function makeSpan(parent, t) {
   const row = document.createElement("div");
@@ -107,7 +128,7 @@ function fitPlots(panel) {
   return panel.clientWidth !== width;
 }
 
-function makePlot(parent, t, plot, seek, rest) {
+function makePlot(parent, t, plot, seek, marks) {
   const box = document.createElement("div");
   box.className = "plot";
   const name = document.createElement("div"), at = document.createElement("span");
@@ -159,13 +180,11 @@ function makePlot(parent, t, plot, seek, rest) {
       context.moveTo(0, y(level)); context.lineTo(width - GUTTER * ratio, y(level));
       context.stroke();
     }
-    if (rest !== null) {
-      context.strokeStyle = style.getPropertyValue("--faint");
-      context.setLineDash([ratio, 2 * ratio]);
-      context.beginPath();
-      context.moveTo(x(rest), 0); context.lineTo(x(rest), height);
-      context.stroke();
-    }
+    context.strokeStyle = style.getPropertyValue("--faint");
+    context.setLineDash([ratio, 2 * ratio]);
+    context.beginPath();
+    for (const mark of new Set(marks)) { context.moveTo(x(mark), 0); context.lineTo(x(mark), height); }
+    context.stroke();
     context.setLineDash([]);
     const curve = (values, colour, thickness, alpha) => {
       context.strokeStyle = colour;

@@ -1,0 +1,140 @@
+"""What the site takes from the code: the reference, the command line, numbered formulas."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from sphinx import addnodes
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+import fflin
+from fflin.commands import cli
+
+
+def titles() -> dict[str, list[str]]:
+    """Return the public names by title, as the stub lists them."""
+    found: dict[str, list[str]] = {}
+    for line in Path(fflin.__file__).with_suffix(".pyi").read_text(encoding="utf-8").splitlines():
+        if line.startswith("# "):
+            names = found[line[2:]] = []
+        elif line.startswith("from "):
+            names.append(line.split()[-1])
+    return found
+
+
+def write(path: Path, text: str) -> None:
+    """Write a page where it differs, so that what did not change is not read again."""
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+
+def reference(app: Sphinx) -> None:
+    """Write a page for each title of the reference, with a table that leads to its names."""
+    folder = Path(app.srcdir) / "reference"
+    head = ".. currentmodule:: fflin\n\n.. autosummary::\n   :nosignatures:\n   :toctree: names\n\n"
+    pages = {}
+    for title, names in titles().items():
+        page = title.lower().replace(" ", "_")
+        rows = "".join(f"   {name}\n" for name in names)
+        pages[page] = f"{title}\n{'=' * len(title)}\n\n{head}{rows}"
+    for page, text in pages.items():
+        write(folder / f"{page}.rst", text)
+    entries = "".join(f"   {page}\n" for page in pages)
+    tables = "".join(text.replace("   :toctree: names\n", "") + "\n" for text in pages.values())
+    write(
+        folder / "index.rst",
+        "Reference\n#########\n\nEvery public name, as ``fflin.NAME``, by what it is for. Each has "
+        "a page with its equation,\nshapes, units, errors and an example.\n\n"
+        f".. toctree::\n   :hidden:\n\n{entries}\n{tables}",
+    )
+
+
+class CommandHelp(SphinxDirective):
+    """The ``--help`` of every command, each under its name."""
+
+    def run(self) -> list[nodes.Node]:
+        """Return a section for each command."""
+        os.environ["COLUMNS"] = "88"
+        parser = cli._parser("")
+        (action,) = (
+            each for each in parser._actions if each.dest == "==SUPPRESS==" or each.choices
+        )
+        made: list[nodes.Node] = [_help(parser.format_help())]
+        for names in cli.TASKS.values():
+            for name in names:
+                section = nodes.section(ids=[f"fflin-{name}"], names=[f"fflin {name}"])
+                section += nodes.title("", f"fflin {name}")
+                section += _help(action.choices[name].format_help())  # type: ignore[index]
+                self.state.document.note_explicit_target(section)
+                made.append(section)
+        return made
+
+
+def _help(text: str) -> nodes.literal_block:
+    return nodes.literal_block(text, text, language="text")
+
+
+def keep_tags(app: Sphinx, doctree: nodes.document) -> None:
+    """Give formulas with a number of their own an environment that bears it."""
+    for node in doctree.findall(nodes.math_block):
+        if r"\tag{" in node.astext():
+            text = rf"\begin{{equation}}{node.astext()}\end{{equation}}"
+            node.children = [nodes.Text(text)]
+            node["no-wrap"] = node["nowrap"] = True
+
+
+def link_names(app: Sphinx, doctree: nodes.document) -> None:
+    """Let public names that stand as code, ``lqr`` or ``fflin.lqr(lin)``, lead to their pages."""
+    page = app.env.current_document.docname
+    if page.startswith("reference/"):
+        return
+    for node in list(doctree.findall(nodes.literal)):
+        named = re.fullmatch(r"(?:fflin\.)?(\w+)(\(.*\))?", node.astext())
+        inside = (nodes.reference, nodes.title, addnodes.pending_xref)
+        if named and named[1] in fflin.__all__ and not isinstance(node.parent, inside):
+            link = addnodes.pending_xref(
+                "", refdomain="py", reftype="obj", reftarget=f"fflin.{named[1]}", refdoc=page
+            )
+            node.replace_self(link)
+            link += node
+
+
+def short_signature(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str, result: str
+) -> tuple[str, str] | None:
+    """Leave out what a record is made of: its attributes are told, and a function makes it."""
+    made = what == "class" and "\nParameters\n---" not in (inspect.getdoc(obj) or "")
+    return ("", result) if made and dataclasses.is_dataclass(obj) else None
+
+
+def link_pages(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Let docstrings that name a page of the documents lead to it."""
+    for at, line in enumerate(lines):
+        lines[at] = re.sub(r"docs/(\w+)\.md", r":doc:`/\1`", line)
+
+
+def results_within(app: Sphinx) -> None:
+    """Keep what the tutorials drew within the site's own folder, not beside it."""
+    folder = str(Path(app.doctreedir) / "executed")
+    app.env.mystnb_config = app.env.mystnb_config.copy(output_folder=folder)
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register with Sphinx."""
+    os.environ["FFLIN_DOCS_PAGES"] = str(Path(app.outdir) / "pages")
+    reference(app)  # here, since autosummary looks for its tables before anything is read
+    app.connect("builder-inited", results_within, priority=900)  # after myst_nb has chosen
+    app.connect("doctree-read", keep_tags)
+    app.connect("doctree-read", link_names)
+    app.connect("autodoc-process-docstring", link_pages)
+    app.connect("autodoc-process-signature", short_signature)
+    app.add_directive("command-help", CommandHelp)
+    return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,213 @@
+"""A receding horizon: the quadratic program of each sample, and the command that solves it."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fflin.base.errors import FflinWarning, MissingPackageError
+from fflin.base.validation import Array, number, vector
+from fflin.control.policies import Clock
+
+# Of limits, as rows of length 1 and in shares of their size: how well they are kept, what passing a
+# soft one costs, and of more than this multiplier how much it yields; what counts as passed.
+_EXACT, _PRICE, _YIELDS, _PASSED = 1e-9, 1e3, 1.0, 1e-6
+
+# DAQP's infinity, its words for a soft limit and for a plan that passes one, and most iterations.
+_OPEN, _SOFT, _PASSES, _MOST = 1e30, 8, 2, 10_000
+
+
+class Stage(NamedTuple):
+    """A sample, e' = A e + B d with d = u - u*, and limits on E e' + D d, first those of inputs."""
+
+    A: Array  # (nx, nx)
+    B: Array  # (nx, nu)
+    K: Array  # (nu, nx), of the regulator that no limit hinders
+    L: Array  # (nu, nu): d = L z - K e costs z'z more than that one
+    E: Array  # (m, nx)
+    D: Array  # (m, nu)
+    low: Array  # (m,)
+    high: Array  # (m,)
+
+
+class Matrices(NamedTuple):
+    """Least d'H d / 2 + g'd with low <= G d <= high over the d = u - u* of N samples."""
+
+    H: Array  # (N nu, N nu)
+    g: Array  # (N nu,)
+    G: Array  # (m, N nu)
+    low: Array  # (m,)
+    high: Array  # (m,)
+    soft: NDArray[np.bool_]  # (m,), what may be passed where nothing else is left
+    Phi: Array  # (N + 1, nx, nx): e_k = Phi_k e + Gamma_k d
+    Gamma: Array  # (N + 1, nx, N nu)
+    inputs: tuple[str, ...]  # "name[k]" of d
+    limits: tuple[str, ...]  # of the rows of G; of states and outputs at the end of sample k
+
+
+def condensed(stages: Sequence[Stage], planned: bool) -> tuple[Array, Array, Array]:
+    """Return e, z and what is limited (N + 1, nx | N nu | m, N nu + nx) of z, or of d, and e_0."""
+    (nx, nu), size = stages[0].B.shape, len(stages) * stages[0].B.shape[1]
+    e = np.eye(nx, size + nx, size)
+    states, efforts, limited = [e], [], []
+    for k, by in enumerate(stages):
+        own = np.eye(nu, size + nx, k * nu)
+        d = by.L @ own - by.K @ e if planned else own
+        efforts.append(own if planned else np.linalg.solve(by.L, own + by.K @ e))
+        e = by.A @ e + by.B @ d
+        states.append(e)
+        limited.append(by.E @ e + by.D @ d)
+    return np.array(states), np.vstack(efforts), np.vstack(limited)
+
+
+@dataclass(frozen=True, eq=False)
+class Horizon:
+    """The samples that a horizon passes over, of which the last N stay."""
+
+    stages: tuple[Stage, ...]
+    samples: int  # N
+    dt: float
+    inputs: tuple[str, ...]
+    acting: NDArray[np.intp]  # the inputs that have limits
+    limited: tuple[str, ...]
+
+    @cached_property
+    def _last(self) -> tuple[Stage, ...]:
+        return self.stages[-self.samples :]
+
+    def window(self, t: float) -> tuple[Stage, ...]:
+        """Return the samples ahead; the same object where they are the same."""
+        k = round(min(t / self.dt, len(self.stages)))
+        moves = k < len(self.stages) - self.samples
+        return self.stages[k : k + self.samples] if moves else self._last
+
+    def bounds(self, stages: Sequence[Stage]) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Return the limits (m,) of some samples, and which are soft."""
+        soft = np.tile(np.arange(len(self.limited)) >= len(self.acting), len(stages))
+        low, high = (np.concatenate([each[i] for each in stages]) for i in (-2, -1))
+        return low, high, soft
+
+    def matrices(self, e: ArrayLike | None, t: float) -> Matrices:
+        """Return the program of a sample [s] at the deviation e (nx,) of the state."""
+        stages = self.window(max(number("t", t), 0.0))
+        nx, size = len(stages[0].A), len(self.inputs) * self.samples
+        start = np.zeros(nx) if e is None else vector("e", e, nx, "a deviation of the state")
+        states, z, limited = condensed(stages, planned=False)
+        (low, high, soft), free = self.bounds(stages), limited[:, size:] @ start
+        slope = 2.0 * z[:, :size].T
+        H, g = slope @ z[:, :size], slope @ (z[:, size:] @ start)
+        names = (
+            tuple(f"{name}[{k}]" for k in range(self.samples) for name in of)
+            for of in (self.inputs, self.limited)
+        )
+        program = (H, g, limited[:, :size], low - free, high - free, soft)
+        return Matrices(*program, states[..., size:], states[..., :size], *names)
+
+
+class Receding:
+    """The commands of a run, the first of each plan; `at` says what u* and e are at t, q, v."""
+
+    def __init__(self, horizon: Horizon, at: Any = None) -> None:
+        self.of, self._at, self._clock = horizon, at, Clock(horizon.dt)
+        self._stages: tuple[Stage, ...] = ()
+        self.solves = self.softened = self.unfinished = 0
+        self._worst, self._said = 0.0, ""
+        if horizon.limited:  # before the first sample, which must not wait
+            self._change(horizon.window(0.0))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is to be said of the run."""
+        said = f"{self.solves} plans of {self.of.samples} samples of {self.of.dt:g} s"
+        if self.softened:
+            said += f", {self.softened} beyond a limit, the farthest {self._said}"
+        if self.unfinished:
+            said += f", {self.unfinished} not found, where the regulator acted, cut at the limits"
+        return (said,) if self.solves else ()
+
+    def __call__(self, t: float, q: Array, v: Array) -> Array:
+        """Return the command (nu,) of a sample."""
+        self._clock.tick(t)
+        u, e = self._at(t, q, v)
+        command: Array = u + self.step(t, e)
+        return command
+
+    def step(self, t: float, e: Array) -> Array:
+        """Return the command (nu,) as the deviation from its target, at the state's e (nx,)."""
+        stages, acting = self.of.window(t), self.of.acting
+        now, d = stages[0], -stages[0].K @ e
+        if not self.of.limited:
+            return d
+        if stages is not self._stages:
+            self._change(stages)
+        free = self._free @ e
+        self.solves += 1
+        z, flag = self._solved(free)
+        if flag <= 0:  # once more, from nothing
+            self._start()
+            z, flag = self._solved(free)
+        if flag > 0:
+            d += now.L @ z[: len(d)]
+        if flag == _PASSES:
+            self._count(t, free + self._G @ z)
+        if flag <= 0:
+            self.unfinished += 1
+            said = f"at t = {t:g} s no plan is found (DAQP ends with {flag}): where that is so the "
+            if self.unfinished == 1:
+                warnings.warn(f"{said}regulator acts, cut at the limits", FflinWarning, 2)
+        d[acting] = np.clip(d[acting], now.low[: len(acting)], now.high[: len(acting)])
+        return d
+
+    def _count(self, t: float, reached: Array) -> None:
+        """Note how far a plan goes beyond the soft limits."""
+        excess = np.maximum(self._low - reached, reached - self._high) * self._soft
+        row = int((shares := excess * self._unit).argmax())
+        self.softened += bool(shares[row] > _PASSED * self._size)
+        if shares[row] > max(self._worst, _PASSED * self._size):
+            sample, at = divmod(row, len(self.of.limited))
+            self._worst, when = float(shares[row]), t + (sample + 1) * self.of.dt
+            self._said = f"{self.of.limited[at]} by {excess[row]:.2g} at {when:.4g} s"
+
+    def _change(self, stages: tuple[Stage, ...]) -> None:
+        fresh, self._stages = not self._stages, stages
+        rows, size = condensed(stages, planned=True)[2], len(self.of.inputs) * self.of.samples
+        low, high, self._soft = self.of.bounds(stages)
+        self._G, self._free = rows[:, :size], rows[:, size:]
+        length = np.linalg.norm(self._G, axis=1)
+        moved = length > 1e-12 * length.max()  # what no input moves within the horizon is let go
+        self._low, self._high = np.where(moved, low, -np.inf), np.where(moved, high, np.inf)
+        self._unit = 1.0 / np.where(moved, length, 1.0)
+        width = (self._high - self._low) * self._unit
+        width = width[np.isfinite(width)]
+        self._size = (float(np.median(width)) if len(width) else 1.0) or 1.0
+        self._rows = self._G * self._unit[:, None]
+        if fresh:
+            self._start()
+        else:
+            self._model.update(A=self._rows)
+
+    def _start(self) -> None:
+        try:
+            import daqp
+        except ImportError:
+            raise MissingPackageError(
+                "this needs the solver DAQP; install it with: pip install 'fflin[mpc]'"
+            ) from None
+        self._model: Any = daqp.Model()
+        self._model.settings = {"primal_tol": _EXACT * self._size, "iter_limit": _MOST}
+        self._model.settings = {"w_soft": _PRICE * self._size, "rho_soft": _YIELDS}
+        (m, size), kinds = self._rows.shape, (_SOFT * self._soft).astype(np.int32)
+        open_ = np.full(m, _OPEN)
+        self._model.setup(np.eye(size), np.zeros(size), self._rows, open_, -open_, kinds)
+
+    def _solved(self, free: Array) -> tuple[Array, int]:
+        low, high = (
+            np.clip((limit - free) * self._unit, -_OPEN, _OPEN) for limit in (self._low, self._high)
+        )
+        self._model.update(bupper=high, blower=low)
+        z, _, flag, _ = self._model.solve()
+        return z, int(flag)

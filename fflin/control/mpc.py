@@ -1,0 +1,268 @@
+"""Model predictive control: limits are foreseen, about a point or along a trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fflin.base.errors import InputError, listed
+from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
+from fflin.base.threads import in_one_thread
+from fflin.base.validation import Array, number, whole
+from fflin.control.differential_riccati import bounded_by, samples_back
+from fflin.control.gain import Gain
+from fflin.control.horizon import Horizon, Matrices, Receding, Stage
+from fflin.control.lqr import lqr
+from fflin.control.policies import Policy, StateFeedback
+from fflin.control.saturation import saturation
+from fflin.control.tracking import TrajectoryFeedback
+from fflin.control.tvlqr import asks_steady, held_stages, steady_regulator, tvlqr
+from fflin.control.weights import Weight, sampled_cost, weight
+from fflin.dynamics.state import StateMap
+from fflin.dynamics.state_rows import moving_error
+from fflin.linear.linear_trajectory import LinearTrajectory, along
+from fflin.linear.model import LinearModel
+from fflin.robot.fields import range_of
+from fflin.robot.limits import chosen_limits
+
+# Entries of the matrices that take inputs to states and limits, some 160 MB.
+_MOST = 20_000_000
+
+
+@in_one_thread
+def mpc(
+    lin: LinearModel | LinearTrajectory,
+    Q: Weight | None = None,
+    R: Weight | None = None,
+    *,
+    horizon: int = 20,
+    dt: float | None = None,
+    limits: float | str | Mapping[str, Any] | Sequence[Any] | None = "urdf",
+    Qf: Weight | str = "steady",
+    weights: str | None = None,
+) -> Mpc | TrajectoryMpc:
+    r"""Return the model predictive controller about a fixed point or along a trajectory.
+
+    At each sample it plans the inputs of the next N, within the limits and of the least
+
+    .. math:: e_N^T Q_f\,e_N + \int_0^{N h} e^T Q\,e + \delta u^T R\,\delta u\;dt,
+
+    and commands the first: where no limit is near the regulator of `lqr` or `tvlqr`. Inputs never
+    pass their limits. States and outputs keep within theirs at the samples, as the linear model
+    has it; where they cannot, they pass them by little, which the motion's `notes` say. Where no
+    plan is found, the regulator acts, cut at the limits, and a warning says so. The quadratic
+    program (docs/mpc.md) is solved by DAQP (``pip install 'fflin[mpc]'``), which begins with the
+    limits that were active a sample before.
+
+    Parameters
+    ----------
+    lin : LinearModel or LinearTrajectory
+        Continuous, or a model with ``dt`` that was made of one.
+    Q, R : see `lqr`, optional
+        Of the integral; by default the weights of `lqr` or `tvlqr`, by the rule `weights`.
+    horizon : int
+        Samples N that it looks ahead.
+    dt : float
+        Sampling time h [s].
+    limits : "urdf", float, mapping or list of them, optional
+        As in `simulate`, also of states and outputs: {name, group or pattern: magnitude, or (least,
+        largest)} of the values themselves; along a trajectory of q_b and r_b those of the error.
+        None for none but that thrusters do not pull.
+    Qf : "steady", or as Q
+        Weight on the error after N samples; of a trajectory at its end. "steady" is the
+        regulator's cost from there on.
+
+    Returns
+    -------
+    Mpc or TrajectoryMpc
+        A policy for `simulate` and `monte_carlo`. Its ``matrices(e)``, along a trajectory
+        ``matrices(e, t)``, are the program at an error of the state, for other solvers.
+
+    Raises
+    ------
+    InputError
+        If an argument has a wrong size or value, or the point is beyond the limits.
+    EquilibriumError, StabilizabilityError
+        See `lqr` and `tvlqr`.
+    MissingPackageError
+        If DAQP is not installed, when it is first needed.
+    UnknownNameError
+        If a name does not exist.
+
+    References
+    ----------
+    D. Arnström, A. Bemporad and D. Axehill, A dual active-set solver for embedded quadratic
+    programming using recursive LDL' updates, IEEE Trans. Automatic Control 67(8), 2022.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> policy = fflin.mpc(lin, dt=0.2, horizon=10, limits={"tau_b": 2.0, "tau_m": 1.0})
+    >>> q0 = fflin.configuration(robot, {"joint_2": 0.4})
+    >>> motion = fflin.simulate(robot, policy, q0=q0, duration=4.0, dt=0.05)
+    >>> bool(abs(motion.u[:, 6:]).max() <= 1.0), policy.matrices(motion.x[0]).H.shape
+    (True, (90, 90))
+    """
+    if not isinstance(lin, LinearModel | LinearTrajectory):
+        raise InputError(
+            f"lin is a {type(lin).__name__}, expected a LinearModel or a LinearTrajectory; "
+            "fflin.linearize and fflin.linearize_trajectory make them"
+        )
+    samples = whole("horizon", horizon, 1)
+    if dt is None and not lin.dt:
+        raise InputError("dt is missing; give the sampling time [s]")
+    dt = number("dt", lin.dt if dt is None else dt)
+    source = lin if isinstance(lin, LinearTrajectory) else lin.generator
+    if source is None or source.dt or dt != (lin.dt or dt):
+        raise InputError("lin is sampled otherwise; give the continuous one that it is of, and dt=")
+    names, at, rows = _limits(source, limits)
+    if samples**2 * (len(at) + len(lin.state_names)) * len(lin.input_names) > _MOST:
+        raise InputError(f"horizon is {samples}, expected fewer samples of so many limits")
+    designed: Any = _along if isinstance(source, LinearTrajectory) else _about
+    made, stages = designed(source, (Q, R, weights), Qf, samples, dt, names, rows)
+    acting = at[at < len(lin.input_names)]
+    return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, names))
+
+
+@dataclass(frozen=True, eq=False)
+class Mpc:
+    """The controller about a point: its sampled model and regulator, and what it looks ahead."""
+
+    lin: LinearModel
+    gain: Gain
+    horizon: Horizon
+
+    def matrices(self, e: ArrayLike | None = None) -> Matrices:
+        """Return the quadratic program at x - x0 = e (nx,), 0 by default."""
+        return self.horizon.matrices(e, 0.0)
+
+    def bind(self, robot: Any) -> Policy:
+        """Return policy(t, q, v) -> u for a robot that has the model's states and inputs."""
+        lin = self.lin
+        StateFeedback(lin, self.gain.K).bind(robot)  # refuses another robot
+        state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+        fed, near = [state.names.index(name) for name in lin.state_names], np.zeros(state.nx)
+        near[fed] = lin.x0
+
+        def at(_: float, q: Array, v: Array) -> tuple[Array, Array]:
+            return lin.u0, state.read(q, v, near=near)[fed] - lin.x0
+
+        return Receding(self.horizon, at)
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryMpc(TrajectoryFeedback):
+    """The controller along a trajectory and about its end, with the regulator's schedule."""
+
+    horizon: Horizon
+
+    def matrices(self, e: ArrayLike | None = None, t: float = 0.0) -> Matrices:
+        """Return the quadratic program of the sample at t [s] at the error e (nx,), or 0."""
+        return self.horizon.matrices(e, t)
+
+    def law(self) -> Callable[[float, Array], Array]:
+        """Return law(t, e) -> u of the error at a time of the run."""
+        plans = Receding(self.horizon)
+        return lambda t, e: self.commanded(t)[2] + plans.step(t, e)
+
+    def bind(self, robot: Any) -> Policy:
+        """Return policy(t, q, v) -> u for a robot that has the trajectory's states and inputs."""
+        super().bind(robot)  # refuses another robot
+        state = StateMap(robot, frame=self.frame)
+
+        def at(t: float, q: Array, v: Array) -> tuple[Array, Array]:
+            q_star, v_star, u_star = self.commanded(t)
+            return u_star, moving_error(state, q_star, v_star, q, v)
+
+        return Receding(self.horizon, at)
+
+
+def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., Any]]:
+    """Return what has limits, where it is among inputs, states and outputs, and a stage's rows."""
+    if (robot := of.robot if isinstance(of, LinearTrajectory) else of._robot) is None:
+        raise InputError("lin is from a file, which has no robot; linearise it again")
+    inputs, states, outputs = of.input_names, of.state_names, of.output_names
+    beside = [name for name in outputs if name not in states]
+    known = (*state_keys(robot.joint_names), *input_keys(of))
+    several, found = isinstance(limits, list | tuple), dict[str, Any]()
+    parts = list(limits) if several else [limits]
+    for k, part in enumerate(parts):
+        keys = [*part] if isinstance(part, Mapping) and beside else []
+        own = [x for x in keys if stands_for_any(x, beside) and not stands_for_any(x, known)]
+        ranges = by_name("output", {key: range_of(key, part[key]) for key in own}, beside)
+        found |= {beside[i]: limit for i, limit in ranges.items()}
+        parts[k] = {key: part[key] for key in keys if key not in own} if own else part
+    acting = chosen_limits(robot, parts if several else parts[0])[0]
+    found |= {name: acting[name] for name in states if name in acting}
+    of_inputs = np.array(saturation(robot, acting, robot.neutral(), 1.0, 1)[:2])
+    names = (*inputs, *states, *(name if name in beside else "" for name in outputs))
+    others = [found.get(name, (-np.inf, np.inf)) for name in names[len(inputs) :]]
+    low, high = np.hstack((of_inputs, np.array(others).T))
+    if (least := low > high).any():
+        raise InputError(f"limits leave nothing to {names[least.argmax()]}: the least is above")
+    at = np.flatnonzero(np.isfinite((low, high)).any(axis=0))
+
+    def rows(C: Array, D: Array, *target: Array) -> tuple[Array, ...]:
+        (nx, nu), there = (C.shape[1], D.shape[1]), np.concatenate(target)
+        of_e = np.vstack((np.zeros((nu, nx)), np.eye(nx), C))[at]
+        of_d = np.vstack((np.eye(nu), np.zeros((nx, nu)), D))[at]
+        return of_e, of_d, (low - there)[at], (high - there)[at]
+
+    return tuple(names[i] for i in at), at, rows
+
+
+def _about(
+    lin: LinearModel, cost: Any, Qf: Any, samples: int, dt: float, names: Any, rows: Any
+) -> tuple[Callable[[Horizon], Mpc], list[Stage]]:
+    """Return what makes the controller, and its samples."""
+    (Q, R, weights), sampled = cost, lin.discretize(dt)
+    given = (Q, R) if Q is None or R is None else sampled_cost(lin, dt, Q, R)
+    gain = lqr(sampled, *given, weights=weights)
+    StateFeedback(sampled, gain.K)  # refuses a moving reference
+    limited = rows(lin.C, lin.D, lin.u0, lin.x0, lin.y0)
+    far = np.maximum(limited[2], -limited[3]) > 1e-9
+    if beyond := [name for name, out in zip(names, far, strict=True) if out]:
+        raise InputError(f"the point is beyond the limits of {listed(beyond)}; give wider ones")
+    total = np.block([[gain.Q, gain.N], [gain.N.T, gain.R]])
+    end = gain.P if asks_steady(Qf) else weight("Qf", Qf, lin.state_names)
+    whole = np.hstack((sampled.A, sampled.B))
+    with bounded_by("a smaller Qf"):
+        K, P, _ = samples_back([(total, whole)] * samples, end)
+    stages = [_stage(total, whole, *each, limited) for each in zip(K, P[:-1], strict=True)]
+    return lambda ahead: Mpc(sampled, gain, ahead), stages[::-1]
+
+
+def _along(
+    traj: LinearTrajectory, cost: Any, Qf: Any, samples: int, dt: float, _: Any, rows: Any
+) -> tuple[Callable[[Horizon], TrajectoryMpc], list[Stage]]:
+    """Return what makes the controller, and its samples, those about the end last."""
+    schedule = tvlqr(traj, cost[0], cost[1], Qf, dt, weights=cost[2])
+    follows, state = TrajectoryFeedback(traj, schedule), StateMap(traj.robot, frame="local")
+    Q, R, models, end = schedule.Q, schedule.R, along(traj.resampled(dt)), follows.end
+
+    def about(of: Any, u: Array) -> Any:
+        # Of the base's place the error is limited.
+        x = np.concatenate((np.zeros(6), state.joint_positions(of.q), state.velocities(of.v)))
+        return rows(of.C, of.D, u, x, of.y0)
+
+    stages = []
+    for k, sample in enumerate(held_stages(traj, dt, Q, R)):
+        limited = about(models[k + 1], follows.commanded(k * dt)[2])
+        stages.append(_stage(*sample, schedule.K[k], schedule.P[k + 1], limited))
+    held, sampled = sampled_cost(end, dt, Q, R), end.discretize(dt)
+    P, K = steady_regulator(end, Q, R, dt)
+    total = np.block([[held.Q, held.N], [held.N.T, held.R]])
+    last = _stage(total, np.hstack((sampled.A, sampled.B)), K, P, about(end, end.u0))
+    return lambda ahead: TrajectoryMpc(traj, schedule, ahead), stages + [last] * samples
+
+
+def _stage(total: Array, whole: Array, K: Array, P: Array, limited: tuple[Array, ...]) -> Stage:
+    """Return a sample of that cost, transition and gain, where P is the cost from its end on."""
+    A, B = np.split(whole, [len(P)], axis=1)
+    L = np.linalg.inv(np.linalg.cholesky(total[len(P) :, len(P) :] + B.T @ P @ B)).T
+    return Stage(A, B, K, L, *limited)

@@ -1,0 +1,286 @@
+"""Linear models in the coordinates of other tools, and back: (15.1) to (15.6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import pinocchio as pin
+
+from fflin.base.errors import InputError
+from fflin.base.record import Design
+from fflin.base.validation import Array, as_double, instance, number, vector
+from fflin.dynamics.state import Frame, StateMap
+from fflin.linear.fit import require_fit
+from fflin.linear.linearization import linearize
+from fflin.linear.model import LinearModel
+from fflin.linear.sampling import held_exponential
+from fflin.linear.tool_coordinates import Slopes, ToolCoordinates, tool_coordinates
+from fflin.robot.robot import Robot
+
+_ROUNDING = 1e-12  # of the largest entry, by which another route to a matrix may miss a zero
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ToolModel(Design):
+    r"""A linear model in another tool's coordinates, ``dx/dt = f0 + A (x - x0) + B (u - u0)``.
+
+    x is q and v of the tool. Where its q is a manifold (mujoco, pinocchio, spart) the displacement
+    from the point, in the order of v, stands for q.
+
+    Attributes
+    ----------
+    tool, robot : str
+    A, B, C, D, f0, x0, u0, y0, dt, state_names, ..., output_units
+        As of `LinearModel`.
+    T : ndarray (nx, 12 + 2n)
+        From deviations of the state of the `LinearModel` to those of x.
+    T_left : ndarray (12 + 2n, nx)
+        Its inverse; a left inverse where x has all four of a quaternion or joints that mimic.
+    T_u : ndarray (nu, nu)
+        Likewise of the input: with a gain K of the `LinearModel` ``T_u K T_left`` is the tool's.
+    q, v : ndarray
+        The point as the tool has it.
+    reference : str
+        "fixed", or "moving" where x is the deviation from what moves through the point.
+
+    Examples
+    --------
+    >>> lin = fflin.linearize(fflin.load("planar_detumble"))
+    >>> spart = lin.to("spart")
+    >>> K = spart.T_u @ fflin.lqr(lin).K @ spart.T_left  # the gain in its coordinates
+    >>> K.shape, spart.state_names[:3], spart.reference
+    ((9, 18), ('theta.x', 'theta.y', 'theta.z'), 'fixed')
+    """
+
+    VECTORS: ClassVar = ("f0", "x0", "u0", "y0", "q", "v")
+
+    tool: str
+    robot: str
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    f0: Array
+    x0: Array
+    u0: Array
+    y0: Array
+    dt: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+    T: Array
+    T_left: Array
+    T_u: Array
+    q: Array
+    v: Array
+    reference: str
+
+    def __repr__(self) -> str:
+        return f"ToolModel('{self.robot}', '{self.tool}', nx={len(self.A)}, dt={self.dt:g})"
+
+
+def transform(robot: Robot, lin: LinearModel, tool: str, *, dt: float | None = None) -> ToolModel:
+    r"""Return a linear model in the coordinates, order and axes of another tool.
+
+    Deviations are x' = T x and u' = T_u u, and at any point, in motion too,
+
+    .. math:: A' = (T A + \dot T)\,T^+ + \ldots, \qquad B' = T B\,T_u^{-1}
+
+    with what comes of inputs held in other axes and of the length of a quaternion: (15.1) to
+    (15.6) of docs/derivation.md. docs/tools.md has the conventions side by side.
+
+    Parameters
+    ----------
+    robot : Robot
+    lin : LinearModel
+        Of this robot, about any point. One that is sampled is sampled in the tool's coordinates.
+    tool : {"drake", "mujoco", "pinocchio", "spart", "euler", "euler_rates"}
+    dt : float, optional
+        Of "mujoco": its time step [s], for the pair of ``mjd_transitionFD`` with the integrator
+        Euler (of a robot with dampers: with ``eulerdamp`` disabled).
+
+    Returns
+    -------
+    ToolModel
+
+    Raises
+    ------
+    InputError
+        If the model is not of this robot or is sampled and from a file, or `dt` does not suit.
+    UnknownNameError
+        If there is no such tool.
+    ChartError
+        If the pitch of Euler's angles is 90 deg.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> drake = fflin.transform(robot, lin, "drake")  # or lin.to("drake")
+    >>> drake.A.shape, drake.state_names[:4]
+    ((19, 19), ('quat.w', 'quat.x', 'quat.y', 'quat.z'))
+    >>> bool(abs(drake.T_left @ drake.A @ drake.T - lin.A).max() < 1e-12)
+    True
+    """
+    instance("lin", lin, LinearModel, "a fflin.LinearModel").require_unchanged()
+    require_fit(lin, robot, StateMap(robot, frame=lin.frame))
+    sampled, whole, step = lin.dt, lin.generator, _step(tool, dt)
+    if whole is None or (step and sampled):
+        raise InputError("the model is sampled; transform the continuous one that it was made of")
+    lin, (kind, own, to, rates) = whole, _bridge(robot, whole, tool)
+    A, B = carried(own, to, lin.A, lin.B)
+    (q, v), states = kind.vectors(lin.q, lin.v), kind.states()
+    rate: Array = to.P @ rates
+    x0 = np.concatenate((np.zeros(len(v)) if kind.tangent else q, v))
+    fields: dict[str, Any] = {"C": np.eye(len(A)), "D": np.zeros(B.shape), "y0": x0}
+    outputs, about = states, "moving" if lin.moving else "fixed"
+    if lin.output_names != lin.state_names:
+        D = lin.D @ np.linalg.inv(own.V)
+        fields = {"C": (lin.C @ own.P + D @ (to.H - own.H)) @ to.left, "D": D @ to.V, "y0": lin.y0}
+        outputs = dict(zip(lin.output_names, lin.output_units, strict=True))
+    if step:
+        A, B, rate = _stepped(A, B, rate, step)
+    f0: Array = rate * (not lin.moving)
+    if sampled:
+        A, held = held_exponential(A, np.column_stack((B, f0)), sampled)
+        B, f0 = held[:, :-1], held[:, -1]
+    T_u = np.linalg.solve(to.V, own.V)
+    for signal, units in (("state", states), ("input", kind.inputs), ("output", outputs)):
+        fields |= {f"{signal}_names": tuple(units), f"{signal}_units": tuple(units.values())}
+    fields |= {"q": q, "v": v, "T": to.P @ own.left, "T_left": own.P @ to.left, "T_u": T_u}
+    fields |= {"A": A, "B": B, "f0": f0, "x0": x0, "u0": T_u @ lin.u0, "dt": step or sampled}
+    return ToolModel(tool=tool, robot=lin.robot, reference=about, verified=lin.verified, **fields)
+
+
+def from_tool(
+    robot: Robot,
+    tool: str,
+    q: Array,
+    v: Array | None = None,
+    u: Array | None = None,
+    *,
+    A: Array | None = None,
+    B: Array | None = None,
+    dt: float | None = None,
+    frame: Frame | None = None,
+    reference: pin.SE3 | None = None,
+    moving: bool = False,
+) -> LinearModel:
+    """Return the linear model at a point of another tool, of that tool's matrices.
+
+    Parameters
+    ----------
+    robot : Robot
+    tool, dt
+        See `transform`; dt is the step that A and B are of.
+    q, v : array_like
+        Of the tool; at rest by default. Of "spart" q is R0 column by column, r0 and qm, and v is
+        u0 and um.
+    u : array_like (nu,), optional
+        Over the robot's inputs in the tool's order and axes; zero by default.
+    A, B : array_like, optional
+        Of the tool at that point, see `ToolModel`; fflin's own by default.
+    frame, reference, moving
+        Of the model that is returned, see `linearize`.
+
+    Returns
+    -------
+    LinearModel
+        Its ``q``, ``v`` and ``u0`` are the point in fflin's order; `check` and ``certificate`` tell
+        how far A and B hold.
+
+    Raises
+    ------
+    InputError
+        If a size is wrong, an entry is not finite, or an attitude is none.
+    UnknownNameError
+        If there is no such tool.
+    ChartError
+        If the base is turned by 180 deg from the reference, or as `transform`.
+
+    Examples
+    --------
+    >>> robot = fflin.load("planar_detumble")
+    >>> lin = fflin.linearize(robot)
+    >>> mujoco = lin.to("mujoco")
+    >>> back = fflin.from_tool(robot, "mujoco", mujoco.q, mujoco.v, A=mujoco.A, B=mujoco.B)
+    >>> bool(abs(back.B - lin.B).max() < 1e-13)
+    True
+    """
+    q, v = tool_coordinates(robot, tool).to_pinocchio(q, v)
+    place: Any = {"frame": frame, "reference": reference, "moving": moving}
+    lin, step = linearize(robot, q, v, **place), _step(tool, dt)
+    if u is not None:
+        u = vector("u", u, len(lin.u0), "the robot's inputs, as the tool has them")
+        _, own, to, _ = _bridge(robot, lin, tool)
+        lin = linearize(robot, q, v, np.linalg.solve(own.V, to.V @ u), **place)
+    if A is None and B is None:
+        return lin
+    _, own, to, rates = _bridge(robot, lin, tool)
+    ours = carried(own, to, lin.A, lin.B)
+    ours = _stepped(*ours, to.P @ rates, step)[:2] if step else ours
+    changes = [_change(*each) for each in zip("AB", (A, B), ours, strict=True)]
+    if step:  # the rows of positions follow from those of rates
+        nv = len(ours[0]) // 2
+        changes = [np.vstack((0.0 * each[:nv], each[nv:] / step)) for each in changes]
+    own, to = (each._replace(rate=0.0 * each.rate, extra=0.0 * each.extra) for each in (own, to))
+    A, B = (
+        np.where((old == 0.0) & (np.abs(new) < _ROUNDING * np.abs(old).max()), 0.0, old + new)
+        for old, new in zip((lin.A, lin.B), carried(to, own, *changes), strict=True)
+    )
+    return replace(lin, A=A, B=B)
+
+
+def _bridge(robot: Robot, lin: LinearModel, tool: str) -> tuple[Any, Slopes, Slopes, Array]:
+    """Return a tool's coordinates, the slopes of a model's own and of these, and the rate of y."""
+    state = StateMap(robot, reference=lin.reference, frame=lin.frame)
+    if lin.state_names != state.names:
+        raise InputError("lin has not all states of the robot; take the whole model of it")
+    own = ToolCoordinates(state, moving=lin.moving)
+    kind = tool_coordinates(robot, tool, moving=lin.moving)
+    nu, rates = state.velocities(lin.v), lin.drift
+    point = lin.q, nu, own.actuation.in_base_axes(state.chart(lin.q), lin.u0)
+    if rates is None:  # f0 is P times the rate of y
+        rates = own.slopes(*point, 0.0 * nu).left @ lin.f0
+    rates = rates[len(nu) :]
+    return kind, own.slopes(*point, rates), kind.slopes(*point, rates), np.append(nu, rates)
+
+
+def carried(source: Slopes, to: Slopes, A: Array, B: Array) -> tuple[Array, Array]:
+    """Return A and B in other coordinates (15.3), (15.4)."""
+    B = source.left @ B @ np.linalg.inv(source.V)
+    A = source.left @ (A @ source.P - source.rate) + B @ (to.H - source.H)
+    return (to.P @ A + to.rate) @ to.left + to.extra, to.P @ B @ to.V
+
+
+def _step(tool: str, dt: Any) -> float:
+    """Return a time step, 0 where there is none."""
+    h = 0.0 if dt is None else number("dt", dt)
+    if dt is not None and (not 0.0 < h < 1e3 or str(tool) != "mujoco"):
+        raise InputError(f"dt is {h:g} s for {tool}, expected a step of mujoco")
+    return h
+
+
+def _stepped(A: Array, B: Array, rate: Array, h: float) -> tuple[Array, Array, Array]:
+    """Return A, B and f0 of a step of semi-implicit Euler (15.6); of the base linear, angular."""
+    v, a = np.split(rate, 2)
+    nv, moved = len(v), h * (v + h * a)
+    K, G = np.eye(nv), h * np.eye(nv)
+    K[3:6, 3:6], G[3:6, 3:6] = pin.exp3(-moved[3:6]), h * pin.Jexp3(moved[3:6])
+    A, B = h * A[nv:] + np.eye(nv, 2 * nv, nv), h * B[nv:]
+    A, B = np.vstack((G @ A, A)), np.vstack((G @ B, B))
+    A[:nv, :nv] += K
+    return A, B, np.concatenate((moved, h * a))
+
+
+def _change(name: str, given: Any, expected: Array) -> Array:
+    """Return by how much a matrix of the caller is more than expected."""
+    array = expected if given is None else as_double(name, given)
+    if array.shape != expected.shape or not np.isfinite(array).all():
+        raise InputError(f"{name} has shape {array.shape}, expected finite {expected.shape}")
+    return np.asarray(array - expected)

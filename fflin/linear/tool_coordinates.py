@@ -1,0 +1,267 @@
+"""How tools write a free flyer, said in a line of `TOOLS`, and the slopes of such coordinates."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+import fflin.base.rotation as turning
+from fflin.base.errors import ChartError, InputError, unknown
+from fflin.base.rotation import quaternion_product, skew
+from fflin.base.validation import NORM_TOLERANCE, Array, placement, vector
+from fflin.dynamics.actuation import Actuation
+from fflin.dynamics.chart import SMALLEST_Q0
+from fflin.dynamics.names import ANGULAR, IN_REFERENCE_AXES, LINEAR, refuse_orbit
+from fflin.dynamics.state import StateMap
+from fflin.robot.frames import ROOT
+from fflin.robot.link_masses import pieces_of
+from fflin.robot.robot import Robot
+
+# Along a motion by so little that its square is nothing: derivatives without any difference.
+_STEP = 1e-20j
+
+_NAMES = {"wxyz": ["quat.w", "quat.x", "quat.y", "quat.z"], "euler": ["roll", "pitch", "yaw"]}
+_UNITS = {"quat": "1", "p": "m", "v": "m/s"}  # of the others rad and rad/s
+
+
+class Convention(NamedTuple):
+    """How a tool writes a free flyer."""
+
+    attitude: str  # in x: "wxyz", "q_b", "euler", or a tangent: "turn", or "pose" with the position
+    stored: str  # in q
+    angular_first: bool
+    axes: tuple[bool, bool]  # whether (omega, v), and (torque, force), stand in the world's axes
+    at_centre: bool = False  # of the root link's own mass, in the axes that its inertia has
+    rates: bool = False  # of the angles in place of omega
+
+
+TOOLS = {
+    "drake": Convention("wxyz", "wxyz", True, IN_REFERENCE_AXES["world"]),
+    "mujoco": Convention("turn", "wxyz", False, IN_REFERENCE_AXES["hybrid"]),
+    "pinocchio": Convention("pose", "xyzw", False, IN_REFERENCE_AXES["local"]),
+    "spart": Convention("turn", "matrix", True, IN_REFERENCE_AXES["hybrid"], at_centre=True),
+    "euler": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"]),
+    "euler_rates": Convention("euler", "euler", True, IN_REFERENCE_AXES["hybrid"], rates=True),
+}
+
+
+class Slopes(NamedTuple):
+    """Slopes of coordinates x' and inputs u' at a point, over y (15.1) and u in base axes."""
+
+    P: Array  # of x' over y (15.2)
+    rate: Array  # of P along the motion
+    left: Array  # left inverse of P
+    V: Array  # of u over u'
+    H: Array  # of u over y, u' held (15.4)
+    extra: Array  # of dx'/dt along what y has not: the length of a quaternion (15.5)
+
+
+class ToolCoordinates:
+    """Coordinates relative to the reference of a `StateMap`: a tool's, or a linear model's own."""
+
+    def __init__(self, state: StateMap, tool: str = "", *, moving: bool = False) -> None:
+        robot, own = state.robot, not tool
+        kind = TOOLS[tool] if tool else Convention("q_b", "xyzw", True, state.axes)
+        self.state, self.convention, self._moving = state, kind, moving
+        self.tangent = kind.attitude in ("turn", "pose")
+        self._roll = 0 if kind.angular_first else 3  # from angular, linear to the tool's order
+        self._world = np.repeat(kind.axes, 3)[:, None]
+        self._base = _centre(robot) if kind.at_centre else pin.SE3.Identity()
+        swap = np.roll(np.arange(6), 3)  # of Pinocchio's linear, angular
+        # Displacements and twists of the tool's base are X y and X nu, wrenches on it X^-T w.
+        self._X: Array = self._base.toActionMatrixInverse()[np.ix_(swap, swap)]
+        followers = [] if own else [follower.joint for follower in robot.followers]
+        self.joints = sorted((*robot.joints, *followers), key=lambda joint: joint.idx_v)
+        if kind.stored in ("wxyz", "matrix") and robot.file_joints:
+            self.joints.sort(key=lambda joint: _way(robot, joint.name))
+        self._idx_v = [joint.idx_v for joint in self.joints]
+        self.actuation = acting = Actuation(state)
+        self._wrench = wrench = acting.fixed[:6]  # of the inputs
+        if wrench[LINEAR].any() and not wrench[ANGULAR].any() and self._X[LINEAR, ANGULAR].any():
+            raise InputError(
+                "spart's force acts at the root link's centre of mass, and a BaseForce alone takes "
+                "no moment about the link's origin; give the robot a BaseTorque too"
+            )
+        # Which of the robot's inputs stands where among the tool's.
+        self._inputs, at = np.arange(len(acting.names)), np.flatnonzero(wrench.any(axis=0))
+        if not own:
+            self._inputs[at] = at[np.argsort((wrench[:, at].argmax(axis=0) + self._roll) % 6)]
+            motors = acting.groups.get("tau_m", at[:0])
+            places = [f"tau_m.{joint.name}" for joint in self.joints]
+            self._inputs[motors] = sorted(motors, key=lambda i: places.index(acting.names[i]))
+        self.inputs = {acting.names[i]: acting.units[i] for i in self._inputs}
+
+    def states(self) -> dict[str, str]:
+        """Return {name: unit} of x'."""
+        kind, found = self.convention, dict[str, str]()
+        turn = _NAMES.get(kind.attitude, ["theta.x", "theta.y", "theta.z"])
+        omega = [f"{x}_rate" for x in turn] if kind.rates else [f"omega.{x}" for x in "xyz"]
+        pose, twist = [*turn, "p.x", "p.y", "p.z"], [*omega, "v.x", "v.y", "v.z"]
+        for names, joint_name, angle in ((pose, "q_m", "rad"), (twist, "qdot_m", "rad/s")):
+            base = np.roll(names, self._roll).tolist()
+            found |= {name: _UNITS.get(name.partition(".")[0], angle) for name in base}
+            found |= {f"{joint_name}.{j.name}": j.unit + angle[3:] for j in self.joints}
+        return found
+
+    def vectors(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return q and v as the tool has them, of valid ones of Pinocchio's."""
+        if (stored := self.convention.stored) == "xyzw":
+            return q, v
+        attitude, R = self._attitude(q)
+        at = pin.SE3(self.state.rotation(q), self.state.positions(q)) * self._base
+        attitude = np.roll(attitude, 1) if stored == "wxyz" else R.T.ravel()  # column by column
+        pose = np.concatenate((_angles(R) if stored == "euler" else attitude, at.translation))
+        twist = self._turn(R, rates=self.convention.rates) @ self._X @ self.state.velocities(v)[:6]
+        joints = [joint.value(q) for joint in self.joints]
+        parts = (pose, joints), (twist, v[self._idx_v])
+        q, v = (np.concatenate((np.roll(base, self._roll), rest)) for base, rest in parts)
+        return q, v
+
+    def to_pinocchio(self, q: Any, v: Any) -> tuple[Array, Array]:
+        """Return Pinocchio's q and v of those of the tool; v None is rest."""
+        robot, state, size = self.state.robot, self.state, 6 + len(self.joints)
+        v = np.zeros(size) if v is None else vector("v", v, size, "the tool's: base, then joints")
+        if self.convention.stored == "xyzw":
+            return robot.checked_configuration(q), robot.checked_velocity(v)
+        k = 3 + {"wxyz": 4, "matrix": 9}.get(self.convention.stored, 3)
+        q = vector("q", q, k - 6 + size, "the tool's: base, then joints")
+        pose, twist = np.roll(q[:k], -self._roll), np.roll(v[:6], -self._roll)
+        R, at = self._rotation(pose[:-3]), pin.neutral(robot.model)
+        base = pin.SE3(R, pose[-3:]) * self._base.inverse()
+        at[:7] = pin.SE3ToXYZQUAT(state.origin.actInv(base))
+        for joint, value in zip(self.joints, q[k:].tolist(), strict=True):
+            joint.place(at, value)
+        nu = np.linalg.solve(self._turn(R, rates=self.convention.rates) @ self._X, twist)
+        speed = state.spread(np.concatenate((nu, np.zeros(robot.n))))
+        speed[self._idx_v] = v[6:]
+        return robot.checked_configuration(at), robot.checked_velocity(speed)
+
+    def _rotation(self, attitude: Array) -> Array:
+        """Return the rotation (3, 3) of an attitude as it is stored."""
+        if self.convention.stored == "euler":
+            return pin.rpy.rpyToMatrix(*attitude)
+        if self.convention.stored == "matrix":
+            R0 = pin.SE3(attitude.reshape(3, 3).T, np.zeros(3))
+            return placement("R0, q[:9] by columns,", R0).rotation
+        length = float(np.linalg.norm(attitude))
+        if abs(length - 1.0) > NORM_TOLERANCE:
+            raise InputError(f"the quaternion w, x, y, z has length {length:.9g}, expected 1")
+        return turning.rotation_matrix(np.roll(attitude, -1) / length)
+
+    def _attitude(self, q: Array) -> tuple[Array, Array]:
+        """Return the quaternion x, y, z, w and the rotation that x' is about."""
+        quaternion = quaternion_product(self.state.origin_quaternion, q[3:7])
+        quaternion = quaternion_product(quaternion, pin.SE3ToXYZQUAT(self._base)[3:])
+        if self.convention.attitude == "q_b":
+            quaternion *= -1.0 if quaternion[3] < 0.0 else 1.0
+            quaternion = np.array((0.0, 0.0, 0.0, 1.0)) if self._moving else quaternion
+        return quaternion, turning.rotation_matrix(quaternion)
+
+    def _turn(self, R: Array, *, rates: bool = False) -> Array:
+        """Return the matrix (6, 6) that takes a twist or wrench in base axes to the tool's."""
+        turn = np.where(self._world, np.kron(np.eye(2), R), np.eye(6))
+        if rates:
+            turn[ANGULAR, ANGULAR] = _of_angles(_angles(R))[0]
+        return turn
+
+    def _held(self, parts: Array) -> Array:
+        """Return the slopes (6, 3) over a turn of what is held in the world, in base axes (4.4)."""
+        return self._world * np.vstack((skew(parts[ANGULAR]), skew(parts[LINEAR])))
+
+    def slopes(self, q: Array, nu: Array, u: Array, rates: Array) -> Slopes:
+        """Return the slopes at a point; nu (6 + n,), u (nu,), rates of nu (6 + n,) in base axes."""
+        n, nv, X, kind = self.state.robot.n, 6 + len(self.joints), self._X, self.convention
+        still, R_now = self._attitude(q)
+        # A step along the motion; errors and tangents go along with a reference that moves.
+        twist: Any = X @ nu[:6] + _STEP * (X @ rates[:6])
+        went = (not self._moving) * _STEP * twist.real
+        turns = 0.5 * turning.product_matrix(still) @ np.append(twist.real[ANGULAR], 0.0)
+        quaternion = still + (not (self._moving and kind.attitude == "q_b")) * _STEP * turns
+        R, w, vec = turning.rotation_matrix(quaternion), quaternion[3], quaternion[:3]
+        by_turn = -self._turn(R) @ self._held(twist)
+        attitude: Any = np.eye(3) + 0.5 * skew(went[ANGULAR])
+        if kind.attitude == "euler":
+            attitude, bends = _of_angles(_angles(R), twist[ANGULAR])
+            by_turn[ANGULAR] = kind.rates * bends @ attitude
+        elif not self.tangent:
+            attitude = 0.5 * (w * np.eye(3) + skew(vec))
+            if kind.attitude == "wxyz":
+                attitude = np.vstack((-0.5 * vec, attitude))
+        k = len(attitude) + 3
+        base = np.zeros((k + 6, 12), dtype=complex)  # over (theta, p), (omega, v)
+        base[: k - 3, :3], base[k - 3 : k, 3:6] = attitude, R
+        if kind.attitude == "pose":
+            base[k - 3 : k, :6] = np.hstack((0.5 * skew(went[LINEAR]), attitude))
+        base[k:, :3], base[k:, 6:] = by_turn, self._turn(R, rates=kind.rates)
+        base[:k], base[k:] = (np.roll(rows, self._roll, axis=0) for rows in (base[:k], base[k:]))
+        first = k + nv - 6
+        P = np.zeros((first + nv, 12 + 2 * n), dtype=complex)
+        rows, columns = [*range(k), *range(first, first + 6)], [*range(6), *range(6 + n, 12 + n)]
+        P[np.ix_(rows, columns)] = base @ np.kron(np.eye(2), X)
+        of_joints = self.state.spread(np.eye(6 + n))[6:, self._idx_v].T
+        P[k:first, 6 : 6 + n] = P[first + 6 :, 12 + n :] = of_joints
+        extra = np.zeros((len(P), len(P)))
+        if k == 7:
+            extra[:4, :4] = np.outer(np.roll(turns, 1), np.roll(still, 1))
+        # By blocks, so that zeros stay zeros.
+        poses, twists = _left(P.real[:first, : 6 + n]), _left(P.real[first:, 6 + n :])
+        below = -twists @ P.real[first:, : 6 + n] @ poses
+        left = np.block([[poses, np.zeros((6 + n, nv))], [below, twists]])
+        pick, H = self._wrench, np.zeros((len(u), 12 + 2 * n))
+        V = np.eye(len(u)) + pick.T @ (X.T @ self._turn(R_now).T - np.eye(6)) @ pick
+        H[:, :3] = pick.T @ X.T @ self._held(np.linalg.solve(X.T, pick @ u)) @ X[ANGULAR, ANGULAR]
+        return Slopes(P.real, P.imag / _STEP.imag, left, V[:, self._inputs], H, extra)
+
+
+def tool_coordinates(robot: Robot, tool: str, *, moving: bool = False) -> ToolCoordinates:
+    """Return those of a tool."""
+    if not isinstance(tool, str) or tool not in TOOLS:
+        raise unknown("tool", str(tool), TOOLS)
+    if tool[:5] != "euler":
+        refuse_orbit(robot, f"the coordinates of {tool}")
+    return ToolCoordinates(StateMap(robot), tool, moving=moving)
+
+
+def _centre(robot: Robot) -> pin.SE3:
+    """Return where the root link's own mass is, in the axes that its inertia is given in."""
+    frames = (f for f in robot.model.frames.tolist() if f.type == pin.FrameType.BODY)
+    name = next((frame.name for frame in frames if frame.parentJoint == ROOT), "")
+    if piece := pieces_of(robot)[0].get(name):
+        return piece.placement
+    return pin.SE3(np.eye(3), np.array(robot.model.inertias[ROOT].lever))
+
+
+def _way(robot: Robot, name: str) -> list[int]:
+    """Return where the joints from the root to one stand in the file; what has none comes last."""
+    frames, way, order = robot.model.frames, list[int](), robot.file_joints
+    at = robot.model.getFrameId(name, pin.FrameType.JOINT)
+    while at:
+        name, at = frames[at].name, frames[at].parentFrame
+        way.insert(0, order.index(name) if name in order else len(order))
+    return way
+
+
+def _left(P: Array) -> Array:
+    return np.asarray(np.linalg.inv(P) if len(P) == len(P.T) else np.linalg.solve(P.T @ P, P.T))
+
+
+def _angles(R: Array) -> Array:
+    """Return roll, pitch and yaw of R = R_z(yaw) R_y(pitch) R_x(roll), along a complex step too."""
+    if np.hypot(R[0, 0].real, R[1, 0].real) < SMALLEST_Q0:
+        raise ChartError("the pitch is 90 deg, where roll and yaw of Euler's angles turn alike")
+    angles: Array = pin.rpy.matrixToRpy(R.real)
+    if np.iscomplexobj(R):
+        W = R.real.T @ R.imag
+        angles = angles + 1j * _of_angles(angles)[0] @ (W[2, 1], W[0, 2], W[1, 0])
+    return angles
+
+
+def _of_angles(angles: Array, omega: Any = (0.0, 0.0, 0.0)) -> tuple[Array, Array]:
+    """Return G, the rates of the angles being G omega, and the slope of G omega over them."""
+    (s, _, _), (c, cp, _), tp = np.sin(angles), np.cos(angles), np.tan(angles[1])
+    G = np.array([[1.0, s * tp, c * tp], [0.0, c, -s], [0.0, s / cp, c / cp]])
+    _, pitch, yaw = G @ omega
+    bends = [[tp * pitch, yaw / cp, 0.0], [-cp * yaw, 0.0, 0.0], [pitch / cp, tp * yaw, 0.0]]
+    return G, np.array(bends)

@@ -1,0 +1,28 @@
+"""Every public name has an example, which runs as it stands in its docstring."""
+
+import doctest
+import inspect
+
+import numpy as np
+import pytest
+
+import fflin
+
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+
+
+@pytest.mark.parametrize("name", fflin.__all__)
+def test_the_example_of_a_public_name_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    text = inspect.getdoc(getattr(fflin, name))
+    assert "\nExamples\n--------\n" in text, f"{name} has no section Examples"
+    example = doctest.DocTestParser().get_doctest(
+        text, {"fflin": fflin, "np": np}, name, inspect.getsourcefile(getattr(fflin, name)), 0
+    )
+    # Nothing may be skipped, and an example that begins nowhere shows nothing.
+    assert example.examples and not any("doctest:" in each.source for each in example.examples)
+    assert any("fflin" in each.source for each in example.examples)
+    said = []
+    failed, _ = doctest.DocTestRunner(optionflags=FLAGS).run(example, out=said.append)
+    assert not failed, "".join(said)

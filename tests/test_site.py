@@ -1,0 +1,124 @@
+"""The site of the documents is whole and needs no network."""
+
+import os
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+import fflin
+from tests.support.browser import chromium
+from tests.support.patience import PATIENCE
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The folder that FFLIN_SITE says was built already, or one that is built here."""
+    if built := os.environ.get("FFLIN_SITE"):
+        return Path(built).resolve()
+    for package in ("sphinx", "myst_nb", "numpydoc", "furo"):
+        pytest.importorskip(package, reason="the extra docs is not installed")
+    folder = tmp_path_factory.mktemp("site") / "site"
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "docs", folder]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+class Page(HTMLParser):
+    """What a page loads, where its links lead, and the places in it that links may name."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.loads, self.links, self.places = [], [], set()
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        self.places.update(given[key] for key in ("id", "name") if given.get(key))
+        led = tag == "a" or given.get("rel") in ("next", "prev", "search", "index")
+        if led and given.get("href"):
+            self.links.append(given["href"])
+        elif tag in ("script", "img", "iframe", "link", "source", "video", "object", "embed"):
+            self.loads += [given[key] for key in ("src", "href", "data") if given.get(key)]
+
+
+@pytest.fixture(scope="module")
+def pages(site):
+    own = [path for path in site.rglob("*.html") if "_static" not in path.parts]
+    return {path: Page(path) for path in own}
+
+
+def test_nothing_is_loaded_from_elsewhere_and_all_that_is_loaded_is_there(site, pages):
+    assert len(pages) > len(fflin.__all__)
+    for path, page in pages.items():
+        for address in page.loads:
+            parts = urlsplit(address)
+            if parts.scheme != "data":
+                assert not parts.scheme and not parts.netloc, f"{path.name} loads {address}"
+                assert (path.parent / unquote(parts.path)).exists(), f"{path.name}: {address}"
+    for path in site.rglob("*.css"):
+        text = path.read_text(encoding="utf-8")
+        assert not re.search(r"url\(\s*['\"]?(https?:)?//|@import[^;]*//", text), path
+
+
+def test_links_lead_somewhere(site, pages):
+    for path, page in pages.items():
+        for address in page.links:
+            parts = urlsplit(address)
+            if parts.scheme or parts.netloc:
+                continue
+            goal = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            assert goal.is_file(), f"{path.name} links to {address}"
+            if parts.fragment and goal in pages:
+                assert unquote(parts.fragment) in pages[goal].places, f"{path.name}: {address}"
+
+
+def test_the_site_is_small_and_has_a_page_for_every_public_name(site):
+    size = sum(
+        path.stat().st_size
+        for path in site.rglob("*")
+        if path.is_file() and ".doctrees" not in path.parts
+    )
+    assert size < 30e6
+    for name in fflin.__all__:
+        text = (site / "reference" / "names" / f"fflin.{name}.html").read_text(encoding="utf-8")
+        assert f'id="fflin.{name}"' in text and "Examples" in text
+
+
+def test_formulas_search_and_pages_that_play_work_from_disk(site):
+    with chromium() as browser:
+
+        def opened(page, ready):
+            tab = browser.new_page()
+            tab.set_default_timeout(1e3 * PATIENCE)
+            tab.on("request", lambda request: asked.append(request.url))
+            tab.on("pageerror", lambda error: said.append(str(error)))
+            tab.goto(
+                (site / page.partition("?")[0]).as_uri() + page[page.find("?") :] * ("?" in page)
+            )
+            tab.wait_for_function(ready)
+            return tab
+
+        asked, said = [], []
+        tab = opened(
+            "derivation.html", "document.querySelectorAll('mjx-container svg').length > 100"
+        )
+        assert not tab.query_selector_all("[data-mml-node=merror]")
+        tab = opened(
+            "search.html?q=momentum", "document.querySelectorAll('ul.search li').length > 5"
+        )
+        assert "momentum_reduction" in tab.inner_text("ul.search")
+        tab = opened("tutorials/first_loop.html", "document.querySelector('iframe.fflin-page')")
+        tab.query_selector("iframe.fflin-page").scroll_into_view_if_needed()
+        frame = tab.query_selector("iframe.fflin-page").content_frame()
+        frame.wait_for_function("window.fflin && fflin.ready")
+    # The search shows excerpts as well where a server is, which a folder on the disk has not.
+    assert set(said) <= {"Failed to fetch"}
+    assert all(url.startswith(("file:", "data:", "blob:", "about:")) for url in asked), asked

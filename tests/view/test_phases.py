@@ -1,0 +1,131 @@
+"""The page of a motion of several phases: what is caught flies to the grasp, and is held."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import fflin
+from fflin.robot.frames import ROOT
+from fflin.view.phases import _flight
+from tests.support.browser import Watched, chromium
+from tests.support.phases import DEBRIS, TWIST, phases
+
+# Positions travel as 32-bit floats, of metres.
+EXACT = 1e-5
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as browser:
+        yield browser
+
+
+def frames(robot, q):
+    data = robot.create_data()
+    pin.framesForwardKinematics(robot.model, data, q)
+    names = [frame.name for frame in robot.model.frames]
+    return dict(zip(names, map(pin.SE3, data.oMf.tolist()), strict=True))
+
+
+def shown(watched, *path):
+    return pin.XYZQUATToSE3(np.array(watched.pose(["meshcat", *path])))
+
+
+def apart(one, other):
+    return np.abs(one.homogeneous - other.homogeneous).max()
+
+
+def row_at(motion, t):
+    return np.argmin(np.abs(motion.t - t))
+
+
+def test_a_body_flies_to_the_grasp_and_is_held(browser, tmp_path):
+    flown = phases()
+    path = tmp_path / "phases.html"
+    fflin.visualize(flown.robot, flown.whole, html=path)
+    watched = Watched(browser, path.as_uri() + "#pause")
+    grasp = frames(flown.robot, flown.approach.q[-1])["tool"]
+    for t in (0.0, 1.5, 3.9):
+        watched.do(f"fflin.seek({t})")
+        body = shown(watched, "held", "payload", "root_joint")
+        # A body of these moments that turns about one of its axes goes on to do so.
+        turned = pin.Quaternion(pin.exp3(TWIST[3:] * (t - 4.0)))
+        center = grasp.translation + grasp.rotation @ DEBRIS.lever
+        spin = grasp.rotation @ (TWIST[:3] + np.cross(TWIST[3:], DEBRIS.lever))
+        R = grasp.rotation @ turned.matrix()
+        at = center + spin * (t - 4.0) - R @ DEBRIS.lever
+        assert apart(body, pin.SE3(R, at)) < EXACT, t
+        here = frames(flown.robot, flown.approach.q[row_at(flown.approach, t)])
+        assert apart(shown(watched, "robot", "joint_7"), here["joint_7"]) < EXACT
+    for part, start, t in (
+        (flown.held, 4.0, 4.0),
+        (flown.held, 4.0, 8.3),
+        (flown.after, 10.0, 12.0),
+    ):
+        watched.do(f"fflin.seek({t})")
+        here = frames(part._robot, part.q[row_at(part, t - start)])
+        assert apart(shown(watched, "held", "payload", "root_joint"), here["payload"]) < EXACT, t
+        for joint in ("joint_3", "joint_7"):  # jammed or not
+            assert apart(shown(watched, "robot", joint), here[joint]) < EXACT, (joint, t)
+    # The phases are named, the one at the time is marked, and each leads to its beginning.
+    buttons = watched.page.locator(".phases button")
+    assert buttons.all_text_contents() == [
+        "servicer_7dof0 s",
+        "payload of 500 kg caught4 s",
+        "joint_3 jammed10 s",
+    ]
+    for k, time in enumerate((0.0, 4.0, 10.0)):
+        buttons.nth(k).click()
+        assert watched.do("fflin.state.time") == pytest.approx(time)
+        pressed = [each.get_attribute("aria-pressed") for each in buttons.all()]
+        assert pressed == [str(k == other).lower() for other in range(3)]
+    assert "joint_3 jammed" in watched.page.locator("#stamp").text_content()
+    box = watched.page.get_by_label("payload", exact=True)
+    box.uncheck(force=True)
+    assert not watched.do("viewer.scene_tree.find(['meshcat', 'held', 'payload']).object.visible")
+    assert "target" in watched.page.locator("#legend").text_content()
+    assert not watched.errors
+    watched.page.close()
+
+
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_a_payload_with_joints_comes_with_them(browser, tmp_path):
+    other = fflin.load("ets_vii", stiffness=20.0, damping=2.0)
+    v = np.r_[TWIST, 0.05, -0.02, 0.0, 0.0, 0.03, 0.0]
+    flown = phases(other, v)
+    path = tmp_path / "phases.html"
+    fflin.visualize(flown.robot, flown.whole, html=path)
+    watched = Watched(browser, path.as_uri() + "#pause")
+    # Free motion without dampers is the same backwards.
+    names = list(other.model.names)[ROOT:]
+    watched.do("fflin.seek(0)")
+    first = {name: shown(watched, "held", "payload", name) for name in names}
+    watched.do("fflin.seek(4)")
+    here = frames(flown.caught.robot, flown.caught.q)
+    for name in names[1:]:
+        body = shown(watched, "held", "payload", name)
+        assert apart(body, here[f"payload.{name}"]) < EXACT
+    undamped = other.replace(damping=0.0)
+    back = fflin.simulate(undamped, None, q0=flown.caught.payload_q, v0=-v, duration=4.0)
+    was = frames(undamped, back.q[-1])
+    for name in names:
+        assert apart(first[name], was[name]) < EXACT
+    assert not watched.errors
+    watched.page.close()
+
+
+@pytest.mark.parametrize("frame", ["lvlh", "hill"])
+def test_in_orbit_a_payload_came_as_it_flies_there(frame):
+    orbit = fflin.CircularOrbit(mean_motion=0.05, mu=1e9, body="rock", body_radius=1e3)
+    payload = fflin.load("cubesat", orbit=orbit)
+    q = fflin.configuration(payload, base=pin.SE3(np.eye(3), np.array([3.0, -2.0, 1.0])))
+    v = 0.1 * np.array([1.0, -2.0, 1.0, 0.5, 0.3, -0.4])
+    flown = fflin.simulate(payload, None, q0=q, v0=v, duration=20.0, dt=0.05, frame=frame)
+    end = SimpleNamespace(payload=payload, payload_q=flown.q[-1], payload_v=flown.v[-1])
+    first, *_, last = _flight(end, frame, np.array([-20.0, -10.0, -0.05]))
+    assert first[0] == pytest.approx(q, abs=1e-6)
+    assert last[0] == pytest.approx(flown.q[-2], abs=1e-9)
+    other = {"lvlh": "hill", "hill": "lvlh"}[frame]
+    assert np.abs(_flight(end, other, np.array([-20.0]))[0][0] - q).max() > 0.1
