@@ -206,7 +206,8 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     UnknownNameError
         If there is no such parameter.
     InputError
-        If a range is empty, is relative to 0, or has no physical robot in its middle.
+        If a range is empty, is relative to 0, has no physical robot in its middle, or masses,
+        densities or inertias of wheels not above 0, stiffness or damping below it.
 
     References
     ----------
@@ -236,11 +237,6 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     for key, value in given.items():
         for name in parameters.find(key):
             found[name] = _range(parameters[name], value)
-    for name in found:
-        if ".direction." in name:
-            raise InputError(
-                f"'{name}' turns a unit vector, in which the model is no fraction; see sensitivity"
-            )
     _refuse_overlap(variants.pieces, found)
     made = Uncertain(robot, tuple(found.values()), variants)
     if why := variants.refusal(made.values(np.zeros(len(found)))):
@@ -257,18 +253,25 @@ def _refuse_overlap(pieces: Mapping[str, Piece], found: Mapping[str, Range]) -> 
 
 
 def _range(one: Parameter, value: Any) -> Range:
+    if one.part[:9] == "direction":
+        said = "turns a unit vector, in which the model is no fraction; see sensitivity"
+        raise InputError(f"'{one.name}' {said}")
     if isinstance(value, tuple | list):
         least, largest = vector(f"range of '{one.name}'", value, 2, "(least, largest)").tolist()
     else:
         share = number(f"range of '{one.name}'", value)
         if not one.value:
-            raise InputError(
-                f"'{one.name}' is 0, of which {share:g} is nothing; give (least, largest)"
-            )
+            raise InputError(f"'{one.name}' is 0, of which a share is 0; give (least, largest)")
         least, largest = sorted((one.value * (1.0 - share), one.value * (1.0 + share)))
-    if not least < largest:
+    expected = "" if least < largest else "less and more"
+    if least < 0.0 and one.part in ("stiffness", "damping"):
+        expected = "0 or more"
+    if least <= 0.0 and one.part in ("mass", "density", "inertia"):  # the last is a wheel's
+        expected = "more than 0"
+    if expected:
         raise InputError(
-            f"range of '{one.name}' is from {least:g} to {largest:g}, expected less and more"
+            f"range of '{one.name}' is from {least:g} to {largest:g}, expected {expected}; 20 % is "
+            "0.2, ends are (least, largest) or LEAST:LARGEST"
         )
     return Range(one, 0.5 * (least + largest), 0.5 * (largest - least))
 
