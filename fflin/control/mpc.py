@@ -127,7 +127,7 @@ def mpc(
     designed: Any = _along if isinstance(source, LinearTrajectory) else _about
     made, stages = designed(source, (Q, R, weights), Qf, samples, dt, names, rows)
     acting = at[at < len(lin.input_names)]
-    of = getattr(source.robot, "name", source.robot)
+    of: Any = getattr(source.robot, "name", source.robot)
     return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, names, ranges, of))
 
 

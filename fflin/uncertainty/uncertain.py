@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -233,10 +234,9 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     if not given:
         raise InputError("ranges is empty, expected {parameter: 0.2 or (least, largest)}")
     variants, found = Variants(robot), dict[str, Range]()
-    parameters = variants.parameters
     for key, value in given.items():
-        for name in parameters.find(key):
-            found[name] = _range(parameters[name], value)
+        for name in variants.parameters.find(key):
+            found[name] = _range(variants.parameters[name], value)
     _refuse_overlap(variants.pieces, found)
     made = Uncertain(robot, tuple(found.values()), variants)
     if why := variants.refusal(made.values(np.zeros(len(found)))):
@@ -246,10 +246,9 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
 
 def _refuse_overlap(pieces: Mapping[str, Piece], found: Mapping[str, Range]) -> None:
     asked = {each.parameter.of for each in found.values()} & pieces.keys()
-    for name in asked:
-        for other in asked - {name}:
-            if pieces[name].whole and pieces[name].joint == pieces[other].joint:
-                raise InputError(f"'{other}' is a link of the body '{name}'; give one of them")
+    for name, other in permutations(asked, 2):
+        if pieces[name].whole and pieces[name].joint == pieces[other].joint:
+            raise InputError(f"'{other}' is a link of the body '{name}'; give one of them")
 
 
 def _range(one: Parameter, value: Any) -> Range:
@@ -279,8 +278,8 @@ def _range(one: Parameter, value: Any) -> Range:
 def _lft(of: Uncertain, lin: Any) -> LFT:
     ready = prepare(of.robot, frame=lin.frame, reference=None, moving=False)
     if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in of.robot.outputs):
-        feels = "an output feels accelerations or weighs the robot"
-        raise InputError(f"{feels}; leave it out with robot.replace(outputs=)")
+        feels = "an output feels accelerations or weighs the robot; leave it out"
+        raise InputError(f"{feels} with robot.replace(outputs=)")
     form = fraction(ready.map, ready.actuation, lin.q, of._variants.pieces, of.ranges)
     nv, nw = len(lin.A) // 2, len(form.z[0])
     x, w, u = form.a
