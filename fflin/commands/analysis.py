@@ -79,6 +79,7 @@ def add_commands(commands: Commands) -> None:
     add_point(sensitivity)
     add_options(sensitivity, "--dt H: of the model sampled, with inputs held over H [s]")
     add_options(sensitivity, "--top N = 15: the N that change most; 15 by default")
+    add_options(sensitivity, "--only NAME: of these alone: mass, link_3, *.density")
     add_output_file(sensitivity, "save dA, dB, df0 over each parameter: .npz, .mat or .json")
     uncertain = command(
         *(commands, "uncertain", _uncertain),
@@ -211,7 +212,7 @@ def _sensitivity(arguments: argparse.Namespace) -> int:
 
     _, lin = linear_model(arguments)
     found = sensitivity(lin if arguments.dt is None else lin.discretize(arguments.dt))
-    say(found, arguments, found.table(arguments.top))
+    say(found, arguments, found.table(arguments.top, arguments.only))
     return DONE
 
 

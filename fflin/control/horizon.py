@@ -77,6 +77,8 @@ class Horizon:
     inputs: tuple[str, ...]
     acting: NDArray[np.intp]  # the inputs that have limits
     limited: tuple[str, ...]
+    ranges: Array  # (2, m), of the values themselves, or of errors of q_b and r_b
+    robot: str
 
     @cached_property
     def _last(self) -> tuple[Stage, ...]:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from fflin.base.errors import InputError, listed
 from fflin.base.names import by_name, input_keys, stands_for_any, state_keys
+from fflin.base.tables import folded
 from fflin.base.threads import in_one_thread
 from fflin.base.validation import Array, number, whole
 from fflin.control.differential_riccati import bounded_by, samples_back
@@ -120,17 +121,34 @@ def mpc(
     source = lin if isinstance(lin, LinearTrajectory) else lin.generator
     if source is None or source.dt or dt != (lin.dt or dt):
         raise InputError("lin is sampled otherwise; give the continuous one that it is of, and dt=")
-    names, at, rows = _limits(source, limits)
+    names, at, rows, ranges = _limits(source, limits)
     if samples**2 * (len(at) + len(lin.state_names)) * len(lin.input_names) > _MOST:
         raise InputError(f"horizon is {samples}, expected fewer samples of so many limits")
     designed: Any = _along if isinstance(source, LinearTrajectory) else _about
     made, stages = designed(source, (Q, R, weights), Qf, samples, dt, names, rows)
     acting = at[at < len(lin.input_names)]
-    return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, names))
+    of: Any = getattr(source.robot, "name", source.robot)
+    return made(Horizon(tuple(stages), samples, dt, lin.input_names, acting, names, ranges, of))
 
 
-@dataclass(frozen=True, eq=False)
-class Mpc:
+class _Shown:
+    horizon: Horizon
+
+    def __repr__(self) -> str:
+        of = self.horizon
+        said = f"'{of.robot}', {of.samples} samples of {of.dt:g} s, {len(of.limited)} limits"
+        return f"{type(self).__name__}({said})"
+
+    def __str__(self) -> str:
+        same, of = dict[str, list[str]](), self.horizon
+        for k, (name, ends) in enumerate(zip(of.limited, of.ranges.T, strict=True)):
+            kind = "hard" if k < len(of.acting) else "soft"
+            same.setdefault(f"{kind}, {ends[0]:.6g} to {ends[1]:.6g}", []).append(name)
+        return folded((repr(self), *(f"{key}: {', '.join(at)}" for key, at in same.items())))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Mpc(_Shown):
     """The controller about a point: its sampled model and regulator, and what it looks ahead."""
 
     lin: LinearModel
@@ -155,8 +173,8 @@ class Mpc:
         return Receding(self.horizon, at)
 
 
-@dataclass(frozen=True, eq=False)
-class TrajectoryMpc(TrajectoryFeedback):
+@dataclass(frozen=True, eq=False, repr=False)
+class TrajectoryMpc(_Shown, TrajectoryFeedback):
     """The controller along a trajectory and about its end, with the regulator's schedule."""
 
     horizon: Horizon
@@ -182,8 +200,8 @@ class TrajectoryMpc(TrajectoryFeedback):
         return Receding(self.horizon, at)
 
 
-def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., Any]]:
-    """Return what has limits, where it is among inputs, states and outputs, and a stage's rows."""
+def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., Any], Array]:
+    """Return what has limits, where among inputs, states and outputs, a stage's rows, ranges."""
     if (robot := of.robot if isinstance(of, LinearTrajectory) else of._robot) is None:
         raise InputError("lin is from a file, which has no robot; linearise it again")
     inputs, states, outputs = of.input_names, of.state_names, of.output_names
@@ -213,7 +231,7 @@ def _limits(of: Any, limits: Any) -> tuple[tuple[str, ...], Any, Callable[..., A
         of_d = np.vstack((np.eye(nu), np.zeros((nx, nu)), D))[at]
         return of_e, of_d, (low - there)[at], (high - there)[at]
 
-    return tuple(names[i] for i in at), at, rows
+    return tuple(names[i] for i in at), at, rows, np.array((low, high))[:, at]
 
 
 def _about(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, asdict, dataclass
 from typing import Any
 
-from fflin.base.errors import InputError, unknown
+from fflin.base.errors import FflinWarning, InputError, unknown
 from fflin.base.validation import number
 
 # Gravitational parameter [m^3/s^2] and equatorial radius [m]: JPL DE440, IAU 2015.
@@ -21,6 +22,10 @@ BODIES = {
     "jupiter": (1.266865341e17, 71492000.0),
     "saturn": (3.793120749e16, 60268000.0),
 }
+
+# Altitudes [m] below the first are doubtful, of bodies without air below the second; those of low
+# earth orbits, whose radius may be given.
+_AIR, _BARE, _LOW_ORBITS = 80e3, {"moon": 1e3, "mercury": 1e3}, (150e3, 1000e3)
 
 _FOLLOWS: Any = None  # from the others
 
@@ -39,7 +44,7 @@ class CircularOrbit:
     Parameters
     ----------
     altitude : float, optional
-        Above the body's surface [m].
+        Above the surface [m]; `FflinWarning` where kilometres or a radius seem to be meant.
     mean_motion : float, optional
         n [rad/s], instead of the altitude.
     body : str
@@ -90,8 +95,7 @@ class CircularOrbit:
             raise InputError("an orbit about another body needs both mu and body_radius; give both")
         if self.mu is None and self.body not in BODIES:
             raise unknown("central body", self.body, BODIES)
-        given = {"altitude": self.altitude, "mean_motion": self.mean_motion}
-        given = {name: value for name, value in given.items() if value is not None}
+        given = [value for value in (self.altitude, self.mean_motion) if value is not None]
         if len(given) != 1:
             said = "both are" if given else "neither is"
             raise InputError(
@@ -117,6 +121,14 @@ class CircularOrbit:
             )
         if self.altitude is not None:
             n = math.sqrt(mu / (ground + altitude)) / (ground + altitude)
+            above, said = altitude - ground, ""
+            if altitude < _BARE.get(self.body, _AIR):
+                said = "altitudes are in metres, 400 km is 400e3"
+            elif self.body == "earth" and _LOW_ORBITS[0] <= above <= _LOW_ORBITS[1]:
+                said = f"if that is the orbit's radius, its altitude is {above:.8g} m"
+            if said and self.mu is None:  # not of an asteroid, nor of an orbit that was saved
+                said = f"an altitude of {altitude:.8g} m over {self.body}: {said}"
+                warnings.warn(said, FflinWarning, stacklevel=3)
         known = {"altitude": altitude, "mean_motion": n, "mu": mu, "body_radius": ground}
         for name, value in known.items():
             object.__setattr__(self, name, value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -48,6 +48,8 @@ class Parameters(dict[str, Parameter]):
 
     def __init__(self, robot: Robot) -> None:
         pieces, self._also = pieces_of(robot)
+        linked = {each.joint for each in pieces.values() if not each.whole}
+        self._sums = {of for of, each in pieces.items() if each.whole and each.joint in linked}
         of_pieces = (each for name, piece in pieces.items() for each in _of_piece(name, piece))
         found = (*of_pieces, *_of_joints(robot), *_of_inputs(robot))
         super().__init__((each.name, each) for each in found)
@@ -58,12 +60,14 @@ class Parameters(dict[str, Parameter]):
         if key not in self and bodies:
             body = max(bodies, key=len)
             key = self._also[body] + key[len(body) :]
-        return matched(key, list(self))
+        names = list(self)
+        return [names[i] for i in matching("parameter", key, names)]
 
-
-def matched(key: str, names: Sequence[str]) -> list[str]:
-    """Return the names that a name or pattern stands for."""
-    return [names[i] for i in matching("parameter", key, names)]
+    def ranked(self, only: str | None) -> list[str]:
+        """Return what a name, part or pattern stands for, without bodies beside their links."""
+        found = [n for n, x in self.items() if only in (None, x.of, x.part, x.part.split(".")[0])]
+        found = found or self.find(str(only))
+        return [name for name in found if self[name].of not in self._sums] or found
 
 
 def moments(mass: float, first: Array, inertia: Array) -> Array:

@@ -205,25 +205,26 @@ class Sensitivity:
         """Tell what 10 % of each parameter changes, the most first; 1 cm of a centre of mass."""
         return self.table()
 
-    def table(self, top: int = 15) -> str:
-        """Return the `top` rows of what 10 % of a parameter changes, or 1 cm, the most first."""
+    def table(self, top: int = 15, only: str | None = None) -> str:
+        """Return the `top` rows of what 10 % of a parameter changes, or 1 cm, the most first.
+
+        Only of ``mass``, ``link_3``, ``*.density``; bodies stand beside no links of theirs.
+        """
+        shown = self.parameters.ranked(only)
         lin, sizes = self.lin, [max(np.abs(x).max(), 1e-300) for x in (self.lin.A, self.lin.B)]
         rows = []
         for one, dA, dB in zip(self.parameters.values(), self.dA, self.dB, strict=True):
             small = one.part.partition(".")[0] in ("com", "position")
             step = 0.01 if small else 0.1 * (abs(one.value) or float(one.part[:9] == "direction"))
-            effect = [
-                step * np.abs(d).max() / size for d, size in zip((dA, dB), sizes, strict=True)
-            ]
-            if max(effect) > 0.0:
-                change = f"{step:.3g} {one.unit}"
-                rows.append((max(effect), one.name, f"{one.value:.5g}", change, *effect))
+            effect = [step * np.abs(d).max() / of for d, of in zip((dA, dB), sizes, strict=True)]
+            if one.name in shown and max(effect) > 0.0:
+                change = f"{step:.3g} {one.unit}".removesuffix(" 1")
+                shares = (f"{100.0 * x:.2g} %" for x in effect)
+                rows.append((max(effect), one.name, f"{one.value:.5g}", change, *shares))
         rows.sort(key=lambda row: -row[0])
-        most = [
-            (*row[1:4], *(f"{100.0 * x:.2g} %" for x in row[4:]))
-            for row in rows[: whole("top", top, 1)]
-        ]
+        most = [row[1:] for row in rows[: whole("top", top, 1)]]
         title = f"{lin.robot}: what changes A and B most, to first order, of the largest entry"
+        most = most or [("none of these changes them", *"    ")]
         return f"{title}\n" + grid([("parameter", "is", "changed by", "A", "B"), *most], "lrrrr")
 
     def save(self, path: str | Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -206,7 +207,8 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     UnknownNameError
         If there is no such parameter.
     InputError
-        If a range is empty, is relative to 0, or has no physical robot in its middle.
+        If a range is empty, is relative to 0, has no physical robot in its middle, or masses,
+        densities or inertias of wheels not above 0, stiffness or damping below it.
 
     References
     ----------
@@ -232,15 +234,9 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
     if not given:
         raise InputError("ranges is empty, expected {parameter: 0.2 or (least, largest)}")
     variants, found = Variants(robot), dict[str, Range]()
-    parameters = variants.parameters
     for key, value in given.items():
-        for name in parameters.find(key):
-            found[name] = _range(parameters[name], value)
-    for name in found:
-        if ".direction." in name:
-            raise InputError(
-                f"'{name}' turns a unit vector, in which the model is no fraction; see sensitivity"
-            )
+        for name in variants.parameters.find(key):
+            found[name] = _range(variants.parameters[name], value)
     _refuse_overlap(variants.pieces, found)
     made = Uncertain(robot, tuple(found.values()), variants)
     if why := variants.refusal(made.values(np.zeros(len(found)))):
@@ -250,25 +246,31 @@ def uncertain(robot: Robot, ranges: Mapping[str, Any]) -> Uncertain:
 
 def _refuse_overlap(pieces: Mapping[str, Piece], found: Mapping[str, Range]) -> None:
     asked = {each.parameter.of for each in found.values()} & pieces.keys()
-    for name in asked:
-        for other in asked - {name}:
-            if pieces[name].whole and pieces[name].joint == pieces[other].joint:
-                raise InputError(f"'{other}' is a link of the body '{name}'; give one of them")
+    for name, other in permutations(asked, 2):
+        if pieces[name].whole and pieces[name].joint == pieces[other].joint:
+            raise InputError(f"'{other}' is a link of the body '{name}'; give one of them")
 
 
 def _range(one: Parameter, value: Any) -> Range:
+    if one.part[:9] == "direction":
+        said = "turns a unit vector, in which the model is no fraction; see sensitivity"
+        raise InputError(f"'{one.name}' {said}")
     if isinstance(value, tuple | list):
         least, largest = vector(f"range of '{one.name}'", value, 2, "(least, largest)").tolist()
     else:
         share = number(f"range of '{one.name}'", value)
         if not one.value:
-            raise InputError(
-                f"'{one.name}' is 0, of which {share:g} is nothing; give (least, largest)"
-            )
+            raise InputError(f"'{one.name}' is 0, of which a share is 0; give (least, largest)")
         least, largest = sorted((one.value * (1.0 - share), one.value * (1.0 + share)))
-    if not least < largest:
+    expected = "" if least < largest else "less and more"
+    if least < 0.0 and one.part in ("stiffness", "damping"):
+        expected = "0 or more"
+    if least <= 0.0 and one.part in ("mass", "density", "inertia"):  # the last is a wheel's
+        expected = "more than 0"
+    if expected:
         raise InputError(
-            f"range of '{one.name}' is from {least:g} to {largest:g}, expected less and more"
+            f"range of '{one.name}' is from {least:g} to {largest:g}, expected {expected}; 20 % is "
+            "0.2, ends are (least, largest) or LEAST:LARGEST"
         )
     return Range(one, 0.5 * (least + largest), 0.5 * (largest - least))
 
@@ -276,8 +278,8 @@ def _range(one: Parameter, value: Any) -> Range:
 def _lft(of: Uncertain, lin: Any) -> LFT:
     ready = prepare(of.robot, frame=lin.frame, reference=None, moving=False)
     if any(output.FEELS_ACCELERATION or type(output) in WEIGH for output in of.robot.outputs):
-        feels = "an output feels accelerations or weighs the robot"
-        raise InputError(f"{feels}; leave it out with robot.replace(outputs=)")
+        feels = "an output feels accelerations or weighs the robot; leave it out"
+        raise InputError(f"{feels} with robot.replace(outputs=)")
     form = fraction(ready.map, ready.actuation, lin.q, of._variants.pieces, of.ranges)
     nv, nw = len(lin.A) // 2, len(form.z[0])
     x, w, u = form.a

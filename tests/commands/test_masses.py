@@ -35,6 +35,13 @@ def test_what_matters_most_is_shown_and_saved(tmp_path):
     assert np.array_equal(file["A"], lin.A) and file["frame"] == "hybrid"
 
 
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_some_alone_are_shown():
+    code, out, _ = run("sensitivity", "servicer_7dof", "--only", "mass", "--top", 99)
+    rows = out.splitlines()[2:]
+    assert code == 0 and len(rows) == 10 and all(".mass " in row for row in rows)
+
+
 def test_of_a_sampled_model_in_every_format(tmp_path):
     for ending in ("npz", "json"):
         code, *_ = run("sensitivity", "cubesat", "--dt", 0.1, "-o", tmp_path / f"c.{ending}")
@@ -66,7 +73,9 @@ def test_what_is_wrong_is_one_line(tmp_path):
     assert "expected less and more" in refused(*vary, "base.mass=3:2")
     assert "twice" in refused(*vary, "base.mass=0.1", "--vary", "base.mass=0.2")
     assert "--vary" in refused("uncertain", "cubesat")
-    assert "is no robot" in refused(*vary, "base.mass=-3:1", "-o", tmp_path / "u.mat")
+    assert "expected more than 0" in refused(*vary, "base.mass=-3:1", "-o", tmp_path / "u.mat")
+    assert "20 % is 0.2" in refused(*vary, "base.mass=20", "-o", tmp_path / "u.mat")
+    assert "no parameter named 'mas'" in refused("sensitivity", "cubesat", "--only", "mas")
     assert "gravity" in refused(*vary, "base.mass=0.1", "--gravity", "0", "0", "-9.8")
     assert "0 is too few" in refused("sensitivity", "cubesat", "--top", "0")
     assert ".npz" in refused("sensitivity", "cubesat", "-o", tmp_path / "s.csv")

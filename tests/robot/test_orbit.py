@@ -52,6 +52,44 @@ def test_refused(given, said):
         fflin.CircularOrbit(**given)
 
 
+METRES = r"an altitude of 400 m over earth: altitudes are in metres, 400 km is 400e3"
+
+
+@pytest.mark.parametrize(
+    ("altitude", "body", "said"),
+    [
+        (400, "earth", METRES),
+        (79e3, "venus", "79000 m over venus: altitudes are in metres"),
+        (100, "moon", "100 m over moon: altitudes are in metres"),
+        (6778e3, "earth", "6778000 m over earth: if .* the orbit's radius, .* is 399863 m"),
+    ],
+)
+def test_a_doubtful_altitude_is_warned_of(altitude, body, said):
+    with pytest.warns(fflin.FflinWarning, match=said) as record:
+        fflin.CircularOrbit(altitude, body=body)
+    assert [each.filename for each in record] == [__file__]
+
+
+@pytest.mark.filterwarnings("error::fflin.FflinWarning")
+def test_no_other_altitude_is_warned_of():
+    for altitude in (100e3, 400e3, 5860e3, 8062e3, 20200e3, 35786e3):  # of LAGEOS, O3b, GPS
+        fflin.CircularOrbit(altitude)
+    fflin.CircularOrbit(2e3, body="moon"), fflin.CircularOrbit(6778e3, body="venus")
+    fflin.CircularOrbit(680.0, body="bennu", mu=4.89, body_radius=245.0)
+    fflin.CircularOrbit(mean_motion=1.2393e-3)  # as low
+
+
+def test_a_robot_says_it_once(tmp_path):
+    (tmp_path / "sat.toml").write_text('urdf = "cubesat"\norbit = 400\n')
+    with pytest.warns(fflin.FflinWarning, match=METRES) as record:
+        robot = fflin.load(tmp_path / "sat.toml")
+        other = pickle.loads(pickle.dumps(robot.replace(inputs=[fflin.BaseTorque()])))
+        fflin.linearize(other).save(tmp_path / "lin.npz")
+        fflin.LinearModel.load(tmp_path / "lin.npz")
+        type(robot.orbit).from_json(robot.orbit.to_json())
+    assert len(record) == 1
+
+
 def test_a_robot_has_one():
     orbit = fflin.CircularOrbit(altitude=700e3)
     robot = fflin.load("cubesat", orbit=orbit)

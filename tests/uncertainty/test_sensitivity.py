@@ -314,6 +314,29 @@ def test_its_table_has_what_a_tenth_of_each_changes_and_the_most_first():
         S.table(0)
 
 
+@pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
+def test_its_table_ranks_links_or_what_is_asked_for():
+    S = fflin.sensitivity(fflin.linearize(fflin.load("planar_detumble")))
+
+    def shown(only=None):
+        return [row.split() for row in S.table(999, only).splitlines()[2:]]
+
+    # joint_3 is hand and target together.
+    assert "joint_3.density" in S.names and "joint_3.stiffness" in S.names
+    owners = {row[0].partition(".")[0] for row in shown()}
+    assert owners == {"base", "link_1", "link_2", "link_3", "hand", "target"}
+    assert {row[0] for row in shown("mass")} == {f"{name}.mass" for name in owners}
+    assert shown("*.mass") == shown("mass")
+    assert shown("link_2.mass") == [row for row in shown("link_?.mass") if "_2" in row[0]]
+    assert {row[0].partition(".")[0] for row in shown("hand")} == {"hand"}
+    assert {row[0][:13] for row in shown("hand.inertia*")} == {"hand.inertia."}
+    assert [row[0] for row in shown("joint_3.density")] == ["joint_3.density"]
+    assert {len(row) for row in shown("density")} == {7}  # name, 1, 0.1, and two of "x %"
+    with pytest.raises(fflin.UnknownNameError, match="no parameter named 'masss'"):
+        S.table(3, "masss")
+    assert "none of these changes them" in S.table(3, "joint_1.stiffness")
+
+
 @pytest.mark.parametrize("axis", "xyz")
 def test_every_place_and_direction_of_a_thruster(axis):
     robot, at = fflin.load("ets_vii"), "xyz".index(axis)

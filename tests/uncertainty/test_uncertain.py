@@ -144,7 +144,7 @@ def test_what_is_wrong_is_one_line():
         (lambda: fflin.uncertain(robot, {"link_99.mass": 0.1}), "no parameter"),
         (lambda: fflin.uncertain(robot, {"base.mass": (3.0, 2.0)}), "expected less and more"),
         (lambda: fflin.uncertain(robot, {"link_1.com.y": 0.1}), "give (least, largest)"),
-        (lambda: fflin.uncertain(robot, {"base.mass": (-3.0, 2.0)}), "is no robot"),
+        (lambda: fflin.uncertain(robot, {"base.mass": (-3.0, 2.0)}), "expected more than 0"),
         (lambda: fflin.uncertain(robot, {"base.inertia.xx": (1e-3, 2e-3)}), "is no robot"),
         (lambda: of.at({"base.mass": -1.0}), "the mass of 'base' is -1 kg"),
         (lambda: of.worst(np.zeros((2, 2))), "gain has shape"),
@@ -164,6 +164,31 @@ def test_what_is_wrong_is_one_line():
     joined = fflin.load("planar_detumble")
     with pytest.raises(fflin.InputError, match="is a link of the body"):
         fflin.uncertain(joined, {"joint_3.mass": 0.1, "hand.mass": 0.1})
+
+
+def test_a_range_that_no_robot_has_is_refused():
+    """Twenty for 20 %, above all; a link whose centre or inertia may be no body's stays."""
+    wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), inertia=1e-3, name="w")
+    robot = fflin.load("inspector", inputs=[wheel], stiffness={"hinge_left_1": 10.0})
+    for name, value, ends in (
+        ("base.mass", 20, "-"),
+        ("base.mass", 1.5, "-"),
+        ("base.mass", (0.0, 2.0), "0 to 2"),
+        ("base.density", 1.0, "0 to 2"),
+        ("w.inertia", 1.0, "0 to 0.002"),
+        ("hinge_left_1.stiffness", 20, "-190 to 210"),
+        ("hinge_left_1.damping", (-0.1, 0.1), "-0.1 to 0.1"),
+    ):
+        with pytest.raises(fflin.InputError) as error:
+            fflin.uncertain(robot, {name: value})
+        said = str(error.value)
+        least = "0 or more" if "hinge" in name else "more than 0"
+        assert f"range of '{name}' is from {ends}" in said and f"expected {least};" in said
+        assert "20 % is 0.2" in said and "LEAST:LARGEST" in said and "\n" not in said
+    for name in ("stiffness", "damping"):
+        fflin.uncertain(robot, {f"hinge_left_1.{name}": (0.0, 1.0)})
+    of = fflin.uncertain(robot, {"base.inertia.xx": 0.9, "base.com.x": (-1.0, 1.0)})
+    assert len(of.samples(3)) == 3 and of.draws(30)[1] > 0
 
 
 def test_a_wheel_with_friction_is_no_thruster():
