@@ -108,7 +108,7 @@ def test_odd_arguments_are_refused_in_one_line_or_accepted(calls, part, monkeypa
 NUMBERS = ("nan", "inf", "1e300", "-1e300", "1e-300", "-1", "0", "x", "", "9" * 20, "1,5", "0x10")
 OPTIONS = {
     "linearize": ("--dt", "--stiffness", "--damping", "--gravity"),
-    "check": ("--stiffness", "--damping", "--rpy", "--position"),
+    "check": ("--stiffness", "--damping", "--rpy", "--position", "--tolerance"),
     "lqr": ("--dt", "--stiffness"),
     "modes": ("--stiffness", "--damping"),
     "sensitivity": ("--dt", "--top"),

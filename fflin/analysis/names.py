@@ -84,14 +84,11 @@ def combination(weights: Array, names: tuple[str, ...], sizes: Array, most: int 
 
 def undecided(lin: LinearModel, margin: Margin, what: str, count: int) -> tuple[str, ...]:
     """Say what is decided within rounding, and the two answers: `count` states, or others."""
-    notes = []
-    for ratio, at, change in margin.doubts:
-        verb = "counts" if change < 0 else "does not count"
-        notes.append(
-            f"undecided: {shape(lin, at)} {verb} as {what}, by {ratio:.1g} times its rounding; "
-            f"{count} or {count + change} of {len(lin.A)} states"
-        )
-    return tuple(notes)
+    return tuple(
+        f"undecided: {shape(lin, at)} {'counts' if change < 0 else 'does not count'} as {what}, by "
+        f"{ratio:.1g} times its rounding; {count} or {count + change} of {len(lin.A)} states"
+        for ratio, at, change in margin.doubts
+    )
 
 
 def unsettled(lin: LinearModel, settling: Margin, what: str) -> tuple[str, ...]:
@@ -107,5 +104,7 @@ def shape(lin: LinearModel, at: Array) -> str:
     """Name the coordinates that rates (nv,) move, real or complex, by the largest."""
     size = np.sqrt(lin.M.diagonal())
     largest = at[int(np.abs(at * size).argmax())]
-    names = tuple(name.partition(".")[2] or name for name in lin.state_names[len(lin.M) :])
+    of_base = {"omega_b": "rotation about ", "v_b": "translation along "}
+    pairs = (name.partition(".") for name in lin.state_names[len(lin.M) :])
+    names = tuple(of_base.get(group, "") + (member or group) for group, _, member in pairs)
     return combination(np.real(at / largest), names, size)

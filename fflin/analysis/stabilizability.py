@@ -159,7 +159,8 @@ def _forces_missing(lin: LinearModel, weights: Array) -> str | None:
     joints = [name.partition(".")[2] for name, x in zip(names[6:], involved[6:], strict=True) if x]
     if joints:
         moved = f"joint{'s' * (len(joints) > 1)} {listed(joints)}, which no input moves"
-        return " and ".join((*base, moved))
+        advice = "; give each a spring (--stiffness, stiffness=) or a motor"
+        return " and ".join((*base, moved)) + advice
     kind = "" if len(base) == 2 else "angular " if involved[:3].any() else "linear "
     what = " and ".join(base).replace("and base", "and")
     return (

@@ -30,18 +30,14 @@ if TYPE_CHECKING:
 def add_commands(commands: Commands) -> None:
     """Add analyze, modes, validity, sensitivity and uncertain."""
     analyze = command(
-        commands,
-        "analyze",
-        _analyze,
+        *(commands, "analyze", _analyze),
         "show what the inputs can move, what is conserved, the modes, and what the outputs show",
         "fflin analyze servicer_7dof --stiffness panel_left=100 --output joints",
     )
     add_point(analyze)
     add_figure(analyze, "draw the modes")
     modes = command(
-        commands,
-        "modes",
-        _modes,
+        *(commands, "modes", _modes),
         "show natural frequencies, damping ratios and time constants",
         "fflin modes servicer_7dof --stiffness panel_left=100 --stiffness panel_right=100",
     )
@@ -49,9 +45,7 @@ def add_commands(commands: Commands) -> None:
     add_figure(modes, "draw frequencies, damping and shapes")
     add_options(modes, "--html FILE: write a page that plays the mode shapes")
     validity = command(
-        commands,
-        "validity",
-        _validity,
+        *(commands, "validity", _validity),
         "measure how far from the point the linear model can be trusted and its regulator holds",
         "fflin validity ets_vii --attitude 120 --samples 200 --jobs 2",
     )
@@ -156,7 +150,8 @@ def _momentum(lin: LinearModel) -> str:
     else:
         count, left = len(reduced.momenta), len(reduced.A)
         wheels = ", the wheels" * (len(lin.A) > left + 2 * count)
-        text = "none is conserved: the inputs, springs and dampers act on all of them"
+        field = "orbit's field, the " * bool(lin.mean_motion)
+        text = f"none is conserved: the {field}inputs, springs and dampers act on all of them"
         if count:
             text = (
                 f"{count} momenta are conserved whatever the inputs do; without them{wheels} and "

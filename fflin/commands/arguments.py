@@ -199,7 +199,7 @@ def add_orbit(command: Container) -> None:
     )
 
 
-def add_system(command: Container) -> None:
+def add_system(command: Container, *, axes: bool = True) -> None:
     """Add what acts on the robot, what is watched of it, and in which axes."""
     add_orbit(command)
     add_options(
@@ -216,12 +216,15 @@ def add_system(command: Container) -> None:
         --output SPEC*: what is watched: state (default), base, joints, rates, joints:NAME,
             rates:NAME (a joint or a pattern), com, momentum, frame:NAME (pose and velocity),
             pose:NAME, velocity:NAME, gyroscope:NAME, accelerometer:NAME; relative:NAME:TO, as
-            another frame sees it
+            another frame sees it""",
+    )
+    frame = """
         --frame hybrid|local|world|lvlh|hill: axes of velocities and wrenches: angular in base axes
             and linear in reference axes (hybrid, default), both in base axes (local), both in
             reference axes (world); in orbit the world is along, minus normal, to the body (lvlh,
-            default), or from the body, along, normal (hill), with axes as hybrid""",
-    )
+            default), or from the body, along, normal (hill), with axes as hybrid"""
+    if axes:
+        add_options(command, frame)
 
 
 def add_output_file(command: Container, what: str) -> None:

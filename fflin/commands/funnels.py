@@ -25,9 +25,7 @@ _NONE += " joint rpy position velocity"
 def add_commands(commands: of.Commands) -> None:
     """Add funnel."""
     funnel = of.command(
-        commands,
-        "funnel",
-        _funnel,
+        *(commands, "funnel", _funnel),
         "measure from which errors along a trajectory its regulator still ends inside a goal",
         "fflin funnel arm.toml --trajectory plan.csv --schedule gains.npz --goal attitude=1",
     )

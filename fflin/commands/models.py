@@ -12,10 +12,10 @@ from fflin.commands import DONE, FELL_SHORT
 from fflin.commands.arguments import (
     Commands,
     add_options,
-    add_orbit,
     add_output_file,
     add_point,
     add_robot,
+    add_system,
     command,
 )
 from fflin.commands.points import linear_model, load_robot
@@ -30,11 +30,10 @@ def add_commands(commands: Commands) -> None:
     """Add robots, info, linearize and check."""
     command(commands, "robots", _robots, "list the robots that can be named", "fflin robots")
     info = command(
-        commands, "info", _info, "show tree, joints, masses and limits", "fflin info servicer_7dof"
+        commands, "info", _info, "show tree, masses, limits, settings", "fflin info servicer_7dof"
     )
     add_robot(info)
-    add_orbit(info)
-    add_options(info, "--inputs FILE.toml: show these as well: a file, or a bundled one's name")
+    add_system(info, axes=False)
     linearize = command(
         *(commands, "linearize", _linearize),
         "show or save A, B, C, D",
@@ -56,6 +55,7 @@ def add_commands(commands: Commands) -> None:
     )
     add_point(check)
     add_trajectory(check)
+    add_options(check, "--tolerance X: relative, of every figure in place of its own")
     add_figure(check, "draw the errors beside what they must not exceed")
 
 
@@ -80,11 +80,14 @@ def _robots(_: argparse.Namespace) -> int:
 
 
 def _info(arguments: argparse.Namespace) -> int:
+    from dataclasses import replace
+
     from fflin.robot.summary import robot_info
 
     robot = load_robot(arguments)
     print(robot_info(robot))
-    if arguments.inputs is not None:
+    default = replace(robot, inputs=()).inputs
+    if arguments.inputs is not None or robot.limits or robot.inputs != default:
         from fflin.commands.model_text import inputs_report
 
         print(f"\n{inputs_report(robot)}")
@@ -125,7 +128,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
     check_figure(arguments.plot)
     robot, lin = linear_model(arguments)
-    found = check(robot, lin)
+    found = check(robot, lin, tolerance=arguments.tolerance)
     print(found)
     draw(arguments.plot, "plot_check", found)
     return DONE if found.ok else FELL_SHORT

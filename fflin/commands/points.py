@@ -28,7 +28,8 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
     if getattr(arguments, "damping", None) == [(None, "urdf")]:
         first["damping"] = "urdf"
     robot = load(arguments.robot, lock=lock, **first)
-    fields: dict[str, Any] = {}
+    given = {name: getattr(arguments, name, None) for name in ("gravity", "orbit")}
+    fields: dict[str, Any] = {name: value for name, value in given.items() if value}
     for name in ("stiffness", "damping"):
         values = getattr(arguments, name, [])
         for_all = [value for joint, value in values if joint is None]
@@ -36,10 +37,6 @@ def load_robot(arguments: argparse.Namespace) -> Robot:
             raise InputError(f"--{name} is given for all joints and once more; give either")
         if values:
             fields[name] = for_all[0] if for_all else once(f"--{name}", values)
-    if getattr(arguments, "gravity", None):
-        fields["gravity"] = arguments.gravity
-    if getattr(arguments, "orbit", None):
-        fields["orbit"] = arguments.orbit
     if getattr(arguments, "inputs", None) is not None:
         inputs = _inputs(robot, arguments.inputs)
         try:

@@ -86,8 +86,10 @@ def linearize_along(arguments: argparse.Namespace) -> int:
 
 def check_along(arguments: argparse.Namespace) -> int:
     """Check the models along a trajectory."""
+    from fflin.linear.check import held_to
+
     along = models_along(arguments)
-    found = along.check()
+    found = held_to(arguments.tolerance, along.check())
     print(f"{along}\n\n{found}")
     return DONE if found.ok else FELL_SHORT
 

@@ -98,7 +98,7 @@ def _of_inertia(
     lin: LinearModel, M: Array, inverse: Array, pace: Pace, momenta: Mapping[str, float]
 ) -> Weights:
     """Return the weights of an inertia M (m, m) that damping adds to; N^-1 is `inverse`."""
-    h, m, size = lin.dt or 1.0, len(M), _displacements(lin, pace.share)
+    h, m, size = lin.dt or 1.0, len(M), displacements(lin, pace.share)
     theta = np.abs(inverse) @ size
     D = np.abs(M) @ theta / theta
     S = lin.M @ lin.B[m:] / h
@@ -147,7 +147,7 @@ def _of_inertia(
     return Weights(h * Q, R, rule, limit.bandwidth)
 
 
-def _displacements(lin: LinearModel, share: float) -> Array:
+def displacements(lin: LinearModel, share: float) -> Array:
     """Return what each coordinate (m,) is displaced by, a share of what it may be."""
     m = len(lin.M)
     names, units = lin.state_names[:m], lin.state_units[:m]
@@ -217,7 +217,7 @@ def _fastest(
 def _limits(what: str, room: Mapping[str, float], used: Array, power: float) -> list[_Limit]:
     """Return what is left of a bandwidth of 1, with a power of which what is used grows."""
     return [
-        _Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('.')[2] or name}")
+        _Limit((most / size) ** (1.0 / power), f"the {what} of {name.partition('_m.')[2] or name}")
         for (name, most), size in zip(room.items(), used.tolist(), strict=True)
         if 0.0 < most < math.inf and size > 0.0
     ]

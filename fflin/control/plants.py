@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from fflin.base.validation import Array
+from fflin.control.default_weights import displacements
 from fflin.linear.linearization import linearize
 from fflin.linear.model import LinearModel
 from fflin.robot.inputs import ReactionWheel
@@ -12,6 +13,8 @@ from fflin.robot.robot import Robot
 
 # Less than this, relative to the largest, is no difference.
 _ROUNDING = 1e-9
+# What a coordinate, or a rate, causes counts as this share of what the largest of them does.
+_LEAST = 1e-2
 
 
 def notes_of(policy: Any, robot: Robot) -> tuple[str, ...]:
@@ -29,15 +32,15 @@ def notes_of(policy: Any, robot: Robot) -> tuple[str, ...]:
     if not isinstance(lin, LinearModel):
         return ()
     here = linearize(plant, lin.q, lin.v, lin.u0, frame=lin.frame, reference=lin.reference)
-    size = np.zeros(len(here.x0))
-    size[-len(here.M) :] = np.sqrt(here.M.diagonal())
+    size = np.pad(np.sqrt(here.M.diagonal()), (len(here.x0) - len(here.M), 0))
     rows = [here.state_names.index(name) for name in lin.state_names]
     sampled = here.discretize(lin.dt) if lin.dt else here
     whole = len(rows) == len(size)
     weight, every = size[rows, None], list(range(len(rows)))
     pairs = zip(_caused(lin, whole, every), _caused(sampled, whole, rows), strict=True)
-    of_inputs, of_states = (_apart(weight * one, weight * other) for one, other in pairs)
-    said = {"inputs": of_inputs, "states": of_states}
+    (own_B, other_B), (own_A, other_A) = ((weight * one, weight * other) for one, other in pairs)
+    usual = _usual(here, own_A, other_A) if whole else 0.0
+    said = {"inputs": _apart(own_B, other_B, 0.0), "states": _apart(own_A, other_A, usual)}
     parts = [
         f"that its {what} cause differ by up to {most:{'.0f' if most >= 10.0 else '.2g'}} %"
         for what, most in said.items()
@@ -54,9 +57,19 @@ def _caused(lin: LinearModel, whole: bool, rows: list[int]) -> tuple[Array, Arra
     return B[rows], np.column_stack((moved, lin.f0))[rows]
 
 
-def _apart(own: Array, other: Array) -> float:
+def _usual(lin: LinearModel, own: Array, other: Array) -> Array:
+    """Return sizes (nx + 1,) below which what each state causes, and f0, is small beside others."""
+    size = displacements(lin, 1.0)
+    both = np.maximum(*(np.linalg.norm(each[:, :-1], axis=0) for each in (own, other)))
+    largest = (both.reshape(2, -1) * size).max(axis=1, keepdims=True)
+    # Of f0, the point's own acceleration, what a displacement of usual size causes.
+    return np.append(_LEAST * largest / size, largest[0])
+
+
+def _apart(own: Array, other: Array, usual: Array | float) -> float:
     """Return the largest relative difference of the columns [%], zero where it is rounding."""
     size, to, off = (np.linalg.norm(each, axis=0) for each in (own, other, own - other))
     least = _ROUNDING * max(size.max(initial=0.0), to.max(initial=0.0))
-    apart = off / np.where(size > least, size, to).clip(1e-300)
+    floor = np.maximum(usual, least)
+    apart = off / np.where(size > floor, size, np.maximum(to, usual)).clip(1e-300)
     return 100.0 * float(apart[off > least].max(initial=0.0))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fflin.base.errors import InputError
-from fflin.base.validation import Array
+from fflin.base.validation import Array, share
 from fflin.dynamics.aba import Aba
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.outputs import Measuring, Sensing
@@ -95,7 +95,7 @@ class Check:
         return check_report(self.rows, self.title)
 
 
-def check(robot: Robot, lin: LinearModel) -> Check:
+def check(robot: Robot, lin: LinearModel, *, tolerance: float | None = None) -> Check:
     r"""Check a linear model by routes other than the one that made it.
 
     A and B are compared, block by block, with Pinocchio's ABA derivatives mapped into the chart
@@ -109,6 +109,9 @@ def check(robot: Robot, lin: LinearModel) -> Check:
         The robot that the model claims to describe.
     lin : LinearModel
         In continuous time; fresh, loaded from a file, or of another make.
+    tolerance : float, optional
+        Relative, of every figure in place of its own: 1e-5, say, where a tool made A and B by
+        differences.
 
     Returns
     -------
@@ -118,7 +121,8 @@ def check(robot: Robot, lin: LinearModel) -> Check:
     Raises
     ------
     InputError
-        If the model is sampled or has other states and inputs than this robot's.
+        If the model is sampled or has other states and inputs than this robot's, or the tolerance
+        is not between 0 and 1.
 
     Examples
     --------
@@ -132,7 +136,15 @@ def check(robot: Robot, lin: LinearModel) -> Check:
         raise InputError(f"lin is a {type(lin).__name__}, expected a fflin.LinearModel")
     if lin.dt:
         raise InputError(f"the model is sampled at dt = {lin.dt:g} s; check the continuous one")
-    return _checked(Aba(StateMap(robot, frame=lin.frame)), lin)
+    return held_to(tolerance, _checked(Aba(StateMap(robot, frame=lin.frame)), lin))
+
+
+def held_to(tolerance: float | None, found: Check) -> Check:
+    """Return what was found with a tolerance of every figure in place of its own, if any."""
+    if tolerance is None:
+        return found
+    rows = tuple(row._replace(tolerance=share("tolerance", tolerance)) for row in found.rows)
+    return Check(rows, f"{found.title}, each error at most {tolerance:.1e}")
 
 
 def _checked(aba: Aba, lin: LinearModel) -> Check:
@@ -148,8 +160,10 @@ def _checked(aba: Aba, lin: LinearModel) -> Check:
     difference = min(max(_DIFFERENCE_TOLERANCE, _DIFFERENCE_ROUNDING * condition), _LOOSEST)
     model = (ErrorDynamics if lin.moving else Nonlinear)(state, lin, aba)
     A, B, inverse = aba_route(state, aba, q, v, lin.u0, moving=lin.moving)
+    chart = state.chart(q)
+    base_M = state.to_base(chart, state.to_base(chart, M).T).T
     # Links far apart cost ABA digits that M keeps; what its inverse of M lacks, its route lacks.
-    own_error = inertia_residual(_in_base_axes(state, M, q), inverse)
+    own_error = inertia_residual(base_M, inverse)
     by_aba = min(max(route, _ROUTE_SAFETY * own_error), _LOOSEST)
     rows = [
         Row("ABA derivatives", *block, by_aba) for block in compare(state, actuation, lin, M, A, B)
@@ -186,11 +200,6 @@ def check_all(robot: Robot, models: Iterable[LinearModel], title: str) -> Check:
             if not row.error * before.tolerance <= before.error * row.tolerance:
                 worst[row.test, row.block] = row
     return Check(tuple(worst.values()), title)
-
-
-def _in_base_axes(state: StateMap, M: Array, q: Array) -> Array:
-    chart = state.chart(q)
-    return state.to_base(chart, state.to_base(chart, M).T).T
 
 
 def _point_errors(

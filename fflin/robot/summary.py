@@ -2,13 +2,15 @@
 
 import math
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
-from fflin.base.tables import counted, grid, width
+from fflin.base.tables import counted, folded, grid, width
 from fflin.robot.inputs import BaseForce, BaseTorque
 from fflin.robot.robot import ROOT, Robot
 
 _LIMITS = "limits in rad, N m and rad/s; of a prismatic joint in m, N and m/s"
+_START = {"rpy": "[deg]", "position": "[m]", "joints": "[rad | m]", "velocity": "[rad/s | m/s]"}
 
 
 def robot_list(entries: Iterable[tuple[str, Robot | str, str]]) -> str:
@@ -33,7 +35,7 @@ def robot_info(robot: Robot) -> str:
         f"{counted(inputs, 'input')}, mass {robot.mass:.6g} kg\nfrom {source}"
     )
     if robot.orbit:
-        head += f"\n{robot.orbit}"
+        head += f"\n{folded([str(robot.orbit)])}"
     depth = {0: -1, 1: 0}
     rows = [["joint", "type", "mass [kg]", "lower", "upper", "effort", "velocity"]]
     rows.append(["(base)", "free", f"{model.inertias[1].mass:.6g}", ".", ".", ".", "."])
@@ -55,11 +57,38 @@ def robot_info(robot: Robot) -> str:
         rows.append(["  " * depth[index] + joint.name, kinds[joint], mass, *map(_limit, limits)])
     frames = [frame.name for frame in model.frames.tolist() if frame.parentJoint >= ROOT]
     limited = any(cell != "." for row in rows[1:] for cell in row[3:])
-    parts = [head, grid(rows, "ll"), *[_LIMITS] * limited]
+    parts = [head, grid(rows, "ll"), *[_LIMITS] * limited, *_settings(robot)]
     parts.append(f"frames\n{_indented(', '.join(dict.fromkeys(frames)), '  ')}")
     if robot.notes:
         parts.append("\n".join(("warnings", *(_indented(note, "    ") for note in robot.notes))))
     return "\n\n".join(parts)
+
+
+def _settings(robot: Robot) -> list[str]:
+    """Show what was set beside the URDF, but inputs and orbit."""
+    outputs = [":".join((y.WORD, *y.frames, *(vars(y).get("joints") or ()))) for y in robot.outputs]
+    shown = {
+        "stiffness [N m/rad | N/m]": robot.stiffness,
+        "damping [N m s/rad | N s/m]": robot.damping,
+        "springs relaxed at [rad | m]": robot.rest,
+        "passive joints": robot.passive,
+        "locked joints": robot.locked,
+        "gravity [m/s^2]": robot.gravity if any(robot.gravity) else (),
+        "outputs": outputs if outputs != ["state"] else (),
+        "limits": {key: f"{low:g} to {high:g}" for key, (low, high) in robot.limits.items()},
+        **{f"weights, {part}": value for part, value in robot.weights.items()},
+        **{f"start, {part} {_START[part]}": value for part, value in robot.start.items()},
+    }
+    lines = [f"{title}: {_said(value)}" for title, value in shown.items() if value]
+    return [folded(lines)] * bool(lines)
+
+
+def _said(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} = {_said(each)}" for key, each in value.items())
+    if isinstance(value, tuple | list):
+        return ", ".join(map(_said, value))
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _indented(text: str, below: str) -> str:

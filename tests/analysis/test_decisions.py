@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import fflin
+from fflin.analysis.names import shape
 from tests.support import decisions
 from tests.support.mechanisms import mechanical, motors
 from tests.support.robots import random_tree
@@ -177,3 +178,10 @@ def test_momenta_are_conserved_in_every_posture(robots):
         reduced = fflin.momentum_reduction(lin)
         assert len(reduced.A) == 2 * robot.n, (robot, at)
         assert not reduced.notes
+
+
+def test_motions_of_the_base_are_named_in_full(robots):
+    lin = fflin.linearize(robots["ets_vii"])
+    at = np.eye(12)
+    assert shape(lin, at[1]) == "rotation about y" and shape(lin, at[4]) == "translation along y"
+    assert shape(lin, at[11]) == "joint_6"

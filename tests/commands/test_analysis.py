@@ -29,6 +29,14 @@ def test_full_actuation_and_outputs(name):
     assert max(map(len, out.splitlines())) <= 80
 
 
+def test_in_orbit_its_field_acts_on_all_momenta():
+    code, out, _ = run("analyze", "cubesat", "--orbit", "700e3", "--equilibrium")
+    text = " ".join(out.split())
+    assert code == 0
+    assert "the orbit's field, the inputs, springs and dampers act on all of them" in text
+    assert "orbit" not in run("analyze", "cubesat")[1]
+
+
 def test_points_off_rest_are_told():
     code, out, err = run("analyze", "ets_vii", "--velocity", "omega_b.z=0.1")
     assert code == 0 and not err

@@ -433,6 +433,67 @@ def test_info_shows_the_inputs_of_a_file_with_the_limits_of_the_urdf():
     assert "nosuch.toml" in refused("info", "cubesat", "--inputs", "./nosuch.toml")
 
 
+SETTINGS = """urdf = "servicer_7dof"
+lock = ["panel_right"]
+passive = ["panel_left"]
+orbit = 500e3
+outputs = ["pose:tool", "joints"]
+[stiffness]
+"panel_*" = 40.0
+[limits]
+tau_b = 10.0
+"qdot_m.joint_1" = 0.2
+[weights]
+rule = "identity"
+[weights.bryson]
+q_b = 0.05
+[start]
+rpy = [10, -5, 8]
+joints = { joint_2 = 0.6 }
+"""
+
+
+def test_info_shows_what_was_set_beside_the_urdf(tmp_path):
+    (tmp_path / "sat.toml").write_text(SETTINGS)
+    code, out, err = run("info", "sat.toml", "--damping", "panel_left=0.4", cwd=tmp_path)
+    lines = out.splitlines()
+    assert code == 0 and not err and max(map(len, lines)) <= 80
+    for line in (
+        "stiffness [N m/rad | N/m]: panel_left = 40",
+        "damping [N m s/rad | N s/m]: panel_left = 0.4",
+        "passive joints: panel_left",
+        "locked joints: panel_right=0.0",
+        "outputs: pose:tool, joints",
+        "limits: qdot_m.joint_1 = -0.2 to 0.2, tau_b.x = -10 to 10, tau_b.y = -10 to 10,",
+        "weights, rule: identity",
+        "weights, bryson: q_b = 0.05",
+        "start, rpy [deg]: 10, -5, 8",
+        "start, joints [rad | m]: joint_2 = 0.6",
+    ):
+        assert line in lines
+    assert "circular orbit 500 km" in out and "tau_b.x        N m    -10   10" in lines
+    bare = run("info", "servicer_7dof")[1]
+    for word in (
+        "stiffness",
+        "damping",
+        "passive",
+        "locked",
+        "outputs",
+        "weights",
+        "start",
+        "orbit",
+    ):
+        assert word not in bare
+    assert "gravity [m/s^2]: 0, 0, -1.6" in run("info", "cubesat", "--gravity", 0, 0, -1.6)[1]
+
+
+def test_check_takes_a_tolerance(tmp_path):
+    code, out, _ = run("check", "ets_vii", "--tolerance", "1e-6")
+    assert code == 0 and "at most 1.0e-06" in out
+    assert run("check", "ets_vii", "--tolerance", "1e-20")[0] == 1
+    assert "tolerance is 2, expected a share" in refused("check", "ets_vii", "--tolerance", 2)
+
+
 def test_check_says_what_a_dot_is_and_shows_no_table_of_zeros():
     code, out, _ = run("check", "cubesat")
     assert code == 0 and "a dot is an error of exactly zero" in out

@@ -251,3 +251,26 @@ def test_measurements_of_other_names_are_refused(nominal):
     other = robot.replace(outputs=[fflin.JointPositions(robot.joint_names)])
     with pytest.raises(fflin.InputError, match=r"without the outputs q_b\.x, q_b\.y"):
         fflin.simulate(other, fflin.OutputFeedback(sampled, law), duration=0.1)
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.2])
+def test_in_orbit_what_is_next_to_nothing_does_not_count(dt):
+    """At the one's equilibrium f0 is rounding, and a nearly round payload hardly feels its turn."""
+    design = fflin.load("servicer_7dof", lock=["panel_*"], orbit=700e3)
+    q = fflin.configuration(design, {"joint_2": 0.6, "joint_4": -1.2, "joint_6": 0.4})
+    inertia = np.diag([0.35, 0.35, 0.2])
+    held, heavier, half = (
+        fflin.capture(design, "tool", pin.Inertia(m, np.array([0, 0, 0.9]), m * inertia), q=q).robot
+        for m in (500.0, 545.0, 250.0)
+    )
+    lin = fflin.linearize(held, q, u=fflin.equilibrium(held, q).u)
+    lin = lin.discretize(dt) if dt else lin
+    policy = fflin.StateFeedback(lin, np.zeros(lin.B.T.shape))
+
+    def far(robot):
+        (note,) = notes_of(policy, robot)
+        return float(re.search("that its states cause differ by up to (.+?) %", note)[1])
+
+    assert notes_of(policy, held) == ()
+    assert 1.0 < far(heavier) < 9.0 < far(half)
+    assert far(held.replace(stiffness=1.0)) > 90.0

@@ -183,3 +183,20 @@ def test_a_continuous_joint_may_pass_half_a_turn(turn, moving):
         A[groups.q_m, groups.qdot_m] *= -1.0
         found = fflin.check(robot, replace(lin, A=A))
         assert "A[q_m, qdot_m]" in {row.block for row in found.failures}
+
+
+def test_a_tolerance_takes_the_place_of_every_figures_own():
+    """As of a tool whose A and B are differences themselves."""
+    robot = fflin.load("servicer_7dof")
+    lin = fflin.linearize(robot, *random_point(robot, np.random.default_rng(3), degrees=30.0))
+    noise = 1e-7 * np.random.default_rng(4).uniform(-1.0, 1.0, lin.A.shape)
+    near = replace(lin, A=lin.A * (1.0 + noise))
+    own, loose = fflin.check(robot, near), fflin.check(robot, near, tolerance=1e-6)
+    assert not own.ok and loose.ok and loose.max_error == own.max_error
+    assert {row.tolerance for row in loose.rows} == {1e-6}
+    assert str(loose).count("at most 1.0e-06") > 3 and "at most 1.0e-06" in loose.title
+    assert not fflin.check(robot, planted(lin, "A", slice(6, 9), slice(9, 12)), tolerance=1e-6).ok
+    assert not fflin.check(robot, lin, tolerance=1e-20).ok
+    for wrong in (0.0, -1e-6, 1.0, np.nan, np.inf, "much", True):
+        with pytest.raises(fflin.InputError, match="tolerance is"):
+            fflin.check(robot, lin, tolerance=wrong)

@@ -73,7 +73,7 @@ def sound(folder):
             **{"altitude": 7e5, "mean_motion": None, "body": "earth", "mu": None},
             "body_radius": None,
         },
-        "check": {"robot": robot, "lin": lin},
+        "check": {"robot": robot, "lin": lin, "tolerance": 1e-6},
         "configuration": {"robot": robot, "joints": {joint: 0.1}, "base": pin.SE3.Identity()},
         "controllability": {"lin": lin},
         "effort": {"robot": robot, "values": {}},
