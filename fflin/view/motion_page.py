@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from fflin.base.tables import counted
 from fflin.base.validation import Array
+from fflin.dynamics.impact import Impact
 from fflin.dynamics.names import frame_of
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
@@ -39,6 +40,9 @@ FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
 # Length of the arrow of the largest force, and the way on which the camera goes along with the
 # base unless it is told otherwise, both in sizes of the robot.
 ARROW, _FAR = 0.62, 20.0
+
+# A ghost that is nowhere farther from the robot, in sizes of it, is not seen beside it.
+_SEEN = 0.01
 
 
 def motion_page(
@@ -78,16 +82,20 @@ def motion_page(
         moving.append((Drawing(robot, scenery["linear"], "linear", sent), poses))
     held = list(payloads(motion, shown))
     for caught, poses in held:
-        moving.append((Drawing(caught.payload, scenery["held"][caught.prefix], sent=sent), poses))
+        node = scenery["held"][caught.prefix]
+        moving.append((Drawing(caught.payload, node, "held", sent), poses))
     clips = []
     for each, poses in moving:
         each.place(poses[0])
         clips += each.tracks(t - t[0], poses)
     window.send(Animation(clips))
 
-    about = f"{subtitle(robot)}, {t[-1] - t[0]:.4g} s"
+    # Of each phase, as far as it is known, the robot that then flies.
+    flown = [part._robot for part in motion._phases if not isinstance(part, Impact)]
+    flown = flown or [robot] * max(1, len(motion.phases))
+    about = [f"{subtitle(each)}, {t[-1] - t[0]:.4g} s" for each in flown]
     info = stage_info(
-        robot, drawing, film.poses[0], scene=scene, subtitle=about, frame=motion.frame
+        robot, drawing, film.poses[0], scene=scene, subtitle=about[0], frame=motion.frame
     )
     shown_points = frame_points(drawing, film, info["size"])
     for each, rows in ((drawing, goals), *moving[len(moving) - len(held) :]):
@@ -113,9 +121,14 @@ def motion_page(
         "speed": speed,
         "follow": follow,
         "points": rounded(shown_points, info["size"]),
-        "target": len(goal) > 0,
+        "target": len(goal) > 0 and _beside(drawing, film.poses, goals) > _SEEN * info["size"],
         "linear": motion.linear is not None,
-        "phases": [*zip(motion.phases, motion.starts.tolist(), strict=True)],
+        "phases": [
+            (*phase, each.name.replace("+", " + "), said)
+            for *phase, each, said in zip(
+                motion.phases, motion.starts.tolist(), flown, about, strict=False
+            )
+        ],
         "held": [caught.prefix for caught, _ in held],
     }
     told = (each.notes for each, _ in moving if each is drawing or each.robot.urdf)
@@ -133,6 +146,15 @@ def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
     states = motion.target.reshape(-1, state.nx)
     states = states[shown] if len(states) > 1 else states
     return np.array([state.to_pinocchio(x)[0] for x in states]).reshape(-1, state.robot.nq)
+
+
+def _beside(drawing: Drawing, poses: Array, goals: Array) -> float:
+    """Return how far (N, njoints - 1, 7) goals are from poses at most [m], at some frames."""
+    rows = range(0, len(poses), max(1, len(poses) // 24))
+    pairs = ((poses[k], goals[min(k, len(goals) - 1)]) for k in rows)
+    return max(
+        float(np.abs(corner_points(drawing, a) - corner_points(drawing, b)).max()) for a, b in pairs
+    )
 
 
 def subtitle(robot: Robot) -> str:
