@@ -270,13 +270,6 @@ class LinearController:
         both, K, _ = self.around(lin)
         return both.A + both.B @ K
 
-    @property
-    def stable_turned(self) -> bool:
-        """Whether the linear loop is stable with the other sign."""
-        by = self.system
-        poles = np.linalg.eigvals(replace(self, system=by._replace(C=-by.C, D=-by.D)).loop)
-        return bool((np.abs(poles) < 1.0 if self.dt else poles.real < 0.0).all())
-
     def sampled(self, dt: float) -> LinearController:
         """Return it in samples of dt [s], y held between them; itself where it is sampled."""
         by = self.system
@@ -296,11 +289,12 @@ def growing(policy: Any) -> tuple[str, ...]:
         if (growth > _ROUNDING * (1.0 + np.abs(poles).max(initial=0.0))).any():
             pole, unit = complex(poles[growth.argmax()]), "" if by.dt else " 1/s"
             said.append(f"the {what} is unstable, with a pole at {pole:.4g}{unit}")
-            if what == "linear loop" and by.stable_turned:
+            poles = np.linalg.eigvals(replace(by, sign=-1.0).loop)
+            if what == "linear loop" and ((np.abs(poles) < 1) if by.dt else (poles.real < 0)).all():
                 said[-1] += (
-                    "; with the other sign it is stable: try sign=-1 (--negative-feedback), or "
-                    "without it"
+                    "; with the other sign it is stable: try sign=-1 (--negative-feedback), "
                 )
+                said[-1] += "or leave it out where it is given"
     return tuple(said)
 
 

@@ -1,6 +1,7 @@
 """What is said of a motion: whether it arrived, what it took, what it passed, what proves it."""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from textwrap import shorten
 from typing import Any, NamedTuple, TypeAlias
 
@@ -10,7 +11,6 @@ from fflin.base.names import group_of, input_keys
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array
 from fflin.dynamics.impact import Impact
-from fflin.dynamics.state_rows import attitude_errors
 
 # An error has settled once it stays below this share of its largest.
 SETTLED = 0.02
@@ -33,10 +33,7 @@ _MOST = 8  # lines of a report
 # What has limits: its name, history (N,), unit, and least and largest value (2,).
 Limited: TypeAlias = "tuple[str, Array, str, Array]"
 
-_OF_PHASES = (
-    "|p|, |h|: momentum, linear and about the centre of mass, of the robot as it is then; before: "
-    "of all that meets, just before the impact"
-)
+_OF_PHASES = "|p|, |h|: momentum, |h| about the centre of mass; before: of all that meets"
 
 _TITLES = {"r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
 _PLACES = ("attitude", "position", "joints")
@@ -166,8 +163,7 @@ def motion_report(motion: Any) -> str:
     parts = [folded([*head, f"{motion.robot}: {run}", *circling, *motion.notes])]
     if not (kinds or motion.target.size):
         rows = [["change from the start", "unit", "largest", "last"]]
-        turned = attitude_errors(motion.x, motion.x[0])
-        gone = [kind.row(motion.t) for kind in _courses(motion, motion.x - motion.x[0], turned)]
+        gone = [each.row(motion.t) for each in courses(replace(motion, target=motion.x[0]))]
         rows += [[*each[:2], *each[3:5]] for each in gone if each[0] in _PLACES]
         parts.append(f"\n{grid(rows, 'll')}\n")
     if kinds:
@@ -181,7 +177,7 @@ def motion_report(motion: Any) -> str:
         more = [f"and {len(said) - _MOST} more"] if len(said) > _MOST else []
         parts.append(folded(said[:_MOST] + more))
     if motion.phases:
-        parts += [f"\n{grid(_phases(motion), 'll')}", folded([_OF_PHASES]), ""]
+        parts += [f"\n{grid(_phases(motion), 'll')}", _OF_PHASES, ""]
     first, last = (f"{energy:.6g} J" for energy in motion.energy[[0, -1]])
     drift = f"{motion.momentum_drift.max():.1e}"
     kept = f"{motion.kept} drift {drift}".replace(" ", "\u00a0")
@@ -208,22 +204,19 @@ def _phases(motion: Any) -> list[list[str]]:
         sizes = (np.linalg.norm(each) for each in (momentum[3:], momentum[:3]))
         table.append([name, when, *(f"{x:.4g}" for x in (time, energy, *sizes))])
 
-    struck: list[Any] = [None] * len(motion.phases)
-    flown = 0
-    for part in motion._phases:
-        if isinstance(part, Impact):
-            struck[flown] = part
-        else:
-            flown += 1
+    parts = motion._phases or motion.phases
+    pairs = zip((None, *parts), parts, strict=False)
+    struck = [before for before, part in pairs if not isinstance(part, Impact)]
     firsts = [0, *np.searchsorted(motion.t, motion.starts[1:], "right") - 1, len(motion.t)]
     for k, (name, impact) in enumerate(zip(motion.phases, struck, strict=True)):
         start, end = firsts[k], firsts[k + 1] - 1
         shown, energy, momentum = shorten(name, 28), motion.energy[start], motion.momentum[start]
-        if impact:
+        met = isinstance(impact, Impact)
+        if met:
             change = np.roll(impact.momentum_after - impact.momentum, 3)
             row(shown, "before", motion.t[start], energy + impact.energy_lost, momentum - change)
             shown = ""
-        row(shown, "after" if impact else "start", motion.t[start], energy, momentum)
+        row(shown, "after" if met else "start", motion.t[start], energy, momentum)
         row("", "end", motion.t[end], motion.energy[end], motion.momentum[end])
     return table
 
@@ -232,12 +225,8 @@ def courses(motion: Any) -> list[Course]:
     """Return the errors of each kind, none where there is no target; wheels are no joints."""
     if motion.error is None or motion.attitude_error is None:
         return []
-    return _courses(motion, motion.error, motion.attitude_error)
-
-
-def _courses(motion: Any, error: Array, turned: Array) -> list[Course]:
     steered = set(motion.steered or motion.state_names)
-    sizes = np.abs(error)
+    sizes = np.abs(motion.error)
     columns: dict[tuple[str, str], list[int]] = {}
     for i, (name, unit) in enumerate(zip(motion.state_names, motion.state_units, strict=True)):
         group, _, entry = name.partition(".")
@@ -247,7 +236,7 @@ def _courses(motion: Any, error: Array, turned: Array) -> list[Course]:
         if group != "q_b" and not (group == "q_m" and entry in motion.wheels):
             columns.setdefault((title, unit), []).append(i)
     attitude = any(name.startswith("q_b.") for name in steered)
-    found = [Course("attitude", "deg", turned, attitude)]
+    found = [Course("attitude", "deg", motion.attitude_error, attitude)]
     for of, at in columns.items():
         fed_back = any(motion.state_names[i] in steered for i in at)
         fed_back &= of[0] != "position" or pushed(motion)
@@ -276,11 +265,11 @@ def verdict(motion: Any, kinds: list[Course]) -> str:
         said = f"settled: {_and([kind.last for kind in moved])} after {when:.3g}\u00a0s"
     else:
         said = "settled: at the target from first to last"
-    aside = [kind for kind in places if kind.late and not kind.steered]
-    beyond = [kind for kind in aside if kind.title == "position" and not pushed(motion)]
-    if others := [kind.last for kind in aside if kind not in beyond]:
-        said += f"; not steered: {_and(others)}"
-    if beyond:
+    aside = {k.title: k.last for k in places if k.late and not k.steered}
+    loose = not pushed(motion) and aside.pop("position", "")
+    if aside:
+        said += f"; not steered: {_and([*aside.values()])}"
+    if loose:
         said += "; position is not controlled"
     shares: dict[str, float] = {}  # at either limit
     for each in motion.saturated:

@@ -41,9 +41,6 @@ FORCE_COLOR, TORQUE_COLOR = "#ffd166", "#d58cff"
 # base unless it is told otherwise, both in sizes of the robot.
 ARROW, _FAR = 0.62, 20.0
 
-# A ghost that is nowhere farther from the robot, in sizes of it, is not seen beside it.
-_SEEN = 0.01
-
 
 def motion_page(
     robot: Robot,
@@ -93,6 +90,7 @@ def motion_page(
     # Of each phase, as far as it is known, the robot that then flies.
     flown = [part._robot for part in motion._phases if not isinstance(part, Impact)]
     flown = flown or [robot] * max(1, len(motion.phases))
+    names = [each.name.replace("+", " + ") for each in flown]
     about = [f"{subtitle(each)}, {t[-1] - t[0]:.4g} s" for each in flown]
     info = stage_info(
         robot, drawing, film.poses[0], scene=scene, subtitle=about[0], frame=motion.frame
@@ -101,6 +99,11 @@ def motion_page(
     for each, rows in ((drawing, goals), *moving[len(moving) - len(held) :]):
         for poses in rows[:: max(1, len(rows) // 24)]:
             shown_points = np.concatenate((shown_points, corner_points(each, poses)))
+    # How far the ghost is beside the robot at most: what coincides with it is not seen.
+    step, beside = max(1, len(t) // 24), 0.0
+    for pose, at in zip(film.poses[::step], [*goals[::step]] * len(t), strict=False):
+        apart = corner_points(drawing, pose) - corner_points(drawing, at)
+        beside = max(beside, float(np.abs(apart).max()))
     info["floor"][2] = float(shown_points[:, 2].min())
     if follow is None:
         # All of a long way at once, and nothing is to be seen of the robot.
@@ -121,14 +124,9 @@ def motion_page(
         "speed": speed,
         "follow": follow,
         "points": rounded(shown_points, info["size"]),
-        "target": len(goal) > 0 and _beside(drawing, film.poses, goals) > _SEEN * info["size"],
+        "target": beside > 0.02 * info["size"],
         "linear": motion.linear is not None,
-        "phases": [
-            (*phase, each.name.replace("+", " + "), said)
-            for *phase, each, said in zip(
-                motion.phases, motion.starts.tolist(), flown, about, strict=False
-            )
-        ],
+        "phases": [*zip(motion.phases, motion.starts.tolist(), names, about, strict=False)],
         "held": [caught.prefix for caught, _ in held],
     }
     told = (each.notes for each, _ in moving if each is drawing or each.robot.urdf)
@@ -146,15 +144,6 @@ def _target(motion: Motion, state: StateMap, shown: Array) -> Array:
     states = motion.target.reshape(-1, state.nx)
     states = states[shown] if len(states) > 1 else states
     return np.array([state.to_pinocchio(x)[0] for x in states]).reshape(-1, state.robot.nq)
-
-
-def _beside(drawing: Drawing, poses: Array, goals: Array) -> float:
-    """Return how far (N, njoints - 1, 7) goals are from poses at most [m], at some frames."""
-    rows = range(0, len(poses), max(1, len(poses) // 24))
-    pairs = ((poses[k], goals[min(k, len(goals) - 1)]) for k in rows)
-    return max(
-        float(np.abs(corner_points(drawing, a) - corner_points(drawing, b)).max()) for a, b in pairs
-    )
 
 
 def subtitle(robot: Robot) -> str:

@@ -77,7 +77,20 @@ def test_the_table_has_energy_and_momentum_at_both_ends_of_each_phase(flown):
     whole = flown.whole
     lines = str(whole).splitlines()
     first = next(k for k, line in enumerate(lines) if line.startswith("phase "))
-    assert lines[first].split() == "phase t [s] energy [J] |p| [N s] |h| [N m s]".split()
+    assert lines[first].split() == [
+        "phase",
+        "t",
+        "[s]",
+        "energy",
+        "[J]",
+        "|p|",
+        "[N",
+        "s]",
+        "|h|",
+        "[N",
+        "m",
+        "s]",
+    ]
     rows = [line.split()[-5:] for line in lines[first + 1 : first + 9]]
     assert [row[0] for row in rows] == ["start", "end", *("before", "after", "end") * 2]
     assert [float(row[1]) for row in rows] == [0.0, 4.0, 4.0, 4.0, 10.0, 10.0, 10.0, 13.0]

@@ -89,9 +89,10 @@ def test_a_body_flies_to_the_grasp_and_is_held(browser, tmp_path):
         assert said[0] == name
         assert f", {flown.robot.mass + kept:.4g} kg, 13 s" in said[1]
         body, edges = watched.do(
-            "(() => { const found = []; viewer.scene_tree.find(['meshcat', 'held', 'payload']).object"
-            ".traverse((x) => { if (x.material) found.push([x.type, x.material.opacity, "
-            "x.material.color.getHex(), x.visible]); }); return found; })()"
+            "(() => { const found = [], path = ['meshcat', 'held', 'payload'];"
+            "viewer.scene_tree.find(path).object.traverse((x) => { if (x.material) "
+            "found.push([x.type, x.material.opacity, x.material.color.getHex(), x.visible]); }); "
+            "return found; })()"
         )
         assert body[0] == "Mesh" and body[1] > 0.8 and edges[0] == "LineSegments" and edges[3]
         red, green, blue = (body[2] >> shift & 255 for shift in (16, 8, 0))

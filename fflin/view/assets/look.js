@@ -7,7 +7,7 @@ const FINISHES = [
   [/black|carbon|rubber/i, { metalness: 0.3, roughness: 0.5 }],
   [/joint|dark|grey|gray/i, { metalness: 0.55, roughness: 0.42 }],
   [/white|tube|light/i, { metalness: 0.05, roughness: 0.42 }],
-  [/held inertia/, { metalness: 0.0, roughness: 0.8, opacity: 0.9 }],
+  [/held inertia/, { metalness: 0.0, roughness: 0.8, opacity: 0.82, lift: 0.6 }],
   [/inertia/, { metalness: 0.0, roughness: 0.7, opacity: 0.55 }],
   [/./, { metalness: 0.1, roughness: 0.5 }],
   [/^$/, { metalness: 0.15, roughness: 0.5 }],

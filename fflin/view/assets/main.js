@@ -13,7 +13,7 @@ function problem(message) {
   box.hidden = !message;
 }
 
-const GHOST = "#8fb4ff", HELD = "#c08a5e";
+const GHOST = "#8fb4ff", HELD = "#b5926f";
 
 // The largest side of the box about points x, y, z, ...
 function extent(points) {
@@ -27,7 +27,7 @@ function legendOf(info) {
   const entry = (label, colour, ...path) => ({ label, colour, path: ["meshcat", ...path] });
   if (info.mode === "modes") return [entry("at rest", GHOST, "rest")];
   const entries = [
-    ...info.trails.filter(({ points }) => extent(points) > 0.01 * info.size).map(({ name, colour }) => entry(`path of the ${name}`, colour, "trails", name)),
+    ...info.trails.filter(({ points }) => extent(points) > 0.02 * info.size).map(({ name, colour }) => entry(`path of the ${name}`, colour, "trails", name)),
     ...info.arrows.map(({ kind, colour }) => entry(`${kind} on the base`, colour, "wrench", kind)),
   ];
   entries.push(...(info.cloud ?? []).map(({ name, label, colour }) => entry(label, colour, "cloud", name)));
