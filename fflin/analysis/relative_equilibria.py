@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from fflin.base.errors import InputError
+from fflin.base.errors import InputError, SingularInertiaError
 from fflin.base.frozen import FrozenArrays
 from fflin.base.tables import grid
 from fflin.base.validation import Array
@@ -119,7 +119,9 @@ def relative_equilibria(
     Raises
     ------
     InputError
-        If the robot is in no orbit, or an argument is none.
+        If the robot is in no orbit, its wheels store momentum, or an argument is none.
+    SingularInertiaError
+        If it has no inertia about an axis.
 
     References
     ----------
@@ -141,12 +143,21 @@ def relative_equilibria(
             f"'{robot.name}' is in no orbit; give it one: "
             "robot.replace(orbit=fflin.CircularOrbit(altitude=...))"
         )
+    if robot.stored_momentum:
+        raise InputError(
+            f"wheels of '{robot.name}' store momentum, which turns it beside the field; take them "
+            "without (momentum=0), or equilibrium at an attitude"
+        )
     q = robot.neutral() if q is None else robot.checked_configuration(q).copy()
     q[:7] = pin.SE3ToXYZQUAT(pin.SE3.Identity())
     data, root = robot.create_data(), robot.model.jointPlacements[ROOT]
     pin.ccrba(robot.model, data, q, np.zeros(robot.nv))
     center = root.actInv(data.com[0])
     sizes, axes = np.linalg.eigh(root.rotation.T @ data.Ig.inertia @ root.rotation)
+    if sizes[0] <= _ROUNDING * sizes[2]:
+        raise SingularInertiaError(
+            f"'{robot.name}' has no inertia about an axis; give it one, as linearize needs too"
+        )
     n, found = mean_motion(robot), []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         own = axes[:, order] * signs

@@ -120,6 +120,8 @@ def loop_of(robot: Robot, arguments: argparse.Namespace) -> Loop:
         "delay": arguments.delay,
         "duration": arguments.duration,
     }
+    if not arguments.controller:
+        _refuse(arguments, ("negative_feedback",), "it is of a --controller")
     if arguments.trajectory or arguments.schedule:
         policy, start = along(robot, arguments)
         return Loop(policy, options | start)

@@ -197,6 +197,8 @@ class LinearController:
         lin = instance("lin", self.lin, LinearModel, "a fflin.LinearModel")
         if lin.moving or number("sign", self.sign) not in (1.0, -1.0):
             raise InputError("expected a model about a point that stays, and sign 1 or -1")
+        if self.noise is not None and not callable(self.noise):
+            raise InputError(f"noise is {self.noise!r}, expected noise(t) -> (ny,), a function")
         by = fitted(system_of(self.system), lin)
         felt = lin.D.any(axis=1) & by.D.any(axis=0)
         if felt.any():

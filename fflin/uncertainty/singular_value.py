@@ -1,8 +1,15 @@
-"""Upper bounds of the structured singular value of parameters that are real and repeated."""
+"""Upper bounds of the structured singular value of parameters that are real and repeated.
+
+Of real ones it jumps with the frequency, where a pole crosses the axis, and values at a grid's own
+frequencies say nothing of those between. So each interval has one scaling for all of it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from heapq import heapify, heappop, heappush
+from itertools import pairwise
+from typing import TypeAlias
 
 import numpy as np
 
@@ -10,21 +17,32 @@ from fflin.base.validation import Array
 
 # Signals up to which slycot is asked, whose time grows with the fifth power of them.
 _SIGNALS = 24
-# Frequencies of a first look, and those put between the neighbours of the largest, twice.
-_LOOK, _CLOSER = 120, 12
+# Frequencies of a first look, those at which an interval is held, and how often intervals are
+# divided or slycot is asked.
+_LOOK, _HELD, _STEPS = 120, 5, 100
+# How near to the bound of one frequency that of its interval is enough.
+_NEAR = 1.01
+
+Scaling: TypeAlias = tuple[Array, Array]  # d > 0 and g, (n,) each
 
 
-def scaled(Z: Array) -> tuple[Array, Array]:
-    """Return d Z / d (.., n, n) of the d > 0 that are best for |Z|, and its largest gains (..)."""
-    # By Perron's vectors of |Z|; the gains are bounds for deltas on a signal each.
+def perron(Z: Array) -> Array:
+    """Return the d > 0 (.., n, 1) that make d Z / d small, by Perron's vectors of |Z|."""
     sizes = np.abs(Z) + 1e-9 * np.abs(Z).max(axis=(-2, -1), keepdims=True) + 1e-300
     right, left = np.ones((2, *Z.shape[:-1], 1))
     for _ in range(100):
         right, left = sizes @ right, sizes.mT @ left
         right, left = (each / each.max(axis=-2, keepdims=True) for each in (right, left))
-    d = np.sqrt(left / right)
-    Z = d * Z / d.mT
-    return Z, np.linalg.svd(Z, compute_uv=False)[..., 0]
+    d: Array = np.sqrt(left / right)
+    return d
+
+
+def held(Z: Array, scaling: Scaling) -> float:
+    """Return the least b with Z^H D^2 Z + j (G Z - Z^H G) <= b^2 D^2 for all of Z (k, n, n)."""
+    d, g = scaling
+    scaled, turned = d[:, None] * Z / d, (g / d)[:, None] * Z / d
+    form = scaled.conj().mT @ scaled + 1j * (turned - turned.conj().mT)
+    return float(np.sqrt(np.linalg.eigvalsh(form)[:, -1].max().clip(0.0)))
 
 
 def largest_bound(
@@ -32,29 +50,56 @@ def largest_bound(
 ) -> float:
     """Return the largest bound of Z = response(w), `end` at infinity, for a loop of such rates."""
     grid = np.geomspace(0.01 * rates.min(), 100.0 * rates.max(), _LOOK)
-    grid, largest = np.unique(np.concatenate(((0.0,), grid, rates))), 0.0
-    for closer in range(3):
-        Z = response(grid)
-        Z, bounds = scaled(Z if closer else np.concatenate((Z, end[None])))
-        for at in np.argsort(-bounds):
-            if bounds[at] <= largest:
-                break
-            bounds[at] = min(bounds[at], _by_slycot(Z[at], blocks))
-            largest = max(largest, float(bounds[at]))
-        at = int(bounds[: len(grid)].argmax())
-        grid = np.linspace(grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)], _CLOSER)
-    return largest
+    grid = np.unique(np.concatenate(((0.0,), grid, rates)))
+    at_end = min(held(end[None], each) for each in _scalings(end, blocks))
+    heap: list[tuple[float, float, float, bool, Scaling]] = []
+
+    def best_of(a: float, b: float, asked: bool, *known: Scaling) -> tuple[float, Scaling, float]:
+        """Return the bound of an interval and what gives it, and that of its middle alone."""
+        Z = response(np.linspace(a, b, _HELD))
+        middle = Z[_HELD // 2]
+        found = [*known, *_scalings(middle, blocks if asked else blocks[:0])]
+        values = [held(Z, each) for each in found]
+        least = min(held(middle[None], each) for each in found)
+        return min(values), found[int(np.argmin(values))], least
+
+    for a, b in pairwise(grid.tolist()):
+        value, by, _ = best_of(a, b, False)
+        heap.append((-value, a, b, False, by))
+    heapify(heap)
+    reached = at_end
+    for _ in range(_STEPS):
+        if -heap[0][0] <= _NEAR * reached:
+            break
+        value, a, b, asked, by = heappop(heap)
+        if asked:
+            half = 0.5 * (a + b)
+            for low, high in ((a, half), (half, b)):
+                heappush(heap, (-best_of(low, high, False, by)[0], low, high, False, by))
+        else:
+            value, by, least = best_of(a, b, True, by)
+            reached = max(reached, least)
+            heappush(heap, (-value, a, b, True, by))
+    return max(at_end, -heap[0][0])
 
 
-def _by_slycot(Z: Array, blocks: Array) -> float:
-    """Return the bound of AB13MD: a delta on one signal is real, a repeated one a full block."""
+def _scalings(Z: Array, blocks: Array) -> list[Scaling]:
+    """Return scalings that are good for Z, with those of AB13MD where blocks are told."""
+    none: Array = np.zeros(len(Z))
+    found: list[Scaling] = [(perron(Z)[:, 0], none)]
+    if len(Z) == 1 and len(blocks) and Z[0, 0].imag:
+        return [*found, (none + 1.0, np.abs(Z[0]) ** 2 / (2.0 * Z[0].imag))]
     try:
         from slycot import ab13md
         from slycot.exceptions import SlycotArithmeticError
     except ImportError:
-        return np.inf
-    try:
-        kinds = np.where(blocks == 1, 1, 2)
-        return float(ab13md(Z, blocks, kinds)[0]) if len(Z) <= _SIGNALS else np.inf
-    except SlycotArithmeticError:
-        return np.inf
+        return found
+    if 0 < len(blocks) and len(Z) <= _SIGNALS:
+        try:
+            # A delta on one signal is real, a repeated one a full block.
+            _, d, g, *_ = ab13md(Z, blocks, np.where(blocks == 1, 1, 2))
+        except SlycotArithmeticError:
+            return found
+        if d.min() > 0.0 and np.isfinite((d, g)).all():
+            found.append((d, g))
+    return found

@@ -54,8 +54,8 @@ class Worst:
         Loops tried, and draws and corners left out because they make no rigid bodies.
     safe : float
         The loop is stable for all ranges widened about their middles by this factor, by an upper
-        bound of the structured singular value over a grid of frequencies; 1 or more is all of the
-        set.
+        bound of the structured singular value over intervals of frequencies, each held at five of
+        them; 1 or more is all of the set.
     """
 
     damping: Found
@@ -81,7 +81,7 @@ class Worst:
         if self.safe >= 1.0:
             lines.append(f"stable on all of the set, up to {self.safe:.3g} times as wide (bound)")
         else:
-            lines.append(f"stable for sure on {100.0 * self.safe:.3g} % of each range (bound)")
+            lines.append(f"stable on {100.0 * self.safe:.3g} % of each range (bound)")
         return folded(lines)
 
 
@@ -111,14 +111,15 @@ def searched(of: Any, lft: LFT, gain: Any, samples: int, seed: int) -> Worst:
         value, delta = _largest(*figures, tried, of.makes)
         found.append(Found(value, of.values(delta)))
         bar.update(len(found), 4)
-    safe = _safe(loops)
+    unstable = loops.undamped(tried) >= 0.0
+    safe = min(_safe(loops), float(np.abs(tried[unstable]).max(axis=1).min(initial=np.inf)))
     bar.close()
     damping, margin, gained = found
     return Worst(
         damping=replace(damping, value=-damping.value),
         margin=replace(margin, value=min(1.0 / margin.value, 2.0)),
         gain=gained,
-        unstable=int((loops.undamped(tried) >= 0.0).sum()),
+        unstable=int(unstable.sum()),
         tried=len(tried),
         excluded=excluded + int((~physical).sum()),
         safe=safe,

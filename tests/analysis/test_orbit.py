@@ -72,6 +72,16 @@ def test_the_kinds_of_attitudes_are_told_and_margins_decide():
     assert len(kinds) == 8
 
 
+def test_what_has_no_such_attitudes_is_refused():
+    robot = fflin.load("cubesat", orbit=700e3)
+    wheel = fflin.ReactionWheel([0.0, 1.0, 0.0], momentum=0.02)
+    with pytest.raises(fflin.InputError, match="store momentum"):
+        fflin.relative_equilibria(robot.replace(inputs=[wheel]))
+    rod = free_body((1.0, 1.0, 0.0)).replace(orbit=700e3)
+    with pytest.raises(fflin.SingularInertiaError, match="no inertia about an axis"):
+        fflin.relative_equilibria(rod)
+
+
 def test_joints_hold_their_posture_in_a_relative_equilibrium():
     robot = fflin.load("servicer_7dof", orbit=800e3)
     robot = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])

@@ -378,6 +378,7 @@ def test_controllers_that_do_not_fit_are_refused(tmp_path):
     assert "has 3 inputs and no names, expected" in refused(*robot, cwd=tmp_path)
     assert "--dt: --controller is what regulates" in refused(*robot, "--dt", 1, cwd=tmp_path)
     assert "--free has no regulator" in refused(*robot, "--free", cwd=tmp_path)
+    assert "is of a --controller" in refused("simulate", "cubesat", "--negative-feedback")
     assert "none.mat: cannot be read" in refused(*robot[:3], "none.mat", cwd=tmp_path)
     unstable = {"D": 100.0 * np.eye(12, 24, 6)}
     scipy.io.savemat(tmp_path / "K.mat", unstable)

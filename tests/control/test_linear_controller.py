@@ -288,6 +288,8 @@ def test_what_is_no_controller_of_the_model_is_refused(lin, arm):
         fflin.LinearController((A, B, C, D, 0.2), lin.discretize(0.1))
     with pytest.raises(fflin.InputError, match="controller is continuous, the model sampled"):
         fflin.LinearController((A, B, C, D, 0.0), lin.discretize(0.1))
+    with pytest.raises(fflin.InputError, match=r"noise is 3, expected noise\(t\)"):
+        fflin.LinearController(D, lin, noise=3)
     policy = fflin.LinearController((A, B, C, D, 0.1), lin)
     cubesat = fflin.load("cubesat", outputs=SEEN)
     with pytest.raises(fflin.InputError, match=r"asked 0\.2 s after its last sample"):

@@ -147,6 +147,9 @@ def test_it_goes_on_at_rest_where_the_trajectory_ends(loop):
     # From the motion at the end, which is none of rest, to rest.
     assert np.abs(on.v[128]).max() > 0.3
     assert np.abs(on.error[-1]).max() < 1e-3
+    jump = policy._sample(policy.duration).jump
+    moved = fflin.StateMap(robot, frame="local").velocities(on.v[128])
+    np.testing.assert_allclose(jump[len(jump) // 2 :], moved, atol=1e-9)
     off = on.error - (on.prediction - on.target)
     # What is foreseen of so large a jump, a linear model has by its second order alone.
     assert np.abs(off[137:161]).max() < 0.35 * np.abs(on.error[137:161]).max()

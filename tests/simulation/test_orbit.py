@@ -137,3 +137,10 @@ def test_a_target_in_the_other_frame_is_no_target():
     with pytest.raises(fflin.InputError, match="frame 'hill', expected 'lvlh'"):
         fflin.simulate(robot, target=target, duration=0.1)
     assert fflin.simulate(robot, target=target, duration=0.1, frame="hill").frame == "hill"
+
+
+def test_what_wheels_store_counts_in_the_jacobi_integral():
+    robot, q, v = moving("cubesat")
+    robot = robot.replace(inputs=[fflin.ReactionWheel([1.0, 2.0, -1.0], momentum=0.02)])
+    motion = fflin.simulate(robot, q0=q, v0=v, duration=4.0, dt=0.02)
+    assert motion.engine == "python" and motion.momentum_drift.max() < 1e-8

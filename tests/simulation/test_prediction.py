@@ -88,3 +88,22 @@ def test_a_model_in_another_reference_foresees_nothing():
     policy = fflin.StateFeedback(lin, gain.K)
     with pytest.raises(fflin.InputError, match="frame and reference of the run"):
         fflin.simulate(robot, policy, duration=0.1, linear=other)
+
+
+def test_a_continuous_controller_is_foreseen_from_another_point_and_with_what_is_felt():
+    outputs = [fflin.BasePose(), fflin.JointPositions(), fflin.Accelerometer("base")]
+    robot = fflin.load("ets_vii", outputs=outputs, stiffness=3.0, damping=1.0)
+    lin = fflin.linearize(robot)
+    (nu, nx), ny = lin.B.T.shape, len(lin.y0)
+    rng = np.random.default_rng(2)
+    B, C = rng.normal(size=(2, ny)), rng.normal(size=(nu, 2))
+    D = np.zeros((nu, ny))
+    D[:, :6] = rng.normal(size=(nu, 6))
+    policy = fflin.LinearController((-np.eye(2), B, C, D), lin)
+    q = fflin.configuration(robot, {"joint_1": 0.02})
+    beside = fflin.linearize(robot, q, u=fflin.equilibrium(robot, q).u)
+    x0 = lin.x0 + 1e-4 * np.cos(np.arange(nx))
+    for linear in (True, beside):
+        run = fflin.simulate(robot, policy, x0=x0, duration=2.0, dt=0.01, linear=linear)
+        moved = np.abs(run.x - x0).max()
+        assert np.abs(run.linear - run.x).max() < 1e-3 * moved

@@ -75,16 +75,17 @@ def test_of_many_signals_the_bound_asks_no_more_of_slycot_than_it_can(monkeypatc
 
 def test_the_bound_by_scaling_is_that_of_textbooks():
     # Packard and Doyle, Automatica 29(1), 1993: of diagonal blocks the bound by D Z D^-1.
-    Z = np.array([[1.0, 4.0], [0.25, 1.0]])
-    assert singular_value.scaled(Z)[1] == pytest.approx(2.0, rel=1e-6)
-    rows = np.random.default_rng(0).normal(size=(20, 5, 5)) + 0j
-    scaled, bounds = singular_value.scaled(rows)
-    radii = np.abs(np.linalg.eigvals(rows)).max(axis=1)
-    assert (bounds >= radii * (1.0 - 1e-12)).all()
-    assert (bounds <= np.abs(np.linalg.eigvals(np.abs(rows))).max(axis=1) * (1.0 + 1e-6)).all()
-    assert np.linalg.eigvals(scaled[3])[0] == pytest.approx(np.linalg.eigvals(rows[3])[0])
-    nothing = singular_value.scaled(np.zeros((1, 3, 3)))
-    assert not nothing[0].any() and not nothing[1].any()
+    def scaled(Z):
+        d = singular_value.perron(Z)
+        return d * Z / d.mT, singular_value.held(Z[None], (d[:, 0], 0.0 * d[:, 0]))
+
+    assert scaled(np.array([[1.0, 4.0], [0.25, 1.0]]))[1] == pytest.approx(2.0, rel=1e-6)
+    for Z in np.random.default_rng(0).normal(size=(20, 5, 5)) + 0j:
+        alike, bound = scaled(Z)
+        assert np.abs(np.linalg.eigvals(Z)).max() * (1.0 - 1e-12) <= bound
+        assert bound <= np.abs(np.linalg.eigvals(np.abs(Z))).max() * (1.0 + 1e-6)
+        assert np.linalg.norm(alike, 2) == pytest.approx(bound)
+    assert scaled(np.zeros((2, 2)))[1] == 0.0
 
 
 def test_slycot_gives_the_structured_singular_value_of_its_own_example():
@@ -98,8 +99,12 @@ def test_slycot_gives_the_structured_singular_value_of_its_own_example():
     blocks, kinds = [1, 1, 2, 1, 1], [1, 1, 2, 2, 2]
     # The example of AB13MD in SLICOT.
     assert slycot.ab13md(Z, blocks, kinds)[0] == pytest.approx(41.74753408, rel=1e-6)
-    # Real numbers and full blocks: as `worst` asks it.
-    assert singular_value._by_slycot(Z, np.array([1, 1, 2, 1, 1])) <= 41.74753408 * (1.0 + 1e-6)
+    # Real numbers and full blocks, as `worst` asks it: what it returns makes its bound.
+    blocks = np.array(blocks)
+    bound = slycot.ab13md(Z, blocks, np.where(blocks == 1, 1, 2))[0]
+    by = singular_value._scalings(Z, blocks)[-1]
+    assert singular_value.held(Z[None], by) == pytest.approx(bound, rel=1e-6)
+    assert bound <= 41.74753408 * (1.0 + 1e-6)
 
 
 def test_the_worst_loop_of_one_parameter_is_at_its_end():
@@ -152,6 +157,19 @@ def test_what_is_safe_is_stable_and_no_more_is_promised():
     for delta in min(worst.safe, 1.0) * rng.uniform(-1.0, 1.0, (200, 3)):
         A, B, *_ = lft.at(delta)
         assert np.linalg.eigvals(A - B @ gain.K).real.max() < 0.0
+
+
+def test_a_pole_that_crosses_the_axis_between_frequencies_of_the_grid_is_not_missed():
+    """s^3 + s^2 + (2 + delta) s + 1 has its poles at +-j where delta is -1, by Routh."""
+    pytest.importorskip("slycot")
+    polynomial = (1.0, 1.0, 2.0, 1.0)
+
+    def response(w):
+        return (-1j * w / np.polyval(polynomial, 1j * w))[:, None, None]
+
+    rates = np.abs(np.roots(polynomial))
+    bound = singular_value.largest_bound(response, np.zeros((1, 1)), rates, np.array([1]))
+    assert bound >= 1.0
 
 
 def test_of_many_parameters_some_corners_are_tried(monkeypatch):
