@@ -79,8 +79,9 @@ def motion_page(
         moving.append((Drawing(robot, scenery["linear"], "linear", sent), poses))
     held = list(payloads(motion, shown))
     for caught, poses in held:
-        node = scenery["held"][caught.prefix]
-        moving.append((Drawing(caught.payload, node, "held", sent), poses))
+        moving.append(
+            (Drawing(caught.payload, scenery["held"][caught.prefix], "held", sent), poses)
+        )
     clips = []
     for each, poses in moving:
         each.place(poses[0])
