@@ -34,6 +34,7 @@ from fflin.kernel.compiled import available_cores
 from fflin.kernel.tree import LANES
 from fflin.robot.robot import Robot
 from fflin.simulation.plan import planned
+from fflin.simulation.report import pushed
 
 # Runs in the largest chunk, and after which it is first looked whether they are enough: chunks are
 # parts of it, so that the number of runs does not depend on them.
@@ -290,6 +291,7 @@ def _header(job: CampaignJob) -> dict[str, Any]:
     plan, plant = job.plan, job.plant
     wheels = {f"q_m.{name}" for name in plant.robot.wheels}
     steered = {name.partition(".")[0] for name in {*(plan.steered or plant.state.names)} - wheels}
+    steered -= set() if pushed(plant.actuation) else {"r_b"}
     groups = zip(KINDS, ("q_b", "r_b", "q_m"), strict=False)
     return {
         "kind": "Campaign",

@@ -20,8 +20,9 @@ def campaign_report(campaign: Any) -> str:
     rows = [["error", "unit", "half", "95 %", "99 %", "worst 95 %", "settled after [s]"]]
     for name, unit in KINDS.items():
         figures = [quantile(name, p).value for p in _SHARES]
-        figures += [quantile(f"{of} {name}", 0.95).value for of in ("worst", "settle")]
-        rows.append([name, unit, *(f"{x:.3g}" for x in figures)])
+        figures.append(quantile(f"worst {name}", 0.95).value)
+        when = _when(quantile(f"settle {name}", 0.95).value)
+        rows.append([name, unit, *(f"{x:.3g}" for x in figures), when])
     told = [goal_met(campaign, goal) for goal in campaign.goals]
     for name, found in whence(campaign).items():
         first = ", ".join(f"{key}\u00a0{value:+.2f}" for key, value in list(found.items())[:4])
@@ -65,10 +66,15 @@ def worst_runs(campaign: Any, k: int) -> list[str]:
         far = int(out[run].argmax())
         stop = STOPS[int(campaign.stop[run])]
         ended = f"{campaign.end[run]:g}{', ' * bool(stop)}{stop}"
-        settled = f"{campaign.values('settle')[run]:.3g}"
+        settled = _when(campaign.values("settle")[run])
         drawn = f"{campaign.names[far]} = {campaign.drawn[run, far]:.3g}"
         rows.append([str(run), f"{values[run]:.3g}", unit, settled, ended, drawn])
     return ["", grid(rows, "rrlrll"), ""]
+
+
+def _when(time: float) -> str:
+    """Show since when something has settled, as the report of a motion does."""
+    return f"{time:.3g}" if math.isfinite(time) else "not yet"
 
 
 def campaign_record(campaign: Any, worst: int) -> dict[str, Any]:

@@ -1,6 +1,8 @@
 """What is said of a motion: whether it arrived, what it took, what it passed, what proves it."""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from textwrap import shorten
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -8,6 +10,7 @@ import numpy as np
 from fflin.base.names import group_of, input_keys
 from fflin.base.tables import folded, grid
 from fflin.base.validation import Array
+from fflin.dynamics.impact import Impact
 
 # An error has settled once it stays below this share of its largest.
 SETTLED = 0.02
@@ -29,6 +32,8 @@ _MOST = 8  # lines of a report
 
 # What has limits: its name, history (N,), unit, and least and largest value (2,).
 Limited: TypeAlias = "tuple[str, Array, str, Array]"
+
+_OF_PHASES = "|p|, |h|: momentum, |h| about the centre of mass; before: of all that meets"
 
 _TITLES = {"r_b": "position", "q_m": "joints", "qdot_m": "joint rates"}
 _PLACES = ("attitude", "position", "joints")
@@ -156,6 +161,11 @@ def motion_report(motion: Any) -> str:
     run = f"{motion.t[-1]:g} s, {len(motion.t)} rows, frame {motion.frame}{by}"
     circling = [str(motion.orbit)] if motion.orbit else []
     parts = [folded([*head, f"{motion.robot}: {run}", *circling, *motion.notes])]
+    if not (kinds or motion.target.size):
+        rows = [["change from the start", "unit", "largest", "last"]]
+        gone = [each.row(motion.t) for each in courses(replace(motion, target=motion.x[0]))]
+        rows += [[*each[:2], *each[3:5]] for each in gone if each[0] in _PLACES]
+        parts.append(f"\n{grid(rows, 'll')}\n")
     if kinds:
         settled = f"within {100.0 * SETTLED:g} % after [s]"
         rows = [["error", "unit", "first", "largest", "last", settled]]
@@ -167,10 +177,11 @@ def motion_report(motion: Any) -> str:
         more = [f"and {len(said) - _MOST} more"] if len(said) > _MOST else []
         parts.append(folded(said[:_MOST] + more))
     if motion.phases:
-        parts.append(f"\n{grid(_phases(motion), 'l')}\n")
+        parts += [f"\n{grid(_phases(motion), 'll')}", _OF_PHASES, ""]
     first, last = (f"{energy:.6g} J" for energy in motion.energy[[0, -1]])
     drift = f"{motion.momentum_drift.max():.1e}"
-    parts.append(f"energy {first} at first, {last} at last; {motion.kept} drift {drift}")
+    kept = f"{motion.kept} drift {drift}".replace(" ", "\u00a0")
+    parts.append(folded([f"energy {first} at first, {last} at last; {kept}"]))
     if len(motion.com_drift):
         far = f"{motion.com_drift.max():.1e} m"
         parts.append(f"largest distance of the centre of mass from its line: {far}")
@@ -186,15 +197,28 @@ def motion_report(motion: Any) -> str:
 
 
 def _phases(motion: Any) -> list[list[str]]:
-    """Return the table of phases; momentum is of the robot as it is, about its centre of mass."""
-    heads = [["phase", "from [s]", "energy [J]", "at its end", "|momentum| [N s]", "[N m s]"]]
-    ends = [*np.searchsorted(motion.t, motion.starts[1:], "right") - 1, len(motion.t)]
-    for k, (name, start) in enumerate(zip(motion.phases, motion.starts, strict=True)):
-        rows = slice(ends[k - 1] if k else 0, ends[k])
-        energy, momentum = motion.energy[rows], motion.momentum[rows][-1]
+    """Return the table of phases; a motion from a file does not know the impacts before them."""
+    table = [["phase", "", "t [s]", "energy [J]", "|p| [N s]", "|h| [N m s]"]]
+
+    def row(name: str, when: str, time: float, energy: float, momentum: Array) -> None:
         sizes = (np.linalg.norm(each) for each in (momentum[3:], momentum[:3]))
-        heads.append([name, *(f"{x:.4g}" for x in (start, *energy[[0, -1]], *sizes))])
-    return heads
+        table.append([name, when, *(f"{x:.4g}" for x in (time, energy, *sizes))])
+
+    parts = motion._phases or motion.phases
+    pairs = zip((None, *parts), parts, strict=False)
+    struck = [before for before, part in pairs if not isinstance(part, Impact)]
+    firsts = [0, *np.searchsorted(motion.t, motion.starts[1:], "right") - 1, len(motion.t)]
+    for k, (name, impact) in enumerate(zip(motion.phases, struck, strict=True)):
+        start, end = firsts[k], firsts[k + 1] - 1
+        shown, energy, momentum = shorten(name, 28), motion.energy[start], motion.momentum[start]
+        met = isinstance(impact, Impact)
+        if met:
+            change = np.roll(impact.momentum_after - impact.momentum, 3)
+            row(shown, "before", motion.t[start], energy + impact.energy_lost, momentum - change)
+            shown = ""
+        row(shown, "after" if met else "start", motion.t[start], energy, momentum)
+        row("", "end", motion.t[end], motion.energy[end], motion.momentum[end])
+    return table
 
 
 def courses(motion: Any) -> list[Course]:
@@ -215,8 +239,14 @@ def courses(motion: Any) -> list[Course]:
     found = [Course("attitude", "deg", motion.attitude_error, attitude)]
     for of, at in columns.items():
         fed_back = any(motion.state_names[i] in steered for i in at)
+        fed_back &= of[0] != "position" or pushed(motion)
         found.append(Course(*of, sizes[:, at].max(axis=1), fed_back))
     return found
+
+
+def pushed(of: Any) -> bool:
+    """Whether of a motion's inputs, or of what else has their names, one is a force on the base."""
+    return any(group_of(name) in ("F_b", "thrust") for name in input_keys(of))
 
 
 def verdict(motion: Any, kinds: list[Course]) -> str:
@@ -226,9 +256,8 @@ def verdict(motion: Any, kinds: list[Course]) -> str:
     places = [kind for kind in kinds if kind.title in _PLACES]
     judged = [kind for kind in places if kind.steered] or [k for k in kinds if k.steered]
     moved = [kind for kind in judged if kind.size.max() > THERE]
-    if motion.tracked:
-        where = "its phases' targets" if motion.phases else "its trajectory"
-        said = f"beside {where} at the end: {_and([kind.last for kind in judged])}"
+    if motion.tracked and not motion.phases:
+        said = f"beside its trajectory at the end: {_and([kind.last for kind in judged])}"
     elif failed := [kind.last for kind in moved if kind.late]:
         said = f"not settled: {_and(failed)} at the end"
     elif moved:
@@ -236,8 +265,12 @@ def verdict(motion: Any, kinds: list[Course]) -> str:
         said = f"settled: {_and([kind.last for kind in moved])} after {when:.3g}\u00a0s"
     else:
         said = "settled: at the target from first to last"
-    if aside := [kind.last for kind in places if kind.late and not kind.steered]:
-        said += f"; not steered: {_and(aside)}"
+    aside = {k.title: k.last for k in places if k.late and not k.steered}
+    loose = not pushed(motion) and aside.pop("position", "")
+    if aside:
+        said += f"; not steered: {_and([*aside.values()])}"
+    if loose:
+        said += "; position is not controlled"
     shares: dict[str, float] = {}  # at either limit
     for each in motion.saturated:
         shares[each.name] = shares.get(each.name, 0.0) + each.share

@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from fflin.base.tables import counted
 from fflin.base.validation import Array
+from fflin.dynamics.impact import Impact
 from fflin.dynamics.names import frame_of
 from fflin.dynamics.orbital import field_of
 from fflin.dynamics.state import StateMap
@@ -78,21 +79,32 @@ def motion_page(
         moving.append((Drawing(robot, scenery["linear"], "linear", sent), poses))
     held = list(payloads(motion, shown))
     for caught, poses in held:
-        moving.append((Drawing(caught.payload, scenery["held"][caught.prefix], sent=sent), poses))
+        moving.append(
+            (Drawing(caught.payload, scenery["held"][caught.prefix], "held", sent), poses)
+        )
     clips = []
     for each, poses in moving:
         each.place(poses[0])
         clips += each.tracks(t - t[0], poses)
     window.send(Animation(clips))
 
-    about = f"{subtitle(robot)}, {t[-1] - t[0]:.4g} s"
+    # Of each phase, as far as it is known, the robot that then flies.
+    flown = [part._robot for part in motion._phases if not isinstance(part, Impact)]
+    flown = flown or [robot] * max(1, len(motion.phases))
+    names = [each.name.replace("+", " + ") for each in flown]
+    about = [f"{subtitle(each)}, {t[-1] - t[0]:.4g} s" for each in flown]
     info = stage_info(
-        robot, drawing, film.poses[0], scene=scene, subtitle=about, frame=motion.frame
+        robot, drawing, film.poses[0], scene=scene, subtitle=about[0], frame=motion.frame
     )
     shown_points = frame_points(drawing, film, info["size"])
     for each, rows in ((drawing, goals), *moving[len(moving) - len(held) :]):
         for poses in rows[:: max(1, len(rows) // 24)]:
             shown_points = np.concatenate((shown_points, corner_points(each, poses)))
+    # How far the ghost is beside the robot at most: what coincides with it is not seen.
+    step, beside = max(1, len(t) // 24), 0.0
+    for pose, at in zip(film.poses[::step], [*goals[::step]] * len(t), strict=False):
+        apart = corner_points(drawing, pose) - corner_points(drawing, at)
+        beside = max(beside, float(np.abs(apart).max()))
     info["floor"][2] = float(shown_points[:, 2].min())
     if follow is None:
         # All of a long way at once, and nothing is to be seen of the robot.
@@ -113,9 +125,9 @@ def motion_page(
         "speed": speed,
         "follow": follow,
         "points": rounded(shown_points, info["size"]),
-        "target": len(goal) > 0,
+        "target": beside > 0.02 * info["size"],
         "linear": motion.linear is not None,
-        "phases": [*zip(motion.phases, motion.starts.tolist(), strict=True)],
+        "phases": [*zip(motion.phases, motion.starts.tolist(), names, about, strict=False)],
         "held": [caught.prefix for caught, _ in held],
     }
     told = (each.notes for each, _ in moving if each is drawing or each.robot.urdf)

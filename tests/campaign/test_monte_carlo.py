@@ -16,6 +16,7 @@ from scipy import stats
 from scipy.linalg import expm
 
 import fflin
+from fflin.campaign.report import worst_runs
 from fflin.campaign.runs import ARRAYS, CampaignJob
 from fflin.simulation.report import courses
 from tests.support.campaigns import both
@@ -626,3 +627,25 @@ def test_runs_that_a_file_has_are_not_flown_again(robots, tmp_path, monkeypatch)
         assert (after.replay(3).x[-1] == before.x[3]).all()
     again = fflin.monte_carlo(robot, policy, {"q_b": 0.06}, runs=16, **options)
     assert (again.drawn != after.drawn).all()
+
+
+def test_what_no_input_pushes_is_judged_in_no_campaign_either():
+    robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
+    lin = fflin.linearize(robot)
+    K = np.zeros((3, 12))
+    K[:, :3] = K[:, 6:9] = 2.0 * np.diag(lin.M.diagonal()[:3])
+    options = {"runs": 4, "duration": 30.0, "dt": 0.05}
+    law = fflin.LinearController(-K, lin)
+    runs = fflin.monte_carlo(robot, law, {"q_b": 0.05, "v_b": 0.01}, **options)
+    assert runs.judged == ("attitude",) and np.isfinite(runs.values("settle")).all()
+    motion = runs.replay(0)
+    assert str(motion).startswith("settled: attitude ")
+    # What has not settled is told as it is of a motion.
+    assert np.isinf(runs.values("settle position")).all()
+    row = next(line for line in str(runs).splitlines() if line.startswith("position "))
+    assert row.endswith(" not yet")
+    late = replace(runs, settle=np.full_like(runs.settle, np.inf))
+    assert not any(
+        "inf" in line.split() for line in [*str(late).splitlines(), *worst_runs(late, 2)]
+    )
+    assert " not yet " in worst_runs(late, 1)[1]

@@ -202,6 +202,11 @@ def test_poles_that_grow_are_told(arm):
     wrong = fflin.LinearController(gain.to_control(), state, sign=-1)
     (note,) = fflin.simulate(own, wrong, **run).notes
     assert note.startswith("the linear loop is unstable, with a pole at ") and "1/s" in note
+    assert "; with the other sign it is stable: try sign=-1 (--negative-feedback)" in note
+    # Nor with the other sign.
+    drifting = fflin.LinearController(np.zeros((len(lin.u0), len(state.y0))) + 1e-3, state)
+    (note,) = fflin.simulate(own, drifting, **run).notes
+    assert "unstable" in note and "try" not in note
     zero = np.zeros((1, len(lin.y0))), np.zeros((len(lin.u0), 1)), 0.0, 0.1
     unstable = fflin.LinearController((1.25 * np.eye(1), *zero), lin)
     notes = fflin.simulate(robot, unstable, **run).notes

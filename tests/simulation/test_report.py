@@ -87,6 +87,52 @@ def test_a_motion_without_a_target_has_no_verdict():
     assert not any(word in report for word in ("settled", "error", "largest inputs"))
 
 
+def test_a_motion_without_a_target_tells_how_far_it_went():
+    robot = fflin.load("ets_vii")
+    v0 = fflin.velocity(robot, {"omega_b.z": 0.1, "v_b.x": 0.05, robot.joint_names[0]: 0.2})
+    motion = fflin.simulate(robot, v0=v0, duration=2.0)
+    turned = np.degrees(2.0 * np.arcsin(np.linalg.norm(motion.x[:, :3], axis=1)))
+    moved, swung = (np.abs(motion.x[:, part]).max(axis=1) for part in (slice(3, 6), slice(6, 12)))
+    assert "change from the start" in motion_report(motion)
+    for title, size in (("attitude", turned), ("position", moved), ("joints", swung)):
+        assert cells(motion, title)[1:] == [f"{size.max():.3g}", f"{size[-1]:.3g}"]
+    orbit = fflin.load("ets_vii", orbit=fflin.CircularOrbit(altitude=700e3))
+    report = motion_report(fflin.simulate(orbit, v0=v0, duration=2.0))
+    assert "change from the start" in report and max(map(len, report.splitlines())) <= 80
+
+
+def test_no_line_is_longer_than_80_columns():
+    orbit = fflin.CircularOrbit(altitude=700e3)
+    motion = fflin.simulate(fflin.load("ets_vii", orbit=orbit), duration=0.1)
+    long = replace(motion, energy=motion.energy - 0.000123456)
+    report = motion_report(long)
+    assert "Jacobi integral drift" in " ".join(report.split())
+    assert max(map(len, report.splitlines())) <= 80
+
+
+def pushed_by(*inputs, policy=True):
+    """A cubesat beside its place and attitude, with the attitude alone controlled, or with all."""
+    robot = fflin.load("cubesat", inputs=inputs)
+    lin = fflin.linearize(robot)
+    K = np.zeros((len(lin.u0), 12))
+    K[:3, :3], K[:3, 6:9] = (np.diag(lin.M.diagonal()[:3]) * gain for gain in (2.0, 2.0))
+    law = fflin.LinearController(-K, lin) if policy else None
+    x0 = np.zeros(12)
+    x0[[0, 3, 9]] = 0.1, 0.01, 1e-4
+    return fflin.simulate(robot, law, x0=x0, duration=30.0, target=lin)
+
+
+def test_where_no_input_pushes_the_base_its_position_is_not_judged():
+    motion = pushed_by(fflin.BaseTorque())
+    said = " ".join(motion_report(motion).split("cubesat:")[0].split())
+    assert said.startswith("settled: attitude ") and said.endswith("; position is not controlled")
+    assert motion_report(motion).count("not controlled") == 1
+    pushing = pushed_by(fflin.BaseTorque(), fflin.BaseForce())
+    assert first(pushing).startswith("not settled: position ")
+    jet = fflin.Thruster("base", (0, 0, 0), (1, 0, 0), "jet")
+    assert first(pushed_by(fflin.BaseTorque(), jet)).startswith("not settled: position ")
+
+
 def test_wheels_are_no_joints():
     robot = fflin.load("cubesat", inputs=fflin.load_inputs("cubesat"))
     lin = fflin.linearize(robot)

@@ -82,12 +82,41 @@ def test_a_body_flies_to_the_grasp_and_is_held(browser, tmp_path):
         pressed = [each.get_attribute("aria-pressed") for each in buttons.all()]
         assert pressed == [str(k == other).lower() for other in range(3)]
     assert "joint_3 jammed" in watched.page.locator("#stamp").text_content()
+    # What flies is named and weighed, and what is caught has a colour of its own and edges.
+    for t, name, kept in ((0.0, "servicer_7dof", 0.0), (4.5, "servicer_7dof + payload", 500.0)):
+        watched.do(f"fflin.seek({t})")
+        said = [watched.page.locator(f"header {tag}").text_content() for tag in ("h1", "p")]
+        assert said[0] == name
+        assert f", {flown.robot.mass + kept:.4g} kg, 13 s" in said[1]
+        body, edges = watched.do(
+            "(() => { const found = [], path = ['meshcat', 'held', 'payload'];"
+            "viewer.scene_tree.find(path).object.traverse((x) => { if (x.material) "
+            "found.push([x.type, x.material.opacity, x.material.color.getHex(), x.visible]); }); "
+            "return found; })()"
+        )
+        assert body[0] == "Mesh" and body[1] > 0.8 and edges[0] == "LineSegments" and edges[3]
+        red, green, blue = (body[2] >> shift & 255 for shift in (16, 8, 0))
+        assert red > 1.2 * green > 1.2 * blue
     box = watched.page.get_by_label("payload", exact=True)
     box.uncheck(force=True)
     assert not watched.do("viewer.scene_tree.find(['meshcat', 'held', 'payload']).object.visible")
     assert "target" in watched.page.locator("#legend").text_content()
     assert not watched.errors
     watched.page.close()
+
+
+def test_what_coincides_with_the_robot_is_not_in_the_legend(browser, tmp_path):
+    robot = fflin.load("servicer_7dof")
+    lin = fflin.linearize(robot)
+    still = {"robot": robot, "policy": fflin.StateFeedback(lin, fflin.lqr(lin).K), "duration": 1.0}
+    q0 = fflin.configuration(robot, {"joint_1": 0.8})
+    for options, there in (({}, False), ({"q0": q0, "duration": 60.0}, True)):
+        path = tmp_path / "page.html"
+        fflin.visualize(robot, fflin.simulate(**still | options), html=path)
+        watched = Watched(browser, path.as_uri() + "#pause")
+        said = watched.page.locator("#legend").text_content()
+        assert ("target" in said, "path of the tool" in said) == (there, there)
+        watched.page.close()
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")

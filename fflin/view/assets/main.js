@@ -13,14 +13,21 @@ function problem(message) {
   box.hidden = !message;
 }
 
-const GHOST = "#8fb4ff", HELD = "#b8bdc4";
+const GHOST = "#8fb4ff", HELD = "#b5926f";
 
-// What is drawn beside the robot; each can be switched off.
+// The largest side of the box about points x, y, z, ...
+function extent(points) {
+  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  points.forEach((x, i) => { low[i % 3] = Math.min(low[i % 3], x); high[i % 3] = Math.max(high[i % 3], x); });
+  return Math.max(...high.map((x, k) => x - low[k]));
+}
+
+// What is drawn beside the robot and can be seen; each can be switched off.
 function legendOf(info) {
   const entry = (label, colour, ...path) => ({ label, colour, path: ["meshcat", ...path] });
   if (info.mode === "modes") return [entry("at rest", GHOST, "rest")];
   const entries = [
-    ...info.trails.map(({ name, colour }) => entry(`path of the ${name}`, colour, "trails", name)),
+    ...info.trails.filter(({ points }) => extent(points) > 0.02 * info.size).map(({ name, colour }) => entry(`path of the ${name}`, colour, "trails", name)),
     ...info.arrows.map(({ kind, colour }) => entry(`${kind} on the base`, colour, "wrench", kind)),
   ];
   entries.push(...(info.cloud ?? []).map(({ name, label, colour }) => entry(label, colour, "cloud", name)));

@@ -56,6 +56,8 @@ function makePhases(parent, phases, seek) {
   return (time) => {
     const now = phases.reduce((last, [, start], k) => (start <= time ? k : last), 0);
     rows.forEach((row, k) => row.setAttribute("aria-pressed", k === now));
+    document.querySelector("h1").textContent = phases[now][2]; // what then flies
+    document.querySelector("header p").textContent = phases[now][3];
     return `, ${phases[now][0]}`;
   };
 }
