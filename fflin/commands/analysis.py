@@ -83,7 +83,7 @@ def add_commands(commands: Commands) -> None:
     )
     add_robot(uncertain)
     add_options(uncertain, "--joint NAME=VALUE*: put a joint at VALUE [rad|m]; others at neutral")
-    add_system(uncertain)
+    add_system(uncertain, axes=False)
     vary = """--vary NAME=RANGE*: a parameter of `fflin sensitivity` or a pattern, and its range:
         0.2, a share of its value, or LEAST:LARGEST"""
     add_options(uncertain, vary, type=_range, required=True)
