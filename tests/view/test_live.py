@@ -145,6 +145,8 @@ def test_what_is_nested_too_deep_ends_its_connection_alone(opening, live, caplog
         after = await state(other)
         for each in (connection, other):
             each.close()
+        while await asyncio.wait_for(other.read_message(), PATIENCE) is not None:
+            pass
         return connection.close_code, connection.close_reason, after
 
     code, reason, after = asyncio.run(play())
