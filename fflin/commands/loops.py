@@ -41,7 +41,7 @@ class Loop(NamedTuple):
 
 def _refuse(arguments: argparse.Namespace, names: tuple[str, ...], why: str) -> None:
     """Refuse options that say nothing beside others."""
-    if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name)]:
+    if given := [f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name, None)]:
         raise InputError(f"{', '.join(given)}: {why}; leave it out")
 
 

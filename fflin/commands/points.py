@@ -173,9 +173,8 @@ def held_at(
         given = once("--effort", arguments.effort)
         return q, effort(robot, given) if given else None, reference
     if arguments.effort:
-        raise InputError(
-            "--effort and an equilibrium both say the inputs at the point; give either"
-        )
+        which = "--relative-equilibrium" if number else "--equilibrium"
+        raise InputError(f"--effort and {which} both say the inputs at the point; give either")
     from fflin.linear.equilibrium import equilibrium
 
     if number:

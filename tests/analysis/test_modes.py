@@ -340,7 +340,7 @@ def test_command_line_takes_an_equilibrium(capsys):
     assert "a relative equilibrium" in capsys.readouterr().out
     for options, words in {
         ("--effort", "F_b.x=1"): "--effort and --equilibrium both say",
-        ("--inputs", "servicer_7dof"): "left are tau_m.panel_left",
+        ("--inputs", "servicer_7dof"): "left are tau_m.panel_right",
         ("--velocity", "joint_1=1"): "only rotors may",
     }.items():
         assert cli.main(["modes", "servicer_7dof", *point, "--equilibrium", *options]) == 2

@@ -108,7 +108,7 @@ def test_wheels_target_and_notes_are_kept_in_files(tmp_path, suffix, steered):
 
 def test_a_page_without_a_target_shows_neither_ghost_nor_errors(tmp_path):
     robot = fflin.load("ets_vii")
-    motion = fflin.simulate(robot, v0=0.01 * np.ones(robot.nv), duration=0.5)
+    motion = fflin.simulate(robot, v0=np.ones(robot.nv), duration=0.5)
     free, steered = tmp_path / "free.html", tmp_path / "steered.html"
     fflin.visualize(robot, motion, html=free, open=False)
     fflin.visualize(robot, motion, html=steered, open=False, target=robot.neutral())
