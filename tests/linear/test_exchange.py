@@ -8,6 +8,7 @@ import pytest
 
 import fflin
 from fflin.dynamics.aba import Aba
+from fflin.linear.certificate import scaled_condition
 from fflin.linear.tool_coordinates import TOOLS
 from tests.support.robots import (
     BUNDLED,
@@ -51,12 +52,14 @@ def test_there_and_back(name, case):
     robot = random_tree(np.random.default_rng(3), 6) if name == "tree" else fflin.load(name)
     q, v, u, how = point(robot, 7, case)
     lin, rng = fflin.linearize(robot, q, v, u, **how), np.random.default_rng(0)
+    # The way back takes the accelerations at the point, which M's condition keeps from more digits.
+    least = max(1e-13, 0.1 * np.finfo(float).eps * scaled_condition(lin.M))
     for tool in TOOLS:
         m = lin.to(tool)
         back = fflin.from_tool(robot, tool, m.q, m.v, m.u0, A=m.A, B=m.B, **how)
         assert back.frame == lin.frame and back.moving == lin.moving
         for key in ("A", "B", "f0", "v", "u0", "x0", "C", "D"):
-            assert relative(getattr(back, key), getattr(lin, key)) < 1e-13, (tool, key)
+            assert relative(getattr(back, key), getattr(lin, key)) < least, (tool, key)
         # A quaternion and its negative are one attitude.
         assert np.abs(pin.difference(robot.model, back.q, lin.q)).max() < 1e-13
         assert np.abs(m.T_left @ m.T - np.eye(len(lin.A))).max() < 1e-13
@@ -67,7 +70,7 @@ def test_there_and_back(name, case):
         m = still.to(tool)
         A, B = m.A + m.T @ X @ m.T_left, m.B + m.T @ Y @ np.linalg.inv(m.T_u)
         back = fflin.from_tool(robot, tool, m.q, m.v, m.u0, A=A, B=B, **how)
-        assert relative(back.A, still.A + X) < 1e-13 and relative(back.B, still.B + Y) < 1e-13
+        assert relative(back.A, still.A + X) < least and relative(back.B, still.B + Y) < least
         assert len(m.state_names) == len(set(m.state_names)) == len(m.state_units) == len(m.A)
         assert len(m.A) == 12 + 2 * robot.n + (tool == "drake")
 
