@@ -1,22 +1,14 @@
 """How the documents become a site: ``sphinx-build -W docs site``."""
 
-import os
 import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE / "_ext"))
-# The kernels that run the tutorials find the same helpers, and say nothing of what they run on.
-os.environ["PYTHONPATH"] = os.pathsep.join(
-    filter(None, (str(HERE / "_ext"), os.environ.get("PYTHONPATH")))
-)
-os.environ.setdefault("PYDEVD_DISABLE_FILE_VALIDATION", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
-from numpydoc.xref import DEFAULT_LINKS  # noqa: E402
+from numpydoc.xref import DEFAULT_LINKS
 
-import fflin  # noqa: E402
+import fflin
 
 project = "fflin"
 author = "The fflin developers"
@@ -30,6 +22,7 @@ extensions = [
     "sphinx.ext.mathjax",
     "numpydoc",
     "sphinx_copybutton",
+    "executed",
     "from_code",
 ]
 exclude_patterns = ["_*"]

@@ -1,4 +1,4 @@
-"""Make docs/controllers.png by what docs/controllers.md does: ``python docs/controllers.py``."""
+"""Make docs/controllers.png from docs/guide/controllers.md: ``python docs/controllers.py``."""
 
 import os
 import re
@@ -13,7 +13,7 @@ NAMES = ("PD with a direct term", "H-infinity, weighed as an integral")
 
 def main() -> None:
     """Run the page's code and draw the two motions that it ends with."""
-    page = (HERE / "controllers.md").read_text(encoding="utf-8")
+    page = (HERE / "guide" / "controllers.md").read_text(encoding="utf-8")
     toml, *_ = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     code, own = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), {}
     with tempfile.TemporaryDirectory() as folder:

@@ -1,7 +1,7 @@
-"""Draw the pictures of pages again: ``python docs/pictures.py catch.md uncertainty.md``.
+"""Redraw the pictures of pages: ``python docs/pictures.py capture uncertain_models``.
 
-It runs the Python of each page in a folder of its own and keeps the figures that this saves; a page
-that shows a motion has a strip of pictures of it too, PAGE_scene.png.
+Run the Python of each page of docs/guide in a temporary folder and keep the figures that it saves.
+A page that shows NAME_scene.png also gets a strip of pictures of its `motion` under this name.
 """
 
 import os
@@ -16,17 +16,16 @@ import fflin
 DOCS = Path(__file__).resolve().parent
 
 for page in sys.argv[1:]:
-    text = (DOCS / page).read_text(encoding="utf-8")
+    text = (DOCS / "guide" / f"{page}.md").read_text(encoding="utf-8")
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         names: dict = {}
         exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), names)
-        scene = f"{Path(page).stem}_scene.png"
-        if f"]({scene})" in text:
+        for scene in re.findall(r"\]\(\.\./(\w+_scene\.png)\)", text):
             motion, start = names["motion"], names["motion"].starts[-1]
             times = [0.0, start, start + 5.0, motion.t[-1]]
             fflin.visualize(names["robot"], motion, png=scene, times=times, open=False)
         for picture in Path().glob("*.png"):
-            if f"]({picture})" in text:
+            if f"](../{picture})" in text:
                 shutil.copy(picture, DOCS)
         os.chdir(DOCS)

@@ -1,6 +1,6 @@
-"""Draw docs/mpc.png, a slew under a regulator that is cut and under `mpc`: ``python docs/slew.py``.
+"""Draw docs/mpc.png, a slew under a saturated regulator and under `mpc`: ``python docs/slew.py``.
 
-The base is turned by 90 deg and back; its own torque is strong and those of the joints are weak.
+The base returns from 90 deg with a strong torque, while the joint torques are weak.
 """
 
 from pathlib import Path
@@ -25,7 +25,7 @@ def main() -> None:
     base = pin.SE3(pin.AngleAxis(np.pi / 2.0, np.array([1.0, 0.0, 0.0])).matrix(), np.zeros(3))
     q0, (figure, axes) = fflin.configuration(robot, base=base), pyplot.subplots(3, 2, sharex=True)
     figure.set_size_inches(9.0, 6.5)
-    cases = {"regulator, cut": fflin.StateFeedback(policy.lin, policy.gain.K), "mpc": policy}
+    cases = {"saturated regulator": fflin.StateFeedback(policy.lin, policy.gain.K), "mpc": policy}
     for column, (title, each) in zip(axes.T, cases.items(), strict=True):
         motion = fflin.simulate(robot, each, q0=q0, duration=80.0, dt=0.05, limits=LIMITS)
         attitude, joints, torques = column

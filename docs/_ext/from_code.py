@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from jinja2 import BaseLoader
+from jinja2.sandbox import SandboxedEnvironment
+from numpydoc import docscrape_sphinx
 from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
@@ -118,22 +121,25 @@ def short_signature(
 def link_pages(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
     """Let docstrings that name a page of the documents lead to it."""
     for at, line in enumerate(lines):
-        lines[at] = re.sub(r"docs/(\w+)\.md", r":doc:`/\1`", line)
+        lines[at] = re.sub(r"docs/([\w/]+)\.md", r":doc:`/\1`", line)
 
 
-def results_within(app: Sphinx) -> None:
-    """Keep what the tutorials drew within the site's own folder, not beside it."""
-    folder = str(Path(app.doctreedir) / "executed")
-    app.env.mystnb_config = app.env.mystnb_config.copy(output_folder=folder)
+def keep_template() -> None:
+    """Let numpydoc compile its template once, not again for every docstring."""
+    kept: list[SandboxedEnvironment] = []
+
+    def environment(loader: BaseLoader) -> SandboxedEnvironment:
+        if not kept:
+            kept.append(SandboxedEnvironment(loader=loader))
+        return kept[0]
+
+    docscrape_sphinx.SandboxedEnvironment = environment
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register with Sphinx."""
-    # What Sphinx keeps for its next build is no part of the site.
-    app.doctreedir = app.srcdir / "_build"
-    os.environ["FFLIN_DOCS_PAGES"] = str(Path(app.outdir) / "pages")
+    keep_template()
     reference(app)  # here, since autosummary looks for its tables before anything is read
-    app.connect("builder-inited", results_within, priority=900)  # after myst_nb has chosen
     app.connect("doctree-read", keep_tags)
     app.connect("doctree-read", link_names)
     app.connect("autodoc-process-docstring", link_pages)

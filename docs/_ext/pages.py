@@ -13,15 +13,13 @@ get_ipython().run_line_magic("matplotlib", "inline")
 warnings.showwarning = lambda message, category, *_: print(f"{category.__name__}: {message}")
 
 
-def embed(page: str, height: int = 480, place: str = "../") -> HTML:
-    """Show a page that `fflin.visualize` wrote, and keep it beside the site's.
-
-    `place` leads from the page that shows it to the top of the site.
-    """
-    folder = Path(os.environ["FFLIN_DOCS_PAGES"])
+def embed(page: str, height: int = 480) -> HTML:
+    """Show a page that `fflin.visualize` wrote, and keep it for the site."""
+    shown_by, kept = os.environ["FFLIN_DOCS_PAGE"], Path(os.environ["FFLIN_DOCS_KEPT"])
+    folder = kept / shown_by
     folder.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(page, folder / Path(page).name)
-    address = f"{place}pages/{Path(page).name}"
+    address = f"{'../' * shown_by.count('/')}pages/{shown_by}/{Path(page).name}"
     return HTML(
         f'<iframe class="fflin-page" src="{address}" height="{height}" loading="lazy" '
         f'title="{page}"></iframe>'

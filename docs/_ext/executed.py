@@ -1,0 +1,62 @@
+"""Pages that are run: what a run writes belongs to every build, whether it runs them again or not.
+
+Sphinx runs a page only when its source changed since the last build. What the run wrote is kept in
+`docs/_build/executed`, beside the page's doctree, and every build copies it into its site.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+
+
+def kept(app: Sphinx) -> Path:
+    """Return the folder of what pages wrote, with a folder of its own for each page."""
+    return Path(app.doctreedir) / "executed" / "pages"
+
+
+def keep_pictures(app: Sphinx) -> None:
+    """Keep the figures of the pages there too, not in a folder beside the site."""
+    folder = str(kept(app).parent)
+    app.env.mystnb_config = app.env.mystnb_config.copy(output_folder=folder)
+
+
+def forget(app: Sphinx, env: BuildEnvironment, page: str) -> None:
+    """Remove what a page wrote before it is run again, or when it is gone."""
+    shutil.rmtree(kept(app) / page, ignore_errors=True)
+
+
+def announce(app: Sphinx, page: str, source: list[str]) -> None:
+    """Tell the kernel that is started for a page which page it runs."""
+    os.environ["FFLIN_DOCS_PAGE"] = page
+
+
+def deliver(app: Sphinx, error: Exception | None) -> None:
+    """Copy what all pages wrote into the site."""
+    folder = Path(app.outdir) / "pages"
+    shutil.rmtree(folder, ignore_errors=True)
+    if error is None and kept(app).exists():
+        shutil.copytree(kept(app), folder)
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register with Sphinx."""
+    # What Sphinx keeps for its next build is no part of the site.
+    app.doctreedir = app.srcdir / "_build"
+    here = str(Path(__file__).parent)
+    # The kernels find the module `pages`, use one thread each, and print nothing about themselves.
+    path = filter(None, (here, os.environ.get("PYTHONPATH")))
+    os.environ["PYTHONPATH"] = os.pathsep.join(path)
+    os.environ.setdefault("PYDEVD_DISABLE_FILE_VALIDATION", "1")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ["FFLIN_DOCS_KEPT"] = str(kept(app))
+    app.connect("builder-inited", keep_pictures, priority=900)  # after myst_nb has chosen
+    app.connect("env-purge-doc", forget)
+    app.connect("source-read", announce)
+    app.connect("build-finished", deliver)
+    return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}
