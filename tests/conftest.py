@@ -4,6 +4,7 @@ import contextlib
 import getpass
 import os
 import signal
+import sys
 import tempfile
 from pathlib import Path
 
@@ -25,7 +26,11 @@ import scipy.linalg  # noqa: F401 - whose OpenBLAS is another than NumPy's
 from threadpoolctl import threadpool_info
 
 import fflin
+from tests.support import kernels
+from tests.support.browser import chromium
 from tests.support.robots import BUNDLED
+
+pytest_plugins = ["tests.support.messages"]
 
 
 def pytest_terminal_summary(terminalreporter):
@@ -42,7 +47,64 @@ def pytest_sessionfinish():
         Path(tempfile.gettempdir(), f"pytest-of-{getpass.getuser()}").rmdir()
 
 
+# Tests of these kinds may start Python again.
+STARTING = {"process", "browser", "docs", "fuzz"}
+_started: list[str] = []
+
+
+def _watch(event, arguments):
+    """Record each Python that is started: as an audit hook, below whatever library does it."""
+    if event == "subprocess.Popen":
+        program, command = str(arguments[0]), arguments[1] or ()
+        if program == sys.executable or str(next(iter(command), "")) == sys.executable:
+            _started.append(" ".join(map(str, command)))
+
+
+def _kinds(item):
+    return {marker.name for marker in item.iter_markers()}
+
+
+def pytest_configure(config):
+    """Compile once, before the workers begin; watch for processes that tests start."""
+    if hasattr(config, "workerinput"):
+        sys.addaudithook(_watch)
+    elif kernels.wanted(config.option.markexpr) and not config.option.collectonly:
+        kernels.prepare()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item, nextitem):
+    """Hide numba from tests that are not marked `compiled`: what ran before changes no result."""
+    if "compiled" in _kinds(item):
+        return (yield)
+    loaded = sys.modules.get("numba")
+    sys.modules["numba"] = None
+    try:
+        return (yield)
+    finally:
+        del sys.modules["numba"]
+        if loaded is not None:
+            sys.modules["numba"] = loaded
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """Fail a test that starts Python and is not marked so: the default command is quick."""
+    _started.clear()
+    result = yield
+    if _started and not STARTING & _kinds(item):
+        pytest.fail(f"starts a process, expected the mark `process`: {_started[0][:200]}")
+    return result
+
+
 @pytest.fixture(scope="session")
 def robots():
     """Every bundled robot, loaded once."""
     return {name: fflin.load(name) for name in BUNDLED}
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """One Chromium for the pages of all tests."""
+    with chromium() as browser:
+        yield browser

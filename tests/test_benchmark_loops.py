@@ -16,6 +16,8 @@ from benchmarks.contender import Contender
 from benchmarks.dispersed import SPREADS, draws, fflin_campaign, started
 from benchmarks.peers import WrongResultError
 
+pytestmark = pytest.mark.compiled
+
 STEP, DURATION = 0.05, 0.5
 LAWS = {
     "at all times": {},

@@ -3,7 +3,6 @@
 import builtins
 import itertools
 import re
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ import fflin
 from benchmarks import peers, tables, timing
 from benchmarks.peers import WrongResultError, check, methods, pinocchio_peer
 from benchmarks.robots import generated, is_rigid, load, plain_urdf, random_point
+from tests.support.patience import finished
 
 RESULTS = tables.RESULTS.read_text(encoding="utf-8")
 README = tables.README.read_text(encoding="utf-8")
@@ -120,19 +120,16 @@ def test_what_else_the_machine_does_is_not_counted(monkeypatch):
     assert times["three"].ratio(times["two"]) == pytest.approx(1.5)
 
 
+@pytest.mark.process
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 def test_command_prints_a_case():
     command = [sys.executable, "-m", "benchmarks"]
-    done = subprocess.run(
-        [*command, "memory"], cwd=tables.ROOT, capture_output=True, text=True, check=False
-    )
+    done = finished([*command, "memory"], cwd=tables.ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     row = next(line for line in done.stdout.splitlines() if line.startswith("| fflin "))
     imported, first = (float(cell) for cell in row.split("|")[2:4])
     assert 5.0 < imported < first
-    done = subprocess.run(
-        [*command, "speed"], cwd=tables.ROOT, capture_output=True, text=True, check=False
-    )
+    done = finished([*command, "speed"], cwd=tables.ROOT, capture_output=True, text=True)
     assert done.returncode == 2 and "CASE is one of at_rest, " in done.stderr
 
 

@@ -8,6 +8,8 @@ import pytest
 
 from benchmarks.instructions import BASELINE, TOLERANCE, ratios
 
+pytestmark = [pytest.mark.process, pytest.mark.exhaustive]
+
 
 @pytest.mark.skipif(shutil.which("valgrind") is None, reason="valgrind is not installed")
 @pytest.mark.skipif(

@@ -2,17 +2,21 @@
 
 import ast
 import pydoc
-import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import fflin
+from tests.support.patience import finished
+
+pytestmark = pytest.mark.process
 
 
 def imported_by(code: str) -> set[str]:
     """Modules that a new interpreter holds after running the code."""
     code += "\nimport sys; print('modules:', *sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = finished([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(done.stdout.rpartition("modules:")[2].split())
 
 
@@ -40,6 +44,7 @@ def test_type_checkers_see_the_same_names():
     assert names == set(fflin.__all__)
 
 
+@pytest.mark.process
 def test_import_pays_for_nothing_heavy():
     heavy = {"scipy", "meshcat", "matplotlib", "control", "example_robot_data"}
     assert not imported_by("import fflin") & (heavy | {"numpy", "pinocchio"})

@@ -1,8 +1,8 @@
 """The site of the documents is whole and needs no network."""
 
+import contextlib
 import os
 import re
-import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
@@ -11,8 +11,12 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 import fflin
-from tests.support.browser import chromium
-from tests.support.patience import PATIENCE
+from tests.support.browser import Watched
+from tests.support.patience import finished
+
+pytestmark = pytest.mark.docs
+
+pytestmark = pytest.mark.docs
 
 ROOT = Path(__file__).parents[1]
 
@@ -26,7 +30,8 @@ def site(tmp_path_factory):
         pytest.importorskip(package, reason="the extra docs is not installed")
     folder = tmp_path_factory.mktemp("site") / "site"
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "docs", folder]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    # Where the kernels are not compiled yet, that takes a processor some minutes.
+    done = finished(command, cwd=ROOT, capture_output=True, text=True, watch={"limit": 1200.0})
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -55,6 +60,7 @@ def pages(site):
     return {path: Page(path) for path in own}
 
 
+@pytest.mark.process
 def test_nothing_is_loaded_from_elsewhere_and_all_that_is_loaded_is_there(site, pages):
     assert len(pages) > len(fflin.__all__)
     for path, page in pages.items():
@@ -68,6 +74,7 @@ def test_nothing_is_loaded_from_elsewhere_and_all_that_is_loaded_is_there(site, 
         assert not re.search(r"url\(\s*['\"]?(https?:)?//|@import[^;]*//", text), path
 
 
+@pytest.mark.process
 def test_links_lead_somewhere(site, pages):
     for path, page in pages.items():
         for address in page.links:
@@ -80,6 +87,7 @@ def test_links_lead_somewhere(site, pages):
                 assert unquote(parts.fragment) in pages[goal].places, f"{path.name}: {address}"
 
 
+@pytest.mark.process
 def test_the_site_is_small_and_has_a_page_for_every_public_name(site):
     size = sum(path.stat().st_size for path in site.rglob("*") if path.is_file())
     assert size < 30e6
@@ -88,33 +96,32 @@ def test_the_site_is_small_and_has_a_page_for_every_public_name(site):
         assert f'id="fflin.{name}"' in text and "Examples" in text
 
 
-def test_formulas_search_and_pages_that_play_work_from_disk(site):
-    with chromium() as browser:
+# What Chromium says of files that a page from the disk may not fetch.
+BLOCKED = re.compile(r"fetch|Failed to load resource: net::ERR_FAILED|CORS", re.IGNORECASE)
 
-        def opened(page, ready):
-            tab = browser.new_page()
-            tab.set_default_timeout(1e3 * PATIENCE)
-            tab.on("request", lambda request: asked.append(request.url))
-            tab.on("pageerror", lambda error: said.append(str(error)))
-            tab.goto(
-                (site / page.partition("?")[0]).as_uri() + page[page.find("?") :] * ("?" in page)
-            )
-            tab.wait_for_function(ready)
-            return tab
 
-        asked, said = [], []
-        tab = opened(
-            "derivation.html", "document.querySelectorAll('mjx-container svg').length > 100"
-        )
-        assert not tab.query_selector_all("[data-mml-node=merror]")
-        tab = opened(
-            "search.html?q=momentum", "document.querySelectorAll('ul.search li').length > 5"
-        )
-        assert "momentum_reduction" in tab.inner_text("ul.search")
-        tab = opened("tutorials/first_loop.html", "document.querySelector('iframe.fflin-page')")
-        tab.query_selector("iframe.fflin-page").scroll_into_view_if_needed()
-        frame = tab.query_selector("iframe.fflin-page").content_frame()
-        frame.wait_for_function("window.fflin && fflin.ready")
-    # The search shows excerpts as well where a server is, which a folder on the disk has not.
-    assert set(said) <= {"Failed to fetch"}
+@pytest.mark.browser
+def test_formulas_search_and_pages_that_play_work_from_disk(site, browser):
+    asked = []
+
+    @contextlib.contextmanager
+    def opened(page, ready):
+        page, _, query = page.partition("?")
+        with Watched(browser, f"{(site / page).as_uri()}?{query}", ready=ready) as watched:
+            yield watched
+        asked.extend(watched.requests)
+
+    many = "document.querySelectorAll('mjx-container svg').length > 100"
+    with opened("derivation.html", many) as watched:
+        assert not watched.page.query_selector_all("[data-mml-node=merror]")
+    found = "document.querySelectorAll('ul.search li').length > 5"
+    with opened("search.html?q=momentum", found) as watched:
+        assert "momentum_reduction" in watched.page.inner_text("ul.search")
+        # It shows excerpts as well where a server is, which a folder on the disk has not.
+        watched.errors[:] = [each for each in watched.errors if not BLOCKED.search(each)]
+    framed = "document.querySelector('iframe.fflin-page')"
+    with opened("tutorials/first_loop.html", framed) as watched:
+        element = watched.page.query_selector("iframe.fflin-page")
+        element.scroll_into_view_if_needed()
+        watched.wait("window.fflin && fflin.ready", element.content_frame())
     assert all(url.startswith(("file:", "data:", "blob:", "about:")) for url in asked), asked

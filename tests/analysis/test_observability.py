@@ -151,11 +151,11 @@ def test_gramians_at_rest_are_exact_over_any_horizon(robots, T):
 def test_gramians_that_do_not_exist(robots):
     lin = fflin.linearize(robots["ets_vii"])
     for model in (lin, lin.discretize(0.1)):
-        with pytest.raises(fflin.InputError, match=r"not asymptotically stable.*give a duration"):
+        with pytest.raises(fflin.InputError, match="duration"):
             fflin.gramians(model)
-    with pytest.raises(fflin.InputError, match="positive horizon"):
+    with pytest.raises(fflin.InputError, match="horizon"):
         fflin.gramians(lin, -1.0)
-    with pytest.raises(fflin.InputError, match="multiple of dt"):
+    with pytest.raises(fflin.InputError, match="multiple"):
         fflin.gramians(lin.discretize(0.1), 0.25)
-    with pytest.raises(fflin.InputError, match=r"expected a fflin\.LinearModel"):
+    with pytest.raises(fflin.InputError, match="LinearModel"):
         fflin.observability(3)

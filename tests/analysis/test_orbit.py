@@ -75,10 +75,10 @@ def test_the_kinds_of_attitudes_are_told_and_margins_decide():
 def test_what_has_no_such_attitudes_is_refused():
     robot = fflin.load("cubesat", orbit=700e3)
     wheel = fflin.ReactionWheel([0.0, 1.0, 0.0], momentum=0.02)
-    with pytest.raises(fflin.InputError, match="store momentum"):
+    with pytest.raises(fflin.InputError, match="momentum"):
         fflin.relative_equilibria(robot.replace(inputs=[wheel]))
     rod = free_body((1.0, 1.0, 0.0)).replace(orbit=700e3)
-    with pytest.raises(fflin.SingularInertiaError, match="no inertia about an axis"):
+    with pytest.raises(fflin.SingularInertiaError, match="inertia"):
         fflin.relative_equilibria(rod)
 
 
@@ -91,7 +91,7 @@ def test_joints_hold_their_posture_in_a_relative_equilibrium():
         held = fflin.equilibrium(robot, one.q, reference=pin.XYZQUATToSE3(one.q[:7]))
         assert held.u.any()
     stands = fflin.configuration(robot, {"joint_2": 0.5})
-    with pytest.raises(fflin.EquilibriumError, match="cannot balance"):
+    with pytest.raises(fflin.EquilibriumError, match="balance"):
         fflin.equilibrium(robot, stands)
 
 

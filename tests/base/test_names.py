@@ -1,5 +1,7 @@
 """Names, groups and patterns mean the same wherever something is named."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -27,7 +29,7 @@ NAMES = ("q_b.x", "q_m.hinge_1", "q_m.hinge_2", "q_m.arm[1]", "qdot_m.hinge_1", 
 )
 def test_what_a_key_stands_for(key, found):
     if found is None:
-        with pytest.raises(fflin.InputError, match=r"write q_m\.hinge_\? or qdot_m\.hinge_\?"):
+        with pytest.raises(fflin.InputError, match=r"q_m\.hinge_"):
             matching("state", key, NAMES)
     else:
         assert matching("state", key, NAMES) == found
@@ -35,7 +37,7 @@ def test_what_a_key_stands_for(key, found):
 
 @pytest.mark.parametrize("key", ["hinge_9", "q_n", "q_m.hinge_9*", "q_m.", ""])
 def test_a_key_that_stands_for_nothing_is_refused(key):
-    with pytest.raises(fflin.UnknownNameError, match="no state named"):
+    with pytest.raises(fflin.UnknownNameError, match=re.escape(f"'{key}'")):
         matching("state", key, NAMES)
 
 
@@ -79,13 +81,13 @@ def test_weights_and_limits_take_the_same_patterns():
     assert np.array_equal(
         K, fflin.lqr(lin, {"q_b": 1, "r_b": 1, "v_b": 1, "q_m": 1, "q_m.joint_1": 2}, 1.0).K
     )
-    run = {"x0": np.r_[0.1, np.zeros(25)], "duration": 1.0}
+    run = {"x0": np.r_[0.1, np.zeros(25)], "duration": 0.5}
     policy = fflin.StateFeedback(lin, K)
     one = fflin.simulate(robot, policy, limits={"joint_*": 0.01, "tau_b": 0.02}, **run)
     two = fflin.simulate(robot, policy, limits={"tau_m": 0.01, "tau_b.?": 0.02}, **run)
     assert np.array_equal(one.u, two.u)
     assert np.abs(one.u[:, 6:]).max() == 0.01
-    with pytest.raises(fflin.InputError, match="states and of inputs"):
+    with pytest.raises(fflin.InputError, match="inputs"):
         fflin.bryson(lin, {"*.x": 1.0})
 
 

@@ -13,6 +13,7 @@ import pytest
 import fflin
 from fflin.base.mat5 import read_mat
 from fflin.base.record import NOT_VERIFIED, content_digest
+from tests.support.messages import any_wording
 
 FLIPS = 150
 
@@ -70,8 +71,9 @@ def files_of(path):
     return sorted(path.parent.glob(f"{path.stem}.*"))
 
 
+@pytest.mark.parametrize("flips", [FLIPS // 6, pytest.param(FLIPS, marks=pytest.mark.fuzz)])
 @pytest.mark.parametrize(("kind", "ending"), CASES)
-def test_no_flipped_bit_is_silent_or_a_crash(kind, ending, tmp_path):
+def test_no_flipped_bit_is_silent_or_a_crash(kind, ending, flips, tmp_path):
     thing, path = made(kind), tmp_path / f"x{ending}"
     thing.save(path)
     load = type(thing).load
@@ -81,7 +83,7 @@ def test_no_flipped_bit_is_silent_or_a_crash(kind, ending, tmp_path):
     files = {file: file.read_bytes() for file in files_of(path)}
     sizes = np.array([len(data) for data in files.values()])
     refused = 0
-    for _ in range(FLIPS):
+    for _ in range(flips):
         file = list(files)[rng.choice(len(sizes), p=sizes / sizes.sum())]
         damaged = bytearray(files[file])
         damaged[rng.integers(len(damaged))] ^= 1 << rng.integers(8)
@@ -95,7 +97,7 @@ def test_no_flipped_bit_is_silent_or_a_crash(kind, ending, tmp_path):
             # In padding, or in the digest's own name, after which it is said to be unverified.
             assert content(read) == content(thing)
         file.write_bytes(files[file])
-    assert refused > 0.5 * FLIPS
+    assert refused > 0.5 * flips
 
 
 @pytest.mark.parametrize("kind", ["model", "gain"])
@@ -177,16 +179,16 @@ def test_an_edited_file_is_refused_and_says_what_to_do(tmp_path):
     made("model").save(path)
     record = json.loads(path.read_text())
     path.write_text(json.dumps(record))
-    with pytest.raises(fflin.FileError, match="take it out"):
+    with pytest.raises(fflin.FileError, match="sha256"):
         fflin.LinearModel.load(path)
     made("model").save(path)
     path.write_text(path.read_text().replace('"dt": 0.0', '"dt": 0.1'))
-    with pytest.raises(fflin.FileError, match="damaged or edited; without the line sha256"):
+    with pytest.raises(fflin.FileError, match="sha256"):
         fflin.LinearModel.load(path)
     made("model").save(tmp_path / "x.csv")
     table = tmp_path / "x.B.csv"
     table.write_text(table.read_text().replace("1", "2"))
-    with pytest.raises(fflin.FileError, match="without that line of the info table"):
+    with pytest.raises(fflin.FileError, match="info"):
         fflin.LinearModel.load(tmp_path / "x.csv")
 
 
@@ -290,13 +292,13 @@ def test_a_header_of_mat_that_is_nearly_sealed_is_refused(kind, tmp_path):
         damaged = bytearray(data)
         damaged[bit // 8] ^= 1 << bit % 8
         path.write_bytes(damaged)
-        with pytest.raises(fflin.FileError):
+        with any_wording(), pytest.raises(fflin.FileError):
             type(made(kind)).load(path)
 
 
 def test_a_record_of_others_says_what_it_has_not(tmp_path):
     np.savez(tmp_path / "x.npz", a=1.0)
-    with pytest.raises(fflin.FileError, match="it has no entry 'state_names'"):
+    with pytest.raises(fflin.FileError, match="'state_names'"):
         fflin.LinearModel.load(tmp_path / "x.npz")
 
 
@@ -315,5 +317,5 @@ def test_a_text_that_claims_more_rows_than_it_has_is_refused():
     buffer = io.BytesIO()
     savemat(buffer, {"x": np.array(["ab", "cd"])})
     damaged = buffer.getvalue().replace(b"\2\0\0\0\2\0\0\0", b"\0\0\0\x7f\2\0\0\0", 1)
-    with pytest.raises(ValueError, match="a text of shape"):
+    with pytest.raises(ValueError, match="shape"):
         read_mat(damaged)

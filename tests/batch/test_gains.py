@@ -51,7 +51,7 @@ def test_many_inputs_and_few(robots):
     for inputs in ([*robot.inputs, thruster], [fflin.BaseTorque()]):
         batch = fflin.sweep(robot.replace(inputs=inputs), q)
         if len(inputs) == 1:
-            with pytest.raises(fflin.StabilizabilityError, match="point 0: "):
+            with pytest.raises(fflin.StabilizabilityError, match="point 0"):
                 fflin.lqr_batch(batch, 1.0, 1.0)
         else:
             gains = fflin.lqr_batch(batch, 1.0, 1.0)
@@ -69,6 +69,7 @@ def test_at_rest_none_is_left_to_the_solver_of_one(robots, monkeypatch):
             assert fflin.lqr_batch(batch, 1.0, R).residual.max() < 1e-11
 
 
+@pytest.mark.compiled
 def test_gains_between_the_points(robots, tmp_path):
     robot = robots["ets_vii"]
     values = np.linspace(-1.0, 1.0, 9)
@@ -100,12 +101,13 @@ def test_gains_between_the_points(robots, tmp_path):
     gains.save(tmp_path / "g.npz")
     assert np.array_equal(fflin.GainBatch.load(tmp_path / "g.npz").gain(joints), gains.gain(joints))
     scattered = fflin.lqr_batch(batch[[0, 4, 5]], 1.0, 1.0)
-    with pytest.raises(fflin.InputError, match="not on a grid"):
+    with pytest.raises(fflin.InputError, match="grid"):
         scattered.gain(joints)
-    with pytest.raises(fflin.InputError, match="are the same"):
+    with pytest.raises(fflin.InputError, match="same"):
         fflin.lqr_batch(batch[:1], 1.0, 1.0).gain(joints)
 
 
+@pytest.mark.compiled
 def test_a_scheduled_feedback_brings_the_robot_to_the_target(robots):
     robot = robots["ets_vii"]
     values = np.linspace(-1.2, 1.2, 7)
@@ -121,7 +123,7 @@ def test_a_scheduled_feedback_brings_the_robot_to_the_target(robots):
     )
     with pytest.raises(fflin.InputError, match="frame"):
         fflin.ScheduledFeedback(fflin.linearize(robot, frame="world"), gains)
-    with pytest.raises(fflin.InputError, match="gains is a Gain, expected a GainBatch"):
+    with pytest.raises(fflin.InputError, match="GainBatch"):
         fflin.ScheduledFeedback(target, fflin.lqr(target, 1.0, 1.0))
     with pytest.raises(fflin.InputError):
         policy.bind(fflin.load("cubesat"))

@@ -8,10 +8,12 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from tests.support.messages import says
 from tests.support.robots import BUNDLED, random_pose, random_tree, singular_at
 from tests.support.sweeps import assert_same, points
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", BUNDLED)
 def test_at_rest_every_model_is_that_of_linearize(name, robots):
     robot = robots[name]
@@ -64,6 +66,7 @@ def test_inputs_outputs_springs_and_gravity(case, robots):
     assert_same(moving[4], fflin.linearize(robot, q[4], moving=True))
 
 
+@pytest.mark.compiled
 def test_wheels_with_an_inertia_are_joints(robots):
     wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), inertia=0.1)
     robot = robots["ets_vii"].replace(inputs=[fflin.BaseTorque(), wheel])
@@ -85,6 +88,7 @@ def test_root_that_stands_elsewhere(robots):
         assert_same(lin, fflin.linearize(robot, point), 1e-11)
 
 
+@pytest.mark.compiled
 def test_what_is_constant_is_held_once_and_memory_is_the_results(robots):
     import tracemalloc
 
@@ -117,9 +121,9 @@ def test_slices_masks_and_joint_values(robots):
     assert chosen.joint_positions[:, [2 - 1, 4 - 1]] == pytest.approx(
         np.array([[-0.5, 0.7], [0.0, 0.7], [0.5, 0.7]])
     )
-    with pytest.raises(fflin.InputError, match="no point of the batch"):
+    with pytest.raises(fflin.InputError, match="batch"):
         batch.select({"joint_4": 0.6})
-    with pytest.raises(fflin.UnknownNameError, match="did you mean joint_2"):
+    with pytest.raises(fflin.UnknownNameError, match="joint_2"):
         batch.nearest({"joint2": 0.6})
     with pytest.raises(IndexError):
         batch[15]
@@ -135,6 +139,7 @@ def test_a_continuous_joint_is_near_the_short_way_round():
     assert len(batch.select({turning.name: 2.0 + 4 * math.pi})) == 1
 
 
+@pytest.mark.compiled
 def test_random_configurations_keep_the_limits_and_do_not_depend_on_how_they_are_read(robots):
     robot = robots["servicer_7dof"]
     drawn = fflin.random_configurations(robot, 9000, seed=7, ranges={"joint_3": (0.1, 0.2)})
@@ -193,32 +198,32 @@ def damaged(robot, row, column, value):
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda r: {"q": damaged(r, 31, 9, np.nan)}, r"configuration 31: q\[9\] is nan"),
-        (lambda r: {"q": damaged(r, 31, 6, 0.9)}, r"configuration 31: the base quaternion"),
-        (lambda r: {"q": np.empty((0, r.nq))}, "q has no rows"),
-        (lambda r: {"q": r.neutral()}, r"q has shape \(16,\), expected \(N, 16\)"),
-        (lambda r: {"q": [["a"]]}, "expected real numbers"),
-        (lambda r: {"q": damaged(r, 0, 7, 0.0), "v": np.zeros((3, r.nv))}, r"v has shape \(3, 15"),
+        (lambda r: {"q": damaged(r, 31, 9, np.nan)}, r"31.*q\[9\]"),
+        (lambda r: {"q": damaged(r, 31, 6, 0.9)}, "31.*quaternion"),
+        (lambda r: {"q": np.empty((0, r.nq))}, "rows"),
+        (lambda r: {"q": r.neutral()}, r"\(16,\)"),
+        (lambda r: {"q": [["a"]]}, "real"),
+        (lambda r: {"q": damaged(r, 0, 7, 0.0), "v": np.zeros((3, r.nv))}, r"\(3, 15"),
         (
             lambda r: {"q": damaged(r, 0, 7, 0.0), "u": np.full((40, 15), np.inf)},
-            r"u\[0, 0\] is inf",
+            r"u\[0, 0\]",
         ),
-        (lambda r: {"q": damaged(r, 0, 7, 0.0), "workers": 0}, "workers is 0"),
-        (lambda r: {"q": damaged(r, 0, 7, 0.0), "executor": 3}, "executor is a int"),
-        (lambda r: {"q": fflin.grid(fflin.load("cubesat"), {})}, "axes of the grid"),
-        (lambda r: {"q": fflin.grid(r, {"joint_1": []})}, "joint_1' has shape"),
+        (lambda r: {"q": damaged(r, 0, 7, 0.0), "workers": 0}, "workers"),
+        (lambda r: {"q": damaged(r, 0, 7, 0.0), "executor": 3}, "executor"),
+        (lambda r: {"q": fflin.grid(fflin.load("cubesat"), {})}, "axes"),
+        (lambda r: {"q": fflin.grid(r, {"joint_1": []})}, "joint_1'"),
         (lambda r: {"q": fflin.grid(r, {"joint_1": [1.0, 0.0]})}, "increase"),
-        (lambda r: {"q": fflin.random_configurations(r, 0)}, "count is 0"),
-        (lambda r: {"q": fflin.grid(fflin.load("ur5"), {"elbow_joint": [1.0]})}, "q is of 'ur5'"),
+        (lambda r: {"q": fflin.random_configurations(r, 0)}, "count"),
+        (lambda r: {"q": fflin.grid(fflin.load("ur5"), {"elbow_joint": [1.0]})}, "'ur5'"),
         (
             lambda r: {"q": fflin.grid(r, {f"joint_{i}": range(10**4) for i in range(1, 7)})},
-            "1,000,000,000,000,000,000,000,000 points are too many",
+            "1,000,000,000,000,000,000,000,000",
         ),
-        (lambda r: {"q": fflin.random_configurations(r, 10**20)}, "count is 1.* of at most 9,223"),
-        (lambda r: {"q": fflin.random_configurations("ur5", 3)}, "robot is a str"),
-        (lambda r: {"q": fflin.random_configurations(r, 3, ranges=[0, 1])}, "ranges is"),
-        (lambda r: {"q": fflin.random_configurations(r, 3), "progress": 3}, "progress is 3"),
-        (lambda r: {"q": fflin.random_configurations(r, 3), "workers": True}, "workers is True"),
+        (lambda r: {"q": fflin.random_configurations(r, 10**20)}, "9,223"),
+        (lambda r: {"q": fflin.random_configurations("ur5", 3)}, r"robot\b.*\bstr\b"),
+        (lambda r: {"q": fflin.random_configurations(r, 3, ranges=[0, 1])}, "ranges"),
+        (lambda r: {"q": fflin.random_configurations(r, 3), "progress": 3}, "progress"),
+        (lambda r: {"q": fflin.random_configurations(r, 3), "workers": True}, "True"),
     ],
 )
 def test_bad_input_is_one_line_that_names_the_row(make, message, robots, tmp_path):
@@ -231,15 +236,16 @@ def test_bad_input_is_one_line_that_names_the_row(make, message, robots, tmp_pat
 def test_what_has_no_room_is_refused_before_it_is_begun(robots, tmp_path):
     robot = robots["servicer_7dof"]
     many = fflin.random_configurations(robot, 10**15)
-    with pytest.raises(fflin.InputError, match=r"points are 1,928.0 PB, and the machine has"):
+    with pytest.raises(fflin.InputError, match=r"1,928.0 PB"):
         fflin.sweep(robot, many)
     pytest.importorskip("h5py")
     for name in ("x.h5", "x.npz"):
-        with pytest.raises(fflin.FileError, match=r"points are 1,928.0 PB.* only .* are free in"):
+        with pytest.raises(fflin.FileError, match=r"1,928.0 PB"):
             fflin.sweep(robot, many, out=tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("parallel", [False, True])
 def test_a_singular_configuration_fails_its_chunk_and_the_rest_is_kept(parallel):
     robot = singular_at(0.5)
@@ -247,7 +253,7 @@ def test_a_singular_configuration_fails_its_chunk_and_the_rest_is_kept(parallel)
     with ThreadPoolExecutor(2) as pool, pytest.raises(fflin.SweepError) as caught:
         fflin.sweep(robot, configurations, chunk=10, executor=pool if parallel else None)
     error = caught.value
-    assert "configurations 30 to 39: configuration 32: M of 'singular'" in str(error)
+    assert says(str(error), "30 to 39", "32", "'singular'")
     assert [failure[:2] for failure in error.failed] == [(30, 40)]
     assert len(error.batch) == 54
     kept = [*range(30), *range(40, 64)]
@@ -256,6 +262,7 @@ def test_a_singular_configuration_fails_its_chunk_and_the_rest_is_kept(parallel)
         assert_same(error.batch[index], fflin.linearize(robot, q), 1e-11)
 
 
+@pytest.mark.compiled
 def test_ill_conditioned_points_are_told_once():
     model = fflin.load("ets_vii").model.copy()
     model.jointPlacements[4] = pin.SE3(np.eye(3), np.array([1e5, 0.0, 0.0]))
@@ -263,9 +270,10 @@ def test_ill_conditioned_points_are_told_once():
     near = fflin.grid(robot, {"joint_5": np.linspace(0.0, 1.0, 19)})
     with pytest.warns(fflin.FflinWarning) as caught:
         fflin.sweep(robot, near)
-    assert len(caught) == 1 and "(and 18 more such)" in str(caught[0].message)
+    assert len(caught) == 1 and "18 more" in str(caught[0].message)
 
 
+@pytest.mark.compiled
 def test_progress_is_told(robots):
     told = []
     q = np.tile(robots["cubesat"].neutral(), (25, 1))
@@ -284,3 +292,13 @@ def test_nothing_of_the_callers_is_changed_or_kept(robots):
     for array in (batch.A, batch.B_lower, batch.q, batch.x0):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1.0
+
+
+def test_masked_values_are_refused_on_a_grid_and_as_an_index():
+    robot = fflin.load("planar_detumble")
+    values = np.ma.masked_array([-0.5, 0.0, 0.5], mask=[False, True, False])
+    with pytest.raises(fflin.InputError, match="masked"):
+        fflin.grid(robot, {"joint_1": values})
+    batch = fflin.sweep(robot, [robot.neutral()] * 2)
+    with pytest.raises(fflin.InputError, match="masked"):
+        batch[np.ma.masked_array([0, 1], mask=[False, True])]

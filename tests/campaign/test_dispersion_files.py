@@ -2,10 +2,13 @@
 
 import pickle
 
+import numpy as np
 import pytest
 from scipy import stats
 
 import fflin
+from fflin.base.progress import Progress
+from fflin.campaign.runs import CampaignJob
 
 
 def read(tmp_path, text, head="[dispersions]\n"):
@@ -39,33 +42,48 @@ def test_all_kinds_of_spreads(tmp_path):
     assert pickle.loads(pickle.dumps(found)) == found
 
 
+def test_a_tied_spread_is_one_draw(tmp_path, robots):
+    found = read(tmp_path, '"*.mass" = {uniform = [-0.1, 0.2], tied = true}\nq_b = 0.01\n')
+    assert found["*.mass"] == {"range": (-0.1, 0.2), "tied": True}
+    scaled = read(tmp_path, 'q_b = {distribution = "norm", scale = 0.1, tied = true}')["q_b"]
+    assert scaled["range"].ppf(0.5) == 0.0
+
+
 @pytest.mark.parametrize(
     ("text", "line", "said"),
     [
-        ("q_b = [1, 2]", 3, r"'q_b': \[1, 2\] is no spread, expected .*{uniform = "),
-        ("q_b = true", 3, "'q_b': True is no spread"),
-        ("q_b = inf", 3, "is no spread"),
-        ("q_b = {}", 3, "is no spread"),
-        ("q_b = {uniform = [1, 2, 3]}", 3, "is no spread"),
-        ("q_b = {uniform = [1, 2], c = 3}", 3, "is no spread"),
-        ("q_b = {uniform = 1}", 3, "is no spread"),
-        ("q_b = {normal = [1]}", 3, "is no spread"),
-        ("q_b = {values = []}", 3, "is no spread"),
-        ("q_b = {unifrom = [1, 2]}", 3, "'q_b.unifrom'.* is no spread"),
-        ("q_b = {distribution = 3}", 3, "is no spread"),
-        ('q_b = {distribution = "trang"}', 3, "no distribution .* 'trang'; did you mean triang"),
-        ('q_b = {distribution = "triang"}', 3, "missing .* 'c'; it takes c, loc, scale"),
-        ('q_b = {distribution = "norm", d = 1}', 3, "unexpected .* 'd'; it takes loc, scale"),
-        ('q_b = {distribution = "triang", c = 7}', 3, "is none with c = 7"),
-        ('q_b = {distribution = "norm", scale = "a"}', 3, "distribution norm"),
-        ("q_b = -1", 3, "standard deviation of 0 or more"),
-        ("\nq_b = {uniform = [1, 0]}", 4, r"\(1, 0\), expected \(least, largest\)"),
-        ("nosuch = 1", 3, "no state to disperse named 'nosuch'"),
-        ("nosuch.mass = 1", 3, "no mass to disperse named 'nosuch'"),
-        ('\n"*.mass" = 0.9', 4, "'(base|joint_.)mass' is drawn as|no robot is made"),
-        ("base.inertia = {uniform = [-2, 0]}", 3, "'base.inertia.x' is drawn as"),
-        ("tau_b.gain = 1\nq_b.sensor = 0.1", 4, "no sensors"),
-        ("q_b = 0.6", 1, "a start is drawn that is no attitude"),
+        ("q_b = [1, 2]", 3, r"\[1, 2\]"),
+        ("q_b = true", 3, "True"),
+        ("q_b = inf", 3, "spread"),
+        ("q_b = {}", 3, "spread"),
+        ("q_b = {uniform = [1, 2, 3]}", 3, "spread"),
+        ("q_b = {uniform = [1, 2], c = 3}", 3, "spread"),
+        ("q_b = {uniform = 1}", 3, "spread"),
+        ("q_b = {normal = [1]}", 3, "spread"),
+        ("q_b = {values = []}", 3, "spread"),
+        ("q_b = {unifrom = [1, 2]}", 3, "'q_b.unifrom'"),
+        ("q_b = {distribution = 3}", 3, "spread"),
+        ('q_b = {distribution = "trang"}', 3, "'trang'"),
+        ('q_b = {distribution = "triang"}', 3, "'c'"),
+        ('q_b = {distribution = "norm", d = 1}', 3, "'d'"),
+        ('q_b = {distribution = "triang", c = 7}', 3, "c = 7"),
+        ('q_b = {distribution = "norm", scale = "a"}', 3, "norm"),
+        ('q_b = {distribution = "norm", scale = inf}', 3, "finite"),
+        ('q_b = {distribution = "triang", c = [[0.5]]}', 3, "finite"),
+        ('q_b = {distribution = "rv_histogram"}', 3, "distribution"),
+        ('q_b = {distribution = "rv_continuous"}', 3, "distribution"),
+        ('q_b = {distribution = "rv_discrete"}', 3, "distribution"),
+        (f"q_b = 0x{'f' * 5000}", 3, "too long"),
+        ("q_b = -1", 3, "standard deviation"),
+        ("\nq_b = {uniform = [1, 0]}", 4, r"\(1, 0\)"),
+        ('q_b = {normal = 0.1, tied = "yes"}', 3, "tied"),
+        ("q_b = {tied = true}", 3, "spread"),
+        ("nosuch = 1", 3, "'nosuch'"),
+        ("nosuch.mass = 1", 3, r"mass\b.*'nosuch'"),
+        ('\n"*.mass" = 0.9', 4, "mass"),
+        ("base.inertia = {uniform = [-2, 0]}", 3, "'base.inertia.x'"),
+        ("tau_b.gain = 1\nq_b.sensor = 0.1", 4, "sensors"),
+        ("q_b = 0.6", 1, "attitude"),
     ],
 )
 def test_what_is_wrong_has_file_and_line(tmp_path, robots, text, line, said):
@@ -79,13 +97,13 @@ def test_what_is_wrong_has_file_and_line(tmp_path, robots, text, line, said):
 @pytest.mark.parametrize(
     ("text", "line", "said"),
     [
-        ("", 1, "holds no spreads; write"),
-        ("[dispersions]", 1, "holds no spreads"),
-        ("dispersions = 3", 1, "holds no spreads"),
-        ("\nq_b = 0.1", 2, "no table named 'q_b'; there are: dispersions; write"),
-        ("[dispersions]\nq_b = 1\n[input]\nx = 1", 3, "no table named 'input'"),
-        ("[dispersions]\nq_b = ", 2, "not TOML"),
-        ("[dispersions]\nq_b = 1\nq_b.sensor = 1", 3, 'dots stand in quotes, "q_b.sensor"'),
+        ("", 1, "spread"),
+        ("[dispersions]", 1, "spread"),
+        ("dispersions = 3", 1, "spread"),
+        ("\nq_b = 0.1", 2, "'q_b'"),
+        ("[dispersions]\nq_b = 1\n[input]\nx = 1", 3, "'input'"),
+        ("[dispersions]\nq_b = ", 2, "TOML"),
+        ("[dispersions]\nq_b = 1\nq_b.sensor = 1", 3, '"q_b.sensor"'),
     ],
 )
 def test_what_is_no_such_file(tmp_path, text, line, said):
@@ -96,5 +114,64 @@ def test_what_is_no_such_file(tmp_path, text, line, said):
 
 def test_errors_about_other_things_name_no_file(tmp_path, robots):
     given = read(tmp_path, "q_b = 0.01")
-    with pytest.raises(fflin.InputError, match=r"^runs is 0"):
+    with pytest.raises(fflin.InputError, match="runs"):
         fflin.monte_carlo(robots["planar_detumble"], None, given, runs=0, duration=0.1)
+
+
+class Given:
+    """A distribution that notes how many values are drawn of it."""
+
+    def __init__(self, ppf):
+        self.inverse, self.count = ppf, 0
+
+    def ppf(self, u):
+        self.count += np.size(u)
+        return self.inverse(u)
+
+
+def test_a_distribution_draws_each_value_once_whatever_is_asked_for(robots):
+    """Those of scipy.stats that integrate take a second for two values."""
+    dispersions = [
+        CampaignJob(
+            robots["planar_detumble"], None, {"r_b.x": given}, 7, "python", {"duration": 1.0}
+        ).dispersions
+        for given in (Given(stats.logistic(scale=0.1).ppf), (-0.1, 0.1), Given(lambda u: u))
+    ]
+    once, uniform, plain = dispersions
+    before = [each.columns[0].inverse.__self__.count for each in (once, plain)]
+    assert once.rows(3, 20).drawn.shape == (17, 1)
+    for each in (once, plain):
+        each.require_possible(2100)
+    parts = [once.rows(*span).drawn for span in ((0, 1000), (1000, 1030), (1030, 2100))]
+    counts = [each.columns[0].inverse.__self__.count for each in (once, plain)]
+    assert counts == [each + 2100 for each in before]
+    u = plain.rows(0, 2100).drawn
+    np.testing.assert_allclose(np.concatenate(parts), stats.logistic(scale=0.1).ppf(u), rtol=1e-14)
+    np.testing.assert_allclose(uniform.rows(5, 2100).drawn, -0.1 + 0.2 * u[5:], rtol=1e-14)
+
+
+def test_slow_draws_are_told_as_they_go(robots, monkeypatch):
+    told = []
+    monkeypatch.setattr(Progress, "update", lambda _, *given: told.append(given))
+    given = {"r_b.x": 0.1, "r_b.y": stats.logistic(scale=0.1)}
+    job = CampaignJob(robots["planar_detumble"], None, given, 0, "python", {"duration": 1.0})
+    job.dispersions.require_possible(1500)
+    done = [each[0] for each in told]
+    assert done == sorted(set(done)) and done[-1] == 1500 and done[0] == 1
+    assert told[-1][1:] == (1500, "drawing 'r_b.y', 1,500 of 1,500 ")
+
+
+@pytest.mark.parametrize(
+    ("ppf", "said"),
+    [
+        (lambda u: np.where(np.asarray(u) > 0.9, np.inf, 0.0), "finite"),
+        (lambda u: np.where(np.asarray(u) > 0.9, np.nan, 0.0), "finite"),
+        (lambda u: 0.0 if np.ndim(u) == 0 else np.linalg.inv(np.zeros((1, 1))), "cannot be drawn"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_before_the_runs(ppf, said, robots, monkeypatch):
+    monkeypatch.setattr("fflin.campaign.monte_carlo.run_chunks", None)  # the runs
+    given = {"r_b.x": Given(ppf)}
+    with pytest.raises(fflin.InputError, match=said) as caught:
+        fflin.monte_carlo(robots["planar_detumble"], None, given, runs=100, duration=0.1)
+    assert "r_b.x" in str(caught.value)

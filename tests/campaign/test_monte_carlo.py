@@ -2,7 +2,6 @@
 
 import itertools
 import os
-import subprocess
 import sys
 import textwrap
 import warnings
@@ -21,11 +20,13 @@ from fflin.campaign.runs import ARRAYS, CampaignJob
 from fflin.simulation.report import courses
 from tests.support.campaigns import both
 from tests.support.measured import FELT, POSITIONS, designed
+from tests.support.messages import any_wording, says
+from tests.support.patience import finished
 from tests.support.robots import BUNDLED, LINKS, MIMIC, free_body
 from tests.support.weights import unit_weights
 
 pytestmark = pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-ENGINES = ["python", "compiled"]
+ENGINES = ["python", pytest.param("compiled", marks=pytest.mark.compiled)]
 
 START = {"q_b": 0.05, "r_b.x": (-0.1, 0.2), "omega_b": 0.02}
 
@@ -41,6 +42,7 @@ def feedback(robot, frame="hybrid"):
     return fflin.StateFeedback(lin, fflin.lqr(lin).K)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", BUNDLED)
 def test_lanes_give_what_single_runs_give(robots, name):
     robot = robots[name]
@@ -55,6 +57,7 @@ def test_lanes_give_what_single_runs_give(robots, name):
     both(robot, feedback(robot), inputs | {f"{lin.input_names[0]}.fails": (0.5, 2.0)})
 
 
+@pytest.mark.compiled
 def test_lanes_of_all_kinds_of_forces():
     spring = {"stiffness": {"joint_*": 2.0}, "damping": {"joint_*": 0.5}}
     robot = fflin.load(
@@ -73,6 +76,7 @@ def test_lanes_of_all_kinds_of_forces():
     both(robot, policy, given)
 
 
+@pytest.mark.compiled
 def test_wheels_with_inertia_and_their_limits():
     wheels = [
         fflin.ReactionWheel(axis, name=f"w{k}", inertia=0.02, max_speed=30.0, max=0.5)
@@ -87,6 +91,7 @@ def test_wheels_with_inertia_and_their_limits():
     assert lanes["largest_x"][:, 12:15].max() <= 30.0 + 1e-9
 
 
+@pytest.mark.compiled
 def test_mimic_joints(tmp_path):
     path = tmp_path / "gripper.urdf"
     for a, b in itertools.product(("revolute", "continuous", "prismatic"), repeat=2):
@@ -96,6 +101,7 @@ def test_mimic_joints(tmp_path):
         both(robot, feedback(robot), {"q_m": 0.3, "*.mass": 0.1}, duration=1.0)
 
 
+@pytest.mark.compiled
 def test_bodies_are_their_own_beside_wheels_on_another_branch(robots):
     """The wheel's joint stands before the joints of the arm's other branch."""
     robot = robots["dual_arm"]
@@ -109,6 +115,7 @@ def test_bodies_are_their_own_beside_wheels_on_another_branch(robots):
     both(robot, fflin.StateFeedback(lin, K), given, duration=0.5)
 
 
+@pytest.mark.compiled
 def test_outputs_samples_delay_and_limits(robots):
     robot, lin, compensator = designed(POSITIONS)
     policy = fflin.OutputFeedback(lin, compensator)
@@ -127,6 +134,7 @@ def test_a_compensator_that_feels_acceleration_runs_in_python():
     assert np.array_equal(campaign.replay(1).q[-1], campaign.q[1])
 
 
+@pytest.mark.compiled
 def test_along_a_trajectory(robots):
     robot = robots["ets_vii"]
     slew = fflin.simulate(robot, feedback(robot), q0=robot.neutral(), duration=2.0, dt=0.1)
@@ -148,6 +156,8 @@ def test_a_run_is_flown_again_to_the_last_bit_and_keeps_its_momentum(robots, eng
         assert motion.engine == campaign.engine == engine
         for name in ("q", "v", "u"):
             assert np.array_equal(getattr(motion, name)[-1], getattr(campaign, name)[run]), name
+        # The state is read from these by other code.
+        np.testing.assert_allclose(motion.x[-1], campaign.x[run], rtol=1e-13, atol=1e-15)
         assert motion.momentum_drift.max() < 1e-13 and motion.com_drift.max() < 1e-13
     masses = campaign.values("drawn base.mass")
     assert motion.energy[0] > 0.0 and len({*masses}) == 11
@@ -189,6 +199,7 @@ SCRIPT = """
 """
 
 
+@pytest.mark.process
 def test_a_campaign_is_the_same_on_any_workers_and_after_a_kill(tmp_path):
     pytest.importorskip("h5py")
     script = tmp_path / "campaign.py"
@@ -196,7 +207,7 @@ def test_a_campaign_is_the_same_on_any_workers_and_after_a_kill(tmp_path):
 
     def run(name, workers, after=1000):
         command = [sys.executable, "-W", "ignore", script, tmp_path / name, workers, after]
-        return subprocess.run(list(map(str, command)), env=os.environ, check=False).returncode
+        return finished(list(map(str, command)), env=os.environ).returncode
 
     for name, workers in (("one.h5", 1), ("two.h5", 2), ("four.h5", 4)):
         assert run(name, workers) == 0
@@ -217,6 +228,7 @@ def test_a_campaign_is_the_same_on_any_workers_and_after_a_kill(tmp_path):
     assert len(one) == 90 and one.names == few.names
 
 
+@pytest.mark.compiled
 def test_any_executor_does_it(robots):
     robot, case = robots["planar_detumble"], {"runs": 20, "duration": 0.2, "chunk": 8}
     here = fflin.monte_carlo(robot, feedback(robot), {"q_b": 0.05}, **case)
@@ -228,6 +240,7 @@ def test_any_executor_does_it(robots):
     assert np.array_equal(there.replay(19).q[-1], here.q[19])
 
 
+@pytest.mark.compiled
 def test_another_campaign_does_not_go_on_in_a_file(tmp_path, robots):
     pytest.importorskip("h5py")
 
@@ -238,7 +251,7 @@ def test_another_campaign_does_not_go_on_in_a_file(tmp_path, robots):
     case["out"] = tmp_path / "runs.h5"
     with pytest.raises(KeyboardInterrupt):
         fflin.monte_carlo(robot, None, {"omega_b": 0.1}, progress=stop, **case)
-    with pytest.raises(fflin.FileError, match="left behind"):
+    with pytest.raises(fflin.FileError, match="campaign"):
         fflin.monte_carlo(robot, None, {"omega_b": 0.1}, seed=1, **case)
     campaign = fflin.monte_carlo(robot, None, {"omega_b": 0.1}, **case)
     assert len(campaign) == 24 and np.isfinite(campaign.q).all()
@@ -276,6 +289,7 @@ def test_each_kind_of_spread_has_its_distribution(robots):
     assert np.abs(np.corrcoef(list(of.values())) - np.eye(4)).max() < 0.06
 
 
+@pytest.mark.compiled
 def test_a_failed_input_does_nothing_from_then_on(robots):
     robot, lin = robots["planar_detumble"], fflin.linearize(robots["planar_detumble"])
     u = np.zeros(lin.B.shape[1])
@@ -309,6 +323,7 @@ def linear_loop():
     return robot, fflin.StateFeedback(lin, K), moved[3, [3, 9]]
 
 
+@pytest.mark.compiled
 def test_intervals_hold_the_known_answer_as_often_as_they_say():
     robot, policy, row = linear_loop()
     spread, held = {"r_b.x": 0.2, "v_b.x": 0.1}, {"mean": 0, "half": 0, "most": 0, "share": 0}
@@ -349,13 +364,14 @@ def test_runs_that_diverge_are_counted_and_are_in_no_figure(robots, engine):
     assert np.isfinite(list(campaign.sensitivity().values())).all()
     assert {*campaign.worst(lost)} == {*np.flatnonzero(campaign.stopped).tolist()}
     said = str(campaign)
-    assert f"{12 - lost} came to their end" in said and "nan" not in said
+    assert says(said, f"{12 - lost} ") and "nan" not in said
     first = campaign.worst(1)[0]
     motion = campaign.replay(first)
     assert motion.stopped and campaign.end[first] < 4.0
     assert np.array_equal(motion.q[-1], campaign.q[first])
 
 
+@pytest.mark.compiled
 def test_lanes_stop_as_single_runs_do(robots):
     robot = robots["ets_vii"]
     given = START | {"tau_b.x.gain": [0.0, -6.0]}
@@ -363,6 +379,7 @@ def test_lanes_stop_as_single_runs_do(robots):
     assert {*lanes["stop"]} >= {0.0} and 0 < (lanes["stop"] > 0).sum() < 19
 
 
+@pytest.mark.compiled
 def test_it_stops_when_the_interval_is_narrow_enough(robots, tmp_path):
     robot, policy, _ = linear_loop()
     spread = {"r_b.x": 0.2}
@@ -371,7 +388,7 @@ def test_it_stops_when_the_interval_is_narrow_enough(robots, tmp_path):
     share = campaign.fraction("position < 1 m")
     assert len(campaign) < 4000 and campaign.asked == 4000
     assert share.high - share.low <= 0.01
-    assert "of 4,000 asked for" in str(campaign)
+    assert says(str(campaign), "4,000")
     other = fflin.monte_carlo(
         robot, policy, spread, runs=4000, out=tmp_path / "c.h5", chunk=32, **case
     )
@@ -385,6 +402,7 @@ def campaign(robots):
     return fflin.monte_carlo(robot, feedback(robot), START, runs=40, duration=6.0, dt=0.02)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("ending", [".npz", ".h5"])
 def test_it_is_saved_and_loaded_to_the_last_bit(campaign, ending, tmp_path):
     if ending == ".h5":
@@ -395,15 +413,16 @@ def test_it_is_saved_and_loaded_to_the_last_bit(campaign, ending, tmp_path):
     for name in ("drawn", *ARRAYS):
         assert np.array_equal(getattr(again, name), getattr(campaign, name))
     assert str(again) == str(campaign)
-    with pytest.raises(fflin.InputError, match="from a file"):
+    with pytest.raises(fflin.InputError, match="file"):
         again.replay(0)
     content = bytearray((tmp_path / f"runs{ending}").read_bytes())
     content[len(content) // 2] ^= 1
     (tmp_path / f"runs{ending}").write_bytes(content)
-    with pytest.raises(fflin.FileError):
+    with any_wording(), pytest.raises(fflin.FileError):
         fflin.Campaign.load(tmp_path / f"runs{ending}")
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("engine", ENGINES)
 def test_histories_are_those_of_the_motions(robots, engine, tmp_path):
     robot = robots["ets_vii"]
@@ -439,6 +458,7 @@ def test_histories_are_those_of_the_motions(robots, engine, tmp_path):
         assert np.array_equal(way[-1], campaign.q[run])
 
 
+@pytest.mark.compiled
 def test_goals_are_told_and_say_what_the_worst_is(robots):
     robot = robots["ets_vii"]
     goals = ["position < 1 mm and settle < 5 s", "attitude > 0 deg"]
@@ -451,6 +471,7 @@ def test_goals_are_told_and_say_what_the_worst_is(robots):
     assert "at 90 % confidence)" in str(campaign)
 
 
+@pytest.mark.compiled
 def test_figures_are_those_of_the_motions(campaign):
     run = campaign.worst(1)[0]
     motion = campaign.replay(run)
@@ -462,6 +483,7 @@ def test_figures_are_those_of_the_motions(campaign):
     assert campaign.values("worst attitude").max() == of["worst attitude"]
 
 
+@pytest.mark.compiled
 def test_the_time_to_settle_is_that_of_the_motions_table(robots):
     robot = robots["planar_detumble"]
     campaign = fflin.monte_carlo(
@@ -477,6 +499,7 @@ def test_the_time_to_settle_is_that_of_the_motions_table(robots):
     assert np.isfinite(campaign.values("settle")).any()
 
 
+@pytest.mark.exhaustive
 def test_a_report_is_within_80_columns(campaign):
     assert max(map(len, str(campaign).splitlines())) <= 80
     assert "|q_b." in str(campaign)
@@ -495,48 +518,48 @@ def test_conditions(campaign):
     )
     assert campaign.fraction(two).value == two.mean()
     for text, said in (
-        ("attitude < 1 m", "in m, expected deg"),
-        ("attitude", "expected NAME < NUMBER UNIT"),
-        ("attitude < x", "expected NAME < NUMBER UNIT"),
+        ("attitude < 1 m", "deg"),
+        ("attitude", "NAME < NUMBER UNIT"),
+        ("attitude < x", "NAME < NUMBER UNIT"),
     ):
         with pytest.raises(fflin.InputError, match=said):
             campaign.fraction(text)
     with pytest.raises(fflin.UnknownNameError, match="attitude"):
         campaign.fraction("atitude < 1 deg")
-    with pytest.raises(fflin.InputError, match=r"expected .* \(40,\) True or False"):
+    with pytest.raises(fflin.InputError, match=r"\(40,\)"):
         campaign.fraction([True])
 
 
 BAD = [
-    ({"given": {}}, "dispersions is empty"),
-    ({"given": 3}, "dispersions is a int"),
-    ({"given": {"nosuch": 1.0}}, "no state to disperse named 'nosuch'.*mass"),
-    ({"given": {"nosuch.mass": 1.0}}, "mass to disperse.*base"),
-    ({"given": {"q_b": -1.0}}, "standard deviation of 0 or more"),
+    ({"given": {}}, "dispersions"),
+    ({"given": 3}, "dispersions"),
+    ({"given": {"nosuch": 1.0}}, "'nosuch'.*mass"),
+    ({"given": {"nosuch.mass": 1.0}}, "mass.*base"),
+    ({"given": {"q_b": -1.0}}, "standard deviation"),
     ({"given": {"q_b": (1.0, 0.0)}}, "least, largest"),
-    ({"given": {"q_b": []}}, "no values"),
-    ({"given": {"q_b": stats.gamma}}, "freeze it"),
-    ({"given": {"q_b": 0.6}}, "no attitude"),
-    ({"given": {"base.mass": 0.5}}, "'base.mass' is drawn as .* no robot is made"),
-    ({"given": {"base.inertia": (-2.0, 0.0)}}, "no robot is made"),
+    ({"given": {"q_b": []}}, "values"),
+    ({"given": {"q_b": stats.gamma}}, "freeze"),
+    ({"given": {"q_b": 0.6}}, "attitude"),
+    ({"given": {"base.mass": 0.5}}, "'base.mass'"),
+    ({"given": {"base.inertia": (-2.0, 0.0)}}, "robot"),
     ({"given": {"*.stiffness": 0.1}}, "is 0"),
-    ({"given": {"q_b.sensor": 0.1}}, "no sensors"),
-    ({"runs": 0}, "runs is 0"),
-    ({"runs": 1.5}, "runs is 1.5"),
-    ({"runs": 10**12}, "1,000,000,000,000 runs are .* memory"),
-    ({"seed": -1}, "seed is -1"),
-    ({"width": 2.0}, "width is 2"),
+    ({"given": {"q_b.sensor": 0.1}}, "sensors"),
+    ({"runs": 0}, "runs"),
+    ({"runs": 1.5}, r"1\.5"),
+    ({"runs": 10**12}, "1,000,000,000,000.*memory"),
+    ({"seed": -1}, "seed"),
+    ({"width": 2.0}, "width"),
     ({"until": "nosuch < 1"}, "nosuch"),
-    ({"until": "attitude < 1 deg", "chunk": 24}, "chunk is 24"),
-    ({"duration": None}, "duration is missing"),
-    ({"durations": 1.0}, "no option of monte_carlo named 'durations'"),
+    ({"until": "attitude < 1 deg", "chunk": 24}, "chunk"),
+    ({"duration": None}, "duration"),
+    ({"durations": 1.0}, "'durations'"),
     ({"engine": "gpu"}, "engine"),
     ({"out": "runs.csv"}, "runs.csv"),
-    ({"histories": -1}, "histories is -1"),
-    ({"goals": 3}, "goals is a int"),
-    ({"goals": [3]}, "a goal is a int"),
-    ({"goals": ["attitude < 1 m"]}, "in m, expected deg"),
-    ({"workers": 2, "executor": 3}, "give either"),
+    ({"histories": -1}, "histories"),
+    ({"goals": 3}, "goals"),
+    ({"goals": [3]}, "goal"),
+    ({"goals": ["attitude < 1 m"]}, "deg"),
+    ({"workers": 2, "executor": 3}, "workers"),
 ]
 
 
@@ -562,12 +585,13 @@ def test_what_cannot_be_sent_to_workers_is_named(robots):
     def nothing(t, q, v):
         return np.zeros(9)
 
-    with pytest.raises(fflin.InputError, match=r"cannot be sent to workers .*nothing"):
+    with pytest.raises(fflin.InputError, match="nothing"):
         fflin.monte_carlo(
             robots["planar_detumble"], nothing, {"q_b": 0.01}, runs=2, duration=0.1, workers=1
         )
 
 
+@pytest.mark.compiled
 def test_what_is_kept_does_not_grow_with_the_duration(robots):
     robot = robots["planar_detumble"]
     short, long = (
@@ -578,6 +602,7 @@ def test_what_is_kept_does_not_grow_with_the_duration(robots):
         assert getattr(short, name).shape == getattr(long, name).shape
 
 
+@pytest.mark.compiled
 def test_the_world_may_be_far_away():
     pytest.importorskip("numba")
     robot = fflin.load("planar_detumble")
@@ -588,6 +613,7 @@ def test_the_world_may_be_far_away():
     both(robot, policy, {"q_b": 0.01, "r_b": 0.01}, tolerance=1e-7, duration=1.0)
 
 
+@pytest.mark.compiled
 def test_warnings_are_given_once(robots):
     robot = robots["ets_vii"]
     with warnings.catch_warnings(record=True) as caught:
@@ -596,15 +622,16 @@ def test_warnings_are_given_once(robots):
     assert len([str(each.message) for each in caught]) <= 1
 
 
+@pytest.mark.compiled
 def test_a_mean_with_what_never_settled_is_refused(robots):
     robot = robots["cubesat"]
     lin = fflin.linearize(robot)
     policy = fflin.StateFeedback(lin, fflin.lqr(lin).K)
     drawn = {"q_b": 0.05, "tau_b.x.fails": (1.0, 2.0)}
     found = fflin.monte_carlo(robot, policy, drawn, runs=8, duration=4.0, dt=0.05)
-    with pytest.raises(fflin.InputError, match=r"'settle' is infinite in \d of 8 runs"):
+    with pytest.raises(fflin.InputError, match=r"'settle'.*\d of 8"):
         found.mean("settle")
-    with pytest.raises(fflin.InputError, match="a list of times or a distribution"):
+    with pytest.raises(fflin.InputError, match="times"):
         fflin.monte_carlo(robot, policy, {"tau_b.x.fails": 3.0}, runs=1, duration=1.0)
     noisy = {"q_b": 0.05, "q_b.x.noise": 1e-4}
     found = fflin.monte_carlo(robot, policy, noisy, runs=8, duration=1.0, dt=0.05, sample=0.05)
@@ -613,6 +640,7 @@ def test_a_mean_with_what_never_settled_is_refused(robots):
     }
 
 
+@pytest.mark.compiled
 def test_runs_that_a_file_has_are_not_flown_again(robots, tmp_path, monkeypatch):
     robot = robots["cubesat"]
     lin = fflin.linearize(robot)
@@ -625,10 +653,39 @@ def test_runs_that_a_file_has_are_not_flown_again(robots, tmp_path, monkeypatch)
         after = fflin.monte_carlo(robot, policy, {"q_b": 0.05}, runs=16, goals=goals, **options)
         assert after.goals == tuple(goals) and (after.x == before.x).all()
         assert (after.replay(3).x[-1] == before.x[3]).all()
-    again = fflin.monte_carlo(robot, policy, {"q_b": 0.06}, runs=16, **options)
-    assert (again.drawn != after.drawn).all()
 
 
+@pytest.mark.parametrize("ending", [".h5", ".npz"])
+def test_a_file_of_anything_else_is_replaced_only_on_request(ending, robots, tmp_path, monkeypatch):
+    pytest.importorskip("h5py")
+    path = tmp_path / f"c{ending}"
+
+    def fly(**changes):
+        options = {"runs": 2, "duration": 0.1, "engine": "python", "out": path, **changes}
+        return fflin.monte_carlo(robots["planar_detumble"], None, {"omega_b": 0.1}, **options)
+
+    np.savez(tmp_path / "other.npz", x=1.0)
+    foreign = b"notes", (tmp_path / "other.npz").read_bytes()
+    for content in foreign:
+        path.write_bytes(content)
+        with pytest.raises(fflin.FileError, match="holds no campaign"), monkeypatch.context() as no:
+            no.setattr("fflin.campaign.monte_carlo.CampaignJob", None)  # the work
+            fly()
+        assert path.read_bytes() == content and len(list(tmp_path.iterdir())) == 2
+    first = fly(overwrite=True)
+    before = path.read_bytes()
+    for changes in ({"seed": 1}, {"runs": 3}, {"duration": 0.2}, {"until": "end > 0", "seed": 1}):
+        with pytest.raises(fflin.FileError, match="seed 0"), monkeypatch.context() as no:
+            no.setattr("fflin.campaign.monte_carlo.run_chunks", None)  # the runs
+            fly(**changes)
+        assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 2
+    assert np.array_equal(fly().q, first.q)
+    assert np.array_equal(fly(until="end > 0").q, first.q)
+    assert not np.array_equal(fly(seed=1, overwrite=True).q, first.q)
+    assert fflin.Campaign.load(path).seed == 1
+
+
+@pytest.mark.compiled
 def test_what_no_input_pushes_is_judged_in_no_campaign_either():
     robot = fflin.load("cubesat", inputs=[fflin.BaseTorque()])
     lin = fflin.linearize(robot)

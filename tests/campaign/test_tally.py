@@ -46,6 +46,7 @@ def rows_of(state, rng, inputs):
     return q.reshape(STEPS, LANES, -1), nu, rng.normal(size=(STEPS, LANES, inputs))
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("follows", [False, True])
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("made", [turning, wheeled, arm])

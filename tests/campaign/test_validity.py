@@ -27,6 +27,8 @@ from fflin.campaign.validity import _LEVELS, _crossing, _slope
 from fflin.simulation.conservation import Conserved
 from fflin.simulation.run import go
 from tests.support.commands import refused, run
+from tests.support.messages import any_wording, says
+from tests.support.patience import finished, finishing
 from tests.support.weights import unit_weights
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -46,6 +48,7 @@ def arm(robots):
     return robots["planar_detumble"]
 
 
+@pytest.mark.compiled
 def test_prediction_error_is_of_second_order(robots, arm):
     for robot, dt in ((arm, 0.0), (robots["cubesat"], 0.2)):
         lin, gain = held(robot, dt)
@@ -129,6 +132,8 @@ def test_displacements_of_a_point_that_is_turned_from_the_reference(robots):
         assert np.rad2deg(np.linalg.norm(pin.log3(moved))) == pytest.approx(100.0)
 
 
+@pytest.mark.compiled
+@pytest.mark.process
 def test_same_seed_same_result_whoever_runs_it(robots):
     robot = robots["cubesat"]
     lin, gain = held(robot)
@@ -143,6 +148,7 @@ def test_same_seed_same_result_whoever_runs_it(robots):
     assert (other.prediction_error != one.prediction_error).any()
 
 
+@pytest.mark.compiled
 def test_what_the_counts_say(robots):
     """A loop that is lost far out: the runs below the first failure, and both intervals."""
     robot = robots["ets_vii"]
@@ -154,11 +160,12 @@ def test_what_the_counts_say(robots):
     level = found.sampled[found.inside - 1]
     assert found.holds == {"attitude": 174.0 * level, "position": 0.5 * level, "joint": level}
     assert found.inside_rate == pytest.approx(0.05 ** (1.0 / found.inside))
-    assert f"{found.inside} of {found.inside} runs" in " ".join(str(found).split())
+    assert says(str(found), f"{found.inside} of {found.inside}")
     near = fflin.validity(robot, lin, gain, attitude=30.0, position=0.5, joint=0.3, samples=4)
     assert near.settled == 4
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize("name", ["cubesat", "ets_vii", "planar_detumble"])
 def test_both_engines_say_the_same(robots, name):
     pytest.importorskip("numba")
@@ -191,6 +198,7 @@ def test_a_linear_loop_is_foreseen_to_rounding_and_settles_when_it_says(robots):
         assert job.run(Draws((x - lin.x0)[None], np.zeros(1)), 0).arrays["outcome"] == [outcome]
 
 
+@pytest.mark.compiled
 def test_limits_are_those_that_are_given(robots):
     robot = robots["cubesat"]
     lin, gain = held(robot)
@@ -199,6 +207,7 @@ def test_limits_are_those_that_are_given(robots):
     assert free.settled == 8 and weak.settled == 0 and set(weak.outcomes) == {"slow"}
 
 
+@pytest.mark.compiled
 def test_what_turns_fast_is_flown_in_shorter_steps():
     robot = fflin.load("canadarm2")
     lin = fflin.linearize(robot)
@@ -212,7 +221,7 @@ def test_poles_too_far_apart_are_refused(robots):
     fast = gain.K.copy()
     fast[3:, 3:6] *= 1e16
     fast[3:, 9:] *= 1e8
-    with pytest.raises(fflin.InputError, match=r"fastest pole is at .* expected at most 1,000,000"):
+    with pytest.raises(fflin.InputError, match="1,000,000"):
         fflin.validity(robot, lin, fast)
 
 
@@ -224,6 +233,7 @@ def test_interval_is_clopper_and_pearsons():
             assert found == pytest.approx((exact.low, exact.high), rel=1e-9)
 
 
+@pytest.mark.compiled
 def test_joints_only_hold_the_reduced_model(robots):
     robot = robots["ets_vii"]
     robot = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
@@ -233,6 +243,7 @@ def test_joints_only_hold_the_reduced_model(robots):
     assert found.settled == 5
 
 
+@pytest.mark.compiled
 def test_what_cannot_be_told_is_not(robots, arm):
     robot = robots["cubesat"]
     lin, gain = held(robot)
@@ -240,20 +251,19 @@ def test_what_cannot_be_told_is_not(robots, arm):
     found = fflin.validity(robot, lin, gain, attitude=0.0, samples=1)
     assert np.isnan(found.slope) and found.trusted == found.largest
     assert found.largest == {"attitude": 0.0, "position": 0.5, "joint": 0.0}
-    said = " ".join(str(found).split())
-    assert "up to 0.5 m and beyond; no order of the error can be told" in said
+    assert says(str(found), "0.5 m", "order")
     # One that is hurled away is nowhere foreseen.
     lin, gain = held(arm)
     found = fflin.validity(arm, lin, gain, attitude=170.0, position=1e6, samples=1)
     assert np.isnan(found.slope) and found.inside == 0
     assert set(found.trusted.values()) == {0.0}
-    said = " ".join(str(found).split())
-    assert "smallest displacement tried, 85 deg, 5e+05 m and 0.5 rad, it did not" in said
-    assert "nan" not in said
+    assert says(str(found), "85 deg", "5e+05 m", "0.5 rad")
+    assert "nan" not in str(found)
     pytest.importorskip("matplotlib")
     fflin.plot_validity(found).draw_without_rendering()
 
 
+@pytest.mark.compiled
 def test_what_a_reduced_model_has_not_is_not_told(robots):
     robot = robots["ets_vii"]
     robot = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
@@ -261,55 +271,59 @@ def test_what_a_reduced_model_has_not_is_not_told(robots):
     found = fflin.validity(robot, lin, gain, joint=0.5, samples=2)
     assert found.largest == {"attitude": 0.0, "position": 0.0, "joint": 0.5}
     assert "deg" not in str(found)
-    with pytest.raises(fflin.InputError, match="none of the coordinates that are displaced"):
+    with pytest.raises(fflin.InputError, match="displaced"):
         fflin.validity(robot, lin, gain, joint=0.0, samples=2)
 
 
 def test_bad_input(arm):
     lin, gain = held(arm)
     for arguments, words in (
-        ((arm, lin, -gain.K), "not stable"),
-        ((arm, lin, gain.K[:, 1:]), "K has shape"),
-        ((arm, lin, "K"), "gain holds <U1 values, expected real numbers"),
-        ((arm, None, gain), "expected a fflin.Robot"),
-        ((arm.replace(inputs=[fflin.BaseTorque()]), lin, gain), "without the inputs F_b"),
+        ((arm, lin, -gain.K), "stable"),
+        ((arm, lin, gain.K[:, 1:]), r"\bK\b.*shape"),
+        ((arm, lin, "K"), "<U1"),
+        ((arm, None, gain), "fflin.Robot"),
+        ((arm.replace(inputs=[fflin.BaseTorque()]), lin, gain), "F_b"),
     ):
         with pytest.raises(fflin.InputError, match=words):
             fflin.validity(*arguments)
     for options, words in (
-        ({"samples": 0}, "samples is 0"),
-        ({"seed": 1.5}, "seed is 1.5"),
-        ({"attitude": 180.0}, "below 175 deg"),
-        ({"joint": -1.0}, "none negative"),
-        ({"confidence": 1.0}, "between 0 and 1"),
+        ({"samples": 0}, "samples"),
+        ({"seed": 1.5}, r"1\.5"),
+        ({"attitude": 180.0}, "175"),
+        ({"joint": -1.0}, "negative"),
+        ({"confidence": 1.0}, "0 and 1"),
     ):
         with pytest.raises(fflin.InputError, match=words):
             fflin.validity(arm, lin, gain, **options)
     gone = fflin.linearize(arm, v=fflin.velocity(arm, {"omega_b.z": 0.1}))
-    with pytest.raises(fflin.InputError, match="no fixed point"):
+    with pytest.raises(fflin.InputError, match="fixed point"):
         fflin.validity(arm, gone, gain)
 
 
+@pytest.mark.exhaustive
 def test_command_line():
     code, out, err = run("validity", "cubesat", "--samples", "4", "--jobs", "2")
     assert code == 0 and not err
-    assert "4 of 4 runs" in out and max(map(len, out.splitlines())) <= 80
-    assert "--jobs: 0 is too few" in refused("validity", "cubesat", "--jobs", "0")
-    assert "below 175 deg" in refused("validity", "cubesat", "--attitude", "200")
+    assert says(out, "4 of 4") and max(map(len, out.splitlines())) <= 80
+    assert "--jobs" in refused("validity", "cubesat", "--jobs", "0")
+    assert "175 deg" in refused("validity", "cubesat", "--attitude", "200")
 
 
+@pytest.mark.process
 def test_jobs_are_at_most_one_for_each_core():
-    code, out, _ = run("validity", "cubesat", "--samples", "2", "--jobs", "10" + "0" * 30)
-    assert code == 0 and "of 2 runs settled" in " ".join(out.split())
-    done = subprocess.run(
+    with any_wording():  # it names the cores
+        code, out, _ = run("validity", "cubesat", "--samples", "2", "--jobs", "10" + "0" * 30)
+    assert code == 0 and says(out, "of 2", "settled")
+    done = finished(
         [sys.executable, "-m", "fflin", "validity", "cubesat", "--samples", "2", "--jobs", "99999"],
         capture_output=True,
         text=True,
         check=True,
     )
-    assert "99999 processes are more than there are cores" in done.stderr
+    assert "99999" in done.stderr
 
 
+@pytest.mark.compiled
 def test_progress_is_told_up_to_every_run(robots):
     robot = robots["cubesat"]
     lin, gain = held(robot)
@@ -320,7 +334,7 @@ def test_progress_is_told_up_to_every_run(robots):
         done = [each for each, _ in told]
         assert done == sorted(set(done)) and len(done) > 8
         assert {total for _, total in told} == {done[-1]} == {2 * (28 + 40)}
-    with pytest.raises(fflin.InputError, match="progress is 3"):
+    with pytest.raises(fflin.InputError, match="progress"):
         fflin.validity(robot, lin, gain, progress=3)
 
 
@@ -328,37 +342,42 @@ def die(*_):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.process
 def test_a_process_that_dies_is_one_line(robots, monkeypatch):
     robot = robots["cubesat"]
     lin, gain = held(robot)
     monkeypatch.setattr(Loop, "__reduce__", lambda _: (die, ()))
     workers = OwnWorkers(1)
     for executor in (workers, ProcessPoolExecutor(1, mp_context=get_context("spawn"))):
-        with executor, pytest.raises(fflin.FflinError, match="a process that did the runs died"):
+        with executor, pytest.raises(fflin.FflinError, match="died"):
             fflin.validity(robot, lin, gain, samples=2, executor=executor)
 
 
+@pytest.mark.process
 @pytest.mark.skipif(os.name != "posix", reason="no pseudo-terminal")
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
     import pty
 
     ours, theirs = pty.openpty()
-    with subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "fflin",
-            "validity",
-            "ets_vii",
-            "--samples",
-            "900000",
-            "--jobs",
-            jobs,
-        ],
-        stderr=theirs,
-        start_new_session=True,
-    ) as process:
+    with (
+        subprocess.Popen(
+            [
+                sys.executable,
+                "-m",
+                "fflin",
+                "validity",
+                "ets_vii",
+                "--samples",
+                "900000",
+                "--jobs",
+                jobs,
+            ],
+            stderr=theirs,
+            start_new_session=True,
+        ) as process,
+        finishing(process),
+    ):
         os.close(theirs)
         said = b""
         while b"s left" not in said:
@@ -373,6 +392,7 @@ def test_it_shows_a_bar_on_a_terminal_and_ends_at_ctrl_c(jobs):
     assert said.endswith(b"\r\x1b[2Kfflin: stopped\r\n")
 
 
+@pytest.mark.exhaustive
 def test_frames_are_compared_in_the_same_linear_loop():
     """What is fed back in base axes is that of `Loop` in that frame, run by run."""
     robot = fflin.load("ur5")
@@ -388,14 +408,14 @@ def test_frames_are_compared_in_the_same_linear_loop():
         assert other.prediction_error == pytest.approx(alone.prediction_error, rel=1e-4)
     # A gain that is as uneven as the inertia bears no turn of the axes that it is given in.
     assert found.settled == 6 > found.frames["world"].settled
-    assert f"in frame world: {found.frames['world'].settled} of 6 runs" in str(found)
+    assert says(str(found), "world", f"{found.frames['world'].settled} of 6")
 
     base = pin.SE3(pin.exp3(np.array([0.3, 0.0, 0.0])), np.zeros(3))
     q = fflin.configuration(robot, {}, base)
     turned = fflin.linearize(robot, q, reference=pin.SE3.Identity())
-    with pytest.raises(fflin.InputError, match="turned against the reference"):
+    with pytest.raises(fflin.InputError, match="reference"):
         fflin.validity(robot, turned, gain, frames=["local"], **options)
-    with pytest.raises(fflin.InputError, match="frames is 'local', expected several"):
+    with pytest.raises(fflin.InputError, match="'local'"):
         fflin.validity(robot, lin, gain, frames="local", **options)
 
 
@@ -403,9 +423,10 @@ def test_command_compares_frames():
     options = ("validity", "cubesat", "--samples", "2")
     code, out, _ = run(*options, "--frames", "local", "hybrid")
     assert code == 0 and out.count("of 2 runs settled, every one up to") == 2
-    assert "choose from 'hybrid', 'local', 'world'" in refused(*options, "--frames", "base")
+    assert "'hybrid', 'local', 'world'" in refused(*options, "--frames", "base")
 
 
+@pytest.mark.exhaustive
 def test_the_table_of_frames_is_what_its_command_makes():
     frames = runpy.run_path(str(DOCS / "frames.py"))
     table = (DOCS / "conventions.md").read_text(encoding="utf-8")

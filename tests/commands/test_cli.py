@@ -15,6 +15,8 @@ import fflin
 from fflin.base.tables import matrix
 from fflin.robot.catalog import bundled_directory
 from tests.support.commands import refused, run, without_warnings
+from tests.support.messages import says
+from tests.support.patience import finished
 from tests.support.robots import BUNDLED
 
 
@@ -25,7 +27,7 @@ def test_robots_lists_all_with_n_mass_and_origin():
     rows = {line.split()[0]: line.split() for line in table.splitlines()}
     assert set(fflin.list_robots()) - set(rows) == {"alex_psyonic_hands"}
     # By the name of its file: where that lies is of no use here, and breaks the lines.
-    assert "does not load: alex_psyonic_hands.urdf:" in refused[0] and "mimics" in refused[0]
+    assert "alex_psyonic_hands.urdf" in refused[0] and "mimics" in refused[0]
     assert max(map(len, out.splitlines())) <= 80
     assert rows["ets_vii"][1:4] == ["6", "2690.4", "fflin"]
     assert rows["talos"][1] == "32" and rows["talos"][3] == "example-robot-data"
@@ -34,12 +36,12 @@ def test_robots_lists_all_with_n_mass_and_origin():
 def test_info_shows_tree_masses_and_limits():
     code, out, err = run("info", "dual_arm")
     assert code == 0 and not err
-    assert "8 joints, 28 states, 14 inputs" in out
+    assert says(out, "8 joints, 28 states, 14 inputs")
     lines = out.splitlines()
     left, deeper = (next(x for x in lines if x.strip().startswith(n)) for n in ("left_1", "left_2"))
     assert len(deeper) - len(deeper.lstrip()) == len(left) - len(left.lstrip()) + 2
     assert "revolute" in left and "tool_left" in out
-    assert "limits in rad, N m and rad/s" in out
+    assert says(out, "rad, N m and rad/s")
     assert max(map(len, lines)) <= 80
 
 
@@ -47,13 +49,14 @@ def test_info_shows_tree_masses_and_limits():
 def test_check_exits_0_on_every_bundled_robot(name):
     code, out, err = run("check", name, "--frame", "world", "--rpy", 20, -30, 160)
     assert code == 0 and not err
-    assert "figures hold; the largest error is" in out
+    assert says(out, "largest error")
     assert max(map(len, out.splitlines())) <= 80
 
 
+@pytest.mark.process
 def test_damping_that_is_asked_for_is_not_warned_of():
     for option, said in (([], True), (["--damping", "urdf"], False)):
-        done = subprocess.run(
+        done = finished(
             [sys.executable, "-m", "fflin", "modes", "planar_detumble", *option],
             capture_output=True,
             text=True,
@@ -62,23 +65,22 @@ def test_damping_that_is_asked_for_is_not_warned_of():
         assert ("damping" in done.stderr) == said
 
 
+@pytest.mark.process
 def test_warnings_are_one_line_each_on_stderr_and_in_info():
-    done = subprocess.run(
+    done = finished(
         [sys.executable, "-m", "fflin", "info", "planar_detumble"],
         capture_output=True,
         text=True,
-        check=False,
     )
     words = "planar_detumble: damping unused: 'joint_1', 'joint_2', 'joint_3'"
     assert done.returncode == 0
     assert done.stderr.startswith("fflin: warning: ") and done.stderr.count("\n") == 1
     assert words in done.stderr
     assert words in " ".join(done.stdout.split())
-    silent = subprocess.run(
+    silent = finished(
         [sys.executable, "-W", "ignore", "-m", "fflin", "info", "planar_detumble"],
         capture_output=True,
         text=True,
-        check=False,
     )
     assert silent.returncode == 0 and not silent.stderr
 
@@ -94,7 +96,7 @@ def test_linearize_prints_readable_tables():
     code, out, err = run("linearize", "ets_vii", "--joint", "joint_2=0.5")
     assert code == 0 and not err
     assert max(map(len, out.splitlines())) <= 80
-    assert "24 states, 12 inputs, frame hybrid, a fixed point" in out
+    assert says(out, "24 states, 12 inputs", "hybrid", "fixed point")
     assert "x0: q_m.joint_2 = 0.5 rad" in out
     assert "\x1b" not in out  # plain where it is not a terminal
     robot = fflin.load("ets_vii")
@@ -132,11 +134,12 @@ def test_sampled_model_is_that_of_python(tmp_path):
         # The command reads the robot by another route, which rounds otherwise.
         np.testing.assert_allclose(getattr(saved, key), getattr(expected, key), rtol=0, atol=1e-13)
     code, out, err = run("linearize", *options)
-    assert code == 0 and not err and "sampled every 0.1 s" in " ".join(out.split())
+    assert code == 0 and not err and says(out, "sampled", "0.1 s")
     assert "q_m.joint_1 = 0.0099" in out and "/s^2" not in out  # f0 is what a step adds
     assert max(map(len, out.splitlines())) <= 80
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     "command",
     [
@@ -145,18 +148,16 @@ def test_sampled_model_is_that_of_python(tmp_path):
     ],
 )
 def test_joints_beyond_their_limits_are_named(command):
-    done = subprocess.run(
-        [sys.executable, "-m", "fflin", *command], capture_output=True, text=True, check=False
-    )
+    done = finished([sys.executable, "-m", "fflin", *command], capture_output=True, text=True)
     assert done.returncode == 0
-    assert done.stderr == (
-        "fflin: warning: joint 'joint_2' at 9 rad is outside -2.094 to 2.094 rad\n"
-    )
+    assert says(done.stderr, "'joint_2' at 9 rad", "-2.094 to 2.094 rad")
+    assert done.stderr.startswith("fflin: warning: ") and done.stderr.count("\n") == 1
 
 
+@pytest.mark.process
 def test_terminal_dims_zeros():
     # `script` gives the command a terminal.
-    done = subprocess.run(
+    done = finished(
         ["script", "-qec", f"{sys.executable} -m fflin linearize cubesat", "/dev/null"],
         capture_output=True,
         text=True,
@@ -223,18 +224,18 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
     typo = tmp_path / "bad.toml"
     typo.write_text('[[input]]\ntype = "truster"\n')
     cases = {
-        ("linearize", "ets_vi", "-o", output): "no robot named 'ets_vi'; did you mean ets_vii",
-        ("linearize", bad, "-o", output): "bad.urdf:1: not well-formed",
-        ("linearize", tmp_path / "no.urdf", "-o", output): "no file at",
-        ("linearize", tmp_path, "-o", output): "a folder",
-        ("linearize", "ets_vii", "--joint", "joint_9=1", "-o", output): "no joint named 'joint_9'",
-        ("linearize", "ets_vii", "--joint", "joint_1=x", "-o", output): "'x' is not a number",
-        ("linearize", "ets_vii", "--joint", "joint_1", "-o", output): "'joint_1' is not NAME=VALUE",
-        ("linearize", "ets_vii", "--joint", "joint_1=nan", "-o", output): "not a finite number",
-        ("linearize", "ets_vii", "--frame", "body", "-o", output): "invalid choice: 'body'",
-        ("linearize", "ets_vii", "--lock", "tail", "-o", output): "no joint to lock named 'tail'",
-        ("linearize", "ets_vii", "-o", tmp_path / "m.xls"): "ends in '.xls'",
-        ("linearize", "ets_vii", "-o", tmp_path / "none" / "m.npz"): "cannot be written",
+        ("linearize", "ets_vi", "-o", output): "'ets_vi'",
+        ("linearize", bad, "-o", output): "bad.urdf:1",
+        ("linearize", tmp_path / "no.urdf", "-o", output): "no file",
+        ("linearize", tmp_path, "-o", output): "folder",
+        ("linearize", "ets_vii", "--joint", "joint_9=1", "-o", output): "'joint_9'",
+        ("linearize", "ets_vii", "--joint", "joint_1=x", "-o", output): "'x'",
+        ("linearize", "ets_vii", "--joint", "joint_1", "-o", output): "'joint_1'",
+        ("linearize", "ets_vii", "--joint", "joint_1=nan", "-o", output): "finite",
+        ("linearize", "ets_vii", "--frame", "body", "-o", output): "'body'",
+        ("linearize", "ets_vii", "--lock", "tail", "-o", output): "'tail'",
+        ("linearize", "ets_vii", "-o", tmp_path / "m.xls"): "'.xls'",
+        ("linearize", "ets_vii", "-o", tmp_path / "none" / "m.npz"): "m.npz",
         (
             "linearize",
             "ets_vii",
@@ -242,30 +243,30 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path):
             "joint_1=1",
             "--joint",
             "joint_1=2",
-        ): "names 'joint_1' twice",
-        ("linearize", "ets_vii", "--lock", "joint_1", "--joint", "joint_1=2"): "is locked",
-        ("linearize", "ets_vii", "--stiffness", "joint_1=-1"): "is -1, expected 0 or more",
-        ("linearize", "ets_vii", "--damping", "viscous"): "'viscous' is not",
-        ("linearize", "cubesat", "--inputs", typo, "-o", output): "bad.toml:2: no type of input",
-        ("check", "cubesat", "--inputs", "none.toml"): "none.toml: cannot be read: No such file",
+        ): "'joint_1'",
+        ("linearize", "ets_vii", "--lock", "joint_1", "--joint", "joint_1=2"): "locked",
+        ("linearize", "ets_vii", "--stiffness", "joint_1=-1"): "-1",
+        ("linearize", "ets_vii", "--damping", "viscous"): "'viscous'",
+        ("linearize", "cubesat", "--inputs", typo, "-o", output): "bad.toml:2",
+        ("check", "cubesat", "--inputs", "none.toml"): "none.toml",
         (
             "check",
             "cubesat",
             "--inputs",
             "servicer_7dof",
-        ): "servicer_7dof: no joint named 'joint_1'",
-        ("check", "cubesat", "--inputs", "cubesats"): "named 'cubesats'; did you mean cubesat",
-        ("linearize", "ets_vii", "--dt", 0, "-o", output): "expected a positive sampling time",
-        ("check", "ets_vii", "--output", "pos:tool"): "no output named 'pos'; did you mean pose",
-        ("check", "ets_vii", "--output", "pose"): "output 'pose' is of no frame; write pose:NAME",
-        ("check", "ets_vii", "--output", "com:tool"): "is of the whole robot; write com",
-        ("check", "ets_vii", "--output", "pose:tol"): "no frame named 'tol'; did you mean tool",
-        ("check", "ets_vii", "--output", "base", "--output", "state"): "is asked for twice",
-        ("linearize", "ets_vii", "--out", "m.mat"): "ambiguous option: --out could match",
-        ("check", "romeo"): "cannot be inverted at any configuration: joint 'LHand'",
-        ("check", "cubesat", "--rpy", 180, 0, 0, "--reference", "world"): "turned by 180 deg",
-        ("check",): "the following arguments are required: ROBOT",
-        ("dance",): "invalid choice: 'dance'",
+        ): "'joint_1'",
+        ("check", "cubesat", "--inputs", "cubesats"): "'cubesats'",
+        ("linearize", "ets_vii", "--dt", 0, "-o", output): "sampling",
+        ("check", "ets_vii", "--output", "pos:tool"): "'pos'",
+        ("check", "ets_vii", "--output", "pose"): "'pose'",
+        ("check", "ets_vii", "--output", "com:tool"): "com",
+        ("check", "ets_vii", "--output", "pose:tol"): "'tol'",
+        ("check", "ets_vii", "--output", "base", "--output", "state"): "twice",
+        ("linearize", "ets_vii", "--out", "m.mat"): "--out",
+        ("check", "romeo"): "'LHand'",
+        ("check", "cubesat", "--rpy", 180, 0, 0, "--reference", "world"): "180 deg",
+        ("check",): "ROBOT",
+        ("dance",): "'dance'",
         (): "required",
     }
     for arguments, words in cases.items():
@@ -284,39 +285,58 @@ def test_robots_own_file_is_never_the_output(tmp_path):
     robot = tmp_path / "robot.json"
     robot.write_bytes((Path(__file__).parents[2] / "robots" / "cubesat.urdf").read_bytes())
     before = robot.read_bytes()
-    assert "is the input file" in refused("linearize", robot, "-o", robot)
+    assert "input file" in refused("linearize", robot, "-o", robot)
     assert robot.read_bytes() == before
     sibling = tmp_path / "arm.A.csv"
     sibling.write_bytes(before)
-    assert "is the input file" in refused("linearize", sibling, "-o", tmp_path / "arm.csv")
+    assert "input file" in refused("linearize", sibling, "-o", tmp_path / "arm.csv")
     assert sibling.read_bytes() == before
 
 
-def test_unwritable_stdout_is_one_line():
+@pytest.mark.process
+@pytest.mark.parametrize(
+    "arguments", [("linearize", "cubesat"), ("--help",), ("lqr", "--help"), ("--version",)]
+)
+def test_unwritable_stdout_is_one_line(arguments):
     with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "fflin", "linearize", "cubesat"],
+        done = finished(
+            [sys.executable, "-m", "fflin", *arguments],
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
-            check=False,
         )
     assert done.returncode == 2
-    assert done.stderr == "fflin: error: the output cannot be written: No space left on device\n"
+    assert says(done.stderr, "fflin: error: ", "No space left on device")
+    assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("arguments", [("check", "nosuch"), ("check",)])
 def test_unwritable_stderr_does_not_change_the_exit_code(arguments):
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-m", "fflin", *arguments]
-        assert subprocess.run(command, stderr=full, check=False).returncode == 2
+        assert finished(command, stderr=full).returncode == 2
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("{}",),
+        ("linearize", "{}"),
+        ("linearize", "cubesat", "--frame", "{}"),
+        ("lqr", "cubesat", "--{}"),
+    ],
+)
+def test_names_neither_split_nor_fill_the_line(arguments):
+    said = refused(*(each.format("a\nb\x1b[31m" + 5000 * "c" + "d") for each in arguments))
+    assert r"a\nb\x1b[31mc" in said and "...c" in said and "cd" in said and len(said) < 500
 
 
 def test_an_empty_name_is_said_to_be_empty():
-    assert "is empty" in refused("linearize", "cubesat", "-o", "")
-    assert "is empty" in refused("linearize", "cubesat", "--inputs", "")
-    assert "is empty" in refused("simulate", "cubesat", "--duration", "1", "--plot", "")
-    with pytest.raises(fflin.InputError, match="path is empty"):
+    assert "empty" in refused("linearize", "cubesat", "-o", "")
+    assert "empty" in refused("linearize", "cubesat", "--inputs", "")
+    assert "empty" in refused("simulate", "cubesat", "--duration", "1", "--plot", "")
+    with pytest.raises(fflin.InputError, match="path"):
         fflin.linearize(fflin.load("cubesat")).save("")
 
 
@@ -491,14 +511,14 @@ def test_check_takes_a_tolerance(tmp_path):
     code, out, _ = run("check", "ets_vii", "--tolerance", "1e-6")
     assert code == 0 and "at most 1.0e-06" in out
     assert run("check", "ets_vii", "--tolerance", "1e-20")[0] == 1
-    assert "tolerance is 2, expected a share" in refused("check", "ets_vii", "--tolerance", 2)
+    assert "tolerance" in refused("check", "ets_vii", "--tolerance", 2)
 
 
 def test_check_says_what_a_dot_is_and_shows_no_table_of_zeros():
     code, out, _ = run("check", "cubesat")
-    assert code == 0 and "a dot is an error of exactly zero" in out
+    assert code == 0 and says(out, "dot", "zero")
     for test in ("differences", "ABA derivatives"):
-        assert f"A and B against {test}: no difference in any of 48 blocks" in out
+        assert says(out, test, "no difference", "48")
     assert "omega_b " not in out
     code, out, _ = run("check", "ets_vii")
     title = next(line for line in out.splitlines() if line.startswith("A and B against diff"))
@@ -540,9 +560,9 @@ def test_plot_draws_what_the_command_found(command, tmp_path, monkeypatch):
     code, out, _ = run(*command, "--plot", tmp_path / "a.svg")
     assert code == 0 and out.endswith(f"wrote {tmp_path / 'a.svg'}\n")
     assert (tmp_path / "a.svg").read_bytes().startswith(b"<?xml")
-    assert "ends in '.bmp'" in refused(*command, "--plot", tmp_path / "a.bmp")
+    assert "'.bmp'" in refused(*command, "--plot", tmp_path / "a.bmp")
     assert "No such" in (said := refused(*command, "--plot", tmp_path / "no" / "a.png")) or (
-        "no folder" in said
+        "folder" in said
     )
     assert [path.name for path in tmp_path.iterdir()] == ["a.svg"]
 
@@ -570,9 +590,11 @@ def test_help_has_an_example_in_every_command():
     assert run("--version")[1] == f"fflin {fflin.__version__}\n"
 
 
+@pytest.mark.sample
+@pytest.mark.process
 def test_closed_pipe_is_no_error():
     command = f"{sys.executable} -m fflin linearize talos | head -n 1"
-    done = subprocess.run(
+    done = finished(
         ["bash", "-c", command],
         capture_output=True,
         text=True,
@@ -598,14 +620,14 @@ def test_wheels_from_a_file_at_speed(tmp_path):
     stored.write_text('[[input]]\ntype = "reaction_wheel"\naxis = [0, 0, 1]\nmomentum = 0.1\n')
     assert run("check", "cubesat", "--inputs", stored)[0] == 0
     err = refused("check", "cubesat", "--inputs", stored, "--velocity", "wheel_1=100")
-    assert "wheel 'wheel_1' has no inertia" in err
+    assert "'wheel_1'" in err
 
 
 def test_linearize_shows_no_rounding_in_f0_and_calls_no_frozen_model_unstable():
     hover = ["linearize", "servicer_7dof", "--gravity", 0, 0, -9.81]
     code, held, _ = run(*hover, "--equilibrium")
     assert code == 0 and "a fixed point" in held
-    assert "unstable: poles" in held and "f0:" not in held
+    assert says(held, "unstable") and "f0:" not in held
     code, falling, _ = run(*hover, "--joint", "joint_2=0.3", "--effort", "F_b.z=9000")
     assert code == 0 and "not a fixed point" in falling
     assert "unstable" not in falling and "f0:" in falling
@@ -633,8 +655,8 @@ def test_equilibria_in_orbit_are_taken_as_panels_sag(tmp_path):
         code, out, _ = run("simulate", *soft, *short, *law)
         assert code == 0
     for words, options in {
-        "--orbit on the": ["cubesat"],
-        "invalid choice: 25": [*soft, 25],
+        "--orbit": ["cubesat"],
+        "25": [*soft, 25],
         "--rpy": [*soft, "--rpy", 5, 0, 0],
         "--effort": [*soft, "--effort", "F_b.x=1"],
     }.items():

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import fflin
 from tests.support.commands import run
@@ -10,6 +11,7 @@ from tests.support.commands import run
 TOML = Path(__file__).parents[2] / "robots" / "inspector.toml"
 
 
+@pytest.mark.exhaustive
 def test_the_inspector_flies_within_its_limits_at_the_first_try(tmp_path):
     code, out, err = run("simulate", TOML, "--html", "a.html", "-o", "a.npz", cwd=tmp_path)
     assert (code, err) == (0, "")

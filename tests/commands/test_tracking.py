@@ -9,6 +9,7 @@ from scipy.io import savemat
 
 import fflin
 from tests.support.commands import refused, run
+from tests.support.messages import says
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,7 @@ def test_the_chain_goes_from_a_file_to_gains(flown):
     given = ("planar_detumble", "--trajectory", folder / "flown.csv", "--frame", "world")
     code, out, err = run("linearize", *given, "-o", folder / "ltv.npz")
     assert (code, err) == (0, "")
-    assert "21 knots, 0 to 2 s, inputs held, frame='world'" in " ".join(out.split())
+    assert says(out, "21 knots, 0 to 2 s", "'world'")
     assert "residual " in out
     along = fflin.LinearTrajectory.load(folder / "ltv.npz", robot)
     expected = fflin.linearize_trajectory(robot, motion)
@@ -60,7 +61,7 @@ def test_the_chain_goes_from_a_file_to_gains(flown):
     assert schedule.R[8, 8] == pytest.approx(4.0)
     assert np.diag(schedule.Qf)[:4].tolist() == [9.0, 9.0, 9.0, 0.0]
     assert schedule.trajectory(robot).residual.max() < 1e-8
-    assert "weights: q_b, tau_m as given, the others from" in out
+    assert says(out, "q_b, tau_m")
     assert not schedule.verified  # as the csv is not
 
 
@@ -69,15 +70,13 @@ def test_what_is_no_motion_is_said_and_what_is_no_trajectory_refused(flown):
     given = ("planar_detumble", "--trajectory", folder / "flown.csv")
     code, out, _ = run("check", *given, "--hold", "previous")
     assert code == 0
-    assert "with u and v in frame world they hold to" in " ".join(out.split())
-    assert "give either" in refused("linearize", *given, "--joint", "joint_1=0.2")
-    assert "give either" in refused("check", *given, "--rpy", "1", "0", "0")
-    assert "leave it out" in refused("tvlqr", *given, "--reduce")
-    assert "no column named 'q_m.joint_4'" in refused(
-        "linearize", "ets_vii", "--trajectory", folder / "flown.csv"
-    )
-    assert "cannot be read" in refused("tvlqr", "planar_detumble", "--trajectory", "nosuch.csv")
-    assert "expected a part of" in refused("tvlqr", *given, "--frame", "world", "--dt", "0.3")
+    assert says(out, "usual causes")
+    assert "--joint" in refused("linearize", *given, "--joint", "joint_1=0.2")
+    assert "--rpy" in refused("check", *given, "--rpy", "1", "0", "0")
+    assert "--reduce" in refused("tvlqr", *given, "--reduce")
+    assert "'q_m.joint_4'" in refused("linearize", "ets_vii", "--trajectory", folder / "flown.csv")
+    assert "nosuch.csv" in refused("tvlqr", "planar_detumble", "--trajectory", "nosuch.csv")
+    assert "0.3 s" in refused("tvlqr", *given, "--frame", "world", "--dt", "0.3")
 
 
 def chain(folder, *options, file="flown.csv"):
@@ -88,6 +87,7 @@ def chain(folder, *options, file="flown.csv"):
 OFFSET = ("--offset", "yaw=1", "--offset", "q_m=0.05", "--offset", "omega_b.z=0.05")
 
 
+@pytest.mark.exhaustive
 def test_a_trajectory_is_followed_from_beside_it_to_files(flown):
     folder, robot, motion = flown
     code, out, err = chain(
@@ -107,7 +107,7 @@ def test_a_trajectory_is_followed_from_beside_it_to_files(flown):
         "a.npz",
     )
     assert (code, err) == (0, "")
-    assert out.startswith("beside its trajectory at the end: attitude")
+    assert says(out, "attitude")
     assert all((folder / name).stat().st_size > 10_000 for name in ("a.html", "a.png", "a.npz"))
     run_ = fflin.Motion.load(folder / "a.npz")
     assert run_.tracked
@@ -158,15 +158,15 @@ def test_a_sampled_trajectory_of_a_mat_file_is_followed_past_its_end(flown):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--free",), "--free: a trajectory says where the robot is to be"),
-        (("--target-joint", "joint_1=1"), "--target-joint: a trajectory says"),
-        (("--rpy", 1, 0, 0), "--rpy: it starts on the trajectory, or beside it by --offset"),
-        (("--offset", "yaw=1", "--offset", "q_b.x=0.1"), "q_b and an angle; give either"),
-        (("--offset", "q_b=0.8"), r"|q_b| of the offset is 1.39, expected less than 1"),
-        (("--offset", "jaw=1"), "no state named 'jaw'; did you mean yaw?"),
-        (("--schedule", "other.npz"), "other.npz has the gains of another motion than"),
-        (("--schedule", "other.npz", "--q", "q_b=1"), "--q: --schedule has its weights"),
-        (("--allocate",), "has no thrusters"),
+        (("--free",), "--free"),
+        (("--target-joint", "joint_1=1"), "--target-joint"),
+        (("--rpy", 1, 0, 0), "--rpy"),
+        (("--offset", "yaw=1", "--offset", "q_b.x=0.1"), "q_b"),
+        (("--offset", "q_b=0.8"), "1.39"),
+        (("--offset", "jaw=1"), "'jaw'"),
+        (("--schedule", "other.npz"), "other.npz"),
+        (("--schedule", "other.npz", "--q", "q_b=1"), "--schedule"),
+        (("--allocate",), "thrusters"),
     ],
 )
 def test_what_a_trajectory_already_says_is_refused(flown, options, said):
@@ -182,10 +182,8 @@ def test_gains_of_another_robot_are_refused(flown):
     folder, robot, motion = flown
     fflin.tvlqr(fflin.linearize_trajectory(robot, motion)).save(folder / "own.npz")
     said = refused("simulate", "ets_vii", "--schedule", "own.npz", cwd=folder)
-    assert "the gains are those of 'planar_detumble', not of 'ets_vii'" in said
-    assert "--offset and --hold are of a --trajectory" in refused(
-        "simulate", "ets_vii", "--offset", "yaw=1"
-    )
+    assert says(said, "'planar_detumble'", "'ets_vii'")
+    assert "--trajectory" in refused("simulate", "ets_vii", "--offset", "yaw=1")
 
 
 @pytest.mark.parametrize("options", [(), ("--dt", "0.1")])
@@ -201,6 +199,6 @@ def test_a_gain_from_a_file_regulates_as_the_one_that_is_designed(tmp_path, opti
     np.testing.assert_allclose(b.x, a.x, atol=1e-9)
     np.testing.assert_allclose(b.linear, a.linear, atol=1e-9)
     said = refused(*start, "c.npz", "--gain", "gain.npz", "--q", "q_b=1", cwd=tmp_path)
-    assert "--q: --gain has its weights and its point" in said
+    assert "--gain" in said
     other = refused("simulate", "canadarm2", "--gain", "gain.npz", cwd=tmp_path)
-    assert "gain.npz is a gain of 'ets_vii', not of 'canadarm2'" in other
+    assert says(other, "gain.npz", "'ets_vii'", "'canadarm2'")

@@ -89,26 +89,26 @@ def test_what_has_no_closed_form_is_refused():
     lin = fflin.linearize(robot)
     joints = robot.replace(inputs=[fflin.JointTorque(name) for name in robot.joint_names])
     for model in (joints, joints.replace(stiffness=0.0)):
-        with pytest.raises(fflin.StabilizabilityError, match="base attitude and position"):
+        with pytest.raises(fflin.StabilizabilityError, match="base attitude"):
             fflin.acceleration_lqr(fflin.linearize(model), 1, 1, 1)
     springs = fflin.linearize(robot.replace(stiffness=1.0))
     for model in (springs, springs.discretize(0.1)):
-        with pytest.raises(fflin.InputError, match="not of double integrators"):
+        with pytest.raises(fflin.InputError, match="integrators"):
             fflin.acceleration_lqr(model, 1, 1, 1)
     for words, weights in {
-        "Qp is a matrix": (np.eye(12), 1, 1),
-        "Qp is not positive definite: its eigenvalue 0 .* q_b.x": (0, 1, 1),
-        "Ra is not positive definite": (1, 1, 0),
-        "Qv is not positive semidefinite": (1, -1, 1),
-        r"Ra has shape \(3,\), expected \(12,\)": (1, 1, np.ones(3)),
-        "Qp has no value for r_b.x; each needs one": ({"q_b": 1}, 1, 1),
+        "Qp": (np.eye(12), 1, 1),
+        "Qp .*q_b.x": (0, 1, 1),
+        "Ra": (1, 1, 0),
+        "Qv": (1, -1, 1),
+        r"\(3,\)": (1, 1, np.ones(3)),
+        "r_b.x": ({"q_b": 1}, 1, 1),
         "overflow": (1e300, 1, 1e-300),
-        "or dt make": (1e-160, 1e160, 1e160),
+        "dt": (1e-160, 1e160, 1e160),
     }.items():
         with pytest.raises(fflin.InputError, match=words):
             fflin.acceleration_lqr(lin, *weights)
     for weights, dt in (((1, 1, 1), 1e20), ((1e300, 1, 1e-300), 0.1), ((1e-160, 1e160, 1e160), 1)):
         with pytest.raises(fflin.InputError, match="overflow"):
             fflin.acceleration_lqr(lin, *weights, dt=dt)
-    with pytest.raises(fflin.InputError, match="sampled already"):
+    with pytest.raises(fflin.InputError, match="sampled"):
         fflin.acceleration_lqr(lin.discretize(0.1), 1, 1, 1, dt=0.1)

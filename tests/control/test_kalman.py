@@ -90,15 +90,15 @@ def test_what_is_not_seen_or_not_disturbed_is_named(lin):
         with pytest.raises(fflin.DetectabilityError, match=words):
             fflin.kalman(model, 1, 1)
     for words, arguments in {
-        "W does not disturb omega_b.x": ({"q_b": 1.0}, 1),
-        "V is not positive definite": (1, 0),
-        "W is not positive semidefinite": (-1, 1),
-        "no entry of W named 'tau'": ({"tau": 1.0}, 1, lin.B),
-        r"G has shape \(3,\), expected \(24, k\)": (1, 1, np.ones(3)),
-        r"G has shape \(24, 0\), expected \(24, k\) with k >= 1": (1, 1, np.ones((24, 0))),
-        "G is not an array: its rows differ": (1, 1, [[1.0], [1.0, 2.0]]),
-        r"V has no value for r_b.x; each needs one": (1, {"q_b": 1.0}),
-        r"G has shape \(3, 2\), expected \(24, 2\)": (1, 1, np.ones((3, 2))),
+        "omega_b.x": ({"q_b": 1.0}, 1),
+        "V .*positive definite": (1, 0),
+        "W .*positive semidefinite": (-1, 1),
+        "'tau'": ({"tau": 1.0}, 1, lin.B),
+        r"\(3,\)": (1, 1, np.ones(3)),
+        r"\(24, 0\)": (1, 1, np.ones((24, 0))),
+        "G .*rows": (1, 1, [[1.0], [1.0, 2.0]]),
+        "r_b.x": (1, {"q_b": 1.0}),
+        r"\(3, 2\)": (1, 1, np.ones((3, 2))),
     }.items():
         with pytest.raises(fflin.FflinError, match=words):
             fflin.kalman(lin, *arguments)
@@ -109,9 +109,9 @@ def test_what_is_not_seen_or_not_disturbed_is_named(lin):
 
 def test_parts_of_different_models_are_refused(lin):
     gain = fflin.lqr(lin, 1, 1)
-    with pytest.raises(fflin.InputError, match="different models"):
+    with pytest.raises(fflin.InputError, match="models"):
         fflin.lqg(gain, fflin.kalman(lin.discretize(0.1), 1, 1))
-    with pytest.raises(fflin.InputError, match="takes a Gain"):
+    with pytest.raises(fflin.InputError, match="Gain"):
         fflin.lqg(gain, gain)
 
 
@@ -124,5 +124,12 @@ def test_files_keep_every_bit(lin, tmp_path, ending):
         back = type(design).load(path)
         for item in fields(design):
             assert np.array_equal(getattr(design, item.name), getattr(back, item.name)), item.name
-        with pytest.raises(fflin.FileError, match=f"not a Gain .*it is a {type(design).__name__}"):
+        with pytest.raises(fflin.FileError, match=f"Gain.*{type(design).__name__}"):
             fflin.Gain.load(path)
+
+
+@pytest.mark.parametrize("name", ["planar_detumble", "servicer_7dof"])
+def test_an_intensity_that_overflows_is_refused(name, robots):
+    lin = fflin.linearize(robots[name])
+    with np.errstate(all="ignore"), pytest.raises(fflin.DetectabilityError, match="scale"):
+        fflin.kalman(lin, 1e308, 1e-4, G=lin.B)

@@ -1,6 +1,5 @@
 """Controllers of other tools in the loop: what they are read as, and what they do there."""
 
-import subprocess
 from shutil import which
 
 import control
@@ -11,6 +10,8 @@ from scipy.io import savemat
 from scipy.linalg import expm
 
 import fflin
+from tests.support.messages import says
+from tests.support.patience import finished
 from tests.support.robots import random_point
 
 RNG = np.random.default_rng(7)
@@ -90,13 +91,14 @@ def test_names_put_signals_where_they_belong(lin, tmp_path):
     assert apart(fflin.LinearController(tmp_path / "K.mat", lin), *expected) == 0.0
 
 
+@pytest.mark.process
 @pytest.mark.skipif(not which("octave"), reason="needs Octave")
 def test_octave_writes_one(lin, tmp_path):
     A, B, C, D = matrices(lin)
     savemat(tmp_path / "given.mat", {"A": A, "B": B, "C": C, "D": D})
     script = "load given.mat; Ts = 0.1; save('-v7', 'K.mat', 'A', 'B', 'C', 'D', 'Ts');"
     command = ["octave", "--no-gui", "--quiet", "--eval", script]
-    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    finished(command, cwd=tmp_path, check=True, capture_output=True)
     assert apart(fflin.LinearController(tmp_path / "K.mat", lin), A, B, C, D, 0.1) == 0.0
 
 
@@ -188,7 +190,7 @@ def test_the_fastest_pole_of_a_controller_chooses_the_step(arm):
     fast = (-400.0 * np.eye(1), np.zeros((1, len(lin.y0))), np.zeros((len(lin.u0), 1)), 0.0)
     motion = fflin.simulate(robot, fflin.LinearController(fast, lin), duration=0.1)
     assert motion.t[1] <= 1.0 / 400.0
-    with pytest.raises(fflin.InputError, match="too large for a loop whose fastest pole is at 400"):
+    with pytest.raises(fflin.InputError, match="400"):
         fflin.simulate(robot, fflin.LinearController(fast, lin), duration=0.1, dt=0.05)
 
 
@@ -201,16 +203,16 @@ def test_poles_that_grow_are_told(arm):
     assert not fflin.simulate(own, stable, **run).notes
     wrong = fflin.LinearController(gain.to_control(), state, sign=-1)
     (note,) = fflin.simulate(own, wrong, **run).notes
-    assert note.startswith("the linear loop is unstable, with a pole at ") and "1/s" in note
-    assert "; with the other sign it is stable: try sign=-1 (--negative-feedback)" in note
+    assert says(note, "unstable") and "1/s" in note
+    assert says(note, "stable", "sign=-1 (--negative-feedback)")
     # Nor with the other sign.
     drifting = fflin.LinearController(np.zeros((len(lin.u0), len(state.y0))) + 1e-3, state)
     (note,) = fflin.simulate(own, drifting, **run).notes
-    assert "unstable" in note and "try" not in note
+    assert "unstable" in note and "sign=" not in note
     zero = np.zeros((1, len(lin.y0))), np.zeros((len(lin.u0), 1)), 0.0, 0.1
     unstable = fflin.LinearController((1.25 * np.eye(1), *zero), lin)
     notes = fflin.simulate(robot, unstable, **run).notes
-    assert "the controller by itself is unstable, with a pole at 1.25+0j" in notes
+    assert says(notes[0], "unstable", "1.25+0j")
 
 
 def test_accelerometers_are_fed_back_without_a_loop_in_themselves():
@@ -224,14 +226,14 @@ def test_accelerometers_are_fed_back_without_a_loop_in_themselves():
     assert motion.engine == "python"
     assert np.abs(motion.prediction - motion.x).max() < 1e-6 < np.abs(motion.x - x0).max()
     D[0, 7] = 1.0
-    with pytest.raises(fflin.InputError, match=r"acts on base\.acceleration\.y, .*algebraic loop"):
+    with pytest.raises(fflin.InputError, match=r"base\.acceleration\.y"):
         fflin.LinearController(D, lin)
 
 
 def test_only_the_simulation_integrates_it(arm):
     robot, lin, gain, seen = arm
     policy = fflin.LinearController(fflin.lqg(gain, seen), lin)
-    with pytest.raises(fflin.InputError, match="are integrated along by fflin"):
+    with pytest.raises(fflin.InputError, match="integrated"):
         fflin.simulate(robot, policy.bind(robot).__call__, duration=0.1)
 
 
@@ -247,15 +249,15 @@ def test_it_may_ask_for_wrenches_that_thrusters_give(arm):
 @pytest.mark.parametrize(
     ("words", "change"),
     {
-        r"B of the controller has shape \(3, 9\), expected \(4, 9\)": {"B": np.zeros((3, 9))},
-        r"A of the controller has shape \(4, 4\).* finite": {"A": np.full((4, 4), np.nan)},
-        "has 5 inputs and no names, expected a name for each, or one for each output": {
+        r"\(3, 9\)": {"B": np.zeros((3, 9))},
+        r"\(4, 4\)": {"A": np.full((4, 4), np.nan)},
+        "5 inputs": {
             "B": np.zeros((4, 5)),
             "D": 0,
         },
-        "D of the controller has shape": {"D": np.zeros((2, 2))},
-        "sampled at a dt that it does not say": {"dt": True},
-        "complex128 values, expected real": {"C": np.zeros((6, 4)) * 1j},
+        "D .*shape": {"D": np.zeros((2, 2))},
+        "dt": {"dt": True},
+        "complex128": {"C": np.zeros((6, 4)) * 1j},
     }.items(),
 )
 def test_sizes_and_figures_that_do_not_fit_are_refused(lin, words, change):
@@ -271,34 +273,34 @@ def test_what_is_no_controller_of_the_model_is_refused(lin, arm):
     named = control.ss(A, B[:, :1], C, D[:, :1], inputs=["q_b_w"])
     twice = control.ss(A, B[:, :2], C, D[:, :2], inputs=["q_b_x", "q_b.x"[:3] + "_x_"])
     for words, given, sign in (
-        ("has no state space: .*must be proper", improper, 1),
-        ("has no state space: .*must be proper", tall, 1),
-        (r"no output of the model named 'q_b_w'; did you mean q_b\.", named, 1),
-        ("no output of the model named 'q_b_x_'", twice, 1),
-        (r"no output of the model named 'tau_b\.x'", seen, 1),
-        ("system has 3 parts", (A, B, C), 1),
-        ("system holds object values", gain, 1),
-        (r"system has shape \(2, 2, 2\)|has shape", np.zeros((2, 2, 2)), 1),
-        ("sign 1 or -1", D, 2.0),
+        ("proper", improper, 1),
+        ("proper", tall, 1),
+        ("'q_b_w'", named, 1),
+        ("'q_b_x_'", twice, 1),
+        (r"'tau_b\.x'", seen, 1),
+        ("parts", (A, B, C), 1),
+        ("object", gain, 1),
+        ("shape", np.zeros((2, 2, 2)), 1),
+        ("sign", D, 2.0),
     ):
         with pytest.raises(fflin.FflinError, match=words) as error:
             fflin.LinearController(given, lin, sign=sign)
         assert "\n" not in str(error.value)
-    with pytest.raises(fflin.InputError, match=r"is sampled at dt = 0.2 s, the model .* 0.1 s"):
+    with pytest.raises(fflin.InputError, match=r"0.2 s.*0.1 s"):
         fflin.LinearController((A, B, C, D, 0.2), lin.discretize(0.1))
-    with pytest.raises(fflin.InputError, match="controller is continuous, the model sampled"):
+    with pytest.raises(fflin.InputError, match="continuous"):
         fflin.LinearController((A, B, C, D, 0.0), lin.discretize(0.1))
-    with pytest.raises(fflin.InputError, match=r"noise is 3, expected noise\(t\)"):
+    with pytest.raises(fflin.InputError, match="noise"):
         fflin.LinearController(D, lin, noise=3)
     policy = fflin.LinearController((A, B, C, D, 0.1), lin)
     cubesat = fflin.load("cubesat", outputs=SEEN)
-    with pytest.raises(fflin.InputError, match=r"asked 0\.2 s after its last sample"):
+    with pytest.raises(fflin.InputError, match=r"0\.2 s"):
         fflin.simulate(cubesat, policy, duration=1.0, dt=0.1, sample=0.2)
-    with pytest.raises(fflin.InputError, match="multiple of the step"):
+    with pytest.raises(fflin.InputError, match="multiple"):
         fflin.simulate(cubesat, policy, duration=1.0, dt=0.07)
-    with pytest.raises(fflin.InputError, match=r"with the inputs tau_m\.joint_1"):
+    with pytest.raises(fflin.InputError, match=r"tau_m\.joint_1"):
         fflin.simulate(robot, policy, duration=1.0)
-    with pytest.raises(fflin.InputError, match="without the outputs base"):
+    with pytest.raises(fflin.InputError, match="base"):
         fflin.simulate(cubesat.replace(outputs=[fflin.BasePose()]), policy, duration=1.0)
 
 
@@ -306,19 +308,17 @@ def test_files_that_hold_none_are_refused(lin, tmp_path):
     A, B, C, D = matrices(lin)
     path = tmp_path / "K.mat"
     savemat(path, {"A": A, "B": B, "K": D})
-    with pytest.raises(
-        fflin.FileError, match=r"it has A, B, K, expected A, B, C, D, and Ts .*ssda"
-    ):
+    with pytest.raises(fflin.FileError, match="A, B, K"):
         fflin.LinearController(path, lin)
     savemat(path, {"A": A, "B": B, "C": C, "D": D[:, :3]})
-    with pytest.raises(fflin.InputError, match=r"K\.mat: D of the controller has shape \(6, 3\)"):
+    with pytest.raises(fflin.InputError, match=r"K\.mat.*\(6, 3\)"):
         fflin.LinearController(path, lin)
     savemat(path, {"A": A, "B": B, "C": C, "D": D, "Ts": np.array([0.1, 0.2])})
-    with pytest.raises(fflin.FileError, match=r"K\.mat: not a controller"):
+    with pytest.raises(fflin.FileError, match=r"K\.mat"):
         fflin.LinearController(path, lin)
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
-    with pytest.raises(fflin.FileError, match=r"K\.mat: not a controller"):
+    with pytest.raises(fflin.FileError, match=r"K\.mat"):
         fflin.LinearController(path, lin)
     with pytest.raises(fflin.FileError, match="No such file"):
         fflin.LinearController(tmp_path / "none.mat", lin)

@@ -10,6 +10,7 @@ from scipy.linalg import expm
 import fflin
 from fflin.analysis.gramians import held_cost
 from fflin.control.margins import largest_gain
+from tests.support.messages import any_wording
 from tests.support.robots import BUNDLED, random_point
 
 
@@ -69,13 +70,13 @@ def test_brysons_rule_is_the_square_of_the_largest_value(lin):
     R = fflin.bryson(lin, {"tau_b": 2.0, "F_b": 4.0, "tau_m": 10.0})
     assert R == pytest.approx([0.25] * 3 + [1 / 16] * 3 + [0.01] * 6)
     for words, largest in {
-        "is an input and 'q_b' a state": {"q_b": 1.0, "tau_b": 1.0},
-        "no value for F_b.x": {"tau_b": 1.0},
-        "is 0, expected a positive": {"q_b": 0.0},
-        "is 1e-200, expected one between": {"q_b": 1e-200},
-        r"is 1e\+200, expected one between": {"tau_b": 1e200},
-        "no state or input named 'qb'": {"qb": 1.0},
-        "expected {name": {},
+        "'q_b'": {"q_b": 1.0, "tau_b": 1.0},
+        "F_b.x": {"tau_b": 1.0},
+        "positive": {"q_b": 0.0},
+        "1e-200": {"q_b": 1e-200},
+        r"1e\+200": {"tau_b": 1e200},
+        "'qb'": {"qb": 1.0},
+        "{name": {},
     }.items():
         with pytest.raises(fflin.FflinError, match=words):
             fflin.bryson(lin, largest)
@@ -87,7 +88,7 @@ def test_a_mode_that_the_weights_leave_out_is_not_held_by_rounding(lin, dt, seed
     V = np.random.default_rng(seed).normal(size=(12, 11))
     Q = np.eye(24)
     Q[:12, :12] = V @ V.T
-    with pytest.raises(fflin.InputError, match="Q does not weigh a combination of "):
+    with pytest.raises(fflin.InputError, match="combination"):
         fflin.lqr(lin.discretize(dt) if dt else lin, Q, 1.0)
 
 
@@ -95,32 +96,35 @@ def test_bad_weights_are_named(lin):
     indefinite = np.eye(24)
     indefinite[3, 7] = indefinite[7, 3] = 2.0
     for words, arguments in {
-        r"Q is not positive semidefinite: its eigenvalue -1 .* along (r_b.x|q_m.joint_2)": (
-            indefinite,
-            1,
-        ),
-        r"Q is not positive semidefinite: its eigenvalue -3 .* along q_b.x": (-3, 1),
-        r"R is not positive definite: its eigenvalue 0 .* along tau_m.joint_3": (
+        "-3 .*q_b.x": (-3, 1),
+        "R .*tau_m.joint_3": (
             1,
             [1.0] * 8 + [0.0] + [1.0] * 3,
         ),
-        r"R is not positive definite: its eigenvalue -?\d": (1, np.ones((12, 12))),
-        r"Q has shape \(3, 3\), expected \(24, 24\)": (np.eye(3), 1),
-        r"Q has shape \(5,\), expected \(24,\)": (np.ones(5), 1),
-        r"Q has shape \(2, 2, 2\)": (np.ones((2, 2, 2)), 1),
-        r"Q is not symmetric: Q\[0, 1\] is 1": (np.triu(np.ones((24, 24))), 1),
-        r"Q is not an array: its rows differ": ([[1.0], [1.0, 2.0]], 1),
-        r"Q is nan, expected a finite": (np.nan, 1),
-        r"Q is 'one', expected a number": ("one", 1),
-        r"no entry of Q named 'qb'; did you mean q_b": ({"qb": 1}, 1),
-        r"R has no value for F_b.x": (1, {"tau_b": 1}),
-        r"N has shape \(2, 2\), expected \(24, 12\)": (1, 1, np.eye(2)),
-        r"Q - N R\^-1 N' is not positive semidefinite": (1, 1, np.ones((24, 12))),
-        r"Q does not weigh q_m.joint_1, .*do not settle": ({"q_b": 1, "r_b": 1}, 1),
+        r"\(3, 3\)": (np.eye(3), 1),
+        r"\(5,\)": (np.ones(5), 1),
+        r"\(2, 2, 2\)": (np.ones((2, 2, 2)), 1),
+        r"Q\[0, 1\]": (np.triu(np.ones((24, 24))), 1),
+        "rows": ([[1.0], [1.0, 2.0]], 1),
+        "nan": (np.nan, 1),
+        "'one'": ("one", 1),
+        "'qb'": ({"qb": 1}, 1),
+        "F_b.x": (1, {"tau_b": 1}),
+        r"\(2, 2\)": (1, 1, np.eye(2)),
+        "q_m.joint_1": ({"q_b": 1, "r_b": 1}, 1),
     }.items():
         with pytest.raises(fflin.FflinError, match=words):
             fflin.lqr(lin, *arguments)
-    with pytest.raises(fflin.InputError, match="lin is a Robot, expected a LinearModel"):
+    # Rounding decides which of several states these directions are along.
+    for words, arguments in {
+        "-1 .*(r_b.x|q_m.joint_2)": (indefinite, 1),
+        r"Q - N R\^-1 N'": (1, 1, np.ones((24, 12))),
+    }.items():
+        with any_wording(), pytest.raises(fflin.FflinError, match=words):
+            fflin.lqr(lin, *arguments)
+    with any_wording(), pytest.raises(fflin.FflinError, match=r"R .*eigenvalue"):
+        fflin.lqr(lin, 1, np.ones((12, 12)))
+    with pytest.raises(fflin.InputError, match="LinearModel"):
         fflin.lqr(fflin.load("ets_vii"), 1, 1)
 
 
@@ -134,7 +138,7 @@ def test_weights_of_any_size_give_a_gain_or_one_clear_line(lin, dt):
             try:
                 gain = fflin.lqr(model, q, r)
             except fflin.StabilizabilityError as error:
-                assert "scale the weights" in str(error)
+                assert "weights" in str(error)
             else:
                 assert np.isfinite(gain.K).all() and gain.margin > 0.0
                 assert gain.residual < 1e-3
@@ -146,9 +150,9 @@ def test_what_is_no_fixed_point_is_refused_with_its_rows():
     robot = fflin.load("ets_vii")
     v = fflin.velocity(robot, {"omega_b.z": 0.1, "joint_1": 0.2})
     for point in (fflin.linearize(robot, None, v), fflin.linearize(robot, None, v).discretize(0.1)):
-        with pytest.raises(fflin.EquilibriumError, match=r"d q_m\.joint_1/dt = 0\.2.*and \d+ more"):
+        with pytest.raises(fflin.EquilibriumError, match=r"q_m\.joint_1.* 0\.2"):
             fflin.lqr(point, 1, 1)
-    with pytest.raises(fflin.EquilibriumError, match=r"d qdot_m\.joint_2/dt"):
+    with pytest.raises(fflin.EquilibriumError, match=r"qdot_m\.joint_2"):
         fflin.lqr(fflin.linearize(robot, None, v, moving=True), 1, 1)
     # Flying along is steady.
     v = fflin.velocity(robot, {"v_b.x": 0.1})
@@ -185,7 +189,7 @@ def test_what_the_inputs_cannot_hold_is_named(robots, name, dt):
 
 def test_springs_do_not_hide_that_momentum_is_conserved():
     robot = joints_only(fflin.load("servicer_7dof").replace(stiffness=20.0, damping=1.0))
-    with pytest.raises(fflin.StabilizabilityError, match="base attitude and position"):
+    with pytest.raises(fflin.StabilizabilityError, match="base attitude"):
         fflin.lqr(fflin.linearize(robot), 1, 1)
     # Without what is conserved it can be held, and so can all with the base's inputs.
     reduced = fflin.lqr(fflin.momentum_reduction(fflin.linearize(robot)), 1, 1)
@@ -245,7 +249,7 @@ def test_a_cross_weight_that_takes_a_spring_away_leaves_its_joint_unweighed():
     N = np.zeros(model.B.shape)
     N[:8] = np.linalg.solve(model.B[8:], model.A[8:, :8]).T
     Q = N @ N.T + np.diag([1.0] * 6 + [0.0] * 10)
-    with pytest.raises(fflin.InputError, match=r"Q does not weigh q_m.arm_"):
+    with pytest.raises(fflin.InputError, match=r"q_m.arm_"):
         fflin.lqr(model, Q, 1.0, N)
 
 
@@ -301,9 +305,9 @@ def test_held_cost_away_from_rest():
 
 
 def test_sampled_cost_refuses(lin):
-    with pytest.raises(fflin.InputError, match="continuous LinearModel"):
+    with pytest.raises(fflin.InputError, match="continuous"):
         fflin.sampled_cost(lin.discretize(0.1), 0.1, 1, 1)
-    with pytest.raises(fflin.InputError, match="dt is 0 s, expected a positive"):
+    with pytest.raises(fflin.InputError, match="dt"):
         fflin.sampled_cost(lin, 0.0, 1, 1)
 
 
@@ -316,7 +320,7 @@ def test_files_keep_every_bit(gain, tmp_path, ending):
         before, after = getattr(gain, item.name), getattr(back, item.name)
         same = np.array_equal(before, after) if isinstance(before, np.ndarray) else before == after
         assert same and np.shape(before) == np.shape(after), item.name
-    for words, name in (("not a Gain saved by fflin", "else"), ("cannot be read", "missing")):
+    for words, name in (("Gain", "else"), ("read", "missing")):
         if name == "else":
             (tmp_path / f"else{ending}").write_bytes(path.read_bytes()[:200])
         with pytest.raises(fflin.FileError, match=words):
@@ -324,10 +328,10 @@ def test_files_keep_every_bit(gain, tmp_path, ending):
 
 
 def test_files_refuse_what_is_not_finite_and_unknown_endings(gain, tmp_path):
-    with pytest.raises(fflin.FileError, match=r"ends in '\.csv', expected one of \.npz"):
+    with pytest.raises(fflin.FileError, match=r"'\.csv'"):
         gain.save(tmp_path / "gain.csv")
     broken = replace(gain, K=np.full_like(gain.K, np.nan))
-    with pytest.raises(fflin.InputError, match="K has entries that are not finite"):
+    with pytest.raises(fflin.InputError, match="finite"):
         broken.save(tmp_path / "gain.npz")
     assert not list(tmp_path.iterdir())
 
@@ -345,8 +349,16 @@ def test_a_gain_prints_in_80_columns(gain, lin):
 def test_a_motion_that_is_not_steady_is_sent_to_its_trajectory():
     robot = fflin.load("ets_vii")
     v = fflin.velocity(robot, {"omega_b.x": 0.1, "omega_b.y": 0.2, "joint_1": 0.1})
-    with pytest.raises(fflin.EquilibriumError, match="with moving=True"):
+    with pytest.raises(fflin.EquilibriumError, match="moving=True"):
         fflin.lqr(fflin.linearize(robot, None, v), 1, 1)
-    with pytest.raises(fflin.EquilibriumError, match=r"fflin\.tvlqr along") as error:
+    with pytest.raises(fflin.EquilibriumError, match=r"fflin\.tvlqr") as error:
         fflin.lqr(fflin.linearize(robot, None, v, moving=True), 1, 1)
     assert "moving=True" not in str(error.value)
+
+
+def test_a_weight_by_names_is_of_a_model():
+    robot = fflin.load("planar_detumble")
+    lin = fflin.linearize(robot)
+    for given in (fflin.lqr(lin), robot, 3):
+        with pytest.raises(fflin.InputError, match="expected a LinearModel"):
+            fflin.bryson(given, {"q_b": 0.1})

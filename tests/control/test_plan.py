@@ -1,11 +1,14 @@
 """Planned motions: closed forms of the least effort, limits, goals, and what is refused."""
 
+import re
+
 import numpy as np
 import pinocchio as pin
 import pytest
 
 import fflin
 from fflin.control.shooting import Shooting
+from tests.support.messages import any_wording
 
 
 def turned(robot, angle, axis=(0.0, 0.0, 1.0), joints=None, at=(0.0, 0.0, 0.0)):
@@ -60,6 +63,7 @@ def test_least_effort_of_linear_inputs_has_the_closed_form(cube):
     assert motion.hold == "linear" and motion.residual.max() < 1e-8
 
 
+@pytest.mark.exhaustive
 def test_a_turn_in_the_least_time_takes_all_there_is(cube):
     """T = 2 sqrt(J angle / u_max) is the least time; what is less misses the goal."""
     robot, inertia = cube
@@ -70,12 +74,10 @@ def test_a_turn_in_the_least_time_takes_all_there_is(cube):
     assert np.abs(u).max() <= 1e-3
     assert (np.abs(u) >= 1e-3 * (1 - 1e-6)).sum() >= 90 and (np.diff(np.sign(u)) != 0).sum() == 1
     assert missed(robot, motion, goal) < 1e-6
-    with pytest.raises(fflin.InputError, match=r"misses omega_b.z by 0\.00\d+ rad/s; give"):
+    with any_wording(), pytest.raises(fflin.InputError, match=r"omega_b.z .*0\.00\d+"):
         fflin.plan(robot, (goal, None), 0.99 * least)
     # At half the time the turn that is reached is a quarter or less.
-    with pytest.raises(
-        fflin.InputError, match=r"after [\d.]+ s; the last one.*misses q_b.z by 0\.\d+"
-    ):
+    with any_wording(), pytest.raises(fflin.InputError, match=r"q_b.z .*0\.\d+"):
         fflin.plan(robot, (goal, None), 0.5 * least, knots=21)
 
 
@@ -91,25 +93,32 @@ def servicer():
     return robot, fflin.velocity(robot, DETUMBLE), turned(robot, 0.4, (0, 1, 0), {"joint_2": 0.9})
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("hold", ["previous", "linear"])
-def test_a_tumble_ends_within_limits(servicer, hold):
-    robot, v, goal = servicer
-    limits = {"tau_b": 8.0, "F_b": 5.0, "tau_m": 6.0}
-    options = {"v0": v, "knots": 41, "hold": hold, "limits": limits}
-    motion = fflin.plan(robot, (goal, None), 40.0, **options)
+def test_a_tumble_ends_within_limits(hold):
+    robot = fflin.load(
+        *("planar_detumble",),
+        lock=["joint_3"],
+        damping="urdf",
+        stiffness={"joint_1": 0.5},
+        gravity=(0.01, 0, 0.02),
+    )
+    v, goal = fflin.velocity(robot, DETUMBLE), turned(robot, 0.4, (0, 1, 0), {"joint_2": 0.9})
+    limits = {"tau_b": 5.0, "F_b": 3.5, "tau_m": 2.5}
+    options = {"v0": v, "knots": 21, "hold": hold, "limits": limits}
+    motion = fflin.plan(robot, (goal, None), 20.0, **options)
     assert missed(robot, motion, goal) < 1e-6
     assert (motion.q[0] == robot.neutral()).all() and (motion.v[0] == v).all()
     assert motion.residual.max() < 1e-6
-    size = np.repeat([8.0, 5.0, 6.0], 3)
-    assert (np.abs(motion.u) <= size).all()
-    # The same again, to the last bit.
-    again = fflin.plan(robot, (goal, None), 40.0, **options)
-    assert (again.u == motion.u).all() and (again.q == motion.q).all()
-    loose = fflin.plan(robot, (goal, None), 40.0, **options | {"limits": None, "R": size**-2.0})
+    size = np.repeat([5.0, 3.5, 2.5], [3, 3, 2])
+    assert (np.abs(motion.u) <= size).all() and (np.abs(motion.u) >= 0.999 * size).any()
+    loose = fflin.plan(robot, (goal, None), 20.0, **options | {"limits": None, "R": size**-2.0})
+    assert (np.abs(loose.u) > 1.01 * size).any()
     effort = (np.square(motion.u / size).sum(), np.square(loose.u / size).sum())
     assert effort[0] >= 0.99 * effort[1]
 
 
+@pytest.mark.exhaustive
 def test_what_is_planned_is_flown(servicer, tmp_path):
     """The simulator under the same inputs ends where the plan does; the file says hold and axes."""
     robot, v, goal = servicer
@@ -128,6 +137,7 @@ def test_what_is_planned_is_flown(servicer, tmp_path):
     assert (read.u == motion.u).all() and (read.hold, read.frame) == ("previous", "local")
 
 
+@pytest.mark.exhaustive
 def test_joints_keep_within_their_speeds_and_travels():
     robot = fflin.load("servicer_7dof", lock=["panel_*"])
     goal = turned(robot, 0.5, (1, 0, 0), {"joint_1": 1.5, "joint_4": -1.0})
@@ -138,10 +148,65 @@ def test_joints_keep_within_their_speeds_and_travels():
     # Without the limit it would pass it.
     assert speeds[:, 0].max() == pytest.approx(0.2, abs=1e-6)
     assert missed(robot, motion, goal) < 1e-6
-    with pytest.raises(fflin.InputError, match="no motion within the limits was found"):
+    with any_wording(), pytest.raises(fflin.InputError, match="limits"):
         fflin.plan(robot, (goal, None), 4.0, **options)
 
 
+SPEEDS = {"qdot_m": 0.13, "tau_b": 20.0, "F_b": 20.0, "tau_m": 20.0}
+
+
+@pytest.fixture(scope="module")
+def one_joint():
+    robot = fflin.load("planar_detumble", lock=["joint_2", "joint_3"])
+    return robot, fflin.configuration(robot, {"joint_1": 1.0})
+
+
+@pytest.mark.parametrize(("knots", "spin"), [(6, 0.0), (11, 0.2)])
+def test_speeds_keep_within_limits_between_knots(one_joint, knots, spin):
+    """Linear torques bend the speeds between knots, beyond limits that the knots keep."""
+    (robot, goal), limit = one_joint, SPEEDS["qdot_m"]
+    options = {"knots": knots, "hold": "linear", "limits": SPEEDS}
+    v0 = fflin.velocity(robot, {"omega_b.z": spin})
+    motion = fflin.plan(robot, (goal, None), 10.0, v0=v0, **options)
+    # The same again, to the last bit.
+    again = fflin.plan(robot, (goal, None), 10.0, v0=v0, **options)
+    assert (again.u == motion.u).all() and (again.q == motion.q).all()
+    parts, largest = 64, 0.0
+    for k in range(knots - 1):
+        q, v = motion.q[k], motion.v[k]
+        for part in range(parts):
+            q, v = motion.flow.end(k, 1, q, v, (part / parts, (part + 1) / parts))
+            largest = max(largest, abs(v[6]))
+    assert 0.97 * limit < largest <= 1.01 * limit
+    assert missed(robot, motion, goal) < 1e-6
+    said = " ".join(str(motion).split())
+    assert "integrated motion exceeds" in said
+    if found := re.search(r"exceeds that of qdot_m\.joint_1 by (\S+) %", said):
+        assert largest >= (1.0 + 0.009 * float(found[1])) * limit
+
+
+def test_a_violation_that_is_left_is_printed_as_it_was_computed(one_joint, monkeypatch):
+    """Of the motion before any limit is tightened: with a warning, unless that much is allowed."""
+    robot, goal = one_joint
+    options = {"knots": 6, "hold": "linear", "limits": SPEEDS}
+    monkeypatch.setattr("fflin.control.plan._BETWEEN", 0.1)
+    motion = fflin.plan(robot, (goal, None), 10.0, **options)
+    found = re.search(r"exceeds that of qdot_m\.joint_1 by (\S+) %", " ".join(str(motion).split()))
+    fine = [
+        motion.flow.end(k, 8, motion.q[k], motion.v[k], (0.0, part / 16))[1][6]
+        for k in range(5)
+        for part in range(1, 17)
+    ]
+    assert found and float(found[1]) > 3.0
+    assert max(fine) / 0.13 - 1.0 == pytest.approx(0.01 * float(found[1]), rel=0.02)
+    monkeypatch.setattr("fflin.control.plan._BETWEEN", 0.01)
+    monkeypatch.setattr("fflin.control.plan._MOST_TIGHTER", 1)
+    with pytest.warns(fflin.FflinWarning, match="qdot_m.joint_1"):
+        left = fflin.plan(robot, (goal, None), 10.0, **options)
+    assert str(left) == str(motion)
+
+
+@pytest.mark.exhaustive
 def test_wheels_turn_a_body_and_may_keep_what_they_took(tmp_path):
     """Only wheels act, so that the turn's momentum is theirs, and angles of wheels are no goal."""
     wheels = [fflin.ReactionWheel(axis, inertia=1e-4, max=1e-3) for axis in np.eye(3)]
@@ -152,7 +217,7 @@ def test_wheels_turn_a_body_and_may_keep_what_they_took(tmp_path):
     motion = fflin.plan(robot, (goal, None), 30.0, v0=v, knots=31, free=free)
     assert np.abs(pin.difference(robot.model, goal, motion.q[-1])[3:6]).max() < 1e-6
     assert np.abs(motion.v[-1, 3:6]).max() < 1e-6 and motion.residual.max() < 1e-6
-    with pytest.raises(fflin.InputError, match="in `free` what may end anywhere"):
+    with any_wording(), pytest.raises(fflin.InputError, match="`free`"):
         fflin.plan(robot, (goal, None), 30.0, v0=v, knots=31, free=["r_b", "v_b"])
 
 
@@ -168,6 +233,7 @@ def test_starts_and_goals_are_given_in_every_form():
     assert (found[0].q[0] == fflin.configuration(robot, {"arm_proximal": 0.2})).all()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("held", [True, False])
 def test_slopes_of_intervals_are_those_of_the_flow(servicer, held):
     robot, v, goal = servicer
@@ -218,13 +284,13 @@ def test_a_plan_meets_the_conditions_of_optimality(cube):
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"knots": 1}, "knots is 1"),
-        ({"hold": "next"}, "hold is 'next', expected 'linear' or 'previous'"),
-        ({"duration": 0.0}, "duration is 0 s, expected a positive time"),
+        ({"knots": 1}, "knots"),
+        ({"hold": "next"}, "'next'"),
+        ({"duration": 0.0}, "duration"),
         ({"free": "r_b.x"}, "free"),
-        ({"R": np.ones((6, 6)) + np.eye(6)}, "a plan takes a diagonal weight"),
-        ({"goal": np.zeros(3)}, r"x has shape \(3,\)"),
-        ({"x0": np.zeros(12), "q0": np.zeros(7)}, "give either"),
+        ({"R": np.ones((6, 6)) + np.eye(6)}, "diagonal"),
+        ({"goal": np.zeros(3)}, r"\(3,\)"),
+        ({"x0": np.zeros(12), "q0": np.zeros(7)}, "x0"),
     ],
 )
 def test_what_is_no_plan_is_refused(cube, wrong, said):

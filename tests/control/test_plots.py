@@ -106,3 +106,12 @@ def test_poles_of_a_sampled_loop_are_shown_as_rates():
     z = np.exp(0.1 * (shown.get_xdata() + 1j * shown.get_ydata()))
     np.testing.assert_allclose(np.sort_complex(z), np.sort_complex(gain.poles), rtol=1e-12)
     assert "poles z of A - B K as rates ln(z)/dt" in [text for text, _ in texts(figure)]
+
+
+def test_what_has_no_poles_is_one_line():
+    masked = np.ma.masked_array([-1.0, -2.0], mask=[True, False])
+    for given in (3, np.zeros((3, 3)), [], {}, {"a": 5.0}, [np.nan], None):
+        with pytest.raises(fflin.InputError, match="poles is a"):
+            fflin.plot_poles(given)
+    with pytest.raises(fflin.InputError, match="masked"):
+        fflin.plot_poles(masked)

@@ -67,5 +67,5 @@ def test_scales_change_nothing_and_hard_bounds_may_leave_nothing():
 
 def test_without_the_solver_it_is_said_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "piqp", None)
-    with pytest.raises(MissingPackageError, match=r"pip install 'fflin\[mpc\]'"):
+    with pytest.raises(MissingPackageError, match=r"'fflin\[mpc\]'"):
         problem().solve()

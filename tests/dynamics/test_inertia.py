@@ -129,7 +129,7 @@ def far_joint(distance):
 
 
 def test_nearly_singular_m_is_warned_of_with_the_error_to_expect():
-    with pytest.warns(fflin.FflinWarning, match=r"relative error of about 1e-07.*joint 'joint_2'"):
+    with pytest.warns(fflin.FflinWarning, match="1e-07.*'joint_2'"):
         lin = fflin.linearize(far_joint(1e5))
     exact = exact_inverse(lin.M)
     mobility = np.sqrt(exact.diagonal())
@@ -165,7 +165,7 @@ def test_a_link_of_next_to_no_inertia_is_named():
 def test_singular_m_is_refused(robot):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(fflin.SingularInertiaError, match=r"joint 'joint_[012]'"):
+        with pytest.raises(fflin.SingularInertiaError, match=r"'joint_[012]'"):
             fflin.linearize(robot)
 
 
@@ -174,7 +174,7 @@ def test_massless_base_is_refused_where_its_m_is_singular():
     model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
     joint = model.addJoint(1, pin.JointModelRZ(), pin.SE3.Random(), "joint")
     model.appendBodyToJoint(joint, pin.Inertia.Random(), pin.SE3.Random())
-    with pytest.raises(fflin.SingularInertiaError, match=r"joint 'joint'"):
+    with pytest.raises(fflin.SingularInertiaError, match="'joint'"):
         fflin.linearize(fflin.from_model(model))
 
 
@@ -218,18 +218,18 @@ def test_what_does_not_follow_its_leader_is_refused():
     q = robot.neutral()
     follower = robot.followers[0].joint
     q[follower.idx_q] += 0.01
-    with pytest.raises(fflin.InputError, match=r"'panda_finger_joint2' is at 0\.01, but it mimics"):
+    with pytest.raises(fflin.InputError, match=r"'panda_finger_joint2'.*0\.01"):
         fflin.linearize(robot, q)
     v = np.zeros(robot.nv)
     v[follower.idx_v] = 0.1
-    with pytest.raises(fflin.InputError, match=r"'panda_finger_joint2' is 0\.1, but it mimics"):
+    with pytest.raises(fflin.InputError, match=r"'panda_finger_joint2'.*0\.1"):
         fflin.linearize(robot, None, v)
-    with pytest.raises(fflin.InputError, match="mimics 'panda_finger_joint1'; place that one"):
+    with pytest.raises(fflin.InputError, match="'panda_finger_joint1'"):
         fflin.configuration(robot, {"panda_finger_joint2": 0.01})
 
 
 def test_singular_m_of_mimic_joints_is_refused():
-    with pytest.raises(fflin.SingularInertiaError, match="joint 'LHand', joint 'RHand'"):
+    with pytest.raises(fflin.SingularInertiaError, match=r"'LHand'.*'RHand'"):
         fflin.linearize(fflin.load("romeo"))
 
 

@@ -191,7 +191,7 @@ def test_loop_about_a_bent_point_comes_to_it_and_differs_in_second_order(sample)
 
     def run(size, duration):
         x0 = lin.x0 + size * np.cos(np.arange(len(lin.x0)))
-        options = {"duration": duration, "dt": 0.01, "sample": sample}
+        options = {"duration": duration, "dt": sample or 0.04, "sample": sample}
         return fflin.simulate(robot, policy, x0=x0, **options)
 
     # What the two models differ by over the displacement halves with it.

@@ -129,9 +129,9 @@ def test_not_a_number_is_not_ok():
 def test_check_of_what_it_cannot_check_is_refused():
     robot = fflin.load("cubesat")
     lin = fflin.linearize(robot)
-    with pytest.raises(fflin.InputError, match=r"sampled at dt = 0\.1 s"):
+    with pytest.raises(fflin.InputError, match=r"0\.1"):
         fflin.check(robot, lin.discretize(0.1))
-    with pytest.raises(fflin.InputError, match=r"'cubesat', not of 'ets_vii' .*, with the state"):
+    with pytest.raises(fflin.InputError, match=r"'cubesat'.*'ets_vii'"):
         fflin.check(fflin.load("ets_vii"), lin)
 
 
@@ -198,5 +198,5 @@ def test_a_tolerance_takes_the_place_of_every_figures_own():
     assert not fflin.check(robot, planted(lin, "A", slice(6, 9), slice(9, 12)), tolerance=1e-6).ok
     assert not fflin.check(robot, lin, tolerance=1e-20).ok
     for wrong in (0.0, -1e-6, 1.0, np.nan, np.inf, "much", True):
-        with pytest.raises(fflin.InputError, match="tolerance is"):
+        with pytest.raises(fflin.InputError, match="tolerance"):
             fflin.check(robot, lin, tolerance=wrong)

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import fflin
 from fflin.linear import trajectory_sampling
 from tests.support.motions import motion
-from tests.support.robots import random_point
+from tests.support.robots import mostly, random_point
 
 
 def test_knots_are_the_moving_models_and_errors_are_carried_along():
@@ -66,7 +66,7 @@ def test_interpolation_is_on_the_manifold():
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.3)
     assert (along.matrices(along.t[5])[0] == along.A[5]).all()
     assert (along.matrices(along.t[-1])[1] == along.B[-1]).all()
-    with pytest.raises(fflin.InputError, match=r"t is 9 s, expected 0 to 0\.4 s"):
+    with pytest.raises(fflin.InputError, match=r"9 s.* 0\.4 s"):
         along.point(9.0)
     with pytest.raises(ValueError, match="read-only"):
         along.A[0] = 0.0
@@ -74,40 +74,40 @@ def test_interpolation_is_on_the_manifold():
 
 def test_what_is_no_motion_is_told_with_the_time_and_refused_where_asked():
     robot = fflin.load("ets_vii")
-    t, q, v, u = motion(robot)
+    t, q, v, u = motion(robot, knots=17)
     jump = q.copy()
-    jump[40:, 0] += 0.1
-    said = r"no motion of 'ets_vii': from t = 0\.195 to 0\.2 s they miss it by \d"
+    jump[8:, 0] += 0.1
+    said = r"no motion of 'ets_vii': from t = 0\.175 to 0\.2 s they miss it by \d"
     with pytest.raises(fflin.InputError, match=said):
         fflin.linearize_trajectory(robot, t, jump, v, u, strict=True)
     with pytest.warns(fflin.FflinWarning, match=said):
         along = fflin.linearize_trajectory(robot, t, jump, v, u)
-    assert along.residual.argmax() == 39
-    assert along.residual[39] > 10.0
+    assert along.residual.argmax() == 7
+    assert along.residual[7] > 1.0
     cases = {
         r"t\[1\] is .* s, after .* s; expected each time later": (t[::-1], q, v, u),
-        r"q has shape \(80, 19\), expected \(81, 19\)": (t, q[:-1], v, u),
-        r"v has shape \(81, 11\), expected \(81, 12\)": (t, q, v[:, 1:], u),
-        r"u has shape \(81, 11\), expected \(81, 12\)": (t, q, v, u[:, 1:]),
+        r"q has shape \(16, 19\), expected \(17, 19\)": (t, q[:-1], v, u),
+        r"v has shape \(17, 11\), expected \(17, 12\)": (t, q, v[:, 1:], u),
+        r"u has shape \(17, 11\), expected \(17, 12\)": (t, q, v, u[:, 1:]),
         "u holds": (t, q, v, "none"),
-        r"at t = 0\.01 s: v\[0\] is nan": (
+        r"at t = 0\.05 s: v\[0\] is nan": (
             t,
             q,
-            np.where(np.arange(81)[:, None] == 2, np.nan, v),
+            np.where(np.arange(17)[:, None] == 2, np.nan, v),
             u,
         ),
     }
     for words, arguments in cases.items():
         with pytest.raises(fflin.InputError, match=words):
             fflin.linearize_trajectory(robot, *arguments)
-    with pytest.raises(fflin.InputError, match="the trajectory has q, v, u"):
+    with pytest.raises(fflin.InputError, match="q, v, u"):
         fflin.linearize_trajectory(robot, fflin.Trajectory(robot, t, q, v, u), hold="linear")
 
 
 def test_an_orbit_and_a_fast_wheel_hide_nothing():
     wheel = fflin.ReactionWheel((0, 0, 1), inertia=0.01)
     robot = fflin.load("ets_vii", inputs=[fflin.BaseForce(), wheel])
-    t = np.linspace(0.0, 1.0, 51)
+    t = np.linspace(0.0, 0.1, 6)
     v = np.tile(fflin.velocity(robot, {"v_b.x": 7000.0, "wheel_1": 500.0}), (len(t), 1))
     q0 = fflin.configuration(robot, base=pin.SE3(np.eye(3), np.array([7e6, 0.0, 0.0])))
     q = np.array([pin.integrate(robot.model, q0, time * v[0]) for time in t])
@@ -115,12 +115,12 @@ def test_an_orbit_and_a_fast_wheel_hide_nothing():
     assert fflin.linearize_trajectory(robot, t, q, v, u).residual.max() < 1e-9
     for column in (2, robot.joints[0].idx_v):  # along z; a joint of the arm
         step = 0.01 * np.eye(robot.nv)[column]
-        jump = np.array([pin.integrate(robot.model, x, (k >= 25) * step) for k, x in enumerate(q)])
-        with pytest.raises(fflin.InputError, match=r"from t = 0\.48 to 0\.5 s"):
+        jump = np.array([pin.integrate(robot.model, x, (k >= 3) * step) for k, x in enumerate(q)])
+        with pytest.raises(fflin.InputError, match=r"0\.04 to 0\.06 s"):
             fflin.linearize_trajectory(robot, t, jump, v, u, strict=True)
     drifting = v.copy()
     drifting[:, robot.joints[0].idx_v] = 0.01
-    with pytest.raises(fflin.InputError, match="no motion"):
+    with pytest.raises(fflin.InputError, match="motion"):
         fflin.linearize_trajectory(robot, t, q, drifting, u, strict=True)
 
 
@@ -173,27 +173,38 @@ def transition(along, start, end):
     return y.reshape(nx, -1)
 
 
-def test_samples_are_those_of_the_variational_equation():
+@pytest.fixture(scope="module", params=["held", "linear"])
+def along(request):
     robot = fflin.load("astrobee_arm", gravity=(0.0, 0.1, -0.2), damping=0.05)
-    for motion_ in (held_motion(robot, frame="hybrid"), fflin.Trajectory(robot, *motion(robot))):
-        along = fflin.linearize_trajectory(robot, motion_, strict=True)
-        for dt in (0.2, 0.05, 0.01):
-            sampled = along.discretize(dt)
-            count = round(0.4 / dt)
-            assert (sampled.dt, len(sampled), len(sampled.t)) == (dt, count, count + 1)
-            for k in (0, count // 2, count - 1):
-                expected = transition(along, sampled.t[k], sampled.t[k + 1])
-                found = np.column_stack((sampled.A[k], sampled.B[k]))
-                size = np.abs(expected).max(axis=0)
-                assert (np.abs(found - expected) / size).max() < 1e-8
-                assert (sampled[k].A == sampled.A[k]).all()
-                assert sampled[k].dt == dt
-                assert (sampled.matrices(float(sampled.t[k]) + 0.3 * dt)[1] == sampled.B[k]).all()
-    with pytest.raises(fflin.InputError, match=r"dt is 0\.3 s, expected a part of the 0\.4 s"):
+    linear = request.param == "linear"
+    given = (
+        fflin.Trajectory(robot, *motion(robot)) if linear else held_motion(robot, frame="hybrid")
+    )
+    return fflin.linearize_trajectory(robot, given, strict=True)
+
+
+@pytest.mark.parametrize("dt", mostly((0.2, 0.05, 0.01), 0.05))
+def test_samples_are_those_of_the_variational_equation(along, dt):
+    sampled = along.discretize(dt)
+    count = round(0.4 / dt)
+    assert (sampled.dt, len(sampled), len(sampled.t)) == (dt, count, count + 1)
+    for k in (0, count // 2, count - 1):
+        expected = transition(along, sampled.t[k], sampled.t[k + 1])
+        found = np.column_stack((sampled.A[k], sampled.B[k]))
+        size = np.abs(expected).max(axis=0)
+        assert (np.abs(found - expected) / size).max() < 1e-8
+        assert (sampled[k].A == sampled.A[k]).all()
+        assert sampled[k].dt == dt
+        assert (sampled.matrices(float(sampled.t[k]) + 0.3 * dt)[1] == sampled.B[k]).all()
+
+
+def test_periods_that_do_not_fit_and_sampled_models_are_refused(along):
+    sampled = along.discretize(0.1)
+    with pytest.raises(fflin.InputError, match=r"0\.3 s"):
         along.discretize(0.3)
-    with pytest.raises(fflin.InputError, match=r"sampled already, at dt = 0\.01 s"):
+    with pytest.raises(fflin.InputError, match=r"0\.1 s"):
         sampled.discretize(0.1)
-    with pytest.raises(fflin.InputError, match="give the continuous one, and sample="):
+    with pytest.raises(fflin.InputError, match="sample="):
         fflin.tvlqr(sampled, 1.0, 1.0, 1.0)
 
 
@@ -274,7 +285,7 @@ def test_it_is_saved_and_loaded(watched, tmp_path, ending):
     with pytest.raises(fflin.FflinError):
         fflin.LinearTrajectory.load(tmp_path / f"ltv.{ending}", fflin.load("ets_vii"))
     fflin.linearize(robot).save(tmp_path / f"lin.{ending}")
-    with pytest.raises(fflin.FileError, match="not a LinearTrajectory saved by fflin"):
+    with pytest.raises(fflin.FileError, match="LinearTrajectory"):
         fflin.LinearTrajectory.load(tmp_path / f"lin.{ending}", robot)
-    with pytest.raises(fflin.FileError, match=r"ends in '\.csv', expected one of"):
+    with pytest.raises(fflin.FileError, match=r"'\.csv'"):
         along.save(tmp_path / "ltv.csv")

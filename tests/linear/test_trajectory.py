@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from scipy.io import savemat
 
 import fflin
+from fflin.linear.flow import Flow
+from tests.support.messages import says
 from tests.support.motions import motion
 
 
@@ -105,50 +108,52 @@ def test_axes_of_inputs_are_those_of_the_frame():
             assert of_world == pytest.approx(expected)
 
 
-def test_causes_are_tried_out():
-    robot = fflin.load("astrobee_arm", damping=0.05)
-    free = robot.replace(damping={})
-    t, q, v, u = motion(free)
+def test_knots_that_are_no_motion_say_where_how_many_and_the_usual_causes():
+    robot = fflin.load("astrobee_arm")
+    t, q, v, u = motion(robot)
+    jump = v.copy()
+    jump[40, 0] += 0.1
+    given = fflin.Trajectory(robot, t, q, jump, u)
+    with pytest.warns(fflin.FflinWarning, match="and 2 of 80 intervals") as found:
+        along = fflin.linearize_trajectory(robot, given)
+    said = str(found[0].message)
+    k = int(given.flow.residual.argmax())
+    assert k in (39, 40) and f"from t = {t[k]:g} to {t[k + 1]:g} s" in said
+    assert f"miss it by {given.residual.max():.2g}" in said and "usual causes" in said
+    assert said in " ".join(str(given).split()) and said in " ".join(str(along).split())
 
-    def said(along):
-        with pytest.warns(fflin.FflinWarning) as found:
-            fflin.linearize_trajectory(along.robot, along)
-        return str(found[0].message)
 
-    given = fflin.Trajectory(robot, t, q, v, u)
-    assert "without damping they hold to" in said(given)
-    assert "without damping they hold to" in str(given)
-    R = np.array([pin.Quaternion(each[3:7]).matrix() for each in q])
-    turned = v.copy()
-    turned[:, :3] = (R @ v[:, :3, None])[..., 0]
-    words = "with the linear velocity of the base in reference axes they hold to"
-    assert words in said(fflin.Trajectory(free, t, q, turned, u))
-    turned[:, 3:6] = (R @ v[:, 3:6, None])[..., 0]
-    words = "with the velocities of the base in reference axes they hold to"
-    assert words in said(fflin.Trajectory(free, t, q, turned, u))
-    hung = free.replace(gravity=(0.0, 0.0, -9.81))
-    assert "without gravity they hold to" in said(fflin.Trajectory(hung, t, q, v, u))
-    sprung = fflin.Trajectory(free.replace(stiffness=5.0, damping=0.05), t, q, v, u)
-    both = said(sprung)
-    assert "without springs" in both
-    assert "without damping" in both
+def test_intervals_are_integrated_once(monkeypatch):
+    robot = fflin.load("astrobee_arm")
+    t, q, v, u = motion(robot)
+    given, ends, end = fflin.Trajectory(robot, t, q, v, 1.1 * u), [], Flow.end
+    monkeypatch.setattr(Flow, "end", lambda *each: ends.append(each[1]) or end(*each))
+    with pytest.warns(fflin.FflinWarning, match="no motion"):
+        along = fflin.linearize_trajectory(robot, given)
+    count = len(ends)
+    assert "no motion" in str(along) and "no motion" in str(given) and len(ends) == count
+    assert 80 <= count <= 8 * 80
 
-    robot = fflin.load("planar_detumble")
-    lin = fflin.linearize(robot)
-    run = fflin.simulate(
-        *(robot, fflin.StateFeedback(lin, fflin.lqr(lin).K)),
-        x0=0.1 * np.ones(18),
-        duration=2.0,
-        sample=0.2,
-        every=20,
-    )
-    given = fflin.Trajectory(robot, run.t, run.q, run.v, run.u, frame="hybrid")
-    assert "with the input of the knot before (hold='previous') they hold to" in said(given)
-    given = fflin.Trajectory(robot, run.t, run.q, run.v, run.u[:-1])
-    assert "with u in frame hybrid they hold to" in said(given)
-    u = np.vstack((run.u[:1], run.u[:-1]))
-    given = fflin.Trajectory(robot, run.t, run.q, run.v, u, hold="previous", frame="hybrid")
-    assert "with the input of the knot after they hold to" in said(given)
+
+@pytest.mark.parametrize(
+    ("name", "row", "value", "where"),
+    [
+        ("v", 20, 1e200, "at t = 0.1 s: v has an entry of 1e+200"),
+        ("v", 20, 1e45, "from t = 0.1 to 0.105 s it overflows"),
+        ("u", 20, 1e200, "from t = 0.095 to 0.1 s it overflows"),
+        ("t", 80, 1e300, "from t = 0.395 to 1e+300 s it overflows"),
+    ],
+)
+def test_what_overflows_is_refused_with_its_place(name, row, value, where, monkeypatch):
+    robot = fflin.load("astrobee_arm")
+    given = dict(zip("tqvu", map(np.array, motion(robot)), strict=True))
+    given[name][row if name == "t" else (row, 2)] = value
+    ends, end = [], Flow.end
+    monkeypatch.setattr(Flow, "end", lambda *each: ends.append(each[1]) or end(*each))
+    with pytest.raises(fflin.InputError, match=re.escape(where)):
+        fflin.linearize_trajectory(robot, *given.values())
+    # An interval that overflows is left at once.
+    assert len(ends) <= 8 * 80
 
 
 def test_continuous_joints_may_be_angles(loop):
@@ -181,7 +186,7 @@ def test_resampled_is_the_same_motion(loop):
     uneven = along.resampled(0.3)
     assert uneven.t == pytest.approx([0.0, 0.3, 0.6, 0.9, 1.2, 1.5, 1.8, 2.0])
     for dt in (0.0, -1.0, 1e-12, "x"):
-        with pytest.raises(fflin.InputError, match="dt is"):
+        with pytest.raises(fflin.InputError, match="dt"):
             along.resampled(dt)
 
 
@@ -284,17 +289,15 @@ def test_files_of_other_programs_are_read(loop, tmp_path):
     found.save(tmp_path / "motion.npz")
     again = fflin.Trajectory.load(tmp_path / "motion.npz", robot, hold="previous")
     assert again.residual.max() < 1e-8
-    with pytest.raises(fflin.InputError, match="give the one that moves"):
+    with pytest.raises(fflin.InputError, match="file"):
         fflin.Motion.load(tmp_path / "motion.npz").trajectory()
     assert fflin.Motion.load(tmp_path / "motion.npz").trajectory(robot).residual.max() < 1e-8
 
     write(columns | {"tau_m.nosuch": along.t})
-    with pytest.raises(
-        fflin.UnknownNameError, match=r"by_hand\.csv: no state or input named 'tau_m"
-    ):
+    with pytest.raises(fflin.UnknownNameError, match=r"by_hand\.csv.*'tau_m"):
         fflin.Trajectory.load(path, robot)
     write({name: x for name, x in columns.items() if name != "r_b.y"})
-    with pytest.raises(fflin.UnknownNameError, match=r"no column named 'r_b\.y'"):
+    with pytest.raises(fflin.UnknownNameError, match=r"'r_b\.y'"):
         fflin.Trajectory.load(path, robot)
     beside = columns["q_m.joint_2"].copy()
     beside[3] = np.nan
@@ -303,18 +306,18 @@ def test_files_of_other_programs_are_read(loop, tmp_path):
     with pytest.raises(fflin.InputError, match=said_):
         fflin.Trajectory.load(path, robot)
     path.write_text("t,tau_b.x\n1,2\n3\n")
-    with pytest.raises(fflin.FileError, match="row 3 has 1 cells, the first 2"):
+    with pytest.raises(fflin.FileError, match="row 3"):
         fflin.Trajectory.load(path, robot)
     path.write_text("t,t\n1,2\n")
-    with pytest.raises(fflin.FileError, match="two of its columns have one name"):
+    with pytest.raises(fflin.FileError, match="columns"):
         fflin.Trajectory.load(path, robot)
     np.savez(tmp_path / "e.npz", t=along.t, u=along.u)
-    with pytest.raises(fflin.FileError, match="it has the entries t, u; expected t, u, and either"):
+    with pytest.raises(fflin.FileError, match="t, u"):
         fflin.Trajectory.load(tmp_path / "e.npz", robot)
-    with pytest.raises(fflin.FileError, match=r"expected one of \.npz"):
+    with pytest.raises(fflin.FileError, match=r"\.npz"):
         fflin.Trajectory.load(tmp_path / "e.txt", robot)
     np.savez(tmp_path / "e.npz", t=along.t, x=x[:, 1:], u=along.u)
-    with pytest.raises(fflin.InputError, match=r"x has shape \(21, 17\), expected \(N, 18\)"):
+    with pytest.raises(fflin.InputError, match=r"\(21, 17\)"):
         fflin.Trajectory.load(tmp_path / "e.npz", robot)
 
 
@@ -327,42 +330,11 @@ def _of_world(along):
     return u
 
 
-def test_two_slips_at_once_and_those_of_units_are_named():
-    robot = fflin.load("ets_vii")
-    u = 0.3 * np.random.default_rng(4).normal(size=(5, 12))
-    run = fflin.simulate(
-        *(robot, lambda t, q, v: u[min(int(t / 0.5 + 1e-9), 4)]),
-        v0=fflin.velocity(robot, {"omega_b.z": 0.2, "v_b.x": 0.1, "joint_1": 0.1}),
-        **{"duration": 2.5, "dt": 0.01, "sample": 0.5, "every": 10, "frame": "world"},
-    )
-    state = fflin.StateMap(robot, frame="local")
-    q, v = map(np.array, zip(*map(state.to_pinocchio, run.x), strict=True))
-    given = fflin.Trajectory(robot, run.t, q, v, run.u, hold="linear")
-    both = "with the input of the knot before (hold='previous'), with u and v in frame world"
-    assert f"{both} they hold to" in " ".join(str(given).split())
-    motion = run.trajectory()
-    late = replace(motion, t=1e3 * motion.t)
-    assert "with t in milliseconds they hold to" in " ".join(str(late).split())
-    bounded = fflin.load("canadarm2", lock=["joint_4", "joint_5", "joint_6", "joint_7"])
-    turned = fflin.simulate(
-        *(bounded, lambda t, q, v: 20.0 * np.cos(np.arange(9))),
-        **{"duration": 2.0, "dt": 0.01, "every": 10, "frame": "local"},
-    ).trajectory()
-    assert not bounded.unbounded
-    q, v = turned.q.copy(), turned.v.copy()
-    q[:, 7:], v[:, 6:] = np.degrees(q[:, 7:]), np.degrees(v[:, 6:])
-    degrees = replace(turned, q=q, v=v)
-    assert "with joints in degrees they hold to" in " ".join(str(degrees).split())
-    # What would not mend it is not advised.
-    wild = replace(motion, u=10.0 * motion.u)
-    assert "give those of one motion" in " ".join(str(wild).split())
-
-
 def test_rows_that_miss_the_samples_are_told():
     robot = fflin.load("cubesat")
     options = {"duration": 2.0, "dt": 0.01, "sample": 0.1}
     run = fflin.simulate(robot, lambda t, q, v: np.zeros(6), every=7, **options)
-    assert "rows every 7 steps miss samples every 10" in run.notes[0]
+    assert says(run.notes[0], "7 steps", "10")
     for every in (1, 2, 5, 10, 20):
         assert not fflin.simulate(robot, lambda t, q, v: np.zeros(6), every=every, **options).notes
 

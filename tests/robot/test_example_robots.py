@@ -5,16 +5,16 @@ import pytest
 
 import fflin
 from fflin.robot.catalog import find_robot
-from tests.support.robots import FRAMES, random_point
+from tests.support.robots import FRAMES, mostly, random_point
 
 # What does not give a model at neutral, and why.
 REFUSED = {
-    "bravo7_gripper": "'bravo_finger1_joint', joint 'bravo_finger2_joint' can move",
-    "falcon_bravo7_gripper": "'bravo_finger1_joint', joint 'bravo_finger2_joint' can move",
-    "bluevolta_bravo7_gripper": "'bravo_finger1_joint', joint 'bravo_finger2_joint' can move",
-    "romeo": "joint 'LHand', joint 'RHand' can move without",
-    "icub": "'neck_roll', joint 'neck_yaw' can move together without moving mass",
-    "alex_psyonic_hands": "'Left_index_q2' mimics a joint that does not exist",
+    "bravo7_gripper": "'bravo_finger1_joint'.*'bravo_finger2_joint'",
+    "falcon_bravo7_gripper": "'bravo_finger1_joint'.*'bravo_finger2_joint'",
+    "bluevolta_bravo7_gripper": "'bravo_finger1_joint'.*'bravo_finger2_joint'",
+    "romeo": "'LHand'.*'RHand'",
+    "icub": "'neck_roll'.*'neck_yaw'",
+    "alex_psyonic_hands": "'Left_index_q2'",
 }
 NAMES = [n for n in fflin.list_robots() if find_robot(n).origin == "example-robot-data"]
 
@@ -23,11 +23,11 @@ def test_names_are_those_of_the_package():
     from example_robot_data.robots_loader import ROBOTS
 
     assert set(ROBOTS) - set(NAMES) == {"cassie"}  # SDF only
-    with pytest.raises(fflin.UrdfError, match="SDF only"):
+    with pytest.raises(fflin.UrdfError, match="SDF"):
         fflin.load("cassie")
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", mostly(NAMES, *REFUSED, "panda", "solo12", "tiago_no_hand"))
 def test_check_holds(name):
     if name in REFUSED:
         with pytest.raises(fflin.FflinError, match=REFUSED[name]):

@@ -115,58 +115,54 @@ def test_thrusters_of_cubesat_push_and_turn_every_way():
 
 
 CASES = {
-    "": "inputs.toml: holds no inputs; write [[input]]",
-    "# nothing": "inputs.toml: holds no inputs",
-    "input = []": "inputs.toml: holds no inputs",
-    "\n[input]\ntype = 'base_force'": ":2: input is not an array of tables; write [[input]]",
-    "input = 3": ":1: input is not an array of tables",
-    "input = [3]": ":1: input is not an array of tables",
-    "#\n[[inputs]]\ntype = 'base_force'": ":2: no table named 'inputs'; did you mean input?",
-    "#\n#\ntype = 'base_force'": ":3: no table named 'type'; there are: input; write [[input]]",
-    "[[input]]\ntype = base_force": ":2: not TOML: Invalid value at column 8; mend it there",
-    "[[input]]\ntype = 'base_force": ":2: not TOML: ",
-    "[[input]]\ntype = 'a'\ntype = 'b'": ":3: not TOML: Cannot overwrite a value",
-    b"[[input]]\n\ntype = '\xe9'": ":3: is not UTF-8 text; save it as UTF-8",
-    "[[input]]": ":1: input 1: has no key 'type'; give one of base_torque, base_force,",
-    "[[input]]\nTYPE = 'thruster'": ":1: input 1: has no key 'type' ('TYPE' is not); give",
-    "[[input]]\n\ntype = 'truster'": ":3: no type of input named 'truster'; did you mean thruster?",
-    "[[input]]\ntype = ['thruster']": ":2: no type of input named",
-    "[[input]]\ntype = 'joint_torque'": ":1: input 1: a joint_torque needs the key 'joint'; add",
-    "[[input]]\ntype = 'joint_torque'\njoint = 1": ":3: input 1: joint is 1, expected a name",
-    "[[input]]\ntype = 'joint_torque'\njoint = ''": ":3: input 1: joint is '', expected a name",
-    "[[input]]\ntype = 'base_force'\nframe = 'b'": ":3: no key of a base_force named 'frame'",
-    "[[input]]\ntype = 'base_force'\n" * 2: ":3: input 2: BaseForce() stands in line 1 already",
-    THRUSTER: ":1: input 1: a thruster needs the key 'direction'; add it",
-    THRUSTER + "direcion = [1, 0, 0]": ":5: no key of a thruster named 'direcion'; did you mean d",
-    THRUSTER + "direction = [0, 0, 0.0]": ":5: input 1: thruster direction is zero; give where",
-    THRUSTER + "direction = [1, 0]": ":5: input 1: direction is [1, 0], expected three finite",
-    THRUSTER + "direction = [1, 0, nan]": ":5: input 1: direction is [1, 0, nan], expected three",
-    THRUSTER + "direction = [1, 0, true]": ":5: input 1: direction is [1, 0, True], expected",
-    THRUSTER + f"direction = [1, 0, 1{'0' * 400}]": ":5: input 1: direction is [1, 0, 1000",
-    THRUSTER + f"direction = [1, 0, 1{'0' * 9999}]": "inputs.toml: not TOML: ",
-    THRUSTER + "direction.x = 1": ":5: input 1: direction is {'x': 1}, expected three finite",
-    THRUSTER + "[input.direction]\nx = 1": ":5: input 1: direction is {'x': 1}, expected three",
-    THRUSTER + "direction = '1 0 0'": ":5: input 1: direction is '1 0 0', expected three",
-    (THRUSTER + "direction = [1, 0, 0]\nname = 'a'\n") * 2: ":12: input 2: the name 'a' stands in",
-    WHEEL.replace("1]", "0]"): ":3: input 1: wheel axis is zero; give what it turns about",
-    WHEEL + "inertia = 0": ":4: input 1: wheel inertia is 0 kg m^2, expected more than 0",
-    WHEEL + "inertia = -1.5": ":4: input 1: wheel inertia is -1.5 kg m^2, expected more than 0",
-    WHEEL + "inertia = '1'": ":4: input 1: inertia is '1', expected a finite number",
-    WHEEL + "inertia = true": ":4: input 1: inertia is True, expected a finite number",
-    WHEEL + "\nmomentum = inf": ":5: input 1: momentum is inf, expected a finite number",
-    WHEEL + "inertia = 1\nmomentum = 2": ":5: input 1: wheel momentum is given beside an inertia",
-    WHEEL + "inertias = 1": ":4: no key of a reaction_wheel named 'inertias'; did you mean inertia",
-    WHEEL.replace("axis = [0, 0, 1]\n", ""): ":1: input 1: a reaction_wheel needs the key 'axis'",
-    (WHEEL + "name = 'a'\n") * 2: ":8: input 2: the name 'a' stands in line 1 already",
+    "": "inputs.toml: [[input]]",
+    "# nothing": "inputs.toml: [[input]]",
+    "input = []": "inputs.toml: [[input]]",
+    "\n[input]\ntype = 'base_force'": ":2: [[input]]",
+    "input = 3": ":1: [[input]]",
+    "input = [3]": ":1: [[input]]",
+    "#\n[[inputs]]\ntype = 'base_force'": ":2: 'inputs'",
+    "#\n#\ntype = 'base_force'": ":3: 'type'",
+    "[[input]]\ntype = base_force": ":2: column 8",
+    "[[input]]\ntype = 'base_force": ":2: TOML",
+    "[[input]]\ntype = 'a'\ntype = 'b'": ":3: TOML",
+    b"[[input]]\n\ntype = '\xe9'": ":3: UTF-8",
+    "[[input]]": ":1: 'type'",
+    "[[input]]\nTYPE = 'thruster'": ":1: 'TYPE'",
+    "[[input]]\n\ntype = 'truster'": ":3: 'truster'",
+    "[[input]]\ntype = ['thruster']": ":2: type",
+    "[[input]]\ntype = 'joint_torque'": ":1: 'joint'",
+    "[[input]]\ntype = 'joint_torque'\njoint = 1": ":3: joint",
+    "[[input]]\ntype = 'joint_torque'\njoint = ''": ":3: ''",
+    "[[input]]\ntype = 'base_force'\nframe = 'b'": ":3: 'frame'",
+    "[[input]]\ntype = 'base_force'\n" * 2: ":3: BaseForce()",
+    THRUSTER: ":1: 'direction'",
+    THRUSTER + "direcion = [1, 0, 0]": ":5: 'direcion'",
+    THRUSTER + "direction = [0, 0, 0.0]": ":5: direction",
+    THRUSTER + "direction = [1, 0]": ":5: [1, 0]",
+    THRUSTER + "direction = [1, 0, nan]": ":5: nan",
+    THRUSTER + "direction = [1, 0, true]": ":5: True",
+    THRUSTER + f"direction = [1, 0, 1{'0' * 400}]": ":5: 1000",
+    THRUSTER + f"direction = [1, 0, 1{'0' * 9999}]": "inputs.toml: TOML",
+    THRUSTER + "direction.x = 1": ":5: {'x': 1}",
+    THRUSTER + "[input.direction]\nx = 1": ":5: {'x': 1}",
+    THRUSTER + "direction = '1 0 0'": ":5: '1 0 0'",
+    (THRUSTER + "direction = [1, 0, 0]\nname = 'a'\n") * 2: ":12: 'a'",
+    WHEEL.replace("1]", "0]"): ":3: axis",
+    WHEEL + "inertia = 0": ":4: inertia",
+    WHEEL + "inertia = -1.5": ":4: -1.5",
+    WHEEL + "inertia = '1'": ":4: '1'",
+    WHEEL + "inertia = true": ":4: True",
+    WHEEL + "\nmomentum = inf": ":5: inf",
+    WHEEL + "inertia = 1\nmomentum = 2": ":5: momentum",
+    WHEEL + "inertias = 1": ":4: 'inertias'",
+    WHEEL.replace("axis = [0, 0, 1]\n", ""): ":1: 'axis'",
+    (WHEEL + "name = 'a'\n") * 2: ":8: 'a'",
     # What looks like keys and tables in texts and comments is none.
-    "[[input]]\ntype = 'base_force'\nnote = '''\n[[input]]\nodd = 1\n'''": (
-        ":3: no key of a base_force named 'note'"
-    ),
+    "[[input]]\ntype = 'base_force'\nnote = '''\n[[input]]\nodd = 1\n'''": (":3: 'note'"),
     "[[input]]\ntype = 'base_force'\n[[input]]\ntype = 'joint_torque'\n"
-    'joint = """\n[[input]]\nodd = 1"""  # \'\'\'\n# """\n\n odd = 1': (
-        ":10: no key of a joint_torque named 'odd'; there are: type, joint"
-    ),
-    "\ninput = [{type = 'base_force'},\n  {type = 'odd'}]": ":2: no type of input named 'odd'",
+    'joint = """\n[[input]]\nodd = 1"""  # \'\'\'\n# """\n\n odd = 1': (":10: 'odd'"),
+    "\ninput = [{type = 'base_force'},\n  {type = 'odd'}]": ":2: 'odd'",
 }
 
 
@@ -176,22 +172,24 @@ def test_every_mistake_has_its_line(written, content):
     with pytest.raises(fflin.FflinError) as caught:
         fflin.load_inputs(path)
     text = str(caught.value)
-    assert text.startswith(str(path)) and CASES[content] in text and "\n" not in text
+    line, _, keyword = CASES[content].partition(" ")
+    assert text.startswith(str(path)) and "\n" not in text
+    assert line in text and keyword in text
 
 
 def test_files_that_are_none(tmp_path, written):
     for path, words in (
-        (tmp_path / "none.toml", "cannot be read: No such file"),
-        (tmp_path, "is a folder; give the path of a TOML file"),
-        (written(b"#" * 2**18), "is larger than 128 KiB, too large for a TOML file"),
+        (tmp_path / "none.toml", "No such file"),
+        (tmp_path, "folder"),
+        (written(b"#" * 2**18), "128 KiB"),
     ):
         with pytest.raises(fflin.FileError, match=re.escape(words)):
             fflin.load_inputs(path)
     os.mkfifo(tmp_path / "pipe.toml")
-    with pytest.raises(fflin.FileError, match="not a regular file"):
+    with pytest.raises(fflin.FileError, match="regular file"):
         fflin.load_inputs(tmp_path / "pipe.toml")
     for path in (3, None, b"a.toml", "a\0b"):
-        with pytest.raises(fflin.InputError, match="is not the path of a file of inputs"):
+        with pytest.raises(fflin.InputError, match="path"):
             fflin.load_inputs(path)
 
 

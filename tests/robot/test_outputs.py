@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from tests.support.robots import FRAMES, random_point, random_pose
+from tests.support.robots import FRAMES, mostly, random_point, random_pose
 
 
 def watched(robot, frame):
@@ -40,9 +40,9 @@ def watched(robot, frame):
 @pytest.mark.parametrize(
     ("name", "link"),
     [
-        ("servicer_7dof", "tool"),
+        pytest.param("servicer_7dof", "tool", marks=pytest.mark.exhaustive),
         ("ets_vii", "link_4"),
-        ("dual_arm", "tool_left"),
+        pytest.param("dual_arm", "tool_left", marks=pytest.mark.exhaustive),
         ("panda", "panda_leftfinger"),
     ],
 )
@@ -59,15 +59,16 @@ def test_check_holds_with_every_output(name, link, frame, turned):
     assert found.ok, found
 
 
+@pytest.mark.parametrize("first", mostly(range(6), 0))
 @pytest.mark.parametrize("matrix", ["C", "D", "y0"])
-def test_planted_error_is_found_in_every_row(matrix):
+def test_planted_error_is_found_in_every_row(matrix, first):
     bare = fflin.load("planar_detumble")
     robot = watched(bare, "hand")
     q, v, _ = random_point(bare, np.random.default_rng(2))
     lin = fflin.linearize(robot, q, v, np.ones(7))
     rows = np.flatnonzero(np.abs(lin.D).max(axis=1)) if matrix == "D" else range(len(lin.y0))
     assert len(rows) >= 3
-    for row in rows:
+    for row in rows[first::6]:
         wrong = getattr(lin, matrix).copy()
         if matrix == "y0":
             wrong[row] += 1e-5 * max(1.0, np.abs(lin.y0).max())
@@ -121,17 +122,17 @@ def test_sampled_model_keeps_its_outputs(tmp_path):
     lin.save(tmp_path / "m.npz")
     loaded = fflin.LinearModel.load(tmp_path / "m.npz")
     assert fflin.check(robot, loaded).ok
-    with pytest.raises(fflin.InputError, match=r"without the outputs base\.gyroscope\.x, "):
+    with pytest.raises(fflin.InputError, match=r"base\.gyroscope\.x"):
         fflin.check(bare, loaded)
 
 
 def test_bad_outputs_are_told():
     robot = fflin.load("servicer_7dof")
     for words, outputs in {
-        "no frame named 'tol'; did you mean tool": [fflin.FramePose("tol")],
-        "is asked for twice": [fflin.CenterOfMass(), fflin.CenterOfMass()],
-        "at least one output": [],
-        "is not an output": ["tool"],
+        "'tol'": [fflin.FramePose("tol")],
+        "twice": [fflin.CenterOfMass(), fflin.CenterOfMass()],
+        "output": [],
+        "'tool'": ["tool"],
     }.items():
         with pytest.raises(fflin.FflinError, match=words):
             fflin.linearize(robot.replace(outputs=outputs))
@@ -147,5 +148,5 @@ def test_pose_of_the_base_link_is_the_base_pose():
 
 
 def test_both_frames_of_an_output_must_be_there(robots):
-    with pytest.raises(fflin.UnknownNameError, match="no frame named 'nope'"):
+    with pytest.raises(fflin.UnknownNameError, match="'nope'"):
         robots["servicer_7dof"].replace(outputs=[fflin.RelativePose("tool", "nope")])

@@ -22,6 +22,8 @@ pytest.importorskip("numba")
 from fflin.kernel import tracking
 from fflin.kernel.loop import advance
 
+pytestmark = pytest.mark.compiled
+
 WHEEL = fflin.ReactionWheel((0, 0, 1), name="spin", inertia=0.02, max_speed=300.0, max=0.5)
 STORING = fflin.ReactionWheel((1, 2, 2), name="storing", momentum=3.0)
 
@@ -260,12 +262,12 @@ def test_what_cannot_be_compiled_says_why(robots):
         with pytest.raises(fflin.InputError, match=words):
             fflin.simulate(robot, **options, **more)
         assert fflin.simulate(robot, **(options | {"engine": None}), **more).engine == "python"
-    with pytest.raises(fflin.UnknownNameError, match="did you mean compiled"):
+    with pytest.raises(fflin.UnknownNameError, match="compiled"):
         fflin.simulate(robot, duration=0.1, engine="compile")
     monkeypatched = pytest.MonkeyPatch()
     with monkeypatched.context() as patch:
         patch.setattr(compiled, "numba_is_there", lambda: False)
-        with pytest.raises(fflin.InputError, match="numba is not installed"):
+        with pytest.raises(fflin.InputError, match="numba"):
             fflin.simulate(robot, **options)
 
 
@@ -351,4 +353,4 @@ def test_a_command_that_is_no_number_is_told(robots):
             fflin.simulate(robot, policy, **options, engine=engine)
         said.append(str(caught.value))
     assert said[0] == said[1]
-    assert "gave nan for tau_b.x" in said[0]
+    assert "tau_b.x" in said[0]

@@ -13,6 +13,8 @@ from tests.support.robots import BUNDLED
 
 pytest.importorskip("numba")
 
+pytestmark = pytest.mark.compiled
+
 
 def apart(robot, policy, **options):
     """Run both loops; return the compiled motion and how far its arrays are apart from 1 on."""

@@ -8,6 +8,7 @@ import pinocchio as pin
 import pytest
 
 import fflin
+from fflin.simulation.conservation import Conserved
 from fflin.simulation.report import motion_report
 from tests.simulation.test_simulate import displaced, free_body, regulated, tumbling
 from tests.support.robots import random_tree
@@ -177,6 +178,54 @@ def test_events_and_a_regulator_see_the_robot_on_its_line():
     assert motion.stopped == "fence at t = 0.31 s"
     np.testing.assert_array_equal(motion.q[1:], seen)
     assert motion.com_drift.max() < 1e-14
+
+
+def test_the_drift_of_a_balanced_spin_is_rounding():
+    """About the centre of mass the momenta of base and joints are rounding, which is no scale."""
+    model = free_body((10.0, 20.0, 15.0)).model.copy()
+    for name, hinge, center in (("left", 0.6, 0.7), ("right", -0.4, -0.9)):
+        place = pin.SE3(np.eye(3), np.array([hinge, 0.0, 0.0]))
+        panel = model.addJoint(1, pin.JointModelRX(), place, name)
+        inertia = pin.Inertia(7.0, np.array([center, 0.0, 0.0]), np.diag([1.0, 2.0, 1.5]))
+        model.appendBodyToJoint(panel, inertia, pin.SE3.Identity())
+    motion = fflin.simulate(
+        fflin.from_model(model), v0=[0, 0, 0, 0.3, 0.2, 0.1, 0, 0], duration=5.0, dt=0.05
+    )
+    assert 0.0 < np.abs(motion.momentum[:, 3:]).max() < 1e-14
+    assert motion.momentum_drift.max() < 1e-14
+
+
+def test_a_motion_at_rest_has_no_drift():
+    motion = fflin.simulate(free_body((20.0, 30.0, 40.0)), duration=0.1)
+    np.testing.assert_array_equal(motion.momentum_drift, 0.0)
+
+
+@pytest.mark.parametrize("part", [slice(0, 3), slice(3, 6)])
+def test_what_is_lost_is_shown_relative_to_mass_speed_and_extent(part, monkeypatch):
+    """Dynamics that hear of a wrench of which the impulse is not told lose all that it gives."""
+    robot = fflin.load("canadarm2")
+    q0, v0 = tumbling(robot, size=0.1)
+    push = np.zeros(robot.nv)
+    push[part] = 5.0, -3.0, 2.0
+    options = {"q0": q0, "v0": v0, "duration": 1.0, "dt": 0.02, "project": False}
+    monkeypatch.setattr(Conserved, "wrench", lambda *_: np.zeros(6))
+    motion = fflin.simulate(robot, disturbance=lambda t, q, v: push, **options)
+    data = robot.create_data()
+    speed, extent, about = [], [], []
+    for q, v, p in zip(motion.q, motion.v, motion.momentum, strict=True):
+        pin.ccrba(robot.model, data, q, v)
+        kinetic = pin.computeKineticEnergy(robot.model, data, q, v)
+        speed.append(math.sqrt(2.0 * kinetic / robot.mass))
+        c = data.com[0] - q0[:3]
+        # The polar moment of inertia is half the trace, of the centre of mass moved by Steiner.
+        extent.append(math.sqrt(np.trace(data.Ig.inertia) / 2.0 / robot.mass + c @ c))
+        about.append(p[:3] + np.cross(c, p[3:]))
+    p, h = motion.momentum[:, 3:], np.array(about)
+    momenta = robot.mass * np.array(speed)
+    linear = np.linalg.norm(p - p[0], axis=1) / momenta.max()
+    angular = np.linalg.norm(h - h[0], axis=1) / (momenta * extent).max()
+    np.testing.assert_allclose(motion.momentum_drift, np.maximum(linear, angular), atol=1e-13)
+    assert motion.momentum_drift[-1] > 1e-4
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".mat", ".json"])

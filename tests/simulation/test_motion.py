@@ -50,8 +50,8 @@ def test_a_free_robot_has_no_target():
 @pytest.mark.parametrize(
     ("target", "said"),
     [
-        (np.zeros(3), "target has shape"),
-        (np.full(30, np.nan), "target has"),
+        (np.zeros(3), r"\(3,\)"),
+        (np.full(30, np.nan), "target"),
         ("start", "target"),
         ({"q": 1}, "target"),
     ],
@@ -65,7 +65,7 @@ def test_a_target_that_is_none_is_refused_in_a_line(target, said):
 
 def test_a_model_of_another_robot_is_no_target():
     lin = fflin.linearize(fflin.load("planar_detumble"))
-    with pytest.raises(fflin.InputError, match="target is a model of 'planar_detumble'"):
+    with pytest.raises(fflin.InputError, match="'planar_detumble'"):
         fflin.simulate(fflin.load("ets_vii"), duration=0.1, target=lin)
 
 

@@ -121,20 +121,19 @@ def test_files_and_words(tmp_path):
     assert fflin.simulate(robot.replace(orbit=None), duration=0.1).orbit is None
 
 
+@pytest.mark.compiled
 def test_refused():
     robot, q, v = moving("cubesat")
-    with pytest.raises(
-        fflin.InputError, match=r"compiled' cannot run this: events, .* and the field of an orbit"
-    ):
+    with pytest.raises(fflin.InputError, match=r"compiled.*events"):
         fflin.simulate(robot, q0=q, v0=v, duration=0.1, engine="compiled")
-    with pytest.raises(fflin.InputError, match="take lvlh or hill"):
+    with pytest.raises(fflin.InputError, match="lvlh or hill"):
         fflin.simulate(robot, q0=q, v0=v, duration=0.1, frame="world")
 
 
 def test_a_target_in_the_other_frame_is_no_target():
     robot = fflin.load("cubesat", orbit=8e5)
     target = fflin.linearize(robot, frame="hill")
-    with pytest.raises(fflin.InputError, match="frame 'hill', expected 'lvlh'"):
+    with pytest.raises(fflin.InputError, match=r"'hill'.*'lvlh'"):
         fflin.simulate(robot, target=target, duration=0.1)
     assert fflin.simulate(robot, target=target, duration=0.1, frame="hill").frame == "hill"
 

@@ -277,6 +277,7 @@ def test_attitude_through_180_degrees_has_a_gap():
     assert np.nanmax(np.abs(np.diff(z))) < 0.1
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("suffix", [".png", ".pdf", ".svg"])
 def test_figures_are_saved_whole(loop, tmp_path, suffix):
     _, _, motion = loop
@@ -289,11 +290,11 @@ def test_figures_are_saved_whole(loop, tmp_path, suffix):
 
 def test_bad_figures_are_refused(loop, tmp_path, monkeypatch):
     _, _, motion = loop
-    with pytest.raises(fflin.FileError, match=r"ends in '\.bmp'"):
+    with pytest.raises(fflin.FileError, match=r"'\.bmp'"):
         motion.plot(tmp_path / "loop.bmp")
-    with pytest.raises(fflin.InputError, match="expected a Motion"):
+    with pytest.raises(fflin.InputError, match="Motion"):
         fflin.plot_motion(3)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(fflin.MissingPackageError, match=r"pip install 'fflin\[plot\]'"):
+    with pytest.raises(fflin.MissingPackageError, match=r"'fflin\[plot\]'"):
         motion.plot()
     assert not list(tmp_path.iterdir())

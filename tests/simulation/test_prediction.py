@@ -46,7 +46,7 @@ def test_a_feedback_of_a_part_is_foreseen_by_the_whole_model():
     moved = np.abs(run.x - x0).max(axis=0)
     assert np.abs(run.linear - run.x).max() < 1e-7 < 1e-5 < moved[:3].max()
     assert fflin.simulate(robot, policy, x0=x0, duration=0.1).linear is None
-    with pytest.raises(fflin.InputError, match="is reduced: give linear= the whole model"):
+    with pytest.raises(fflin.InputError, match="linear="):
         fflin.simulate(robot, policy, x0=x0, duration=0.1, linear=True)
 
 
@@ -86,7 +86,7 @@ def test_a_model_in_another_reference_foresees_nothing():
     moved[0] += 1.0
     other = fflin.linearize(robot, moved)
     policy = fflin.StateFeedback(lin, gain.K)
-    with pytest.raises(fflin.InputError, match="frame and reference of the run"):
+    with pytest.raises(fflin.InputError, match="frame"):
         fflin.simulate(robot, policy, duration=0.1, linear=other)
 
 

@@ -55,9 +55,9 @@ def test_states_alone_and_inputs_alone(motion):
 
 
 def test_what_is_not_there_is_told(motion):
-    with pytest.raises(fflin.UnknownNameError, match="no state or input named 'thrust'"):
+    with pytest.raises(fflin.UnknownNameError, match="'thrust'"):
         motion.plot(show=["thrust"])
-    with pytest.raises(fflin.InputError, match="show is 3, expected a list of names"):
+    with pytest.raises(fflin.InputError, match="show"):
         motion.plot(show=3)
 
 

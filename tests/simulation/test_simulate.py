@@ -21,6 +21,7 @@ def tumbling(robot, seed=0, size=0.4):
     return q, size * state.spread(rng.normal(size=6 + robot.n))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("project", "accuracy"), [(False, 1e-12), (True, 1e-11)])
 def test_torque_free_axisymmetric_body_turns_as_the_closed_form_says(project, accuracy):
     # Andrle and Crassidis 2012: J = (a, a, c). With the momentum H in inertial axes
@@ -172,6 +173,7 @@ def test_momentum_follows_the_impulse_of_wrenches_thrusters_wheels_and_gravity(f
     assert state.names == fine.state_names
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", ["ets_vii", "servicer_7dof"])
 def test_regulated_loop_converges_and_the_linear_model_foresees_it(name):
     robot, lin, gain = regulated(name)
@@ -279,11 +281,12 @@ def test_allocation_gives_the_wrench_with_thrusts_that_push():
     assert (held.u[0:-1:2] == held.u[1::2]).all() and held.u[0].any()
     # The loop is the design's, whose fastest pole the step must follow.
     stiff = fflin.acceleration_lqr(lin, 1e4, 1e4, 1.0)
-    with pytest.raises(fflin.InputError, match="too large for a loop whose fastest pole"):
+    with pytest.raises(fflin.InputError, match="fastest pole"):
         hasty = fflin.Allocation(fflin.StateFeedback(lin, stiff.K), design)
         fflin.simulate(robot, hasty, q0=turned, duration=5.0, dt=1.0)
 
 
+@pytest.mark.exhaustive
 def test_feedback_along_a_trajectory_brings_the_robot_back_to_it():
     robot = fflin.load("ets_vii")
     q0, v0 = tumbling(robot, size=0.05)
@@ -389,18 +392,19 @@ def test_csv_has_names_and_rows(tmp_path):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"duration": -1.0}, "duration is -1 s"),
-        ({"duration": 1.0, "dt": 0.0}, "dt is 0 s"),
+        ({"duration": -1.0}, "duration"),
+        ({"duration": 1.0, "dt": 0.0}, "dt"),
         ({"duration": 1.0, "method": "euler"}, "method"),
-        ({"duration": 1.0, "dt": 0.1, "sample": 0.15}, "multiple of the step dt"),
-        ({"duration": 1.0, "delay": -0.1}, "delay is -0.1 s"),
+        ({"duration": 1.0, "dt": 0.1, "sample": 0.15}, "dt"),
+        ({"duration": 1.0, "delay": -0.1}, "delay"),
+        ({"duration": 1.0, "delay": 1e9}, "duration"),
         ({"duration": 1.0, "limits": {"tau_x": 1.0}}, "tau_x"),
-        ({"duration": 1.0, "limits": -2.0}, "limit of 'tau_b'"),
+        ({"duration": 1.0, "limits": -2.0}, "'tau_b'"),
         ({"duration": 1.0, "limits": {"tau_b": (1.0, -1.0)}}, "least, largest"),
         ({"duration": 1.0, "x0": np.zeros(5)}, "x"),
         ({"duration": 1.0, "x0": np.zeros(24), "v0": np.zeros(12)}, "either"),
-        ({"duration": 1.0, "every": 0}, "every is 0"),
-        ({"duration": 1.0, "events": [3]}, "no function"),
+        ({"duration": 1.0, "every": 0}, "every"),
+        ({"duration": 1.0, "events": [3]}, "function"),
         ({"duration": 1.0, "disturbance": lambda t, q, v: [1.0]}, "disturbance(t, q, v)"),
         ({"duration": 1.0, "frame": "base"}, "frame"),
     ],
@@ -416,15 +420,15 @@ def test_bad_input_is_one_clear_line(options, said):
 def test_policies_that_do_not_fit_are_refused():
     robot, lin, gain = regulated("ets_vii")
     other = fflin.load("canadarm2")
-    with pytest.raises(fflin.InputError, match="not of 'canadarm2'"):
+    with pytest.raises(fflin.InputError, match="'canadarm2'"):
         fflin.simulate(other, fflin.StateFeedback(lin, gain.K), duration=1.0)
-    with pytest.raises(fflin.InputError, match="K has shape"):
+    with pytest.raises(fflin.InputError, match=r"\bK\b.*shape"):
         fflin.StateFeedback(lin, gain.K.T)
-    with pytest.raises(fflin.InputError, match="policy is a int"):
+    with pytest.raises(fflin.InputError, match="policy"):
         fflin.simulate(robot, 3, duration=1.0)
-    with pytest.raises(fflin.InputError, match=r"policy\(t, q, v\) gave shape"):
+    with pytest.raises(fflin.InputError, match=r"\(3,\)"):
         fflin.simulate(robot, lambda t, q, v: np.zeros(3), duration=1.0)
-    with pytest.raises(fflin.InputError, match="too large for a loop"):
+    with pytest.raises(fflin.InputError, match="fastest pole"):
         fflin.simulate(robot, fflin.StateFeedback(lin, gain.K), duration=10.0, dt=2.0)
     moving = fflin.linearize(robot, moving=True)
     with pytest.raises(fflin.InputError, match="TrajectoryFeedback"):

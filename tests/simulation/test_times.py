@@ -10,6 +10,7 @@ from fflin.control.tracking import largest_rate
 from fflin.simulation import times
 from fflin.simulation.report import motion_report
 from tests.support.commands import run
+from tests.support.messages import says
 from tests.support.motions import displaced, regulated
 
 
@@ -45,9 +46,7 @@ def test_a_thinned_run_is_the_run_at_some_of_its_rows(monkeypatch):
     assert len(full.t) == 204 and not full.notes
     for key in ("t", "x", "u", "linear", "energy"):
         np.testing.assert_array_equal(getattr(thin, key), getattr(full, key)[kept])
-    assert "one in 21 of 203 steps is recorded; every=1 (--every 1) records all" in motion_report(
-        thin
-    )
+    assert says(motion_report(thin), "21 of 203", "every=1 (--every 1)")
     short = fflin.simulate(robot, policy, **options | {"duration": 1.0})
     assert len(short.t) == 101 and not short.notes
 
@@ -69,9 +68,8 @@ def test_the_pole_that_makes_a_run_slow_is_named():
         motion = fflin.simulate(robot, policy, duration=120.0, events=[at_once])
     fastest = np.abs(np.linalg.eigvals(lin.A - lin.B @ K)).max()
     (line,) = [str(each.message) for each in said]
-    assert line == (
-        f"the loop's fastest pole at {fastest:.3g} 1/s asks for steps of 0.000977 s, 122,880 "
-        "in all; give dt= or sample=, or a slower gain: qdot_m.joint_5 moves most there"
+    assert says(
+        line, f"{fastest:.3g} 1/s", "0.000977 s", "122,880", "dt=", "sample=", "qdot_m.joint_5"
     )
     assert motion.notes == (
         "one in 13 of 122,880 steps is recorded; every=1 (--every 1) records all",
@@ -99,7 +97,7 @@ def test_what_a_loop_passes_for_a_twentieth_of_the_time_makes_no_run_slow(t, rat
 
 def test_hours_that_nobody_asked_for_are_refused():
     robot = fflin.load("planar_detumble")
-    with pytest.raises(fflin.InputError, match=r"2e\+07 steps .* take a larger dt or `every`"):
+    with pytest.raises(fflin.InputError, match=r"2e\+07 .*every"):
         fflin.simulate(robot, duration=2e5)
     times.times_of(None, 2e5, 0.01, 1000, None, 0.0).require_room(55, chosen=True)
 

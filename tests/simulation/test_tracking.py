@@ -8,6 +8,7 @@ import fflin
 from benchmarks.cases.trajectory import beside as beside_knots
 from benchmarks.cases.trajectory import flown
 from fflin.dynamics.state_rows import moved_by, moving_error, moving_errors
+from tests.support.messages import says
 from tests.support.motions import beside, swung
 
 
@@ -35,6 +36,7 @@ def test_the_errors_of_rows_are_those_of_points_and_lead_back(frame):
     np.testing.assert_allclose(moved_by(frame, x[:-1], e), x[1:], atol=1e-13)
 
 
+@pytest.mark.exhaustive
 def test_a_schedule_runs_as_the_feedback_along_its_trajectory(case):
     robot, schedule, traj = case
     q0, v0 = beside(robot, traj, 0.02)
@@ -60,7 +62,7 @@ def test_a_schedule_runs_as_the_feedback_along_its_trajectory(case):
     np.testing.assert_allclose(
         run.attitude_error, np.degrees(np.linalg.norm(apart, axis=1)), atol=1e-9
     )
-    assert str(run).startswith("beside its trajectory at the end: attitude")
+    assert says(str(run), "attitude")
 
 
 def test_without_a_start_it_begins_on_its_trajectory(case):
@@ -94,6 +96,7 @@ def test_what_is_foreseen_is_sampled_late_and_limited_as_the_run_is(case, option
     assert apart < 0.05 * np.abs(plain.x - run.x).max()
 
 
+@pytest.mark.exhaustive
 def test_after_the_end_the_last_configuration_is_held_at_rest():
     robot = fflin.load("planar_detumble")
     traj = swung(robot, size=0.3, spin=0.02).trajectory()
@@ -124,6 +127,7 @@ def test_a_sampled_schedule_is_asked_at_its_samples():
     np.testing.assert_allclose(run.u[50], u - schedule.gain(run.t[50]) @ e, atol=1e-12)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("sample", [None, 0.2])
 def test_what_a_trajectory_holds_is_foreseen_to_end_at_its_knots(sample):
     robot = fflin.load("ets_vii")
@@ -133,6 +137,7 @@ def test_what_a_trajectory_holds_is_foreseen_to_end_at_its_knots(sample):
     assert np.abs(run.linear - run.x).max() < 1e-6
 
 
+@pytest.mark.exhaustive
 def test_a_clock_that_does_not_begin_at_zero_is_counted_from_the_first_knot(case):
     robot, schedule, traj = case
     late = fflin.Trajectory(robot, traj.t + 100.0, traj.q, traj.v, traj.u, hold=traj.hold)
@@ -142,6 +147,7 @@ def test_a_clock_that_does_not_begin_at_zero_is_counted_from_the_first_knot(case
     np.testing.assert_allclose(runs[1].x, runs[0].x, atol=1e-9)
 
 
+@pytest.mark.exhaustive
 def test_thrusters_take_what_a_schedule_asks_of_the_base():
     design = fflin.load("cubesat", inputs=[fflin.BaseTorque(), fflin.BaseForce()])
     traj = swung(design, size=1e-4, spin=0.02).trajectory()
@@ -163,15 +169,15 @@ def test_thrusters_take_what_a_schedule_asks_of_the_base():
 
 def test_limits_that_the_trajectory_itself_breaks_are_told(case):
     robot, schedule, _ = case
-    with pytest.warns(fflin.FflinWarning, match=r"on its trajectory: .* is asked for 0\.\d+ N"):
+    with pytest.warns(fflin.FflinWarning, match=r"0\.\d+ N"):
         fflin.simulate(robot, schedule, duration=0.1, limits=0.05)
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"frame": "hybrid"}, "frame is 'hybrid', expected 'local' along a trajectory"),
-        ({"linear": "lin"}, "linear along a trajectory, not about one point"),
+        ({"frame": "hybrid"}, "'hybrid'"),
+        ({"linear": "lin"}, "trajectory"),
     ],
 )
 def test_what_does_not_go_along_a_trajectory_is_refused(case, options, said):
@@ -184,7 +190,7 @@ def test_what_does_not_go_along_a_trajectory_is_refused(case, options, said):
 
 def test_a_run_without_an_end_is_refused():
     robot = fflin.load("cubesat")
-    with pytest.raises(fflin.InputError, match="duration is missing"):
+    with pytest.raises(fflin.InputError, match="duration"):
         fflin.simulate(robot)
 
 
@@ -204,7 +210,7 @@ def test_where_nothing_holds_the_robot_a_run_ends_with_its_trajectory():
     schedule = fflin.tvlqr(along, 1.0, 1.0, 1.0)
     assert len(t) == len(fall.t)
     assert np.abs(fflin.simulate(robot, schedule).error).max() < 1e-6
-    with pytest.raises(fflin.InputError, match=r"after the trajectory's 0\.4 s nothing holds"):
+    with pytest.raises(fflin.InputError, match=r"0\.4 s"):
         fflin.simulate(robot, schedule, duration=1.0)
 
 
@@ -220,12 +226,13 @@ def test_a_motion_that_is_followed_comes_back_from_its_file(case, tmp_path):
         assert back.tracked
 
 
+@pytest.mark.exhaustive
 def test_a_loop_of_ten_seconds_comes_back_to_a_hundredth_of_a_degree():
     """Under the default weights, and inputs that are limited to a third of what they ask for."""
     traj = flown()
     robot, along = traj.robot, fflin.linearize_trajectory(traj.robot, traj)
     schedule = fflin.tvlqr(along)
-    assert "the base from 3 deg" in schedule.weights
+    assert says(schedule.weights, "3 deg")
     q0, v0 = beside_knots(traj)
     for limit, degrees in ((None, 0.01), (20.0, 0.1)):
         run = fflin.simulate(robot, schedule, q0=q0, v0=v0, limits=limit, linear=False)
@@ -235,6 +242,7 @@ def test_a_loop_of_ten_seconds_comes_back_to_a_hundredth_of_a_degree():
         assert largest == 20.0 if limit else largest > 60.0
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("sample", [None, 0.1])
 def test_after_the_end_the_regulator_about_rest_acts_whatever_the_weight_at_the_end(sample):
     robot = fflin.load("planar_detumble")
@@ -263,7 +271,7 @@ def test_the_last_step_ends_on_the_trajectory_whatever_its_time_is_rounded_to():
     assert not policy.reference(policy.duration + 1e-6)[1].any()
 
 
-@pytest.mark.parametrize("engine", ["python", "compiled"])
+@pytest.mark.parametrize("engine", ["python", pytest.param("compiled", marks=pytest.mark.compiled)])
 @pytest.mark.parametrize("how", ["schedule", "option"])
 def test_at_the_very_end_held_inputs_are_those_of_rest(engine, how):
     """The last input of a motion brakes: held on for a sample it kicks the robot out of rest."""
@@ -292,7 +300,7 @@ def test_at_the_very_end_held_inputs_are_those_of_rest(engine, how):
     assert np.abs(flown.linear - flown.x).max() < 1e-4
 
 
-@pytest.mark.parametrize("engine", ["python", "compiled"])
+@pytest.mark.parametrize("engine", ["python", pytest.param("compiled", marks=pytest.mark.compiled)])
 def test_inputs_that_jump_at_knots_are_followed_to_the_integrators_order(engine):
     robot = fflin.load("ets_vii")
     u = 0.5 * np.random.default_rng(6).normal(size=(5, 12))
@@ -364,5 +372,5 @@ def test_a_start_beside_a_trajectory_is_off_by_what_is_asked(case):
     expected[2], expected[6 : 6 + robot.n], expected[7] = np.sqrt(0.5), 0.1, 0.2
     expected[6 + robot.n + 1] = 0.3
     np.testing.assert_allclose(e, expected, atol=1e-12)
-    with pytest.raises(fflin.InputError, match="q_b and an angle"):
+    with pytest.raises(fflin.InputError, match="q_b"):
         policy.beside({"yaw": 1.0, "q_b": 0.1})

@@ -1,24 +1,50 @@
-"""The command line as a user runs it: in a process of its own."""
+"""The command line, in this process or, as a user runs it, in one of its own."""
 
+import contextlib
+import io
 import os
-import subprocess
 import sys
+import warnings
+from unittest import mock
 
-from tests.support.patience import PATIENCE
+from fflin.commands import cli
+from tests.support.messages import hear_lines
+from tests.support.patience import finished
 
 
 def run(*arguments, cwd=None, **environment):
-    """Run fflin; return exit code, stdout, and stderr without its warnings, a line each."""
-    done = subprocess.run(
+    """Call fflin's command line; return exit code, stdout, and stderr without its warnings.
+
+    In this process: the same code from the arguments to the exit code, without the half second
+    that an interpreter and its packages take to start.
+    """
+    out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in range(2))
+    with (
+        mock.patch.dict(os.environ, environment),
+        _inside(cwd),
+        warnings.catch_warnings(),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        warnings.resetwarnings()
+        try:
+            code = cli.main([*map(str, arguments)])
+        except SystemExit as ended:
+            code = ended.code or 0
+    said, complained = (each.buffer.getvalue().decode() for each in (out, err))
+    return code, said, without_warnings(hear_lines(complained))
+
+
+def run_in_process(*arguments, cwd=None, **environment):
+    """Run fflin in a process of its own; return the same as `run`."""
+    done = finished(
         [sys.executable, "-m", "fflin", *map(str, arguments)],
         capture_output=True,
         text=True,
         cwd=cwd,
         env={**os.environ, **environment},
-        timeout=PATIENCE,
-        check=False,
     )
-    return done.returncode, done.stdout, without_warnings(done.stderr)
+    return done.returncode, done.stdout, without_warnings(hear_lines(done.stderr))
 
 
 def without_warnings(err):
@@ -31,3 +57,14 @@ def refused(*arguments, cwd=None):
     assert code == 2 and not out
     assert err.startswith("fflin: error: ") and err.count("\n") == 1 and err.endswith("\n")
     return err
+
+
+@contextlib.contextmanager
+def _inside(folder):
+    """Work in a folder, and come back."""
+    before = os.getcwd()
+    os.chdir(folder or before)
+    try:
+        yield
+    finally:
+        os.chdir(before)

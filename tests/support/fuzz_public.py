@@ -110,6 +110,7 @@ def sound(folder):
         "lqr": {"lin": lin} | weights | {"N": None},
         "lqr_batch": {"batch": batch} | weights,
         "modes": {"lin": lin},
+        "effective_masses": {"lin": lin},
         "relative_equilibria": {"robot": robot.replace(orbit=7e5), "q": q, "frame": "hill"},
         "Momentum": {},
         "mpc": {

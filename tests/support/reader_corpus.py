@@ -118,7 +118,7 @@ for attribute, texts in {
 }.items():
     for text in texts:
         inside = AXIS + f'<limit {attribute}="{text}"/>'
-        warn(f"{attribute} of '{text}'", arm(inside=inside), ":4:", attribute, "'hinge'", "no lim")
+        warn(f"{attribute} of '{text}'", arm(inside=inside), ":4:", attribute, "'hinge'", "lim")
 accept(
     "infinite limits",
     arm(inside=AXIS + '<limit lower="-inf" upper="INF" effort="+inf" velocity="Infinity"/>'),
@@ -128,13 +128,13 @@ warn(
     arm(inside=AXIS + '<limit lower="1" upper="-1"/>'),
     ":4:",
     "'hinge'",
-    "more than upper",
+    "upper",
 )
 for title, text, words in (
     ("two entries", "1 2", "has 2 entries"),
     ("four entries", "1 2 3 4", "has 4 entries"),
-    ("commas", "1,2,3", "no commas"),
-    ("commas and spaces", "1, 2, 3", "no commas"),
+    ("commas", "1,2,3", "commas"),
+    ("commas and spaces", "1, 2, 3", "commas"),
     ("nan", "0 nan 0", "'nan'"),
     ("empty", "", "empty"),
     ("words", "left of it", "'left'"),
@@ -143,14 +143,14 @@ for title, text, words in (
     refuse(f"rpy: {title}", arm(inside=f'{AXIS}<origin rpy="{text}"/>'), ":4:", words, "rpy")
     refuse(f"axis: {title}", arm(inside=f'<axis xyz="{text}"/>'), ":4:", words, "<axis>")
 refuse("com of two entries", arm(child=inertial(origin='<origin xyz="0 0"/>')), ":3:", "'arm'")
-refuse("rpy beyond anything", arm(inside=f'{AXIS}<origin rpy="1e40 0 0"/>'), "beyond anything")
+refuse("rpy beyond anything", arm(inside=f'{AXIS}<origin rpy="1e40 0 0"/>'), "'hinge'")
 refuse("xyz of 1e29", arm(inside=f'{AXIS}<origin xyz="0 -1e29 0"/>'), ":4:", "'hinge'", "1e+07 m")
 refuse("xyz of 1e8", arm(inside=f'{AXIS}<origin xyz="1e8 0 0"/>'), ":4:", "'hinge'", "1e+08 m")
 warn(
     "xyz of 1e7",
     arm(inside=f'{AXIS}<origin xyz="1e7 0 0"/>'),
-    "moves an inertia of 1.0e+00 only",
-    "see whether joints are placed in metres",
+    "1.0e+00",
+    "metres",
 )
 refuse(
     "mimic offset of 1e29",
@@ -162,7 +162,7 @@ refuse(
     "1e+07 m",
 )
 refuse("com of 1e29", arm(child=inertial(origin='<origin xyz="1e29 0 0"/>')), ":3:", "'arm'", "m;")
-refuse("mass beyond anything", arm(child=inertial("1e40")), "beyond anything")
+refuse("mass beyond anything", arm(child=inertial("1e40")), "'arm'")
 accept("numbers in every form", arm(child=inertial("+1.", moments(".5", "-0", "0e5", "5E-1"))))
 accept("spaces around numbers", arm(inside='<axis xyz="  0\t0\n1 "/>', child=inertial(" 1 ")))
 
@@ -211,20 +211,16 @@ refuse(
 )
 refuse("two inertia", arm(child=inertial("1", INERTIA * 2)), "second <inertia>")
 refuse("two origins of an inertial", arm(child=inertial(origin="<origin/>" * 2)), "second <origin>")
-refuse(
-    "mass outside of inertial", arm(child=link("arm", '<mass value="1"/>')), "into an <inertial>"
-)
+refuse("mass outside of inertial", arm(child=link("arm", '<mass value="1"/>')), "<inertial>")
 refuse("inertia outside of inertial", arm(child=link("arm", INERTIA)), "<inertial>")
 refuse(
     "Inertial in capitals", arm(child=link("arm", INERTIAL.replace("inertial", "Inertial"))), "mean"
 )
-refuse(
-    "intertial", arm(child=link("arm", INERTIAL.replace("inertial", "intertial"))), "did you mean"
-)
-warn("unit of a mass", arm(child=inertial('1" unit="kg')), ":3:", "'unit'", "<mass>", "not in")
+refuse("intertial", arm(child=link("arm", INERTIAL.replace("inertial", "intertial"))), "<inertial>")
+warn("unit of a mass", arm(child=inertial('1" unit="kg')), ":3:", "'unit'", "<mass>")
 refuse("mass misspelt", arm(child=inertial('1" vaule="2')), ":3:", "'vaule'", "<mass>")
-warn("triangle inequality", arm(child=inertial("1", moments(izz=3))), "'arm'", "rigid body")
-warn("inertia without mass", arm(child=inertial("0")), "'arm'", "no mass")
+warn("triangle inequality", arm(child=inertial("1", moments(izz=3))), "'arm'", "inertia")
+warn("inertia without mass", arm(child=inertial("0")), "'arm'", "mass")
 warn(
     "tiny negative moment of a link that is welded to another",
     arm(child=inertial("1e-6", moments("2e-8", "6e-8", 0, "3e-8", 0, "4e-8")), kind="fixed"),
@@ -245,17 +241,17 @@ warn(
         link("a"), inertial("1", moments("-1e-20", 0, 0, 0, 0, 0)), joint("j", "a", "arm", "fixed")
     ),
     "'arm'",
-    "rigid body",
+    "inertia",
 )
 refuse(
     "a point mass on the axis",
     arm(child=inertial("1", moments(0, 0, 0, 0, 0, 0))),
     "'hinge'",
-    "without moving mass",
+    "mass",
 )
-refuse("massless leaf", arm(child=link("arm", "")), "'hinge'", "without moving mass")
+refuse("massless leaf", arm(child=link("arm", "")), "'hinge'", "mass")
 refuse("massless leaf with zeros", arm(child=inertial("0", moments(0, 0, 0, 0, 0, 0))), "'hinge'")
-refuse("massless robot", robot(link("base", "")), "the base", "without moving mass")
+refuse("massless robot", robot(link("base", "")), "the base", "mass")
 accept("massless root", robot(link("root", ""), link("base"), joint("j", "root", "base", "fixed")))
 accept(
     "massless link amid a chain",
@@ -271,23 +267,23 @@ accept("massless flange", arm(more=link("tool", "") + joint("weld", "arm", "tool
 
 # --- The document --------------------------------------------------------------------------------
 
-refuse("empty", b"", "is empty")
-refuse("blank", b" \n\t\n", "is empty")
-refuse("binary", bytes(range(256)) * 40, "not well-formed")
-refuse("zeros", bytes(10_000), "not well-formed")
-refuse("an ELF file", b"\x7fELF\x02\x01\x01" + bytes(500), "not well-formed")
-refuse("plain text", "A robot with an arm.", ":1:", "not well-formed")
-refuse("JSON", '{"robot": {}}', "not well-formed")
-refuse("cut off", arm()[:-30], "not well-formed")
-refuse("cut off in a tag", arm()[:60], "not well-formed")
+refuse("empty", b"", "empty")
+refuse("blank", b" \n\t\n", "empty")
+refuse("binary", bytes(range(256)) * 40, "well-formed")
+refuse("zeros", bytes(10_000), "well-formed")
+refuse("an ELF file", b"\x7fELF\x02\x01\x01" + bytes(500), "well-formed")
+refuse("plain text", "A robot with an arm.", ":1:", "well-formed")
+refuse("JSON", '{"robot": {}}', "well-formed")
+refuse("cut off", arm()[:-30], "well-formed")
+refuse("cut off in a tag", arm()[:60], "well-formed")
 refuse("end tags crossed", "<robot name='r'><link name='a'></robot></link>", "mismatched tag")
 refuse(
     "attribute twice", '<robot name="r"><link name="a" name="b"/></robot>', "duplicate attribute"
 )
-refuse("attribute unquoted", "<robot name=r><link name='a'/></robot>", ":1:", "not well-formed")
+refuse("attribute unquoted", "<robot name=r><link name='a'/></robot>", ":1:", "well-formed")
 refuse("two robots", arm() + arm(), ":7:", "one <robot>")
-refuse("text after the robot", arm() + "done", "nothing after it")
-refuse("robot in robot", robot(link("base"), robot(link("arm"))), ":3:", "inside <robot>")
+refuse("text after the robot", arm() + "done", "<robot>")
+refuse("robot in robot", robot(link("base"), robot(link("arm"))), ":3:", "<robot>")
 refuse("another root", "<model name='r'><link name='a'/></model>", "<model>", "<robot>")
 refuse("SDF", '<sdf version="1.9"><model name="r"><link name="a"/></model></sdf>', "<sdf>")
 refuse("MJCF", "<mujoco><worldbody/></mujoco>", "<mujoco>")
@@ -311,7 +307,7 @@ refuse("unknown encoding", '<?xml version="1.0" encoding="klingon"?>' + arm(), "
 refuse(
     "Latin-1 that is said to be UTF-8",
     arm(child=link("arm", INERTIAL), more="<!--\u00e4-->").encode("latin-1"),
-    "not well-formed",
+    "well-formed",
 )
 refuse("nested 200 deep", robot(link("base"), "<x>" * 200 + "</x>" * 200), "nested")
 refuse("nested 100,000 deep", "<robot>" + "<x>" * 100_000, "nested")
@@ -347,7 +343,7 @@ refuse(
 )
 refuse("link of empty name", robot(link("base"), link("")), ":3:", "empty 'name'")
 refuse("joint without a name", arm().replace('name="hinge"', ""), ":4:", "<joint>", "name")
-refuse("two links of one name", arm(more=link("arm")), ":5:", "second link named 'arm'", "line 3")
+refuse("two links of one name", arm(more=link("arm")), ":5:", "'arm'", "line 3")
 refuse("two joints of one name", arm(more=link("b") + joint("hinge", "arm", "b")), "second joint")
 refuse("joint named universe", arm().replace('"hinge"', '"universe"'), "'universe'", "rename")
 refuse(
@@ -371,9 +367,7 @@ accept("spaces in names", arm().replace('"hinge"', '" the hinge "'))
 refuse("no links", robot(), ":1:", "no <link>")
 refuse("no links but joints", robot(joint("j", "a", "b")), "no <link>")
 refuse("unknown parent", robot(link("arm"), joint("j", "bass", "arm")), ":3:", "'bass'")
-refuse(
-    "unknown child", robot(link("base"), link("arm"), joint("j", "base", "amr")), ":4:", "mean arm"
-)
+refuse("unknown child", robot(link("base"), link("arm"), joint("j", "base", "amr")), ":4:", "arm")
 refuse(
     "no parent",
     robot(link("a"), '<joint name="j" type="fixed"><child link="a"/></joint>'),
@@ -424,12 +418,10 @@ refuse("links in a wrapper", robot(link("base"), f"<arms>{link('arm')}</arms>"),
 refuse(
     "joint in a wrapper", robot(link("base"), f"<arms>{joint('j', 'base', 'arm')}</arms>"), "<arms>"
 )
-refuse(
-    "joint in a link", robot(link("base", INERTIAL + joint("j", "base", "arm"))), "<joint> inside"
-)
+refuse("joint in a link", robot(link("base", INERTIAL + joint("j", "base", "arm"))), "<joint>")
 refuse("Link in capitals", robot(link("base"), link("arm").replace("link", "Link")), "<Link>")
 refuse("Joint in capitals", arm().replace("joint", "Joint"), "<Joint>")
-refuse("a chain of 10,000 links", chain(10_000, "fixed"), "10000 links deep", "1000")
+refuse("a chain of 10,000 links", chain(10_000, "fixed"), "10000", "1000")
 refuse("1,000 joints", chain(999, "continuous"), "998 degrees of freedom", "GiB")
 refuse("20,000 links", robot(*(link(f"l{k}", "") for k in range(20_000))), "20000 links")
 refuse("317 joints", chain(318, "continuous"), "317 degrees of freedom")
@@ -441,7 +433,6 @@ warn(
     ),
     "'world'",
     "'free'",
-    "left out",
 )
 refuse(
     "a world that two bases float in",
@@ -465,7 +456,7 @@ refuse("no type", arm().replace('type="revolute"', ""), ":4:", "'type'", "'hinge
 for kind in ("hinge", "Revolute", "ball", "universal", "revolute2", "screw", "${type}x"):
     if "$" not in kind:
         refuse(f"type {kind}", arm(kind=kind), ":4:", f"'{kind}'", "revolute", "'hinge'")
-refuse("type spherical", arm(kind="spherical"), "'spherical'", "three revolute")
+refuse("type spherical", arm(kind="spherical"), "'spherical'", "revolute")
 refuse("type floating", arm(kind="floating"), "'hinge'", "lock")
 refuse("type planar", arm(kind="planar"), "'hinge'", "lock")
 refuse("planar about x", arm(kind="planar", inside='<axis xyz="1 0 0"/>'), ":4:", "planar", "0 0 1")
@@ -492,14 +483,13 @@ refuse("quaternion zero", arm(inside=AXIS + '<origin quat_xyzw="0 0 0 0"/>'), "l
 refuse("quaternion of three", arm(inside=AXIS + '<origin quat_xyzw="0 0 1"/>'), "has 3 entries")
 refuse("negative damping", arm(inside=AXIS + '<dynamics damping="-1"/>'), "damping", "negative")
 refuse("negative friction", arm(inside=AXIS + '<dynamics friction="-1"/>'), "friction", "negative")
-warn("damping", arm(inside=AXIS + '<dynamics damping="0.1"/>'), "damping unused: 'hinge'")
+warn("damping", arm(inside=AXIS + '<dynamics damping="0.1"/>'), "'hinge'")
 warn("friction", arm(inside=AXIS + '<dynamics friction="0.1"/>'), "friction", "'hinge'")
 warn(
     "stiffness of a spring",
     arm(inside=AXIS + '<dynamics spring_stiffness="1"/>'),
     ":4:",
     "'spring_stiffness'",
-    "not in the model",
 )
 warn(
     "rotor inertia",
@@ -507,7 +497,6 @@ warn(
     ":4:",
     "<drake:rotor_inertia>",
     "'hinge'",
-    "not in the model",
 )
 accept("damping of zero", arm(inside=AXIS + '<dynamics damping="0" friction="0.0"/>'))
 accept("damping of a fixed joint", arm(kind="fixed", inside='<dynamics damping="1"/>'))
@@ -528,7 +517,7 @@ accept("empty origin", arm(inside=AXIS + "<origin/>"))
 
 refuse("mimic of nothing", three("<mimic/>"), ":6:", "'joint'", "'j1'")
 refuse("mimic of an unknown joint", three('<mimic joint="j9"/>'), ":6:", "'j1'", "'j9'")
-refuse("mimic of Drake", three("", '<drake:mimic joint="j1"/>'), ":7:", "'j2'", "as <mimic>")
+refuse("mimic of Drake", three("", '<drake:mimic joint="j1"/>'), ":7:", "'j2'", "<mimic>")
 refuse("mimic of itself", three('<mimic joint="j1"/>'), ":6:", "itself", "'j1'")
 refuse(
     "mimics of each other", three('<mimic joint="j2"/>', '<mimic joint="j1"/>'), "circle", "'j2'"
@@ -575,7 +564,7 @@ for wrapper in ("gazebo", "group", "transmission", "ros2_control", "drake:group"
         ":5:",
         "'tip'",
         f"<{wrapper}>",
-        "directly into <robot>",
+        "<robot>",
     )
     refuse(
         f"{wrapper} around a joint",
@@ -638,13 +627,13 @@ refuse(
 refuse(
     "xacro: error after expansion",
     arm(child=MACRO.replace("2 * m", "-m"), attributes=XACRO),
-    "expanded by xacro",
+    "xacro",
     "-1 kg",
 )
 refuse(
     "xacro: bad expression", arm(child=inertial("${1/0}"), attributes=XACRO), "xacro", "division"
 )
-refuse("xacro: not well-formed", "<robot><xacro:", "not well-formed", suffix=".xacro")
+refuse("xacro: not well-formed", "<robot><xacro:", "well-formed", suffix=".xacro")
 
 # --- What is no file -----------------------------------------------------------------------------
 
@@ -691,13 +680,13 @@ refuse("a name that is too long", lambda path: path.with_name("x" * 5000 + ".urd
 if sys.platform == "linux":
     accept("a file name that is no text", _no_text)
 refuse("a missing file", lambda path: path, "no file")
-refuse("a folder", _folder, "is a folder")
+refuse("a folder", _folder, "folder")
 refuse("a dangling link", _dangling, "no file")
 if sys.platform != "win32":
-    refuse("a pipe", _fifo, "not a regular file")
-    refuse("/dev/zero", lambda _: Path("/dev/zero"), "not a regular file")
-    refuse("/dev/null", lambda _: Path("/dev/null"), "not a regular file")
-    refuse("a sparse file of 3 GB", _sparse, "larger than 64 MiB")
+    refuse("a pipe", _fifo, "regular")
+    refuse("/dev/zero", lambda _: Path("/dev/zero"), "regular")
+    refuse("/dev/null", lambda _: Path("/dev/null"), "regular")
+    refuse("a sparse file of 3 GB", _sparse, "64 MiB")
     refuse("a symbolic link to itself", _looping, "")
     if os.geteuid() != 0:
         refuse("no permission", _unreadable, "ermission")  # root may read it

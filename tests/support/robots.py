@@ -2,12 +2,20 @@
 
 import numpy as np
 import pinocchio as pin
+import pytest
 
 import fflin
 from fflin.robot.catalog import bundled_directory
 
 BUNDLED = tuple(sorted(path.stem for path in bundled_directory().glob("*.urdf")))
 FRAMES = ("hybrid", "local", "world")
+
+
+def mostly(names, *quick):
+    """Return test parameters for names, of which all but the quick ones are exhaustive."""
+    assert set(quick) <= set(names)
+    marks = pytest.mark.exhaustive
+    return [name if name in quick else pytest.param(name, marks=marks) for name in names]
 
 
 def random_pose(rng, degrees):

@@ -1,9 +1,8 @@
-"""Uncertain models where others take them up, as docs/uncertainty.md says."""
+"""Uncertain models in slycot and Octave, as docs/guide/uncertain_models.md describes."""
 
 import os
 import re
 import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +10,11 @@ import pytest
 from scipy.io import loadmat
 
 import fflin
-from tests.support.patience import PATIENCE
+from tests.support.patience import finished
 
-PAGE = (Path(__file__).parents[2] / "docs" / "uncertainty.md").read_text(encoding="utf-8")
+pytestmark = pytest.mark.docs
+
+PAGE = (Path(__file__).parents[2] / "docs/guide/uncertain_models.md").read_text(encoding="utf-8")
 
 # What of the toolbox the page needs, for one value of each delta.
 TOOLBOX = {
@@ -25,10 +26,10 @@ TOOLBOX = {
 }
 
 
-def blocks(language, heading="## A set of robots"):
-    return re.findall(
-        rf"```{language}\n(.*?)```", PAGE.split(heading)[1].split("\n## ")[0], re.DOTALL
-    )
+def blocks(language):
+    """Return the blocks of a language before the section on sensitivity."""
+    before = PAGE.split("## Sensitivity")[0]
+    return re.findall(rf"```{language}\n(.*?)```", before, re.DOTALL)
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +46,7 @@ def followed(tmp_path_factory):
     return folder, names
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_slycot_takes_the_model_of_the_page(followed):
     _, names = followed
@@ -59,6 +61,7 @@ def test_slycot_takes_the_model_of_the_page(followed):
     assert 0.0 < bound < 1.0
 
 
+@pytest.mark.process
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 @pytest.mark.skipif(shutil.which("octave") is None, reason="octave is not installed")
 def test_octave_takes_the_model_of_the_page(followed):
@@ -76,13 +79,11 @@ def test_octave_takes_the_model_of_the_page(followed):
         "save('-v6', 'out.mat', 'first', 'second', 'plant');\n"
     )
     (folder / "reader.m").write_text(script)
-    done = subprocess.run(
+    done = finished(
         ["octave", "--no-gui", "--quiet", "--norc", "reader.m"],
         cwd=folder,
         capture_output=True,
         text=True,
-        timeout=PATIENCE,
-        check=False,
     )
     assert done.returncode == 0, done.stderr
     found = loadmat(folder / "out.mat", squeeze_me=True)

@@ -8,6 +8,7 @@ import pytest
 
 import fflin
 from tests.support.complex_crba import inertia, motions
+from tests.support.messages import says
 from tests.support.orbits import in_orbit
 from tests.support.robots import BUNDLED, random_point, random_pose
 
@@ -245,9 +246,9 @@ def test_what_is_wrong_is_one_line():
     S = fflin.sensitivity(lin)
     with pytest.raises(fflin.UnknownNameError, match=r"link_2\.mass"):
         S["link_2.mas"]
-    with pytest.raises(fflin.InputError, match="take along"):
+    with pytest.raises(fflin.InputError, match="along"):
         S["link_2.*"]
-    with pytest.raises(fflin.InputError, match="gain has shape"):
+    with pytest.raises(fflin.InputError, match=r"\(2, 2\)"):
         S.poles(np.zeros((2, 2)))
     with pytest.raises(fflin.InputError, match="empty"):
         S.along({})
@@ -310,7 +311,7 @@ def test_its_table_has_what_a_tenth_of_each_changes_and_the_most_first():
         expected = 100.0 * step * np.abs(S[name].dB).max() / largest
         assert float(row.split()[-2]) == pytest.approx(expected, rel=0.05)
     assert len(S.table(3).splitlines()) == 5
-    with pytest.raises(fflin.InputError, match="top is 0"):
+    with pytest.raises(fflin.InputError, match="top"):
         S.table(0)
 
 
@@ -332,9 +333,9 @@ def test_its_table_ranks_links_or_what_is_asked_for():
     assert {row[0][:13] for row in shown("hand.inertia*")} == {"hand.inertia."}
     assert [row[0] for row in shown("joint_3.density")] == ["joint_3.density"]
     assert {len(row) for row in shown("density")} == {7}  # name, 1, 0.1, and two of "x %"
-    with pytest.raises(fflin.UnknownNameError, match="no parameter named 'masss'"):
+    with pytest.raises(fflin.UnknownNameError, match="'masss'"):
         S.table(3, "masss")
-    assert "none of these changes them" in S.table(3, "joint_1.stiffness")
+    assert says(S.table(3, "joint_1.stiffness"), "none")
 
 
 @pytest.mark.parametrize("axis", "xyz")

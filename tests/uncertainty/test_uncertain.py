@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import fflin
+from tests.support.messages import says
 
 CASES = {
     "cubesat": {
@@ -130,9 +131,7 @@ def test_samples_are_rigid_bodies_and_corners_that_are_none_are_counted():
     worst = of.worst(fflin.lqr(fflin.linearize(robot)), samples=20)
     assert bad and worst.tried == 20 + 4 - bad + 1
     assert worst.excluded == of.draws(20)[1] + bad
-    assert f"{worst.excluded} draws and corners make no rigid bodies" in " ".join(
-        str(worst).split()
-    )
+    assert says(str(worst), f"{worst.excluded} draws")
 
 
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
@@ -140,16 +139,16 @@ def test_what_is_wrong_is_one_line():
     robot = fflin.load("servicer_7dof")
     of = fflin.uncertain(robot, {"base.mass": 0.2})
     cases = [
-        (lambda: fflin.uncertain(robot, {}), "ranges is empty"),
-        (lambda: fflin.uncertain(robot, {"link_99.mass": 0.1}), "no parameter"),
-        (lambda: fflin.uncertain(robot, {"base.mass": (3.0, 2.0)}), "expected less and more"),
-        (lambda: fflin.uncertain(robot, {"link_1.com.y": 0.1}), "give (least, largest)"),
-        (lambda: fflin.uncertain(robot, {"base.mass": (-3.0, 2.0)}), "expected more than 0"),
-        (lambda: fflin.uncertain(robot, {"base.inertia.xx": (1e-3, 2e-3)}), "is no robot"),
-        (lambda: of.at({"base.mass": -1.0}), "the mass of 'base' is -1 kg"),
-        (lambda: of.worst(np.zeros((2, 2))), "gain has shape"),
+        (lambda: fflin.uncertain(robot, {}), "ranges"),
+        (lambda: fflin.uncertain(robot, {"link_99.mass": 0.1}), "link_99"),
+        (lambda: fflin.uncertain(robot, {"base.mass": (3.0, 2.0)}), "less and more"),
+        (lambda: fflin.uncertain(robot, {"link_1.com.y": 0.1}), "(least, largest)"),
+        (lambda: fflin.uncertain(robot, {"base.mass": (-3.0, 2.0)}), "base.mass"),
+        (lambda: fflin.uncertain(robot, {"base.inertia.xx": (1e-3, 2e-3)}), "robot"),
+        (lambda: of.at({"base.mass": -1.0}), "'base'"),
+        (lambda: of.worst(np.zeros((2, 2))), "(2, 2)"),
         (lambda: of.worst(np.zeros((15, 30))), "unstable"),
-        (lambda: of.lft().at([0.0, 0.0]), "deltas have shape"),
+        (lambda: of.lft().at([0.0, 0.0]), "deltas"),
     ]
     for call, said in cases:
         with pytest.raises(fflin.FflinError) as error:
@@ -159,10 +158,10 @@ def test_what_is_wrong_is_one_line():
     with pytest.raises(fflin.InputError, match="gravity"):
         fflin.uncertain(sprung, {"base.mass": 0.1}).lft()
     bent = fflin.configuration(robot, {"panel_left": 0.3})
-    with pytest.raises(fflin.InputError, match="out of its rest"):
+    with pytest.raises(fflin.InputError, match="rest"):
         fflin.uncertain(robot, {"panel_left.stiffness": (80.0, 90.0)}).lft(bent)
     joined = fflin.load("planar_detumble")
-    with pytest.raises(fflin.InputError, match="is a link of the body"):
+    with pytest.raises(fflin.InputError, match="link"):
         fflin.uncertain(joined, {"joint_3.mass": 0.1, "hand.mass": 0.1})
 
 
@@ -183,7 +182,7 @@ def test_a_range_that_no_robot_has_is_refused():
             fflin.uncertain(robot, {name: value})
         said = str(error.value)
         least = "0 or more" if "hinge" in name else "more than 0"
-        assert f"range of '{name}' is from {ends}" in said and f"expected {least};" in said
+        assert f"'{name}' is from {ends}" in said and f"{least};" in said
         assert "20 % is 0.2" in said and "LEAST:LARGEST" in said and "\n" not in said
     for name in ("stiffness", "damping"):
         fflin.uncertain(robot, {f"hinge_left_1.{name}": (0.0, 1.0)})
@@ -216,7 +215,7 @@ def test_a_wheel_too_large_for_its_carrier_is_no_robot():
     largest = robot._bare.model.inertias[1].inertia[2, 2]
     of = fflin.uncertain(robot, {"wheel_1.inertia": (1e-4, 1.5 * largest)})
     assert of.makes(np.array([-0.9])) and not of.makes(np.array([0.9]))
-    with pytest.raises(fflin.InputError, match="the density of 'base' is -1"):
+    with pytest.raises(fflin.InputError, match=r"density .*'base'"):
         of.at({"base.density": -1.0})
 
 
@@ -225,19 +224,110 @@ def test_a_range_that_leaves_hardly_any_robot_is_one_line():
     robot = fflin.load("cubesat").with_mass_properties({"base": rod})
     of = fflin.uncertain(robot, {"base.inertia.xx": 0.5, "base.inertia.yy": 0.5})
     for call in (lambda: of.samples(1), lambda: of.worst(fflin.lqr(fflin.linearize(robot)))):
-        with pytest.raises(fflin.InputError, match=r"0 were physical.*no rigid body.*narrower"):
+        with pytest.raises(fflin.InputError, match="physical"):
             call()
 
 
 def test_stored_momentum_is_no_fixed_point():
     wheel = fflin.ReactionWheel((0.0, 0.0, 1.0), momentum=2.0)
     robot = fflin.load("cubesat", inputs=[wheel])
-    with pytest.raises(fflin.InputError, match="stored momentum; take a point at rest"):
+    with pytest.raises(fflin.InputError, match="momentum"):
         fflin.uncertain(robot, {"base.mass": 0.1}).lft()
 
 
 @pytest.mark.parametrize("output", [fflin.CenterOfMass(), fflin.Momentum()])
 def test_an_output_that_weighs_the_robot_is_no_fraction(output):
     robot = fflin.load("cubesat", outputs=[output])
-    with pytest.raises(fflin.InputError, match="weighs the robot; leave it out"):
+    with pytest.raises(fflin.InputError, match="weigh"):
         fflin.uncertain(robot, {"base.mass": 0.1}).lft()
+
+
+SLOSH = """<robot name="tank">
+  <link name="tank"><inertial><mass value="100"/>
+    <inertia ixx="20" iyy="25" izz="30" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="fuel"><inertial><origin xyz="0 0 0.1"/><mass value="8"/>
+    <inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="slosh" type="prismatic"><parent link="tank"/><child link="fuel"/>
+    <origin xyz="0.2 0 0.5"/><axis xyz="1 0 0"/>
+    <limit lower="-1" upper="1" effort="10" velocity="1"/></joint>
+</robot>"""
+
+
+def test_a_point_mass_that_moves_is_a_body(tmp_path):
+    (tmp_path / "tank.urdf").write_text(SLOSH)
+    robot = fflin.load(tmp_path / "tank.urdf", stiffness={"slosh": 4.0})
+    parts = {"mass": 0.3, "density": 0.2, "com.z": (0.0, 0.2)}
+    of = fflin.uncertain(robot, {"fuel": parts, "slosh.stiffness": 0.2})
+    draws, lost = of.draws(5, seed=1)
+    assert not lost
+    for delta, made in zip(draws, of.samples(5, seed=1), strict=True):
+        lin, (A, B, *_) = fflin.linearize(made), of.lft().at(delta)
+        assert np.abs(A - lin.A).max() < 1e-12 and np.abs(B - lin.B).max() < 1e-12
+    # Its mass may not be none, and an inertia about one axis alone is no body's.
+    with pytest.raises(fflin.InputError, match="mass of 'fuel'"):
+        of.at({"fuel.mass": 0.0})
+    with pytest.raises(fflin.InputError, match="realisable"):
+        fflin.uncertain(robot, {"fuel.inertia.xx": (1e-3, 2e-3)})
+
+
+PANELS = {"panel_left": 60.0, "panel_right": 80.0}
+
+
+def test_tied_parameters_have_one_delta():
+    robot = fflin.load("servicer_7dof", stiffness=PANELS)
+    tied = {"panel_*.stiffness": {"range": 0.2, "tied": True}, "base.mass": 0.1}
+    of = fflin.uncertain(robot, tied)
+    lft, apart = of.lft(), fflin.uncertain(robot, {"panel_*.stiffness": 0.2, "base.mass": 0.1})
+    assert of.names == lft.parameters == ("base.mass", "panel_*.stiffness")
+    assert lft.repeats.tolist() == [3.0, 2.0] and len(apart.names) == 3
+    assert lft.units == ("kg", "1") and (lft.middle[1], lft.half[1]) == (1.0, 0.2)
+    for delta, made in zip(of.draws(5, seed=3)[0], of.samples(5, seed=3), strict=True):
+        factor = 1.0 + 0.2 * delta[1]
+        assert made.stiffness == pytest.approx({name: factor * k for name, k in PANELS.items()})
+        lin = fflin.linearize(made)
+        # By deltas, by the names of the set, and by the same delta for each of them.
+        for A, B, *_ in (
+            lft.at(delta),
+            lft.at(of.values(delta)),
+            apart.lft().at(delta[[1, 1, 0]]),
+        ):
+            assert np.abs(A - lin.A).max() < 1e-11 * np.abs(lin.A).max()
+            assert np.abs(B - lin.B).max() < 1e-11 * np.abs(lin.B).max()
+    assert of.at({"panel_left.stiffness": 5.0}).stiffness["panel_left"] == 5.0
+    assert "2 tied" in str(of) and all(len(line) <= 80 for line in str(of).splitlines())
+
+
+def test_tied_parameters_share_a_value_between_ends_and_the_worst_names_it():
+    robot = fflin.load("servicer_7dof", stiffness=PANELS)
+    of = fflin.uncertain(robot, {"panel_*.stiffness": {"range": (50.0, 90.0), "tied": True}})
+    assert of.lft().units == ("N m/rad",)
+    for made in of.samples(3):
+        left, right = made.stiffness.values()
+        assert left == right and 50.0 <= left <= 90.0
+    worst = of.worst(fflin.lqr(fflin.linearize(robot)), samples=3)
+    assert list(worst.gain.parameters) == ["panel_*.stiffness"] and worst.tried == 3 + 2 + 1
+
+
+def test_a_tied_share_takes_what_is_below_zero_further_from_it():
+    robot = fflin.load("cubesat")
+    robot = robot.with_mass_properties({"base": {"com": [0.01, -0.02, 0.03]}})
+    of = fflin.uncertain(robot, {"base.com.*": {"range": 0.5, "tied": True}})
+    more = of.at({"base.com.*": 1.5})._bare.model.inertias[1].lever
+    assert more == pytest.approx([0.015, -0.03, 0.045]) and of.makes(np.array([1.0]))
+    lin, (_, B, *_) = fflin.linearize(of.at({"base.com.*": 1.5})), of.lft().at([1.0])
+    assert np.abs(B - lin.B).max() < 1e-11 * np.abs(B).max()
+
+
+def test_a_tie_that_is_unclear_is_refused():
+    robot = fflin.load("servicer_7dof", stiffness=PANELS)
+    pattern = "panel_*.stiffness"
+    for given, said in (
+        ({pattern: {"range": 0.2}}, "tied"),
+        ({pattern: {"range": 0.2, "tied": "yes"}}, "tied"),
+        ({pattern: {"range": 0.2, "tied": True}, "panel_left.stiffness": 0.1}, "tied to others"),
+        ({"link_3.*": {"range": (1.0, 2.0), "tied": True}}, "units"),
+    ):
+        with pytest.raises(fflin.InputError, match=said):
+            fflin.uncertain(robot, given)
+    loose = fflin.uncertain(robot, {pattern: {"range": 0.2, "tied": False}})
+    assert len(loose.names) == 2

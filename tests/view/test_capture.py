@@ -16,11 +16,12 @@ from PIL import Image
 
 import fflin
 from tests.support.motions import led
-from tests.support.patience import PATIENCE, wait_until
+from tests.support.patience import finishing, wait_until
 
 needs_chromium = pytest.mark.skipif(not shutil.which("chromium"), reason="no chromium")
 
 
+@pytest.mark.browser
 @needs_chromium
 def test_pictures(robots, motion, tmp_path):
     robot = robots["planar_detumble"]
@@ -34,7 +35,7 @@ def test_pictures(robots, motion, tmp_path):
     assert (np.abs(frames[0] - frames[3]).max(axis=2) > 30).mean() > 0.01
     with Image.open(film) as image:
         assert image.n_frames == 6 and image.size == (640, 400)
-    with pytest.raises(fflin.InputError, match="times are"):
+    with pytest.raises(fflin.InputError, match="times"):
         fflin.visualize(robot, motion, png=strip, times=[9.0])
 
 
@@ -60,11 +61,12 @@ def test_a_chromium_that_does_not_answer_is_one_line(robots, motion, tmp_path, m
     program.chmod(0o755)
     monkeypatch.setattr("fflin.view.capture.find_chromium", lambda: str(program))
     monkeypatch.setattr("fflin.view.capture._PATIENCE", 1.0)
-    with pytest.raises(fflin.FileError, match="does not answer"):
+    with pytest.raises(fflin.FileError, match="answer"):
         fflin.visualize(robots["planar_detumble"], motion, png=tmp_path / "m.png", times=[0.0])
     assert not (tmp_path / "m.png").exists()
 
 
+@pytest.mark.browser
 @needs_chromium
 def test_films(robots, motion, tmp_path, monkeypatch):
     """Whenever a motion begins all of it is shown, and nothing is left behind."""
@@ -82,6 +84,8 @@ def test_films(robots, motion, tmp_path, monkeypatch):
     assert not list(folder.iterdir())
 
 
+@pytest.mark.process
+@pytest.mark.browser
 @needs_chromium
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
 def test_the_browser_ends_with_the_one_who_films(tmp_path, sent, code):
@@ -99,19 +103,21 @@ def test_the_browser_ends_with_the_one_who_films(tmp_path, sent, code):
     )
     browsing = f"--user-data-dir={folder}".encode()
     try:
-        wait_until(lambda: list(folder.glob("*/Default")))
-        assert running(browsing)
-        process.send_signal(sent)
-        _, error = process.communicate(timeout=PATIENCE)
+        with finishing(process):
+            wait_until(lambda: list(folder.glob("*/Default")), "the profile of Chromium")
+            assert running(browsing)
+            process.send_signal(sent)
+            _, error = process.communicate()
         assert process.returncode == code and "Traceback" not in error
-        wait_until(lambda: not running(browsing))
+        wait_until(lambda: not running(browsing), "the end of Chromium")
         assert not (tmp_path / "m.gif").exists()
         assert sent == signal.SIGKILL or not list(folder.iterdir())
     finally:
         process.kill()
-        process.communicate()
+        process.wait()
+        process.stderr.close()
         # What dies of a signal may still write for a moment.
-        wait_until(lambda: removed(folder))
+        wait_until(lambda: removed(folder), f"the end of what writes to {folder}")
 
 
 def removed(folder):

@@ -9,7 +9,6 @@ import pinocchio as pin
 import pytest
 
 import fflin
-from tests.support.browser import Watched, chromium
 
 pytestmark = pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 
@@ -23,7 +22,8 @@ def campaign(robots):
     return fflin.monte_carlo(robot, policy, given, runs=300, duration=2.0, dt=0.02)
 
 
-def test_the_page_has_the_paths_of_base_and_tool(robots, campaign, tmp_path):
+@pytest.mark.browser
+def test_the_page_has_the_paths_of_base_and_tool(robots, campaign, watch, tmp_path):
     robot, motion = robots["ets_vii"], campaign.replay(299)
     assert motion.urdf_sha256 != robot.urdf_sha256  # it has masses of its own
     path = fflin.visualize(robot, motion, html=tmp_path / "runs.html", cloud=campaign)
@@ -44,13 +44,11 @@ def test_the_page_has_the_paths_of_base_and_tool(robots, campaign, tmp_path):
         at = data.oMi[1].translation, data.oMf[frame].translation
         for row, here, there in zip(rows, points, at, strict=True):
             assert here[row] == pytest.approx(there, abs=1e-6)
-    with chromium() as browser:
-        page = Watched(browser, f"{path.as_uri()}#pause")
-        lines = "viewer.scene_tree.find(['meshcat', 'cloud', 'tool']).object.children"
-        count = page.do(f"{lines}.at(-1).geometry.index.count")
-        assert count == 2 * (len(points[1]) - 240)
-        assert "tool in 240 of 300 runs" in page.do("document.getElementById('legend').textContent")
-        assert not page.errors
+    page = watch(f"{path.as_uri()}#pause", painted=True)
+    lines = "viewer.scene_tree.find(['meshcat', 'cloud', 'tool']).object.children"
+    count = page.do(f"{lines}.at(-1).geometry.index.count")
+    assert count == 2 * (len(points[1]) - 240)
+    assert "tool in 240 of 300 runs" in page.do("document.getElementById('legend').textContent")
 
 
 def test_a_cloud_of_something_else_is_refused(robots, campaign, tmp_path):
@@ -58,9 +56,9 @@ def test_a_cloud_of_something_else_is_refused(robots, campaign, tmp_path):
     motion = campaign.replay(0)
     campaign.save(tmp_path / "runs.npz")
     for cloud, whose, said in (
-        (3, robot, "cloud is a int, expected a Campaign"),
-        (campaign, other, "the cloud is of 'ets_vii', not of 'canadarm2'"),
-        (fflin.Campaign.load(tmp_path / "runs.npz"), robot, "the campaign is from a file"),
+        (3, robot, "cloud"),
+        (campaign, other, "'canadarm2'"),
+        (fflin.Campaign.load(tmp_path / "runs.npz"), robot, "file"),
     ):
         with pytest.raises(fflin.InputError, match=said):
             fflin.visualize(whose, motion, html=tmp_path / "x.html", cloud=cloud)

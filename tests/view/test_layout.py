@@ -8,16 +8,12 @@ import numpy as np
 import pytest
 
 import fflin
-from tests.support.browser import Watched, chromium
+from tests.support.browser import Watched
 from tests.support.motions import led, settling
 
+pytestmark = pytest.mark.browser
+
 SIZES = [(800, 600), (1400, 900)]
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as browser:
-        yield browser
 
 
 def with_inputs(name):
@@ -48,12 +44,10 @@ def watched(request, browser, tmp_path_factory):
     x[:, wheels] = np.sin(motion.t)[:, None] * 100.0
     path = tmp_path_factory.mktemp("layout") / "motion.html"
     fflin.visualize(robot, replace(motion, x=x), html=path)
-    watched = Watched(browser, path.as_uri() + "#pause", size=SIZES[0])
-    watched.name, watched.led = request.param, motion.tracked
-    watched.do("fflin.seek(7)")
-    yield watched
-    assert not watched.errors
-    watched.page.close()
+    with Watched(browser, path.as_uri() + "#pause", size=SIZES[0]) as watched:
+        watched.name, watched.led = request.param, motion.tracked
+        watched.do("fflin.seek(7)")
+        yield watched
 
 
 def boxes(watched, selector):
@@ -204,7 +198,7 @@ def test_frames_of_a_strip_have_their_time_and_the_first_a_legend(watched, size)
     assert not watched.page.locator("#legend label.strip:visible").count()
 
 
-def test_what_was_passed_leads_to_its_time(browser, tmp_path):
+def test_what_was_passed_leads_to_its_time(watch, tmp_path):
     robot = fflin.load("ets_vii")
     motion = settling(robot, 20.0)
     names = ("tau_m.joint_1", "tau_m.joint_2")
@@ -214,7 +208,7 @@ def test_what_was_passed_leads_to_its_time(browser, tmp_path):
     limits = np.array([[-4.0, 4.0], [-4.0, 4.0]])
     path = tmp_path / "m.html"
     fflin.visualize(robot, replace(motion, u=u, limit_names=names, limits=limits), html=path)
-    watched = Watched(browser, path.as_uri() + "#pause", size=(800, 600))
+    watched = watch(path.as_uri() + "#pause", size=(800, 600))
     line = watched.page.locator(".passed")
     expected = "beyond its limit, the farthest of 2:\ntau_m.joint_2 -9 N m at 3.01 s, limit -4"
     assert line.text_content() == expected
@@ -225,7 +219,6 @@ def test_what_was_passed_leads_to_its_time(browser, tmp_path):
         "(({ scrollWidth, clientWidth }) => scrollWidth <= clientWidth)"
         "(document.querySelector('.passed'))"
     )
-    watched.page.close()
 
 
 def rows_of(watched, at, colour, low, high, least=120):
@@ -242,7 +235,7 @@ def rows_of(watched, at, colour, low, high, least=120):
     return near, values, (high - low) / (height - 2)
 
 
-def test_curves_and_limits_are_drawn_where_the_data_have_them(browser, tmp_path):
+def test_curves_and_limits_are_drawn_where_the_data_have_them(watch, tmp_path):
     robot = fflin.load("ets_vii")
     motion = settling(robot, 20.0)
     name = "tau_m.joint_1"
@@ -253,7 +246,7 @@ def test_curves_and_limits_are_drawn_where_the_data_have_them(browser, tmp_path)
     motion = replace(motion, u=u, limit_names=(name, "tau_m.joint_2"), limits=limits)
     path = tmp_path / "m.html"
     fflin.visualize(robot, motion, html=path)
-    watched = Watched(browser, path.as_uri() + "#pause", size=(1400, 900))
+    watched = watch(path.as_uri() + "#pause", size=(1400, 900))
     watched.drawn()
     titles = watched.do("fflin.plots.map(({ title }) => title)")
     plot = titles.index("joint torques")
@@ -271,10 +264,9 @@ def test_curves_and_limits_are_drawn_where_the_data_have_them(browser, tmp_path)
         seen = values[near[:, column] & (np.abs(values) < 8.0)]
         assert np.abs(seen - expected).min() < 2.0 * step
     assert not near[np.argmin(np.abs(values - 8.5))].any()
-    watched.page.close()
 
 
-def test_a_reference_is_pale_under_its_curve_and_a_line_is_where_it_rests(browser, tmp_path):
+def test_a_reference_is_pale_under_its_curve_and_a_line_is_where_it_rests(watch, tmp_path):
     robot = fflin.load("ets_vii")
     motion = settling(robot, 20.0)
     at = motion.state_names.index("q_m.joint_1")
@@ -286,7 +278,7 @@ def test_a_reference_is_pale_under_its_curve_and_a_line_is_where_it_rests(browse
     target[motion.t > 14.995, :6] = target[-1, :6]
     path = tmp_path / "m.html"
     fflin.visualize(robot, replace(motion, x=x, target=target), html=path)
-    watched = Watched(browser, path.as_uri() + "#pause", size=(1400, 900))
+    watched = watch(path.as_uri() + "#pause", size=(1400, 900))
     watched.drawn()
     titles = watched.do("fflin.plots.map(({ title }) => title)")
     assert titles[:3] == ["attitude error", "position error", "largest joint error"]
@@ -313,15 +305,16 @@ def test_a_reference_is_pale_under_its_curve_and_a_line_is_where_it_rests(browse
     free = line[np.abs(values + 0.7) < 0.5]  # between the curves
     found = np.flatnonzero(free.mean(axis=0) > 0.2)
     assert len(found) and np.abs(times[found] - 15.0).max() < 0.2
-    watched.page.close()
 
 
 @pytest.mark.parametrize("name", ["servicer_7dof", "talos"])
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
 def test_sliders_of_the_live_page_can_be_aimed_at(browser, name):
-    with fflin.visualize(fflin.load(name), open=False) as live:
-        watched = Watched(browser, live.url, size=(800, 600))
-        watched.page.wait_for_function("fflin.state !== null")
+    with (
+        fflin.visualize(fflin.load(name), open=False) as live,
+        Watched(browser, live.url, size=(800, 600)) as watched,
+    ):
+        watched.wait("fflin.state !== null")
         sliders = boxes(watched, "#panel input[type=range]")
         assert len(sliders) == live.robot.n
         assert np.diff(sliders[:, ::2]).min() >= 60.0
@@ -333,5 +326,4 @@ def test_sliders_of_the_live_page_can_be_aimed_at(browser, name):
             assert not overlap(one, other)
         clipped = "(each) => each.scrollWidth > each.clientWidth"
         clipped = watched.do(f"[...document.querySelectorAll('.slider span')].some({clipped})")
-        assert not clipped and not watched.errors
-        watched.page.close()
+        assert not clipped

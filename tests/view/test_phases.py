@@ -9,17 +9,10 @@ import pytest
 import fflin
 from fflin.robot.frames import ROOT
 from fflin.view.phases import _flight
-from tests.support.browser import Watched, chromium
 from tests.support.phases import DEBRIS, TWIST, phases
 
 # Positions travel as 32-bit floats, of metres.
 EXACT = 1e-5
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as browser:
-        yield browser
 
 
 def frames(robot, q):
@@ -41,11 +34,12 @@ def row_at(motion, t):
     return np.argmin(np.abs(motion.t - t))
 
 
-def test_a_body_flies_to_the_grasp_and_is_held(browser, tmp_path):
+@pytest.mark.browser
+def test_a_body_flies_to_the_grasp_and_is_held(watch, tmp_path):
     flown = phases()
     path = tmp_path / "phases.html"
     fflin.visualize(flown.robot, flown.whole, html=path)
-    watched = Watched(browser, path.as_uri() + "#pause")
+    watched = watch(path.as_uri() + "#pause", painted=True)
     grasp = frames(flown.robot, flown.approach.q[-1])["tool"]
     for t in (0.0, 1.5, 3.9):
         watched.do(f"fflin.seek({t})")
@@ -101,11 +95,10 @@ def test_a_body_flies_to_the_grasp_and_is_held(browser, tmp_path):
     box.uncheck(force=True)
     assert not watched.do("viewer.scene_tree.find(['meshcat', 'held', 'payload']).object.visible")
     assert "target" in watched.page.locator("#legend").text_content()
-    assert not watched.errors
-    watched.page.close()
 
 
-def test_what_coincides_with_the_robot_is_not_in_the_legend(browser, tmp_path):
+@pytest.mark.browser
+def test_what_coincides_with_the_robot_is_not_in_the_legend(watch, tmp_path):
     robot = fflin.load("servicer_7dof")
     lin = fflin.linearize(robot)
     still = {"robot": robot, "policy": fflin.StateFeedback(lin, fflin.lqr(lin).K), "duration": 1.0}
@@ -113,20 +106,20 @@ def test_what_coincides_with_the_robot_is_not_in_the_legend(browser, tmp_path):
     for options, there in (({}, False), ({"q0": q0, "duration": 60.0}, True)):
         path = tmp_path / "page.html"
         fflin.visualize(robot, fflin.simulate(**still | options), html=path)
-        watched = Watched(browser, path.as_uri() + "#pause")
+        watched = watch(path.as_uri() + "#pause")
         said = watched.page.locator("#legend").text_content()
         assert ("target" in said, "path of the tool" in said) == (there, there)
-        watched.page.close()
 
 
+@pytest.mark.browser
 @pytest.mark.filterwarnings("ignore::fflin.FflinWarning")
-def test_a_payload_with_joints_comes_with_them(browser, tmp_path):
+def test_a_payload_with_joints_comes_with_them(watch, tmp_path):
     other = fflin.load("ets_vii", stiffness=20.0, damping=2.0)
     v = np.r_[TWIST, 0.05, -0.02, 0.0, 0.0, 0.03, 0.0]
     flown = phases(other, v)
     path = tmp_path / "phases.html"
     fflin.visualize(flown.robot, flown.whole, html=path)
-    watched = Watched(browser, path.as_uri() + "#pause")
+    watched = watch(path.as_uri() + "#pause")
     # Free motion without dampers is the same backwards.
     names = list(other.model.names)[ROOT:]
     watched.do("fflin.seek(0)")
@@ -141,8 +134,6 @@ def test_a_payload_with_joints_comes_with_them(browser, tmp_path):
     was = frames(undamped, back.q[-1])
     for name in names:
         assert apart(first[name], was[name]) < EXACT
-    assert not watched.errors
-    watched.page.close()
 
 
 @pytest.mark.parametrize("frame", ["lvlh", "hill"])

@@ -19,6 +19,8 @@ from fflin.robot.urdf import xacro as expansion
 from fflin.robot.urdf.joints import Mimic
 from fflin.robot.urdf.reader import describe, read_urdf
 from fflin.robot.urdf.xml import parse
+from tests.support.messages import says
+from tests.support.patience import finishing
 from tests.support.reader_corpus import (
     AXIS,
     INERTIA,
@@ -81,7 +83,11 @@ H = math.sqrt(0.5)
                 )
             ),
         ),
-        (arm(child=inertial("${1 + 1}")), arm(child=inertial("2"))),
+        pytest.param(
+            arm(child=inertial("${1 + 1}")),
+            arm(child=inertial("2")),
+            marks=pytest.mark.process,
+        ),
     ],
     ids=[
         "byte order mark",
@@ -227,7 +233,7 @@ def test_a_pruned_mimic_is_gone_and_a_pruned_leader_is_missed():
         joint("j", "a", "b", inside=AXIS + '<mimic joint="k"/>'),
         joint("k", "a", "c"),
     )
-    with pytest.raises(fflin.UrdfError, match=r"'j' mimics a joint that does not exist.*'k'"):
+    with pytest.raises(fflin.UrdfError, match=r"'j'.*'k'"):
         describe(document.encode(), Path("r.urdf"), ["k"])
 
 
@@ -245,11 +251,11 @@ def test_notes_name_six_joints_and_count_the_rest():
     damped = AXIS + '<dynamics damping="1"/>'
     joints = [joint(f"j{k}", "l0", f"l{k}", inside=damped) for k in range(1, 9)]
     (advice,) = read(robot(*links, *joints)).advice
-    assert "damping unused: 'j1', 'j2', 'j3', 'j4', 'j5', 'j6' and 2 more" in advice.note
+    assert says(advice.note, "'j1', 'j2', 'j3', 'j4', 'j5', 'j6'", "2 more")
 
 
 def test_blanks_at_the_end_of_a_name_are_seen():
-    with pytest.raises(fflin.UrdfError, match=r"did you mean base2, 'base '\?"):
+    with pytest.raises(fflin.UrdfError, match="base2"):
         read(robot(link("base "), link("base2"), joint("j", "base", "base2")))
 
 
@@ -262,7 +268,7 @@ def test_hash_is_of_the_file(tmp_path):
 def test_load_warns_and_keeps_the_notes(tmp_path):
     path = tmp_path / "r.urdf"
     path.write_text(arm(inside=AXIS + '<dynamics damping="1"/>'))
-    with pytest.warns(fflin.FflinWarning, match="damping unused: 'hinge'") as caught:
+    with pytest.warns(fflin.FflinWarning, match="'hinge'") as caught:
         loaded = fflin.load(path)
     assert [warning.filename for warning in caught] == [__file__]
     assert loaded.notes == tuple(str(warning.message) for warning in caught)
@@ -289,7 +295,7 @@ def test_info_lists_the_warnings(tmp_path):
     path.write_text(arm(inside=AXIS + '<dynamics damping="1"/>'))
     with pytest.warns(fflin.FflinWarning):
         text = robot_info(fflin.load(path))
-    assert "\nwarnings\n  r: damping unused: 'hinge'" in text
+    assert says(text, "r: ", "'hinge'")
 
 
 def test_info_lists_mimic_joints_and_what_hangs_on_them(tmp_path):
@@ -306,13 +312,14 @@ def test_info_lists_mimic_joints_and_what_hangs_on_them(tmp_path):
 
 def test_without_xacrodoc_one_line_says_how(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "xacrodoc", None)
-    with pytest.raises(fflin.MissingPackageError, match=r"pip install 'fflin\[xacro\]'"):
+    with pytest.raises(fflin.MissingPackageError, match=r"'fflin\[xacro\]'"):
         read(arm(child=inertial("${1 + 1}")))
     with pytest.raises(fflin.MissingPackageError):
         read(arm(), "robot.xacro")
     read(arm())
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     "endless",
     [
@@ -326,10 +333,11 @@ def test_a_xacro_without_end_is_one_line(endless, monkeypatch):
     """In Python, inside a call that holds the interpreter, and by macros."""
     pytest.importorskip("xacrodoc")
     monkeypatch.setattr(expansion, "LIMIT", 1.0)
-    with pytest.raises(fflin.UrdfError, match=r"cannot be expanded by xacro, .*: .* 1 s; is there"):
+    with pytest.raises(fflin.UrdfError, match=r"xacro.* 1 s"):
         read(arm(child=endless, attributes='name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"'))
 
 
+@pytest.mark.process
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere it ends in time")
 def test_a_xacro_ends_with_who_expands_it(tmp_path):
     pytest.importorskip("xacrodoc")
@@ -344,6 +352,7 @@ def test_a_xacro_ends_with_who_expands_it(tmp_path):
     os.mkfifo(tmp_path / "fifo")
     with (
         subprocess.Popen([sys.executable, "-m", "fflin", "info", path]) as process,
+        finishing(process),
         # Opened for writing once xacro opens it for reading, and broken as xacro ends.
         (tmp_path / "fifo").open("wb", buffering=0) as fifo,
     ):
@@ -354,6 +363,7 @@ def test_a_xacro_ends_with_who_expands_it(tmp_path):
         assert poll.poll(55_000)
 
 
+@pytest.mark.process
 def test_xacro_includes_from_its_own_folder(tmp_path):
     pytest.importorskip("xacrodoc")
     namespace = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
@@ -389,9 +399,7 @@ def test_wrong_and_infinite_limits_are_none():
 def test_a_note_is_told_once_for_all_its_lines():
     document = robot(*(link(name) for name in "abc"), joint("j", "a", "b"), joint("k", "a", "c"))
     (note,) = read(document.replace('<mass value="1"', '<mass unit="kg" value="1"')).notes
-    assert note == (
-        "robot.urdf:2: the attribute 'unit' of <mass> is not in the model (and in 2 more places)"
-    )
+    assert says(note, "robot.urdf:2: ", "'unit'", "<mass>", "2 more")
 
 
 def test_limit_given_is_the_limit():

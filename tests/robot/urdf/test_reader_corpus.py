@@ -2,7 +2,6 @@
 
 import os
 import re
-import subprocess
 import sys
 from collections import Counter
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -10,8 +9,11 @@ from dataclasses import dataclass
 
 import pytest
 
-from tests.support.patience import PATIENCE
+from tests.support.messages import hear_lines
+from tests.support.patience import finished
 from tests.support.reader_corpus import ACCEPT, CASES, REFUSE, WARN
+
+pytestmark = pytest.mark.fuzz
 
 TIME_LIMIT = 20  # [s] of the processor
 MEMORY_LIMIT = 4 * 2**20  # [KiB]
@@ -39,11 +41,9 @@ def run(case, folder):
         command = ["check", str(path)]
     before = set(os.listdir(folder))
     shell = ["sh", "-c", f'ulimit -v {MEMORY_LIMIT}; ulimit -t {TIME_LIMIT}; exec "$@"', "sh"]
-    result = subprocess.run(
+    result = finished(
         [*shell, sys.executable, "-m", "fflin", *command],
         capture_output=True,
-        timeout=PATIENCE,
-        check=False,
         env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONWARNINGS": "default"},
         cwd=folder,
     )
@@ -62,7 +62,7 @@ def runs(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("corpus")
     with ThreadPoolExecutor(2) as pool:
         futures: dict[str, Future[Run]] = {
-            case.name: pool.submit(run, case, folder / str(k)) for k, case in enumerate(chosen)
+            case.name: pool.submit(run, case, folder / str(CASES.index(case))) for case in chosen
         }
         yield futures
         for future in futures.values():
@@ -75,12 +75,13 @@ def test_corpus_is_large_and_its_names_differ():
     assert {case.expected for case in CASES} == {ACCEPT, WARN, REFUSE}
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_corpus(case, runs):
     if "xacro" in case.name:
         pytest.importorskip("xacrodoc")
     result = runs[case.name].result()
-    lines = result.err.splitlines()
+    lines = hear_lines(result.err).splitlines()
     if case.expected == REFUSE:
         assert (result.code, result.out, result.left) == (2, "", [])
         assert len(lines) == 1 and lines[0].startswith("fflin: error: "), result.err

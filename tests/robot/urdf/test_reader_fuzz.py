@@ -2,17 +2,21 @@
 
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
-from tests.support.patience import PATIENCE
+import pytest
+
+from tests.support.patience import LIMIT, finished
+
+pytestmark = pytest.mark.fuzz
 
 
+@pytest.mark.process
 def test_fuzz(tmp_path):
     count = int(os.environ.get("FFLIN_FUZZ_COUNT", "10000"))
     seed = os.environ.get("FFLIN_FUZZ_SEED", "1")
-    result = subprocess.run(
+    result = finished(
         # In a process of its own, for a crash must not take the tests along.
         [
             *("sh", "-c", 'ulimit -v 4194304; exec "$@"', "sh"),
@@ -21,8 +25,7 @@ def test_fuzz(tmp_path):
         capture_output=True,
         text=True,
         errors="replace",
-        timeout=PATIENCE + count,
-        check=False,
+        watch={"limit": LIMIT + count},
         cwd=Path(__file__).parents[3],
         env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
     )

@@ -1,7 +1,6 @@
 """The reader gives the model that Pinocchio builds from the same file, where it builds one."""
 
 import re
-import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -14,7 +13,7 @@ from example_robot_data.robots_loader import getModelPath
 import fflin
 from fflin.base.errors import FflinError
 from fflin.robot.urdf.reader import read_urdf
-from tests.support.patience import PATIENCE
+from tests.support.patience import finished
 
 BUNDLED = Path(__file__).parents[3] / "robots"
 EXAMPLES = Path(getModelPath("talos_data/robots/talos_reduced.urdf")).resolve()
@@ -22,10 +21,10 @@ FILES = sorted(EXAMPLES.glob("**/*.urdf"))
 
 # What the reader refuses, and the words of the reason. Pinocchio builds the first two of them.
 REFUSED = {
-    "alex_psyonic_hands.urdf": "mimics a joint that does not exist: no joint named 'index_q1'",
-    "romeo_laas_small.urdf": "principal moments -0.0213, 0.0521, 0.099 kg m",
-    "falcon.urdf": "no link named 'Z_propeller'",
-    "ur3.urdf": "has no <link>",
+    "alex_psyonic_hands.urdf": "'index_q1'",
+    "romeo_laas_small.urdf": "-0.0213",
+    "falcon.urdf": "'Z_propeller'",
+    "ur3.urdf": "<link>",
 }
 
 
@@ -117,11 +116,10 @@ thread.join()
 """
 
 
+@pytest.mark.process
 def test_deep_chain_in_a_thread_of_small_stack():
     # Pinocchio itself overruns such a stack between 200 and 400 links.
-    result = subprocess.run(
-        [sys.executable, "-c", CHAIN], capture_output=True, text=True, timeout=PATIENCE, check=False
-    )
+    result = finished([sys.executable, "-c", CHAIN], capture_output=True, text=True)
     assert (result.stdout.strip(), result.stderr) == ("1000.0", "")
 
 

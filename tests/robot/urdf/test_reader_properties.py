@@ -104,6 +104,7 @@ def _mass(root: ET.Element) -> float:
     return math.fsum(float(m.get("value", "nan")) for m in root.findall("link/inertial/mass"))
 
 
+@pytest.mark.fuzz
 @pytest.mark.parametrize("path", sorted(ROBOTS.glob("*.urdf")), ids=lambda path: path.stem)
 @settings(
     max_examples=150,

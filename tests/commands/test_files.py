@@ -1,0 +1,89 @@
+"""No command writes over a file that it reads: every option that takes one, with every output."""
+
+import itertools
+import os
+
+import pytest
+
+from fflin.commands import cli
+from fflin.commands.arguments import input_file, input_name, output_file
+from tests.support.commands import run
+
+# Of options that every call of a command needs and that take no file.
+NEEDED = {"runs": "1", "vary": "base.mass=0.1"}
+
+
+def commands():
+    """Yield (name, options) of all commands."""
+    (parsers,) = cli._parser("")._subparsers._group_actions
+    for name, parser in parsers.choices.items():
+        yield name, parser._actions
+
+
+def pairs():
+    """Yield (command, option that is read, option that is written) for all of them."""
+    for name, actions in commands():
+        reads = [each for each in actions if each.type in (input_file, input_name)]
+        writes = [each for each in actions if each.type is output_file]
+        for read, write in itertools.product(reads, writes):
+            yield pytest.param(name, actions, read, write, id=f"{name} {read.dest} {write.dest}")
+
+
+def said(action, value):
+    """Return the words that give an option or an argument a value."""
+    return [*action.option_strings[-1:], str(value)]
+
+
+@pytest.mark.parametrize("name, actions, read, write", [*pairs()])
+def test_no_output_is_what_an_option_reads(
+    name, actions, read, write, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    precious, other = tmp_path / "precious.toml", tmp_path / "other.toml"
+    for each in (precious, other):
+        each.write_text(each.name)  # nothing that a command could read
+    (tmp_path / "symbolic.npz").symlink_to(precious)
+    os.link(precious, "hard.npz")
+    words = [name]
+    for action in actions:
+        if action is read:
+            words += said(action, precious)
+        elif action.required:
+            words += said(action, NEEDED.get(action.dest, other))
+    for target in ("precious.toml", "./precious.toml", "symbolic.npz", "hard.npz"):
+        code, _, error = run(*words, *said(write, target))
+        assert code == 2 and f"is the input file {precious}" in error and error.count("\n") == 1
+    assert precious.read_text() == "precious.toml" and len(list(tmp_path.iterdir())) == 4
+
+
+def test_every_option_that_takes_a_file_says_whether_it_is_written():
+    kinds = {input_file, input_name, output_file}
+    count = 0
+    for name, actions in commands():
+        for action in actions:
+            metavar, words = str(action.metavar), action.help or ""
+            takes = any(word in metavar for word in ("FILE", "ROBOT", "URDF", "DISPERSIONS"))
+            assert takes == (action.type in kinds), (name, action.dest)
+            if takes:
+                writes = words.startswith(("write", "save", "draw", "where to")) or "into" in words
+                assert writes == (action.type is output_file), (name, action.dest)
+                count += 1
+    assert count > 40
+
+
+@pytest.mark.parametrize("included", ["r.urdf", "in.toml"])
+def test_what_a_robot_file_names_is_kept_too(included, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "r.urdf").write_text(
+        '<robot name="r"><link name="l"><inertial><mass value="1"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
+    )
+    (tmp_path / "r.toml").write_text('urdf = "r.urdf"\n')
+    (tmp_path / "in.toml").write_text('[[input]]\ntype = "base_torque"\n')
+    os.link(included, "m.npz")
+    before = (tmp_path / included).read_bytes()
+    monkeypatch.setattr("fflin.linear.linearization.linearize", None)  # the work
+    command = ("linearize", "r.toml", "--inputs", "in.toml", "-o", "m.npz")
+    code, _, error = run(*command)
+    assert code == 2 and f"is the input file {tmp_path / included}" in error
+    assert (tmp_path / included).read_bytes() == before

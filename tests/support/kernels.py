@@ -1,0 +1,36 @@
+"""Machine code for all workers of a run of the tests: made once, before they begin."""
+
+import subprocess
+import sys
+from importlib.util import find_spec
+
+# Two processes, for two cores. Each loads a robot and calls what its kernels serve.
+_CALLS = (
+    """
+law = fflin.StateFeedback(lin, fflin.lqr(lin).K)
+spread = {"*.mass": 0.05, "q_b": 0.02}
+fflin.monte_carlo(robot, law, spread, runs=8, duration=0.02, dt=0.01, engine="compiled")
+""",
+    """
+import numpy as np
+fflin.simulate(robot, duration=0.02, dt=0.01, engine="compiled")
+q, v = robot.neutral(), np.zeros(robot.nv)
+fflin.Linearizer(robot, engine="compiled")(q, v)
+rows = np.tile(q, (2000, 1))
+fflin.sweep(robot, rows)
+fflin.sweep(robot, rows, np.full((2000, robot.nv), 0.1))
+""",
+)
+_BEFORE = "import fflin; robot = fflin.load('planar_detumble'); lin = fflin.linearize(robot)"
+
+
+def wanted(selection: str) -> bool:
+    """Return whether a selection of marks (`-m`) takes the compiled tests in number."""
+    return find_spec("numba") is not None and selection in ("", "compiled")
+
+
+def prepare() -> None:
+    """Compile what is not on disk yet, and wait for it."""
+    started = [subprocess.Popen([sys.executable, "-c", _BEFORE + calls]) for calls in _CALLS]
+    for process in started:
+        assert process.wait() == 0, "the kernels were not compiled; the reason stands above"
